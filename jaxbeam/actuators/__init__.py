@@ -1,0 +1,19 @@
+"""Actuators, one kind a file, behind the interface in `base`."""
+
+from jaxbeam.actuators.base import AbstractActuator, Attachment
+from jaxbeam.actuators.patch import Patch
+from jaxbeam.actuators.point import PointForce
+from jaxbeam.actuators.shaker import Shaker
+from jaxbeam.actuators.spring import SpringDamper
+
+KINDS = {"point": PointForce, "shaker": Shaker, "patch": Patch, "spring": SpringDamper}
+
+__all__ = [
+    "KINDS",
+    "AbstractActuator",
+    "Attachment",
+    "Patch",
+    "PointForce",
+    "Shaker",
+    "SpringDamper",
+]

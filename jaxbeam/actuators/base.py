@@ -1,0 +1,49 @@
+"""What every actuator says about itself: one linear attachment to the beam."""
+
+import abc
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+
+class Attachment(eqx.Module):
+    """A linear device attached to the beam through one generalised coordinate.
+
+    With s the stroke (the beam's deflection or difference of slopes where the device acts,
+    s = shape . q) and r the generalised force it exerts on the beam along s,
+
+        z' = A z + B u + E s',      r = C z + D u - mass s'' - damping s' - stiffness s
+
+    so that power flowing into the beam is r s'. States z are the device's own; `mass` is None
+    where the device has none, which saves the modes from being coupled by it.
+    """
+
+    state_matrix: Float[Array, "state state"]
+    input_matrix: Float[Array, " state"]
+    stroke_matrix: Float[Array, " state"]
+    output_matrix: Float[Array, " state"]
+    feedthrough: Float[Array, ""]
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    mass: Float[Array, ""] | None = None
+
+
+class AbstractActuator(eqx.Module):
+    """Interface of all actuators.
+
+    To add one, write a file with a subclass and name it in `jaxbeam.actuators.KINDS`.
+    """
+
+    limits: eqx.AbstractVar[Float[Array, "2"] | None]
+
+    @abc.abstractmethod
+    def stroke(self) -> tuple[tuple[Float[Array, ""], int, float], ...]:
+        """Where it acts: terms (position in m, derivative of the deflection, factor).
+
+        A point force acts on the deflection at its position: ((x, 0, 1.0),); a patch on the
+        difference of slopes over its length: ((x1, 1, 1.0), (x2, 1, -1.0)).
+        """
+
+    @abc.abstractmethod
+    def attachment(self) -> Attachment:
+        """Its linear model, from command (V or N) to generalised force."""

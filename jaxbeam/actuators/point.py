@@ -1,0 +1,21 @@
+"""A force applied at a point, exactly as commanded."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.actuators.base import AbstractActuator, Attachment
+from jaxbeam.fields import number
+
+
+class PointForce(AbstractActuator):
+    """An ideal point force: a command of 1 N pushes the beam up with 1 N."""
+
+    position: Float[Array, ""] = number("m", "distance from the left end")
+    limits: Float[Array, "2"] | None = number("N", "smallest and largest command", default=None)
+
+    def stroke(self):
+        return ((self.position, 0, 1.0),)
+
+    def attachment(self) -> Attachment:
+        none, zero = jnp.zeros(0), jnp.zeros(())
+        return Attachment(jnp.zeros((0, 0)), none, none, none, jnp.ones(()), zero, zero)

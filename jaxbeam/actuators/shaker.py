@@ -1,0 +1,37 @@
+"""Electrodynamic shaker as a first-order lag on a suspension."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.actuators.base import AbstractActuator, Attachment
+from jaxbeam.fields import number
+
+
+class Shaker(AbstractActuator):
+    """Electrodynamic shaker: voltage to force through a first-order lag, with its suspension.
+
+    z' = bandwidth (u - z), force = force_per_volt z - stiffness w - damping w', eqs (2.35) and
+    (2.36) of the thesis with alpha = beta = bandwidth. Positive voltage lifts the beam. With no
+    command it is the spring and damper of its suspension.
+    """
+
+    position: Float[Array, ""] = number("m", "distance from the left end")
+    stiffness: Float[Array, ""] = number("N/m", "suspension stiffness", default=0.0)
+    damping: Float[Array, ""] = number("N s/m", "suspension damping", default=0.0)
+    force_per_volt: Float[Array, ""] = number("N/V", "steady force per volt", default=4.6)
+    bandwidth: Float[Array, ""] = number("1/s", "first-order lag", default=1e4)
+    limits: Float[Array, "2"] | None = number("V", "smallest and largest voltage", default=None)
+
+    def stroke(self):
+        return ((self.position, 0, 1.0),)
+
+    def attachment(self) -> Attachment:
+        return Attachment(
+            state_matrix=-self.bandwidth[None, None],
+            input_matrix=self.bandwidth[None],
+            stroke_matrix=jnp.zeros(1),
+            output_matrix=self.force_per_volt[None],
+            feedthrough=jnp.zeros(()),
+            stiffness=self.stiffness,
+            damping=self.damping,
+        )

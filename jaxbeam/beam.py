@@ -1,0 +1,78 @@
+"""The beam and what it rests on: section, material, damping, ends and supports."""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from jaxbeam.fields import choice, count, number
+
+ENDS = ("pinned", "clamped", "free", "guided")
+
+
+class Support(eqx.Module):
+    """A support between (or at) the ends of a beam.
+
+    Without a `stiffness` it holds the deflection rigidly; with one it is a vertical spring.
+    Supports shape the modes of the beam, except for their dampers, which couple those modes.
+    """
+
+    position: Float[Array, ""] = number("m", "distance from the left end")
+    stiffness: Float[Array, ""] | None = number(
+        "N/m", "vertical spring; rigid if left out", default=None
+    )
+    damping: Float[Array, ""] = number("N s/m", "vertical damper", default=0.0)
+    rotational_stiffness: Float[Array, ""] = number(
+        "N m/rad", "spring against rotation", default=0.0
+    )
+
+
+class Beam(eqx.Module):
+    """A straight Euler-Bernoulli beam of uniform section.
+
+    Give either `flexural_rigidity` and `mass_per_length`, or the rectangular section and material
+    `width`, `height`, `youngs_modulus`, `density` (height is measured in the bending direction).
+
+    Damping is modal: one `damping_ratio` for all modes or one for each; or, when
+    `rayleigh_damping` is given, proportional to mass and stiffness, D = a M + b K.
+    """
+
+    length: Float[Array, ""] = number("m", "total length")
+    flexural_rigidity: Float[Array, ""] | None = number(
+        "N m^2", "bending stiffness E I", default=None
+    )
+    mass_per_length: Float[Array, ""] | None = number("kg/m", "mass per length", default=None)
+    damping_ratio: Float[Array, " *modes"] = number(
+        "1", "modal damping ratio, one for all modes or a list", default=0.0
+    )
+    ends: str = choice("end conditions, left-right", default="pinned-pinned")
+    modes: int = count("number of modes of the supported beam", default=3)
+    width: Float[Array, ""] | None = number("m", "section width", default=None)
+    height: Float[Array, ""] | None = number("m", "section height", default=None)
+    youngs_modulus: Float[Array, ""] | None = number("Pa", "Young's modulus", default=None)
+    density: Float[Array, ""] | None = number("kg/m^3", "density", default=None)
+    rayleigh_damping: Float[Array, "2"] | None = number(
+        "1/s, s", "coefficients a (of mass) and b (of stiffness)", default=None
+    )
+
+    @property
+    def rigidity(self) -> Float[Array, ""]:
+        """Bending stiffness E I in N m^2, given or from the rectangular section."""
+        if self.flexural_rigidity is not None:
+            return self.flexural_rigidity
+        return self.youngs_modulus * self.width * self.height**3 / 12
+
+    @property
+    def linear_density(self) -> Float[Array, ""]:
+        """Mass per length in kg/m, given or from section and density."""
+        if self.mass_per_length is not None:
+            return self.mass_per_length
+        return self.density * self.width * self.height
+
+    @property
+    def left_end(self) -> str:
+        """End condition at x = 0."""
+        return self.ends.split("-")[0]
+
+    @property
+    def right_end(self) -> str:
+        """End condition at x = length."""
+        return self.ends.split("-")[1]

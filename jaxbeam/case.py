@@ -1,0 +1,130 @@
+"""The case: everything that decides a run, as one immutable tree whose numbers have addresses."""
+
+import difflib
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.actuators import AbstractActuator
+from jaxbeam.beam import Beam, Support
+from jaxbeam.fields import choice, number
+from jaxbeam.loads import AbstractLoad
+from jaxbeam.sensors import Sensor
+
+
+class Run(eqx.Module):
+    """How long to simulate, and how often to save a sample."""
+
+    duration: Float[Array, ""] = number("s", "simulated time, from 0")
+    sample_rate: Float[Array, ""] = number("Hz", "saved samples per second", default=1000.0)
+    gravity: Float[Array, ""] = number("m/s^2", "acceleration of gravity", default=9.81)
+
+
+class Case(eqx.Module):
+    """Beam, supports, actuators, sensors, loads, controller and run settings.
+
+    A plain tree: make a changed copy with `replace(case, {"loads.0.mass": 0.3})` or
+    `equinox.tree_at`. Every number has an address, its dotted path.
+    """
+
+    beam: Beam
+    supports: tuple[Support, ...] = ()
+    actuators: tuple[AbstractActuator, ...] = ()
+    sensors: tuple[Sensor, ...] = ()
+    loads: tuple[AbstractLoad, ...] = ()
+    controller: Any = None
+    run: Run | None = None
+    title: str = choice("free text", default="")
+
+    def __init__(
+        self,
+        beam: Beam,
+        supports=(),
+        actuators=(),
+        sensors=(),
+        loads=(),
+        controller=None,
+        run: Run | None = None,
+        title: str = "",
+    ):
+        self.beam = beam
+        self.supports = tuple(supports)
+        self.actuators = tuple(actuators)
+        self.sensors = tuple(sensors)
+        self.loads = tuple(loads)
+        self.controller = controller
+        self.run = Run(duration=1.0) if run is None else run
+        self.title = title
+
+
+def _name(key) -> str:
+    """The word or number in one step of a tree path."""
+    return str(getattr(key, "name", getattr(key, "idx", getattr(key, "key", key))))
+
+
+def _leaves(case: Case) -> dict[str, Any]:
+    paths, _ = jax.tree_util.tree_flatten_with_path(case)
+    return {".".join(_name(key) for key in path): leaf for path, leaf in paths}
+
+
+def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
+    """All numbers of a case by address; each entry of a list has its own address too.
+
+    `beam.damping_ratio` given as a list is addressed as a whole and as `beam.damping_ratio.0`, ...
+    Values are in the SI unit of the field.
+    """
+    found = {}
+    for address, leaf in _leaves(case).items():
+        found[address] = leaf
+        if jnp.ndim(leaf) == 1:
+            found |= {f"{address}.{i}": leaf[i] for i in range(leaf.shape[0])}
+    return found
+
+
+def unknown_address(case: Case, address: str) -> ValueError:
+    """The error for an address that the case does not have, with the nearest one it has."""
+    names = list(addresses(case))
+    near = difflib.get_close_matches(address, names, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]!r}?" if near else f"; it has {', '.join(names)}"
+    return ValueError(f"the case has no number at address {address!r}{hint}")
+
+
+def value_at(case: Case, address: str) -> Float[Array, "..."]:
+    """Return the number at an address.
+
+    Raises ValueError, with the nearest known address, if there is none there.
+    """
+    found = addresses(case)
+    if address not in found:
+        raise unknown_address(case, address)
+    return found[address]
+
+
+def replace(case: Case, values: dict[str, Any]) -> Case:
+    """Return a copy of the case with other numbers at some addresses (SI units).
+
+    Differentiable in the values. Raises ValueError for an unknown address or a wrong shape.
+    """
+    paths, structure = jax.tree_util.tree_flatten_with_path(case)
+    leaves = [leaf for _, leaf in paths]
+    index = {".".join(_name(key) for key in path): i for i, (path, _) in enumerate(paths)}
+    for address, value in values.items():
+        value = jnp.asarray(value, float)
+        parent, _, entry = address.rpartition(".")
+        if address in index:
+            old = leaves[index[address]]
+            if jnp.shape(value) != jnp.shape(old):
+                raise ValueError(
+                    f"{address} takes a value of shape {jnp.shape(old)}, not {jnp.shape(value)}"
+                )
+            leaves[index[address]] = value
+        elif parent in index and entry.isdigit() and int(entry) < jnp.size(leaves[index[parent]]):
+            if value.shape:
+                raise ValueError(f"{address} takes one number, not {value.shape}")
+            leaves[index[parent]] = leaves[index[parent]].at[int(entry)].set(value)
+        else:
+            raise unknown_address(case, address)
+    return jax.tree_util.tree_unflatten(structure, leaves)

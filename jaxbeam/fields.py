@@ -1,0 +1,63 @@
+"""Field declarations shared by all data classes of a case.
+
+A number of a case is a JAX array leaf, so that it can be traced, batched and differentiated;
+names and counts are static. The metadata carries the SI unit and one line of meaning, which
+error messages, tables and plots read, so that each is written once.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def _as_array(value):
+    """Make a float array leaf of a number; leave tracers and placeholders alone."""
+    if isinstance(value, int | float | list | tuple | np.ndarray | np.generic):
+        return jnp.asarray(value, float)
+    return value
+
+
+def _as_optional_array(value):
+    return None if value is None else _as_array(value)
+
+
+def number(unit: str, meaning: str, **options):
+    """Declare a number of a case: a differentiable leaf with its SI unit and its meaning.
+
+    With `default=None` the number may be left out; its absence is part of the structure.
+    """
+    converter = _as_optional_array if options.get("default", 0.0) is None else _as_array
+    return eqx.field(converter=converter, metadata={"unit": unit, "meaning": meaning}, **options)
+
+
+def choice(meaning: str, *allowed: str, **options):
+    """Declare a word of a case, one of `allowed` (any word if none is named)."""
+    metadata = {"meaning": meaning, "allowed": allowed}
+    return eqx.field(static=True, metadata=metadata, **options)
+
+
+def count(meaning: str, **options):
+    """Declare a whole number of a case; it decides array shapes, so it is static."""
+    return eqx.field(static=True, metadata={"meaning": meaning, "count": True}, **options)
+
+
+def is_known(value) -> bool:
+    """Tell whether `value` has numbers one can look at now (it is not an abstract tracer)."""
+    if not isinstance(value, jax.core.Tracer):
+        return True
+    try:
+        np.asarray(known(value))
+    except jax.errors.ConcretizationTypeError:
+        return False
+    return True
+
+
+def known(value) -> np.ndarray:
+    """Return the numbers behind `value`, also while it is being differentiated.
+
+    Raises `jax.errors.ConcretizationTypeError` inside `jit` or `vmap`, where there are none yet.
+    """
+    if isinstance(value, jax.core.Tracer):
+        value = jax.core.concrete_or_error(None, value)
+    return np.asarray(value, float)

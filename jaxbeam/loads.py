@@ -1,0 +1,87 @@
+"""Loads that travel along the beam: what they weigh, and how they move.
+
+A load is a mass or a force; how it travels (constant deceleration or a table of positions) is a
+separate matter, see `motion`. Both kinds answer the same three questions: what inertia presses
+with the load, what it weighs, and how it moves.
+"""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.fields import number
+from jaxbeam.motion import AbstractMotion, Braking, Tabulated
+
+
+class AbstractLoad(eqx.Module):
+    """Interface of all travelling loads."""
+
+    speed: eqx.AbstractVar[Float[Array, ""] | None]
+    entry_time: eqx.AbstractVar[Float[Array, ""]]
+    deceleration: eqx.AbstractVar[Float[Array, ""]]
+    times: eqx.AbstractVar[Float[Array, " point"] | None]
+    positions: eqx.AbstractVar[Float[Array, " point"] | None]
+
+    @abc.abstractmethod
+    def inertia(self) -> Float[Array, ""]:
+        """Mass that follows the deflection of the beam, in kg."""
+
+    @abc.abstractmethod
+    def weight(self, gravity: Float[Array, ""]) -> Float[Array, ""]:
+        """Force with which it presses on a beam at rest, in N, positive downwards."""
+
+
+class MovingMass(AbstractLoad):
+    """A mass that stays on the beam: it presses with its weight and with its inertia.
+
+    Its acceleration is the full convective one along its path (corrected eq. 2.3 of the thesis).
+    Give `speed` (negative: it enters at the right end and travels left), `entry_time` and
+    `deceleration`; or a table of `times` and `positions`.
+    """
+
+    mass: Float[Array, ""] = number("kg", "mass")
+    speed: Float[Array, ""] | None = number("m/s", "speed at entry", default=None)
+    entry_time: Float[Array, ""] = number("s", "time of entry", default=0.0)
+    deceleration: Float[Array, ""] = number("m/s^2", "constant braking", default=0.0)
+    times: Float[Array, " point"] | None = number("s", "table: times", default=None)
+    positions: Float[Array, " point"] | None = number("m", "table: positions", default=None)
+
+    def inertia(self):
+        return self.mass
+
+    def weight(self, gravity):
+        return self.mass * gravity
+
+
+class MovingForce(AbstractLoad):
+    """A constant force that travels: weight without inertia.
+
+    Give the `force` in N (positive downwards), or the `mass` whose weight it is; the rest is as
+    for a moving mass.
+    """
+
+    mass: Float[Array, ""] | None = number("kg", "mass whose weight it is", default=None)
+    force: Float[Array, ""] | None = number("N", "force, positive downwards", default=None)
+    speed: Float[Array, ""] | None = number("m/s", "speed at entry", default=None)
+    entry_time: Float[Array, ""] = number("s", "time of entry", default=0.0)
+    deceleration: Float[Array, ""] = number("m/s^2", "constant braking", default=0.0)
+    times: Float[Array, " point"] | None = number("s", "table: times", default=None)
+    positions: Float[Array, " point"] | None = number("m", "table: positions", default=None)
+
+    def inertia(self):
+        return jnp.zeros(())
+
+    def weight(self, gravity):
+        return self.force if self.force is not None else self.mass * gravity
+
+
+KINDS = {"mass": MovingMass, "force": MovingForce}
+
+
+def motion(load: AbstractLoad, length: Float[Array, ""]) -> AbstractMotion:
+    """How the load travels along a beam of the given length (m)."""
+    if load.times is not None:
+        return Tabulated(load.times, load.positions, length)
+    return Braking(load.speed, load.entry_time, load.deceleration, length)

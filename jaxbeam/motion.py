@@ -1,0 +1,163 @@
+"""How a load travels: position, speed and acceleration along the beam at any time."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+NEVER = 1e300  # a time that is never reached, finite so that its arithmetic has derivatives
+
+
+class AbstractMotion(eqx.Module):
+    """A path x(t) over the beam, entered once and left at most once."""
+
+    length: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def travel(self, t) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+        """Position (m), speed (m/s) and acceleration (m/s^2) at times t (s), of any shape."""
+
+    @abc.abstractmethod
+    def window(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Times of entry and exit in s; the exit is `NEVER` where the load stays on the beam."""
+
+    @abc.abstractmethod
+    def arrivals(self, places: Float[Array, " place"]) -> Float[Array, " kink"]:
+        """Times in s at which the motion is not smooth, or passes one of the places (m)."""
+
+
+class Braking(AbstractMotion):
+    """Constant deceleration from the speed at entry: x = v t - a t^2 / 2 until it stops.
+
+    A negative speed enters at the right end and travels left. A negative deceleration speeds the
+    load up.
+    """
+
+    speed: Float[Array, ""]
+    entry_time: Float[Array, ""]
+    deceleration: Float[Array, ""]
+    length: Float[Array, ""]
+
+    def _stop(self):
+        """Time from entry until it stands still."""
+        braking = self.deceleration > 0
+        deceleration = jnp.where(braking, self.deceleration, 1.0)
+        return jnp.where(braking, jnp.abs(self.speed) / deceleration, NEVER)
+
+    def _reach(self, distance):
+        """Time from entry until `distance` is covered: the smaller root of the parabola."""
+        speed = jnp.abs(self.speed)
+        root = speed**2 - 2 * self.deceleration * distance
+        left = jnp.where(root > 0, jnp.sqrt(jnp.where(root > 0, root, 1.0)), 0.0)
+        reached = (root >= 0) & (speed + left > 0)
+        return jnp.where(reached, 2 * distance / jnp.where(reached, speed + left, 1.0), NEVER)
+
+    def travel(self, t):
+        since = t - self.entry_time
+        stop = self._stop()
+        moving = since < stop
+        run = jnp.minimum(since, stop)
+        way = jnp.sign(self.speed)
+        distance = jnp.abs(self.speed) * run - self.deceleration * run**2 / 2
+        speed = jnp.where(moving, jnp.abs(self.speed) - self.deceleration * run, 0.0)
+        start = jnp.where(self.speed < 0, self.length, 0.0)
+        braking = jnp.where(moving, -self.deceleration, 0.0)
+        return start + way * distance, way * speed, way * braking
+
+    def window(self):
+        reach = self._reach(self.length)
+        return self.entry_time, jnp.where(reach < NEVER, self.entry_time + reach, NEVER)
+
+    def arrivals(self, places):
+        distance = jnp.where(self.speed < 0, self.length - places, places)
+        kinks = jnp.append(self._reach(distance), self._stop())
+        return jnp.where(kinks < NEVER, self.entry_time + kinks, NEVER)
+
+
+class Tabulated(AbstractMotion):
+    """A path through given positions at given times: a not-a-knot cubic spline.
+
+    The load is put on the beam at the first time (or enters when it passes an end) and, when the
+    table ends on the beam, stays where it is. Positions must run one way for the times at which
+    it passes supports to be step boundaries; a path that turns round is followed all the same.
+    """
+
+    times: Float[Array, " point"]
+    positions: Float[Array, " point"]
+    length: Float[Array, ""]
+
+    def _curvatures(self):
+        """Second derivatives of the spline at its knots."""
+        t, x = self.times, self.positions
+        n = t.shape[0]
+        h, slope = jnp.diff(t), jnp.diff(x) / jnp.diff(t)
+        if n == 2:
+            return jnp.zeros(2)
+        if n == 3:
+            return jnp.full(3, 2 * (slope[1] - slope[0]) / (h[0] + h[1]))
+        inner = jnp.arange(1, n - 1)
+        rows = jnp.zeros((n, n))
+        rows = rows.at[inner, inner - 1].set(h[:-1])
+        rows = rows.at[inner, inner].set(2 * (h[:-1] + h[1:]))
+        rows = rows.at[inner, inner + 1].set(h[1:])
+        rows = rows.at[0, :3].set(jnp.stack([h[1], -(h[0] + h[1]), h[0]]))
+        rows = rows.at[-1, -3:].set(jnp.stack([h[-1], -(h[-2] + h[-1]), h[-2]]))
+        return jnp.linalg.solve(rows, jnp.zeros(n).at[inner].set(6 * jnp.diff(slope)))
+
+    def travel(self, t):
+        knots, x, bend = self.times, self.positions, self._curvatures()
+        on = (t >= knots[0]) & (t <= knots[-1])
+        held = jnp.clip(t, knots[0], knots[-1])
+        i = jnp.clip(jnp.searchsorted(knots, held, side="right") - 1, 0, knots.shape[0] - 2)
+        h = knots[i + 1] - knots[i]
+        after, before = held - knots[i], knots[i + 1] - held
+        position = (
+            (bend[i] * before**3 + bend[i + 1] * after**3) / (6 * h)
+            + (x[i] / h - bend[i] * h / 6) * before
+            + (x[i + 1] / h - bend[i + 1] * h / 6) * after
+        )
+        speed = (
+            (bend[i + 1] * after**2 - bend[i] * before**2) / (2 * h)
+            + (x[i + 1] - x[i]) / h
+            - (bend[i + 1] - bend[i]) * h / 6
+        )
+        acceleration = (bend[i] * before + bend[i + 1] * after) / h
+        return position, jnp.where(on, speed, 0.0), jnp.where(on, acceleration, 0.0)
+
+    def _pass(self, place):
+        """First time at which the path passes a place: bisection, then one Newton step.
+
+        The Newton step leaves the value as it is and gives it its derivative.
+        """
+        beyond = jnp.sign(self.positions - place) * jnp.sign(self.positions[0] - place) <= 0
+        last = jnp.argmax(beyond)
+        low, high = self.times[jnp.maximum(last - 1, 0)], self.times[last]
+        side = jnp.sign(self.positions[0] - place)
+
+        def halve(_, bracket):
+            low, high = bracket
+            middle = (low + high) / 2
+            before = jnp.sign(self.travel(middle)[0] - place) == side
+            return jnp.where(before, middle, low), jnp.where(before, high, middle)
+
+        low, high = jax.lax.fori_loop(0, 60, halve, jax.lax.stop_gradient((low, high)))
+        time = (low + high) / 2
+        position, speed, _ = self.travel(time)
+        moving = jnp.abs(speed) > 0
+        step = jnp.where(moving, (position - place) / jnp.where(moving, speed, 1.0), 0.0)
+        return jnp.where(jnp.any(beyond), time - (step - jax.lax.stop_gradient(step)), NEVER)
+
+    def window(self):
+        first, last = self.positions[0], self.positions[-1]
+        near = jnp.where(first < last, 0.0, self.length)
+        outside = (first < 0) | (first > self.length)
+        entry = jnp.where(outside, self._pass(near), self.times[0])
+        left = (last < 0) | (last > self.length)
+        leaves = jnp.where(left, self._pass(self.length - near), NEVER)
+        return entry, jnp.where(last == self.length - near, self.times[-1], leaves)
+
+    def arrivals(self, places):
+        passes = [self._pass(place) for place in places]
+        return jnp.stack([*passes, self.times[-1]])
