@@ -1,0 +1,36 @@
+"""What every test needs, set before anything else is imported.
+
+float64 is not set here: importing `jaxbeam` sets it, and the tests rely on that as users do.
+"""
+
+import os
+import sys
+
+# No window, on a machine with or without a screen; also in processes a test starts.
+os.environ["MPLBACKEND"] = "Agg"
+# On a machine with a GPU, several test processes share it: none may take most of the memory.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+import hypothesis
+import pytest
+
+# The same examples in every run, so a red test stays red until it is mended. No deadline:
+# the first example pays for compiling. No database: with fixed examples there is nothing
+# to remember.
+hypothesis.settings.register_profile(
+    "jaxbeam",
+    derandomize=True,
+    deadline=None,
+    database=None,
+    print_blob=False,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("jaxbeam")
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    """Close what a test drew: matplotlib warns of many open figures, and warnings are errors."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")

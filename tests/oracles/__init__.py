@@ -1,0 +1,1 @@
+"""Independent solutions to hold jaxbeam against: numpy and scipy only, nothing from jaxbeam."""
