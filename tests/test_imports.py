@@ -1,0 +1,92 @@
+"""Data flows one way: a module imports only what ranks below it."""
+
+import ast
+
+import pytest
+
+from tests.modules import PACKAGES, module_files, parse
+
+# One layer a line, lowest first; the modules of a layer do not import each other. A new module
+# goes into the lowest layer above all that it imports. A package named here stands for all its
+# modules, which may import each other.
+LAYERS = """
+jaxbeam.fields
+jaxbeam.beam  jaxbeam.sensors  jaxbeam.motion  jaxbeam.actuators
+jaxbeam.loads
+jaxbeam.case
+jaxbeam.checks
+jaxbeam.casefile
+jaxbeam.modes
+jaxbeam.rig
+jaxbeam.static  jaxbeam.duhamel
+jaxbeam.grid  jaxbeam.plan
+jaxbeam.dynamics
+jaxbeam.integrate  jaxbeam.reference
+jaxbeam.record
+jaxbeam.simulate
+jaxbeam.sweep
+jaxbeam.plot
+jaxbeam.__init__
+tuning
+experiments
+jaxbeam.cli
+jaxbeam.__main__
+"""
+RANKS = {name: rank for rank, layer in enumerate(LAYERS.split("\n")) for name in layer.split()}
+FILES = module_files()
+
+
+def place(module: str) -> str | None:
+    """The entry of the table under which a module falls."""
+    parts = module.split(".")
+    names = [".".join(parts[: i + 1]) for i in range(len(parts))]
+    return next((name for name in names if name in RANKS), None)
+
+
+def imported(tree: ast.AST) -> set[str]:
+    """Our modules that the code in a syntax tree imports, anywhere in it."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            # `from package import name` may mean the module package.name
+            found |= {
+                inner if (inner := f"{node.module}.{alias.name}") in FILES else str(node.module)
+                for alias in node.names
+            }
+    ours = {name for name in found if name.split(".")[0] in PACKAGES}
+    return {name if name in FILES else f"{name}.__init__" for name in ours}
+
+
+def imported_at_once(tree: ast.Module) -> set[str]:
+    """Our modules that are imported as soon as the module itself is, not within a function."""
+    eager = [node for node in tree.body if not isinstance(node, ast.FunctionDef)]
+    return imported(ast.Module(eager, []))
+
+
+@pytest.mark.parametrize("module", FILES)
+def test_has_a_rank(module):
+    assert place(module), f"give {module} a place in LAYERS of tests/test_imports.py"
+
+
+@pytest.mark.parametrize("module", FILES)
+def test_imports_only_downward(module):
+    here = place(module)
+    for other in imported(parse(FILES[module])):
+        there = place(other)
+        assert here and there
+        below = RANKS[there] < RANKS[here]
+        assert below or here == there, f"{module} imports {other}, which does not rank below it"
+
+
+def test_experiments_are_imported_only_when_a_command_needs_them():
+    for module, path in FILES.items():
+        if place(module) == "experiments":
+            continue
+        tree = parse(path)
+        wanted = [name for name in imported(tree) if name.startswith("experiments")]
+        assert not wanted or module == "jaxbeam.cli", f"{module} imports {wanted}"
+        eager = [name for name in imported_at_once(tree) if name.startswith("experiments")]
+        assert not eager, f"{module} imports {eager} outside a function"
