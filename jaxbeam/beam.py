@@ -3,7 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import choice, count, number
+from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, number
 
 ENDS = ("pinned", "clamped", "free", "guided")
 
@@ -15,13 +15,13 @@ class Support(eqx.Module):
     Supports shape the modes of the beam, except for their dampers, which couple those modes.
     """
 
-    position: Float[Array, ""] = number("m", "distance from the left end")
+    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
     stiffness: Float[Array, ""] | None = number(
-        "N/m", "vertical spring; rigid if left out", default=None
+        "N/m", "vertical spring; rigid if left out", NOT_NEGATIVE, default=None
     )
-    damping: Float[Array, ""] = number("N s/m", "vertical damper", default=0.0)
+    damping: Float[Array, ""] = number("N s/m", "vertical damper", NOT_NEGATIVE, default=0.0)
     rotational_stiffness: Float[Array, ""] = number(
-        "N m/rad", "spring against rotation", default=0.0
+        "N m/rad", "spring against rotation", NOT_NEGATIVE, default=0.0
     )
 
 
@@ -35,22 +35,26 @@ class Beam(eqx.Module):
     `rayleigh_damping` is given, proportional to mass and stiffness, D = a M + b K.
     """
 
-    length: Float[Array, ""] = number("m", "total length")
+    length: Float[Array, ""] = number("m", "total length", POSITIVE)
     flexural_rigidity: Float[Array, ""] | None = number(
-        "N m^2", "bending stiffness E I", default=None
+        "N m^2", "bending stiffness E I", POSITIVE, default=None
     )
-    mass_per_length: Float[Array, ""] | None = number("kg/m", "mass per length", default=None)
+    mass_per_length: Float[Array, ""] | None = number(
+        "kg/m", "mass per length", POSITIVE, default=None
+    )
     damping_ratio: Float[Array, " *modes"] = number(
-        "1", "modal damping ratio, one for all modes or a list", default=0.0
+        "1", "modal damping ratio, one for all modes or a list", NOT_NEGATIVE, default=0.0
     )
     ends: str = choice("end conditions, left-right", default="pinned-pinned")
     modes: int = count("number of modes of the supported beam", default=3)
-    width: Float[Array, ""] | None = number("m", "section width", default=None)
-    height: Float[Array, ""] | None = number("m", "section height", default=None)
-    youngs_modulus: Float[Array, ""] | None = number("Pa", "Young's modulus", default=None)
-    density: Float[Array, ""] | None = number("kg/m^3", "density", default=None)
+    width: Float[Array, ""] | None = number("m", "section width", POSITIVE, default=None)
+    height: Float[Array, ""] | None = number("m", "section height", POSITIVE, default=None)
+    youngs_modulus: Float[Array, ""] | None = number(
+        "Pa", "Young's modulus", POSITIVE, default=None
+    )
+    density: Float[Array, ""] | None = number("kg/m^3", "density", POSITIVE, default=None)
     rayleigh_damping: Float[Array, "2"] | None = number(
-        "1/s, s", "coefficients a (of mass) and b (of stiffness)", default=None
+        "1/s, s", "coefficients a (of mass) and b (of stiffness)", NOT_NEGATIVE, default=None
     )
 
     @property

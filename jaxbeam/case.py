@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.actuators import AbstractActuator
 from jaxbeam.beam import Beam, Support
-from jaxbeam.fields import choice, number
+from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, choice, number
 from jaxbeam.loads import AbstractLoad
 from jaxbeam.sensors import Sensor
 
@@ -18,9 +18,13 @@ from jaxbeam.sensors import Sensor
 class Run(eqx.Module):
     """How long to simulate, and how often to save a sample."""
 
-    duration: Float[Array, ""] = number("s", "simulated time, from 0")
-    sample_rate: Float[Array, ""] = number("Hz", "saved samples per second", default=1000.0)
-    gravity: Float[Array, ""] = number("m/s^2", "acceleration of gravity", default=9.81)
+    duration: Float[Array, ""] = number("s", "simulated time, from 0", POSITIVE)
+    sample_rate: Float[Array, ""] = number(
+        "Hz", "saved samples per second", POSITIVE, default=1000.0
+    )
+    gravity: Float[Array, ""] = number(
+        "m/s^2", "acceleration of gravity", NOT_NEGATIVE, default=9.81
+    )
 
 
 class Case(eqx.Module):

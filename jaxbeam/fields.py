@@ -22,13 +22,22 @@ def _as_optional_array(value):
     return None if value is None else _as_array(value)
 
 
-def number(unit: str, meaning: str, **options):
+# What a number must do, in the words of the error message; `checks` enforces it.
+POSITIVE = "be positive"
+NOT_NEGATIVE = "not be negative"
+ON_BEAM = "lie on the beam"
+INCREASING = "increase"
+
+
+def number(unit: str, meaning: str, must: str = "", **options):
     """Declare a number of a case: a differentiable leaf with its SI unit and its meaning.
 
-    With `default=None` the number may be left out; its absence is part of the structure.
+    With `default=None` the number may be left out; its absence is part of the structure. `must`
+    is one of the rules above (none: any finite value).
     """
     converter = _as_optional_array if options.get("default", 0.0) is None else _as_array
-    return eqx.field(converter=converter, metadata={"unit": unit, "meaning": meaning}, **options)
+    metadata = {"unit": unit, "meaning": meaning, "must": must}
+    return eqx.field(converter=converter, metadata=metadata, **options)
 
 
 def choice(meaning: str, *allowed: str, **options):

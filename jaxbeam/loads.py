@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import number
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, number
 from jaxbeam.motion import AbstractMotion, Braking, Tabulated
 
 
@@ -41,11 +41,11 @@ class MovingMass(AbstractLoad):
     `deceleration`; or a table of `times` and `positions`.
     """
 
-    mass: Float[Array, ""] = number("kg", "mass")
+    mass: Float[Array, ""] = number("kg", "mass", NOT_NEGATIVE)
     speed: Float[Array, ""] | None = number("m/s", "speed at entry", default=None)
     entry_time: Float[Array, ""] = number("s", "time of entry", default=0.0)
     deceleration: Float[Array, ""] = number("m/s^2", "constant braking", default=0.0)
-    times: Float[Array, " point"] | None = number("s", "table: times", default=None)
+    times: Float[Array, " point"] | None = number("s", "table: times", INCREASING, default=None)
     positions: Float[Array, " point"] | None = number("m", "table: positions", default=None)
 
     def inertia(self):
@@ -62,12 +62,14 @@ class MovingForce(AbstractLoad):
     for a moving mass.
     """
 
-    mass: Float[Array, ""] | None = number("kg", "mass whose weight it is", default=None)
+    mass: Float[Array, ""] | None = number(
+        "kg", "mass whose weight it is", NOT_NEGATIVE, default=None
+    )
     force: Float[Array, ""] | None = number("N", "force, positive downwards", default=None)
     speed: Float[Array, ""] | None = number("m/s", "speed at entry", default=None)
     entry_time: Float[Array, ""] = number("s", "time of entry", default=0.0)
     deceleration: Float[Array, ""] = number("m/s^2", "constant braking", default=0.0)
-    times: Float[Array, " point"] | None = number("s", "table: times", default=None)
+    times: Float[Array, " point"] | None = number("s", "table: times", INCREASING, default=None)
     positions: Float[Array, " point"] | None = number("m", "table: positions", default=None)
 
     def inertia(self):

@@ -3,7 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import choice, number
+from jaxbeam.fields import ON_BEAM, choice, number
 
 QUANTITIES = {
     "deflection": "m",
@@ -21,7 +21,7 @@ class Sensor(eqx.Module):
     -z d2w/dx2; deflection is positive upwards. `offset` is added to the reading.
     """
 
-    position: Float[Array, ""] = number("m", "distance from the left end")
+    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
     quantity: str = choice("what is measured", *QUANTITIES, default="deflection")
     offset: Float[Array, ""] = number("unit of quantity", "constant added", default=0.0)
     fibre_distance: Float[Array, ""] | None = number(

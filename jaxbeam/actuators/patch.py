@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.actuators.base import AbstractActuator, Attachment
-from jaxbeam.fields import number
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number
 
 
 class Patch(AbstractActuator):
@@ -15,21 +15,21 @@ class Patch(AbstractActuator):
     beam. `added_mass` and `added_rigidity` act over its length and shape the modes.
     """
 
-    start: Float[Array, ""] = number("m", "left edge")
-    end: Float[Array, ""] = number("m", "right edge")
+    start: Float[Array, ""] = number("m", "left edge", ON_BEAM)
+    end: Float[Array, ""] = number("m", "right edge", ON_BEAM)
     moment_per_volt: Float[Array, ""] = number("N m/V", "moment per volt at the patch")
     correction: Float[Array, ""] = number(
         "1", "share of the moment that reaches the beam", default=1.0
     )
-    amplifier_gain: Float[Array, ""] = number(
-        "1", "patch volts per volt of command", default=1.0
-    )
+    amplifier_gain: Float[Array, ""] = number("1", "patch volts per volt of command", default=1.0)
     limits: Float[Array, "2"] | None = number(
-        "V", "smallest and largest command, at the amplifier's input", default=None
+        "V", "smallest and largest command, at the amplifier's input", INCREASING, default=None
     )
-    added_mass: Float[Array, ""] | None = number("kg/m", "mass per length added", default=None)
+    added_mass: Float[Array, ""] | None = number(
+        "kg/m", "mass per length added", NOT_NEGATIVE, default=None
+    )
     added_rigidity: Float[Array, ""] | None = number(
-        "N m^2", "bending stiffness added", default=None
+        "N m^2", "bending stiffness added", NOT_NEGATIVE, default=None
     )
 
     def stroke(self):

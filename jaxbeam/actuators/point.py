@@ -4,14 +4,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.actuators.base import AbstractActuator, Attachment
-from jaxbeam.fields import number
+from jaxbeam.fields import INCREASING, ON_BEAM, number
 
 
 class PointForce(AbstractActuator):
     """An ideal point force: a command of 1 N pushes the beam up with 1 N."""
 
-    position: Float[Array, ""] = number("m", "distance from the left end")
-    limits: Float[Array, "2"] | None = number("N", "smallest and largest command", default=None)
+    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
+    limits: Float[Array, "2"] | None = number(
+        "N", "smallest and largest command", INCREASING, default=None
+    )
 
     def stroke(self):
         return ((self.position, 0, 1.0),)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.actuators.base import AbstractActuator, Attachment
-from jaxbeam.fields import number
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
 
 
 class Shaker(AbstractActuator):
@@ -15,12 +15,14 @@ class Shaker(AbstractActuator):
     command it is the spring and damper of its suspension.
     """
 
-    position: Float[Array, ""] = number("m", "distance from the left end")
-    stiffness: Float[Array, ""] = number("N/m", "suspension stiffness", default=0.0)
-    damping: Float[Array, ""] = number("N s/m", "suspension damping", default=0.0)
+    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
+    stiffness: Float[Array, ""] = number("N/m", "suspension stiffness", NOT_NEGATIVE, default=0.0)
+    damping: Float[Array, ""] = number("N s/m", "suspension damping", NOT_NEGATIVE, default=0.0)
     force_per_volt: Float[Array, ""] = number("N/V", "steady force per volt", default=4.6)
-    bandwidth: Float[Array, ""] = number("1/s", "first-order lag", default=1e4)
-    limits: Float[Array, "2"] | None = number("V", "smallest and largest voltage", default=None)
+    bandwidth: Float[Array, ""] = number("1/s", "first-order lag", POSITIVE, default=1e4)
+    limits: Float[Array, "2"] | None = number(
+        "V", "smallest and largest voltage", INCREASING, default=None
+    )
 
     def stroke(self):
         return ((self.position, 0, 1.0),)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.actuators.base import AbstractActuator, Attachment
-from jaxbeam.fields import number
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number
 
 
 class SpringDamper(AbstractActuator):
@@ -14,10 +14,12 @@ class SpringDamper(AbstractActuator):
     eq. (2.17) of the thesis. The result depends on the number of modes kept.
     """
 
-    position: Float[Array, ""] = number("m", "distance from the left end")
-    stiffness: Float[Array, ""] = number("N/m", "spring", default=0.0)
-    damping: Float[Array, ""] = number("N s/m", "damper", default=0.0)
-    limits: Float[Array, "2"] | None = number("1", "unused: takes no command", default=None)
+    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
+    stiffness: Float[Array, ""] = number("N/m", "spring", NOT_NEGATIVE, default=0.0)
+    damping: Float[Array, ""] = number("N s/m", "damper", NOT_NEGATIVE, default=0.0)
+    limits: Float[Array, "2"] | None = number(
+        "1", "unused: takes no command", INCREASING, default=None
+    )
 
     def stroke(self):
         return ((self.position, 0, 1.0),)
