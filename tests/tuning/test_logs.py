@@ -1,0 +1,172 @@
+"""Logs read from text written here, so that every value is known."""
+
+import numpy as np
+import pytest
+
+from jaxbeam.loads import MovingMass
+from tuning import Log, read_log
+
+EXPECTED = [[1.5e-3, -2e-3], [2.5e-3, 0.0], [3.5e-3, 1e-3]]
+FORMATS = {
+    "comma": "time [s],d1 [mm],d2 [mm]\n0,1.5,-2\n0.1,2.5,0\n0.2,3.5,1\n",
+    "semicolon, decimal comma": "time (s);d1 (mm);d2 (mm)\n0;1,5;-2\n0,1;2,5;0\n0,2;3,5;1\n",
+    "semicolon, decimal point": "time (s);d1 (mm);d2 (mm)\n0;1.5;-2\n0.1;2.5;0\n0.2;3.5;1\n",
+    "tab": "time [ms]\td1 [mm]\td2 [µm]\n0\t1.5\t-2e3\n100\t2.5\t0\n200\t3.5\t1000\n",
+    "comments and blank lines": "# rig\n\ntime [s],d1 [mm],d2 [m]\n0,1.5,-2e-3\n\n0.1,2.5,0\n"
+    "0.2,3.5,1e-3\n",
+    "trailing separators": "time [s],d1 [mm],d2 [mm],\n0,1.5,-2,\n0.1,2.5,0,\n0.2,3.5,1,\n",
+    "quotes": '"time [s]","d1 [mm]","d2 [mm]"\n"0","1.5","-2"\n0.1,2.5,0\n0.2,3.5,1\n',
+    "time elsewhere": "d1 [mm],t [s],d2 [mm]\n1.5,0,-2\n2.5,0.1,0\n3.5,0.2,1\n",
+    "time by unit": "clock [s],d1 [mm],d2 [mm]\n0,1.5,-2\n0.1,2.5,0\n0.2,3.5,1\n",
+}
+
+
+def write(folder, text, name="run.csv", encoding="utf-8"):
+    path = folder / name
+    path.write_text(text, encoding=encoding)
+    return path
+
+
+@pytest.mark.parametrize("text", FORMATS.values(), ids=FORMATS)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_separated_values(tmp_path, text, encoding):
+    log = read_log(write(tmp_path, text, encoding=encoding))
+    assert log.names == ("d1", "d2")
+    assert log.quantities == ("deflection", "deflection")
+    np.testing.assert_allclose(log.times, [0, 0.1, 0.2], rtol=1e-15)
+    np.testing.assert_allclose(log.values, EXPECTED, rtol=1e-14)
+    assert log.sample_rate == pytest.approx(10)
+
+
+def test_declared_columns_and_units(tmp_path):
+    path = write(tmp_path, "stamp,a,b\n0,1,2\n1,3,4\n2,5,6\n")
+    log = read_log(path, columns=["b", "a"], units={"stamp": "ms", "a": "g", "b": "um/m"},
+                   time="stamp")  # fmt: skip
+    assert (log.names, log.units) == (("b", "a"), ("um/m", "g"))
+    assert log.quantities == ("strain", "acceleration")
+    np.testing.assert_allclose(log.values[:, 0], [2e-6, 4e-6, 6e-6])
+    np.testing.assert_allclose(log.values[:, 1], [9.80665, 29.41995, 49.03325])
+    np.testing.assert_allclose(log.times, [0, 1e-3, 2e-3])
+
+
+def test_one_unit_for_all_channels(tmp_path):
+    log = read_log(write(tmp_path, "t [s],a,b\n0,1,2\n1,3,4\n"), units="mm")
+    np.testing.assert_allclose(log.values, [[1e-3, 2e-3], [3e-3, 4e-3]])
+
+
+def test_a_log_cannot_be_changed(tmp_path):
+    log = read_log(write(tmp_path, FORMATS["comma"]))
+    with pytest.raises(ValueError, match="read-only"):
+        log.values[0, 0] = 1.0
+    with pytest.raises(AttributeError):
+        log.names = ("x", "y")
+
+
+def test_file_beside_the_log(tmp_path):
+    path = write(tmp_path, "t,left,right,room\n0,1,2,20\n100,3,4,20\n")
+    write(
+        tmp_path,
+        '[columns]\nt = "ms"\nright = { unit = "mm", sensor = 1, position = 0.4 }\nleft = "mm"\n'
+        "[[loads]]\nmass = 0.5\nspeed = 0.55\n"
+        '[[loads]]\nkind = "force"\nforce = 3\nspeed = -1\nentry_time = 0.2\n',
+        "run.toml",
+    )
+    log = read_log(path)
+    assert log.names == ("right", "left")
+    assert log.sensors == (1, None)
+    assert log.positions == (0.4, None)
+    np.testing.assert_allclose(log.values, [[2e-3, 1e-3], [4e-3, 3e-3]])
+    assert isinstance(log.loads[0], MovingMass)
+    assert float(log.loads[1].entry_time) == 0.2
+    assert read_log(path, columns=["left"], units={"left": "m"}).values[0, 0] == 1.0
+
+
+def test_case_file_with_the_name_of_the_log(tmp_path):
+    write(tmp_path, "[beam]\nlength = 1.0\n", "run.toml")
+    assert read_log(write(tmp_path, FORMATS["comma"])).loads is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("colums = 1", "unknown key colums; did you mean 'columns'"),
+        ("[columns]\nd1 = {units = 'mm'}", "unknown key columns.d1.units; did you mean 'unit'"),
+        ("[columns]\nd1 = {sensor = 0.5}", "columns.d1.sensor: must be a whole number"),
+        ("[columns]\nd1 = 3", "columns.d1: give a unit"),
+        ("[columns]\nd3 = 'mm'", "no column 'd3'; did you mean 'd1'|no column 'd3'"),
+        ("[[loads]]\nmas = 1", "unknown key loads.0.mas; did you mean 'mass'"),
+        ("[[loads]]\nkind = 'train'", "loads.0.kind: 'train' is none of mass, force"),
+        ("[[loads]]\nspeed = 1", "loads.0: .*mass"),
+        ("[columns", "run.toml: "),
+    ],
+)
+def test_mistakes_beside_the_log(tmp_path, text, message):
+    write(tmp_path, text, "run.toml")
+    with pytest.raises(ValueError, match=message):
+        read_log(write(tmp_path, FORMATS["comma"]))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "run.csv: the log is empty"),
+        ("# only a comment\n", "the log is empty"),
+        ("t [s],d [mm]\n", "the log is empty: there are column names but no rows"),
+        ("t [s],d [mm]\n0,1\n", "at least two samples"),
+        ("0,1\n1,2\n", "line 1: the first line must name the columns"),
+        ("t [s],d [mm]\n0,1\n1,x\n", "line 3, column 'd': 'x' is no number"),
+        ("t [s],d [mm]\n0,1\n1,\n", "line 3, column 'd': the cell is empty"),
+        ("t [s],d [mm]\n0,1\n\n1,nan\n", "line 4, column 'd': nan is not a finite number"),
+        ("t [s],d [mm]\n0,1\n1,inf\n", "line 3, column 'd': inf is not a finite"),
+        ("t [s],d [mm]\n0,1\n1,2,3\n", "line 3: 3 cells for 2 columns"),
+        ("t [s],d [mm]\n0,1\n1,2\n1,3\n", "line 4: time 1 s is repeated"),
+        ("t [s],d [mm]\n0,1\n2,2\n1,3\n", "line 4: time 1 s comes after 2 s"),
+        ("t [s],d [parsec]\n0,1\n1,2\n", "column 'd': unknown unit 'parsec'"),
+        ("t [s],d\n0,1\n1,2\n", r"column 'd': no unit found; write it in the heading, d \[mm\]"),
+        ("t,d [mm]\n0,1\n1,2\n", "column 't': no unit found"),
+        ("t [mm],d [mm]\n0,1\n1,2\n", "the column of times, 't', has the unit 'mm'"),
+        ("a [mm],d [mm]\n0,1\n1,2\n", "no column is called time"),
+        ("t [s],d [mm],d [mm]\n0,1,1\n1,2,2\n", "two columns are called 'd'"),
+        ("t [s],,d [mm]\n0,1,1\n1,2,2\n", "column 2 has no name"),
+        ("t [s];d [mm]\n0;1,5\n1;2.5\n", "lines 2 and 3: numbers have both decimal commas"),
+        ("t [s]\n0\n1\n", "no column besides the time"),
+    ],
+)
+def test_mistakes(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        read_log(write(tmp_path, text))
+
+
+def test_mistaken_arguments(tmp_path):
+    path = write(tmp_path, "time [s],left [mm]\n0,1\n1,2\n")
+    with pytest.raises(ValueError, match="no column 'lefft'; did you mean 'left'"):
+        read_log(path, columns=["lefft"])
+    with pytest.raises(ValueError, match="no column 'lef'; did you mean 'left'"):
+        read_log(path, units={"lef": "mm"})
+    with pytest.raises(ValueError, match="no column 'tiem'; did you mean 'time'"):
+        read_log(path, time="tiem")
+    with pytest.raises(ValueError, match="there is no such log"):
+        read_log(tmp_path / "nothing.csv")
+    with pytest.raises(ValueError, match="unknown kind of log '.xls'"):
+        read_log(write(tmp_path, "x", "run.xls"))
+
+
+def make(times):
+    values = np.zeros((len(times), 1))
+    return Log(np.asarray(times, float), values, ("a",), ("deflection",), ("m",))
+
+
+def test_sampling_comes_from_the_times():
+    rounded = np.round(np.arange(2000) / 2048, 4)  # half the last printed digit: 0.1 of a step
+    assert make(rounded).sample_rate == pytest.approx(2048, rel=1e-3)
+    uneven = make(np.r_[0, 1, 2, 3, 5, 6])
+    assert uneven.duration == 6
+    with pytest.raises(ValueError, match="not sampled evenly .at t = 3 s"):
+        _ = uneven.sample_rate
+
+
+def test_a_log_checks_what_it_is_given():
+    with pytest.raises(ValueError, match="sample 2: time 0.5 s comes after 1 s"):
+        make([0, 1, 0.5])
+    with pytest.raises(ValueError, match="2 names for 1 channels"):
+        Log(np.arange(3.0), np.zeros((3, 1)), ("a", "b"), ("deflection",), ("m",))

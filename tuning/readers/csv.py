@@ -1,0 +1,81 @@
+"""Logs as separated values: names (with units) in the first line, numbers below.
+
+    time (s); d1 [mm]; d2 [mm]
+    0,000; 0,12; -0,03
+
+Lines at the top that start with `#` are comments.
+"""
+
+import csv
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+
+from tuning.readers.table import Table, numbers, read_text
+
+_HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+
+
+def read_csv(path: Path) -> Table:
+    """Read a file of values separated by tabs, semicolons or commas.
+
+    The separator is the first of these three that occurs in the line of names. Unless it is the
+    comma, numbers may have a decimal comma. Units stand in brackets or parentheses after names.
+
+    Raises ValueError, naming file and line, for a missing line of names, a row of another length
+    and a cell that is no number.
+    """
+    text = read_text(path)
+    top = 0
+    kept = text.splitlines(keepends=True)
+    while top < len(kept) and (not kept[top].strip() or kept[top].startswith("#")):
+        top += 1
+    if top == len(kept):
+        raise ValueError(f"{path}: the log is empty: it has comments only")
+    separator = next((mark for mark in "\t;" if mark in kept[top]), ",")
+    reader = csv.reader(io.StringIO("".join(kept[top:])), delimiter=separator)
+    headings = [cell.strip() for cell in next(reader)]
+    if _all_numbers(headings):
+        raise ValueError(
+            f"{path}, line {top + 1}: the first line must name the columns, "
+            f"e.g. time [s]{separator}d1 [mm]"
+        )
+    if not headings[-1]:
+        headings.pop()
+    rows, lines = [], []
+    for row in reader:
+        if any(cell.strip() for cell in row):
+            # A separator that ends every line closes the last column; it opens no new one.
+            trailing = len(row) == len(headings) + 1 and not row[-1].strip()
+            rows.append(row[:-1] if trailing else row)
+            lines.append(top + reader.line_num)
+    parts = [_HEADING.match(heading) for heading in headings]
+    names = tuple(
+        part["name"] if part else heading for part, heading in zip(parts, headings, strict=True)
+    )
+    units = tuple(part["unit"] if part else None for part in parts)
+    decimal_comma = separator != "," and _has_decimal_comma(path, rows, lines)
+    values = numbers(path, names, rows, lines, decimal_comma)
+    return Table(names, units, values, np.array(lines))
+
+
+def _all_numbers(cells) -> bool:
+    try:
+        [float(cell.replace(",", ".")) for cell in cells]
+    except ValueError:
+        return False
+    return True
+
+
+def _has_decimal_comma(path, rows, lines) -> bool:
+    """Tell whether cells have commas; a file with points as well is not guessed at."""
+    comma = next((i for i, row in enumerate(rows) if any("," in cell for cell in row)), None)
+    point = next((i for i, row in enumerate(rows) if any("." in cell for cell in row)), None)
+    if comma is not None and point is not None:
+        raise ValueError(
+            f"{path}, lines {lines[comma]} and {lines[point]}: numbers have both decimal commas "
+            "and decimal points; write one of them throughout, without thousands separators"
+        )
+    return comma is not None

@@ -1,0 +1,97 @@
+"""The TOML file beside a log, of the same stem: loads, and which column is which sensor."""
+
+import difflib
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from jaxbeam.loads import KINDS, AbstractLoad
+
+_KEYS = ("loads", "columns", "time")
+_COLUMN_KEYS = {
+    "unit": (str, "a word"),
+    "sensor": (int, "a whole number from 0"),
+    "position": ((int, float), "a number in m"),
+}
+
+
+@dataclass(frozen=True)
+class Sidecar:
+    """What the file beside a log says; empty where there is none."""
+
+    time: str | None = None
+    columns: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    loads: tuple[AbstractLoad, ...] | None = None
+
+    def unit(self, name: str) -> str | None:
+        """Unit declared for a column."""
+        return self.columns.get(name, {}).get("unit")
+
+    def sensor(self, name: str) -> int | None:
+        """Index of the sensor of the case that a column is."""
+        return self.columns.get(name, {}).get("sensor")
+
+    def position(self, name: str) -> float | None:
+        """Distance of a column's sensor from the left end in m."""
+        position = self.columns.get(name, {}).get("position")
+        return None if position is None else float(position)
+
+
+def read_sidecar(log: Path) -> Sidecar:
+    """Read the TOML file beside a log, if there is one.
+
+    Raises ValueError, naming file and key, for TOML that cannot be read, unknown keys (with the
+    nearest known one) and values of the wrong type.
+    """
+    path = log.with_suffix(".toml")
+    if not path.is_file():
+        return Sidecar()
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: {error}") from None
+    if "beam" in data:  # a case file that happens to have the name of the log
+        return Sidecar()
+    _check_keys(path, "", data, _KEYS)
+    columns = {}
+    for name, entry in data.get("columns", {}).items():
+        entry = {"unit": entry} if isinstance(entry, str) else entry
+        if not isinstance(entry, dict):
+            raise ValueError(f'{path}, columns.{name}: give a unit, {name} = "mm", or a table')
+        _check_keys(path, f"columns.{name}.", entry, _COLUMN_KEYS)
+        _check_types(path, f"columns.{name}.", entry)
+        columns[name] = entry
+    loads = None
+    if "loads" in data:
+        loads = tuple(_load(path, i, dict(entry)) for i, entry in enumerate(data["loads"]))
+    return Sidecar(data.get("time"), columns, loads)
+
+
+def _check_keys(path, prefix, data, known) -> None:
+    for key in data:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+            raise ValueError(f"{path}: unknown key {prefix}{key}; {hint}")
+
+
+def _check_types(path, prefix, entry) -> None:
+    for key, value in entry.items():
+        kind, words = _COLUMN_KEYS[key]
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise ValueError(f"{path}, {prefix}{key}: must be {words}, not {value!r}")
+
+
+def _load(path, index, entry) -> AbstractLoad:
+    """Build one load from its table."""
+    kind = entry.pop("kind", "mass")
+    if kind not in KINDS:
+        raise ValueError(f"{path}, loads.{index}.kind: {kind!r} is none of {', '.join(KINDS)}")
+    known = list(KINDS[kind].__dataclass_fields__)
+    _check_keys(path, f"loads.{index}.", entry, known)
+    try:
+        return KINDS[kind](**entry)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}, loads.{index}: {error}") from None

@@ -1,0 +1,80 @@
+"""Units of logged columns, and what one of each is in SI.
+
+Units live at the edge: a log is converted once, on reading, and is SI from then on.
+"""
+
+import difflib
+import math
+from typing import NamedTuple
+
+
+class Unit(NamedTuple):
+    """A unit of a logged column: value in SI = factor x value as read."""
+
+    si: str
+    factor: float
+    quantity: str
+
+
+STANDARD_GRAVITY = 9.80665  # m/s^2, exact by definition
+
+# The same word never means two things here: mg is a thousandth of g, not a milligram.
+UNITS = {
+    "s": Unit("s", 1.0, "time"),
+    "ms": Unit("s", 1e-3, "time"),
+    "us": Unit("s", 1e-6, "time"),
+    "min": Unit("s", 60.0, "time"),
+    "m": Unit("m", 1.0, "deflection"),
+    "cm": Unit("m", 1e-2, "deflection"),
+    "mm": Unit("m", 1e-3, "deflection"),
+    "um": Unit("m", 1e-6, "deflection"),
+    "in": Unit("m", 0.0254, "deflection"),
+    "m/s": Unit("m/s", 1.0, "velocity"),
+    "mm/s": Unit("m/s", 1e-3, "velocity"),
+    "in/s": Unit("m/s", 0.0254, "velocity"),
+    "m/s^2": Unit("m/s^2", 1.0, "acceleration"),
+    "mm/s^2": Unit("m/s^2", 1e-3, "acceleration"),
+    "g": Unit("m/s^2", STANDARD_GRAVITY, "acceleration"),
+    "mg": Unit("m/s^2", 1e-3 * STANDARD_GRAVITY, "acceleration"),
+    "rad": Unit("rad", 1.0, "slope"),
+    "mrad": Unit("rad", 1e-3, "slope"),
+    "deg": Unit("rad", math.pi / 180, "slope"),
+    "strain": Unit("1", 1.0, "strain"),
+    "m/m": Unit("1", 1.0, "strain"),
+    "ue": Unit("1", 1e-6, "strain"),
+    "um/m": Unit("1", 1e-6, "strain"),
+    "N": Unit("N", 1.0, "force"),
+    "kN": Unit("N", 1e3, "force"),
+    "V": Unit("V", 1.0, "voltage"),
+    "mV": Unit("V", 1e-3, "voltage"),
+}
+
+# Other spellings of the same units; what is not here is looked up as written.
+_SPELLINGS = {
+    "sec": "s",
+    "seconds": "s",
+    "Sekunden": "s",
+    "inch": "in",
+    "g_n": "g",
+    "°": "deg",
+    "ustrain": "ue",
+    "microstrain": "ue",
+    "uε": "ue",
+    "ε": "strain",
+}
+
+
+def unit(text: str) -> Unit:
+    """Return the unit a log names, e.g. `mm`, `µm`, `m/s²` or `g`.
+
+    Raises ValueError, with the nearest known units, for one that is not in the table.
+    """
+    name = text.strip().replace("µ", "u").replace("μ", "u")
+    for square in ("²", "**2", "s2"):
+        name = name.replace(square, "s^2" if square == "s2" else "^2")
+    name = _SPELLINGS.get(name, name)
+    if name not in UNITS:
+        near = difflib.get_close_matches(name, UNITS, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}" if near else f"known are {', '.join(UNITS)}"
+        raise ValueError(f"unknown unit {text!r}; {hint}")
+    return UNITS[name]
