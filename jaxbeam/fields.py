@@ -5,6 +5,8 @@ names and counts are static. The metadata carries the SI unit and one line of me
 error messages, tables and plots read, so that each is written once.
 """
 
+import typing
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -49,6 +51,30 @@ def choice(meaning: str, *allowed: str, **options):
 def count(meaning: str, **options):
     """Declare a whole number of a case; it decides array shapes, so it is static."""
     return eqx.field(static=True, metadata={"meaning": meaning, "count": True}, **options)
+
+
+def dimensions(field) -> str:
+    """The axes in the annotation of a number: "" for one number, "2", "point", "*modes"."""
+    return next(iter(typing.get_args(field.type)), field.type).dim_str
+
+
+def fits(field, shape: tuple[int, ...]) -> bool:
+    """Tell whether a number declared by this field may have this shape."""
+    axes = dimensions(field).split()
+    if axes and axes[0].startswith("*"):
+        return len(shape) <= 1
+    sizes = zip(axes, shape, strict=False)
+    return len(axes) == len(shape) and all(not a.isdigit() or int(a) == n for a, n in sizes)
+
+
+def shape_in_words(field) -> str:
+    """What a number declared by this field consists of, for error messages."""
+    axes = dimensions(field).split()
+    if not axes:
+        return "one number"
+    if axes[0].startswith("*"):
+        return "one number or a list of numbers"
+    return f"a list of {axes[0]} numbers" if axes[0].isdigit() else "a list of numbers"
 
 
 def is_known(value) -> bool:

@@ -1,0 +1,199 @@
+"""Cases as TOML files and as plain dictionaries, both ways.
+
+Everything follows from the declared fields: a new actuator or load needs a name in its `KINDS`
+and nothing here.
+"""
+
+import dataclasses
+import os
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from jaxbeam import actuators, loads
+from jaxbeam.beam import Beam, Support
+from jaxbeam.case import Case, Run
+from jaxbeam.checks import check, check_field, missing, suggestion
+from jaxbeam.fields import fits, known, shape_in_words
+from jaxbeam.sensors import Sensor
+
+Kind = type | dict[str, type]  # one class, or the registry in which a `kind` is looked up
+
+CONTROLLERS: dict[str, type] = {}
+TABLES: dict[str, Kind] = {"beam": Beam, "controller": CONTROLLERS, "run": Run}
+LISTS: dict[str, Kind] = {
+    "supports": Support,
+    "actuators": actuators.KINDS,
+    "sensors": Sensor,
+    "loads": loads.KINDS,
+}
+ORDER = ("beam", "supports", "actuators", "sensors", "loads", "controller", "run")
+
+
+def load_case(path: str | os.PathLike) -> Case:
+    """Read a case from a TOML file and check it.
+
+    Raises ValueError, naming the file and the address or line, for invalid TOML, unknown keys or
+    kinds, wrong types and whatever `check` refuses; OSError if the file cannot be read.
+    """
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise type(error)(f"cannot read the case file {path}: {reason}") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: a case file is text in UTF-8, which this is not") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: not valid TOML: {error}") from None
+    try:
+        case = case_from_dict(content)
+        check(case)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return case
+
+
+def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> None:
+    """Write a case to a TOML file, with the unit of every number beside it.
+
+    Reading the file back gives the same numbers, to the last bit. Raises FileExistsError if the
+    file exists and `overwrite` is not set, ValueError if the case holds a part of no known kind.
+    """
+    text = _as_toml(case)
+    try:
+        with open(path, "w" if overwrite else "x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise FileExistsError(
+            f"{path} exists already; choose another name, or ask to overwrite it"
+        ) from None
+
+
+def case_from_dict(content: dict[str, Any]) -> Case:
+    """Build a case from the tables of a case file: numbers in SI units, lists and words.
+
+    Raises ValueError, naming the address, for keys and kinds that are unknown or missing and for
+    values of the wrong type or shape. The values themselves are the business of `check`.
+    """
+    known_keys = [field.name for field in dataclasses.fields(Case)]
+    parts = {}
+    for key, value in content.items():
+        if key in TABLES:
+            if not isinstance(value, dict):
+                raise ValueError(f"{key} must be one table; write [{key}]")
+            parts[key] = _read_part(key, value, TABLES[key])
+        elif key in LISTS:
+            if not isinstance(value, list) or not all(isinstance(v, dict) for v in value):
+                raise ValueError(f"{key} must be a list of tables; write [[{key}]]")
+            parts[key] = tuple(
+                _read_part(f"{key}.{i}", table, LISTS[key]) for i, table in enumerate(value)
+            )
+        elif key == "title":
+            if not isinstance(value, str):
+                raise ValueError(f"title must be text in quotes, not {value!r}")
+            parts[key] = value
+        else:
+            raise ValueError(f"a case has no {key!r}; {suggestion(key, known_keys)}")
+    if "beam" not in parts:
+        raise ValueError("a case needs a beam; write a table [beam]")
+    return Case(**parts)
+
+
+def case_to_dict(case: Case) -> dict[str, Any]:
+    """Return the tables of a case file for a case, without what was left out.
+
+    Raises ValueError if the case holds a part whose class has no kind in its registry.
+    """
+    content: dict[str, Any] = {"title": case.title} if case.title else {}
+    for key in ORDER:
+        value = getattr(case, key)
+        if key in TABLES and value is not None:
+            content[key] = _write_part(key, value, TABLES[key])
+        elif key in LISTS and value:
+            content[key] = [
+                _write_part(f"{key}.{i}", part, LISTS[key]) for i, part in enumerate(value)
+            ]
+    return content
+
+
+def _read_part(address: str, table: dict[str, Any], kind: Kind) -> Any:
+    values = dict(table)
+    if isinstance(kind, dict):
+        kind = _look_up(address, values.pop("kind", None), kind)
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    for key, value in values.items():
+        if key not in fields:
+            raise ValueError(f"{address} has no key {key!r}; {suggestion(key, fields)}")
+        _check_type(f"{address}.{key}", value, fields[key])
+    for name, field in fields.items():
+        if field.default is dataclasses.MISSING and name not in values:
+            raise missing(f"{address}.{name}", field)
+    return kind(**values)
+
+
+def _look_up(address: str, word: Any, registry: dict[str, type]) -> type:
+    if not registry:
+        raise ValueError(f"there are no kinds of {address} yet; leave [{address}] out")
+    if word is None:
+        raise ValueError(f"{address}.kind is missing; it may be {', '.join(registry)}")
+    if not isinstance(word, str) or word not in registry:
+        hint = suggestion(str(word), registry)
+        raise ValueError(f"{address}.kind cannot be {word!r}; {hint}")
+    return registry[word]
+
+
+def _check_type(address: str, value: Any, field: dataclasses.Field) -> None:
+    """Check what a file says for a field before it becomes an array."""
+    if "unit" not in field.metadata:
+        check_field(address, value, field)
+        return
+    entries = value if isinstance(value, list) else [value]
+    numeric = all(isinstance(x, int | float) and not isinstance(x, bool) for x in entries)
+    if not numeric or not fits(field, np.shape(value)):
+        raise ValueError(f"{address} must be {shape_in_words(field)}, not {value!r}")
+
+
+def _write_part(address: str, part: Any, kind: Kind) -> dict[str, Any]:
+    table = {}
+    if isinstance(kind, dict):
+        names = [name for name, made in kind.items() if type(part) is made]
+        if not names:
+            raise ValueError(
+                f"{address} is a {type(part).__name__}, which has no kind in case files;"
+                " add it to the registry of its family"
+            )
+        table["kind"] = names[0]
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        if value is not None:
+            is_number = "unit" in field.metadata
+            table[field.name] = known(value).tolist() if is_number else value
+    return table
+
+
+def _as_toml(case: Case) -> str:
+    content = case_to_dict(case)
+    blocks = [_line("title", content.pop("title"))] if "title" in content else []
+    for key, value in content.items():
+        if isinstance(value, list):
+            for part, table in zip(getattr(case, key), value, strict=True):
+                blocks.append(_block(f"[[{key}]]", part, table))
+        else:
+            blocks.append(_block(f"[{key}]", getattr(case, key), value))
+    return "\n".join(blocks)
+
+
+def _block(header: str, part: Any, table: dict[str, Any]) -> str:
+    units = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(part)}
+    return header + "\n" + "".join(_line(key, table[key], units.get(key, "")) for key in table)
+
+
+def _line(key: str, value: Any, unit: str = "") -> str:
+    if isinstance(value, list):
+        text = f"{key} = [{', '.join(map(repr, value))}]"
+    else:
+        text = tomli_w.dumps({key: value}).rstrip("\n")
+    return f"{text}  # {unit}\n" if unit not in ("", "1") else f"{text}\n"
