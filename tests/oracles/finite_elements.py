@@ -123,16 +123,43 @@ def mesh(beam: Beam, extra: Sequence[float] = ()) -> np.ndarray:
                      beam.length)  # fmt: skip
 
 
+def section(beam: Beam, x: float) -> tuple[float, float]:
+    """Flexural rigidity and mass per length at x, patches included."""
+    over = [p for p in beam.patches if p.start < x < p.end]
+    rigidity, density = (
+        value(x) if callable(value) else value
+        for value in (beam.flexural_rigidity, beam.mass_per_length)
+    )
+    return (
+        rigidity + sum(p.flexural_rigidity for p in over),
+        density + sum(p.mass_per_length for p in over),
+    )
+
+
+def supports_on(beam: Beam, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Springs and dampers on the degrees of freedom, and which of these are free to move."""
+    size = 2 * len(nodes)
+    springs, dampers, fixed = np.zeros(size), np.zeros(size), []
+    for end, dof in zip(beam.ends.split("-"), (0, size - 2), strict=True):
+        fixed += {"pinned": [dof], "clamped": [dof, dof + 1], "free": [], "guided": [dof + 1]}[end]
+    for support in beam.supports:
+        dof = 2 * int(np.argmin(np.abs(nodes - support.position)))
+        if support.stiffness is None:
+            fixed.append(dof)
+        else:
+            springs[dof] += support.stiffness
+            dampers[dof] += support.damping
+        springs[dof + 1] += support.rotational_stiffness
+    return springs, dampers, np.setdiff1d(np.arange(size), fixed)
+
+
 def assemble(beam: Beam, extra_nodes: Sequence[float] = ()) -> Model:
     nodes = mesh(beam, extra_nodes)
-    size = 2 * len(nodes)
-    mass, stiffness, damping = (np.zeros((size, size)) for _ in range(3))
+    springs, dampers, free = supports_on(beam, nodes)
+    stiffness, mass = np.diag(springs), np.zeros((len(springs), len(springs)))
     for e, (left, right) in enumerate(zip(nodes[:-1], nodes[1:], strict=True)):
-        h, middle = right - left, 0.5 * (left + right)
-        over = [p for p in beam.patches if p.start < middle < p.end]
-        rigidity = _at(beam.flexural_rigidity, middle) + sum(p.flexural_rigidity for p in over)
-        density = _at(beam.mass_per_length, middle) + sum(p.mass_per_length for p in over)
-        at = slice(2 * e, 2 * e + 4)
+        h, at = right - left, slice(2 * e, 2 * e + 4)
+        rigidity, density = section(beam, 0.5 * (left + right))
         stiffness[at, at] += rigidity / h**3 * np.array(
             [[12, 6 * h, -12, 6 * h],
              [6 * h, 4 * h**2, -6 * h, 2 * h**2],
@@ -143,20 +170,7 @@ def assemble(beam: Beam, extra_nodes: Sequence[float] = ()) -> Model:
              [22 * h, 4 * h**2, 13 * h, -3 * h**2],
              [54, 13 * h, 156, -22 * h],
              [-13 * h, -3 * h**2, -22 * h, 4 * h**2]])  # fmt: skip
-
-    fixed: list[int] = []
-    for end, dof in zip(beam.ends.split("-"), (0, size - 2), strict=True):
-        fixed += {"pinned": [dof], "clamped": [dof, dof + 1], "free": [], "guided": [dof + 1]}[end]
-    for support in beam.supports:
-        dof = 2 * int(np.argmin(np.abs(nodes - support.position)))
-        if support.stiffness is None:
-            fixed.append(dof)
-        else:
-            stiffness[dof, dof] += support.stiffness
-            damping[dof, dof] += support.damping
-        stiffness[dof + 1, dof + 1] += support.rotational_stiffness
-    free = np.setdiff1d(np.arange(size), fixed)
-    return Model(beam, nodes, mass, stiffness, damping, free)
+    return Model(beam, nodes, mass, stiffness, np.diag(dampers), free)
 
 
 def natural_frequencies(beam: Beam, count: int) -> np.ndarray:
@@ -189,7 +203,3 @@ def static_deflection(
     deflection = np.zeros(len(load))
     deflection[at] = np.linalg.solve(stiffness[np.ix_(at, at)], load[at])
     return np.array([model.shape(x) @ deflection for x in positions])
-
-
-def _at(value: float | Callable[[float], float], x: float) -> float:
-    return value(x) if callable(value) else value
