@@ -1,0 +1,130 @@
+"""Random valid cases, for tests of laws that hold for every case."""
+
+import itertools
+
+from hypothesis import strategies as st
+
+from jaxbeam.actuators import Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.beam import ENDS, Beam, Support
+from jaxbeam.case import Case, Run
+from jaxbeam.loads import MovingForce, MovingMass
+from jaxbeam.sensors import QUANTITIES, Sensor
+
+
+def numbers(low: float, high: float) -> st.SearchStrategy[float]:
+    """Finite numbers between two bounds, of either sign of zero but never subnormal."""
+    return st.floats(low, high, allow_subnormal=False)
+
+
+def maybe(strategy: st.SearchStrategy) -> st.SearchStrategy:
+    """A value, or None where a number may be left out."""
+    return st.none() | strategy
+
+
+@st.composite
+def beams(draw) -> Beam:
+    """Beams with any ends, by rigidity or by section, with modal or Rayleigh damping."""
+    modes = draw(st.integers(1, 6))
+    if draw(st.booleans()):
+        stuff = {
+            "flexural_rigidity": draw(numbers(1.0, 1e6)),
+            "mass_per_length": draw(numbers(0.1, 1e3)),
+        }
+    else:
+        stuff = {
+            "width": draw(numbers(0.01, 1.0)),
+            "height": draw(numbers(0.001, 1.0)),
+            "youngs_modulus": draw(numbers(1e9, 3e11)),
+            "density": draw(numbers(500.0, 1e4)),
+        }
+    ratio = numbers(0.0, 0.2)
+    if draw(st.booleans()):
+        damping = {"damping_ratio": draw(ratio | st.lists(ratio, min_size=modes, max_size=modes))}
+    else:
+        damping = {"rayleigh_damping": [draw(numbers(0.0, 1.0)), draw(numbers(0.0, 1e-3))]}
+    ends = draw(st.sampled_from([f"{a}-{b}" for a, b in itertools.product(ENDS, ENDS)]))
+    return Beam(length=draw(numbers(0.1, 50.0)), ends=ends, modes=modes, **stuff, **damping)
+
+
+@st.composite
+def supports(draw, length: float) -> tuple[Support, ...]:
+    """Up to three supports, rigid or elastic, at different places."""
+    shares = draw(st.lists(st.integers(0, 20), max_size=3, unique=True))
+    return tuple(
+        Support(
+            position=length * share / 20,
+            stiffness=draw(maybe(numbers(0.0, 1e8))),
+            damping=draw(numbers(0.0, 100.0)),
+            rotational_stiffness=draw(numbers(0.0, 1e4)),
+        )
+        for share in shares
+    )
+
+
+@st.composite
+def actuators(draw, length: float):
+    """An actuator of any kind."""
+    place = numbers(0.0, length)
+    limits = maybe(st.tuples(numbers(-10.0, -1.0), numbers(0.0, 10.0)).map(list))
+    kind = draw(st.sampled_from(["point", "shaker", "patch", "spring"]))
+    if kind == "point":
+        return PointForce(draw(place), draw(limits))
+    if kind == "shaker":
+        return Shaker(draw(place), stiffness=draw(numbers(0.0, 1e4)), limits=draw(limits))
+    if kind == "spring":
+        return SpringDamper(draw(place), draw(numbers(0.0, 1e5)), draw(numbers(0.0, 100.0)))
+    return Patch(
+        start=draw(numbers(0.0, 0.45 * length)),
+        end=draw(numbers(0.5 * length, length)),
+        moment_per_volt=draw(numbers(-1e-3, 1e-3)),
+        limits=draw(limits),
+        added_mass=draw(maybe(numbers(0.0, 0.1))),
+        added_rigidity=draw(maybe(numbers(0.0, 10.0))),
+    )
+
+
+@st.composite
+def sensors(draw, length: float) -> Sensor:
+    """A sensor of any quantity."""
+    quantity = draw(st.sampled_from(list(QUANTITIES)))
+    fibre = draw(numbers(-0.1, 0.1)) if quantity == "strain" else None
+    offset = draw(numbers(-1.0, 1.0))
+    return Sensor(draw(numbers(0.0, length)), quantity, offset, fibre)
+
+
+@st.composite
+def loads(draw, length: float):
+    """A mass or force that crosses either way, brakes, or follows a table."""
+    if draw(st.booleans()):
+        way = {
+            "speed": draw(numbers(0.05, 20.0)) * draw(st.sampled_from([1, -1])),
+            "entry_time": draw(numbers(0.0, 2.0)),
+            "deceleration": draw(numbers(-0.1, 0.1)),
+        }
+    else:
+        steps = draw(st.lists(numbers(0.01, 1.0), min_size=2, max_size=6))
+        place = numbers(0.0, length)
+        way = {
+            "times": list(itertools.accumulate(steps)),
+            "positions": draw(st.lists(place, min_size=len(steps), max_size=len(steps))),
+        }
+    if draw(st.booleans()):
+        return MovingMass(mass=draw(numbers(0.0, 100.0)), **way)
+    weight = draw(st.sampled_from(["mass", "force"]))
+    return MovingForce(**{weight: draw(numbers(0.0, 1e3))}, **way)
+
+
+@st.composite
+def cases(draw) -> Case:
+    """Cases that pass `checks.check`, with up to two of everything."""
+    beam = draw(beams())
+    length = float(beam.length)
+    return Case(
+        beam,
+        supports=draw(supports(length)),
+        actuators=draw(st.lists(actuators(length), max_size=2)),
+        sensors=draw(st.lists(sensors(length), max_size=2)),
+        loads=draw(st.lists(loads(length), max_size=2)),
+        run=Run(draw(numbers(0.01, 100.0)), draw(numbers(1.0, 1e5)), draw(numbers(0.0, 20.0))),
+        title=draw(st.text(max_size=30)),
+    )

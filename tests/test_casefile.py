@@ -1,0 +1,206 @@
+"""Case files: read exactly, written exactly, and refused with a sentence that helps."""
+
+import tomllib
+
+import equinox as eqx
+import numpy as np
+import pytest
+from hypothesis import given
+
+from jaxbeam.actuators import Patch, PointForce, Shaker
+from jaxbeam.beam import Beam, Support
+from jaxbeam.case import Case, Run
+from jaxbeam.casefile import case_from_dict, case_to_dict, load_case, save_case
+from jaxbeam.loads import MovingForce, MovingMass
+from jaxbeam.sensors import Sensor
+from tests.strategies import cases
+
+FULL = """
+title = "one-span rig, shaker, one ball"
+[beam]
+length = 0.6
+flexural_rigidity = 11.68
+mass_per_length = 0.535
+damping_ratio = 0.03
+ends = "pinned-pinned"
+modes = 3
+[[supports]]
+position = 0.6
+stiffness = 2.0e6
+damping = 0.0
+[[actuators]]
+kind = "shaker"
+position = 0.5
+stiffness = 3500.0
+damping = 80.0
+force_per_volt = 4.6
+bandwidth = 10000.0
+limits = [-10.0, 10.0]
+[[actuators]]
+kind = "patch"
+start = 0.2575
+end = 0.3425
+moment_per_volt = 8.292e-4
+correction = 0.32
+amplifier_gain = 200.0
+limits = [-2.5, 7.5]
+[[sensors]]
+position = 0.25
+quantity = "deflection"
+[[loads]]
+kind = "mass"
+mass = 0.509
+speed = 0.55
+entry_time = 0.0
+deceleration = 0.0
+[[loads]]
+kind = "force"
+force = 3
+times = [0, 1, 2]
+positions = [0, 0.2, 0.6]
+[run]
+duration = 2.0
+sample_rate = 1000.0
+"""
+SMALL = {"beam": {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}}
+
+
+@pytest.fixture
+def full(tmp_path):
+    """A case file that uses every table."""
+    path = tmp_path / "case.toml"
+    path.write_text(FULL)
+    return path
+
+
+def test_file_and_python_describe_the_same_case(full):
+    written = Case(
+        Beam(0.6, 11.68, 0.535, 0.03, modes=3),
+        supports=[Support(0.6, 2e6)],
+        actuators=[
+            Shaker(0.5, 3500.0, 80.0, 4.6, 1e4, limits=[-10, 10]),
+            Patch(0.2575, 0.3425, 8.292e-4, 0.32, 200.0, limits=[-2.5, 7.5]),
+        ],
+        sensors=[Sensor(0.25)],
+        loads=[
+            MovingMass(0.509, 0.55),
+            MovingForce(force=3, times=[0, 1, 2], positions=[0, 0.2, 0.6]),
+        ],
+        run=Run(2.0, 1000.0),
+        title="one-span rig, shaker, one ball",
+    )
+    assert eqx.tree_equal(load_case(full), written)
+
+
+@given(cases())
+def test_dictionary_round_trip_is_exact(case):
+    assert eqx.tree_equal(case_from_dict(case_to_dict(case)), case)
+
+
+@given(cases())
+def test_file_round_trip_is_exact(tmp_path_factory, case):
+    path = tmp_path_factory.mktemp("case") / "case.toml"
+    save_case(case, path)
+    assert eqx.tree_equal(load_case(path), case)
+
+
+def test_saved_file_says_units(tmp_path, full):
+    save_case(load_case(full), tmp_path / "copy.toml")
+    text = (tmp_path / "copy.toml").read_text()
+    assert "flexural_rigidity = 11.68  # N m^2\n" in text
+    assert "limits = [-2.5, 7.5]  # V\n" in text
+    assert tomllib.loads(text)["loads"][1]["times"] == [0.0, 1.0, 2.0]
+
+
+def test_saving_never_overwrites_unasked(full):
+    case = load_case(full)
+    before = full.read_text()
+    with pytest.raises(FileExistsError, match=r"case\.toml exists already; .* overwrite"):
+        save_case(case, full)
+    assert full.read_text() == before
+    save_case(case, full, overwrite=True)
+    assert eqx.tree_equal(load_case(full), case)
+
+
+class Jack(PointForce):
+    """A kind of actuator that no registry knows."""
+
+
+def test_part_without_a_kind_is_not_written():
+    case = Case(Beam(0.6, 11.68, 0.535), actuators=[Jack(0.3)])
+    with pytest.raises(ValueError, match="actuators.0 is a Jack, which has no kind"):
+        case_to_dict(case)
+
+
+# What is changed in the file above, and what the message must then say.
+REFUSED = [
+    ("[beam]", "[bean]", "a case has no 'bean'; did you mean 'beam'?"),
+    ("length = 0.6", "lenght = 0.6", "beam has no key 'lenght'; did you mean 'length'?"),
+    ("length = 0.6", "", "beam.length is missing; give the total length in m"),
+    ("length = 0.6", 'length = "0.6"', "beam.length must be one number, not '0.6'"),
+    ("length = 0.6", "length = [0.6]", "beam.length must be one number, not [0.6]"),
+    ("length = 0.6", "length = true", "beam.length must be one number, not True"),
+    ("length = 0.6", "length = {}", "beam.length must be one number, not {}"),
+    ("length = 0.6", "length = nan", "beam.length must be a finite number; it is nan"),
+    ("0.03", '[0.03, "a"]', "beam.damping_ratio must be one number or a list of numbers, not"),
+    ("0.03", "[0.03]", "beam.damping_ratio lists 1 values for 3 modes"),
+    ('"pinned-pinned"', "3", "beam.ends must be a word in quotes, not 3"),
+    ("modes = 3", "modes = 3.0", "beam.modes must be a whole number, 1 or more; it is 3.0"),
+    ("[[supports]]", "[supports]", "supports must be a list of tables; write [[supports]]"),
+    ("[run]", "[[run]]", "run must be one table; write [run]"),
+    ("title =", "title = 3 #", "title must be text in quotes, not 3"),
+    ('kind = "shaker"', "", "actuators.0.kind is missing; it may be point, shaker, patch, spring"),
+    ('"shaker"', '"shakr"', "actuators.0.kind cannot be 'shakr'; did you mean 'shaker'?"),
+    ('"mass"', '"car"', "loads.0.kind cannot be 'car'; it may be mass, force"),
+    ('"mass"', "1", "loads.0.kind cannot be 1; it may be mass, force"),
+    ("speed = 0.55", "sped = 0.55", "loads.0 has no key 'sped'; did you mean 'speed'?"),
+    ("[-2.5, 7.5]", "7.5", "actuators.1.limits must be a list of 2 numbers, not 7.5"),
+    ("[-2.5, 7.5]", "[1, 2, 3]", "actuators.1.limits must be a list of 2 numbers, not [1, 2, 3]"),
+    ("times = [0, 1, 2]", "times = 1", "loads.1.times must be a list of numbers, not 1"),
+    ("times = [0, 1, 2]", "times = [[0]]", "loads.1.times must be a list of numbers, not [[0]]"),
+    ('"deflection"', '"deflexion"', "sensors.0.quantity cannot be 'deflexion'; did you mean"),
+    ("[run]", '[controller]\nkind = "lqr"\n[run]', "there are no kinds of controller yet"),
+    ("modes = 3", "modes = 3 3", "not valid TOML: "),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), REFUSED)
+def test_bad_files_are_refused_by_name(tmp_path, old, new, message):
+    path = tmp_path / "case.toml"
+    assert old in FULL
+    path.write_text(FULL.replace(old, new, 1))
+    with pytest.raises(ValueError) as caught:
+        load_case(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_invalid_toml_names_the_line(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text("[beam]\nlength = 0.6 m\n")
+    with pytest.raises(ValueError, match="not valid TOML: .*line 2"):
+        load_case(path)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(FileNotFoundError, match="cannot read the case file .*none.toml: no such"):
+        load_case(tmp_path / "none.toml")
+    (tmp_path / "log.bin").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match=r"log.bin: a case file is text in UTF-8"):
+        load_case(tmp_path / "log.bin")
+    (tmp_path / "empty.toml").write_text("")
+    with pytest.raises(
+        ValueError, match=r"empty.toml: a case needs a beam; write a table \[beam\]"
+    ):
+        load_case(tmp_path / "empty.toml")
+
+
+def test_whole_numbers_become_floats():
+    case = case_from_dict({"beam": {"length": 2, "flexural_rigidity": 1, "mass_per_length": 1}})
+    assert case.beam.length.dtype == np.float64
+
+
+def test_what_is_left_out_stays_out():
+    assert "stiffness" not in case_to_dict(Case(Beam(1, 1, 1), [Support(0.5)]))["supports"][0]
+    assert set(case_to_dict(case_from_dict(SMALL))) == {"beam", "run"}
