@@ -43,7 +43,9 @@ def check(case: Case) -> None:
     """
     for address, part, kind in _parts(case):
         if not isinstance(part, kind):
-            raise ValueError(f"{address} must be a {kind.__name__}, not {_words(part)}")
+            raise ValueError(
+                f"{address} holds {_words(part)}; it takes objects of type {kind.__name__}"
+            )
         for field in dataclasses.fields(part):
             check_field(f"{address}.{field.name}", getattr(part, field.name), field)
         _check_places(address, part, case.beam.length)
@@ -61,7 +63,7 @@ def check(case: Case) -> None:
 def suggestion(word: str, known_words: Iterable[str]) -> str:
     """The end of a sentence about an unknown word: the nearest known one, or all of them."""
     known_words = list(known_words)
-    near = difflib.get_close_matches(word, known_words, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(word, known_words, n=1)
     return f"did you mean {near[0]!r}?" if near else f"it may be {', '.join(known_words)}"
 
 
@@ -196,11 +198,11 @@ def _check_section(beam: Beam, direct: str, material: str, section: tuple[str, .
                 f"beam.{direct} and beam.{material} contradict each other; leave one out"
             )
         return
-    missing = [name for name in (*section, material) if getattr(beam, name) is None]
-    if missing:
+    absent = [name for name in (*section, material) if getattr(beam, name) is None]
+    if absent:
         raise ValueError(
             f"beam.{direct} is missing; give it, or all of {', '.join(section)} and {material}"
-            f" (without {', '.join(missing)} it cannot be computed)"
+            f" (of which {', '.join(absent)} is missing)"
         )
 
 
@@ -262,7 +264,7 @@ def _check_load(address: str, load: AbstractLoad) -> None:
             " a table needs one position for each time"
         )
     if points < 2:
-        raise ValueError(f"{address}.times has {points} points; a table needs at least two")
+        raise ValueError(f"{address}.times needs at least two points; it has {points}")
     for name in ("entry_time", "deceleration"):
         value = getattr(load, name)
         if is_known(value) and known(value) != 0:

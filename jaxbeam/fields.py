@@ -9,6 +9,7 @@ import typing
 
 import equinox as eqx
 import jax
+import jax.extend
 import jax.numpy as jnp
 import numpy as np
 
@@ -94,5 +95,5 @@ def known(value) -> np.ndarray:
     Raises `jax.errors.ConcretizationTypeError` inside `jit` or `vmap`, where there are none yet.
     """
     if isinstance(value, jax.core.Tracer):
-        value = jax.core.concrete_or_error(None, value)
+        value = jax.extend.core.concrete_or_error(None, value)
     return np.asarray(value, float)

@@ -1,0 +1,191 @@
+"""A bad case is refused before anything compiles, by address and with a way out."""
+
+import re
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+from hypothesis import given
+
+from jaxbeam.actuators import Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.beam import ENDS, Beam, Support
+from jaxbeam.case import Case, Run, replace
+from jaxbeam.checks import check
+from jaxbeam.loads import MovingForce, MovingMass
+from jaxbeam.sensors import Sensor
+from tests.strategies import cases
+
+RIG = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}
+BEAM = Beam(**RIG, damping_ratio=[0.03, 0.02, 0.01])
+CASE = Case(
+    BEAM,
+    supports=[Support(0.3), Support(0.5, 2e6)],
+    actuators=[Shaker(0.5, limits=[-10, 10]), Patch(0.2, 0.3, 1e-3), PointForce(0.1)],
+    sensors=[Sensor(0.25), Sensor(0.25, "strain", fibre_distance=0.002)],
+    loads=[
+        MovingMass(0.5, 0.55),
+        MovingForce(force=2.0, times=[0.0, 1.0, 2.0], positions=[0.0, 0.4, 0.6]),
+    ],
+    run=Run(2.0),
+)
+
+
+@given(cases())
+def test_valid_cases_pass(case):
+    check(case)
+
+
+def test_our_own_case_passes():
+    check(CASE)
+
+
+@pytest.mark.parametrize("left", ENDS)
+@pytest.mark.parametrize("right", ENDS)
+def test_all_ends_pass(left, right):
+    check(Case(Beam(**RIG, ends=f"{left}-{right}")))
+
+
+# Replaced numbers, and what the message must say.
+NUMBERS = [
+    ("beam.length", 0.0, "beam.length must be positive; it is 0 m"),
+    ("beam.length", jnp.nan, "beam.length must be a finite number; it is nan"),
+    ("beam.flexural_rigidity", -1.0, "beam.flexural_rigidity must be positive; it is -1 N m^2"),
+    ("beam.mass_per_length", jnp.inf, "beam.mass_per_length must be a finite number; it is inf"),
+    ("beam.damping_ratio.1", -0.1, "beam.damping_ratio.1 must not be negative; it is -0.1"),
+    ("supports.0.position", 0.7, "supports.0.position must lie on the beam, between 0 and 0.6 m"),
+    ("supports.1.stiffness", -1.0, "supports.1.stiffness must not be negative; it is -1 N/m"),
+    ("actuators.0.position", -0.1, "actuators.0.position must lie on the beam"),
+    ("actuators.0.bandwidth", 0.0, "actuators.0.bandwidth must be positive; it is 0 1/s"),
+    ("actuators.0.limits", [10.0, -10.0], "actuators.0.limits.1 must be above the entry before"),
+    ("actuators.1.end", 0.2, "actuators.1.end must lie to the right of actuators.1.start; 0.2 m"),
+    ("actuators.1.end", 0.65, "actuators.1.end must lie on the beam"),
+    ("sensors.1.position", 0.61, "sensors.1.position must lie on the beam, between 0 and 0.6 m;"),
+    ("loads.0.mass", -0.5, "loads.0.mass must not be negative; it is -0.5 kg"),
+    ("loads.0.speed", 0.0, "loads.0.speed must not be 0: the load would never enter"),
+    ("loads.0.entry_time", jnp.nan, "loads.0.entry_time must be a finite number; it is nan"),
+    ("loads.1.times.2", 1.0, "loads.1.times.2 must be above the entry before it; 1 s follows 1 s"),
+    ("loads.1.positions.0", jnp.nan, "loads.1.positions.0 must be a finite number; it is nan"),
+    ("loads.1.entry_time", 1.0, "loads.1.entry_time would have no effect"),
+    ("run.duration", 0.0, "run.duration must be positive; it is 0 s"),
+    ("run.sample_rate", -1.0, "run.sample_rate must be positive; it is -1 Hz"),
+]
+
+
+@pytest.mark.parametrize(("address", "value", "message"), NUMBERS)
+def test_bad_numbers_are_refused(address, value, message):
+    refuses(replace(CASE, {address: value}), message)
+
+
+# Cases that contradict themselves, and what the message must say.
+TABLE = {"times": [0.0, 1.0], "positions": [0.0, 0.6]}
+CASES = [
+    (Case(Beam(length=1.0)), "beam.flexural_rigidity is missing; give it, or all of width, height"),
+    (Case(Beam(1.0, 1.0)), "beam.mass_per_length is missing; give it, or all of width"),
+    (
+        Case(Beam(1.0, width=1.0, youngs_modulus=1.0, density=1.0)),
+        "(of which height is missing)",
+    ),
+    (
+        Case(Beam(**RIG, youngs_modulus=2e11)),
+        "beam.flexural_rigidity and beam.youngs_modulus contradict each other; leave one out",
+    ),
+    (Case(Beam(**RIG, density=7850.0)), "beam.mass_per_length and beam.density contradict"),
+    (Case(Beam(**RIG, height=0.01)), "beam.height would have no effect: leave it out"),
+    (Case(Beam(**RIG, damping_ratio=[0.1, 0.1])), "lists 2 values for 3 modes; give one for each"),
+    (
+        Case(Beam(**RIG, damping_ratio=0.1, rayleigh_damping=[0.1, 0.0])),
+        "beam has both damping_ratio and rayleigh_damping; leave one out",
+    ),
+    (Case(Beam(**RIG, modes=0)), "beam.modes must be a whole number, 1 or more; it is 0"),
+    (Case(Beam(**RIG, ends="pinned-fixed")), "no end is called 'fixed'; it may be pinned, clamped"),
+    (Case(Beam(**RIG, ends="clampd-free")), "no end is called 'clampd'; did you mean 'clamped'?"),
+    (Case(Beam(**RIG, ends="pinned")), "must name the left and the right end, such as"),
+    (
+        Case(BEAM, [Support(0.2), Support(0.4, 10.0), Support(0.4), Support(0.2)]),
+        "supports.0 and supports.3 both hold the beam rigidly at 0.2 m; remove one",
+    ),
+    (Case(BEAM, sensors=[Sensor(0.2, "strain")]), "sensors.0.fibre_distance is missing: strain"),
+    (
+        Case(BEAM, sensors=[Sensor(0.2, fibre_distance=0.1)]),
+        "sensors.0.fibre_distance would have no effect on a sensor of deflection",
+    ),
+    (Case(BEAM, sensors=[Sensor(0.2, "stress")]), "sensors.0.quantity cannot be 'stress'; it may"),
+    (Case(BEAM, loads=[MovingMass(1.0)]), "loads.0 has neither speed nor times; give one of them"),
+    (Case(BEAM, loads=[MovingMass(1.0, 1.0, **TABLE)]), "loads.0 has both speed and times"),
+    (Case(BEAM, loads=[MovingMass(1.0, times=[0.0, 1.0])]), "loads.0.positions is missing"),
+    (Case(BEAM, loads=[MovingMass(1.0, positions=[0.0, 1.0])]), "loads.0.times is missing"),
+    (Case(BEAM, loads=[MovingForce(speed=1.0)]), "loads.0 has neither force nor mass; give one"),
+    (
+        Case(BEAM, loads=[MovingForce(mass=1.0, force=1.0, speed=1.0)]),
+        "loads.0 has both force and mass; leave one out",
+    ),
+    (
+        Case(BEAM, loads=[MovingMass(1.0, times=[0.0, 1.0, 2.0], positions=[0.0, 1.0])]),
+        "loads.0 has 3 times and 2 positions; a table needs one position for each time",
+    ),
+    (
+        Case(BEAM, loads=[MovingMass(1.0, times=[0.0], positions=[0.0])]),
+        "loads.0.times needs at least two points; it has 1",
+    ),
+    (
+        Case(BEAM, sensors=[Support(0.2)]),
+        "sensors.0 holds a Support; it takes objects of type Sensor",
+    ),
+    (
+        Case(BEAM, loads=[Shaker(0.2)]),
+        "loads.0 holds a Shaker; it takes objects of type AbstractLoad",
+    ),
+]
+
+
+@pytest.mark.parametrize(("case", "message"), CASES)
+def test_contradictions_are_refused(case, message):
+    refuses(case, message)
+
+
+def test_wrong_shapes_and_types_are_refused():
+    """What gets past the constructors, whose shapes are only checked in these tests."""
+    lengths = eqx.tree_at(lambda c: c.beam.length, CASE, jnp.ones(2))
+    refuses(lengths, "beam.length must be one number, not an array of shape (2,)")
+    nothing = eqx.tree_at(lambda c: c.beam.length, CASE, None)
+    refuses(nothing, "beam.length is missing; give the total length in m")
+    word = eqx.tree_at(lambda c: c.loads[0].mass, CASE, "heavy")
+    refuses(word, "loads.0.mass must be one number, not 'heavy'")
+    limit = eqx.tree_at(lambda c: c.actuators[0].limits, CASE, jnp.ones(()))
+    refuses(limit, "actuators.0.limits must be a list of 2 numbers, not one number")
+
+
+def test_negative_speed_and_rounded_places_pass():
+    check(replace(CASE, {"loads.0.speed": -0.5, "sensors.0.position": 3 * 0.2}))
+    check(Case(BEAM, actuators=[SpringDamper(0.0, 1.0)], supports=[Support(0.6)]))
+
+
+def test_unknown_numbers_are_passed_over():
+    """Inside jit and vmap a case is checked as far as its numbers are known."""
+
+    def length(value):
+        case = replace(CASE, {"beam.length": value, "loads.0.speed": 0 * value})
+        check(case)
+        return case.beam.length
+
+    assert jax.jit(length)(-1.0) == -1.0
+    assert (jax.vmap(length)(jnp.array([-1.0, 1.0])) == jnp.array([-1.0, 1.0])).all()
+    with pytest.raises(ValueError, match="beam.length must be positive"):
+        jax.grad(length)(-1.0)
+
+
+def test_a_check_takes_milliseconds():
+    check(CASE)
+    start = time.perf_counter()
+    for _ in range(10):
+        check(CASE)
+    assert time.perf_counter() - start < 0.5, "ten checks should take far less than 50 ms"
+
+
+def refuses(case, message):
+    """The case is refused with one sentence that contains the message."""
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        check(case)
+    assert "\n" not in str(caught.value)
