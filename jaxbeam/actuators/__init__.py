@@ -1,6 +1,6 @@
 """Actuators, one kind a file, behind the interface in `base`."""
 
-from jaxbeam.actuators.base import AbstractActuator, Attachment
+from jaxbeam.actuators.base import AbstractActuator, Attachment, Bonded
 from jaxbeam.actuators.patch import Patch
 from jaxbeam.actuators.point import PointForce
 from jaxbeam.actuators.shaker import Shaker
@@ -12,6 +12,7 @@ __all__ = [
     "KINDS",
     "AbstractActuator",
     "Attachment",
+    "Bonded",
     "Patch",
     "PointForce",
     "Shaker",

@@ -28,6 +28,15 @@ class Attachment(eqx.Module):
     mass: Float[Array, ""] | None = None
 
 
+class Bonded(eqx.Module):
+    """What a bonded actuator adds to the section of the beam between two positions (m)."""
+
+    start: Float[Array, ""]
+    end: Float[Array, ""]
+    rigidity: Float[Array, ""]
+    mass: Float[Array, ""]
+
+
 class AbstractActuator(eqx.Module):
     """Interface of all actuators.
 
@@ -47,3 +56,7 @@ class AbstractActuator(eqx.Module):
     @abc.abstractmethod
     def attachment(self) -> Attachment:
         """Its linear model, from command (V or N) to generalised force."""
+
+    def bonded(self) -> Bonded | None:
+        """Bending stiffness (N m^2) and mass per length (kg/m) added; they shape the modes."""
+        return None

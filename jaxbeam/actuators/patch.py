@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.actuators.base import AbstractActuator, Attachment
+from jaxbeam.actuators.base import AbstractActuator, Attachment, Bonded
 from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number
 
 
@@ -39,3 +39,10 @@ class Patch(AbstractActuator):
         none, zero = jnp.zeros(0), jnp.zeros(())
         moment = self.moment_per_volt * self.correction * self.amplifier_gain
         return Attachment(jnp.zeros((0, 0)), none, none, none, moment, zero, zero)
+
+    def bonded(self) -> Bonded | None:
+        if self.added_mass is None and self.added_rigidity is None:
+            return None
+        mass = jnp.zeros(()) if self.added_mass is None else self.added_mass
+        rigidity = jnp.zeros(()) if self.added_rigidity is None else self.added_rigidity
+        return Bonded(self.start, self.end, rigidity, mass)
