@@ -68,9 +68,9 @@ def actuators(draw, length: float):
     limits = maybe(st.tuples(numbers(-10.0, -1.0), numbers(0.0, 10.0)).map(list))
     kind = draw(st.sampled_from(["point", "shaker", "patch", "spring"]))
     if kind == "point":
-        return PointForce(draw(place), draw(limits))
+        return PointForce(position=draw(place), limits=draw(limits))
     if kind == "shaker":
-        return Shaker(draw(place), stiffness=draw(numbers(0.0, 1e4)), limits=draw(limits))
+        return Shaker(position=draw(place), stiffness=draw(numbers(0.0, 1e4)), limits=draw(limits))
     if kind == "spring":
         return SpringDamper(draw(place), draw(numbers(0.0, 1e5)), draw(numbers(0.0, 100.0)))
     return Patch(

@@ -78,8 +78,22 @@ def test_file_and_python_describe_the_same_case(full):
         Beam(0.6, 11.68, 0.535, 0.03, modes=3),
         supports=[Support(0.6, 2e6)],
         actuators=[
-            Shaker(0.5, 3500.0, 80.0, 4.6, 1e4, limits=[-10, 10]),
-            Patch(0.2575, 0.3425, 8.292e-4, 0.32, 200.0, limits=[-2.5, 7.5]),
+            Shaker(
+                position=0.5,
+                stiffness=3500.0,
+                damping=80.0,
+                force_per_volt=4.6,
+                bandwidth=1e4,
+                limits=[-10, 10],
+            ),
+            Patch(
+                start=0.2575,
+                end=0.3425,
+                moment_per_volt=8.292e-4,
+                correction=0.32,
+                amplifier_gain=200.0,
+                limits=[-2.5, 7.5],
+            ),
         ],
         sensors=[Sensor(0.25)],
         loads=[

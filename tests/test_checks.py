@@ -22,7 +22,11 @@ BEAM = Beam(**RIG, damping_ratio=[0.03, 0.02, 0.01])
 CASE = Case(
     BEAM,
     supports=[Support(0.3), Support(0.5, 2e6)],
-    actuators=[Shaker(0.5, limits=[-10, 10]), Patch(0.2, 0.3, 1e-3), PointForce(0.1)],
+    actuators=[
+        Shaker(position=0.5, limits=[-10, 10]),
+        Patch(start=0.2, end=0.3, moment_per_volt=1e-3),
+        PointForce(position=0.1),
+    ],
     sensors=[Sensor(0.25), Sensor(0.25, "strain", fibre_distance=0.002)],
     loads=[
         MovingMass(0.5, 0.55),
