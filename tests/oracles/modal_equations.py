@@ -96,6 +96,8 @@ class _System:
 
     def __init__(self, span: Span, loads: Sequence[Load], middle: float):
         self.span, self.loads = span, loads
+        self.stiffness = span.frequencies**2
+        self.damping = 2.0 * span.damping_ratio * span.frequencies
         self.on = [load.entry_time < middle < load.time_at(span.length) for load in loads]
         self.stopped = [middle > load.stop_time for load in loads]
 
@@ -105,8 +107,7 @@ class _System:
 
     def rate(self, t: float, state: np.ndarray) -> np.ndarray:
         q, u = np.split(state, 2)
-        omega = self.span.frequencies
-        mass, force = np.eye(len(q)), -2.0 * self.span.damping_ratio * omega * u - omega**2 * q
+        mass, force = np.eye(len(q)), -self.damping * u - self.stiffness * q
         for i, load in enumerate(self.loads):
             if not self.on[i]:
                 continue
