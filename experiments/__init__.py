@@ -1,0 +1,1 @@
+"""Studies that stand on jaxbeam and tuning: what was published, done again, and benchmarks."""

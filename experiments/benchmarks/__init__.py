@@ -1,0 +1,1 @@
+"""Timings against other solvers: each table from one command, by a written method."""
