@@ -1,0 +1,112 @@
+"""The physics of contact: travelling loads on a vibrating beam.
+
+A load of mass m at x(t) stays on the beam, so it is accelerated with the deflection under it,
+
+    D2w/Dt2 = w_tt + 2 x' w_xt + x'^2 w_xx + x'' w_x,
+
+and the force on the beam, positive upwards, is r = -W - m D2w/Dt2 with W its weight (corrected
+eqs 2.3 to 2.13 of the thesis; a force has m = 0). In the states z of the rig, with f the forces
+on the modes, D2w/Dt2 = (contact row) . z + (shape row) . f.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.case import Case
+from jaxbeam.loads import motion
+from jaxbeam.motion import AbstractMotion
+from jaxbeam.rig import Rig
+
+
+class Traffic(eqx.Module):
+    """All loads of a run: how they move, and how heavy they are.
+
+    Inertia (kg) and weight (N) may differ between lanes: runs that share everything else.
+    """
+
+    motions: tuple[AbstractMotion, ...]
+    inertia: Float[Array, "load lane"]
+    weight: Float[Array, "load lane"]
+
+    def travel(self, times: Float[Array, "*time"]) -> tuple[Float[Array, "load *time"], ...]:
+        """Positions (m), speeds (m/s) and accelerations (m/s^2) at given times (s)."""
+        if not self.motions:
+            return (jnp.zeros((0, *times.shape)),) * 3
+        paths = zip(*(path.travel(times) for path in self.motions), strict=True)
+        position, speed, acceleration = (jnp.stack(parts) for parts in paths)
+        return position, speed, acceleration
+
+
+def traffic(case: Case) -> Traffic:
+    """The loads of a case, as a single lane."""
+    motions = tuple(motion(load, case.beam.length) for load in case.loads)
+    gravity = case.run.gravity
+    inertia = [load.inertia() for load in case.loads]
+    weight = [load.weight(gravity) for load in case.loads]
+    column = (len(motions), 1)
+    return Traffic(
+        motions, jnp.array(inertia).reshape(column), jnp.array(weight).reshape(column)
+    )
+
+
+def contact_rows(rig: Rig, position, speed, acceleration, active):
+    """Shape rows (*place, block, mode) and contact rows (*place, block, side) at the loads.
+
+    Position (m), speed (m/s), acceleration (m/s^2) and whether it is on the beam, all (*place,);
+    where it is not, the rows are zero.
+    """
+    inside = jnp.where(active, position, 0.0)
+    shape, slope, curvature = jnp.where(
+        active[..., None], rig.shapes(inside, (0, 1, 2)), 0.0
+    )
+    speed, acceleration = speed[..., None], acceleration[..., None]
+    convected = speed**2 * curvature + acceleration * slope
+    travelling = 2 * speed * slope
+    blocks, each = rig.state_matrix.shape[0], rig.modes_per_block
+    split = (*position.shape, blocks, each)
+    shape = shape.reshape(split)
+    rates = rig.state_matrix[:, 1 : 2 * each : 2, :]
+    free = jnp.sum(shape[..., None] * rates, axis=-2) if each == 1 else shape @ rates
+    added = jnp.stack([convected.reshape(split), travelling.reshape(split)], axis=-1)
+    added = added.reshape(*split[:-1], 2 * each)
+    rows = free.at[..., : 2 * each].add(added)
+    return shape, rows
+
+
+def solve_contact(gains, inertia, drive):
+    """Solve (1 + m_i G_ij) r_j = -d_i for every lane, by elimination without pivoting.
+
+    `gains` (row, row) are shared, `inertia` and `drive` are (row, lane). The matrix is close to
+    the identity plus a positive matrix for the step lengths in use, so pivots stay away from
+    zero. Spelt out, because the compiler then keeps small systems in registers.
+    """
+    size = gains.shape[0]
+    rows = [inertia[i] * gains[i][:, None] for i in range(size)]
+    rows = [row.at[i].add(1.0) for i, row in enumerate(rows)] if size > 8 else rows
+    if size > 8:
+        return _eliminate(jnp.stack(rows), -drive)
+    matrix = [[rows[i][j] + (i == j) for j in range(size)] for i in range(size)]
+    right = [-drive[i] for i in range(size)]
+    for i in range(size):
+        for k in range(i + 1, size):
+            factor = matrix[k][i] / matrix[i][i]
+            for j in range(i + 1, size):
+                matrix[k][j] = matrix[k][j] - factor * matrix[i][j]
+            right[k] = right[k] - factor * right[i]
+    forces = [right[0]] * size
+    for i in reversed(range(size)):
+        rest = sum((matrix[i][j] * forces[j] for j in range(i + 1, size)), jnp.zeros_like(right[i]))
+        forces[i] = (right[i] - rest) / matrix[i][i]
+    return jnp.stack(forces)
+
+
+def _eliminate(matrix, right):
+    """Gauss-Jordan elimination of (row, row, lane), a whole pivot at a time."""
+    size = right.shape[0]
+    for i in range(size):
+        row, value = matrix[i] / matrix[i, i], right[i] / matrix[i, i]
+        factor = matrix[:, i].at[i].set(0.0)
+        matrix = (matrix - factor[:, None] * row[None]).at[i].set(row)
+        right = (right - factor * value).at[i].set(value)
+    return right

@@ -1,0 +1,130 @@
+"""Exact propagation of a linear system over a step, with forces polynomial in time.
+
+For z' = A z + B f with f(t) = sum_k f_k l_k(t / h), the l_k being the Lagrange polynomials
+through Gauss nodes, the state at any fraction c of a step h is
+
+    z(c h) = Phi_c z(0) + sum_k Theta_ck f_k
+
+with Phi_c = exp(A c h) and Theta_ck a combination of the phi functions
+phi_p(X) = int_0^1 e^{(1 - s) X} s^{p - 1} / (p - 1)! ds (Hochbruck and Ostermann, Acta Numerica
+2010, section 2). They are summed as a Taylor series of a fraction of X and doubled a fixed number
+of times, which holds for any damping, rigid-body modes and lags alike, and differentiates.
+"""
+
+import functools
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.rig import Rig
+
+NODES = 6  # Gauss nodes a step; the integrator is of order 12
+POINTS = 6  # equal intervals a step at whose ends the deflection is looked at for its peak
+DOUBLINGS = 7
+TERMS = 12
+LONGEST = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is right to rounding
+
+GAUSS = (np.polynomial.legendre.leggauss(NODES)[0] + 1) / 2
+
+
+class Step(eqx.Module):
+    """Propagators over steps of given lengths: at the Gauss nodes, at the end, at equal points.
+
+    `drift_*` take the state at the start, `push_*` the modal forces at the Gauss nodes; in the
+    blocks of the rig. `points` run from the start to the end of the step, both included.
+    """
+
+    drift_nodes: Float[Array, "*length node block side side"]
+    push_nodes: Float[Array, "*length node force block side mode"]
+    drift_end: Float[Array, "*length block side side"]
+    push_end: Float[Array, "*length force block side mode"]
+    drift_points: Float[Array, "*length point block side side"]
+    push_points: Float[Array, "*length point force block side mode"]
+
+
+@functools.cache
+def _lagrange() -> np.ndarray:
+    """Monomial coefficients (node, power) of the Lagrange polynomials through the Gauss nodes."""
+    polynomials = []
+    for k, node in enumerate(GAUSS):
+        others = np.delete(GAUSS, k)
+        polynomials.append(np.polynomial.polynomial.polyfromroots(others) / np.prod(node - others))
+    return np.array(polynomials)
+
+
+def _multiply(a, b):
+    """Matrix product over the last two axes; spelt out for the tiny blocks of single modes."""
+    if a.shape[-1] > 3:
+        return a @ b
+    return sum(a[..., :, i, None] * b[..., None, i, :] for i in range(a.shape[-1]))
+
+
+def norm(rig: Rig) -> Float[Array, ""]:
+    """Norm of the balanced state matrix in 1/s: steps must be shorter than `LONGEST` over it."""
+    balance = _balance(rig)
+    matrix = rig.state_matrix * balance[:, :, None] / balance[:, None, :]
+    return jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=-1)))
+
+
+def _balance(rig: Rig):
+    """Scale of the states (block, side) that gives deflections and speeds of modes equal size."""
+    blocks, side, _ = rig.state_matrix.shape
+    each = rig.modes_per_block
+    modes = np.arange(each)
+    square = jnp.abs(rig.state_matrix[:, 2 * modes + 1, 2 * modes])
+    scale = jnp.ones((blocks, side)).at[:, 2 * modes].set(jnp.sqrt(1.0 + square))
+    return jax.lax.stop_gradient(scale)
+
+
+def propagators(rig: Rig, lengths: Float[Array, " *length"]) -> Step:
+    """Propagators of the rig over steps of the given lengths (s), zero included."""
+    balance = _balance(rig)
+    side, each = rig.state_matrix.shape[1], rig.modes_per_block
+    matrix = rig.state_matrix * balance[:, :, None] / balance[:, None, :]
+    force = np.eye(side)[:, 1 : 2 * each : 2]  # speeds are not scaled
+    fractions = np.concatenate([GAUSS, np.arange(POINTS + 1) / POINTS])
+    spans = lengths[..., None] * fractions
+    x = matrix * spans[..., None, None, None] / 2**DOUBLINGS
+    drift, pushes = _series(x, force)
+    for _ in range(DOUBLINGS):
+        drift, pushes = _double(drift, pushes)
+    powers = np.arange(NODES)
+    weights = _lagrange() * np.array([math.factorial(p) for p in powers])  # force, power
+    weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
+    push = jnp.einsum("cfp,p...cbsm->...cfbsm", weights, jnp.stack(pushes))
+    push = push * spans[..., None, None, None, None] / balance[:, :, None]
+    drift = drift * balance[:, None, :] / balance[:, :, None]
+    end = NODES + POINTS
+    at = jnp.moveaxis(drift, -4, 0), jnp.moveaxis(push, -5, 0)
+    nodes = (jnp.moveaxis(part[:NODES], 0, axis) for part, axis in zip(at, (-4, -5), strict=True))
+    points = (jnp.moveaxis(part[NODES:], 0, axis) for part, axis in zip(at, (-4, -5), strict=True))
+    return Step(*nodes, at[0][end], at[1][end], *points)
+
+
+def _series(x, force):
+    """exp(x) and phi_1 ... phi_NODES of x times the force matrix, for small x."""
+    identity = jnp.broadcast_to(jnp.eye(x.shape[-1]), x.shape)
+    exponential = identity
+    for k in range(TERMS + NODES, 0, -1):
+        exponential = identity + _multiply(x, exponential) / k
+    top = jnp.broadcast_to(force, (*x.shape[:-1], force.shape[-1]))
+    phi = top / math.factorial(NODES + TERMS)
+    for k in range(TERMS - 1, -1, -1):
+        phi = top / math.factorial(NODES + k) + _multiply(x, phi)
+    pushes = [phi]
+    for p in range(NODES - 1, 0, -1):
+        pushes.insert(0, top / math.factorial(p) + _multiply(x, pushes[0]))
+    return exponential, pushes
+
+
+def _double(drift, pushes):
+    """The same functions of twice the argument."""
+    doubled = []
+    for p in range(1, NODES + 1):
+        rest = sum(pushes[j] / math.factorial(p - 1 - j) for j in range(p))
+        doubled.append((_multiply(drift, pushes[p - 1]) + rest) / 2**p)
+    return _multiply(drift, drift), doubled

@@ -1,0 +1,111 @@
+"""Where the time steps lie: panels of equal steps between events and saved samples.
+
+An event is a time at which the motion is not smooth: a load enters, leaves, stops, or passes a
+support or the edge of a patch. Steps never straddle one. The number of panels is fixed by the
+case's structure, so it can be compiled; their edges are numbers like any other, and a panel of
+no length does no harm.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxbeam.case import Case
+from jaxbeam.loads import motion
+from jaxbeam.rig import Rig
+
+
+class Grid(eqx.Module):
+    """Panels, each with a number of equal steps; step lengths are shared among panels.
+
+    `kind` says which of `lengths` (s) the steps of a panel have. The last of the lengths is zero:
+    it belongs to the steps after the end, which fill up a chunk.
+    """
+
+    edges: Float[Array, " edge"]
+    counts: Int[Array, " panel"]
+    kind: Int[Array, " panel"]
+    lengths: Float[Array, " length"]
+    active: Bool[Array, "panel load"]
+    last_exit: Float[Array, ""]
+
+    @property
+    def total(self) -> Int[Array, ""]:
+        """Number of steps."""
+        return jnp.sum(self.counts)
+
+    def steps(self, index: Int[Array, " step"]):
+        """Panel, start time (s) and kind of length of the steps with these indices."""
+        first = jnp.cumsum(self.counts) - self.counts
+        beyond = index >= self.total
+        panel = jnp.searchsorted(jnp.cumsum(self.counts), index, side="right")
+        panel = jnp.minimum(panel, self.counts.shape[0] - 1)
+        kind = jnp.where(beyond, self.lengths.shape[0] - 1, self.kind[panel])
+        start = self.edges[panel] + (index - first[panel]) * self.lengths[self.kind[panel]]
+        return panel, jnp.where(beyond, self.edges[-1], start), kind
+
+
+def _events(case: Case, rig: Rig):
+    """Entry and exit of every load (load, 2), and all events (event,), in s."""
+    inner = rig.modes.nodes[1:-1]
+    motions = [motion(load, case.beam.length) for load in case.loads]
+    if not motions:
+        return jnp.zeros((0, 2)), jnp.zeros(0)
+    windows = jnp.stack([jnp.stack(path.window()) for path in motions])
+    kinks = [path.arrivals(inner) for path in motions]
+    return windows, jnp.concatenate([windows.ravel(), *kinks])
+
+
+def _activity(windows, edges):
+    """Which loads are on the beam in each panel (panel, load)."""
+    middle = (edges[1:] + edges[:-1]) / 2
+    return (windows[:, 0] < middle[:, None]) & (middle[:, None] < windows[:, 1])
+
+
+def _last_exit(windows):
+    return jnp.max(windows[:, 1], initial=0.0)
+
+
+def even_grid(case: Case, rig: Rig, longest: Float[Array, ""]) -> Grid:
+    """Panels from event to event, with as many steps as keep them below `longest` (s)."""
+    windows, events = _events(case, rig)
+    end = case.run.duration
+    edges = jnp.concatenate([jnp.zeros(1), jnp.clip(jnp.sort(events), 0.0, end), end[None]])
+    spans = jnp.diff(edges)
+    counts = jnp.ceil(jax.lax.stop_gradient(spans / longest)).astype(int)
+    lengths = spans / jnp.maximum(counts, 1)
+    kind = jnp.arange(spans.shape[0])
+    lengths = jnp.append(lengths, 0.0)
+    active = _activity(windows, edges)
+    return Grid(edges, counts, kind, lengths, active, _last_exit(windows))
+
+
+def sampled_grid(
+    case: Case, rig: Rig, times: Float[Array, " time"], substeps: int, even: bool
+) -> tuple[Grid, Int[Array, " time"]]:
+    """Panels from sample to sample (or event between them), each with `substeps` steps.
+
+    `times` (s) ascend from the start of the run; `even` promises that they are equally spaced,
+    so that nearly all panels share one step length. Also returns the edge of every sample.
+    """
+    windows, events = _events(case, rig)
+    where = jnp.concatenate([times, jnp.clip(events, times[0], times[-1])])
+    order = jnp.argsort(where)
+    edges = where[order]
+    spans = jnp.diff(edges)
+    sample = order < times.shape[0]
+    if even:
+        # The others lie beside an event: at most two for each.
+        usual = sample[1:] & sample[:-1]
+        room = 2 * events.shape[0]
+    else:
+        usual = jnp.zeros(spans.shape, bool)
+        room = spans.shape[0]
+    kind = jnp.where(usual, 0, jnp.cumsum(~usual))
+    spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
+    lengths = jnp.zeros(room + 2).at[kind].set(jnp.where(usual, spacing, spans))
+    counts = jnp.full(spans.shape, substeps)
+    active = _activity(windows, edges)
+    grid = Grid(edges, counts, kind, lengths / substeps, active, _last_exit(windows))
+    return grid, jnp.argsort(order)[: times.shape[0]]

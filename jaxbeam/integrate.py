@@ -1,0 +1,254 @@
+"""The fast integrator: exact modal propagation, contact forces collocated at Gauss nodes.
+
+Within a step every contact force is the polynomial through its values at the Gauss nodes, and so
+is the force it puts on each mode; the rig answers exactly (`exponentials`). Demanding the contact
+law at the nodes gives a small linear system a step. The free rig brings neither error nor
+stiffness at any step length; the order is twice the number of nodes. Steps are taken in chunks:
+what depends on the path alone is tabulated for a chunk at once and shared by all lanes, a short
+loop then advances the states, and what is wanted of the chunk is reduced at once again.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxbeam.dynamics import Traffic, contact_rows, solve_contact
+from jaxbeam.exponentials import GAUSS, POINTS, Step, propagators
+from jaxbeam.grid import Grid
+from jaxbeam.motion import NEVER
+from jaxbeam.peaks import refine, vertex
+from jaxbeam.rig import Rig
+
+CHUNK = 16
+
+
+class Extremes(eqx.Module):
+    """What a march keeps of a run without storing it.
+
+    `samples` are the deflections at equal points of the step with the largest absolute deflection
+    of each watched place, `start` (s) and `span` (s) that step. Contact forces are those with
+    which a load presses on the beam; `lost` (s) is the first time it would have to pull.
+    """
+
+    score: Float[Array, "sensor lane"]
+    samples: Float[Array, "point sensor lane"]
+    start: Float[Array, "sensor lane"]
+    span: Float[Array, "sensor lane"]
+    lowest: Float[Array, "load lane"]
+    lost: Float[Array, "load lane"]
+
+    def peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
+        """Largest absolute deflection (m) of each watched place, and when (s)."""
+        value, place = refine(self.samples)
+        return value, self.start + place * self.span
+
+
+class Tables(eqx.Module):
+    """What one chunk of steps needs, computed from path and rig alone."""
+
+    respond: Float[Array, "step row state"]
+    gains: Float[Array, "step row row"]
+    drift: Float[Array, "step block side side"]
+    push: Float[Array, "step state row"]
+    watch: Float[Array, "step looked state"]
+    watch_push: Float[Array, "step looked row"]
+    slots: Int[Array, "step slot"]
+    active: Float[Array, "step slot"]
+
+
+class Rigging(eqx.Module):
+    """Propagators of the rig on a grid, and the rows that give the watched deflections."""
+
+    step: Step
+    watch: Float[Array, "length looked block side"]
+    watch_push: Float[Array, "length looked force block mode"]
+
+
+def _rigging(rig: Rig, grid: Grid, watched) -> Rigging:
+    step = propagators(rig, grid.lengths)
+    each = rig.modes_per_block
+    blocks = rig.state_matrix.shape[0]
+    rows = rig.shapes(watched, (0,))[0].reshape(-1, blocks, each)
+    places = np.arange(0, 2 * each, 2)
+    watch = jnp.einsum("wbm,lpbmj->lpwbj", rows, step.drift_points[..., places, :])
+    push = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, step.push_points[..., places, :])
+    flat = (grid.lengths.shape[0], -1)
+    return Rigging(
+        step, watch.reshape(*flat, *watch.shape[3:]), push.reshape(*flat, *push.shape[3:])
+    )
+
+
+def _tabulate(rig: Rig, traffic: Traffic, grid: Grid, rigging: Rigging, slots: int, index):
+    """Tables of the steps with the given indices, and their start times and lengths (s)."""
+    panel, start, kind = grid.steps(index)
+    span = grid.lengths[kind]
+    times = start[:, None] + span[:, None] * GAUSS
+    position, speed, acceleration = (jnp.moveaxis(p, 0, 1) for p in traffic.travel(times))
+    active = grid.active[panel]  # step, load
+    if slots < len(traffic.motions):
+        # Loads on the beam first; those that find no slot are off the beam.
+        chosen = jnp.argsort(~active, axis=1)[:, :slots]
+        pick = chosen[:, :, None]
+        position, speed, acceleration = (
+            jnp.take_along_axis(part, pick, axis=1) for part in (position, speed, acceleration)
+        )
+        active = jnp.take_along_axis(active, chosen, axis=1)
+    else:
+        chosen = jnp.broadcast_to(jnp.arange(slots), active.shape)
+    on = jnp.broadcast_to(active[:, :, None], position.shape)
+    shape, rows = contact_rows(rig, position, speed, acceleration, on)
+    step = jax.tree.map(lambda table: table[kind], rigging.step)
+    steps, nodes = index.shape[0], len(GAUSS)
+    size = slots * nodes
+    respond = _across(rows, step.drift_nodes, "tpcbi,tcbij->tpcbj")
+    felt = _across(rows, step.push_nodes, "tpcbi,tcfbim->tpcfbm")
+    gains = jnp.einsum("tpcfbm,tqfbm->tpcqf", felt, shape)
+    direct = jnp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
+    gains = gains + direct[..., None] * np.eye(nodes)[:, None, :]
+    push = _across(shape, step.push_end, "tqfbm,tfbim->tbiqf")
+    seen = jnp.einsum("tlfbm,tqfbm->tlqf", rigging.watch_push[kind], shape)
+    tables = Tables(
+        respond.reshape(steps, size, rig.states),
+        gains.reshape(steps, size, size),
+        step.drift_end,
+        push.reshape(steps, rig.states, size),
+        rigging.watch[kind].reshape(steps, -1, rig.states),
+        seen.reshape(steps, -1, size),
+        chosen,
+        active.astype(float),
+    )
+    return tables, start, span
+
+
+def _across(rows, table, rule):
+    return jnp.einsum(rule, rows, table)
+
+
+def _advance(state, tables: Tables, inertia, weight):
+    """One step of all lanes: the contact forces at the nodes, and the state at the end."""
+    nodes = len(GAUSS)
+    on = tables.active[:, None]
+    inertia = jnp.repeat(inertia[tables.slots] * on, nodes, axis=0)
+    weight = jnp.repeat(weight[tables.slots] * on, nodes, axis=0)
+    forces = solve_contact(
+        tables.gains, inertia, weight + inertia * (tables.respond @ state)
+    )
+    blocks, side, _ = tables.drift.shape
+    split = state.reshape(blocks, side, -1)
+    if side == 2:
+        drifted = tables.drift[:, :, :1] * split[:, :1] + tables.drift[:, :, 1:] * split[:, 1:]
+    else:
+        drifted = tables.drift @ split
+    after = drifted.reshape(state.shape) + tables.push @ forces
+    return after, (state, forces)
+
+
+def _reduce(best: Extremes, tables: Tables, states, forces, start, span) -> Extremes:
+    """Fold a chunk into the extremes."""
+    steps, lanes = states.shape[0], states.shape[-1]
+    seen = tables.watch @ states + tables.watch_push @ forces
+    samples = seen.reshape(steps, POINTS + 1, -1, lanes)
+    score = jax.vmap(vertex)(samples)
+    top = jnp.argmax(score, axis=0)
+    score = jnp.max(score, axis=0)
+    better = score > best.score
+    chosen = jnp.take_along_axis(samples, top[None, None], axis=0)[0]
+    pressing = -forces.reshape(steps, -1, len(GAUSS), lanes)
+    loads = best.lowest.shape[0]
+    # A load that is not on the beam, or has no slot, does not count.
+    at_slot = tables.slots[:, :, None] == np.arange(loads)
+    counts = (at_slot & (tables.active[:, :, None] > 0))[:, :, None, :, None]
+    least = jnp.where(counts, pressing[:, :, :, None], jnp.inf)
+    times = (start[:, None] + span[:, None] * GAUSS)[:, None, :, None, None]
+    lost = jnp.where(least < 0, times, NEVER)
+    return Extremes(
+        jnp.where(better, score, best.score),
+        jnp.where(better, chosen, best.samples),
+        jnp.where(better, start[top], best.start),
+        jnp.where(better, span[top], best.span),
+        jnp.minimum(best.lowest, jnp.min(least, axis=(0, 1, 2))),
+        jnp.minimum(best.lost, jnp.min(lost, axis=(0, 1, 2))),
+    )
+
+
+def march(
+    rig: Rig,
+    traffic: Traffic,
+    grid: Grid,
+    watched: Float[Array, " sensor"],
+    *,
+    slots: int,
+    steps: int | None = None,
+):
+    """Integrate from rest over a grid; return extremes, and states (and forces) of every step.
+
+    `watched` are the places (m) whose peaks are kept; `slots` is how many loads may be on the
+    beam at once. With `steps` known the loop has a fixed length, states and forces at all steps
+    are returned as (step, state, lane), and reverse mode works, storing one state a chunk.
+    Without, the loop runs as long as it must, only extremes are kept, and it ends early when the
+    energy left after the last exit cannot raise any peak.
+    """
+    lanes = traffic.inertia.shape[1]
+    rigging = _rigging(rig, grid, watched)
+    places, loads = watched.shape[0], len(traffic.motions)
+    nothing = jnp.zeros((places, lanes))
+    best = Extremes(
+        nothing,
+        jnp.zeros((POINTS + 1, places, lanes)),
+        nothing,
+        nothing,
+        jnp.full((loads, lanes), jnp.inf),
+        jnp.full((loads, lanes), NEVER),
+    )
+
+    def chunk(state, best, first):
+        index = first + jnp.arange(CHUNK)
+        tables, start, span = _tabulate(rig, traffic, grid, rigging, slots, index)
+
+        def step(state, tables):
+            return _advance(state, tables, traffic.inertia, traffic.weight)
+
+        state, (states, forces) = jax.lax.scan(step, state, tables)
+        return state, _reduce(best, tables, states, forces, start, span), states, forces
+
+    rest = jnp.zeros((rig.states, lanes))
+    if steps is not None:
+
+        def whole(carry, first):
+            state, best, states, forces = chunk(*carry, first)
+            return (state, best), (states, forces)
+
+        firsts = jnp.arange(0, steps, CHUNK)
+        (state, best), kept = jax.lax.scan(jax.checkpoint(whole), (rest, best), firsts)
+        states, forces = (part.reshape(-1, *part.shape[2:])[:steps] for part in kept)
+        return best, jnp.concatenate([states, state[None]]), forces
+
+    flexibility = _flexibility(rig, watched)
+    stiffness = rig.stiffness()
+
+    def more(carry):
+        _, _, first, going = carry
+        return going & (first < grid.total)
+
+    def go(carry):
+        state, best, first, _ = carry
+        state, best, _, _ = chunk(state, best, first)
+        first = first + CHUNK
+        left = grid.steps(first[None])[1][0] >= grid.last_exit
+        size = 2 * stiffness.shape[0]
+        place, rate = state[0:size:2], state[1:size:2]
+        energy = jnp.sum(rate**2, axis=0) + jnp.sum(place * (stiffness @ place), axis=0)
+        reach = jnp.sqrt(flexibility[:, None] * energy)
+        return state, best, first, ~(left & jnp.all(reach < best.score))
+
+    start = (rest, best, jnp.zeros((), int), jnp.ones((), bool))
+    state, best, _, _ = jax.lax.while_loop(more, go, start)
+    return best, state
+
+
+def _flexibility(rig: Rig, watched):
+    """Static deflection at each place under a unit force there: bounds |w|^2 by the energy."""
+    rows = rig.shapes(watched, (0,))[0]
+    return jnp.sum(rows * jnp.linalg.solve(rig.stiffness(), rows.T).T, axis=-1)

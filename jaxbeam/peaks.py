@@ -1,0 +1,52 @@
+"""Largest absolute value of a smooth curve known at a few equal points."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+FINE = 64  # places at which the interpolant is looked at before Newton's method takes over
+
+
+def vertex(samples: Float[Array, "point *rest"]) -> Float[Array, " *rest"]:
+    """Largest absolute value, estimated by parabolas through neighbouring samples.
+
+    Each parabola counts between its own samples only. Cheap, to tell which of many steps holds
+    the peak; `refine` then finds it.
+    """
+    before, middle, after = samples[:-2], samples[1:-1], samples[2:]
+    slope, bend = (after - before) / 2, after - 2 * middle + before
+    inside = jnp.abs(slope) < jnp.abs(bend)
+    top = middle - jnp.where(inside, slope**2 / (2 * jnp.where(inside, bend, 1.0)), 0.0)
+    return jnp.maximum(jnp.max(jnp.abs(samples), axis=0), jnp.max(jnp.abs(top), axis=0))
+
+
+def refine(samples: Float[Array, "point *rest"]) -> tuple[Float[Array, " *rest"], ...]:
+    """Largest absolute value of the polynomial through the samples, and where in [0, 1] it is.
+
+    The derivative is that at the fixed place of the peak, which is exact where the peak is a
+    maximum inside the curve and where it is at an end that stays.
+    """
+    points = samples.shape[0]
+    powers = np.arange(points)
+    # The curve as a polynomial in 2 c - 1, where it is best conditioned.
+    nodes = np.linspace(-1.0, 1.0, points)
+    monomials = jnp.tensordot(np.linalg.inv(nodes[:, None] ** powers), samples, axes=1)
+    frozen = jax.lax.stop_gradient(monomials)
+
+    def value(curve, place, order=0):
+        factor = np.array([np.prod(np.arange(p - order + 1, p + 1)) for p in powers])
+        total = jnp.zeros_like(place)
+        for p in range(points - 1, order - 1, -1):
+            total = total * place + factor[p] * curve[p]
+        return total
+
+    fine = np.linspace(-1.0, 1.0, FINE + 1)
+    curve = jnp.tensordot(fine[:, None] ** powers, frozen, axes=1)
+    place = jnp.asarray(fine)[jnp.argmax(jnp.abs(curve), axis=0)]
+    for _ in range(4):
+        bend = value(frozen, place, 2)
+        step = value(frozen, place, 1) / jnp.where(bend == 0, 1.0, bend)
+        step = jnp.where(bend == 0, 0.0, jnp.clip(step, -2 / FINE, 2 / FINE))
+        place = jnp.clip(place - step, -1.0, 1.0)
+    return jnp.abs(value(monomials, place)), (place + 1) / 2
