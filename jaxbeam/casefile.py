@@ -15,7 +15,7 @@ import tomli_w
 
 from jaxbeam import actuators, loads
 from jaxbeam.beam import Beam, Support
-from jaxbeam.case import Case, Run
+from jaxbeam.case import Case, Run, unknown_address
 from jaxbeam.checks import check, check_field, missing, suggestion
 from jaxbeam.fields import fits, known, shape_in_words
 from jaxbeam.sensors import Sensor
@@ -117,6 +117,39 @@ def case_to_dict(case: Case) -> dict[str, Any]:
                 _write_part(f"{key}.{i}", part, LISTS[key]) for i, part in enumerate(value)
             ]
     return content
+
+
+def with_settings(case: Case, settings: dict[str, Any]) -> Case:
+    """Return a copy of a case with other entries at addresses, as if the file had said so.
+
+    Unlike `case.replace` this also sets words, counts and numbers that were left out, and it
+    checks the result; it takes plain values (SI units), not traced ones. Raises ValueError for
+    an address that no case file could have, and for whatever `check` refuses.
+    """
+    content = case_to_dict(case)
+    for address, value in settings.items():
+        *path, last = address.split(".")
+        place: Any = content
+        for step in path:
+            place = _entry(place, step)
+        if isinstance(place, dict):
+            place[last] = value
+        elif _entry(place, last) is not None:
+            place[int(last)] = value
+        else:
+            raise unknown_address(case, address)
+    changed = case_from_dict(content)
+    check(changed)
+    return changed
+
+
+def _entry(place: Any, step: str) -> Any:
+    """What a table or list holds at one step of an address; None if nothing."""
+    if isinstance(place, dict):
+        return place.get(step)
+    if isinstance(place, list) and step.isdigit() and int(step) < len(place):
+        return place[int(step)]
+    return None
 
 
 def _read_part(address: str, table: dict[str, Any], kind: Kind) -> Any:

@@ -1,5 +1,6 @@
 """Case files: read exactly, written exactly, and refused with a sentence that helps."""
 
+import re
 import tomllib
 
 import equinox as eqx
@@ -10,7 +11,7 @@ from hypothesis import given
 from jaxbeam.actuators import Patch, PointForce, Shaker
 from jaxbeam.beam import Beam, Support
 from jaxbeam.case import Case, Run
-from jaxbeam.casefile import case_from_dict, case_to_dict, load_case, save_case
+from jaxbeam.casefile import case_from_dict, case_to_dict, load_case, save_case, with_settings
 from jaxbeam.loads import MovingForce, MovingMass
 from jaxbeam.sensors import Sensor
 from tests.strategies import cases
@@ -218,3 +219,42 @@ def test_whole_numbers_become_floats():
 def test_what_is_left_out_stays_out():
     assert "stiffness" not in case_to_dict(Case(Beam(1, 1, 1), [Support(0.5)]))["supports"][0]
     assert set(case_to_dict(case_from_dict(SMALL))) == {"beam", "run"}
+
+
+def test_settings_change_anything_a_file_may_say(full):
+    case = load_case(full)
+    settings = {
+        "beam.modes": 2,
+        "beam.ends": "clamped-free",
+        "beam.damping_ratio": [0.01, 0.02],
+        "loads.1.times.2": 3,
+        "loads.0.speed": -0.3,
+        "run.gravity": 9.8,
+    }
+    changed = with_settings(case, settings)
+    assert (changed.beam.modes, changed.beam.ends) == (2, "clamped-free")
+    assert changed.beam.damping_ratio.tolist() == [0.01, 0.02]
+    assert changed.loads[1].times.tolist() == [0, 1, 3]
+    assert changed.loads[0].speed == -0.3
+    assert case.beam.modes == 3
+
+
+@pytest.mark.parametrize(
+    ("address", "value", "message"),
+    [
+        ("loads.0.sped", 1.0, "loads.0 has no key 'sped'; did you mean 'speed'?"),
+        (
+            "loads.2.speed",
+            1.0,
+            "no number at address 'loads.2.speed'; did you mean 'loads.0.speed'",
+        ),
+        ("loads.1.times.3", 1.0, "no number at address 'loads.1.times.3'; did you mean"),
+        ("beam.length.0", 1.0, "no number at address 'beam.length.0'; did you mean 'beam.length'"),
+        ("beam.length", "long", "beam.length must be one number, not 'long'"),
+        ("beam.length", -1.0, "beam.length must be positive; it is -1 m"),
+        ("bean.length", 1.0, "no number at address 'bean.length'; did you mean 'beam.length'?"),
+    ],
+)
+def test_settings_are_checked(full, address, value, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        with_settings(load_case(full), {address: value})

@@ -29,6 +29,7 @@ jaxbeam.plot
 jaxbeam.__init__
 tuning
 experiments
+jaxbeam.arguments
 jaxbeam.cli
 jaxbeam.__main__
 """

@@ -1,0 +1,5 @@
+"""`python -m jaxbeam`: the command line."""
+
+from jaxbeam.cli import main
+
+main()

@@ -1,0 +1,97 @@
+"""What the arguments of the command line mean, checked before any work is done."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxbeam.case import Case
+from jaxbeam.casefile import load_case, with_settings
+
+
+def read_case(path: Path, settings: Iterable[str]) -> Case:
+    """The case in a file, with the entries changed that the command line sets."""
+    changes = dict(assignment("--set", text) for text in settings)
+    return with_settings(load_case(path), {a: value_of(text) for a, text in changes.items()})
+
+
+def assignment(option: str, text: str) -> tuple[str, str]:
+    """The two sides of ADDRESS=VALUE. Raises ValueError if one is empty."""
+    address, equals, value = text.partition("=")
+    if not (address and equals and value):
+        raise ValueError(f"{option} takes ADDRESS=VALUE, such as loads.0.speed=0.5, not {text!r}")
+    return address, value
+
+
+def value_of(text: str) -> Any:
+    """A number, a list of numbers (with or without brackets) or a word."""
+    for read in (int, float):
+        try:
+            return read(text)
+        except ValueError:
+            pass
+    if "," in text:
+        return [value_of(entry.strip()) for entry in text.strip("[]").split(",")]
+    return text
+
+
+def _numbers(option: str, text: str, entries: Sequence[str]) -> list[float]:
+    try:
+        return [float(entry) for entry in entries]
+    except ValueError as error:
+        word = str(error).rsplit(": ", 1)[-1]
+        raise ValueError(f"{option} {text}: {word} is not a number") from None
+
+
+def values_of(text: str, value: str) -> list[float]:
+    """The values of START:STOP:COUNT or V1,V2,... in `text`, ADDRESS=VALUE.
+
+    Raises ValueError if they are no numbers.
+    """
+    if ":" not in value:
+        return _numbers("--over", text, value.split(","))
+    limits = _numbers("--over", text, value.split(":"))
+    if len(limits) != 3 or limits[2] < 1 or limits[2] % 1:
+        raise ValueError(
+            f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"
+        )
+    start, stop, count = limits
+    step = (stop - start) / max(count - 1, 1)
+    return [start + i * step for i in range(int(count) - 1)] + [stop]
+
+
+def bounds_of(text: str) -> tuple[str, tuple[float, float] | None]:
+    """The address and the bounds of ADDRESS or ADDRESS=LOW:HIGH.
+
+    Raises ValueError if the bounds are no two increasing numbers.
+    """
+    address, equals, value = text.partition("=")
+    if not equals:
+        return address, None
+    bounds = _numbers("--free", text, value.split(":"))
+    if len(bounds) != 2 or bounds[0] >= bounds[1]:
+        raise ValueError(f"--free {text}: bounds are LOW:HIGH, such as 5:20")
+    return address, (bounds[0], bounds[1])
+
+
+def picture_path(output: Path | None, source: Path) -> Path:
+    """Where a picture goes: beside the output, or named after the source in this folder."""
+    return (output or Path(source.name)).with_suffix(".png")
+
+
+def check_suffix(path: Path | None, suffix: str) -> None:
+    """Raises ValueError if a file is not named as what will be in it."""
+    if path and path.suffix != suffix:
+        raise ValueError(f"the output is a {suffix} file; call it {path.with_suffix(suffix)}")
+
+
+def check_outputs(overwrite: bool, *paths: Path | None) -> None:
+    """Refuse, before any work, what could not be written after it.
+
+    Raises FileNotFoundError without a folder to write to, FileExistsError for a file that exists
+    and may not be overwritten.
+    """
+    for path in filter(None, paths):
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"there is no folder {path.parent} to write {path.name} to")
+        if path.exists() and not overwrite:
+            raise FileExistsError(f"{path} exists; choose another name or add --overwrite")

@@ -1,0 +1,337 @@
+"""The command line: reads arguments, calls the library, prints what it returns.
+
+Libraries are imported inside the commands, so that help and complaints come at once.
+"""
+
+import json
+import math
+import sys
+import warnings
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+from cyclopts import App, CycloptsError, Parameter
+
+from jaxbeam.arguments import (
+    assignment,
+    bounds_of,
+    check_outputs,
+    check_suffix,
+    picture_path,
+    read_case,
+    values_of,
+)
+
+app = App(
+    name="jaxbeam",
+    help="Beams under moving loads: simulate, sweep, and identify from measured logs.",
+    help_format="plaintext",
+    result_action="return_value",
+    default_parameter=Parameter(negative=(), show_default=False),
+)
+
+Settings = Annotated[
+    tuple[str, ...],
+    Parameter("--set", help="ADDRESS=VALUE: change an entry of the case."),
+]
+Json = Annotated[bool, Parameter("--json", help="Print JSON on standard output, for programs.")]
+Overwrite = Annotated[bool, Parameter("--overwrite", help="Replace output files that exist.")]
+
+Output = Annotated[Path | None, Parameter(("-o", "--output"))]
+
+
+@app.command
+def demo(
+    *,
+    output: Annotated[Path, Parameter(("-o", "--output"))] = Path("out/demo"),
+    json_: Json = False,
+) -> None:
+    """Identify a rig from logged data, end to end, in under a minute.
+
+    Parameters
+    ----------
+    output
+        Folder for the figure and the record.
+    """
+    from experiments import demo as demonstration
+
+    demonstration.run(output, json=json_)
+
+
+@app.command
+def modes(case: Path, /, *, set_: Settings = (), json_: Json = False) -> None:
+    """Print natural frequencies and damping ratios.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    """
+    import jaxbeam as jb
+
+    described = read_case(case, set_)
+    found = jb.modes(described)
+    if json_:
+        _print_json({"frequencies_hz": found.frequencies, "damping_ratios": found.damping_ratios})
+        return
+    rows = zip(found.frequencies, found.damping_ratios, strict=True)
+    _print_table(
+        ("mode", "frequency (Hz)", "damping ratio"),
+        [(i + 1, f"{f:.6g}", f"{d:.4g}") for i, (f, d) in enumerate(rows)],
+    )
+
+
+@app.command
+def simulate(
+    case: Path,
+    /,
+    *,
+    output: Output = None,
+    set_: Settings = (),
+    plot: bool = False,
+    overwrite: Overwrite = False,
+    json_: Json = False,
+) -> None:
+    """Simulate a case: peaks, contact forces, and on request the whole record.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    output
+        Write the record to this netCDF file, OUT.nc.
+    plot
+        Draw the record to a PNG beside the output, or named after the case.
+    """
+    import jaxbeam as jb
+
+    picture = picture_path(output, case) if plot else None
+    check_outputs(overwrite, output, picture)
+    check_suffix(output, ".nc")
+    described = read_case(case, set_)
+    record = jb.simulate(described)
+    if output:
+        record.to_netcdf(output)
+    if picture:
+        from jaxbeam.plot import plot_record
+
+        plot_record(record).savefig(picture)
+    if json_:
+        names = ("peak_deflection", "lowest_contact_force", "contact_lost_time")
+        summary = {name: getattr(record, name) for name in names}
+        summary |= {"error_estimate": record.error_estimate, "steps": record.steps}
+        _print_json(summary | {"verdict": record.verdict})
+        return
+    print(record.verdict)
+    peaks = zip(described.sensors, record.peak_deflection, strict=True)
+    _print_table(
+        ("sensor", "position (m)", "peak deflection (m)"),
+        [(i, f"{s.position:.4g}", f"{peak:.6g}") for i, (s, peak) in enumerate(peaks)],
+    )
+    _print_table(
+        ("load", "lowest contact force (N)"),
+        [(i, f"{force:.6g}") for i, force in enumerate(record.lowest_contact_force)],
+    )
+    print(f"{record.steps} steps, estimated error {float(record.error_estimate):.2g}")
+    _print_written(output, picture)
+
+
+@app.command
+def sweep(
+    case: Path,
+    /,
+    *,
+    over: Annotated[tuple[str, ...], Parameter(required=True)],
+    output: Output = None,
+    paired: bool = False,
+    resume: bool = False,
+    set_: Settings = (),
+    overwrite: Overwrite = False,
+    json_: Json = False,
+) -> None:
+    """Simulate a case for many values of some of its numbers.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    over
+        ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: the values of one number; repeat it for
+        more numbers.
+    output
+        Write the results to this zarr store, OUT.zarr, block by block.
+    paired
+        Take the values of all numbers together, one by one, not in every combination.
+    resume
+        Continue an interrupted sweep in the same store.
+    """
+    import jaxbeam as jb
+
+    if resume and not output:
+        raise ValueError("--resume needs the store to continue; name it with -o OUT.zarr")
+    if not resume:
+        check_outputs(overwrite, output)
+    check_suffix(output, ".zarr")
+    values = {}
+    for text in over:
+        address, value = assignment("--over", text)
+        values[address] = values_of(text, value)
+    results = jb.sweep(
+        read_case(case, set_),
+        values,
+        store=output,
+        resume=resume,
+        overwrite=overwrite,
+        paired=paired,
+        progress=not json_,
+    )
+    peaks = results["peak_deflection"]
+    if json_:
+        _print_json(
+            {"values": values, "dimensions": peaks.dims, "peak_deflection": peaks.to_numpy()}
+        )
+        return
+    rows = []
+    for i in range(peaks.sizes["sensor"]):
+        one = peaks.isel(sensor=i)
+        worst = one.isel(one.argmax(...))
+        where = [f"{float(worst[address]):.6g}" for address in values]
+        rows.append((i, f"{float(worst):.6g}", *where))
+    print(f"{peaks.size // max(len(rows), 1)} runs; the largest peak at each sensor:")
+    _print_table(("sensor", "peak deflection (m)", *(f"at {name}" for name in values)), rows)
+    _print_written(output)
+
+
+@app.command
+def identify(
+    *files: Path,
+    free: tuple[str, ...] = (),
+    output: Output = None,
+    plot: bool = False,
+    set_: Settings = (),
+    overwrite: Overwrite = False,
+    json_: Json = False,
+) -> None:
+    """Identify numbers of a case from logs; without --free, the modes seen in a free decay.
+
+    Parameters
+    ----------
+    files
+        [CASE.toml] LOG...: the case to fit, if any, and the logs.
+    free
+        ADDRESS[=LOW:HIGH]: a number to identify, between bounds; repeat it for more.
+    output
+        Write the fitted case to this file, FIT.toml.
+    plot
+        Draw measured and fitted to a PNG beside the output, or named after the log.
+    """
+    cases = [path for path in files if path.suffix == ".toml"]
+    logs = [path for path in files if path.suffix != ".toml"]
+    if not logs:
+        raise ValueError("identify needs at least one log: jaxbeam identify [CASE.toml] LOG...")
+    if len(cases) > 1:
+        raise ValueError(f"identify fits one case, not {len(cases)}: {', '.join(map(str, cases))}")
+    if free and cases:
+        case = read_case(cases[0], set_)
+        _identify_case(
+            case,
+            logs,
+            free,
+            output,
+            picture_path(output, logs[0]) if plot else None,
+            overwrite,
+            json_,
+        )
+        return
+    if free:
+        raise ValueError("--free needs the case whose numbers it names: identify CASE.toml LOG...")
+    if output or set_:
+        raise ValueError(
+            "-o and --set are for fitting a case; name what is free with --free ADDRESS"
+        )
+    if cases:
+        _say(f"nothing is named with --free, so {cases[0]} is not used; modes of the free decay:")
+    _identify_modes(logs, plot, overwrite, json_)
+
+
+def _identify_case(case, logs, free, output, picture, overwrite, json_) -> None:
+    import tuning
+    from jaxbeam.casefile import save_case
+
+    check_outputs(overwrite, output, picture)
+    bounds = dict(bounds_of(text) for text in free)
+    fit = tuning.identify(case, [tuning.read_log(path) for path in logs], bounds)
+    if output:
+        save_case(fit.case, output, overwrite)
+    if picture:
+        fit.plot().savefig(picture)
+    if json_:
+        _print_json(fit.to_dict())
+    else:
+        print(fit)
+        _print_written(output, picture)
+
+
+def _identify_modes(logs, plot, overwrite, json_) -> None:
+    import tuning
+
+    pictures = [picture_path(None, log) if plot else None for log in logs]
+    check_outputs(overwrite, *pictures)
+    found = {}
+    for log, picture in zip(logs, pictures, strict=True):
+        fit = found[str(log)] = tuning.identify_modes(tuning.read_log(log))
+        if picture:
+            fit.plot().savefig(picture)
+        if not json_:
+            print(f"{log}\n{fit}")
+            _print_written(picture)
+    if json_:
+        _print_json({log: fit.to_dict() for log, fit in found.items()})
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, and what JSON has no number for as null."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print_json(content: dict[str, Any]) -> None:
+    print(json.dumps(_plain(content), indent=2, allow_nan=False))
+
+
+def _print_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    lines = [header, *([str(entry) for entry in row] for row in rows)]
+    if len(lines) == 1:
+        return
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    for line in lines:
+        print("  ".join(entry.rjust(width) for entry, width in zip(line, widths, strict=True)))
+
+
+def _print_written(*paths: Path | None) -> None:
+    for path in filter(None, paths):
+        print(f"written: {path}")
+
+
+def _say(sentence: str) -> None:
+    print(f"jaxbeam: {sentence}", file=sys.stderr)
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run a command line (that of the process by default) and exit: 0, or 1 where it is wrong.
+
+    A mistake of the user ends in one sentence on standard error, a warning is one as well.
+    """
+    warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
+    try:
+        app(arguments, exit_on_error=False, print_error=False)
+    except (ValueError, OSError, CycloptsError) as error:
+        _say(" ".join(str(error).split()))
+        sys.exit(1)
+    sys.exit(0)
