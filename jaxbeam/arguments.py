@@ -78,10 +78,12 @@ def picture_path(output: Path | None, source: Path) -> Path:
     return (output or Path(source.name)).with_suffix(".png")
 
 
-def check_suffix(path: Path | None, suffix: str) -> None:
+def check_suffix(path: Path | None, suffix: str, content: str) -> None:
     """Raises ValueError if a file is not named as what will be in it."""
     if path and path.suffix != suffix:
-        raise ValueError(f"the output is a {suffix} file; call it {path.with_suffix(suffix)}")
+        raise ValueError(
+            f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}"
+        )
 
 
 def check_outputs(overwrite: bool, *paths: Path | None) -> None:

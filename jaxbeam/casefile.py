@@ -84,12 +84,12 @@ def case_from_dict(content: dict[str, Any]) -> Case:
         if key in TABLES:
             if not isinstance(value, dict):
                 raise ValueError(f"{key} must be one table; write [{key}]")
-            parts[key] = _read_part(key, value, TABLES[key])
+            parts[key] = read_part(key, value, TABLES[key])
         elif key in LISTS:
             if not isinstance(value, list) or not all(isinstance(v, dict) for v in value):
                 raise ValueError(f"{key} must be a list of tables; write [[{key}]]")
             parts[key] = tuple(
-                _read_part(f"{key}.{i}", table, LISTS[key]) for i, table in enumerate(value)
+                read_part(f"{key}.{i}", table, LISTS[key]) for i, table in enumerate(value)
             )
         elif key == "title":
             if not isinstance(value, str):
@@ -152,7 +152,11 @@ def _entry(place: Any, step: str) -> Any:
     return None
 
 
-def _read_part(address: str, table: dict[str, Any], kind: Kind) -> Any:
+def read_part(address: str, table: dict[str, Any], kind: Kind) -> Any:
+    """Build one part of a case from its table; `kind` is its class, or the registry of its kind.
+
+    Raises ValueError, naming the address, for what `case_from_dict` refuses.
+    """
     values = dict(table)
     if isinstance(kind, dict):
         kind = _look_up(address, values.pop("kind", None), kind)

@@ -108,7 +108,7 @@ def simulate(
 
     picture = picture_path(output, case) if plot else None
     check_outputs(overwrite, output, picture)
-    check_suffix(output, ".nc")
+    check_suffix(output, ".nc", "a record")
     described = read_case(case, set_)
     record = jb.simulate(described)
     if output:
@@ -172,10 +172,12 @@ def sweep(
         raise ValueError("--resume needs the store to continue; name it with -o OUT.zarr")
     if not resume:
         check_outputs(overwrite, output)
-    check_suffix(output, ".zarr")
+    check_suffix(output, ".zarr", "a sweep")
     values = {}
     for text in over:
         address, value = assignment("--over", text)
+        if address in values:
+            raise ValueError(f"--over names {address} twice; give all its values at once")
         values[address] = values_of(text, value)
     results = jb.sweep(
         read_case(case, set_),

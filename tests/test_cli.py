@@ -1,0 +1,246 @@
+"""The command line: what it prints, what it writes, and how it refuses."""
+
+import itertools
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from jaxbeam.cli import main
+
+CASE = """
+title = "one span, one ball"
+[beam]
+length = 0.6
+flexural_rigidity = 11.68
+mass_per_length = 0.535
+damping_ratio = 0.03
+[[sensors]]
+position = 0.3
+[[sensors]]
+position = 0.15
+[[loads]]
+kind = "mass"
+mass = 0.5
+speed = 1.0
+[run]
+duration = 1.0
+sample_rate = 200.0
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a case file in it, in which the commands run."""
+    (tmp_path / "case.toml").write_text(CASE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def run(folder, capsys):
+    """Run a command line that works; returns what it printed, decoded if it is JSON."""
+
+    def call(line: str):
+        with pytest.raises(SystemExit) as ended:
+            main(line.split())
+        printed = capsys.readouterr()
+        assert ended.value.code == 0, printed.err
+        return json.loads(printed.out) if "--json" in line else printed.out
+
+    return call
+
+
+@pytest.fixture
+def refused(folder, capsys):
+    """Run a command line that is wrong; returns the sentence on standard error."""
+
+    def call(line: str) -> str:
+        with pytest.raises(SystemExit) as ended:
+            main(line.split())
+        printed = capsys.readouterr()
+        assert ended.value.code == 1
+        assert printed.out == ""
+        assert printed.err.count("\n") == 1, "one sentence, no traceback"
+        assert printed.err.startswith("jaxbeam: ")
+        return printed.err.removeprefix("jaxbeam: ").strip()
+
+    return call
+
+
+def frequency(n: int, rigidity: float = 11.68) -> float:
+    """Natural frequency n of the pinned beam above, in Hz (n pi / L)^2 sqrt(E I / m) / 2 pi."""
+    return (n * math.pi / 0.6) ** 2 * math.sqrt(rigidity / 0.535) / (2 * math.pi)
+
+
+# Refusals that need no engine
+
+REFUSED = [
+    ("simulat case.toml", 'Unknown command "simulat". Did you mean "simulate"?'),
+    ("simulate", "requires an argument"),
+    ("simulate case.toml --plott", "--plott"),
+    ("simulate none.toml", "cannot read the case file none.toml: no such file or directory"),
+    ("simulate case.toml -o out.txt", "a record is written to a .nc file; call it out.nc"),
+    ("simulate case.toml -o none/out.nc", "there is no folder none to write out.nc to"),
+    ("simulate case.toml -o old.nc", "old.nc exists; choose another name or add --overwrite"),
+    ("simulate case.toml --set loads.0.speed", "--set takes ADDRESS=VALUE, such as"),
+    ("simulate case.toml --set loads.0.sped=1", "loads.0 has no key 'sped'; did you mean 'speed'?"),
+    ("simulate case.toml --set loads.1.speed=1", "no number at address 'loads.1.speed'; did you"),
+    ("simulate case.toml --set loads.0.speed=fast", "must be one number, not 'fast'"),
+    ("simulate case.toml --set beam.length=-1", "beam.length must be positive; it is -1 m"),
+    ("modes case.toml --set beam.ends=pinned-fre", "no end is called 'fre'; did you mean 'free'?"),
+    ("sweep case.toml", "requires an argument"),
+    ("sweep case.toml --over loads.0.speed=1:2", "a range is START:STOP:COUNT, such as 0.3:10:64"),
+    ("sweep case.toml --over loads.0.speed=1:2:0.5", "a range is START:STOP:COUNT"),
+    ("sweep case.toml --over loads.0.speed=1,x", "--over loads.0.speed=1,x: 'x' is not a number"),
+    (
+        "sweep case.toml --over loads.0.speed=1,2 --over loads.0.speed=1,2",
+        "--over names loads.0.speed twice",
+    ),
+    ("sweep case.toml --over loads.0.speed=1,2 --resume", "--resume needs the store to continue"),
+    ("identify", "identify needs at least one log: jaxbeam identify [CASE.toml] LOG..."),
+    ("identify case.toml", "identify needs at least one log"),
+    ("identify case.toml case.toml log.csv", "identify fits one case, not 2: case.toml, case.toml"),
+    ("identify log.csv --free beam.length", "--free needs the case whose numbers it names"),
+    ("identify log.csv -o fit.toml", "-o and --set are for fitting a case; name what is free"),
+    ("identify case.toml log.csv --free beam.length=2:1", "bounds are LOW:HIGH, such as 5:20"),
+    ("identify case.toml log.csv --free beam.length=0:b", "'b' is not a number"),
+    ("identify case.toml log.csv --free beam.length -o case.toml", "case.toml exists; choose"),
+]
+
+
+@pytest.mark.parametrize(("line", "message"), REFUSED)
+def test_wrong_lines_end_in_one_sentence(folder, refused, line, message):
+    (folder / "old.nc").touch()
+    assert message in refused(line)
+
+
+def test_a_process_exits_with_status_one_and_no_traceback(folder):
+    line = [sys.executable, "-m", "jaxbeam", "modes", "none.toml"]
+    ended = subprocess.run(line, cwd=folder, capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr == (
+        "jaxbeam: cannot read the case file none.toml: no such file or directory\n"
+    )
+
+
+def test_help_names_the_commands_and_imports_nothing_heavy():
+    code = (
+        "import sys; sys.argv = ['jaxbeam', '--help']\n"
+        "from jaxbeam.cli import main\n"
+        "try: main()\n"
+        "finally: print([m for m in ('matplotlib', 'diffrax', 'zarr', 'tuning', 'experiments')"
+        " if m in sys.modules])"
+    )
+    line = [sys.executable, "-c", code]
+    ended = subprocess.run(line, capture_output=True, text=True, check=True)
+    for command in ("demo", "modes", "simulate", "sweep", "identify"):
+        assert f" {command} " in ended.stdout
+    assert ended.stdout.endswith("[]\n")
+
+
+# Commands that compute
+
+
+def test_modes(run):
+    found = run("modes case.toml --json --set beam.modes=4")
+    expected = [frequency(n) for n in (1, 2, 3, 4)]
+    np.testing.assert_allclose(found["frequencies_hz"], expected, rtol=1e-9)
+    np.testing.assert_allclose(found["damping_ratios"], 0.03, rtol=1e-9)
+    assert f"{frequency(1):.6g}" in run("modes case.toml")
+
+
+def test_simulate_prints_and_writes_the_same(run, folder):
+    import jaxbeam as jb
+    from jaxbeam.casefile import load_case
+
+    record = jb.simulate(load_case(folder / "case.toml"))
+    found = run("simulate case.toml --json")
+    np.testing.assert_array_equal(found["peak_deflection"], record.peak_deflection)
+    assert set(found) == {
+        "peak_deflection",
+        "lowest_contact_force",
+        "contact_lost_time",
+        "error_estimate",
+        "steps",
+        "verdict",
+    }
+    printed = run("simulate case.toml -o out.nc --plot")
+    assert f"{float(record.peak_deflection[0]):.6g}" in printed
+    assert "written: out.nc" in printed
+    assert (folder / "out.nc").stat().st_size > 0
+    assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_simulate_overwrites_only_when_told(run, refused, folder):
+    run("simulate case.toml -o out.nc")
+    first = (folder / "out.nc").read_bytes()
+    assert "out.nc exists" in refused("simulate case.toml -o out.nc --set loads.0.mass=0.1")
+    assert (folder / "out.nc").read_bytes() == first
+    run("simulate case.toml -o out.nc --set loads.0.mass=0.1 --overwrite")
+    assert (folder / "out.nc").read_bytes() != first
+
+
+def test_sweep_agrees_with_single_runs(run, refused, folder):
+    line = "sweep case.toml --over loads.0.mass=0.1,0.5 --over loads.0.speed=0.5:1.5:3"
+    found = run(f"{line} --json -o out.zarr")
+    assert found["dimensions"] == ["loads.0.mass", "loads.0.speed", "sensor"]
+    assert found["values"]["loads.0.speed"] == [0.5, 1.0, 1.5]
+    peaks = np.array(found["peak_deflection"])
+    assert peaks.shape == (2, 3, 2)
+    for (i, mass), (j, speed) in itertools.product(enumerate([0.1, 0.5]), enumerate([0.5, 1, 1.5])):
+        one = run(
+            f"simulate case.toml --json --set loads.0.mass={mass} --set loads.0.speed={speed}"
+        )
+        np.testing.assert_allclose(peaks[i, j], one["peak_deflection"], rtol=2e-6)
+    assert "out.zarr exists" in refused(f"{line} -o out.zarr")
+    again = run(f"{line} --json -o out.zarr --resume")
+    assert again == found
+    assert f"{peaks[..., 0].max():.6g}" in run(line)
+
+
+def test_paired_sweep(run):
+    line = "sweep case.toml --over loads.0.mass=0.1,0.5 --over loads.0.speed=0.5,1 --paired"
+    assert np.shape(run(f"{line} --json")["peak_deflection"]) == (2, 2)
+    assert "2 runs" in run(line)
+
+
+def write_decay(path):
+    """A log of a free decay: 12 Hz with ratio 0.01, 31 Hz with 0.02, and a little noise."""
+    times = np.arange(4000) / 400.0
+    signal = 1e-6 * np.random.default_rng(0).standard_normal(times.size)
+    for hertz, ratio, size in ((12.0, 0.01, 1.0), (31.0, 0.02, 0.5)):
+        undamped = 2 * math.pi * hertz
+        wave = np.sin(undamped * math.sqrt(1 - ratio**2) * times)
+        signal += size * 1e-3 * np.exp(-ratio * undamped * times) * wave
+    rows = "".join(f"{t:.6f},{x:.9e}\n" for t, x in zip(times, signal, strict=True))
+    path.write_text("time [s],w [m]\n" + rows)
+
+
+def test_identify_modes_of_a_decay(run, folder):
+    write_decay(folder / "decay.csv")
+    printed = run("identify decay.csv --plot")
+    assert "12.0" in printed
+    assert (folder / "decay.png").exists()
+    assert list(run("identify decay.csv --json")) == ["decay.csv"]
+
+
+def test_identify_a_case(run, folder):
+    import jaxbeam as jb
+    from jaxbeam.casefile import load_case
+
+    record = jb.simulate(load_case(folder / "case.toml"))
+    table = np.column_stack([record.times, np.asarray(record.deflection)[:, 0]])
+    rows = "".join(f"{t:.6f},{x:.9e}\n" for t, x in table)
+    (folder / "log.csv").write_text("time [s],w [m]\n" + rows)
+    (folder / "log.toml").write_text("[columns]\nw = { unit = 'm', sensor = 0 }\n")
+    run(
+        "identify case.toml log.csv --set beam.flexural_rigidity=10"
+        " --free beam.flexural_rigidity=5:20 -o fit.toml --plot"
+    )
+    fitted = load_case(folder / "fit.toml")
+    np.testing.assert_allclose(fitted.beam.flexural_rigidity, 11.68, rtol=1e-4)
+    assert (folder / "fit.png").exists()
