@@ -4,6 +4,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxbeam.case import Case
 from jaxbeam.casefile import load_case, with_settings
 
@@ -23,15 +25,54 @@ def assignment(option: str, text: str) -> tuple[str, str]:
 
 
 def value_of(text: str) -> Any:
-    """A number, a list of numbers (with or without brackets) or a word."""
+    """A number, a list of numbers (with or without brackets), or else a word."""
     for read in (int, float):
         try:
             return read(text)
         except ValueError:
             pass
-    if "," in text:
-        return [value_of(entry.strip()) for entry in text.strip("[]").split(",")]
-    return text
+    try:
+        return [float(entry) for entry in text.removeprefix("[").removesuffix("]").split(",")]
+    except ValueError:
+        return text
+
+
+def sweep_values(over: Iterable[str]) -> dict[str, list[float]]:
+    """The values by address of ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...
+
+    Raises ValueError if they are no numbers, or if an address is named twice.
+    """
+    values = {}
+    for text in over:
+        address, value = assignment("--over", text)
+        if address in values:
+            raise ValueError(f"--over names {address} twice; give all its values at once")
+        if ":" not in value:
+            values[address] = _numbers("--over", text, value.split(","))
+            continue
+        limits = _numbers("--over", text, value.split(":"))
+        if len(limits) != 3 or limits[2] < 1 or limits[2] % 1:
+            raise ValueError(
+                f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"
+            )
+        values[address] = np.linspace(limits[0], limits[1], int(limits[2])).tolist()
+    return values
+
+
+def split_files(files: Iterable[Path], free: Sequence[str]) -> tuple[Path | None, list[Path]]:
+    """The case among the files (.toml), if there is one, and the logs.
+
+    Raises ValueError without a log, with several cases, or with no case whose numbers are free.
+    """
+    cases = [path for path in files if path.suffix == ".toml"]
+    logs = [path for path in files if path.suffix != ".toml"]
+    if not logs:
+        raise ValueError("identify needs at least one log: jaxbeam identify [CASE.toml] LOG...")
+    if len(cases) > 1:
+        raise ValueError(f"identify fits one case, not {len(cases)}: {', '.join(map(str, cases))}")
+    if free and not cases:
+        raise ValueError("--free needs the case whose numbers it names: identify CASE.toml LOG...")
+    return (cases[0] if cases else None), logs
 
 
 def _numbers(option: str, text: str, entries: Sequence[str]) -> list[float]:
@@ -40,23 +81,6 @@ def _numbers(option: str, text: str, entries: Sequence[str]) -> list[float]:
     except ValueError as error:
         word = str(error).rsplit(": ", 1)[-1]
         raise ValueError(f"{option} {text}: {word} is not a number") from None
-
-
-def values_of(text: str, value: str) -> list[float]:
-    """The values of START:STOP:COUNT or V1,V2,... in `text`, ADDRESS=VALUE.
-
-    Raises ValueError if they are no numbers.
-    """
-    if ":" not in value:
-        return _numbers("--over", text, value.split(","))
-    limits = _numbers("--over", text, value.split(":"))
-    if len(limits) != 3 or limits[2] < 1 or limits[2] % 1:
-        raise ValueError(
-            f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"
-        )
-    start, stop, count = limits
-    step = (stop - start) / max(count - 1, 1)
-    return [start + i * step for i in range(int(count) - 1)] + [stop]
 
 
 def bounds_of(text: str) -> tuple[str, tuple[float, float] | None]:
@@ -84,6 +108,12 @@ def check_suffix(path: Path | None, suffix: str, content: str) -> None:
         raise ValueError(
             f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}"
         )
+
+
+def refuse(given: bool, why: str) -> None:
+    """Raises ValueError, saying why, if an option was given that cannot be followed."""
+    if given:
+        raise ValueError(why)
 
 
 def check_outputs(overwrite: bool, *paths: Path | None) -> None:

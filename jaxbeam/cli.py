@@ -14,13 +14,14 @@ from typing import Annotated, Any, NoReturn
 from cyclopts import App, CycloptsError, Parameter
 
 from jaxbeam.arguments import (
-    assignment,
     bounds_of,
     check_outputs,
     check_suffix,
     picture_path,
     read_case,
-    values_of,
+    refuse,
+    split_files,
+    sweep_values,
 )
 
 app = App(
@@ -106,9 +107,9 @@ def simulate(
     """
     import jaxbeam as jb
 
+    check_suffix(output, ".nc", "a record")
     picture = picture_path(output, case) if plot else None
     check_outputs(overwrite, output, picture)
-    check_suffix(output, ".nc", "a record")
     described = read_case(case, set_)
     record = jb.simulate(described)
     if output:
@@ -168,17 +169,10 @@ def sweep(
     """
     import jaxbeam as jb
 
-    if resume and not output:
-        raise ValueError("--resume needs the store to continue; name it with -o OUT.zarr")
-    if not resume:
-        check_outputs(overwrite, output)
+    values = sweep_values(over)
+    refuse(resume and not output, "--resume needs the store to continue; name it with -o OUT.zarr")
     check_suffix(output, ".zarr", "a sweep")
-    values = {}
-    for text in over:
-        address, value = assignment("--over", text)
-        if address in values:
-            raise ValueError(f"--over names {address} twice; give all its values at once")
-        values[address] = values_of(text, value)
+    check_outputs(overwrite or resume, output)
     results = jb.sweep(
         read_case(case, set_),
         values,
@@ -197,10 +191,11 @@ def sweep(
     rows = []
     for i in range(peaks.sizes["sensor"]):
         one = peaks.isel(sensor=i)
-        worst = one.isel(one.argmax(...))
+        worst = one.isel(one.fillna(-1.0).argmax(...))
         where = [f"{float(worst[address]):.6g}" for address in values]
         rows.append((i, f"{float(worst):.6g}", *where))
-    print(f"{peaks.size // max(len(rows), 1)} runs; the largest peak at each sensor:")
+    failed = peaks.isnull().any("sensor")
+    print(f"{failed.size} runs, {int(failed.sum())} failed; the largest peak at each sensor:")
     _print_table(("sensor", "peak deflection (m)", *(f"at {name}" for name in values)), rows)
     _print_written(output)
 
@@ -228,44 +223,31 @@ def identify(
     plot
         Draw measured and fitted to a PNG beside the output, or named after the log.
     """
-    cases = [path for path in files if path.suffix == ".toml"]
-    logs = [path for path in files if path.suffix != ".toml"]
-    if not logs:
-        raise ValueError("identify needs at least one log: jaxbeam identify [CASE.toml] LOG...")
-    if len(cases) > 1:
-        raise ValueError(f"identify fits one case, not {len(cases)}: {', '.join(map(str, cases))}")
-    if free and cases:
-        case = read_case(cases[0], set_)
-        _identify_case(
-            case,
-            logs,
-            free,
-            output,
-            picture_path(output, logs[0]) if plot else None,
-            overwrite,
-            json_,
-        )
+    case, logs = split_files(files, free)
+    if case and free:
+        picture = picture_path(output, logs[0]) if plot else None
+        check_outputs(overwrite, output, picture)
+        _identify_case(read_case(case, set_), logs, free, output, picture, json_)
         return
-    if free:
-        raise ValueError("--free needs the case whose numbers it names: identify CASE.toml LOG...")
-    if output or set_:
-        raise ValueError(
-            "-o and --set are for fitting a case; name what is free with --free ADDRESS"
-        )
-    if cases:
-        _say(f"nothing is named with --free, so {cases[0]} is not used; modes of the free decay:")
-    _identify_modes(logs, plot, overwrite, json_)
+    refuse(
+        bool(output or set_),
+        "-o and --set are for fitting a case; name what is free with --free ADDRESS",
+    )
+    if case:
+        _say(f"nothing is named with --free, so {case} is not used; modes of the free decay:")
+    pictures = [picture_path(None, log) if plot else None for log in logs]
+    check_outputs(overwrite, *pictures)
+    _identify_modes(logs, pictures, json_)
 
 
-def _identify_case(case, logs, free, output, picture, overwrite, json_) -> None:
+def _identify_case(case, logs, free, output, picture, json_) -> None:
     import tuning
     from jaxbeam.casefile import save_case
 
-    check_outputs(overwrite, output, picture)
     bounds = dict(bounds_of(text) for text in free)
     fit = tuning.identify(case, [tuning.read_log(path) for path in logs], bounds)
     if output:
-        save_case(fit.case, output, overwrite)
+        save_case(fit.case, output, overwrite=True)  # checked before the work
     if picture:
         fit.plot().savefig(picture)
     if json_:
@@ -275,11 +257,9 @@ def _identify_case(case, logs, free, output, picture, overwrite, json_) -> None:
         _print_written(output, picture)
 
 
-def _identify_modes(logs, plot, overwrite, json_) -> None:
+def _identify_modes(logs, pictures, json_) -> None:
     import tuning
 
-    pictures = [picture_path(None, log) if plot else None for log in logs]
-    check_outputs(overwrite, *pictures)
     found = {}
     for log, picture in zip(logs, pictures, strict=True):
         fit = found[str(log)] = tuning.identify_modes(tuning.read_log(log))

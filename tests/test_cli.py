@@ -242,5 +242,5 @@ def test_identify_a_case(run, folder):
         " --free beam.flexural_rigidity=5:20 -o fit.toml --plot"
     )
     fitted = load_case(folder / "fit.toml")
-    np.testing.assert_allclose(fitted.beam.flexural_rigidity, 11.68, rtol=1e-4)
+    np.testing.assert_allclose(fitted.beam.rigidity, 11.68, rtol=1e-4)
     assert (folder / "fit.png").exists()

@@ -18,11 +18,12 @@ jaxbeam.checks
 jaxbeam.casefile
 jaxbeam.modes
 jaxbeam.rig
+jaxbeam.exponentials  jaxbeam.peaks
 jaxbeam.static  jaxbeam.duhamel
-jaxbeam.grid  jaxbeam.plan
+jaxbeam.grid
 jaxbeam.dynamics
 jaxbeam.integrate  jaxbeam.reference
-jaxbeam.record
+jaxbeam.plan  jaxbeam.record
 jaxbeam.simulate
 jaxbeam.sweep
 jaxbeam.plot
@@ -54,11 +55,16 @@ def imported(tree: ast.AST) -> set[str]:
             assert node.level == 0, "imports are absolute"
             # `from package import name` may mean the module package.name
             found |= {
-                inner if (inner := f"{node.module}.{alias.name}") in FILES else str(node.module)
+                inner if is_module(inner := f"{node.module}.{alias.name}") else str(node.module)
                 for alias in node.names
             }
     ours = {name for name in found if name.split(".")[0] in PACKAGES}
     return {name if name in FILES else f"{name}.__init__" for name in ours}
+
+
+def is_module(name: str) -> bool:
+    """Tell whether a dotted name is a module or package of ours."""
+    return name in FILES or f"{name}.__init__" in FILES
 
 
 def imported_at_once(tree: ast.Module) -> set[str]:
