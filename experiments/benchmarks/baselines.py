@@ -101,7 +101,7 @@ def scipy_peaks(masses, speeds, modes, free=0.5):
     times = free_times(rig, free)
 
     def run(mass, speed):
-        return _scipy_runs(rig, np.array([mass]), speed, times, tolerance=1e-7, samples=4)[0]
+        return _scipy_runs(rig, np.array([mass]), speed, times, tolerance=5e-8, samples=4)[0]
 
     return np.array([[run(mass, speed) for speed in speeds] for mass in masses])
 
@@ -150,12 +150,12 @@ def scipy_time(masses, speeds, modes, runs=12):
     """Seconds `scipy_peaks` would take for all masses and speeds, from a sample of `runs`.
 
     The cost of a run is a constant plus a share that grows with its duration, L / v; both are
-    fitted to runs spread over the speeds, each with another mass.
+    fitted to runs spread over the speeds, each with another mass, each timed thrice.
     """
     chosen = np.linspace(0, len(speeds) - 1, runs).round().astype(int)
     mixed = np.resize(np.asarray(masses)[:: max(len(masses) // runs, 1)], runs)
     pairs = zip(mixed, np.asarray(speeds)[chosen], strict=True)
-    costs = [time_call(scipy_peaks, [m], [v], modes, repeat=1).run for m, v in pairs]
+    costs = [time_call(scipy_peaks, [m], [v], modes, repeat=3).run for m, v in pairs]
     growing, constant = np.polyfit(1 / np.asarray(speeds)[chosen], costs, 1)
     return len(masses) * np.sum(constant + growing / np.asarray(speeds))
 
@@ -267,7 +267,7 @@ def _diffrax_runs(rig, masses, speed, times):
     def worst_run(error):
         return jnp.sqrt(jnp.max(jnp.mean((error / size) ** 2, axis=(0, 1))))
 
-    samples = jnp.linspace(0.0, duration, 250 + 25 * rig.modes)
+    samples = jnp.linspace(0.0, duration, 200 + 50 * rig.modes)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, state, args: rate(t, state)),
         diffrax.Dopri8(),
