@@ -244,3 +244,9 @@ def test_identify_a_case(run, folder):
     fitted = load_case(folder / "fit.toml")
     np.testing.assert_allclose(fitted.beam.rigidity, 11.68, rtol=1e-4)
     assert (folder / "fit.png").exists()
+
+
+def test_lost_contact_is_said_once(run):
+    printed = run("simulate case.toml --set loads.0.speed=6 --set loads.0.mass=3")
+    assert printed.count("load 0 would have to pull") == 1
+    assert "lowest contact force (N)" in printed
