@@ -19,7 +19,7 @@ jaxbeam.casefile
 jaxbeam.modes
 jaxbeam.rig
 jaxbeam.exponentials  jaxbeam.peaks
-jaxbeam.static  jaxbeam.duhamel
+jaxbeam.static  jaxbeam.duhamel  jaxbeam.sine_basis
 jaxbeam.grid
 jaxbeam.dynamics
 jaxbeam.integrate  jaxbeam.reference
