@@ -19,10 +19,10 @@ jaxbeam.casefile
 jaxbeam.modes
 jaxbeam.rig
 jaxbeam.exponentials  jaxbeam.peaks
-jaxbeam.static  jaxbeam.duhamel  jaxbeam.sine_basis
+jaxbeam.duhamel  jaxbeam.sine_basis
 jaxbeam.grid
 jaxbeam.dynamics
-jaxbeam.integrate  jaxbeam.reference
+jaxbeam.integrate  jaxbeam.reference  jaxbeam.static
 jaxbeam.plan  jaxbeam.record
 jaxbeam.simulate
 jaxbeam.sweep
