@@ -7,3 +7,35 @@ import jax
 # Peaks to one part in a million need double precision; whoever asks JAX for single keeps it.
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
+
+from jaxbeam.actuators import Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.beam import Beam, Support
+from jaxbeam.case import Case, Run, addresses, replace
+from jaxbeam.casefile import load_case, save_case
+from jaxbeam.loads import MovingForce, MovingMass
+from jaxbeam.modes import modes
+from jaxbeam.record import Record, read_record
+from jaxbeam.sensors import Sensor
+from jaxbeam.simulate import simulate
+
+__all__ = [
+    "Beam",
+    "Case",
+    "MovingForce",
+    "MovingMass",
+    "Patch",
+    "PointForce",
+    "Record",
+    "Run",
+    "Sensor",
+    "Shaker",
+    "SpringDamper",
+    "Support",
+    "addresses",
+    "load_case",
+    "modes",
+    "read_record",
+    "replace",
+    "save_case",
+    "simulate",
+]

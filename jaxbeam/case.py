@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.actuators import AbstractActuator
 from jaxbeam.beam import Beam, Support
-from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, choice, number
+from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, choice, known, number
 from jaxbeam.loads import AbstractLoad
 from jaxbeam.sensors import Sensor
 
@@ -132,3 +132,11 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
         else:
             raise unknown_address(case, address)
     return jax.tree_util.tree_unflatten(structure, leaves)
+
+
+def known_case(case: Case) -> Case:
+    """The same case with plain numbers, also while it is being differentiated.
+
+    Raises `jax.errors.ConcretizationTypeError` inside `jit` or `vmap`.
+    """
+    return jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), case)

@@ -28,7 +28,12 @@ class Grid(eqx.Module):
     kind: Int[Array, " panel"]
     lengths: Float[Array, " length"]
     active: Bool[Array, "panel load"]
-    last_exit: Float[Array, ""]
+    windows: Float[Array, "load 2"]
+
+    @property
+    def last_exit(self) -> Float[Array, ""]:
+        """Time (s) after which no load is on the beam."""
+        return jnp.max(self.windows[:, 1], initial=0.0)
 
     @property
     def total(self) -> Int[Array, ""]:
@@ -63,10 +68,6 @@ def _activity(windows, edges):
     return (windows[:, 0] < middle[:, None]) & (middle[:, None] < windows[:, 1])
 
 
-def _last_exit(windows):
-    return jnp.max(windows[:, 1], initial=0.0)
-
-
 def even_grid(case: Case, rig: Rig, longest: Float[Array, ""]) -> Grid:
     """Panels from event to event, with as many steps as keep them below `longest` (s)."""
     windows, events = _events(case, rig)
@@ -78,7 +79,7 @@ def even_grid(case: Case, rig: Rig, longest: Float[Array, ""]) -> Grid:
     kind = jnp.arange(spans.shape[0])
     lengths = jnp.append(lengths, 0.0)
     active = _activity(windows, edges)
-    return Grid(edges, counts, kind, lengths, active, _last_exit(windows))
+    return Grid(edges, counts, kind, lengths, active, windows)
 
 
 def sampled_grid(
@@ -107,5 +108,5 @@ def sampled_grid(
     lengths = jnp.zeros(room + 2).at[kind].set(jnp.where(usual, spacing, spans))
     counts = jnp.full(spans.shape, substeps)
     active = _activity(windows, edges)
-    grid = Grid(edges, counts, kind, lengths / substeps, active, _last_exit(windows))
+    grid = Grid(edges, counts, kind, lengths / substeps, active, windows)
     return grid, jnp.argsort(order)[: times.shape[0]]

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.polynomial import legendre
 
 from jaxbeam.case import Case
@@ -61,7 +61,7 @@ def _bonded(case: Case) -> list:
     return [(i, bonded) for i, bonded in pairs if bonded is not None]
 
 
-def layout(case: Case) -> Layout:
+def lay_out(case: Case) -> Layout:
     """Order the places along the beam, from the numbers known now (not inside `jit`)."""
     length = float(known(case.beam.length))
     places = np.array([float(known(place)) / length for place in _places(case)])
@@ -105,8 +105,7 @@ def _element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     The four Hermite cubics (deflection and slope at both ends), then functions that vanish with
     their slope at both ends: Legendre polynomials integrated twice, orthonormal in bending.
     """
-    hermite = np.array([[2, -3, 0, 1], [1, -1, -1, 1], [2, 3, 0, -1], [1, 1, -1, -1]]) / 4.0
-    hermite = hermite * np.array([1, 1, -1, 1])[:, None]
+    hermite = np.array([[2, -3, 0, 1], [1, -1, -1, 1], [2, 3, 0, -1], [-1, -1, 1, 1]]) / 4.0
     basis = np.zeros((degree + 1, degree + 1))
     for i, cubic in enumerate(hermite):
         basis[:4, i] = legendre.poly2leg(cubic)
@@ -121,7 +120,7 @@ def _element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @jax.custom_jvp
-def _eigen(stiffness, mass):
+def eigen(stiffness, mass):
     """Solve K x = lambda M x: ascending values, mass-normalised vectors, zero coupling.
 
     Vectors of (nearly) repeated values have no derivative of their own. Their tangents leave the
@@ -141,15 +140,19 @@ def _eigen(stiffness, mass):
     return values, vectors, jnp.zeros_like(mass)
 
 
-@_eigen.defjvp
+@eigen.defjvp
 def _eigen_jvp(primals, tangents):
-    values, vectors, none = _eigen(*primals)
+    values, vectors, none = eigen(*primals)
     stiffness, mass = (vectors.T @ tangent @ vectors for tangent in tangents)
     gap = values[None, :] - values[:, None]
     near = jnp.abs(gap) <= SAME_EIGENVALUE * (1 + values[None, :] + values[:, None])
     turn = (stiffness - values[None, :] * mass) / jnp.where(near, 1.0, gap)
     turn = jnp.where(near, -mass / 2, turn)
     couple = stiffness - (values[None, :] + values[:, None]) / 2 * mass
+    # Zero, but a second derivative sees how the coupling changes.
+    twist = turn.T @ none + none @ turn
+    turn = turn + jnp.where(near, 0.0, twist / jnp.where(near, 1.0, gap))
+    couple = couple + twist
     diagonal = jnp.diag(couple)
     couple = jnp.where(near, couple, 0.0) - jnp.diag(diagonal)
     return (values, vectors, none), (diagonal, vectors @ turn, couple)
@@ -159,7 +162,8 @@ class Modes(eqx.Module):
     """Modes of the supported beam: q_j'' + damping_j q_j' + stiffness_j q_j = psi_j(x) . force.
 
     `coupling` is the off-diagonal stiffness between repeated modes, zero in value but not in
-    derivative (see `_eigen`). Shapes are mass-normalised, in kg^-1/2, positive near the left end.
+    derivative (see `eigen`). `unit` is E I / (m L^4), in which stiffness is of order one for the
+    lowest mode. Shapes are mass-normalised, in kg^-1/2, positive near the left end.
     """
 
     stiffness: Float[Array, " mode"]
@@ -168,6 +172,7 @@ class Modes(eqx.Module):
     damping_coupling: Float[Array, "mode mode"]
     nodes: Float[Array, " node"]
     series: Float[Array, "segment degree mode"]
+    unit: Float[Array, ""]
 
     @property
     def angular_frequencies(self) -> Float[Array, " mode"]:
@@ -180,10 +185,18 @@ class Modes(eqx.Module):
         return self.angular_frequencies / (2 * jnp.pi)
 
     @property
+    def repeated(self) -> Bool[Array, ""]:
+        """Whether any two of the modes have (nearly) the same frequency."""
+        low, high = self.stiffness[:-1], self.stiffness[1:]
+        return jnp.any(high - low <= SAME_EIGENVALUE * (self.unit + low + high))
+
+    @property
     def damping_ratios(self) -> Float[Array, " mode"]:
         """Modal damping ratios; zero for rigid-body modes."""
         moving = self.stiffness > 0
-        return jnp.where(moving, self.damping / (2 * jnp.where(moving, _root(self.stiffness), 1)), 0)
+        return jnp.where(
+            moving, self.damping / (2 * jnp.where(moving, _root(self.stiffness), 1)), 0
+        )
 
     def shapes(self, x, derivative: int = 0) -> Float[Array, "*place mode"]:
         """Mode shapes, or their derivatives up to the third, at positions x (m) of any shape.
@@ -194,25 +207,31 @@ class Modes(eqx.Module):
 
     def shapes_together(self, x, derivatives: tuple[int, ...]) -> Float[Array, "order *place mode"]:
         """Several derivatives of the mode shapes at once, which costs little more than one."""
-        x = jnp.asarray(x, float)
-        size = jnp.diff(self.nodes) / 2
-        segments, terms, modes = self.series.shape
-        stretched = [
-            _differentiate(terms, d) @ self.series / size[:, None, None] ** d for d in derivatives
-        ]
-        series = jnp.stack(stretched, axis=2).reshape(segments, terms, len(derivatives) * modes)
-        segment = jnp.sum(x[..., None] >= self.nodes[1:-1], axis=-1)
-        local = (x - self.nodes[segment]) / size[segment] - 1
-        table = _legendre_table(local, terms)
-        masks = (segment[..., None] == s for s in range(segments))
-        parts = [jnp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
-        values = jnp.concatenate(parts, axis=-1) @ series.reshape(segments * terms, -1)
-        return jnp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
+        return piecewise(self.nodes, self.series, x, derivatives)
 
 
 def _root(square):
     """Square root whose derivative at zero is zero."""
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def piecewise(nodes, series, x, derivatives) -> Float[Array, "order *place column"]:
+    """Functions given by one Legendre series for each segment between nodes, at positions x.
+
+    `series` is (segment, degree, column); the derivatives are by x, in the unit of the nodes.
+    """
+    x = jnp.asarray(x, float)
+    size = jnp.diff(nodes) / 2
+    segments, terms, modes = series.shape
+    stretched = [_differentiate(terms, d) @ series / size[:, None, None] ** d for d in derivatives]
+    series = jnp.stack(stretched, axis=2).reshape(segments, terms, len(derivatives) * modes)
+    segment = jnp.sum(x[..., None] >= nodes[1:-1], axis=-1)
+    local = (x - nodes[segment]) / size[segment] - 1
+    table = _legendre_table(local, terms)
+    masks = (segment[..., None] == s for s in range(segments))
+    parts = [jnp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
+    values = jnp.concatenate(parts, axis=-1) @ series.reshape(segments * terms, -1)
+    return jnp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
 
 
 @functools.cache
@@ -231,41 +250,55 @@ def _legendre_table(t, terms: int):
     return jnp.stack(rows[:terms], axis=-1)
 
 
-def modes(case: Case, plan: Layout | None = None) -> Modes:
+def modes(case: Case, layout: Layout | None = None) -> Modes:
     """Find the lowest `case.beam.modes` natural modes of the beam on its supports.
 
     Euler-Bernoulli beam, E I w'''' + m w_tt = 0, with supports, rotational springs and bonded
     patches; actuators' suspensions and support dampers act on these modes later. Differentiable
-    in every number, at repeated frequencies too. Inside `jit`, give the `plan` found outside by
-    `layout(case)`.
+    in every number, at repeated frequencies too. Inside `jit`, give the `layout` found outside by
+    `lay_out(case)`.
     """
-    plan = layout(case) if plan is None else plan
+    layout = lay_out(case) if layout is None else layout
     beam = case.beam
-    places = jnp.stack([place / beam.length for place in _places(case)])
-    spots = places[np.array([node[0] for node in plan.nodes])]
-    stiffness, mass, expand = _assemble(case, plan, spots)
-    values, vectors, coupling = _eigen(stiffness, mass)
+    spots, stiffness, mass, expand = assemble(case, layout)
+    values, vectors, coupling = eigen(stiffness, mass)
     keep = slice(beam.modes)
-    unit = beam.rigidity / (beam.linear_density * beam.length**4)
-    values, coupling = values[keep] * unit, coupling[keep, keep] * unit
+    values, coupling = values[keep] * _unit(beam), coupling[keep, keep] * _unit(beam)
     series = jnp.einsum("std,dm->stm", expand, vectors[:, keep])
     series = series / jnp.sqrt(beam.linear_density * beam.length)
+    return oriented(beam, values, coupling, spots * beam.length, series)
+
+
+def oriented(beam, values, coupling, nodes, series) -> Modes:
+    """Modes of given stiffness (1/s^2), damped as the beam says, positive near the left end."""
     damping, damping_coupling = _damping(beam, values, coupling)
-    found = Modes(values, damping, coupling, damping_coupling, spots * beam.length, series)
-    near_left = found.shapes(beam.length * 1e-3 / beam.modes)
+    near_left = piecewise(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
     signs = jax.lax.stop_gradient(jnp.where(near_left < 0, -1.0, 1.0))
     swap = signs[:, None] * signs[None, :]
     return Modes(
-        values, damping, coupling * swap, damping_coupling * swap, found.nodes, series * signs
+        values,
+        damping,
+        coupling * swap,
+        damping_coupling * swap,
+        nodes,
+        series * signs,
+        _unit(beam),
     )
 
 
-def _assemble(case: Case, plan: Layout, spots):
-    """Stiffness and mass in beam units, and the map from unknowns to Legendre series."""
-    beam, degrees = case.beam, plan.degrees
-    nodal = [[-1, -1] for _ in plan.nodes]
+def _unit(beam):
+    """E I / (m L^4) in 1/s^2."""
+    return beam.rigidity / (beam.linear_density * beam.length**4)
+
+
+def assemble(case: Case, layout: Layout):
+    """Nodes, stiffness and mass in beam units, and the map from unknowns to Legendre series."""
+    beam, degrees = case.beam, layout.degrees
+    places = jnp.stack([place / beam.length for place in _places(case)])
+    spots = places[np.array([node[0] for node in layout.nodes])]
+    nodal = [[-1, -1] for _ in layout.nodes]
     size = 0
-    for i, held in enumerate(plan.held):
+    for i, held in enumerate(layout.held):
         for j in range(2):
             if not held[j]:
                 nodal[i][j], size = size, size + 1
@@ -275,11 +308,7 @@ def _assemble(case: Case, plan: Layout, spots):
     expand = []
     for i, degree in enumerate(degrees):
         half = (spots[i + 1] - spots[i]) / 2
-        rigidity, density = 1.0, 1.0
-        for actuator in plan.bonded[i]:
-            patch = case.actuators[actuator].bonded()
-            rigidity = rigidity + patch.rigidity / beam.rigidity
-            density = density + patch.mass / beam.linear_density
+        rigidity, density = section(case, layout, i)
         index = np.array([*nodal[i], *nodal[i + 1], *range(size, size + degree - 3)])
         size += degree - 3
         free = np.flatnonzero(index >= 0)
@@ -296,19 +325,29 @@ def _assemble(case: Case, plan: Layout, spots):
         rows = np.ix_(np.arange(degree + 1), index[free])
         expand.append(piece.at[rows].set(basis[:, free] * scale))
     spring_unit = beam.length**3 / beam.rigidity
-    for support, node in _supported(case, plan):
+    for support, node in supported(case, layout):
         deflection, rotation = nodal[node]
         if support.stiffness is not None and deflection >= 0:
             stiffness = stiffness.at[deflection, deflection].add(support.stiffness * spring_unit)
         if rotation >= 0:
             turn = support.rotational_stiffness * beam.length / beam.rigidity
             stiffness = stiffness.at[rotation, rotation].add(turn)
-    return stiffness, mass, jnp.stack(expand)
+    return spots, stiffness, mass, jnp.stack(expand)
 
 
-def _supported(case: Case, plan: Layout):
+def section(case: Case, layout: Layout, segment: int):
+    """Bending stiffness and mass per length of a segment, in those of the beam without patches."""
+    rigidity, density = jnp.ones(()), jnp.ones(())
+    for actuator in layout.bonded[segment]:
+        patch = case.actuators[actuator].bonded()
+        rigidity = rigidity + patch.rigidity / case.beam.rigidity
+        density = density + patch.mass / case.beam.linear_density
+    return rigidity, density
+
+
+def supported(case: Case, layout: Layout):
     """Every support with its node."""
-    for i, node in enumerate(plan.nodes):
+    for i, node in enumerate(layout.nodes):
         for index in node:
             if 2 <= index < 2 + len(case.supports):
                 yield case.supports[index - 2], i

@@ -8,15 +8,13 @@ that follows works on blocks and does not ask which of the two it has.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag, solve_triangular
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
-from jaxbeam.fields import known
-from jaxbeam.modes import SAME_EIGENVALUE, Layout, Modes, layout, modes
+from jaxbeam.modes import Layout, Modes, lay_out, modes
 
 
 class Rig(eqx.Module):
@@ -58,29 +56,21 @@ class Rig(eqx.Module):
         return full[1:size:2, 0:size:2]
 
 
-def couples(case: Case, plan: Layout | None = None) -> bool:
-    """Tell whether anything couples the modes: actuators, dampers at supports, repeated modes.
-
-    Needs known numbers, so call it outside `jit`.
-    """
-    if case.actuators or any(support.damping is not None for support in case.supports):
-        return True
-    values = known(jax.lax.stop_gradient(modes(case, plan).stiffness))
-    scale = float(known(case.beam.rigidity / case.beam.linear_density / case.beam.length**4))
-    values = values / scale
-    return bool(np.any(np.diff(values) <= SAME_EIGENVALUE * (1 + values[1:] + values[:-1])))
+def couples(case: Case) -> bool:
+    """Tell whether any part of the case couples the modes: an actuator, a damper at a support."""
+    return bool(case.actuators) or any(support.damping is not None for support in case.supports)
 
 
-def rig(case: Case, plan: Layout | None = None, coupled: bool | None = None) -> Rig:
+def rig(case: Case, layout: Layout | None = None, coupled: bool = True) -> Rig:
     """Assemble the rig of a case, eqs (2.31) to (2.36) of the thesis in mass-normalised modes.
 
     Actuators' suspensions and support dampers act on the modes, coupled and exact; non-classical
-    damping is not dropped. `plan` and `coupled` (from `layout` and `couples`) are needed inside
-    `jit`, where the numbers that decide them are not known.
+    damping is not dropped. Without `coupled` the modes stay single blocks, which is right only where
+    nothing couples them (see `couples`) and none are repeated. `layout` (from `lay_out`) is needed
+    inside `jit`, where the numbers that decide it are not known.
     """
-    plan = layout(case) if plan is None else plan
-    coupled = couples(case, plan) if coupled is None else coupled
-    found = modes(case, plan)
+    layout = lay_out(case) if layout is None else layout
+    found = modes(case, layout)
     count = case.beam.modes
     if not coupled:
         zero, one = jnp.zeros(count), jnp.ones(count)

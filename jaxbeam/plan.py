@@ -1,0 +1,166 @@
+"""What must be decided before a run is compiled: shapes, orders and step lengths.
+
+Decisions are made from known numbers, in plain Python, and handed on as static data; the compiled
+code then works for any numbers for which the decisions hold.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.case import Case, known_case
+from jaxbeam.checks import check
+from jaxbeam.dynamics import Traffic, traffic
+from jaxbeam.exponentials import LONGEST, norm
+from jaxbeam.fields import known
+from jaxbeam.grid import even_grid
+from jaxbeam.integrate import Extremes, march
+from jaxbeam.loads import motion
+from jaxbeam.modes import Layout, lay_out
+from jaxbeam.rig import couples, rig
+
+TOLERANCE = 1e-7  # relative to the largest deflection
+EVEN = 1e-6  # of the spacing: more even samples are taken for equally spaced
+PROBES = (0.13, 0.29, 0.47, 0.62, 0.88)  # of the length: where errors are looked for
+
+
+@dataclasses.dataclass(frozen=True)
+class Form:
+    """What decides array shapes: order of the supports, coupling, loads on the beam at once."""
+
+    layout: Layout
+    coupled: bool
+    slots: int
+
+
+def form(case: Case) -> Form:
+    """The form of a case, from the numbers known now (not inside `jit`)."""
+    case = known_case(case)
+    layout = lay_out(case)
+    _, repeated, windows = _survey(case, layout)
+    return Form(layout, couples(case) or bool(repeated), _most_at_once(np.asarray(windows)))
+
+
+@eqx.filter_jit
+def _survey(case: Case, layout: Layout):
+    """Norm of the rig (1/s), whether modes are repeated, and when loads enter and leave."""
+    assembled = rig(case, layout)
+    paths = [motion(load, case.beam.length) for load in case.loads]
+    windows = jnp.array([path.window() for path in paths]).reshape(-1, 2)
+    return norm(assembled), assembled.modes.repeated, windows
+
+
+def _most_at_once(windows: np.ndarray) -> int:
+    """How many loads are on the beam at once, at most; at least one if there are any."""
+    entries, exits = windows.T
+    # The count only rises when a load enters.
+    on = (entries[None, :] <= entries[:, None]) & (entries[:, None] < exits[None, :])
+    return max(min(1, entries.size), int(np.max(on.sum(axis=1), initial=0)))
+
+
+def run_extremes(
+    case: Case,
+    form: Form,
+    longest: Float[Array, ""],
+    watched: Float[Array, " sensor"],
+    lanes: Traffic | None = None,
+) -> Extremes:
+    """Peaks and contact forces of a run, with steps no longer than `longest` (s).
+
+    `lanes` gives the loads of several runs that differ in nothing else; without, the case's own.
+    """
+    assembled = rig(case, form.layout, form.coupled)
+    grid = even_grid(case, assembled, longest)
+    loads = traffic(case) if lanes is None else lanes
+    return march(assembled, loads, grid, watched, slots=form.slots)[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How a case is to be run: its form, steps from sample to sample, and their error.
+
+    Holds for cases that differ in numbers only, as long as these change neither the order of
+    supports and loads nor the frequencies much; make a new one otherwise. `lead` samples are
+    added before the first one asked for, back to the start of the run.
+    """
+
+    form: Form
+    substeps: int
+    lead: int
+    even: bool
+    error: float
+
+
+def make_plan(
+    case: Case, times: Float[Array, " time"] | None = None, tolerance: float = TOLERANCE
+) -> Plan:
+    """Choose form and time steps for a case, from the numbers known now.
+
+    `times` (s) are those of the wanted samples, the run's own if left out; `tolerance` is the
+    error allowed, relative to the largest deflection. Raises ValueError for a faulty case, and
+    RuntimeError if no time step meets the tolerance.
+    """
+    check(case)
+    case = known_case(case)
+    shape = form(case)
+    times = np.asarray(sample_times(case) if times is None else known(times))
+    step, error = suitable_step(case, shape, tolerance)
+    gaps = np.diff(times)
+    even = bool(np.all(np.abs(gaps - gaps.mean()) < EVEN * gaps.mean()))
+    lead = max(0, int(np.ceil(times[0] / gaps.mean() - EVEN)))
+    substeps = max(1, int(np.ceil(gaps.max() / step)))
+    return Plan(shape, substeps, lead, even, error)
+
+
+def sample_times(case: Case) -> Float[Array, " time"]:
+    """Times (s) at which a run saves samples: from 0 to its duration at its sample rate."""
+    duration, rate = float(known(case.run.duration)), float(known(case.run.sample_rate))
+    return jnp.arange(max(2, int(np.floor(duration * rate * (1 + 1e-12))) + 1)) / rate
+
+
+@eqx.filter_jit
+def _probe(case, form, longest, lanes):
+    places = case.beam.length * jnp.array(PROBES)
+    return run_extremes(case, form, longest, places, lanes).peak()[0]
+
+
+def _longest_step(case: Case, form: Form) -> float:
+    """The longest step (s) over which the rig can be propagated."""
+    limit = LONGEST / float(_survey(case, form.layout)[0])
+    return min(limit, float(known(case.run.duration)))
+
+
+def suitable_step(
+    case: Case, form: Form, tolerance: float, lanes: Traffic | None = None
+) -> tuple[float, float]:
+    """Longest step (s) whose peaks at some places are right to `tolerance`, and their error.
+
+    Found by halving the step until halving it once more changes no peak by more than the
+    tolerance, relative to the largest peak; the error is that change. Raises RuntimeError if no
+    step down to a millionth of the run will do.
+    """
+    case = known_case(case)
+
+    def peaks(step):
+        return np.asarray(_probe(case, form, jnp.asarray(step), lanes))
+
+    step = _longest_step(case, form)
+    shortest = step * 1e-6
+    coarse = peaks(step)
+    while step > shortest:
+        fine = peaks(step / 2)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            error = np.max(np.abs(coarse - fine) / np.max(np.abs(fine), axis=0), initial=0.0)
+        if not np.any(fine):
+            error = 0.0
+        if error <= tolerance:
+            return step, float(error)
+        step, coarse = step / 2, fine
+    raise RuntimeError(
+        f"no time step makes the peaks agree to {tolerance:g}; the response grows without bound, "
+        "or its frequencies are too far apart: check stiffnesses, masses and damping, "
+        "or keep fewer modes (beam.modes)"
+    )

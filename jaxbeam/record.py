@@ -1,0 +1,201 @@
+"""What a simulation returns: labelled histories, peaks, and how far to trust them."""
+
+import json
+import os
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import xarray
+from jaxtyping import Array, Float
+
+from jaxbeam.case import Case
+from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.fields import known
+from jaxbeam.modes import Modes
+from jaxbeam.motion import NEVER
+from jaxbeam.sensors import QUANTITIES
+
+
+class Record(eqx.Module):
+    """One simulated run.
+
+    Deflection is positive upwards. Samples at a time at which a load enters or leaves are those
+    just after. `load_position` (m) and `contact_force` (N, positive where the load presses on the
+    beam) are NaN and zero while a load is off the beam. Peaks are those of the deflection between
+    and at samples. `contact_lost_time` (s) and `contact_lost_position` (m) tell where a load would
+    first have to pull, which the model lets it do; NaN where it never would. `error_estimate` is
+    relative to the largest deflection.
+    """
+
+    case: Case
+    modes: Modes
+    times: Float[Array, " time"]
+    coordinates: Float[Array, "time mode"]
+    rates: Float[Array, "time mode"]
+    accelerations: Float[Array, "time mode"]
+    load_position: Float[Array, "time load"]
+    contact_force: Float[Array, "time load"]
+    peak_deflection: Float[Array, " sensor"]
+    peak_time: Float[Array, " sensor"]
+    lowest_contact_force: Float[Array, " load"]
+    contact_lost_time: Float[Array, " load"]
+    contact_lost_position: Float[Array, " load"]
+    error_estimate: Float[Array, ""]
+    steps: int = eqx.field(static=True)
+
+    def at(self, x, quantity: str = "deflection", fibre_distance=None) -> Float[Array, "time ..."]:
+        """History of a quantity at positions x (m) of any shape, in SI units.
+
+        Strain is that of the fibre `fibre_distance` (m) above the neutral axis, -z w_xx. Raises
+        ValueError for an unknown quantity, or strain without a fibre.
+        """
+        if quantity not in QUANTITIES:
+            raise ValueError(f"no quantity {quantity!r}; there are {', '.join(QUANTITIES)}")
+        if quantity == "strain" and fibre_distance is None:
+            raise ValueError("strain needs fibre_distance, the height above the neutral axis in m")
+        order = {"slope": 1, "strain": 2}.get(quantity, 0)
+        amplitudes = {"velocity": self.rates, "acceleration": self.accelerations}
+        shapes = self.modes.shapes(x, order)
+        history = jnp.tensordot(amplitudes.get(quantity, self.coordinates), shapes, axes=[1, -1])
+        return -fibre_distance * history if quantity == "strain" else history
+
+    def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
+        positions = [sensor.position for sensor in self.case.sensors]
+        return self.at(jnp.array(positions).reshape(-1), quantity)
+
+    @property
+    def deflection(self) -> Float[Array, "time sensor"]:
+        """Deflection at the sensors in m, whatever they measure."""
+        return self._at_sensors("deflection")
+
+    @property
+    def velocity(self) -> Float[Array, "time sensor"]:
+        """Velocity at the sensors in m/s."""
+        return self._at_sensors("velocity")
+
+    @property
+    def acceleration(self) -> Float[Array, "time sensor"]:
+        """Acceleration at the sensors in m/s^2."""
+        return self._at_sensors("acceleration")
+
+    @property
+    def slope(self) -> Float[Array, "time sensor"]:
+        """Slope at the sensors in rad."""
+        return self._at_sensors("slope")
+
+    @property
+    def strain(self) -> Float[Array, "time sensor"]:
+        """Bending strain at the sensors; NaN for those without a fibre distance."""
+        columns = [
+            self.at(s.position, "strain", jnp.nan if s.fibre_distance is None else s.fibre_distance)
+            for s in self.case.sensors
+        ]
+        return jnp.array(columns).reshape(-1, self.times.shape[0]).T
+
+    @property
+    def measured(self) -> Float[Array, "time sensor"]:
+        """What each sensor reads, its offset included, in the SI unit of its quantity."""
+        columns = [
+            self.at(s.position, s.quantity, s.fibre_distance) + s.offset for s in self.case.sensors
+        ]
+        return jnp.array(columns).reshape(-1, self.times.shape[0]).T
+
+    @property
+    def verdict(self) -> str:
+        """In words: whether every load stays in contact, and the estimated error."""
+        lost = np.asarray(known(self.contact_lost_time))
+        where = np.asarray(known(self.contact_lost_position))
+        least = np.asarray(known(self.lowest_contact_force))
+        pulls = [
+            f"load {i} would have to pull, first at t = {lost[i]:.4g} s, x = {where[i]:.4g} m "
+            f"(smallest contact force {least[i]:.4g} N)"
+            for i in np.flatnonzero(np.isfinite(lost))
+        ]
+        contact = "; ".join(pulls) if pulls else "every load presses on the beam throughout"
+        return f"{contact}; estimated error {float(known(self.error_estimate)):.1e} of the peak"
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Labelled dataset with units; `from_xarray` restores the record exactly."""
+        names = [f"{i}: {s.quantity}" for i, s in enumerate(self.case.sensors)]
+        variables = {
+            name: (dims, np.asarray(getattr(self, name)), {"units": unit, "long_name": words})
+            for name, (dims, unit, words) in _VARIABLES.items()
+        }
+        coordinates = {
+            "time": ("time", np.asarray(self.times), {"units": "s"}),
+            "sensor": ("sensor", np.array(names, dtype=str)),
+            "frequency": ("mode", np.asarray(self.modes.frequencies), {"units": "Hz"}),
+        }
+        attributes = {
+            "title": self.case.title,
+            "case": json.dumps(case_to_dict(self.case)),
+            "error_estimate": float(self.error_estimate),
+            "steps": self.steps,
+            "verdict": self.verdict,
+        }
+        return xarray.Dataset(variables, coordinates, attributes)
+
+    def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
+        """Write the labelled dataset to a netCDF file.
+
+        Raises FileExistsError if the file exists and `overwrite` is not set.
+        """
+        if not overwrite and os.path.exists(path):
+            raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
+        self.to_xarray().to_netcdf(path, engine="scipy")
+
+
+_VARIABLES = {
+    "deflection": (("time", "sensor"), "m", "deflection at the sensor"),
+    "velocity": (("time", "sensor"), "m/s", "velocity at the sensor"),
+    "acceleration": (("time", "sensor"), "m/s^2", "acceleration at the sensor"),
+    "measured": (("time", "sensor"), "SI unit of its quantity", "reading of the sensor"),
+    "coordinates": (("time", "mode"), "m kg^0.5", "modal coordinate"),
+    "rates": (("time", "mode"), "m kg^0.5/s", "rate of the modal coordinate"),
+    "accelerations": (("time", "mode"), "m kg^0.5/s^2", "acceleration of the modal coordinate"),
+    "load_position": (("time", "load"), "m", "position of the load"),
+    "contact_force": (("time", "load"), "N", "force with which the load presses on the beam"),
+    "peak_deflection": (("sensor",), "m", "largest absolute deflection"),
+    "peak_time": (("sensor",), "s", "time of the largest absolute deflection"),
+    "lowest_contact_force": (("load",), "N", "smallest contact force"),
+    "contact_lost_time": (("load",), "s", "first time at which the load would have to pull"),
+    "contact_lost_position": (("load",), "m", "where the load would first have to pull"),
+}
+_STORED = [name for name in _VARIABLES if name in Record.__annotations__]
+
+
+def record_from_xarray(dataset: xarray.Dataset) -> Record:
+    """Restore a record from the dataset made by `Record.to_xarray` (or read from its file).
+
+    Raises ValueError if the dataset was not made by a record.
+    """
+    from jaxbeam.modes import modes
+
+    absent = [name for name in (*_STORED, "time") if name not in dataset.variables]
+    if absent or "case" not in dataset.attrs:
+        raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(absent) or 'its case'}")
+    case = case_from_dict(json.loads(dataset.attrs["case"]))
+    values = {name: jnp.asarray(dataset[name].values) for name in _STORED}
+    return Record(
+        case=case,
+        modes=modes(case),
+        times=jnp.asarray(dataset["time"].values),
+        error_estimate=jnp.asarray(float(dataset.attrs["error_estimate"])),
+        steps=int(dataset.attrs["steps"]),
+        **values,
+    )
+
+
+def read_record(path: str | os.PathLike) -> Record:
+    """Read a record from a netCDF file written by `Record.to_netcdf`.
+
+    Raises OSError if it cannot be read, ValueError if it holds something else.
+    """
+    with xarray.open_dataset(path, engine="scipy") as dataset:
+        return record_from_xarray(dataset.load())
+
+
+def never_as_nan(times: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Times with NaN for those never reached."""
+    return jnp.where(times < NEVER, times, jnp.nan)
