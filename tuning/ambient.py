@@ -1,0 +1,151 @@
+"""Modes from the response to ambient excitation, by maximum likelihood on the spectrum.
+
+Under excitation whose spectrum is flat across a resonance, the power spectrum of channel c is
+
+    M_c(f) = b_c B_c(f) + sum_k a_kc (f / f_k)^q / ((1 - f^2 / f_k^2)^2 + (2 z_k f / f_k)^2)
+
+with q = 0, 2, 4 for deflection, velocity, acceleration and B the slowly varying background. The
+power in the bins of a long record is independent and exponentially distributed about it, which
+gives the likelihood (Whittle 1953). Channels are added as if independent; as they are not, the
+covariance is that of fully coherent channels, which near a resonance they are.
+"""
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import norm
+
+from tuning.decay import MOST_MODES, Spectrum, transform
+from tuning.decay_fit import LEAST_BINS, in_time
+from tuning.findings import Findings, Mode, reason_against
+
+_SLOPE = {"deflection": 0, "velocity": 2, "acceleration": 4}
+CHANCE = 1e-4
+LEAST_DAMPING, START_DAMPING = 1e-5, (0.003, 0.01, 0.03)
+# A resonance must stand on enough bins for its width to be seen.
+WIDTHS = (0, 1, 4, 12)
+
+
+def fit_ambient(values, rate: float, start: int, stop: int, band, quantities) -> Findings:
+    """Identify modes from the samples `start` to `stop` of a log (values: time, channel)."""
+    spectrum = transform(values[start:stop], rate, band)
+    modes, reasons = (), ()
+    if spectrum.bins.size >= LEAST_BINS:
+        modes = _find_modes(spectrum, np.array([_SLOPE.get(name, 0) for name in quantities]))
+        reasons = tuple(reason_against(mode, spectrum.duration, band) for mode in modes)
+    return Findings(
+        modes=modes,
+        reasons=reasons,
+        start=start,
+        stop=stop,
+        quantile=float(norm.ppf(0.975)),
+        measured=in_time(spectrum.values, spectrum),
+        fitted=None,
+    )
+
+
+def _find_modes(spectrum: Spectrum, slopes) -> tuple[Mode, ...]:
+    """Add resonances one at a time while the likelihood gains more than chance would give."""
+    power = np.abs(spectrum.values) ** 2
+    background = _background(power)
+    power, bins, channels = power / background, spectrum.bins, power.shape[1]
+    worth = channels + 2 + np.log(len(bins) / CHANCE)
+    parameters = np.zeros(channels)
+    shape = (bins, power, background / background.mean(axis=0), slopes)
+    best = _cost(parameters, *shape)[0]
+    while (parameters.size // (channels + 2)) < MOST_MODES:
+        ratio = power / _model(parameters, bins, *shape[2:])[0]
+        starts = [np.append(parameters, guess) for guess in _guesses(ratio, bins)]
+        trial = _refined(min(starts, key=lambda start: _cost(start, *shape)[0]), shape)
+        if best - trial.fun < worth:
+            break
+        best, parameters = trial.fun, trial.x
+    return _modes(parameters, shape)
+
+
+def _background(power):
+    """Median of the power over a wide range of bins: resonances are narrow beside it."""
+    width = max(len(power) // 8, 10)
+    edges = np.arange(0, len(power), width)
+    middles = [np.median(power[i : i + 2 * width], axis=0) / np.log(2) for i in edges]
+    centres = np.minimum(edges + width, len(power))
+    levels = [np.interp(np.arange(len(power)), centres, level) for level in np.array(middles).T]
+    return np.stack(levels, axis=1) + 1e-30 * power.max()
+
+
+def _guesses(ratio, bins):
+    """Parameters (log f, log z, log a_c) of resonances where the power exceeds the model most."""
+    guesses = set()
+    for width in WIDTHS:
+        window = np.ones(2 * width + 1) / np.sqrt(2 * width + 1)
+        guesses.add(int(np.argmax(np.convolve(ratio.sum(axis=1) - ratio.shape[1], window, "same"))))
+    for peak in sorted(guesses):
+        height = np.maximum(ratio[max(peak - 1, 0) : peak + 2].mean(axis=0), 0.1)
+        for damping in START_DAMPING:
+            level = np.log(height * (2 * damping) ** 2)
+            yield np.concatenate([[np.log(bins[peak]), np.log(damping)], level])
+
+
+def _model(parameters, bins, background, slopes):
+    """Power of each bin and channel in units of the background, and its slopes by parameters."""
+    channels = slopes.size
+    modes = parameters[channels:].reshape(-1, channels + 2)
+    model = np.exp(parameters[:channels]) * np.ones((bins.size, 1))
+    gradient = np.zeros((bins.size, channels, parameters.size))
+    own = np.arange(channels)
+    gradient[:, own, own] = model
+    for k, mode in enumerate(modes):
+        place = channels + k * (channels + 2)
+        square = (bins / np.exp(mode[0])) ** 2
+        damping = np.exp(mode[1])
+        bottom = (1 - square) ** 2 + 4 * damping**2 * square
+        part = np.exp(mode[2:]) * square[:, None] ** (slopes / 2) / bottom[:, None] / background
+        by_square = (-2 * (1 - square) + 4 * damping**2) * square / bottom
+        gradient[:, :, place] = part * -2 * (slopes / 2 - by_square[:, None])
+        gradient[:, :, place + 1] = part * (-8 * damping**2 * square / bottom)[:, None]
+        gradient[:, own, place + 2 + own] = part
+        model = model + part
+    return model, gradient
+
+
+def _cost(parameters, bins, power, background, slopes):
+    """Minus the logarithm of the likelihood, and its gradient."""
+    model, gradient = _model(parameters, bins, background, slopes)
+    cost = np.sum(np.log(model) + power / model)
+    return cost, np.einsum("jc,jcp->p", (1 - power / model) / model, gradient)
+
+
+def _refined(parameters, shape):
+    """Best parameters from a start, frequencies in the band and damping in a wide range."""
+    bins, _, _, slopes = shape
+    each = [(np.log(bins[0]), np.log(bins[-1])), (np.log(LEAST_DAMPING), 0.0)]
+    each += [(-60.0, 60.0)] * slopes.size
+    count = (parameters.size - slopes.size) // len(each)
+    bounds = [(-10.0, 10.0)] * slopes.size + each * count
+    return minimize(_cost, parameters, shape, "L-BFGS-B", jac=True, bounds=bounds)
+
+
+def _modes(parameters, shape) -> tuple[Mode, ...]:
+    """Modes with standard deviations (sandwich covariance, coherent channels) and energies."""
+    bins, power, background, slopes = shape
+    channels = slopes.size
+    model, gradient = _model(parameters, bins, background, slopes)
+    relative = gradient / model[:, :, None]
+    information = np.einsum("jcp,jcq->pq", relative, relative)
+    together = relative.sum(axis=1)
+    inverse = np.linalg.pinv(information, hermitian=True)
+    covariance = inverse @ (together.T @ together) @ inverse
+    deviation = np.sqrt(np.diag(covariance))
+    found = []
+    for place in range(channels, parameters.size, channels + 2):
+        frequency, damping = np.exp(parameters[place : place + 2])
+        part = gradient[:, np.arange(channels), place + 2 + np.arange(channels)]
+        found.append(
+            Mode(
+                frequency=float(frequency),
+                frequency_sd=float(frequency * deviation[place]),
+                damping_ratio=float(damping),
+                damping_sd=float(damping * deviation[place + 1]),
+                share=float(np.sum(part * background) / np.sum(power * background)),
+            )
+        )
+    return tuple(sorted(found))

@@ -1,0 +1,272 @@
+"""Poles of a free decay, by maximum likelihood in the frequency domain.
+
+The samples of a decay are damped sinusoids common to all channels, a slow drift, and noise:
+
+    y_c(t) = sum_k Re(a_kc exp(p_k t)) + drift_c(t) + noise_c(t),   p_k = -s_k + i w_k.
+
+The discrete Fourier transform over the N samples of the window is known in closed form, cut off at
+its end as it is: a geometric series, S(p, w) = (exp(p N h) - 1) / (exp((p - i w) h) - 1). Noise
+of any colour is nearly independent from bin to bin, so least squares weighted by its local level
+is maximum likelihood, and only the noise near a mode matters to it. The amplitudes are linear and
+are projected out (variable projection: Golub and Pereyra 1973, Kaufman 1975). Modes are
+added one at a time where the residual is largest, all refined together each time (RELAX: Li and
+Stoica 1996), and kept only while the likelihood gains more than chance would give.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.optimize import least_squares
+
+SMOOTHING = 12  # bins on either side over which the level of the noise is averaged
+MOST_MODES = 24
+# A mode of C channels has 2 C + 2 numbers; chance must not find one in hundreds of logs, though
+# it may look for it at every bin.
+CHANCE = 1e-4
+# No real structure is linear to the last digit, so that beside a strong mode its own misfit looks
+# like weak ones: what is below this share of the amplitudes nearby is not taken for a mode.
+MISFIT = 0.1
+NEARBY = 2  # bins
+REACH = 1.5  # bins that a pole may move in one refinement
+TREND_ORDER = 3
+LEAKAGE_ORDER = 2
+
+
+class Spectrum(NamedTuple):
+    """Transform of a window: bins (Hz), values, and the samples and step (s) they come from."""
+
+    bins: Float[np.ndarray, " bin"]
+    values: Complex[np.ndarray, "bin channel"]
+    samples: int
+    step: float
+
+    @property
+    def duration(self) -> float:
+        """Length of the window in s; bins are 1 / duration apart."""
+        return self.samples * self.step
+
+
+class Poles(NamedTuple):
+    """Poles found in a spectrum, with what is left when they are fitted.
+
+    `poles` (mode,) in 1/s, upper half plane, ascending; `covariance` is that of all -real and
+    imaginary parts, (s_1, w_1, s_2, w_2, ...); `amplitudes` (mode, channel) at the start of the
+    window; `model` is the modes' part of the spectrum and `residual` what nothing explains;
+    `freedom` the degrees of freedom of the noise level, for intervals.
+    """
+
+    poles: Complex[np.ndarray, " mode"]
+    covariance: Float[np.ndarray, "parameter parameter"]
+    amplitudes: Complex[np.ndarray, "mode channel"]
+    model: Complex[np.ndarray, "bin channel"]
+    residual: Complex[np.ndarray, "bin channel"]
+    noise: Float[np.ndarray, "bin channel"]
+    freedom: float
+
+
+def transform(
+    values: Float[np.ndarray, "time channel"], rate: float, band: tuple[float, float]
+) -> Spectrum:
+    """Transform samples taken at `rate` (Hz); keep the bins of a band (Hz), zero excluded."""
+    count = len(values)
+    bins = np.fft.rfftfreq(count, 1 / rate)
+    # The bin of the Nyquist frequency is real, unlike all others: leave it out.
+    keep = (bins >= band[0]) & (bins <= band[1]) & (bins > 0) & (bins < rate / 2)
+    return Spectrum(bins[keep], np.fft.rfft(values, axis=0)[keep], count, 1 / rate)
+
+
+def find_poles(spectrum: Spectrum, most: int = MOST_MODES) -> Poles:
+    """Find the poles, `most` at most, that a free decay's spectrum shows beyond chance."""
+    channels = spectrum.values.shape[1]
+    # Chi-square tail: half the drop in weighted squares is what the likelihood gains.
+    tries = 4 * spectrum.bins.size
+    worth = channels + 1 + np.log(tries / CHANCE) + np.sqrt(2 * (channels + 1) * np.log(tries))
+    best = _fit(np.zeros(0, complex), spectrum, _robust_level(spectrum.values))
+    floor = MISFIT**2 * _smooth(np.abs(spectrum.values) ** 2, NEARBY) / (2 * NEARBY + 1)
+    while best.poles.size < min(most, spectrum.bins.size // 4):
+        level = _robust_level(best.residual) + floor
+        guess = _guess(spectrum, best.residual, level)
+        trial = refine(np.append(best.poles, guess), spectrum, level)
+        if _misfit(best.residual, level) - _misfit(trial.residual, level) < worth:
+            break
+        best = trial
+    for _ in range(2):
+        best = refine(best.poles, spectrum, best.noise)
+    return best
+
+
+def _misfit(residual, level) -> float:
+    return float(np.sum(np.abs(residual) ** 2 / level))
+
+
+def _smooth(power, width):
+    """Moving sum over `width` bins on either side, shorter at the ends."""
+    total = np.cumsum(np.concatenate([np.zeros((1, *power.shape[1:])), power]), axis=0)
+    i = np.arange(len(power))
+    return total[np.minimum(i + width + 1, len(power))] - total[np.maximum(i - width, 0)]
+
+
+def _robust_level(residual):
+    """Level of the noise at each bin, from medians so that a mode not yet found stands out."""
+    power = np.abs(residual) ** 2
+    width = min(2 * SMOOTHING, len(power) // 2)
+    padded = np.pad(power, ((width, width), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * width + 1, axis=0)
+    return np.median(windows, axis=-1) / np.log(2) + 1e-30 * power.max()
+
+
+def _guess(spectrum: Spectrum, residual, level) -> complex:
+    """The pole that alone explains most of a residual, of a few at and beside its highest peaks."""
+    ratio = np.sum(np.abs(residual) ** 2 / level, axis=1, keepdims=True)
+    shares = [_smooth(ratio, width)[:, 0] / np.sqrt(2 * width + 1) for width in (0, 2, 8)]
+    peaks = spectrum.bins[[int(np.argmax(share)) for share in shares]]
+    spacing = 1 / spectrum.duration
+    places = np.add.outer(peaks, spacing * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])).ravel()
+    rates = spacing * np.array([0.1, 0.5, 1.5, 4.0, 10.0, 30.0])
+    poles = np.subtract.outer(2j * np.pi * places[places > 0], rates).ravel()
+    columns, _ = _series(poles, spectrum)
+    match = np.abs(columns.conj().T @ (residual / level)) ** 2
+    gain = np.sum(match / ((np.abs(columns) ** 2).T @ (1 / level)), axis=1)
+    return poles[int(np.argmax(gain))]
+
+
+def _series(poles, spectrum: Spectrum):
+    """The closed-form transform of exp(p t) at every bin, and its derivative by p."""
+    turn = (poles - 2j * np.pi * spectrum.bins[:, None]) * spectrum.step
+    # exp(-i w N h) is 1 at every bin. A pole on a bin, undamped, would divide zero by zero.
+    turn = np.where(np.abs(turn) < 1e-12, 1e-12, turn)
+    top, bottom = np.expm1(spectrum.samples * turn), np.expm1(turn)
+    slope = spectrum.samples * (top + 1) / bottom - top * (bottom + 1) / bottom**2
+    return top / bottom, spectrum.step * slope
+
+
+def _nuisance(spectrum: Spectrum):
+    """What is no mode: a drift over the window, and leakage from modes outside the band."""
+    time = np.linspace(-1, 1, spectrum.samples)
+    every = np.fft.rfftfreq(spectrum.samples, spectrum.step)
+    first = int(np.argmin(np.abs(every - spectrum.bins[0])))
+    drifts = [
+        np.fft.rfft(np.polynomial.Legendre.basis(order)(time))[first : first + spectrum.bins.size]
+        for order in range(1, TREND_ORDER + 1)
+    ]
+    across = np.linspace(-1, 1, spectrum.bins.size)
+    leakage = [across**order * unit for order in range(LEAKAGE_ORDER + 1) for unit in (1, 1j)]
+    columns = np.stack([*drifts, *leakage], axis=1)
+    return columns / np.linalg.norm(columns, axis=0)
+
+
+def _modal_columns(poles, spectrum: Spectrum):
+    """Columns of the real and imaginary part of each amplitude, and their slopes by s and w."""
+    above, slope_above = _series(poles, spectrum)
+    below, slope_below = _series(poles.conj(), spectrum)
+    columns = np.stack([above + below, 1j * (above - below)], axis=-1) / 2
+    by_rate = -np.stack([slope_above + slope_below, 1j * (slope_above - slope_below)], axis=-1) / 2
+    by_turn = np.stack([1j * (slope_above - slope_below), -(slope_above + slope_below)], -1) / 2
+    return columns, np.stack([by_rate, by_turn], axis=2)
+
+
+def _stack(columns):
+    """Real and imaginary parts under each other."""
+    return np.concatenate([columns.real, columns.imag])
+
+
+def _project(poles, spectrum: Spectrum, weights, nuisance):
+    """Weighted residual with the best amplitudes, its Jacobian, amplitudes, and leverages."""
+    columns, slopes = _modal_columns(poles, spectrum)
+    bins, count = columns.shape[0], poles.size
+    design = np.concatenate([columns.reshape(bins, 2 * count), nuisance], axis=1)
+    size = np.linalg.norm(design, axis=0)
+    residuals, jacobians, solutions, leverages = [], [], [], []
+    for values, weight in zip(spectrum.values.T, weights.T, strict=True):
+        basis, triangle = np.linalg.qr(_stack(design / size * weight[:, None]))
+        data = _stack(values * weight)
+        fitted = basis.T @ data
+        solution = np.linalg.lstsq(triangle, fitted, rcond=1e-12)[0] / size
+        bent = np.einsum("jkpr,kr->jkp", slopes, solution[: 2 * count].reshape(count, 2))
+        bent = _stack(bent.reshape(bins, 2 * count) * weight[:, None])
+        residuals.append(data - basis @ fitted)
+        jacobians.append(basis @ (basis.T @ bent) - bent)
+        solutions.append(solution)
+        leverages.append(np.sum(basis**2, axis=1).reshape(2, bins).sum(axis=0))
+    model = columns.reshape(bins, 2 * count) @ np.array(solutions).T[: 2 * count]
+    return np.array(residuals), np.array(jacobians), np.array(solutions), model, leverages
+
+
+def _parameters(poles, duration):
+    """(s, w) of each pole times the duration: numbers of order one change a spectrum."""
+    return np.stack([-poles.real, poles.imag], axis=1).ravel() * duration
+
+
+def _poles(parameters, duration):
+    rate, turn = parameters.reshape(-1, 2).T / duration
+    return -rate + 1j * turn
+
+
+def refine(
+    poles: Complex[np.ndarray, " mode"],
+    spectrum: Spectrum,
+    level: Float[np.ndarray, "bin channel"],
+) -> Poles:
+    """Refine all poles together by least squares weighted by a level of the noise."""
+    if poles.size:
+        duration, nuisance, weights = spectrum.duration, _nuisance(spectrum), level**-0.5
+
+        @functools.lru_cache(maxsize=1)
+        def projected(key):
+            parameters = np.frombuffer(key)
+            return _project(_poles(parameters, duration), spectrum, weights, nuisance)
+
+        def residual(parameters):
+            return projected(parameters.tobytes())[0].ravel()
+
+        def jacobian(parameters):
+            return projected(parameters.tobytes())[1].reshape(-1, parameters.size)
+
+        start = _parameters(poles, duration)
+        # A pole stays near where it was seen: joint fits of many weak ones would wander.
+        reach = np.tile([np.inf, 2 * np.pi * REACH], poles.size)
+        low, high = start - reach, start + reach
+        low[::2] = np.maximum(low[::2], -1.0)
+        low[1::2] = np.maximum(low[1::2], 0.0)
+        start = np.clip(start, low + 1e-9, high - 1e-9)
+        solved = least_squares(
+            residual, start, jacobian, (low, high), xtol=1e-7, ftol=1e-7, max_nfev=25
+        )
+        poles = _poles(solved.x, duration)
+        poles = np.where(poles.imag < 0, poles.conj(), poles)
+        poles = poles[np.argsort(poles.imag)]
+    return _fit(poles, spectrum, level)
+
+
+def _fit(poles, spectrum: Spectrum, level) -> Poles:
+    """Amplitudes, noise level and covariance at given poles."""
+    bins, channels = spectrum.values.shape
+    stacked, slopes, solutions, model, leverages = _project(
+        poles, spectrum, level**-0.5, _nuisance(spectrum)
+    )
+    weighted = (stacked[:, :bins] + 1j * stacked[:, bins:]).T  # bin, channel
+    slopes = slopes[:, :bins] + 1j * slopes[:, bins:]  # channel, bin, parameter
+    normal = np.einsum("cjp,cjq->pq", slopes.conj(), slopes).real
+    inverse = np.linalg.pinv(normal, hermitian=True) if poles.size else normal
+    taken = np.array(leverages).T  # of the two real numbers of each bin and channel
+    taken = taken + np.einsum("cjp,pq,cjq->jc", slopes.conj(), inverse, slopes).real
+    left = np.maximum(2 - taken, 0.02) / 2
+    count = _smooth(left, SMOOTHING)
+    noise = level * _smooth(np.abs(weighted) ** 2, SMOOTHING) / count
+    # Channels share disturbances, so their noise is correlated: score covariance from the local
+    # cross-spectra of the residual, then the sandwich.
+    cross = _smooth(np.einsum("jc,jd->jcd", weighted, weighted.conj()), SMOOTHING)
+    cross = cross / np.sqrt(count[:, :, None] * count[:, None, :])
+    score = np.einsum("cjp,jcd,djq->pq", slopes.conj(), cross, slopes).real / 2
+    pairs = solutions[:, : 2 * poles.size].reshape(channels, poles.size, 2)
+    return Poles(
+        poles=poles,
+        covariance=inverse @ score @ inverse,
+        amplitudes=(pairs[..., 0] + 1j * pairs[..., 1]).T,
+        model=model,
+        residual=weighted * np.sqrt(level),
+        noise=noise,
+        freedom=float(2 * np.median(count)),
+    )

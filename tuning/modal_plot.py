@@ -1,0 +1,93 @@
+"""Picture of identified modes: the log and its window, the spectrum, the fit and what is left."""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from jaxbeam.sensors import QUANTITIES
+
+INK, MODE, FIT, FAINT = "#333333", "#c0392b", "#1f6f8b", "#9aa5ab"
+MOST_POINTS = 4000  # a longer log is drawn as the range of each of so many pieces
+
+
+def plot_modes(fit, path: str | Path | None = None):
+    """Draw a `ModalFit`; save it if a path is given. Returns the matplotlib figure."""
+    decays = fit.fitted is not None
+    figure, rows = plt.subplots(
+        4 if decays else 2, 1, figsize=(9, 9.5 if decays else 6), layout="constrained",
+        height_ratios=(1, 1.6, 1.3, 0.6) if decays else (1, 1.6),
+    )  # fmt: skip
+    strongest = int(np.argmax(np.sum(fit.measured**2, axis=0)))
+    unit = QUANTITIES.get(fit.log.quantities[strongest], fit.log.units[strongest])
+    _draw_log(rows[0], fit, strongest, unit)
+    _draw_spectrum(rows[1], fit, strongest, unit)
+    if decays:
+        _draw_fit(rows[2], rows[3], fit, strongest, unit)
+    for row in rows:
+        row.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(f"{Path(fit.log.source).name}: modes from {_kind(fit)}", color=INK)
+    if path is not None:
+        figure.savefig(path, dpi=150)
+    return figure
+
+
+def _kind(fit) -> str:
+    return "a free decay" if fit.fitted is not None else "ambient vibration"
+
+
+def _draw_log(axes, fit, channel, unit):
+    """The whole log of one channel, the window marked."""
+    times, values = fit.log.times, fit.log.values[:, channel]
+    size = max(times.size // MOST_POINTS, 1)
+    pieces = values[: times.size // size * size].reshape(-1, size)
+    axes.fill_between(
+        times[::size][: len(pieces)], pieces.min(axis=1), pieces.max(axis=1),
+        color=FAINT, linewidth=0.6, edgecolor=FAINT,
+    )  # fmt: skip
+    axes.axvspan(*fit.window, color=FIT, alpha=0.15, linewidth=0)
+    axes.text(
+        fit.window[0], 0.97, f" {fit.window[0]:.2f} to {fit.window[1]:.2f} s", color=FIT,
+        transform=axes.get_xaxis_transform(), va="top",
+    )  # fmt: skip
+    axes.set(xlabel="time (s)", ylabel=f"{fit.log.names[channel]} ({unit})")
+    axes.set_xlim(times[0], times[-1])
+
+
+def _draw_spectrum(axes, fit, channel, unit):
+    """Amplitude of the window's spectrum, with the modes found."""
+    inside = slice(*np.searchsorted(fit.log.times, [fit.window[0], fit.window[1]]))
+    values = fit.log.values[inside, channel]
+    window = np.hanning(values.size)
+    amplitude = np.abs(np.fft.rfft((values - values.mean()) * window)) * 2 / window.sum()
+    bins = np.fft.rfftfreq(values.size, 1 / fit.log.sample_rate)
+    keep = (bins >= fit.band[0]) & (bins <= fit.band[1])
+    axes.semilogy(bins[keep], amplitude[keep], color=INK, linewidth=0.9)
+    for mode, reason in fit.rejected:
+        if reason and fit.band[0] <= mode.frequency <= fit.band[1]:
+            axes.axvline(mode.frequency, color=FAINT, linewidth=0.7, linestyle=":")
+    for k, mode in enumerate(fit.modes):
+        axes.axvline(mode.frequency, color=MODE, linewidth=1.0)
+        axes.annotate(
+            f"{mode.frequency:.2f} Hz\n{100 * mode.damping_ratio:.2f} %", (mode.frequency, 1.0),
+            xycoords=axes.get_xaxis_transform(), xytext=(3, -2 - 24 * (k % 2)),
+            textcoords="offset points", va="top", fontsize=8, color=MODE,
+        )  # fmt: skip
+    axes.set(xlabel="frequency (Hz)", ylabel=f"amplitude ({unit})", xlim=fit.band)
+
+
+def _draw_fit(axes, below, fit, channel, unit):
+    """Measured and fitted decay in the band, and the residual on the same scale."""
+    measured, fitted = fit.measured[:, channel], fit.fitted[:, channel]
+    axes.plot(fit.times, measured, color=FAINT, linewidth=2.2, label="measured, in the band")
+    axes.plot(fit.times, fitted, color=FIT, linewidth=0.9, label="fitted modes")
+    axes.legend(frameon=False, loc="upper right", ncols=2)
+    below.plot(fit.times, measured - fitted, color=INK, linewidth=0.8)
+    left = np.sum((measured - fitted) ** 2) / max(np.sum(measured**2), 1e-300)
+    below.text(
+        0.995, 0.97, f"residual, {100 * left:.2g} % of the energy", color=INK, va="top",
+        ha="right", transform=below.transAxes,
+    )  # fmt: skip
+    below.set_ylim(np.array(axes.get_ylim()) / 2)
+    axes.set(ylabel=f"{fit.log.names[channel]} ({unit})", xlim=fit.window)
+    below.set(xlabel="time (s)", ylabel="residual", xlim=fit.window)
