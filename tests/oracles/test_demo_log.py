@@ -23,12 +23,12 @@ def test_making_the_demo_logs_again_gives_the_committed_numbers():
         np.testing.assert_allclose(table, committed, rtol=0, atol=0.51e-4)
 
 
+@pytest.mark.slow
 def test_the_nominal_number_of_modes_is_enough_for_the_noise():
-    """What the model of the case file leaves out stays below the noise of a reading."""
+    """What the model of the case file leaves out stays far below the noise of a reading."""
     rig, logs = truth()
-    name = "log_3"  # the fastest crossing
     few, many = (
-        measure(rig, logs[name]["loads"], *SAMPLING[name], modes=modes)
+        measure(rig, logs["log_2"]["loads"], *SAMPLING["log_2"], modes=modes)
         for modes in (rig["beam"]["modes"], make_demo_log.MODES)
     )
-    assert np.abs(few - many).max() < NOISE
+    assert np.abs(few - many).max() < 0.2 * NOISE
