@@ -59,10 +59,10 @@ def _count_below(omega: float, members: list, springs: np.ndarray, free: np.ndar
     starts = 2 * np.append(0, np.cumsum(pieces))  # degrees of freedom (deflection, slope) per node
     stiffness = np.zeros((starts[-1] + 2, starts[-1] + 2))
     for k, n, start, (length, rigidity, _) in zip(wave, pieces, starts, members, strict=False):
-        for at in range(start, start + 2 * n, 2):
+        for at in range(int(start), int(start) + 2 * n, 2):
             stiffness[at : at + 4, at : at + 4] += _piece(k * length / n, length / n, rigidity)
     ends = (starts[:, None] + [0, 1]).ravel()  # where the given springs and restraints are
-    stiffness[ends, ends] += springs
+    np.add.at(stiffness, (ends, ends), springs)
     kept = np.setdiff1d(np.arange(len(stiffness)), np.delete(ends, free))
     stiffness = stiffness[np.ix_(kept, kept)]
     # A change of units keeps the signs of the eigenvalues; with entries of one size, rounding of
