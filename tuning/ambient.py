@@ -2,10 +2,10 @@
 
 Under excitation whose spectrum is flat across a resonance, the power spectrum of channel c is
 
-    M_c(f) = b_c B_c(f) + sum_k a_kc (f / f_k)^q / ((1 - f^2 / f_k^2)^2 + (2 z_k f / f_k)^2)
+    M_c(f) = b_c + d_c (f_0 / f)^2 + sum_k a_kc r^q / ((1 - r^2)^2 + (2 z_k r)^2),   r = f / f_k,
 
-with q = 0, 2, 4 for deflection, velocity, acceleration and B the slowly varying background. The
-power in the bins of a long record is independent and exponentially distributed about it, which
+with q = 0, 2, 4 for deflection, velocity, acceleration; b is the noise and d the drift. The power
+in the bins of a long record is independent and exponentially distributed about it, which
 gives the likelihood (Whittle 1953). Channels are added as if independent; as they are not, the
 covariance is that of fully coherent channels, which near a resonance they are.
 """
@@ -46,30 +46,20 @@ def fit_ambient(values, rate: float, start: int, stop: int, band, quantities) ->
 def _find_modes(spectrum: Spectrum, slopes) -> tuple[Mode, ...]:
     """Add resonances one at a time while the likelihood gains more than chance would give."""
     power = np.abs(spectrum.values) ** 2
-    background = _background(power)
-    power, bins, channels = power / background, spectrum.bins, power.shape[1]
+    unit = np.median(power, axis=0) + 1e-30 * power.max()
+    power, bins, channels = power / unit, spectrum.bins, power.shape[1]
     worth = channels + 2 + np.log(len(bins) / CHANCE)
-    parameters = np.zeros(channels)
-    shape = (bins, power, background / background.mean(axis=0), slopes)
-    best = _cost(parameters, *shape)[0]
-    while (parameters.size // (channels + 2)) < MOST_MODES:
-        ratio = power / _model(parameters, bins, *shape[2:])[0]
+    shape = (bins, power, slopes)
+    start = _refined(np.repeat([0.0, -2.0], channels), shape)
+    best, parameters = start.fun, start.x
+    while parameters.size < (channels + 2) * MOST_MODES:
+        ratio = power / _model(parameters, bins, slopes)[0]
         starts = [np.append(parameters, guess) for guess in _guesses(ratio, bins)]
         trial = _refined(min(starts, key=lambda start: _cost(start, *shape)[0]), shape)
         if best - trial.fun < worth:
             break
         best, parameters = trial.fun, trial.x
-    return _modes(parameters, shape)
-
-
-def _background(power):
-    """Median of the power over a wide range of bins: resonances are narrow beside it."""
-    width = max(len(power) // 8, 10)
-    edges = np.arange(0, len(power), width)
-    middles = [np.median(power[i : i + 2 * width], axis=0) / np.log(2) for i in edges]
-    centres = np.minimum(edges + width, len(power))
-    levels = [np.interp(np.arange(len(power)), centres, level) for level in np.array(middles).T]
-    return np.stack(levels, axis=1) + 1e-30 * power.max()
+    return _modes(parameters, shape, unit)
 
 
 def _guesses(ratio, bins):
@@ -85,20 +75,26 @@ def _guesses(ratio, bins):
             yield np.concatenate([[np.log(bins[peak]), np.log(damping)], level])
 
 
-def _model(parameters, bins, background, slopes):
-    """Power of each bin and channel in units of the background, and its slopes by parameters."""
+def _model(parameters, bins, slopes):
+    """Power of each bin and channel, and its slopes by parameters.
+
+    Parameters are logarithms: b and d of all channels, then of each mode f_k, z_k and a_kc.
+    """
     channels = slopes.size
-    modes = parameters[channels:].reshape(-1, channels + 2)
-    model = np.exp(parameters[:channels]) * np.ones((bins.size, 1))
-    gradient = np.zeros((bins.size, channels, parameters.size))
+    modes = parameters[2 * channels :].reshape(-1, channels + 2)
     own = np.arange(channels)
-    gradient[:, own, own] = model
+    noise = np.exp(parameters[:channels]) * np.ones((bins.size, 1))
+    drift = np.exp(parameters[channels : 2 * channels]) * ((bins[0] / bins) ** 2)[:, None]
+    model = noise + drift
+    gradient = np.zeros((bins.size, channels, parameters.size))
+    gradient[:, own, own] = noise
+    gradient[:, own, channels + own] = drift
     for k, mode in enumerate(modes):
-        place = channels + k * (channels + 2)
+        place = 2 * channels + k * (channels + 2)
         square = (bins / np.exp(mode[0])) ** 2
         damping = np.exp(mode[1])
         bottom = (1 - square) ** 2 + 4 * damping**2 * square
-        part = np.exp(mode[2:]) * square[:, None] ** (slopes / 2) / bottom[:, None] / background
+        part = np.exp(mode[2:]) * square[:, None] ** (slopes / 2) / bottom[:, None]
         by_square = (-2 * (1 - square) + 4 * damping**2) * square / bottom
         gradient[:, :, place] = part * -2 * (slopes / 2 - by_square[:, None])
         gradient[:, :, place + 1] = part * (-8 * damping**2 * square / bottom)[:, None]
@@ -107,28 +103,28 @@ def _model(parameters, bins, background, slopes):
     return model, gradient
 
 
-def _cost(parameters, bins, power, background, slopes):
+def _cost(parameters, bins, power, slopes):
     """Minus the logarithm of the likelihood, and its gradient."""
-    model, gradient = _model(parameters, bins, background, slopes)
+    model, gradient = _model(parameters, bins, slopes)
     cost = np.sum(np.log(model) + power / model)
     return cost, np.einsum("jc,jcp->p", (1 - power / model) / model, gradient)
 
 
 def _refined(parameters, shape):
     """Best parameters from a start, frequencies in the band and damping in a wide range."""
-    bins, _, _, slopes = shape
+    bins, _, slopes = shape
     each = [(np.log(bins[0]), np.log(bins[-1])), (np.log(LEAST_DAMPING), 0.0)]
     each += [(-60.0, 60.0)] * slopes.size
-    count = (parameters.size - slopes.size) // len(each)
-    bounds = [(-10.0, 10.0)] * slopes.size + each * count
+    count = (parameters.size - 2 * slopes.size) // len(each)
+    bounds = [(-30.0, 60.0)] * (2 * slopes.size) + each * count
     return minimize(_cost, parameters, shape, "L-BFGS-B", jac=True, bounds=bounds)
 
 
-def _modes(parameters, shape) -> tuple[Mode, ...]:
+def _modes(parameters, shape, unit) -> tuple[Mode, ...]:
     """Modes with standard deviations (sandwich covariance, coherent channels) and energies."""
-    bins, power, background, slopes = shape
+    bins, power, slopes = shape
     channels = slopes.size
-    model, gradient = _model(parameters, bins, background, slopes)
+    model, gradient = _model(parameters, bins, slopes)
     relative = gradient / model[:, :, None]
     information = np.einsum("jcp,jcq->pq", relative, relative)
     together = relative.sum(axis=1)
@@ -136,7 +132,7 @@ def _modes(parameters, shape) -> tuple[Mode, ...]:
     covariance = inverse @ (together.T @ together) @ inverse
     deviation = np.sqrt(np.diag(covariance))
     found = []
-    for place in range(channels, parameters.size, channels + 2):
+    for place in range(2 * channels, parameters.size, channels + 2):
         frequency, damping = np.exp(parameters[place : place + 2])
         part = gradient[:, np.arange(channels), place + 2 + np.arange(channels)]
         found.append(
@@ -145,7 +141,7 @@ def _modes(parameters, shape) -> tuple[Mode, ...]:
                 frequency_sd=float(frequency * deviation[place]),
                 damping_ratio=float(damping),
                 damping_sd=float(damping * deviation[place + 1]),
-                share=float(np.sum(part * background) / np.sum(power * background)),
+                share=float(np.sum(part * unit) / np.sum(power * unit)),
             )
         )
     return tuple(sorted(found))
