@@ -44,9 +44,12 @@ def refine(samples: Float[Array, "point *rest"]) -> tuple[Float[Array, " *rest"]
     fine = np.linspace(-1.0, 1.0, FINE + 1)
     curve = jnp.tensordot(fine[:, None] ** powers, frozen, axes=1)
     place = jnp.asarray(fine)[jnp.argmax(jnp.abs(curve), axis=0)]
-    for _ in range(4):
+
+    def improve(_, place):
         bend = value(frozen, place, 2)
         step = value(frozen, place, 1) / jnp.where(bend == 0, 1.0, bend)
         step = jnp.where(bend == 0, 0.0, jnp.clip(step, -2 / FINE, 2 / FINE))
-        place = jnp.clip(place - step, -1.0, 1.0)
+        return jnp.clip(place - step, -1.0, 1.0)
+
+    place = jax.lax.stop_gradient(jax.lax.fori_loop(0, 4, improve, place))
     return jnp.abs(value(monomials, place)), (place + 1) / 2
