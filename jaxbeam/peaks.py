@@ -43,7 +43,7 @@ def refine(samples: Float[Array, "point *rest"]) -> tuple[Float[Array, " *rest"]
 
     fine = np.linspace(-1.0, 1.0, FINE + 1)
     curve = jnp.tensordot(fine[:, None] ** powers, frozen, axes=1)
-    place = jnp.asarray(fine)[jnp.argmax(jnp.abs(curve), axis=0)]
+    start = jnp.asarray(fine)[jnp.argmax(jnp.abs(curve), axis=0)]
 
     def improve(_, place):
         bend = value(frozen, place, 2)
@@ -51,5 +51,8 @@ def refine(samples: Float[Array, "point *rest"]) -> tuple[Float[Array, " *rest"]
         step = jnp.where(bend == 0, 0.0, jnp.clip(step, -2 / FINE, 2 / FINE))
         return jnp.clip(place - step, -1.0, 1.0)
 
-    place = jax.lax.stop_gradient(jax.lax.fori_loop(0, 4, improve, place))
+    place = jax.lax.fori_loop(0, 4, improve, start)
+    # Where the curve is highest at an end, Newton's method may run away to a lower place.
+    higher = jnp.abs(value(frozen, place)) > jnp.abs(value(frozen, start))
+    place = jax.lax.stop_gradient(jnp.where(higher, place, start))
     return jnp.abs(value(monomials, place)), (place + 1) / 2
