@@ -25,7 +25,7 @@ from jaxbeam.rig import Rig
 NODES = 6  # Gauss nodes a step; the integrator is of order 12
 POINTS = 6  # equal intervals a step at whose ends the deflection is looked at for its peak
 DOUBLINGS = 7
-TERMS = 12
+TERMS = 14
 LONGEST = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is right to rounding
 
 GAUSS = (np.polynomial.legendre.leggauss(NODES)[0] + 1) / 2
@@ -90,12 +90,11 @@ def propagators(rig: Rig, lengths: Float[Array, " *length"]) -> Step:
     spans = lengths[..., None] * fractions
     x = matrix * spans[..., None, None, None] / 2**DOUBLINGS
     drift, pushes = _series(x, force)
-    for _ in range(DOUBLINGS):
-        drift, pushes = _double(drift, pushes)
+    (drift, pushes), _ = jax.lax.scan(_double, (drift, pushes), length=DOUBLINGS)
     powers = np.arange(NODES)
     weights = _lagrange() * np.array([math.factorial(p) for p in powers])  # force, power
     weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
-    push = jnp.einsum("cfp,p...cbsm->...cfbsm", weights, jnp.stack(pushes))
+    push = jnp.einsum("cfp,p...cbsm->...cfbsm", weights, pushes)
     push = push * spans[..., None, None, None, None] / balance[:, :, None]
     drift = drift * balance[:, None, :] / balance[:, :, None]
     end = NODES + POINTS
@@ -106,25 +105,34 @@ def propagators(rig: Rig, lengths: Float[Array, " *length"]) -> Step:
 
 
 def _series(x, force):
-    """exp(x) and phi_1 ... phi_NODES of x times the force matrix, for small x."""
+    """exp(x), and phi_1 ... phi_NODES of x times the force matrix (phi, ...), for small x."""
     identity = jnp.broadcast_to(jnp.eye(x.shape[-1]), x.shape)
-    exponential = identity
-    for k in range(TERMS + NODES, 0, -1):
-        exponential = identity + _multiply(x, exponential) / k
-    top = jnp.broadcast_to(force, (*x.shape[:-1], force.shape[-1]))
-    phi = top / math.factorial(NODES + TERMS)
-    for k in range(TERMS - 1, -1, -1):
-        phi = top / math.factorial(NODES + k) + _multiply(x, phi)
-    pushes = [phi]
+    force = jnp.broadcast_to(force, (*x.shape[:-1], force.shape[-1]))
+
+    def horner(sums, k):
+        exponential, top = sums
+        exponential = identity + _multiply(x, exponential) / (k + 1)
+        top = force + _multiply(x, top) / (NODES + k + 1)
+        return (exponential, top), None
+
+    sums, _ = jax.lax.scan(horner, (identity, force), jnp.arange(TERMS - 1, -1, -1.0))
+    pushes = [sums[1] / math.factorial(NODES)]
     for p in range(NODES - 1, 0, -1):
-        pushes.insert(0, top / math.factorial(p) + _multiply(x, pushes[0]))
-    return exponential, pushes
+        pushes.insert(0, force / math.factorial(p) + _multiply(x, pushes[0]))
+    return sums[0], jnp.stack(pushes)
 
 
-def _double(drift, pushes):
+def _double(functions, _):
     """The same functions of twice the argument."""
-    doubled = []
-    for p in range(1, NODES + 1):
-        rest = sum(pushes[j] / math.factorial(p - 1 - j) for j in range(p))
-        doubled.append((_multiply(drift, pushes[p - 1]) + rest) / 2**p)
-    return _multiply(drift, drift), doubled
+    drift, pushes = functions
+    doubled = _multiply(drift, pushes) + jnp.tensordot(_doubling(), pushes, axes=1)
+    halves = 0.5 ** np.arange(1, NODES + 1)
+    shape = (NODES,) + (1,) * (pushes.ndim - 1)
+    return (_multiply(drift, drift), doubled * halves.reshape(shape)), None
+
+
+@functools.cache
+def _doubling() -> np.ndarray:
+    """Weights 1 / (p - l)! of phi_l in phi_p of the doubled argument."""
+    rows = range(1, NODES + 1)
+    return np.array([[1 / math.factorial(p - q) if q <= p else 0.0 for q in rows] for p in rows])

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
-from numpy.polynomial import legendre
+from numpy.polynomial import chebyshev, legendre
 
 from jaxbeam.case import Case
 from jaxbeam.fields import known
@@ -100,7 +100,7 @@ def lay_out(case: Case) -> Layout:
 
 @functools.cache
 def _element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Basis on t in [-1, 1] as Legendre series, with its mass and bending matrices.
+    """Basis on t in [-1, 1] as Chebyshev series, with its mass and bending matrices.
 
     The four Hermite cubics (deflection and slope at both ends), then functions that vanish with
     their slope at both ends: Legendre polynomials integrated twice, orthonormal in bending.
@@ -116,7 +116,7 @@ def _element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     mass = basis.T @ (weights[:, None] * basis)
     curvature = legendre.legder(basis, 2)
     bending = curvature.T @ (weights[: degree - 1, None] * curvature)
-    return basis, mass, bending
+    return _to_chebyshev(degree + 1) @ basis, mass, bending
 
 
 @jax.custom_jvp
@@ -227,7 +227,7 @@ def piecewise(nodes, series, x, derivatives) -> Float[Array, "order *place colum
     series = jnp.stack(stretched, axis=2).reshape(segments, terms, len(derivatives) * modes)
     segment = jnp.sum(x[..., None] >= nodes[1:-1], axis=-1)
     local = (x - nodes[segment]) / size[segment] - 1
-    table = _legendre_table(local, terms)
+    table = _chebyshev_table(local, terms)
     masks = (segment[..., None] == s for s in range(segments))
     parts = [jnp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
     values = jnp.concatenate(parts, axis=-1) @ series.reshape(segments * terms, -1)
@@ -236,18 +236,32 @@ def piecewise(nodes, series, x, derivatives) -> Float[Array, "order *place colum
 
 @functools.cache
 def _differentiate(terms: int, times: int) -> np.ndarray:
-    """Matrix that differentiates a Legendre series `times` times, keeping its length."""
+    """Matrix that differentiates a Chebyshev series `times` times, keeping its length."""
     matrix = np.zeros((terms, terms))
-    matrix[: terms - times] = legendre.legder(np.eye(terms), times)[: terms - times]
+    matrix[: terms - times] = chebyshev.chebder(np.eye(terms), times)[: terms - times]
     return matrix
 
 
-def _legendre_table(t, terms: int):
-    """Legendre polynomials of degree 0 to terms - 1 at t, along a new last axis."""
-    rows = [jnp.ones_like(t), t]
-    for n in range(1, terms - 1):
-        rows.append(((2 * n + 1) * t * rows[n] - n * rows[n - 1]) / (n + 1))
-    return jnp.stack(rows[:terms], axis=-1)
+@functools.cache
+def _to_chebyshev(terms: int) -> np.ndarray:
+    """Matrix from Legendre to Chebyshev coefficients, by the values at Chebyshev points."""
+    points = chebyshev.chebpts1(terms)
+    values = legendre.legvander(points, terms - 1)
+    scale = np.where(np.arange(terms) == 0, 1.0, 2.0)[:, None] / terms
+    return scale * (chebyshev.chebvander(points, terms - 1).T @ values)
+
+
+def _chebyshev_table(t, terms: int):
+    """Chebyshev polynomials of degree 0 to terms - 1 at t, along a new last axis.
+
+    Built by doubling, T_(k+j) = 2 T_k T_j - T_(k-j), which takes few steps and does not lose
+    accuracy.
+    """
+    table = jnp.stack([jnp.ones_like(t), t], axis=-1)
+    while table.shape[-1] < terms:
+        last = table[..., -1:]
+        table = jnp.concatenate([table, 2 * last * table[..., 1:] - table[..., -2::-1]], axis=-1)
+    return table[..., :terms]
 
 
 def modes(case: Case, layout: Layout | None = None) -> Modes:
@@ -292,7 +306,7 @@ def _unit(beam):
 
 
 def assemble(case: Case, layout: Layout):
-    """Nodes, stiffness and mass in beam units, and the map from unknowns to Legendre series."""
+    """Nodes, stiffness and mass in beam units, and the map from unknowns to Chebyshev series."""
     beam, degrees = case.beam, layout.degrees
     places = jnp.stack([place / beam.length for place in _places(case)])
     spots = places[np.array([node[0] for node in layout.nodes])]

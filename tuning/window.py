@@ -113,7 +113,8 @@ def free_decay(
             after = level[stop : stop + piece.size]
             quiet = np.all(after < level[start:stop].max() - fall / 2)
             if fall > LEAST_FALL and score > best and quiet:
-                best, found = score, (start * size, stop * size)
+                # The excitation may end within the first block.
+                best, found = score, ((start + 1) * size, stop * size)
     return found
 
 
