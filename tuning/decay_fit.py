@@ -51,23 +51,39 @@ def fit_decay(values, rate: float, start: int, stop: int, band) -> Findings | No
     )
 
 
-def end_of_excitation(values, rate, start, stop, band) -> int:
-    """First sample from which on the vibration is free: modes seen later predict it backwards."""
+def free_part(values, rate: float, start: int, stop: int, band) -> tuple[int, int]:
+    """The samples around a decay, roughly known, in which its modes predict what is measured.
+
+    The beginning is cut, in coarse steps and then in fine ones, while the modes of the later part
+    do not predict it backwards: there something still excites the structure. The end is moved on
+    while they predict what follows.
+    """
+    for part in (max((stop - start) // PARTS, 1), max((stop - start) // (4 * PARTS), 1)):
+        while stop - start > PARTS // 2 * part:
+            late = start + int(LATE * (stop - start))
+            if _unpredicted(values, rate, (late, stop), (start, start + part), band) < UNPREDICTED:
+                break
+            start += part
     part = max((stop - start) // PARTS, 1)
-    while stop - start > PARTS // 2 * part:
-        late = start + int(LATE * (stop - start))
-        spectrum = transform(values[late:stop], rate, band)
-        if spectrum.bins.size < LEAST_BINS:
+    while stop + part <= len(values):
+        if _unpredicted(values, rate, (start, stop), (stop, stop + part), band) > UNPREDICTED:
             break
-        found = find_poles(spectrum, most=STRONGEST)
-        times = (np.arange(start, start + part) - late) / rate
-        growth = np.exp(np.multiply.outer(times, found.poles))
-        predicted = (growth @ found.amplitudes).real
-        measured = in_band(values[start:stop], rate, band)[:part]
-        if np.sum((measured - predicted) ** 2) < UNPREDICTED * np.sum(measured**2):
-            break
-        start += part
-    return start
+        stop += part
+    return start, stop
+
+
+def _unpredicted(values, rate, known, wanted, band) -> float:
+    """Share of the energy of the samples `wanted` that modes of the samples `known` do not make."""
+    spectrum = transform(values[known[0] : known[1]], rate, band)
+    if spectrum.bins.size < LEAST_BINS:
+        return 0.0
+    found = find_poles(spectrum, most=STRONGEST)
+    times = (np.arange(*wanted) - known[0]) / rate
+    predicted = (np.exp(np.multiply.outer(times, found.poles)) @ found.amplitudes).real
+    # Filtered with what follows, if anything does, for a filter is unsure at the ends.
+    first, last = min(known[0], wanted[0]), max(known[1], 2 * wanted[1] - wanted[0])
+    measured = in_band(values[first:last], rate, band)[wanted[0] - first : wanted[1] - first]
+    return float(np.sum((measured - predicted) ** 2) / np.sum(measured**2))
 
 
 def in_time(values, spectrum: Spectrum):

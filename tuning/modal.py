@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tuning.ambient import fit_ambient
-from tuning.decay_fit import end_of_excitation, fit_decay
+from tuning.decay_fit import fit_decay, free_part
 from tuning.findings import Findings, Mode
 from tuning.logs import Log
 from tuning.window import MOST, energy_band, find_decay
@@ -185,7 +185,7 @@ def _decay(log, rate, start, stop, window, band) -> tuple[Findings | None, tuple
             return None, limits
         start, stop = found
         lasting = energy_band(log.values[start:stop], rate, log.quantities, MOST)
-        start = end_of_excitation(log.values, rate, start, stop, band or lasting)
+        start, stop = free_part(log.values, rate, start, stop, band or lasting)
     limits = band or energy_band(log.values[start:stop], rate, log.quantities)
     return fit_decay(log.values, rate, start, stop, limits), limits
 
@@ -193,7 +193,7 @@ def _decay(log, rate, start, stop, window, band) -> tuple[Findings | None, tuple
 def _explains(found: Findings) -> bool:
     """Tell whether modes make most of what was measured, as they do of a free decay."""
     left = np.sum((found.measured - found.fitted) ** 2)
-    return not all(found.reasons) and left < 0.25 * np.sum(found.measured**2)
+    return bool(not all(found.reasons) and left < 0.25 * np.sum(found.measured**2))
 
 
 def _samples(log: Log, window) -> tuple[int, int]:
