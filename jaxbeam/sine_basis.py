@@ -5,7 +5,8 @@ are exact. A rigid support becomes a stiff spring, and each such spring makes on
 the last of the list.
 """
 
-import equinox as eqx
+import dataclasses
+
 import jax.numpy as jnp
 
 from jaxbeam.case import Case
@@ -23,7 +24,7 @@ def sine_basis_modes(case: Case, rigid_stiffness: float = RIGID) -> Modes:
     enter alike, with slopes. Frequencies (Hz) and mass-normalised shapes are those of the result.
     """
     beam = case.beam
-    bare = modes(eqx.tree_at(lambda c: c.supports, case, ()))
+    bare = modes(dataclasses.replace(case, supports=()))
     stiffness = jnp.diag(bare.stiffness) + bare.coupling
     for support in case.supports:
         spring = rigid_stiffness if support.stiffness is None else support.stiffness

@@ -9,6 +9,7 @@ are springs anywhere on the beam, solved for together with the nodes.
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -247,13 +248,10 @@ def _checked(case: Case, layout: Layout | None, **places) -> Layout:
         if is_known(place) and is_known(case.beam.length):
             _check_on_beam(name, known(place), float(known(case.beam.length)))
     layout = lay_out(case) if layout is None else layout
-    if all(is_known(leaf) for leaf in _numbers(case)):
-        _check_stable(known_case(case), layout)
+    resting = Case(case.beam, case.supports, case.actuators)
+    if all(is_known(leaf) for leaf in jax.tree.leaves(resting)):
+        _check_stable(known_case(resting), layout)
     return layout
-
-
-def _numbers(case: Case):
-    return eqx.filter((case.beam, case.supports, case.actuators), eqx.is_array)
 
 
 def _check_on_beam(name: str, place: np.ndarray, length: float) -> None:

@@ -1,0 +1,228 @@
+"""Static solutions against textbooks, finite elements (exact for point forces), and each other."""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from jaxbeam.actuators import Patch, Shaker, SpringDamper
+from jaxbeam.beam import ENDS, Beam, Support
+from jaxbeam.case import Case, replace, value_at
+from jaxbeam.loads import MovingForce, MovingMass, motion
+from jaxbeam.modes import lay_out
+from jaxbeam.static import influence_line, static_deflection, static_peak
+from tests.as_oracle import as_oracle
+from tests.differences import central
+from tests.oracles import closed_forms, finite_elements
+
+STUFF = {"flexural_rigidity": 3.0, "mass_per_length": 1.0}
+UNSTABLE = ("free-free", "free-pinned", "pinned-free", "free-guided", "guided-free",
+            "guided-guided")  # fmt: skip
+GENERAL = Case(
+    Beam(1.3, 2.0, 0.7, ends="guided-free"),
+    supports=[Support(0.3, 500.0, 0.4, 3.0), Support(0.91), Support(1.3, 20.0, 0.2)],
+    actuators=[
+        Patch(0.2, 0.45, 1e-3, added_mass=0.4, added_rigidity=1.0),
+        Shaker(0.7, 300.0),
+        Patch(0.4, 0.7, 1e-3, added_mass=0.1, added_rigidity=0.5),
+        SpringDamper(0.11, 800.0),
+    ],
+    loads=[MovingMass(0.5, 0.7), MovingForce(force=2.0, speed=0.7, entry_time=0.4)],
+)
+X = np.array([0.0, 0.05, 0.25, 0.33, 0.6, 1.0, 1.3])
+
+
+def oracle_line(case: Case, x, positions) -> np.ndarray:
+    """(position, place), with no more elements than needed: they are exact."""
+    beam = as_oracle(case, elements=1)
+    return np.array([finite_elements.static_deflection(beam, x, [(p, -1.0)]) for p in positions])
+
+
+@pytest.mark.parametrize("ends", [f"{a}-{b}" for a in ENDS for b in ENDS])
+def test_one_span_has_the_line_of_macaulays_method(ends):
+    case, positions = Case(Beam(1.7, **STUFF, ends=ends)), np.linspace(0.0, 1.7, 8)
+    if ends in UNSTABLE:
+        with pytest.raises(ValueError, match="rigid body.*hold its ends or add supports"):
+            influence_line(case, 0.6, positions)
+        return
+    expected = closed_forms.influence_line(1.7, 3.0, ends, 0.6, positions)
+    found = influence_line(case, 0.6, positions)
+    assert_allclose(found, expected, rtol=1e-12, atol=1e-13 * np.abs(expected).max())
+
+
+def test_two_spans_have_the_textbook_deflections():
+    """23 and -9 in 1536ths of P l^3 / E I."""
+    case = Case(Beam(2.0, **STUFF), supports=[Support(1.0)])
+    found = influence_line(case, [0.5, 1.5], [0.5])[0]
+    assert_allclose(found, np.array([-23.0, 9.0]) / 1536 / 3.0, rtol=1e-13)
+    loaded = replace_loads(case, [MovingForce(force=3.0, speed=2.0)])
+    assert_allclose(static_peak(loaded, 0.5), 0.015012, atol=5e-7)
+
+
+def test_everything_at_once_as_finite_elements_have_it():
+    y = np.array([0.02, 0.11, 0.3, 0.47, 0.7, 0.95, 1.29])
+    expected = oracle_line(GENERAL, X, y)
+    found = influence_line(GENERAL, X, y)
+    assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    at, forces = [0.2, 0.95], [3.0, -1.5]
+    expected = finite_elements.static_deflection(
+        as_oracle(GENERAL, 1), X, [(0.2, -3.0), (0.95, 1.5)]
+    )
+    found = static_deflection(GENERAL, X, at, forces)
+    assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_without_forces_the_loads_of_the_case_press_with_their_weights():
+    found = static_deflection(GENERAL, X, [0.2, 0.95])
+    expected = static_deflection(GENERAL, X, [0.2, 0.95], [0.5 * 9.81, 2.0])
+    assert_allclose(found, expected, rtol=1e-14)
+
+
+def test_a_beam_that_only_suspensions_hold():
+    springs = [Shaker(0.1, 3500.0), SpringDamper(0.5, 1000.0)]
+    case = Case(Beam(0.6, 11.68, 0.535, ends="free-free"), actuators=springs)
+    expected = oracle_line(case, [0.2, 0.6], [0.05, 0.3])
+    assert_allclose(influence_line(case, [0.2, 0.6], [0.05, 0.3]), expected, rtol=1e-12)
+    case = Case(Beam(0.6, 11.68, 0.535, ends="free-free"), actuators=springs[:1])
+    with pytest.raises(ValueError, match="rigid body"):
+        influence_line(case, 0.2, 0.1)
+
+
+def test_reciprocity():
+    line = influence_line(GENERAL, X, X)
+    assert_allclose(line, line.T, rtol=0, atol=1e-13 * np.abs(line).max())
+
+
+def test_very_stiff_springs_are_rigid_supports():
+    def line(stiffness):
+        case = Case(Beam(1.2, **STUFF), supports=[Support(0.5, stiffness)])
+        return influence_line(case, 0.8, np.linspace(0, 1.2, 9))
+
+    assert_allclose(line(1e16), line(None), rtol=0, atol=1e-13 * np.abs(line(None)).max())
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_derivatives_along_the_beam(order):
+    y = [0.02, 0.3, 0.6, 0.95]
+    found = influence_line(GENERAL, 0.5, y, order)
+    expected = central(lambda x: influence_line(GENERAL, x[0], y, order - 1), [0.5], 1e-2)[:, 0]
+    assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+# Peaks while loads travel slowly
+
+
+def replace_loads(case: Case, loads) -> Case:
+    return dataclasses.replace(case, loads=loads)
+
+
+def sampled_peak(case: Case, x, until: float) -> np.ndarray:
+    """The same by brute force, at many instants."""
+    times, total = np.linspace(0.0, until, 40001), 0.0
+    length = float(case.beam.length)
+    for load in case.loads:
+        path = motion(load, case.beam.length)
+        position = np.clip(np.asarray(path.travel(times)[0]), 0.0, length)
+        entry, leave = (float(t) for t in path.window())
+        line = np.asarray(influence_line(case, x, position))
+        on = ((times >= entry) & (times <= leave))[:, None]
+        total = total + float(load.weight(case.run.gravity)) * on * line
+    return np.abs(total).max(axis=0)
+
+
+@pytest.mark.parametrize("speed", [0.01, 3.0, -3.0])
+def test_one_load_makes_the_extreme_of_the_influence_line_at_any_speed(speed):
+    """Pinned, midspan: P L^3 / 48 E I; a quarter span, by Roark's largest deflection."""
+    case = Case(Beam(2.0, **STUFF), loads=[MovingMass(0.4, speed)])
+    a = 0.5  # the load at a: deflection elsewhere is largest sqrt((L^2 - a^2) / 3) from the far end
+    extreme = a * (4.0 - a**2) ** 1.5 / (9 * np.sqrt(3) * 2.0)
+    expected = 0.4 * 9.81 / 3.0 * np.array([8 / 48, extreme])
+    assert_allclose(static_peak(case, [1.0, a]), expected, rtol=1e-12)
+
+
+STREAM = [
+    MovingMass(0.509, 0.55, deceleration=0.05),
+    MovingForce(force=3.0, speed=-0.7, entry_time=0.3),
+    MovingMass(0.4, times=[0.0, 1.0, 2.0, 3.0], positions=[1.3, 0.7, 0.5, 0.1]),
+]
+
+
+@pytest.mark.parametrize("loads", [STREAM[:1], STREAM[2:], STREAM], ids=["one", "table", "all"])
+def test_peaks_of_a_stream_are_those_of_a_fine_sampling(loads):
+    case = replace_loads(GENERAL, loads)
+    x = np.array([0.1, 0.5, 1.3])
+    expected = sampled_peak(case, x, 4.0)
+    found = static_peak(case, x)
+    assert np.all(found >= expected * (1 - 1e-12))
+    assert_allclose(found, expected, rtol=2e-4)  # samples miss the instant of an exit
+
+
+def test_loads_of_equal_speed_keep_their_distance():
+    """A stream twice as fast whose members follow in half the time."""
+    slow = [MovingMass(0.3, 0.5), MovingMass(0.3, 0.5, entry_time=1.0)]
+    fast = [MovingMass(0.3, 1.0), MovingMass(0.3, 1.0, entry_time=0.5)]
+    peaks = [static_peak(replace_loads(GENERAL, loads), X) for loads in (slow, fast)]
+    assert_allclose(*peaks, rtol=1e-12)
+
+
+def test_no_load_no_peak():
+    assert_allclose(static_peak(replace_loads(GENERAL, []), X), 0.0)
+
+
+# Derivatives
+
+NUMBERS = [
+    "beam.length", "beam.flexural_rigidity", "supports.0.position", "supports.0.stiffness",
+    "supports.0.rotational_stiffness", "supports.1.position", "actuators.0.start",
+    "actuators.0.end", "actuators.0.added_rigidity", "actuators.1.position",
+    "actuators.1.stiffness", "actuators.3.position", "loads.0.mass", "loads.1.force",
+    "loads.1.entry_time", "loads.0.speed", "run.gravity",
+]  # fmt: skip
+
+
+def test_gradients_of_lines_and_peaks():
+    """Relative changes of every number; forward and reverse against central differences."""
+    # A support at the very end cannot follow when the length changes alone.
+    case = replace(GENERAL, {"supports.2.position": 1.2, "actuators.2.end": 0.75})
+    layout = lay_out(case)
+    start = np.array([float(value_at(case, address)) for address in NUMBERS])
+    x = jnp.array([0.25, 0.6])
+
+    @jax.jit
+    def quantities(change):
+        changed = replace(case, dict(zip(NUMBERS, start * (1 + change), strict=True)))
+        line = influence_line(changed, x, jnp.array([0.35, 1.0]), layout=layout)
+        return jnp.append(line.ravel(), static_peak(changed, x, layout))
+
+    none = jnp.zeros(len(NUMBERS))
+    expected = central(quantities, none, 1e-3)
+    scale = np.abs(expected).max(axis=1, keepdims=True)
+    for found in (jax.jacfwd(quantities)(none), jax.jacrev(quantities)(none)):
+        assert_allclose(found / scale, expected / scale, rtol=1e-6, atol=1e-8)
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: influence_line(GENERAL, 1.4, 0.1), "x must lie on the beam, between 0 and 1.3 m"),
+        (lambda: influence_line(GENERAL, 0.1, [0.1, -0.2]), "positions must lie on the beam"),
+        (lambda: influence_line(GENERAL, 0.1, jnp.nan), "positions must lie on the beam"),
+        (lambda: static_deflection(GENERAL, 0.1, [0.1]), "one for each of the 2 loads of the case"),
+        (lambda: static_deflection(GENERAL, 0.1, [0.1, 0.2], 1.0), "one for each of the 1 forces"),
+        (lambda: static_peak(GENERAL, -1.0), "x must lie on the beam"),
+        (
+            lambda: static_peak(replace(GENERAL, {"beam.length": -1.0}), 0.1),
+            "beam.length must be positive",
+        ),
+    ],
+)
+def test_bad_input_is_refused(call, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        call()
