@@ -1,0 +1,85 @@
+"""A fit: what was measured, what the model says, and what is left between them."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from jaxbeam.plot.style import GREY, INK, colour, name, scale, styled
+
+
+@dataclasses.dataclass(frozen=True)
+class FitPanel:
+    """One log in a picture of a fit: its samples and the fitted ones, in the SI `unit`."""
+
+    title: str
+    times: Float[np.ndarray, " time"]
+    measured: Float[np.ndarray, "time channel"]
+    fitted: Float[np.ndarray, "time channel"]
+    names: Sequence[str]
+    unit: str = "m"
+
+
+@styled
+def plot_fit(panels: Sequence[FitPanel], title: str = "") -> Figure:
+    """One column a log: measured (dots) and fitted (line), and the residual of each channel.
+
+    Residuals of a log share one scale; each says its standard deviation.
+    Raises ValueError without panels.
+    """
+    if not panels:
+        raise ValueError("there is nothing to draw: give at least one log")
+    channels = max(panel.measured.shape[1] for panel in panels)
+    figure = Figure(figsize=(max(7.0, 1.2 + 3.6 * len(panels)), 3.6 + 0.8 * channels))
+    grid = figure.subplots(
+        1 + channels,
+        len(panels),
+        squeeze=False,
+        sharex="col",
+        height_ratios=[3.2] + channels * [0.8],
+    )
+    for column, panel in zip(grid.T, panels, strict=True):
+        _draw(column, panel)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    grid[0, 0].legend(handles[:2], labels[:2], loc="best", handlelength=1.2, markerscale=3)
+    name(figure, title)
+    return figure
+
+
+def _draw(column, panel):
+    """Fill one column: the channels together, then the residual of each in its colour."""
+    top, *strips = column
+    residual = panel.measured - panel.fitted
+    deviation = np.std(residual, axis=0)
+    factor, unit = scale(panel.measured, panel.unit)
+    fine, fine_unit = scale(deviation, panel.unit)
+    reach = 1.05 * np.max(np.abs(residual)) / fine or 1.0
+    for i, strip in enumerate(strips):
+        if i >= len(panel.names):
+            strip.axis("off")
+            continue
+        dots = {"markersize": 1.8, "color": colour(i), "markeredgewidth": 0}
+        top.plot(panel.times, panel.measured[:, i] / factor, "o", label="measured", **dots)
+        top.plot(panel.times, panel.fitted[:, i] / factor, color=INK, linewidth=0.9, label="fitted")
+        strip.plot(panel.times, residual[:, i] / fine, "o", **dots)
+        strip.axhline(0, color=INK, linewidth=0.7)
+        strip.set(ylim=(-reach, reach))
+        strip.set_ylabel(panel.names[i], color=colour(i))
+        strip.annotate(
+            f"residual sd {deviation[i] / fine:.3g} {fine_unit}",
+            (1.0, 1.0),
+            xycoords="axes fraction",
+            xytext=(-2, 0),
+            textcoords="offset points",
+            ha="right",
+            va="bottom",
+            color=GREY,
+            fontsize=8,
+        )
+    top.set_title(panel.title)
+    top.set_ylabel(f"measured and fitted ({unit})")
+    top.set_xlim(panel.times[0], panel.times[-1])
+    strips[len(panel.names) - 1].set_xlabel("time (s)")
+    strips[len(panel.names) - 1].tick_params(labelbottom=True)

@@ -1,0 +1,54 @@
+"""Mode shapes along the beam."""
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxbeam.case import Case
+from jaxbeam.fields import known
+from jaxbeam.modes import Modes
+from jaxbeam.modes import modes as find_modes
+from jaxbeam.plot.schematic import draw_supports
+from jaxbeam.plot.style import FAINT, GREY, INK, colour, name, styled
+
+
+@styled
+def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
+    """Shapes of the modes of a case, one above the other, with frequencies and damping ratios.
+
+    All are drawn to the same height: their size has no meaning. `modes` are computed from the
+    case if left out.
+    """
+    modes = find_modes(case) if modes is None else modes
+    length = float(known(case.beam.length))
+    x = np.linspace(0, length, 401)
+    shapes = np.asarray(modes.shapes(jnp.asarray(x)))
+    shapes = 0.36 * shapes / np.max(np.abs(shapes), axis=0)
+    count = shapes.shape[1]
+    figure = Figure(figsize=(7, 1.1 + 0.8 * count))
+    axes = figure.subplots()
+    for i, (frequency, ratio) in enumerate(
+        zip(modes.frequencies, modes.damping_ratios, strict=True)
+    ):
+        shape = shapes[:, i] - i
+        axes.plot([0, length], [-i, -i], color=GREY, linewidth=0.8, zorder=1)
+        axes.fill_between(x, -i, shape, color=colour(0), alpha=0.12, linewidth=0)
+        axes.plot(x, shape, color=colour(0), linewidth=1.8)
+        draw_supports(axes, case, y=-i, size=17)
+        axes.annotate(
+            f"{float(frequency):.4g} Hz\ndamping {100 * float(ratio):.3g} %",
+            (1.0, -i),
+            xycoords=axes.get_yaxis_transform(),
+            xytext=(12, 0),
+            textcoords="offset points",
+            va="center",
+            color=INK,
+        )
+    axes.set(xlabel="position (m)", ylabel="mode", xlim=(0, length), ylim=(0.6 - count, 0.55))
+    axes.set_yticks(-np.arange(count), [str(i + 1) for i in range(count)])
+    axes.tick_params(axis="y", length=0, pad=10)
+    axes.spines["left"].set_visible(False)
+    axes.grid(False, axis="y")
+    axes.grid(True, axis="x", color=FAINT)
+    name(figure, case.title)
+    return figure

@@ -1,0 +1,144 @@
+"""One run: deflection at the sensors and contact forces over time."""
+
+import dataclasses
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxbeam.fields import known
+from jaxbeam.loads import motion
+from jaxbeam.plot.schematic import draw_rig
+from jaxbeam.plot.style import (
+    ALARM,
+    GREY,
+    INK,
+    SHADE,
+    colour,
+    margin_labels,
+    name,
+    scale,
+    signed,
+    styled,
+)
+from jaxbeam.record import Record
+
+
+@styled
+def plot_record(record: Record) -> Figure:
+    """Deflection at the sensors (dots: peaks), and below it the contact forces of the loads.
+
+    The times with loads on the beam are shaded. On top, the rig shows where the sensors are.
+    Raises ValueError if the record has neither sensors nor loads.
+    """
+    case = record.case
+    panels = [
+        (height, draw)
+        for height, draw, wanted in (
+            (0.7, _draw_rig, True),
+            (3.2, _draw_deflection, case.sensors),
+            (1.7, _draw_forces, case.loads),
+        )
+        if wanted
+    ]
+    if len(panels) == 1:
+        raise ValueError("the record has nothing to draw: its case has neither sensors nor loads")
+    heights = [height for height, _ in panels]
+    figure = Figure(figsize=(8, 0.7 + sum(heights)))
+    rows = figure.subplots(len(panels), 1, height_ratios=heights)
+    for axes, (_, draw) in zip(rows, panels, strict=True):
+        draw(axes, record)
+    rows[-1].set_xlabel("time (s)")
+    for axes in rows[1:-1]:
+        axes.tick_params(labelbottom=False)
+    name(figure, case.title)
+    return figure
+
+
+def load_windows(record: Record) -> list[tuple[int, float, float]]:
+    """Each load seen in the record, by number, with its entry and exit (s), cut to the record."""
+    times = np.asarray(record.times)
+    paths = [motion(load, record.case.beam.length) for load in record.case.loads]
+    windows = [np.clip([known(t) for t in path.window()], times[0], times[-1]) for path in paths]
+    return [(i, *map(float, window)) for i, window in enumerate(windows) if window[0] < window[1]]
+
+
+def _draw_rig(axes, record):
+    draw_rig(axes, record.case)
+
+
+def _shade(axes, record):
+    times = np.asarray(record.times)
+    axes.set_xlim(times[0], times[-1])
+    for _, entry, leaves in load_windows(record):
+        axes.axvspan(entry, leaves, color=SHADE, zorder=0.5, linewidth=0)
+        for edge in (entry, leaves):
+            axes.axvline(edge, color=GREY, linewidth=0.7, linestyle=(0, (4, 3)), zorder=0.6)
+
+
+def _name_loads(axes, record):
+    """Write at its entry what a load is; several are numbered."""
+    loads = record.case.loads
+    for i, entry, _ in load_windows(record):
+        label = f"load {i}" if len(loads) > 1 else _described(loads[0])
+        axes.annotate(
+            label,
+            (entry, 1.0),
+            xycoords=axes.get_xaxis_transform(),
+            xytext=(4, -4),
+            textcoords="offset points",
+            va="top",
+            color=GREY,
+            fontsize=8,
+        )
+
+
+def _described(load) -> str:
+    """The numbers of a load that tell it from others, with units: "0.5 kg, 1.2 m/s"."""
+    numbers = [(field, getattr(load, field.name)) for field in dataclasses.fields(load)]
+    return ", ".join(
+        f"{float(known(value)):.4g} {field.metadata['unit']}"
+        for field, value in numbers
+        if field.name in ("mass", "force", "speed") and value is not None
+    )
+
+
+def _draw_deflection(axes, record):
+    times, deflection = np.asarray(record.times), np.asarray(record.deflection)
+    factor, unit = scale(deflection, "m")
+    _shade(axes, record)
+    axes.axhline(0, color=GREY, linewidth=0.8)
+    peaks = []
+    for i, when in enumerate(np.asarray(record.peak_time)):
+        axes.plot(times, deflection[:, i] / factor, color=colour(i))
+        # A record keeps the size of a peak; its sign is that of the history there.
+        sign = np.sign(np.interp(when, times, deflection[:, i]))
+        peaks.append(sign * float(record.peak_deflection[i]) / factor)
+        axes.plot([when], peaks[-1:], "o", color=colour(i), markeredgecolor="white", zorder=3)
+    axes.set_ylabel(f"deflection ({unit})")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.07 * (high - low))  # room for the names
+    _name_loads(axes, record)
+    names = [f"peak {signed(peak)} {unit}" for peak in peaks]
+    margin_labels(axes, peaks, names, [colour(i) for i in range(len(peaks))])
+
+
+def _draw_forces(axes, record):
+    times, force = np.asarray(record.times), np.asarray(record.contact_force)
+    on = np.isfinite(np.asarray(record.load_position))
+    factor, unit = scale(force[on], "N")
+    _shade(axes, record)
+    for i, lost in enumerate(np.asarray(record.contact_lost_time)):
+        axes.plot(times, np.where(on[:, i], force[:, i], np.nan) / factor, color=INK, linewidth=1.1)
+        if np.isfinite(lost):
+            axes.axhline(0, color=GREY, linewidth=0.8)
+            axes.plot([lost], [0], "X", color=ALARM, markersize=8, zorder=3)
+            axes.annotate(
+                "has to pull", (lost, 0), xytext=(7, -11), textcoords="offset points", color=ALARM
+            )
+    axes.set_ylabel(f"contact force ({unit})")
+    gravity = record.case.run.gravity
+    weights = sorted({float(known(load.weight(gravity))) / factor for load in record.case.loads})
+    for weight in weights:
+        axes.axhline(weight, color=GREY, linewidth=0.9, linestyle=":")
+    names = [f"weight {signed(weight)} {unit}" for weight in weights]
+    margin_labels(axes, weights, names, [GREY] * len(weights))

@@ -1,0 +1,136 @@
+"""A sweep: peak deflection over one or two of its addresses, for each sensor."""
+
+import dataclasses
+import json
+
+import numpy as np
+import xarray
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
+
+from jaxbeam.case import Case
+from jaxbeam.casefile import case_from_dict
+from jaxbeam.fields import known
+from jaxbeam.plot.style import ALARM, FAINT, INK, colour, margin_labels, name, scale, styled
+
+MARKED = 40  # runs; each is a dot on a curve of so few
+
+
+@styled
+def plot_sweep(dataset: xarray.Dataset) -> Figure:
+    """Peak deflection over the swept addresses: curves for one, a map per sensor for two.
+
+    The largest peak is marked with a dot, and failed runs are left out. Of a sweep over more
+    addresses, draw a slice: `plot_sweep(dataset.isel({"loads.0.mass": 0}))`. Paired runs are
+    drawn over their number. Raises ValueError for more than two addresses, or for a dataset that
+    was not made by a sweep.
+    """
+    if "peak_deflection" not in dataset or "case" not in dataset.attrs:
+        raise ValueError("not a sweep of jaxbeam: the dataset lacks peak_deflection or its case")
+    case = case_from_dict(json.loads(dataset.attrs["case"]))
+    peaks = dataset["peak_deflection"]
+    over = [str(dimension) for dimension in peaks.dims if dimension != "sensor"]
+    if "sensor" not in peaks.dims:
+        peaks = peaks.expand_dims("sensor")
+    if not 1 <= len(over) <= 2:
+        raise ValueError(
+            f"a sweep is drawn over one or two addresses, not {len(over)} ({', '.join(over)}); "
+            f"select values of the others, as in dataset.isel({{{over[0]!r}: 0}})"
+            if over
+            else "a sweep is drawn over one or two addresses; this dataset holds a single run"
+        )
+    factor, unit = scale(peaks, "m")
+    peaks = peaks.transpose("sensor", *over) / factor
+    figure = (_curves if len(over) == 1 else _maps)(peaks, over, unit, case)
+    held = [
+        f"{axis_label(case, str(address))} = {float(value):.4g}"
+        for address, value in peaks.coords.items()
+        if value.ndim == 0 and address != "sensor"
+    ]
+    name(figure, "\n".join(filter(None, [case.title, ", ".join(held)])))
+    return figure
+
+
+def axis_label(case: Case, address: str) -> str:
+    """An address with the unit of its number: "loads.0.speed (m/s)"."""
+    part, unit = case, ""
+    for step in address.split("."):
+        if step.isdigit():
+            part = part[int(step)]
+            continue
+        fields = {field.name: field for field in dataclasses.fields(part)}
+        if step not in fields:
+            return address
+        unit = fields[step].metadata.get("unit", "")
+        part = getattr(part, step)
+    return f"{address} ({unit})" if unit not in ("", "1") else address
+
+
+def _sensor_names(peaks, case):
+    """Sensors by position, or by number where the position is swept too."""
+    if "sensor" not in peaks.coords:
+        return [f"sensor {i}" for i in range(peaks.sizes["sensor"])]
+    numbers = [int(str(label).split(":")[0]) for label in peaks["sensor"].values]
+    swept = any(str(address).startswith("sensors.") for address in peaks.coords)
+    return [
+        f"sensor {i}" if swept else f"at {float(known(case.sensors[i].position)):.4g} m"
+        for i in numbers
+    ]
+
+
+def _curves(peaks, over, unit, case):
+    (address,) = over
+    figure = Figure(figsize=(6.4, 4))
+    axes = figure.subplots()
+    x = peaks[address].values if address in peaks.coords else np.arange(peaks.sizes[address])
+    few = "o-" if x.size <= MARKED else "-"
+    ends = []
+    for i, values in enumerate(peaks.values):
+        axes.plot(x, values, few, markersize=3, color=colour(i))
+        done = np.flatnonzero(np.isfinite(values))
+        ends.append(values[done[-1]] if done.size else 0.0)
+        top = done[np.argmax(values[done])] if done.size else []
+        axes.plot(x[top], values[top], "o", markersize=7, markeredgecolor="white", color=colour(i))
+    axes.set(xlabel=axis_label(case, address), ylabel=f"peak deflection ({unit})")
+    axes.set_ylim(bottom=0)
+    axes.margins(x=0.01)
+    margin_labels(axes, ends, _sensor_names(peaks, case), [colour(i) for i in range(len(ends))])
+    return figure
+
+
+def _maps(peaks, over, unit, case):
+    count = peaks.sizes["sensor"]
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(1.5 + 2.9 * columns, 0.7 + 2.8 * rows))
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axes in grid.flat[count:]:
+        axes.set_visible(False)
+    y, x = (peaks[address].values for address in over)
+    # One scale for all sensors, so that equal colours and lines are equal deflections.
+    highest = np.max(peaks.values, initial=0.0, where=np.isfinite(peaks.values)) or 1.0
+    lines = MaxNLocator(8).tick_values(0, highest)
+    fills = np.linspace(0, lines[-1], 8 * (lines.size - 1) + 1)
+    names = _sensor_names(peaks, case)
+    filled = None
+    for axes, values, title in zip(grid.flat, peaks.values, names, strict=False):
+        axes.set_facecolor(FAINT)  # seen where runs failed
+        filled = axes.contourf(x, y, values, levels=fills, cmap="YlGnBu")
+        drawn = axes.contour(x, y, values, levels=lines[1:-1], colors=INK, linewidths=0.5)
+        texts = axes.clabel(drawn, fontsize=7, fmt="%.4g")
+        for text in texts:
+            text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+        if np.any(np.isfinite(values)):
+            row, column = np.unravel_index(np.nanargmax(values), values.shape)
+            axes.plot(x[column], y[row], "o", color=ALARM, markeredgecolor="white", clip_on=False)
+            title = f"{title}, largest {values[row, column]:.4g} {unit}"
+        axes.set_title(title)
+        axes.grid(False)
+    for axes in grid[-1]:
+        axes.set_xlabel(axis_label(case, over[1]))
+    for axes in grid[:, 0]:
+        axes.set_ylabel(axis_label(case, over[0]))
+    bar = figure.colorbar(filled, ax=grid, ticks=lines, label=f"peak deflection ({unit})", pad=0.02)
+    bar.outline.set_visible(False)
+    return figure
