@@ -92,8 +92,21 @@ def find_poles(spectrum: Spectrum, most: int = MOST_MODES) -> Poles:
         if _misfit(best.residual, level) - _misfit(trial.residual, level) < worth:
             break
         best = trial
+    best = _without_needless(best, spectrum, floor, worth)
     for _ in range(2):
         best = refine(best.poles, spectrum, best.noise)
+    return best
+
+
+def _without_needless(best: Poles, spectrum: Spectrum, floor, worth: float) -> Poles:
+    """Take out again, weakest first, the poles that the others have made needless."""
+    level = _robust_level(best.residual) + floor
+    best = refine(best.poles, spectrum, level)
+    for pole in best.poles[np.argsort(np.sum(np.abs(best.amplitudes), axis=1))]:
+        nearest = int(np.argmin(np.abs(best.poles - pole)))
+        trial = refine(np.delete(best.poles, nearest), spectrum, level)
+        if _misfit(trial.residual, level) - _misfit(best.residual, level) < worth:
+            best = trial
     return best
 
 
@@ -213,28 +226,27 @@ def refine(
     if poles.size:
         duration, nuisance, weights = spectrum.duration, _nuisance(spectrum), level**-0.5
 
+        start = _parameters(poles, duration)
+
         @functools.lru_cache(maxsize=1)
         def projected(key):
-            parameters = np.frombuffer(key)
-            return _project(_poles(parameters, duration), spectrum, weights, nuisance)
+            moved = start + np.frombuffer(key)
+            return _project(_poles(moved, duration), spectrum, weights, nuisance)
 
-        def residual(parameters):
-            return projected(parameters.tobytes())[0].ravel()
-
-        def jacobian(parameters):
-            return projected(parameters.tobytes())[1].reshape(-1, parameters.size)
-
-        start = _parameters(poles, duration)
-        # A pole stays near where it was seen: joint fits of many weak ones would wander.
+        # A pole stays near where it was seen: joint fits of many weak ones would wander. Moves,
+        # not parameters, are the unknowns, as the solver's trust region goes by their size.
         reach = np.tile([np.inf, 2 * np.pi * REACH], poles.size)
-        low, high = start - reach, start + reach
-        low[::2] = np.maximum(low[::2], -1.0)
-        low[1::2] = np.maximum(low[1::2], 0.0)
-        start = np.clip(start, low + 1e-9, high - 1e-9)
+        least = np.tile([-1.0, 0.0], poles.size) - start
         solved = least_squares(
-            residual, start, jacobian, (low, high), xtol=1e-7, ftol=1e-7, max_nfev=25
+            lambda moves: projected(moves.tobytes())[0].ravel(),
+            np.maximum(np.zeros_like(start), least + 1e-9),
+            lambda moves: projected(moves.tobytes())[1].reshape(-1, moves.size) / duration,
+            (np.maximum(-reach, least), reach),
+            ftol=1e-8,
+            xtol=1e-7,
+            max_nfev=40,
         )
-        poles = _poles(solved.x, duration)
+        poles = _poles(start + solved.x, duration)
         poles = np.where(poles.imag < 0, poles.conj(), poles)
         poles = poles[np.argsort(poles.imag)]
     return _fit(poles, spectrum, level)

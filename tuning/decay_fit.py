@@ -42,7 +42,9 @@ def fit_decay(values, rate: float, start: int, stop: int, band) -> Findings | No
     lost = _lost(found, others, spectrum)
     return Findings(
         modes=modes,
-        reasons=tuple(LOST if gone else why for gone, why in zip(lost, reasons, strict=True)),
+        reasons=tuple(
+            why or (LOST if gone else "") for gone, why in zip(lost, reasons, strict=True)
+        ),
         start=start,
         stop=stop,
         quantile=float(student.ppf(0.975, max(found.freedom, 3.0))),

@@ -21,6 +21,9 @@ from tuning.logs import Log
 from tuning.window import MOST, energy_band, find_decay
 
 LEAST_SAMPLES = 64
+# What the log is taken for: in steady random vibration, too, a few cycles look like a decay.
+DECAY_CYCLES = 10.0
+UNEXPLAINED = 0.25  # of the energy
 KINDS = ("free decay", "ambient")
 
 
@@ -148,7 +151,11 @@ def identify_modes(
     found = None
     if kind != "ambient":
         found, limits = _decay(log, rate, start, stop, window, band)
-        if found is not None and kind is None and not _explains(found):
+        if (
+            found is not None
+            and kind is None
+            and not _explains(found, rate, DECAY_CYCLES if window is None else 0.0)
+        ):
             found = None
     decays = found is not None
     if kind == "free decay" and not decays:
@@ -190,10 +197,13 @@ def _decay(log, rate, start, stop, window, band) -> tuple[Findings | None, tuple
     return fit_decay(log.values, rate, start, stop, limits), limits
 
 
-def _explains(found: Findings) -> bool:
-    """Tell whether modes make most of what was measured, as they do of a free decay."""
-    left = np.sum((found.measured - found.fitted) ** 2)
-    return bool(not all(found.reasons) and left < 0.25 * np.sum(found.measured**2))
+def _explains(found: Findings, rate: float, least_cycles: float) -> bool:
+    """Tell whether modes make most of what was measured, over many cycles, as in a free decay."""
+    duration = (found.stop - found.start) / rate
+    left = np.sum((found.measured - found.fitted) ** 2) / np.sum(found.measured**2)
+    good = [mode for mode, why in zip(found.modes, found.reasons, strict=True) if not why]
+    cycles = max(good, key=lambda mode: mode.share).frequency * duration if good else 0.0
+    return bool(cycles > least_cycles and left < UNEXPLAINED)
 
 
 def _samples(log: Log, window) -> tuple[int, int]:
