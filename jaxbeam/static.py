@@ -7,6 +7,7 @@ are springs anywhere on the beam, solved for together with the nodes.
 """
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
@@ -26,34 +27,43 @@ SOFTEST = 1e-10  # stiffness against rigid-body motion in E I / L^3: less is an 
 POINTS = 10  # on a stretch of a crossing: a cubic of a cubic is known exactly by so many
 
 
+class Points(eqx.Module):
+    """Unit forces, or x-derivatives of them: positions (in L), each with its own derivative."""
+
+    places: Float[Array, " point"]
+    derivatives: tuple[int, ...] = eqx.field(static=True)
+
+    def groups(self) -> list[tuple[int, np.ndarray]]:
+        """Derivatives that occur, each with the indices of its points."""
+        orders = np.array(self.derivatives, int)
+        return [(int(order), np.flatnonzero(orders == order)) for order in np.unique(orders)]
+
+
 class Compliance(eqx.Module):
-    """Deflections of the beam under unit forces (or pairs) at given sources, prepared for any y.
+    """Deflections of the beam under given sources, prepared for any y.
 
     All in beam units: lengths in L, stiffness in E I / L^3. `series` are the cubics between the
-    nodes, one column a source; `fixed` the points at which segments bend between their nodes:
-    position, derivative, and how much of it each source brings.
+    nodes, one column a source; `points` those at which segments bend between their nodes, and
+    `amounts` how much of each point a source brings.
     """
 
     nodes: Float[Array, " node"]
     rigidity: Float[Array, " segment"]
     series: Float[Array, "segment degree source"]
-    fixed: tuple[tuple[Float[Array, ""], int, Float[Array, " source"]], ...]
+    points: Points
+    amounts: Float[Array, "point source"]
 
-    def __call__(self, y: Float[Array, "*place"], order: int = 0) -> Float[Array, "*place source"]:
-        """Deflection, or its derivative of an order up to 3, at positions y."""
-        total = piecewise(self.nodes, self.series, y, (order,))[0]
-        for place, derivative, amount in self.fixed:
-            bend = _clamped(self.nodes, self.rigidity, y, order, place, derivative)
-            total = total + bend[..., None] * amount
-        return total
+    def __call__(self, y: Float[Array, "*place"]) -> Float[Array, "*place source"]:
+        """Deflection at positions y under each source."""
+        between = _bending(self.nodes, self.rigidity, y, 0, self.points)
+        return piecewise(self.nodes, self.series, y, (0,))[0] + between @ self.amounts
 
 
 def _power(x, exponent: int):
     """<x>^n / n! of Macaulay's method, zero for negative n."""
     if exponent < 0:
         return jnp.zeros_like(x)
-    value = jnp.where(x > 0, x, 0.0) ** exponent / (1.0, 1.0, 2.0, 6.0)[exponent]
-    return jnp.where(x > 0, value, 0.0)
+    return jnp.where(x > 0, x**exponent / math.factorial(exponent), 0.0)
 
 
 def _clamped(nodes, rigidity, x, order: int, y, derivative: int):
@@ -77,65 +87,84 @@ def _clamped(nodes, rigidity, x, order: int, y, derivative: int):
     return jnp.where(at_x == at_y, (-1) ** derivative * bend / rigidity[at_y], 0.0)
 
 
+def _bending(nodes, rigidity, x, order: int, points: Points) -> Float[Array, "*place point"]:
+    """What each point bends its own segment at positions x, or an x-derivative of it."""
+    total = jnp.zeros((*x.shape, len(points.derivatives)))
+    for derivative, index in points.groups():
+        part = _clamped(nodes, rigidity, x[..., None], order, points.places[index], derivative)
+        total = total.at[..., index].set(part)
+    return total
+
+
 def _compliance(case: Case, layout: Layout, x: Float[Array, " place"], order: int) -> Compliance:
     """Prepare unit forces at positions x (m); with an order, its derivatives by x.
 
     With K the stiffness of nodes, f the forces of suspensions of stiffness k and B their rows:
     K u - B' f = load,  f = -k (B u + (what the segment under the stroke bends)).
     """
-    layout = dataclasses.replace(layout, degrees=(3,) * len(layout.degrees))
     length = case.beam.length
-    nodes, stiffness, _, expand = assemble(case, layout)
+    nodes, stiffness, _, expand = assemble(case, _cubics(layout))
     rigidity = jnp.stack([section(case, layout, i)[0] for i in range(len(layout.degrees))])
-    size = stiffness.shape[0]
 
-    def rows(place, derivative):
-        return piecewise(nodes, expand, place, (derivative,))[0]
+    def nodal(points):
+        """Rows (point, unknown) of nodal forces."""
+        rows = jnp.zeros((len(points.derivatives), stiffness.shape[0]))
+        for derivative, index in points.groups():
+            there = piecewise(nodes, expand, points.places[index], (derivative,))[0]
+            rows = rows.at[index].set(there)
+        return rows
 
-    def bend(at, derivative, place, other):
-        return _clamped(nodes, rigidity, at, derivative, place, other)
+    def between(at, points):
+        """Matrix (point, point) of bending within segments, at some points due to others."""
+        matrix = jnp.zeros((len(at.derivatives), len(points.derivatives)))
+        for derivative, index in at.groups():
+            there = _bending(nodes, rigidity, at.places[index], derivative, points)
+            matrix = matrix.at[index].set(there)
+        return matrix
 
-    sources = [(place / length, order) for place in x]
-    devices = [actuator.attachment().stiffness for actuator in case.actuators]
-    # In beam units a stroke of derivative d counts L^-d deflections, a stiffness E I / L^3.
-    springs = jnp.array(devices).reshape(-1) * length**3 / case.beam.rigidity
-    strokes = [
-        [(place / length, d, factor / length**d) for place, d, factor in actuator.stroke()]
-        for actuator in case.actuators
-    ]
-    zero = jnp.zeros(size)
-    load = jnp.stack([rows(place, d) for place, d in sources], axis=-1)
-    hung = [sum((f * rows(place, d) for place, d, f in stroke), zero) for stroke in strokes]
-    hung = jnp.array(hung).reshape(len(strokes), size)
-
-    def strokes_bent_by(terms):
-        """Strokes due to bending between nodes alone, under forces given as terms."""
-        return jnp.array(
-            [
-                sum(f * g * bend(at, d, place, e) for at, d, f in stroke for place, e, g in terms)
-                for stroke in strokes
-            ]
-        ).reshape(-1)
-
-    between = [strokes_bent_by(stroke) for stroke in strokes]
-    between = jnp.array(between).reshape(len(strokes), len(strokes)).T
-    bent = jnp.stack([strokes_bent_by([(place, d, 1.0)]) for place, d in sources], axis=-1)
+    sources = Points(x / length, (order,) * x.shape[0])
+    held, factors, springs = _suspensions(case)
+    rows = factors @ nodal(held)
+    own = factors @ between(held, held) @ factors.T
+    bent = factors @ between(held, sources)
     system = jnp.block(
-        [
-            [stiffness, -hung.T],
-            [springs[:, None] * hung, jnp.eye(len(strokes)) + springs[:, None] * between],
-        ]
+        [[stiffness, -rows.T], [springs * rows, jnp.eye(rows.shape[0]) + springs * own]]
     )
-    found = jnp.linalg.solve(system, jnp.concatenate([load, -springs[:, None] * bent]))
-    series = jnp.einsum("std,dx->stx", expand, found[:size])
-    one = jnp.eye(len(sources))
-    fixed = [(place, d, one[i]) for i, (place, d) in enumerate(sources)]
-    fixed += [
-        (place, d, factor * found[size + i])
-        for i, stroke in enumerate(strokes)
-        for place, d, factor in stroke
-    ]
-    return Compliance(nodes, rigidity, series, tuple(fixed))
+    found = jnp.linalg.solve(system, jnp.concatenate([nodal(sources).T, -springs * bent]))
+    motions, forces = jnp.split(found, [stiffness.shape[0]])
+    return Compliance(
+        nodes,
+        rigidity,
+        jnp.einsum("std,dx->stx", expand, motions),
+        Points(
+            jnp.concatenate([sources.places, held.places]),
+            sources.derivatives + held.derivatives,
+        ),
+        jnp.concatenate([jnp.eye(x.shape[0]), factors.T @ forces]),
+    )
+
+
+def _suspensions(case: Case):
+    """Where actuators hold the beam: points, their factors (actuator, point), and stiffness.
+
+    In beam units, in which a stroke of derivative d counts L^-d deflections.
+    """
+    length = case.beam.length
+    strokes = [actuator.stroke() for actuator in case.actuators]
+    terms = [(i, *term) for i, stroke in enumerate(strokes) for term in stroke]
+    points = Points(
+        jnp.array([place for _, place, _, _ in terms]).reshape(-1) / length,
+        tuple(derivative for _, _, derivative, _ in terms),
+    )
+    factors = jnp.zeros((len(strokes), len(terms)))
+    for column, (i, _, derivative, factor) in enumerate(terms):
+        factors = factors.at[i, column].set(factor / length**derivative)
+    springs = jnp.array([actuator.attachment().stiffness for actuator in case.actuators])
+    return points, factors, springs.reshape(-1, 1) * length**3 / case.beam.rigidity
+
+
+def _cubics(layout: Layout) -> Layout:
+    return dataclasses.replace(layout, degrees=(3,) * len(layout.degrees))
 
 
 @eqx.filter_jit
@@ -221,9 +250,7 @@ def _peak(case: Case, layout: Layout, x):
     compliance = _compliance(case, layout, x.reshape(-1), 0)
     motions = [motion(load, length) for load in case.loads]
     windows = jnp.stack([jnp.stack(path.window()) for path in motions])
-    corners = jnp.concatenate(
-        [compliance.nodes, *(jnp.atleast_1d(place) for place, _, _ in compliance.fixed)]
-    )
+    corners = jnp.concatenate([compliance.nodes, compliance.points.places])
     tables = [load.times for load in case.loads if load.times is not None]
     events = [windows.ravel(), *(path.arrivals(corners * length) for path in motions), *tables]
     events = jnp.concatenate(events)
@@ -266,21 +293,22 @@ def _check_on_beam(name: str, place: np.ndarray, length: float) -> None:
 def _check_stable(case: Case, layout: Layout) -> None:
     """A beam can move rigidly, w = a + b x, unless something resists both of the two motions."""
     length, unit = case.beam.length, case.beam.length**3 / case.beam.rigidity
-    nodes, *_ = assemble(case, dataclasses.replace(layout, degrees=(3,) * len(layout.degrees)))
+    nodes, *_ = assemble(case, _cubics(layout))
+    shift, turn = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     held = [
-        (np.array([1.0, x]), 1.0) for x, (fixed, _) in zip(nodes, layout.held, strict=True) if fixed
+        (shift + x * turn, 1.0) for x, (fixed, _) in zip(nodes, layout.held, strict=True) if fixed
     ]
-    held += [(np.array([0.0, 1.0]), 1.0) for _, turned in layout.held if turned]
+    held += [(turn, 1.0) for _, turned in layout.held if turned]
     for support, node in supported(case, layout):
         if support.stiffness is not None:
-            held.append((np.array([1.0, nodes[node]]), support.stiffness * unit))
-        held.append((np.array([0.0, 1.0]), support.rotational_stiffness * unit / length**2))
-    for actuator in case.actuators:
-        terms = [
-            f / length**d * np.array([[1.0, x / length], [0.0, 1.0], [0.0, 0.0], [0.0, 0.0]][d])
-            for x, d, f in actuator.stroke()
-        ]
-        held.append((sum(terms), actuator.attachment().stiffness * unit))
+            held.append((shift + nodes[node] * turn, support.stiffness * unit))
+        held.append((turn, support.rotational_stiffness * unit / length**2))
+    points, factors, springs = _suspensions(case)
+    moved = [
+        (shift + x * turn, turn, 0 * turn, 0 * turn)[derivative]
+        for x, derivative in zip(points.places, points.derivatives, strict=True)
+    ]
+    held += zip(factors @ np.array(moved).reshape(-1, 2), springs[:, 0], strict=True)
     resistance = sum((min(1.0, float(k)) * np.outer(row, row) for row, k in held), np.zeros((2, 2)))
     if np.linalg.eigvalsh(resistance)[0] < SOFTEST:
         raise ValueError(
