@@ -19,7 +19,7 @@ def animate(
     path: str | os.PathLike,
     *,
     frames: int = 120,
-    rate: float = 24.0,
+    rate: int | float = 24,
     overwrite: bool = False,
 ) -> None:
     """Write a GIF of the beam (deflection enlarged) with the loads that cross it.

@@ -9,7 +9,7 @@ from jaxbeam.fields import known
 from jaxbeam.modes import Modes
 from jaxbeam.modes import modes as find_modes
 from jaxbeam.plot.schematic import draw_supports
-from jaxbeam.plot.style import FAINT, GREY, INK, colour, name, styled
+from jaxbeam.plot.style import FAINT, GREY, INK, colour, digits, name, scale, styled
 
 
 @styled
@@ -36,7 +36,7 @@ def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
         axes.plot(x, shape, color=colour(0), linewidth=1.8)
         draw_supports(axes, case, y=-i, size=17)
         axes.annotate(
-            f"{float(frequency):.4g} Hz\ndamping {100 * float(ratio):.3g} %",
+            f"{_in_hertz(float(frequency))}\ndamping {100 * float(ratio):.3g} %",
             (1.0, -i),
             xycoords=axes.get_yaxis_transform(),
             xytext=(12, 0),
@@ -52,3 +52,8 @@ def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
     axes.grid(True, axis="x", color=FAINT)
     name(figure, case.title)
     return figure
+
+
+def _in_hertz(frequency: float) -> str:
+    factor, unit = scale(frequency, "Hz")
+    return f"{digits(frequency / factor, 4)} {unit}"

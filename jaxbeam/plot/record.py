@@ -14,10 +14,10 @@ from jaxbeam.plot.style import (
     INK,
     SHADE,
     colour,
+    digits,
     margin_labels,
     name,
     scale,
-    signed,
     styled,
 )
 from jaxbeam.record import Record
@@ -118,7 +118,7 @@ def _draw_deflection(axes, record):
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.07 * (high - low))  # room for the names
     _name_loads(axes, record)
-    names = [f"peak {signed(peak)} {unit}" for peak in peaks]
+    names = [f"peak {digits(peak)} {unit}" for peak in peaks]
     margin_labels(axes, peaks, names, [colour(i) for i in range(len(peaks))])
 
 
@@ -127,18 +127,37 @@ def _draw_forces(axes, record):
     on = np.isfinite(np.asarray(record.load_position))
     factor, unit = scale(force[on], "N")
     _shade(axes, record)
-    for i, lost in enumerate(np.asarray(record.contact_lost_time)):
-        axes.plot(times, np.where(on[:, i], force[:, i], np.nan) / factor, color=INK, linewidth=1.1)
-        if np.isfinite(lost):
-            axes.axhline(0, color=GREY, linewidth=0.8)
-            axes.plot([lost], [0], "X", color=ALARM, markersize=8, zorder=3)
+    for i, entry, _ in load_windows(record):
+        pressing = np.where(on[:, i], force[:, i], np.nan) / factor
+        axes.plot(times, pressing, color=INK, linewidth=1.1)
+        if len(record.case.loads) > 1 and on[:, i].any():
             axes.annotate(
-                "has to pull", (lost, 0), xytext=(7, -11), textcoords="offset points", color=ALARM
+                f"{i}",
+                (entry, pressing[np.argmax(on[:, i])]),
+                xytext=(-3, 0),
+                textcoords="offset points",
+                ha="right",
+                va="center",
+                fontsize=8,
             )
+    lost = np.asarray(record.contact_lost_time)
+    lost = lost[np.isfinite(lost)]
+    if lost.size:
+        axes.axhline(0, color=GREY, linewidth=0.8)
+        axes.plot(lost, 0 * lost, "X", color=ALARM, markersize=7, zorder=3)
+        axes.annotate(
+            "has to pull",
+            (lost.min(), 0),
+            xytext=(-6, -6),
+            textcoords="offset points",
+            ha="right",
+            va="top",
+            color=ALARM,
+        )
     axes.set_ylabel(f"contact force ({unit})")
     gravity = record.case.run.gravity
     weights = sorted({float(known(load.weight(gravity))) / factor for load in record.case.loads})
     for weight in weights:
         axes.axhline(weight, color=GREY, linewidth=0.9, linestyle=":")
-    names = [f"weight {signed(weight)} {unit}" for weight in weights]
+    names = [f"weight {digits(weight)} {unit}" for weight in weights]
     margin_labels(axes, weights, names, [GREY] * len(weights))

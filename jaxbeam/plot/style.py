@@ -76,9 +76,9 @@ def colour(index: int) -> str:
     return COLOURS[index % len(COLOURS)]
 
 
-def signed(value: float) -> str:
-    """A number with four digits and a proper minus sign."""
-    return f"{value:.4g}".replace("-", "\N{MINUS SIGN}")
+def digits(value: float, count: int = 3) -> str:
+    """A number rounded to so many digits, zeros at its end kept, with a proper minus sign."""
+    return f"{value:#.{count}g}".rstrip(".").replace("-", "\N{MINUS SIGN}")
 
 
 def name(figure, title: str) -> None:

@@ -1,6 +1,5 @@
 """A sweep: peak deflection over one or two of its addresses, for each sensor."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -30,21 +29,23 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
         raise ValueError("not a sweep of jaxbeam: the dataset lacks peak_deflection or its case")
     case = case_from_dict(json.loads(dataset.attrs["case"]))
     peaks = dataset["peak_deflection"]
+    peaks = peaks.squeeze([d for d in peaks.dims if d != "sensor" and peaks.sizes[d] == 1])
     over = [str(dimension) for dimension in peaks.dims if dimension != "sensor"]
+    peaks = peaks.sortby([address for address in over if address in peaks.coords])
     if "sensor" not in peaks.dims:
         peaks = peaks.expand_dims("sensor")
-    if not 1 <= len(over) <= 2:
+    if not over:
+        raise ValueError("the dataset holds a single run; a sweep is drawn over its addresses")
+    if len(over) > 2:
         raise ValueError(
             f"a sweep is drawn over one or two addresses, not {len(over)} ({', '.join(over)}); "
-            f"select values of the others, as in dataset.isel({{{over[0]!r}: 0}})"
-            if over
-            else "a sweep is drawn over one or two addresses; this dataset holds a single run"
+            f"select a value of the others, as in dataset.isel({{{over[0]!r}: 0}})"
         )
     factor, unit = scale(peaks, "m")
     peaks = peaks.transpose("sensor", *over) / factor
     figure = (_curves if len(over) == 1 else _maps)(peaks, over, unit, case)
     held = [
-        f"{axis_label(case, str(address))} = {float(value):.4g}"
+        f"{address} = {float(value):.4g} {_unit(case, str(address))}".rstrip()
         for address, value in peaks.coords.items()
         if value.ndim == 0 and address != "sensor"
     ]
@@ -52,19 +53,22 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
     return figure
 
 
-def axis_label(case: Case, address: str) -> str:
-    """An address with the unit of its number: "loads.0.speed (m/s)"."""
+def _unit(case: Case, address: str) -> str:
+    """The unit of the number at an address; empty if it has none."""
     part, unit = case, ""
     for step in address.split("."):
         if step.isdigit():
             part = part[int(step)]
-            continue
-        fields = {field.name: field for field in dataclasses.fields(part)}
-        if step not in fields:
-            return address
-        unit = fields[step].metadata.get("unit", "")
-        part = getattr(part, step)
-    return f"{address} ({unit})" if unit not in ("", "1") else address
+        else:
+            field = type(part).__dataclass_fields__.get(step)
+            unit = field.metadata.get("unit", "") if field else ""
+            part = getattr(part, step, None)
+    return "" if unit == "1" else unit
+
+
+def _axis_label(case: Case, address: str) -> str:
+    unit = _unit(case, address)
+    return f"{address} ({unit})" if unit else address
 
 
 def _sensor_names(peaks, case):
@@ -92,7 +96,7 @@ def _curves(peaks, over, unit, case):
         ends.append(values[done[-1]] if done.size else 0.0)
         top = done[np.argmax(values[done])] if done.size else []
         axes.plot(x[top], values[top], "o", markersize=7, markeredgecolor="white", color=colour(i))
-    axes.set(xlabel=axis_label(case, address), ylabel=f"peak deflection ({unit})")
+    axes.set(xlabel=_axis_label(case, address), ylabel=f"peak deflection ({unit})")
     axes.set_ylim(bottom=0)
     axes.margins(x=0.01)
     margin_labels(axes, ends, _sensor_names(peaks, case), [colour(i) for i in range(len(ends))])
@@ -128,9 +132,9 @@ def _maps(peaks, over, unit, case):
         axes.set_title(title)
         axes.grid(False)
     for axes in grid[-1]:
-        axes.set_xlabel(axis_label(case, over[1]))
+        axes.set_xlabel(_axis_label(case, over[1]))
     for axes in grid[:, 0]:
-        axes.set_ylabel(axis_label(case, over[0]))
+        axes.set_ylabel(_axis_label(case, over[0]))
     bar = figure.colorbar(filled, ax=grid, ticks=lines, label=f"peak deflection ({unit})", pad=0.02)
     bar.outline.set_visible(False)
     return figure
