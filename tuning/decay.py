@@ -266,11 +266,14 @@ def _fit(poles, spectrum: Spectrum, level) -> Poles:
     taken = taken + np.einsum("cjp,pq,cjq->jc", slopes.conj(), inverse, slopes).real
     left = np.maximum(2 - taken, 0.02) / 2
     count = _smooth(left, SMOOTHING)
-    noise = level * _smooth(np.abs(weighted) ** 2, SMOOTHING) / count
+    # Not the weighted residual is averaged: that would keep the shape of the level assumed.
     # Channels share disturbances, so their noise is correlated: score covariance from the local
     # cross-spectra of the residual, then the sandwich.
-    cross = _smooth(np.einsum("jc,jd->jcd", weighted, weighted.conj()), SMOOTHING)
+    residual = weighted * np.sqrt(level)
+    cross = _smooth(np.einsum("jc,jd->jcd", residual, residual.conj()), SMOOTHING)
     cross = cross / np.sqrt(count[:, :, None] * count[:, None, :])
+    noise = np.einsum("jcc->jc", cross).real + 1e-30 * np.max(np.abs(spectrum.values)) ** 2
+    cross = cross / np.sqrt(level[:, :, None] * level[:, None, :])
     score = np.einsum("cjp,jcd,djq->pq", slopes.conj(), cross, slopes).real / 2
     pairs = solutions[:, : 2 * poles.size].reshape(channels, poles.size, 2)
     return Poles(
@@ -278,7 +281,7 @@ def _fit(poles, spectrum: Spectrum, level) -> Poles:
         covariance=inverse @ score @ inverse,
         amplitudes=(pairs[..., 0] + 1j * pairs[..., 1]).T,
         model=model,
-        residual=weighted * np.sqrt(level),
+        residual=residual,
         noise=noise,
         freedom=float(2 * np.median(count)),
     )
