@@ -17,6 +17,7 @@ from jaxbeam.modes import modes
 from jaxbeam.record import Record, read_record
 from jaxbeam.sensors import Sensor
 from jaxbeam.simulate import simulate
+from jaxbeam.sweep import sweep
 
 __all__ = [
     "Beam",
@@ -38,4 +39,5 @@ __all__ = [
     "replace",
     "save_case",
     "simulate",
+    "sweep",
 ]

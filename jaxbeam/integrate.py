@@ -241,7 +241,9 @@ def march(
         place, rate = state[0:size:2], state[1:size:2]
         energy = jnp.sum(rate**2, axis=0) + jnp.sum(place * (stiffness @ place), axis=0)
         reach = jnp.sqrt(flexibility[:, None] * energy)
-        return state, best, first, ~(left & jnp.all(reach < best.score))
+        # A run that has blown up has nothing more to show.
+        over = jnp.all((reach < best.score) | ~jnp.isfinite(energy))
+        return state, best, first, ~(left & over)
 
     start = (rest, best, jnp.zeros((), int), jnp.ones((), bool))
     state, best, _, _ = jax.lax.while_loop(more, go, start)

@@ -41,7 +41,7 @@ def form(case: Case) -> Form:
     case = known_case(case)
     layout = lay_out(case)
     _, repeated, windows = _survey(case, layout)
-    return Form(layout, couples(case) or bool(repeated), _most_at_once(np.asarray(windows)))
+    return Form(layout, couples(case) or bool(repeated), most_at_once(np.asarray(windows)))
 
 
 @eqx.filter_jit
@@ -53,7 +53,7 @@ def _survey(case: Case, layout: Layout):
     return norm(assembled), assembled.modes.repeated, windows
 
 
-def _most_at_once(windows: np.ndarray) -> int:
+def most_at_once(windows: np.ndarray) -> int:
     """How many loads are on the beam at once, at most; at least one if there are any."""
     entries, exits = windows.T
     # The count only rises when a load enters.

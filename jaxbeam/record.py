@@ -117,14 +117,13 @@ class Record(eqx.Module):
 
     def to_xarray(self) -> xarray.Dataset:
         """Labelled dataset with units; `from_xarray` restores the record exactly."""
-        names = [f"{i}: {s.quantity}" for i, s in enumerate(self.case.sensors)]
         variables = {
             name: (dims, np.asarray(getattr(self, name)), {"units": unit, "long_name": words})
             for name, (dims, unit, words) in _VARIABLES.items()
         }
         coordinates = {
             "time": ("time", np.asarray(self.times), {"units": "s"}),
-            "sensor": ("sensor", np.array(names, dtype=str)),
+            "sensor": ("sensor", sensor_labels(self.case)),
             "frequency": ("mode", np.asarray(self.modes.frequencies), {"units": "Hz"}),
         }
         attributes = {
@@ -194,6 +193,11 @@ def read_record(path: str | os.PathLike) -> Record:
     """
     with xarray.open_dataset(path, engine="scipy") as dataset:
         return record_from_xarray(dataset.load())
+
+
+def sensor_labels(case: Case) -> np.ndarray:
+    """A name for each sensor: its number and quantity, as in "0: deflection"."""
+    return np.array([f"{i}: {s.quantity}" for i, s in enumerate(case.sensors)], dtype=str)
 
 
 def never_as_nan(times: Float[Array, "..."]) -> Float[Array, "..."]:

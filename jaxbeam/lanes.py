@@ -1,0 +1,54 @@
+"""Many runs arranged for speed: tasks that share a path, lanes within them.
+
+Loads that differ only in mass or force cross the beam on the same path; all that depends on the
+path is then computed once for them. A task is one path; its lanes are the runs on it.
+"""
+
+import dataclasses
+import re
+
+import numpy as np
+from jaxtyping import Float, Int
+
+LIGHT = re.compile(r"loads\.\d+\.(mass|force)|run\.gravity")
+LANES = 256  # more lanes in one task fall out of the cache
+
+
+@dataclasses.dataclass(frozen=True)
+class Tasks:
+    """Runs by task and lane: `heavy` values decide the path and the rig, `light` the loads.
+
+    `index` is the number of the run, -1 for lanes that only fill up a task.
+    """
+
+    heavy_addresses: tuple[str, ...]
+    light_addresses: tuple[str, ...]
+    heavy: Float[np.ndarray, "task heavy"]
+    light: Float[np.ndarray, "task lane light"]
+    index: Int[np.ndarray, "task lane"]
+
+
+def arrange(addresses: list[str], runs: Float[np.ndarray, "run address"]) -> Tasks:
+    """Arrange runs, given by their values at the addresses (SI units), into tasks and lanes."""
+    is_light = np.array([bool(LIGHT.fullmatch(address)) for address in addresses])
+    heavy, light = runs[:, ~is_light], runs[:, is_light]
+    _, group = np.unique(heavy, axis=0, return_inverse=True)
+    if heavy.shape[1] == 0:
+        group = np.zeros(runs.shape[0], int)
+    order = np.argsort(group.ravel(), kind="stable")
+    sizes = np.bincount(group.ravel())
+    lanes = min(LANES, int(sizes.max()))
+    members = np.split(order, np.cumsum(sizes)[:-1])
+    rows = [part[i : i + lanes] for part in members for i in range(0, part.size, lanes)]
+    index = np.full((len(rows), lanes), -1)
+    for row, runs_of_row in zip(index, rows, strict=True):
+        row[: runs_of_row.size] = runs_of_row
+    filled = np.where(index < 0, index[:, :1], index)
+    names = np.array(addresses)
+    return Tasks(
+        tuple(names[~is_light].tolist()),
+        tuple(names[is_light].tolist()),
+        heavy[filled[:, 0]],
+        light[filled],
+        index,
+    )
