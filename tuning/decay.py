@@ -29,6 +29,7 @@ CHANCE = 1e-4
 # like weak ones: what is below this share of the amplitudes nearby is not taken for a mode.
 MISFIT = 0.1
 NEARBY = 2  # bins
+ROUGHLY = 1e-3  # accuracy while modes are counted
 REACH = 1.5  # bins that a pole may move in one refinement
 TREND_ORDER = 3
 LEAKAGE_ORDER = 2
@@ -88,7 +89,7 @@ def find_poles(spectrum: Spectrum, most: int = MOST_MODES) -> Poles:
     while best.poles.size < min(most, spectrum.bins.size // 4):
         level = _robust_level(best.residual) + floor
         guess = _guess(spectrum, best.residual, level)
-        trial = refine(np.append(best.poles, guess), spectrum, level)
+        trial = refine(np.append(best.poles, guess), spectrum, level, ROUGHLY)
         if _misfit(best.residual, level) - _misfit(trial.residual, level) < worth:
             break
         best = trial
@@ -104,7 +105,7 @@ def _without_needless(best: Poles, spectrum: Spectrum, floor, worth: float) -> P
     best = refine(best.poles, spectrum, level)
     for pole in best.poles[np.argsort(np.sum(np.abs(best.amplitudes), axis=1))]:
         nearest = int(np.argmin(np.abs(best.poles - pole)))
-        trial = refine(np.delete(best.poles, nearest), spectrum, level)
+        trial = refine(np.delete(best.poles, nearest), spectrum, level, ROUGHLY)
         if _misfit(trial.residual, level) - _misfit(best.residual, level) < worth:
             best = trial
     return best
@@ -221,8 +222,12 @@ def refine(
     poles: Complex[np.ndarray, " mode"],
     spectrum: Spectrum,
     level: Float[np.ndarray, "bin channel"],
+    accuracy: float = 1e-8,
 ) -> Poles:
-    """Refine all poles together by least squares weighted by a level of the noise."""
+    """Refine all poles together by least squares weighted by a level of the noise.
+
+    It ends when a step gains less than the share `accuracy` of the squares left.
+    """
     if poles.size:
         duration, nuisance, weights = spectrum.duration, _nuisance(spectrum), level**-0.5
 
@@ -242,8 +247,8 @@ def refine(
             np.maximum(np.zeros_like(start), least + 1e-9),
             lambda moves: projected(moves.tobytes())[1].reshape(-1, moves.size) / duration,
             (np.maximum(-reach, least), reach),
-            ftol=1e-8,
-            xtol=1e-7,
+            ftol=accuracy,
+            xtol=1e-8,
             max_nfev=40,
         )
         poles = _poles(start + solved.x, duration)
