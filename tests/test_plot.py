@@ -89,6 +89,8 @@ def test_record_of_many_parts(record):
             load_position=jnp.full((count, 3), jnp.nan).at[:100, 0].set(0.2).at[50:, 1].set(0.1),
             contact_force=jnp.zeros((count, 3)).at[:100, 0].set(-1.0).at[50:, 1].set(2.0),
             contact_lost_time=jnp.array([0.05, jnp.nan, jnp.nan]),
+            contact_lost_position=jnp.array([0.3, jnp.nan, jnp.nan]),
+            lowest_contact_force=jnp.array([-1.0, 2.0, 0.0]),
         )
     )
     _, top, bottom = figure.axes

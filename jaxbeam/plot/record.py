@@ -11,10 +11,10 @@ from jaxbeam.plot.schematic import draw_rig
 from jaxbeam.plot.style import (
     ALARM,
     GREY,
-    INK,
     SHADE,
     colour,
     digits,
+    load_colour,
     margin_labels,
     name,
     scale,
@@ -87,7 +87,7 @@ def _name_loads(axes, record):
             xytext=(4, -4),
             textcoords="offset points",
             va="top",
-            color=GREY,
+            color=load_colour(i),
             fontsize=8,
         )
 
@@ -127,19 +127,12 @@ def _draw_forces(axes, record):
     on = np.isfinite(np.asarray(record.load_position))
     factor, unit = scale(force[on], "N")
     _shade(axes, record)
-    for i, entry, _ in load_windows(record):
+    weights = {}
+    for i, load in enumerate(record.case.loads):
         pressing = np.where(on[:, i], force[:, i], np.nan) / factor
-        axes.plot(times, pressing, color=INK, linewidth=1.1)
-        if len(record.case.loads) > 1 and on[:, i].any():
-            axes.annotate(
-                f"{i}",
-                (entry, pressing[np.argmax(on[:, i])]),
-                xytext=(-3, 0),
-                textcoords="offset points",
-                ha="right",
-                va="center",
-                fontsize=8,
-            )
+        axes.plot(times, pressing, color=load_colour(i), linewidth=1.1)
+        weight = float(known(load.weight(record.case.run.gravity))) / factor
+        weights.setdefault(weight, load_colour(i))
     lost = np.asarray(record.contact_lost_time)
     lost = lost[np.isfinite(lost)]
     if lost.size:
@@ -155,9 +148,7 @@ def _draw_forces(axes, record):
             color=ALARM,
         )
     axes.set_ylabel(f"contact force ({unit})")
-    gravity = record.case.run.gravity
-    weights = sorted({float(known(load.weight(gravity))) / factor for load in record.case.loads})
-    for weight in weights:
-        axes.axhline(weight, color=GREY, linewidth=0.9, linestyle=":")
+    for weight, tint in weights.items():
+        axes.axhline(weight, color=tint, linewidth=0.9, linestyle=":")
     names = [f"weight {digits(weight)} {unit}" for weight in weights]
-    margin_labels(axes, weights, names, [GREY] * len(weights))
+    margin_labels(axes, list(weights), names, list(weights.values()))

@@ -35,7 +35,7 @@ def _hang(axes, x, y, glyph, size, **look):
     axes.plot([x], [y], marker=glyph, markersize=size, clip_on=False, zorder=3, **look)
 
 
-def draw_supports(axes, case: Case, y: float = 0.0, size: float = 22.0) -> None:
+def draw_supports(axes, case: Case, y: int | float = 0, size: int | float = 22) -> None:
     """Draw ends and supports of a case at height y; `size` is in points."""
     length = float(known(case.beam.length))
     for x, end, side in ((0.0, case.beam.left_end, 1), (length, case.beam.right_end, -1)):

@@ -12,6 +12,7 @@ INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, which can be told apart with any kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 ALARM = COLOURS[1]
+LOADS = (INK, "#A6611A", "#7B3294", "#7A868F")  # as far from those as from each other
 
 STYLE = {
     "figure.dpi": 150,
@@ -72,8 +73,13 @@ def scale(values, unit: str) -> Scale:
 
 
 def colour(index: int) -> str:
-    """Colour of sensor, channel or load `index`; they repeat after six."""
+    """Colour of a sensor or channel by its number; they repeat after six."""
     return COLOURS[index % len(COLOURS)]
+
+
+def load_colour(index: int) -> str:
+    """Colour of a load by its number; they repeat after four."""
+    return LOADS[index % len(LOADS)]
 
 
 def digits(value: float, count: int = 3) -> str:
