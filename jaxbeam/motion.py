@@ -159,5 +159,5 @@ class Tabulated(AbstractMotion):
         return entry, jnp.where(last == self.length - near, self.times[-1], leaves)
 
     def arrivals(self, places):
-        passes = [self._pass(place) for place in places]
-        return jnp.stack([*passes, self.times[-1]])
+        passes = jax.vmap(self._pass)(places)
+        return jnp.append(passes, self.times[-1])
