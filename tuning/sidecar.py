@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from jaxbeam.casefile import read_part
 from jaxbeam.loads import KINDS, AbstractLoad
 
 _KEYS = ("loads", "columns", "time")
@@ -65,7 +66,7 @@ def read_sidecar(log: Path) -> Sidecar:
         columns[name] = entry
     loads = None
     if "loads" in data:
-        loads = tuple(_load(path, i, dict(entry)) for i, entry in enumerate(data["loads"]))
+        loads = tuple(_load(path, i, entry) for i, entry in enumerate(data["loads"]))
     return Sidecar(data.get("time"), columns, loads)
 
 
@@ -85,13 +86,8 @@ def _check_types(path, prefix, entry) -> None:
 
 
 def _load(path, index, entry) -> AbstractLoad:
-    """Build one load from its table."""
-    kind = entry.pop("kind", "mass")
-    if kind not in KINDS:
-        raise ValueError(f"{path}, loads.{index}.kind: {kind!r} is none of {', '.join(KINDS)}")
-    known = list(KINDS[kind].__dataclass_fields__)
-    _check_keys(path, f"loads.{index}.", entry, known)
+    """Build one load from its table, as a case file has it."""
     try:
-        return KINDS[kind](**entry)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}, loads.{index}: {error}") from None
+        return read_part(f"loads.{index}", entry, KINDS)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
