@@ -3,13 +3,11 @@
 Libraries are imported inside the commands, so that help and complaints come at once.
 """
 
-import json
-import math
 import sys
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -23,6 +21,7 @@ from jaxbeam.arguments import (
     split_files,
     sweep_values,
 )
+from jaxbeam.printing import print_json, print_table, print_written
 
 app = App(
     name="jaxbeam",
@@ -61,26 +60,43 @@ def demo(
 
 
 @app.command
-def modes(case: Path, /, *, set_: Settings = (), json_: Json = False) -> None:
+def modes(
+    case: Path,
+    /,
+    *,
+    set_: Settings = (),
+    plot: bool = False,
+    overwrite: Overwrite = False,
+    json_: Json = False,
+) -> None:
     """Print natural frequencies and damping ratios.
 
     Parameters
     ----------
     case
         Case file, TOML.
+    plot
+        Draw the mode shapes to CASE_modes.png in this folder.
     """
     import jaxbeam as jb
 
+    picture = picture_path(None, case.with_stem(f"{case.stem}_modes")) if plot else None
+    check_outputs(overwrite, picture)
     described = read_case(case, set_)
     found = jb.modes(described)
+    if picture:
+        from jaxbeam.plot import plot_modes
+
+        plot_modes(described, found).savefig(picture)
     if json_:
-        _print_json({"frequencies_hz": found.frequencies, "damping_ratios": found.damping_ratios})
+        print_json({"frequencies_hz": found.frequencies, "damping_ratios": found.damping_ratios})
         return
     rows = zip(found.frequencies, found.damping_ratios, strict=True)
-    _print_table(
+    print_table(
         ("mode", "frequency (Hz)", "damping ratio"),
         [(i + 1, f"{f:.6g}", f"{d:.4g}") for i, (f, d) in enumerate(rows)],
     )
+    print_written(picture)
 
 
 @app.command
@@ -125,20 +141,20 @@ def simulate(
         names = ("peak_deflection", "lowest_contact_force", "contact_lost_time")
         summary = {name: getattr(record, name) for name in names}
         summary |= {"error_estimate": record.error_estimate, "steps": record.steps}
-        _print_json(summary | {"verdict": record.verdict})
+        print_json(summary | {"verdict": record.verdict})
         return
     print(record.verdict)
     peaks = zip(described.sensors, record.peak_deflection, strict=True)
-    _print_table(
+    print_table(
         ("sensor", "position (m)", "peak deflection (m)"),
         [(i, f"{s.position:.4g}", f"{peak:.6g}") for i, (s, peak) in enumerate(peaks)],
     )
-    _print_table(
+    print_table(
         ("load", "lowest contact force (N)"),
         [(i, f"{force:.6g}") for i, force in enumerate(record.lowest_contact_force)],
     )
     print(f"{record.steps} steps")
-    _print_written(output, picture)
+    print_written(output, picture)
 
 
 @app.command
@@ -187,7 +203,7 @@ def sweep(
     )
     peaks = results["peak_deflection"]
     if json_:
-        _print_json(
+        print_json(
             {"values": values, "dimensions": peaks.dims, "peak_deflection": peaks.to_numpy()}
         )
         return
@@ -199,8 +215,8 @@ def sweep(
         rows.append((i, f"{float(worst):.6g}", *where))
     failed = peaks.isnull().any("sensor")
     print(f"{failed.size} runs, {int(failed.sum())} failed; the largest peak at each sensor:")
-    _print_table(("sensor", "peak deflection (m)", *(f"at {name}" for name in values)), rows)
-    _print_written(output)
+    print_table(("sensor", "peak deflection (m)", *(f"at {name}" for name in values)), rows)
+    print_written(output)
 
 
 @app.command
@@ -254,10 +270,10 @@ def _identify_case(case, logs, free, output, picture, json_) -> None:
     if picture:
         fit.plot().savefig(picture)
     if json_:
-        _print_json(fit.to_dict())
+        print_json(fit.to_dict())
     else:
         print(fit)
-        _print_written(output, picture)
+        print_written(output, picture)
 
 
 def _identify_modes(logs, pictures, json_) -> None:
@@ -270,38 +286,9 @@ def _identify_modes(logs, pictures, json_) -> None:
             fit.plot().savefig(picture)
         if not json_:
             print(f"{log}\n{fit}")
-            _print_written(picture)
+            print_written(picture)
     if json_:
-        _print_json({log: fit.to_dict() for log, fit in found.items()})
-
-
-def _plain(value: Any) -> Any:
-    """Arrays as lists, and what JSON has no number for as null."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _print_json(content: dict[str, Any]) -> None:
-    print(json.dumps(_plain(content), indent=2, allow_nan=False))
-
-
-def _print_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    lines = [header, *([str(entry) for entry in row] for row in rows)]
-    if len(lines) == 1:
-        return
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    for line in lines:
-        print("  ".join(entry.rjust(width) for entry, width in zip(line, widths, strict=True)))
-
-
-def _print_written(*paths: Path | None) -> None:
-    for path in filter(None, paths):
-        print(f"written: {path}")
+        print_json({log: fit.to_dict() for log, fit in found.items()})
 
 
 def _say(sentence: str) -> None:

@@ -145,12 +145,15 @@ def test_help_names_the_commands_and_imports_nothing_heavy():
 # Commands that compute
 
 
-def test_modes(run):
+def test_modes(run, folder):
     found = run("modes case.toml --json --set beam.modes=4")
     expected = [frequency(n) for n in (1, 2, 3, 4)]
     np.testing.assert_allclose(found["frequencies_hz"], expected, rtol=1e-9)
     np.testing.assert_allclose(found["damping_ratios"], 0.03, rtol=1e-9)
-    assert f"{frequency(1):.6g}" in run("modes case.toml")
+    printed = run("modes case.toml --plot")
+    assert f"{frequency(1):.6g}" in printed
+    assert "written: case_modes.png" in printed
+    assert (folder / "case_modes.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_simulate_prints_and_writes_the_same(run, folder):

@@ -30,7 +30,7 @@ jaxbeam.plot
 jaxbeam.__init__
 tuning
 experiments
-jaxbeam.arguments
+jaxbeam.arguments  jaxbeam.printing
 jaxbeam.cli
 jaxbeam.__main__
 """
