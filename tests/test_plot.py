@@ -223,7 +223,7 @@ def test_fit():
     said = words(figure)
     for text in ("two logs", "first.csv", "second.csv", "d1", "d2", "measured and fitted (mm)",
                  "measured and fitted (mm/s\N{SUPERSCRIPT TWO})", "fitted",
-                 f"residual sd {np.std(noise[:, 1]) * 1e6:.3g} \N{MICRO SIGN}m"):  # fmt: skip
+                 f"residual sd {digits(np.std(noise[:, 1]) * 1e6)} \N{MICRO SIGN}m"):  # fmt: skip
         assert text in said
     with pytest.raises(ValueError, match="at least one log"):
         plot_fit([])
@@ -232,7 +232,7 @@ def test_fit():
 def test_a_perfect_fit():
     zeros = np.zeros((5, 1))
     said = words(plot_fit([FitPanel("log", np.arange(5.0), zeros, zeros, ("w",))]))
-    assert "residual sd 0 m" in said
+    assert "residual sd 0.00 m" in said
 
 
 def test_animation(record, tmp_path):

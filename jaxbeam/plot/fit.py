@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from jaxbeam.plot.style import GREY, INK, colour, name, scale, styled
+from jaxbeam.plot.style import GREY, INK, colour, digits, name, scale, styled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,7 @@ def _draw(column, panel):
     deviation = np.std(residual, axis=0)
     factor, unit = scale(panel.measured, panel.unit)
     fine, fine_unit = scale(deviation, panel.unit)
-    reach = 1.05 * np.max(np.abs(residual)) / fine or 1.0
+    reach = 1.15 * np.max(np.abs(residual)) / fine or 1.0
     for i, strip in enumerate(strips):
         if i >= len(panel.names):
             strip.axis("off")
@@ -68,7 +68,7 @@ def _draw(column, panel):
         strip.set(ylim=(-reach, reach))
         strip.set_ylabel(panel.names[i], color=colour(i))
         strip.annotate(
-            f"residual sd {deviation[i] / fine:.3g} {fine_unit}",
+            f"residual sd {digits(deviation[i] / fine)} {fine_unit}",
             (1.0, 1.0),
             xycoords="axes fraction",
             xytext=(-2, 0),

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from jaxbeam.case import Case
 from jaxbeam.casefile import case_from_dict
 from jaxbeam.fields import known
-from jaxbeam.plot.style import ALARM, FAINT, INK, colour, margin_labels, name, scale, styled
+from jaxbeam.plot.style import ALARM, FAINT, INK, colour, digits, margin_labels, name, scale, styled
 
 MARKED = 40  # runs; each is a dot on a curve of so few
 
@@ -128,7 +128,7 @@ def _maps(peaks, over, unit, case):
         if np.any(np.isfinite(values)):
             row, column = np.unravel_index(np.nanargmax(values), values.shape)
             axes.plot(x[column], y[row], "o", color=ALARM, markeredgecolor="white", clip_on=False)
-            title = f"{title}, largest {values[row, column]:.4g} {unit}"
+            title = f"{title}, largest {digits(values[row, column])} {unit}"
         axes.set_title(title)
         axes.grid(False)
     for axes in grid[-1]:
