@@ -9,15 +9,23 @@ FINE = 64  # places at which the interpolant is looked at before Newton's method
 
 
 def vertex(samples: Float[Array, "point *rest"]) -> Float[Array, " *rest"]:
-    """Largest absolute value, estimated by parabolas through neighbouring samples.
+    """Largest absolute value, closely estimated from at least five samples.
 
-    Each parabola counts between its own samples only. Cheap, to tell which of many steps holds
-    the peak; `refine` then finds it.
+    Each sample is the middle of a parabola through its neighbours, corrected at its vertex by the
+    third and fourth differences. Cheap, to tell which of many steps holds the peak; `refine` then
+    finds it.
     """
     before, middle, after = samples[:-2], samples[1:-1], samples[2:]
     slope, bend = (after - before) / 2, after - 2 * middle + before
     inside = jnp.abs(slope) < jnp.abs(bend)
-    top = middle - jnp.where(inside, slope**2 / (2 * jnp.where(inside, bend, 1.0)), 0.0)
+    way = jnp.where(inside, -slope / jnp.where(inside, bend, 1.0), 0.0)
+    fourth = bend[2:] - 2 * bend[1:-1] + bend[:-2]
+    third = (bend[2:] - bend[:-2]) / 2
+    # The outermost stencils lend their differences to the samples beside them.
+    third = jnp.concatenate([third[:1] - fourth[:1], third, third[-1:] + fourth[-1:]])
+    fourth = jnp.concatenate([fourth[:1], fourth, fourth[-1:]])
+    square = way**2 - 1
+    top = middle + way * (slope / 2 + square * (third / 6 + way * fourth / 24))
     return jnp.maximum(jnp.max(jnp.abs(samples), axis=0), jnp.max(jnp.abs(top), axis=0))
 
 
