@@ -58,8 +58,9 @@ def load_windows(record: Record) -> list[tuple[int, float, float]]:
     """Each load seen in the record, by number, with its entry and exit (s), cut to the record."""
     times = np.asarray(record.times)
     paths = [motion(load, record.case.beam.length) for load in record.case.loads]
-    windows = [np.clip([known(t) for t in path.window()], times[0], times[-1]) for path in paths]
-    return [(i, *map(float, window)) for i, window in enumerate(windows) if window[0] < window[1]]
+    windows = np.array([[float(known(t)) for t in path.window()] for path in paths]).reshape(-1, 2)
+    cut = np.clip(windows, times[0], times[-1]).tolist()
+    return [(i, entry, leaves) for i, (entry, leaves) in enumerate(cut) if entry < leaves]
 
 
 def _draw_rig(axes, record):
