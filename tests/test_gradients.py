@@ -1,0 +1,106 @@
+"""Derivatives of what a run gives, by every number of its case, against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.plan import make_plan
+
+# A load that enters over the free end loses contact; the model is bilateral, and smooth in it.
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning"),
+]
+
+TIMES = jnp.linspace(0.0, 0.4, 101)  # loads enter and leave within it
+
+ONE_SPAN = jb.Case(
+    jb.Beam(
+        length=0.6,
+        ends="pinned-clamped",
+        modes=3,
+        damping_ratio=[0.03, 0.02, 0.01],
+        width=0.04,
+        height=0.005,
+        youngs_modulus=2.8e10,
+        density=2675.0,
+    ),
+    sensors=[jb.Sensor(0.25, offset=1e-4), jb.Sensor(0.4, "strain", 2e-6, 0.0025)],
+    loads=[
+        jb.MovingMass(0.4, speed=2.5, entry_time=0.013, deceleration=1.5),
+        jb.MovingForce(force=3.0, times=[0.05, 0.12, 0.2, 0.31], positions=[0.1, 0.2, 0.45, 0.7]),
+    ],
+    run=jb.Run(0.5),
+)
+TWO_SPANS = jb.Case(
+    jb.Beam(1.2, 11.68, 0.535, ends="pinned-free", modes=3, rayleigh_damping=[0.8, 2e-4]),
+    supports=[
+        jb.Support(0.55, damping=1.0, rotational_stiffness=3.0),
+        jb.Support(1.0, stiffness=6e3, damping=5.0, rotational_stiffness=1.0),
+    ],
+    actuators=[
+        jb.Shaker(0.3, stiffness=500.0, damping=8.0, force_per_volt=4.6, bandwidth=900.0),
+        jb.Patch(0.7, 0.85, 8e-4, correction=0.3, added_mass=0.05, added_rigidity=2.0),
+    ],
+    sensors=[jb.Sensor(0.25, offset=1e-4), jb.Sensor(0.8, "velocity", offset=0.01)],
+    loads=[
+        jb.MovingMass(0.4, speed=3.5, entry_time=0.013, deceleration=0.6),
+        jb.MovingMass(0.3, speed=-1.2, entry_time=0.05, deceleration=5.0),  # stops and stays
+    ],
+    run=jb.Run(0.5),
+)
+
+
+class Problem:
+    """Peaks and a misfit as functions of all numbers of a case, in units of their own size."""
+
+    def __init__(self, case):
+        found = jb.addresses(case)
+        entries = [a for a in found if jnp.ndim(found[a]) == 0]
+        values = np.array([found[a] for a in entries])
+        self.case, self.addresses, self.sizes = case, entries, np.where(values == 0, 1, values)
+        self.point = jnp.asarray(values / self.sizes)
+        self.plan = make_plan(case, TIMES)
+        record = jb.simulate(case, TIMES, self.plan)
+        self.peaks = record.peak_deflection
+        self.scale = jnp.std(record.measured, axis=0)
+        self.data = record.measured + self.scale * jnp.cos(jnp.arange(101.0))[:, None]
+        self.value = jax.jit(self.outputs)
+
+    def outputs(self, point):
+        """Peaks (over their own size), and the sum of squares of what the sensors read off data."""
+        case = jb.replace(self.case, dict(zip(self.addresses, point * self.sizes, strict=True)))
+        record = jb.simulate(case, TIMES, self.plan)
+        misfit = jnp.mean(((record.measured - self.data) / self.scale) ** 2)
+        return jnp.append(record.peak_deflection / self.peaks, misfit)
+
+    def differences(self, step=2e-4):
+        """Jacobian (output, number) by central differences, extrapolated from two steps."""
+        columns = []
+        for i in range(self.point.size):
+            one = np.eye(self.point.size)[i]
+            single, double = (
+                (self.value(self.point + h * one) - self.value(self.point - h * one)) / (2 * h)
+                for h in (step, 2 * step)
+            )
+            columns.append((4 * single - double) / 3)
+        return np.array(columns).T
+
+
+@pytest.fixture(scope="module", params=[ONE_SPAN, TWO_SPANS], ids=["one span", "two spans"])
+def problem(request):
+    found = Problem(request.param)
+    found.expected = found.differences()
+    return found
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_gradients_are_those_of_differences(problem, mode):
+    found = jax.jit(mode(problem.outputs))(problem.point)
+    for i, address in enumerate(problem.addresses):
+        expected = problem.expected[:, i]
+        # What hardly depends on a number is only known to the rounding of the outputs.
+        assert_allclose(found[:, i], expected, rtol=1e-6, atol=1e-9, err_msg=address)

@@ -1,0 +1,156 @@
+"""Records: labelled results, their way to a file and back, and what they refuse."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxbeam as jb
+from jaxbeam.record import record_from_xarray
+from jaxbeam.sensors import QUANTITIES
+
+CASE = jb.Case(
+    jb.Beam(1.2, 11.68, 0.535, 0.02, modes=3),
+    supports=[jb.Support(0.5)],
+    sensors=[
+        jb.Sensor(0.25, offset=1e-4),
+        jb.Sensor(0.8, "acceleration", offset=0.5),
+        jb.Sensor(0.8, "strain", fibre_distance=0.0025),
+        jb.Sensor(0.3, "slope"),
+        jb.Sensor(0.3, "velocity"),
+    ],
+    loads=[jb.MovingMass(0.4, speed=4.0), jb.MovingForce(force=3.0, speed=-2.0, entry_time=0.1)],
+    run=jb.Run(0.4, sample_rate=250.0),
+    title="a run for its record",
+)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return jb.simulate(CASE)
+
+
+def test_arrays_have_the_promised_shapes(record):
+    assert record.times.shape == (101,)
+    assert_allclose(record.times, np.arange(101) / 250.0)
+    assert record.coordinates.shape == record.rates.shape == (101, 3)
+    for quantity in (*QUANTITIES, "measured"):
+        assert getattr(record, quantity).shape == (101, 5)
+    assert record.contact_force.shape == record.load_position.shape == (101, 2)
+    assert record.peak_deflection.shape == record.peak_time.shape == (5,)
+
+
+def test_at_gives_every_quantity_anywhere(record):
+    """Slope, strain and rates against differences of the deflection."""
+    x, h = np.array([[0.2, 0.4], [0.7, 1.0]]), 1e-4
+    low, middle, high = (record.at(x + d) for d in (-h, 0.0, h))
+    assert middle.shape == (101, 2, 2)
+    size = np.max(np.abs(middle))
+    assert_allclose(record.at(x, "slope"), (high - low) / (2 * h), rtol=0, atol=1e-5 * size)
+    bend = -0.002 * (high - 2 * middle + low) / h**2
+    assert_allclose(record.at(x, "strain", 0.002), bend, rtol=0, atol=1e-5 * size)
+    assert_allclose(record.at(0.5), 0.0, atol=1e-12 * size)  # a rigid support
+    assert record.at(0.2).shape == (101,)
+    spline = np.gradient(np.asarray(record.at(0.3)), record.times[1])[1:-1]
+    velocity = record.at(0.3, "velocity")[1:-1]
+    assert_allclose(spline, velocity, rtol=0, atol=0.1 * np.max(np.abs(velocity)))
+    spline = np.gradient(np.asarray(record.at(0.3, "velocity")), record.times[1])[1:-1]
+    error = np.abs(spline - record.at(0.3, "acceleration")[1:-1])
+    assert np.median(error) < 0.2 * np.max(np.abs(record.at(0.3, "acceleration")))
+
+
+def test_sensors_read_their_quantity_with_their_offset(record):
+    columns = [
+        record.at(0.25) + 1e-4,
+        record.at(0.8, "acceleration") + 0.5,
+        record.at(0.8, "strain", 0.0025),
+        record.at(0.3, "slope"),
+        record.at(0.3, "velocity"),
+    ]
+    assert_allclose(record.measured, np.array(columns).T, rtol=1e-12)
+    assert_allclose(record.deflection[:, 0], record.at(0.25), rtol=1e-12)
+    assert_allclose(record.strain[:, 2], record.at(0.8, "strain", 0.0025), rtol=1e-12)
+    assert np.isnan(record.strain[:, 0]).all()
+
+
+def test_an_unknown_quantity_is_refused(record):
+    with pytest.raises(ValueError, match="no quantity 'force'; there are deflection"):
+        record.at(0.3, "force")
+    with pytest.raises(ValueError, match="fibre_distance"):
+        record.at(0.3, "strain")
+
+
+def assert_same(found, expected):
+    """Every number of two records is the same, to the last bit."""
+    for name, ours in vars(expected).items():
+        theirs = getattr(found, name)
+        assert jax.tree.structure(ours) == jax.tree.structure(theirs), name
+        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+            assert_array_equal(a, b, err_msg=name)
+
+
+def test_a_dataset_restores_the_record_exactly(record):
+    assert_same(record_from_xarray(record.to_xarray()), record)
+
+
+def test_a_netcdf_file_restores_the_record_exactly(record, tmp_path):
+    path = tmp_path / "run.nc"
+    record.to_netcdf(path)
+    assert_same(jb.read_record(path), record)
+
+
+def test_the_dataset_is_labelled_with_units(record):
+    dataset = record.to_xarray()
+    assert dataset.attrs["title"] == "a run for its record"
+    assert dataset.deflection.dims == ("time", "sensor")
+    assert dataset.sizes == {"time": 101, "sensor": 5, "mode": 3, "load": 2}
+    assert dataset.deflection.attrs["units"] == "m"
+    assert dataset.contact_force.attrs["units"] == "N"
+    assert dataset.time.attrs["units"] == "s"
+    assert list(dataset.sensor.values[:2]) == ["0: deflection", "1: acceleration"]
+    assert all("units" in v.attrs and "long_name" in v.attrs for v in dataset.data_vars.values())
+    assert_array_equal(dataset.deflection.sel(sensor="0: deflection"), record.deflection[:, 0])
+    later = dataset.sel(time=0.1, method="nearest")
+    assert_array_equal(later.measured, record.measured[25])
+
+
+def test_an_existing_file_is_not_overwritten_unasked(record, tmp_path):
+    path = tmp_path / "run.nc"
+    path.write_text("precious")
+    with pytest.raises(FileExistsError, match="exists already"):
+        record.to_netcdf(path)
+    assert path.read_text() == "precious"
+    record.to_netcdf(path, overwrite=True)
+    assert jb.read_record(path).case.title == "a run for its record"
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="not a record of jaxbeam"):
+        record_from_xarray(xarray.Dataset({"deflection": ("time", np.zeros(3))}))
+    with pytest.raises(OSError, match="absent.nc"):
+        jb.read_record(tmp_path / "absent.nc")
+
+
+def test_the_verdict_tells_of_contact_and_error(record):
+    assert record.verdict.startswith("every load presses on the beam throughout; estimated error")
+    nan = jnp.nan
+    lost = eqx.tree_at(
+        lambda r: (r.contact_lost_time, r.contact_lost_position, r.lowest_contact_force),
+        record,
+        (jnp.array([nan, 0.25]), jnp.array([nan, 0.9]), jnp.array([1.0, -0.5])),
+    )
+    assert "load 1 would have to pull, first at t = 0.25 s, x = 0.9 m" in lost.verdict
+    assert "(smallest contact force -0.5 N)" in lost.verdict
+    assert "load 0" not in lost.verdict
+
+
+def test_a_run_without_loads_or_sensors_has_a_record(tmp_path):
+    case = jb.Case(jb.Beam(1.0, 10.0, 1.0, modes=2), run=jb.Run(0.1))
+    record = jb.simulate(case)
+    assert record.deflection.shape == (101, 0) and record.contact_force.shape == (101, 0)
+    assert not np.any(record.coordinates)
+    record.to_netcdf(tmp_path / "nothing.nc")
+    assert_same(jb.read_record(tmp_path / "nothing.nc"), record)
