@@ -64,7 +64,7 @@ def test_two_spans_obey_the_three_moment_condition(ratio):
     assert_allclose(found, two_span_parameters(ratio, 12), rtol=1e-12)
 
 
-TABLE = [  # k times the length of a span; see tests/data/README.md
+TABLE = [  # k times the length of a span; source: independent reference tables
     (1, "clamped-free", [1.8751041, 4.6940911, 7.8547574, 10.9955407, 14.1371684]),
     (1, "free-free", [0.0, 0.0, 4.7300407, 7.8532046, 10.9956078, 14.1371655, 17.2787597]),
     (2, "pinned-pinned", [3.141593, 3.926602, 6.283185, 7.068583]),
@@ -162,6 +162,7 @@ def random_beams(draw) -> Case:
     return Case(Beam(1.3, **STUFF, ends=draw(st.sampled_from(PAIRS)), modes=5), [support], patches)
 
 
+@pytest.mark.slow
 @given(random_beams())
 @hypothesis.settings(max_examples=10)
 def test_random_beams_have_exact_frequencies(case):
@@ -279,15 +280,21 @@ NUMBERS = [
 ]  # fmt: skip
 
 
-def assert_derivatives(function, size: int, rtol: float = 1e-6, step: float = 1e-3) -> None:
-    """Forward and reverse mode against central differences, at zero, each result on its scale."""
-    expected = central(function, np.zeros(size), step)
+def assert_derivatives(function, size: int, floor: float = 0.0) -> None:
+    """Forward and reverse mode against central differences, at zero, each result on its scale.
+
+    What is smaller than `floor` times the largest, and so only rounding, is on that scale.
+    """
+    expected = central(function, np.zeros(size), 1e-3)
     scale = np.abs(expected).max(axis=1, keepdims=True)
+    scale = np.maximum(scale, floor * scale.max())
+    scale = np.where(scale > 0, scale, 1.0)
     for jacobian in (jax.jacfwd, jax.jacrev):
         found = jax.jit(jacobian(function))(jnp.zeros(size))
-        assert_allclose(found / scale, expected / scale, rtol=rtol, atol=1e-9)
+        assert_allclose(found / scale, expected / scale, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "numbers"),
     [
@@ -323,7 +330,7 @@ def flexibility(found: Modes, x) -> jax.Array:
     return (shapes @ jnp.linalg.solve(dynamic, shapes.T))[jnp.triu_indices(x.shape[0])]
 
 
-def crossing() -> Case:
+def crossing(**damping) -> Case:
     """A pinned beam whose midspan spring lifts the first mode into the second.
 
     The second has its node there. At its wavenumber b = 2 pi / L the deflection at midspan under
@@ -331,7 +338,7 @@ def crossing() -> Case:
     """
     wave = 2 * np.pi / 1.2
     spring = 4 * 11.68 * wave**3 / np.tanh(np.pi)
-    return Case(Beam(1.2, **STUFF, modes=6, damping_ratio=0.1), [Support(0.6, spring)])
+    return Case(Beam(1.2, **STUFF, modes=6, **damping), [Support(0.6, spring)])
 
 
 def decoupled(**damping) -> Case:
@@ -344,7 +351,10 @@ FREE = Case(
     actuators=[Patch(0.2, 0.5, 1.0, added_mass=0.2, added_rigidity=3.0)],
 )
 REPEATED = {
-    "crossing": (crossing(), ["supports.0.position", "supports.0.stiffness", "beam.length"]),
+    "crossing": (
+        crossing(damping_ratio=0.1),
+        ["supports.0.position", "supports.0.stiffness", "beam.length"],
+    ),
     "decoupled": (decoupled(damping_ratio=0.1), ["supports.0.position", "beam.length"]),
     "rayleigh": (
         decoupled(rayleigh_damping=[0.3, 1e-4]),
@@ -367,24 +377,26 @@ def response(case: Case, numbers: list[str]):
     return function
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REPEATED)
 def test_responses_have_derivatives_where_frequencies_are_repeated(name):
     case, numbers = REPEATED[name]
     assert bool(solve(case).repeated)
-    assert_derivatives(response(case, numbers), len(numbers))
+    # Spans that a stiff spring keeps apart answer each other with 1e-11 of their own response.
+    assert_derivatives(response(case, numbers), len(numbers), floor=1e-4)
 
 
-@pytest.mark.parametrize("name", ["crossing", "decoupled"])
-def test_second_derivatives_where_frequencies_are_repeated(name):
-    case, numbers = REPEATED[name]
-    if name == "decoupled":
-        case = decoupled()  # a damping ratio's matrix square root is differentiated once only
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [crossing(), decoupled()], ids=["crossing", "decoupled"])
+def test_second_derivatives_where_frequencies_are_repeated(case):
+    """Undamped: a damping ratio goes with the root of the stiffness, right to first order only."""
+    numbers = ["supports.0.position", "beam.length"]
     function = response(case, numbers)
     slope = jax.jit(jax.jacfwd(function))
     found = jax.jit(jax.jacfwd(jax.jacfwd(function)))(jnp.zeros(len(numbers)))
     expected = central(lambda p: slope(p).reshape(-1), np.zeros(len(numbers)), 1e-3)
     scale = np.abs(expected).max()
-    assert_allclose(found.reshape(expected.shape) / scale, expected / scale, atol=1e-6)
+    assert_allclose(found.reshape(expected.shape), expected, rtol=0, atol=1e-6 * scale)
 
 
 def test_a_free_beam_feels_the_first_newton_per_metre_that_holds_it():
