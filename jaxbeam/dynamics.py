@@ -82,6 +82,8 @@ def solve_contact(gains, inertia, drive):
     zero. Spelt out, because the compiler then keeps small systems in registers.
     """
     size = gains.shape[0]
+    if size == 0:
+        return drive
     rows = [inertia[i] * gains[i][:, None] for i in range(size)]
     rows = [row.at[i].add(1.0) for i, row in enumerate(rows)] if size > 8 else rows
     if size > 8:
@@ -94,7 +96,7 @@ def solve_contact(gains, inertia, drive):
             for j in range(i + 1, size):
                 matrix[k][j] = matrix[k][j] - factor * matrix[i][j]
             right[k] = right[k] - factor * right[i]
-    forces = [right[0]] * size
+    forces = list(right)
     for i in reversed(range(size)):
         rest = sum((matrix[i][j] * forces[j] for j in range(i + 1, size)), jnp.zeros_like(right[i]))
         forces[i] = (right[i] - rest) / matrix[i][i]

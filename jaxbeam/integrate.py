@@ -115,7 +115,7 @@ def _tabulate(rig: Rig, traffic: Traffic, grid: Grid, rigging: Rigging, slots: i
         step.drift_end,
         push.reshape(steps, rig.states, size),
         rigging.watch[kind].reshape(steps, -1, rig.states),
-        seen.reshape(steps, -1, size),
+        seen.reshape(steps, seen.shape[1], size),
         chosen,
         active.astype(float),
     )
@@ -132,9 +132,7 @@ def _advance(state, tables: Tables, inertia, weight):
     on = tables.active[:, None]
     inertia = jnp.repeat(inertia[tables.slots] * on, nodes, axis=0)
     weight = jnp.repeat(weight[tables.slots] * on, nodes, axis=0)
-    forces = solve_contact(
-        tables.gains, inertia, weight + inertia * (tables.respond @ state)
-    )
+    forces = solve_contact(tables.gains, inertia, weight + inertia * (tables.respond @ state))
     blocks, side, _ = tables.drift.shape
     split = state.reshape(blocks, side, -1)
     if side == 2:
@@ -168,8 +166,8 @@ def _reduce(best: Extremes, tables: Tables, states, forces, start, span) -> Extr
         jnp.where(better, chosen, best.samples),
         jnp.where(better, start[top], best.start),
         jnp.where(better, span[top], best.span),
-        jnp.minimum(best.lowest, jnp.min(least, axis=(0, 1, 2))),
-        jnp.minimum(best.lost, jnp.min(lost, axis=(0, 1, 2))),
+        jnp.minimum(best.lowest, jnp.min(least, axis=(0, 1, 2), initial=jnp.inf)),
+        jnp.minimum(best.lost, jnp.min(lost, axis=(0, 1, 2), initial=NEVER)),
     )
 
 
@@ -222,7 +220,7 @@ def march(
 
         firsts = jnp.arange(0, steps, CHUNK)
         (state, best), kept = jax.lax.scan(jax.checkpoint(whole), (rest, best), firsts)
-        states, forces = (part.reshape(-1, *part.shape[2:])[:steps] for part in kept)
+        states, forces = (jax.lax.collapse(part, 0, 2)[:steps] for part in kept)
         return best, jnp.concatenate([states, state[None]]), forces
 
     flexibility = _flexibility(rig, watched)

@@ -121,6 +121,15 @@ class Record(eqx.Module):
             name: (dims, np.asarray(getattr(self, name)), {"units": unit, "long_name": words})
             for name, (dims, unit, words) in _VARIABLES.items()
         }
+        # Found anew, the modes of repeated frequencies might be turned.
+        variables |= {
+            f"mode_{name}": (
+                dims,
+                np.asarray(getattr(self.modes, name)),
+                {"units": unit, "long_name": words},
+            )
+            for name, (dims, unit, words) in _OF_MODES.items()
+        }
         coordinates = {
             "time": ("time", np.asarray(self.times), {"units": "s"}),
             "sensor": ("sensor", sensor_labels(self.case)),
@@ -142,7 +151,10 @@ class Record(eqx.Module):
         """
         if not overwrite and os.path.exists(path):
             raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
-        self.to_xarray().to_netcdf(path, engine="scipy")
+        dataset = self.to_xarray()
+        empty = [name for name, variable in dataset.variables.items() if variable.size == 0]
+        # The format takes an empty axis for an unlimited one.
+        dataset.drop_vars(empty).to_netcdf(path, engine="scipy")
 
 
 _VARIABLES = {
@@ -161,6 +173,15 @@ _VARIABLES = {
     "contact_lost_time": (("load",), "s", "first time at which the load would have to pull"),
     "contact_lost_position": (("load",), "m", "where the load would first have to pull"),
 }
+_OF_MODES = {
+    "stiffness": (("mode",), "1/s^2", "stiffness of the mode"),
+    "damping": (("mode",), "1/s", "damping of the mode"),
+    "coupling": (("mode", "other_mode"), "1/s^2", "stiffness between repeated modes"),
+    "damping_coupling": (("mode", "other_mode"), "1/s", "damping between repeated modes"),
+    "nodes": (("node",), "m", "where the segments of the mode shapes meet"),
+    "series": (("segment", "degree", "mode"), "kg^-0.5", "Chebyshev series of the mode shapes"),
+    "unit": ((), "1/s^2", "flexural rigidity / (mass per length x length^4)"),
+}
 _STORED = [name for name in _VARIABLES if name in Record.__annotations__]
 
 
@@ -169,16 +190,29 @@ def record_from_xarray(dataset: xarray.Dataset) -> Record:
 
     Raises ValueError if the dataset was not made by a record.
     """
-    from jaxbeam.modes import modes
-
-    absent = [name for name in (*_STORED, "time") if name not in dataset.variables]
-    if absent or "case" not in dataset.attrs:
-        raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(absent) or 'its case'}")
+    if "case" not in dataset.attrs:
+        raise ValueError("not a record of jaxbeam: it lacks its case")
     case = case_from_dict(json.loads(dataset.attrs["case"]))
+    # A file does not hold what there is no sensor or load for.
+    sizes = {"sensor": len(case.sensors), "load": len(case.loads), **dataset.sizes}
+    shapes = {name: [sizes.get(d, 0) for d in _VARIABLES[name][0]] for name in _STORED}
+    empty = {
+        name: (_VARIABLES[name][0], np.zeros(shape))
+        for name, shape in shapes.items()
+        if 0 in shape and name not in dataset.variables
+    }
+    dataset = dataset.assign(empty)
+    of_modes = {name: f"mode_{name}" for name in _OF_MODES}
+    wanted = (*_STORED, *of_modes.values(), "time")
+    absent = [name for name in wanted if name not in dataset.variables]
+    if absent:
+        raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(absent)}")
     values = {name: jnp.asarray(dataset[name].values) for name in _STORED}
     return Record(
         case=case,
-        modes=modes(case),
+        modes=Modes(
+            **{name: jnp.asarray(dataset[label].values) for name, label in of_modes.items()}
+        ),
         times=jnp.asarray(dataset["time"].values),
         error_estimate=jnp.asarray(float(dataset.attrs["error_estimate"])),
         steps=int(dataset.attrs["steps"]),

@@ -4,6 +4,7 @@ import dataclasses
 import warnings
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -118,7 +119,7 @@ def _outputs(rig: Rig, loads: Traffic, windows, times, states):
     weight = jnp.where(active, loads.weight[:, 0], 0.0)
     # The contact law at one instant: (1 + m S S') r = -W - m (contact row) . z.
     drive = weight + mass * jnp.einsum("tlbi,tbi->tl", rows, split)
-    shape = shape.reshape(*position.shape, -1)
+    shape = jax.lax.collapse(shape, 2)
     matrix = jnp.eye(len(loads.motions)) + mass[:, :, None] * (shape @ shape.mT)
     force = -jnp.linalg.solve(matrix, drive[..., None])[..., 0]
     size = 2 * shape.shape[-1]

@@ -72,7 +72,7 @@ def load_of(load: Load):
     )
 
 
-def plan_of(case: jb.Case, substeps: int = 4, even: bool = True, slots: int | None = None) -> Plan:
+def plan_of(case: jb.Case, substeps: int = 12, even: bool = True, slots: int | None = None) -> Plan:
     """A plan with a given number of steps a sample, which spares the search for it."""
     shape = form(case)
     shape = dataclasses.replace(shape, slots=slots or shape.slots)
@@ -324,7 +324,6 @@ UNDAMPED = dataclasses.replace(SPAN, damping_ratio=0.0)
 def test_a_moving_force_has_its_closed_form_at_every_speed(one_force, ratio):
     record = one_force(ratio * critical_speed(UNDAMPED))
     q, u = moving_force(UNDAMPED, 3.0, ratio * critical_speed(UNDAMPED), np.asarray(record.times))
-    assert_close(record.coordinates, q * np.sign(record.coordinates[50] / q[50]), 1e-10)
     assert_close(record.deflection, q @ UNDAMPED.shapes(np.array(SENSORS)).T, 1e-10)
     assert_close(record.velocity, u @ UNDAMPED.shapes(np.array(SENSORS)).T, 1e-10)
 
@@ -352,16 +351,21 @@ def test_a_light_mass_of_the_same_weight_tends_to_the_force(one_mass):
 
 
 def test_a_slow_mass_bends_the_beam_statically(one_mass):
-    """Linearly in speed, as damping delays the beam; halving the speed twice takes that out."""
-    places = np.linspace(0.3, 0.45, 101)  # after the vibration of the entry has died out
-    slow, slower = (
-        one_mass(Load(0.3, v, entry_time=-0.3 / v), times=(places - 0.3) / v) for v in (0.02, 0.01)
+    """Damping delays the beam in proportion to the speed, inertia to its square."""
+    places = np.linspace(0.3, 0.45, 101)  # put on the middle, and calm for the last third of these
+    first, second, third = (
+        one_mass(
+            Load(0.3, v, entry_time=-0.3 / v),
+            times=(places - 0.3) / v,
+            **{"beam.damping_ratio": 0.2},
+        ).deflection
+        for v in (0.08, 0.04, 0.02)
     )
+    extrapolated = (first - 6 * second + 8 * third) / 3
     weight = 0.3 * GRAVITY
     shapes = SPAN.shapes(np.array(SENSORS)) / SPAN.frequencies**2
     static = -weight * SPAN.shapes(places) @ shapes.T
     calm = slice(70, None)
-    extrapolated = 2 * slower.deflection - slow.deflection
     assert_close(extrapolated[calm], static[calm], 1e-6)
     exact = [influence_line(0.6, 11.68, "pinned-pinned", x, places[calm]) for x in SENSORS]
     assert_close(extrapolated[calm], weight * np.array(exact).T, 5e-3)  # four modes of all
@@ -372,24 +376,23 @@ def test_a_slow_mass_bends_the_beam_statically(one_mass):
 
 def test_modal_energy_changes_by_the_work_of_the_contact_force_and_by_damping():
     """At Gauss points of the time on the beam, which are given, uneven times."""
+    span = dataclasses.replace(SPAN, modes=2)
     load, pieces = Load(0.4, 2.0), np.linspace(0.0, 0.3, 31)
-    nodes, weights = np.polynomial.legendre.leggauss(8)
+    nodes, weights = np.polynomial.legendre.leggauss(12)
     half = np.diff(pieces) / 2
     inner = (pieces[:-1] + half)[:, None] + half[:, None] * nodes
     times = np.concatenate([[0.0], inner.ravel(), [0.3 - 1e-12]])
     quadrature = np.concatenate([[0.0], np.outer(half, weights).ravel(), [0.0]])
-    case = case_of(SPAN, [load])
+    case = case_of(span, [load])
     record = jb.simulate(case, jnp.asarray(times), plan_of(case, substeps=1, even=False))
-    expected = modal_equations.respond(SPAN, [load], SENSORS, times)
+    expected = modal_equations.respond(span, [load], SENSORS, times)
     assert_close(record.deflection, expected.deflection, 1e-9)
 
-    q, u = np.asarray(expected.modal), np.asarray(record.rates)
-    signs = np.sign(record.coordinates[100] / q[100])
-    q, u = np.asarray(record.coordinates) * signs, u * signs
-    energy = np.sum(u**2 + SPAN.frequencies**2 * q**2, axis=1) / 2
-    under = np.sum(u * SPAN.shapes(np.asarray(record.load_position[:, 0])), axis=1)
+    q, u = np.asarray(record.coordinates), np.asarray(record.rates)
+    energy = np.sum(u**2 + span.frequencies**2 * q**2, axis=1) / 2
+    under = np.sum(u * record.modes.shapes(record.load_position[:, 0]), axis=1)
     work = quadrature @ (-record.contact_force[:, 0] * under)
-    dissipated = quadrature @ np.sum(2 * SPAN.damping_ratio * SPAN.frequencies * u**2, axis=1)
+    dissipated = quadrature @ np.sum(2 * span.damping_ratio * span.frequencies * u**2, axis=1)
     assert_allclose(energy[-1] + dissipated, work, rtol=1e-9)
     assert dissipated > 0.01 * work
 
@@ -420,7 +423,7 @@ def test_a_lost_contact_is_reported_once(one_mass):
     first = fine[np.argmax(force < 0)]
     assert force.min() < -1.0
     # It is looked for at the nodes of the steps.
-    step = 0.2 / 400
+    step = 0.2 / 1200
     assert first - 1e-5 <= record.contact_lost_time[0] < first + step
     assert_allclose(record.contact_lost_position[0], 8.0 * record.contact_lost_time[0], rtol=1e-12)
     assert_allclose(record.lowest_contact_force[0], force.min(), rtol=0.01)
@@ -440,35 +443,48 @@ def test_peaks_are_those_between_samples(one_mass, speed):
     load = Load(0.2, speed, 0.013)
     record = one_mass(load)
     fine = np.linspace(0.0, 1.0, 40001)
-    deflection = modal_equations.respond(SPAN, [load], SENSORS, fine).deflection
-    assert_allclose(record.peak_deflection, np.max(np.abs(deflection), axis=0), rtol=1e-7)
-    when = fine[np.argmax(np.abs(deflection), axis=0)]
-    assert_allclose(record.peak_time, when, rtol=0, atol=1e-4)
+    deflection = np.abs(modal_equations.respond(SPAN, [load], SENSORS, fine).deflection)
+    assert_allclose(record.peak_deflection, vertex(deflection), rtol=1e-9)
+    when = fine[np.argmax(deflection, axis=0)]
+    assert_allclose(record.peak_time, when, rtol=0, atol=fine[1])
+
+
+def vertex(samples: np.ndarray) -> np.ndarray:
+    """Height of the parabola through the largest sample and its neighbours, for each column."""
+    top, column = np.argmax(samples, axis=0), np.arange(samples.shape[1])
+    before, middle, after = (samples[top + d, column] for d in (-1, 0, 1))
+    return middle - (after - before) ** 2 / (8 * (before - 2 * middle + after))
 
 
 def test_samples_depend_neither_on_the_time_step_nor_on_the_sample_rate(one_mass):
     load = Load(0.3, 2.0, 0.013, deceleration=1.0)
     case = case_of(SPAN, [load])
     record = one_mass(load)
-    other = jb.simulate(case, jnp.asarray(TIMES[10::2]), dataclasses.replace(plan_of(case), lead=5))
+    plan = dataclasses.replace(plan_of(case, substeps=30), lead=5)  # back to the start
+    other = jb.simulate(case, jnp.asarray(TIMES[10::2]), plan)
     assert_close(other.deflection, record.deflection[10::2], 1e-10)
     assert_close(other.contact_force, record.contact_force[10::2], 1e-9)
     assert_allclose(other.peak_deflection, record.peak_deflection, rtol=1e-9)
 
 
 def test_the_integrator_converges_with_twice_the_order_of_its_nodes():
-    case = jb.replace(case_of(SPAN, [Load(0.5, 1.5)]), {"run.duration": 0.32})  # still on the beam
+    """To the state of the modal equations, with the mass still on the beam."""
+    span, load = dataclasses.replace(SPAN, modes=2), Load(0.5, 1.5)
+    case = jb.replace(case_of(span, [load]), {"run.duration": 0.32})
+    shape = form(case)
 
     @eqx.filter_jit
     def end(longest):
-        assembled = rig(case, form_of.layout, form_of.coupled)
+        assembled = rig(case, shape.layout, shape.coupled)
         grid = even_grid(case, assembled, longest)
         return march(assembled, traffic(case), grid, jnp.array(SENSORS), slots=1)[1][:, 0]
 
-    form_of = form(case)
-    states = [np.asarray(end(jnp.array(0.32 / n))) for n in (8, 12, 16, 24, 200)]
-    errors = [np.max(np.abs(state - states[-1]) / np.abs(states[-1])) for state in states[:-1]]
-    print(errors)
+    counts = np.array([24, 32, 48, 64])
+    expected = modal_equations.respond(span, [load], SENSORS, np.array([0.0, 0.32])).modal[1]
+    ends = [np.abs(end(jnp.array(0.32 / n)))[0:4:2] for n in counts]
+    errors = [np.max(np.abs(found - np.abs(expected))) / np.abs(expected).max() for found in ends]
+    order = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
+    assert 11 < order < 13
 
 
 # Bad times
@@ -478,7 +494,6 @@ def test_the_integrator_converges_with_twice_the_order_of_its_nodes():
     ("times", "complaint"),
     [
         ([0.0], "at least two"),
-        ([[0.0, 1.0]], "at least two"),
         ([0.0, 0.2, 0.1], "ascend"),
         ([0.0, np.nan], "finite"),
     ],
