@@ -1,0 +1,142 @@
+"""Logs and the case that is to explain them, made ready for a fit."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.case import Case, replace
+from jaxbeam.checks import check
+from jaxbeam.loads import motion
+from jaxbeam.plan import Plan, make_plan
+from jaxbeam.simulate import simulate
+from tuning.free import insert
+from tuning.logs import Log
+
+
+@dataclasses.dataclass(frozen=True)
+class Campaign:
+    """Logs with the case of each: logs alike in structure share one compiled simulation.
+
+    Logs are padded to the longest with equally spaced times, `counts` says how many samples are
+    real. Samples are (log, time, channel).
+    """
+
+    cases: list[Case]
+    logs: list[Log]
+    plan: Plan
+    times: Float[np.ndarray, "log time"]
+    measured: Float[np.ndarray, "log time channel"]
+    real: Float[np.ndarray, "log time"]
+
+    def predict(self, values: dict[str, Float[Array, ""]]) -> Float[Array, "log time channel"]:
+        """What the sensors read in every log, with given values at the free addresses."""
+        cases = [insert(case, i, values) for i, case in enumerate(self.cases)]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
+
+        def one(case, times):
+            return simulate(case, times, plan=self.plan).measured
+
+        if len(cases) == 1:
+            return one(cases[0], jnp.asarray(self.times[0]))[None]
+        return eqx.filter_vmap(one)(stacked, jnp.asarray(self.times))
+
+
+def case_of_log(case: Case, log: Log) -> Case:
+    """The case as it was during a log: with the loads that crossed, until its end."""
+    if log.loads is not None:
+        case = dataclasses.replace(case, loads=tuple(log.loads))
+    return replace(case, {"run.duration": float(log.times[-1])})
+
+
+def prepare(case: Case, logs: list[Log], tolerance: float = 1e-5) -> Campaign:
+    """Check logs against the case and bring them to one shape.
+
+    Raises ValueError, naming the log, if its channels do not match the sensors, no load is known,
+    it ends before the first load has crossed, or logs differ too much to be fitted together.
+    """
+    if not logs:
+        raise ValueError("give at least one log")
+    check(case)
+    cases = [case_of_log(case, log) for log in logs]
+    ordered = [_at_sensors(case, log) for log in logs]
+    for log, own in zip(logs, cases, strict=True):
+        _check_loads(log, own)
+    shapes = {jax.tree.structure(own) for own in cases}
+    if len(shapes) > 1:
+        raise ValueError(
+            "the logs differ in the kind or number of their loads; fit them apart, or give all "
+            "the same (a mass of 1e-9 kg does no harm)"
+        )
+    spacings = [np.diff(log.times).mean() for log in logs]
+    count = max(log.times.size for log in logs)
+    times, measured, real = [], [], []
+    for log, values, spacing in zip(logs, ordered, spacings, strict=True):
+        more = count - log.times.size
+        times.append(np.append(log.times, log.times[-1] + spacing * np.arange(1, more + 1)))
+        measured.append(np.pad(values, ((0, more), (0, 0))))
+        real.append(np.arange(count) < log.times.size)
+    plans = [make_plan(own, jnp.asarray(t), tolerance) for own, t in zip(cases, times, strict=True)]
+    if len({plan.form.layout for plan in plans}) > 1:
+        raise ValueError("the logs differ in the order of places along the beam; fit them apart")
+    form = dataclasses.replace(
+        plans[0].form,
+        slots=max(plan.form.slots for plan in plans),
+        coupled=any(plan.form.coupled for plan in plans),
+    )
+    plan = dataclasses.replace(
+        plans[0],
+        form=form,
+        substeps=max(plan.substeps for plan in plans),
+        lead=max(plan.lead for plan in plans),
+        even=all(plan.even for plan in plans),
+    )
+    return Campaign(cases, logs, plan, np.array(times), np.array(measured), np.array(real, float))
+
+
+def _at_sensors(case: Case, log: Log) -> Float[np.ndarray, "time sensor"]:
+    """The channels of a log in the order of the case's sensors."""
+    sensors = case.sensors
+    if not sensors:
+        raise ValueError("the case has no sensors to compare the logs with")
+    given = [i for i, sensor in enumerate(log.sensors) if sensor is not None]
+    order = {log.sensors[i]: i for i in given} if given else dict(enumerate(range(len(log.names))))
+    if sorted(order) != list(range(len(sensors))):
+        raise ValueError(
+            f"{log.source}: its channels {', '.join(log.names)} do not match the case's "
+            f"{len(sensors)} sensors; name `sensor` for each column in the TOML file beside it"
+        )
+    for number, channel in order.items():
+        quantity = sensors[number].quantity
+        if log.quantities[channel] != quantity:
+            raise ValueError(
+                f"{log.source}: {log.names[channel]} is a {log.quantities[channel]} in "
+                f"{log.units[channel]}, but sensors.{number} measures {quantity}"
+            )
+    return log.values[:, [order[i] for i in range(len(sensors))]]
+
+
+def _check_loads(log: Log, case: Case) -> None:
+    if not case.loads:
+        raise ValueError(
+            f"{log.source}: no load is known, neither in the case nor in the TOML file beside the "
+            "log; without loads, only modes can be identified (leave out --free)"
+        )
+    exits = [float(motion(load, case.beam.length).window()[1]) for load in case.loads]
+    entries = [float(motion(load, case.beam.length).window()[0]) for load in case.loads]
+    end = float(log.times[-1])
+    if end < min(entries):
+        raise ValueError(
+            f"{log.source}: it ends at {end:.4g} s, before the first load enters at "
+            f"{min(entries):.4g} s"
+        )
+    crossing = [leave for leave in exits if np.isfinite(leave) and leave < 1e200]
+    if crossing and end < min(crossing):
+        raise ValueError(
+            f"{log.source}: it ends at {end:.4g} s, before the first load has crossed at "
+            f"{min(crossing):.4g} s; check the load's speed and entry time"
+        )
+
