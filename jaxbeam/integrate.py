@@ -99,31 +99,50 @@ def _tabulate(rig: Rig, traffic: Traffic, grid: Grid, rigging: Rigging, slots: i
         chosen = jnp.broadcast_to(jnp.arange(slots), active.shape)
     on = jnp.broadcast_to(active[:, :, None], position.shape)
     shape, rows = contact_rows(rig, position, speed, acceleration, on)
-    step = jax.tree.map(lambda table: table[kind], rigging.step)
-    steps, nodes = index.shape[0], len(GAUSS)
+
+    def alike(_):
+        return _tables_of_kind(rigging, kind[0], shape, rows)
+
+    def one_by_one(_):
+        def single(step):
+            kind, shape, rows = step
+            tables = _tables_of_kind(rigging, kind, shape[None], rows[None])
+            return jax.tree.map(lambda table: table[0], tables)
+
+        return jax.lax.map(single, (kind, shape, rows))
+
+    # Mostly all steps of a chunk are equally long, and then share their propagators.
+    tables = jax.lax.cond(jnp.all(kind == kind[0]), alike, one_by_one, None)
+    return Tables(*tables, chosen, active.astype(float)), start, span
+
+
+def _tables_of_kind(rigging: Rigging, kind, shape, rows):
+    """Tables of steps of one length, from the shape and contact rows (step, slot, node, ...)."""
+    step, watch, watch_push = jax.tree.map(
+        lambda table: table[kind], (rigging.step, rigging.watch, rigging.watch_push)
+    )
+    steps, slots, nodes = shape.shape[:3]
     size = slots * nodes
-    respond = _across(rows, step.drift_nodes, "tpcbi,tcbij->tpcbj")
-    felt = _across(rows, step.push_nodes, "tpcbi,tcfbim->tpcfbm")
+    states = rows.shape[3] * rows.shape[4]
+    respond = jnp.einsum("tpcbi,cbij->tpcbj", rows, step.drift_nodes)
+    felt = jnp.einsum("tpcbi,cfbim->tpcfbm", rows, step.push_nodes)
     gains = jnp.einsum("tpcfbm,tqfbm->tpcqf", felt, shape)
     direct = jnp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
     gains = gains + direct[..., None] * np.eye(nodes)[:, None, :]
-    push = _across(shape, step.push_end, "tqfbm,tfbim->tbiqf")
-    seen = jnp.einsum("tlfbm,tqfbm->tlqf", rigging.watch_push[kind], shape)
-    tables = Tables(
-        respond.reshape(steps, size, rig.states),
+    push = jnp.einsum("tqfbm,fbim->tbiqf", shape, step.push_end)
+    seen = jnp.einsum("lfbm,tqfbm->tlqf", watch_push, shape)
+
+    def each(table):
+        return jnp.broadcast_to(table, (steps, *table.shape))
+
+    return (
+        respond.reshape(steps, size, states),
         gains.reshape(steps, size, size),
-        step.drift_end,
-        push.reshape(steps, rig.states, size),
-        rigging.watch[kind].reshape(steps, -1, rig.states),
-        seen.reshape(steps, seen.shape[1], size),
-        chosen,
-        active.astype(float),
+        each(step.drift_end),
+        push.reshape(steps, states, size),
+        each(watch.reshape(watch.shape[0], states)),
+        seen.reshape(steps, watch.shape[0], size),
     )
-    return tables, start, span
-
-
-def _across(rows, table, rule):
-    return jnp.einsum(rule, rows, table)
 
 
 def _advance(state, tables: Tables, inertia, weight):
