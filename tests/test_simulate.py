@@ -352,7 +352,7 @@ def test_a_light_mass_of_the_same_weight_tends_to_the_force(one_mass):
 
 def test_a_slow_mass_bends_the_beam_statically(one_mass):
     """Damping delays the beam in proportion to the speed, inertia to its square."""
-    places = np.linspace(0.3, 0.45, 101)  # put on the middle, and calm for the last third of these
+    places = np.linspace(0.3, 0.45, 101)  # put on the middle, and calm towards the end of these
     first, second, third = (
         one_mass(
             Load(0.3, v, entry_time=-0.3 / v),
@@ -365,8 +365,8 @@ def test_a_slow_mass_bends_the_beam_statically(one_mass):
     weight = 0.3 * GRAVITY
     shapes = SPAN.shapes(np.array(SENSORS)) / SPAN.frequencies**2
     static = -weight * SPAN.shapes(places) @ shapes.T
-    calm = slice(70, None)
-    assert_close(extrapolated[calm], static[calm], 1e-6)
+    calm = slice(85, None)
+    assert_close(extrapolated[calm], static[calm], 1e-7)
     exact = [influence_line(0.6, 11.68, "pinned-pinned", x, places[calm]) for x in SENSORS]
     assert_close(extrapolated[calm], weight * np.array(exact).T, 5e-3)  # four modes of all
 
