@@ -45,9 +45,7 @@ def traffic(case: Case) -> Traffic:
     inertia = [load.inertia() for load in case.loads]
     weight = [load.weight(gravity) for load in case.loads]
     column = (len(motions), 1)
-    return Traffic(
-        motions, jnp.array(inertia).reshape(column), jnp.array(weight).reshape(column)
-    )
+    return Traffic(motions, jnp.array(inertia).reshape(column), jnp.array(weight).reshape(column))
 
 
 def contact_rows(rig: Rig, position, speed, acceleration, active):
@@ -57,9 +55,7 @@ def contact_rows(rig: Rig, position, speed, acceleration, active):
     where it is not, the rows are zero.
     """
     inside = jnp.where(active, position, 0.0)
-    shape, slope, curvature = jnp.where(
-        active[..., None], rig.shapes(inside, (0, 1, 2)), 0.0
-    )
+    shape, slope, curvature = jnp.where(active[..., None], rig.shapes(inside, (0, 1, 2)), 0.0)
     speed, acceleration = speed[..., None], acceleration[..., None]
     convected = speed**2 * curvature + acceleration * slope
     travelling = 2 * speed * slope

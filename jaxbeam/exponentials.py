@@ -80,13 +80,16 @@ def _balance(rig: Rig):
     return jax.lax.stop_gradient(scale)
 
 
-def propagators(rig: Rig, lengths: Float[Array, " *length"]) -> Step:
-    """Propagators of the rig over steps of the given lengths (s), zero included."""
+def propagators(rig: Rig, lengths: Float[Array, " *length"], points: int = 0) -> Step:
+    """Propagators of the rig over steps of the given lengths (s), zero included.
+
+    `points` is the number of equal intervals at whose ends the state is wanted within a step.
+    """
     balance = _balance(rig)
     side, each = rig.state_matrix.shape[1], rig.modes_per_block
     matrix = rig.state_matrix * balance[:, :, None] / balance[:, None, :]
     force = np.eye(side)[:, 1 : 2 * each : 2]  # speeds are not scaled
-    fractions = np.concatenate([GAUSS, np.arange(POINTS + 1) / POINTS])
+    fractions = np.concatenate([GAUSS, np.arange(points) / max(points, 1), [1.0]])
     spans = lengths[..., None] * fractions
     x = matrix * spans[..., None, None, None] / 2**DOUBLINGS
     drift, pushes = _series(x, force)
@@ -97,7 +100,7 @@ def propagators(rig: Rig, lengths: Float[Array, " *length"]) -> Step:
     push = jnp.einsum("cfp,p...cbsm->...cfbsm", weights, pushes)
     push = push * spans[..., None, None, None, None] / balance[:, :, None]
     drift = drift * balance[:, None, :] / balance[:, :, None]
-    end = NODES + POINTS
+    end = NODES + points
     at = jnp.moveaxis(drift, -4, 0), jnp.moveaxis(push, -5, 0)
     nodes = (jnp.moveaxis(part[:NODES], 0, axis) for part, axis in zip(at, (-4, -5), strict=True))
     points = (jnp.moveaxis(part[NODES:], 0, axis) for part, axis in zip(at, (-4, -5), strict=True))

@@ -52,8 +52,8 @@ class Tables(eqx.Module):
     gains: Float[Array, "step row row"]
     drift: Float[Array, "step block side side"]
     push: Float[Array, "step state row"]
-    watch: Float[Array, "step looked state"]
-    watch_push: Float[Array, "step looked row"]
+    watch: Float[Array, "step looked state"] | None
+    watch_push: Float[Array, "step looked row"] | None
     slots: Int[Array, "step slot"]
     active: Float[Array, "step slot"]
 
@@ -62,12 +62,14 @@ class Rigging(eqx.Module):
     """Propagators of the rig on a grid, and the rows that give the watched deflections."""
 
     step: Step
-    watch: Float[Array, "length looked block side"]
-    watch_push: Float[Array, "length looked force block mode"]
+    watch: Float[Array, "length looked block side"] | None
+    watch_push: Float[Array, "length looked force block mode"] | None
 
 
 def _rigging(rig: Rig, grid: Grid, watched) -> Rigging:
-    step = propagators(rig, grid.lengths)
+    step = propagators(rig, grid.lengths, 0 if watched is None else POINTS)
+    if watched is None:
+        return Rigging(step, None, None)
     each = rig.modes_per_block
     blocks = rig.state_matrix.shape[0]
     rows = rig.shapes(watched, (0,))[0].reshape(-1, blocks, each)
@@ -130,18 +132,24 @@ def _tables_of_kind(rigging: Rigging, kind, shape, rows):
     direct = jnp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
     gains = gains + direct[..., None] * np.eye(nodes)[:, None, :]
     push = jnp.einsum("tqfbm,fbim->tbiqf", shape, step.push_end)
-    seen = jnp.einsum("lfbm,tqfbm->tlqf", watch_push, shape)
 
     def each(table):
         return jnp.broadcast_to(table, (steps, *table.shape))
 
-    return (
+    tables = (
         respond.reshape(steps, size, states),
         gains.reshape(steps, size, size),
         each(step.drift_end),
         push.reshape(steps, states, size),
-        each(watch.reshape(watch.shape[0], states)),
-        seen.reshape(steps, watch.shape[0], size),
+    )
+    if watch is None:
+        return *tables, None, None
+    seen = jnp.einsum("lfbm,tqfbm->tlqf", watch_push, shape)
+    looked = watch.shape[0]
+    return (
+        *tables,
+        each(watch.reshape(looked, states)),
+        seen.reshape(steps, looked, size),
     )
 
 
@@ -190,28 +198,9 @@ def _reduce(best: Extremes, tables: Tables, states, forces, start, span) -> Extr
     )
 
 
-def march(
-    rig: Rig,
-    traffic: Traffic,
-    grid: Grid,
-    watched: Float[Array, " sensor"],
-    *,
-    slots: int,
-    steps: int | None = None,
-):
-    """Integrate from rest over a grid; return extremes, and states (and forces) of every step.
-
-    `watched` are the places (m) whose peaks are kept; `slots` is how many loads may be on the
-    beam at once. With `steps` known the loop has a fixed length, states and forces at all steps
-    are returned as (step, state, lane), and reverse mode works, storing one state a chunk.
-    Without, the loop runs as long as it must, only extremes are kept, and it ends early when the
-    energy left after the last exit cannot raise any peak.
-    """
-    lanes = traffic.inertia.shape[1]
-    rigging = _rigging(rig, grid, watched)
-    places, loads = watched.shape[0], len(traffic.motions)
+def _nothing_seen(places: int, loads: int, lanes: int) -> Extremes:
     nothing = jnp.zeros((places, lanes))
-    best = Extremes(
+    return Extremes(
         nothing,
         jnp.zeros((POINTS + 1, places, lanes)),
         nothing,
@@ -220,30 +209,67 @@ def march(
         jnp.full((loads, lanes), NEVER),
     )
 
+
+def _stepper(rig: Rig, traffic: Traffic, grid: Grid, watched, slots: int):
+    """Function that takes state and extremes through the chunk that begins with a given step."""
+    rigging = _rigging(rig, grid, watched)
+
+    def step(state, tables):
+        return _advance(state, tables, traffic.inertia, traffic.weight)
+
     def chunk(state, best, first):
         index = first + jnp.arange(CHUNK)
         tables, start, span = _tabulate(rig, traffic, grid, rigging, slots, index)
-
-        def step(state, tables):
-            return _advance(state, tables, traffic.inertia, traffic.weight)
-
         state, (states, forces) = jax.lax.scan(step, state, tables)
-        return state, _reduce(best, tables, states, forces, start, span), states, forces
+        if watched is not None:
+            best = _reduce(best, tables, states, forces, start, span)
+        return state, best, states
 
+    return chunk
+
+
+def trace(
+    rig: Rig,
+    traffic: Traffic,
+    grid: Grid,
+    watched: Float[Array, " sensor"] | None,
+    *,
+    slots: int,
+    steps: int,
+) -> tuple[Extremes | None, Float[Array, "edge state lane"]]:
+    """Integrate from rest over a grid of so many steps; return extremes and all states.
+
+    States are those at the start of every step and at the end. Extremes are those at the
+    `watched` places (m), None without any. `slots` is how many loads may be on the beam at once.
+    Reverse mode stores one state a chunk.
+    """
+    chunk = _stepper(rig, traffic, grid, watched, slots)
+    lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
+
+    def whole(carry, first):
+        state, best, states = chunk(*carry, first)
+        return (state, best), states
+
+    best = None if watched is None else _nothing_seen(watched.shape[0], loads, lanes)
     rest = jnp.zeros((rig.states, lanes))
-    if steps is not None:
+    firsts = jnp.arange(0, steps, CHUNK)
+    (state, best), states = jax.lax.scan(jax.checkpoint(whole), (rest, best), firsts)
+    states = jax.lax.collapse(states, 0, 2)[:steps]
+    return best, jnp.concatenate([states, state[None]])
 
-        def whole(carry, first):
-            state, best, states, forces = chunk(*carry, first)
-            return (state, best), (states, forces)
 
-        firsts = jnp.arange(0, steps, CHUNK)
-        (state, best), kept = jax.lax.scan(jax.checkpoint(whole), (rest, best), firsts)
-        states, forces = (jax.lax.collapse(part, 0, 2)[:steps] for part in kept)
-        return best, jnp.concatenate([states, state[None]]), forces
+def march(
+    rig: Rig, traffic: Traffic, grid: Grid, watched: Float[Array, " sensor"], *, slots: int
+) -> Extremes:
+    """Integrate from rest over a grid, keeping only extremes at the `watched` places (m).
 
+    The loop runs as long as it must, and ends early when the energy left after the last exit
+    cannot raise any peak. `slots` is how many loads may be on the beam at once. Forward mode only.
+    """
+    chunk = _stepper(rig, traffic, grid, watched, slots)
     flexibility = _flexibility(rig, watched)
     stiffness = rig.stiffness()
+    size = 2 * stiffness.shape[0]
 
     def more(carry):
         _, _, first, going = carry
@@ -251,10 +277,9 @@ def march(
 
     def go(carry):
         state, best, first, _ = carry
-        state, best, _, _ = chunk(state, best, first)
+        state, best, _ = chunk(state, best, first)
         first = first + CHUNK
         left = grid.steps(first[None])[1][0] >= grid.last_exit
-        size = 2 * stiffness.shape[0]
         place, rate = state[0:size:2], state[1:size:2]
         energy = jnp.sum(rate**2, axis=0) + jnp.sum(place * (stiffness @ place), axis=0)
         reach = jnp.sqrt(flexibility[:, None] * energy)
@@ -262,9 +287,10 @@ def march(
         over = jnp.all((reach < best.score) | ~jnp.isfinite(energy))
         return state, best, first, ~(left & over)
 
-    start = (rest, best, jnp.zeros((), int), jnp.ones((), bool))
-    state, best, _, _ = jax.lax.while_loop(more, go, start)
-    return best, state
+    lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
+    best = _nothing_seen(watched.shape[0], loads, lanes)
+    start = (jnp.zeros((rig.states, lanes)), best, jnp.zeros((), int), jnp.ones((), bool))
+    return jax.lax.while_loop(more, go, start)[1]
 
 
 def _flexibility(rig: Rig, watched):

@@ -75,7 +75,7 @@ def run_extremes(
     assembled = rig(case, form.layout, form.coupled)
     grid = even_grid(case, assembled, longest)
     loads = traffic(case) if lanes is None else lanes
-    return march(assembled, loads, grid, watched, slots=form.slots)[0]
+    return march(assembled, loads, grid, watched, slots=form.slots)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -50,15 +50,8 @@ class Record(eqx.Module):
         Strain is that of the fibre `fibre_distance` (m) above the neutral axis, -z w_xx. Raises
         ValueError for an unknown quantity, or strain without a fibre.
         """
-        if quantity not in QUANTITIES:
-            raise ValueError(f"no quantity {quantity!r}; there are {', '.join(QUANTITIES)}")
-        if quantity == "strain" and fibre_distance is None:
-            raise ValueError("strain needs fibre_distance, the height above the neutral axis in m")
-        order = {"slope": 1, "strain": 2}.get(quantity, 0)
-        amplitudes = {"velocity": self.rates, "acceleration": self.accelerations}
-        shapes = self.modes.shapes(x, order)
-        history = jnp.tensordot(amplitudes.get(quantity, self.coordinates), shapes, axes=[1, -1])
-        return -fibre_distance * history if quantity == "strain" else history
+        motion = self.coordinates, self.rates, self.accelerations
+        return _history(self.modes, motion, x, quantity, fibre_distance)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
         positions = [sensor.position for sensor in self.case.sensors]
@@ -96,10 +89,7 @@ class Record(eqx.Module):
     @property
     def measured(self) -> Float[Array, "time sensor"]:
         """What each sensor reads, its offset included, in the SI unit of its quantity."""
-        columns = [
-            self.at(s.position, s.quantity, s.fibre_distance) + s.offset for s in self.case.sensors
-        ]
-        return jnp.array(columns).reshape(-1, self.times.shape[0]).T
+        return measure(self.case, self.modes, self.coordinates, self.rates, self.accelerations)
 
     @property
     def verdict(self) -> str:
@@ -227,6 +217,33 @@ def read_record(path: str | os.PathLike) -> Record:
     """
     with xarray.open_dataset(path, engine="scipy") as dataset:
         return record_from_xarray(dataset.load())
+
+
+def _history(modes: Modes, motion, x, quantity: str, fibre_distance) -> Float[Array, "time ..."]:
+    if quantity not in QUANTITIES:
+        raise ValueError(f"no quantity {quantity!r}; there are {', '.join(QUANTITIES)}")
+    if quantity == "strain" and fibre_distance is None:
+        raise ValueError("strain needs fibre_distance, the height above the neutral axis in m")
+    order = {"slope": 1, "strain": 2}.get(quantity, 0)
+    amplitudes = motion[{"velocity": 1, "acceleration": 2}.get(quantity, 0)]
+    history = jnp.tensordot(amplitudes, modes.shapes(x, order), axes=[1, -1])
+    return -fibre_distance * history if quantity == "strain" else history
+
+
+def measure(
+    case: Case,
+    modes: Modes,
+    coordinates: Float[Array, "time mode"],
+    rates: Float[Array, "time mode"],
+    accelerations: Float[Array, "time mode"],
+) -> Float[Array, "time sensor"]:
+    """What the sensors of a case read, offsets included, when its modes move so (SI units)."""
+    motion = coordinates, rates, accelerations
+    columns = [
+        _history(modes, motion, s.position, s.quantity, s.fibre_distance) + s.offset
+        for s in case.sensors
+    ]
+    return jnp.array(columns).reshape(-1, coordinates.shape[0]).T
 
 
 def sensor_labels(case: Case) -> np.ndarray:

@@ -13,9 +13,9 @@ from jaxbeam.case import Case
 from jaxbeam.dynamics import Traffic, contact_rows, traffic
 from jaxbeam.fields import is_known, known
 from jaxbeam.grid import sampled_grid
-from jaxbeam.integrate import march
+from jaxbeam.integrate import trace
 from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
-from jaxbeam.record import Record, never_as_nan
+from jaxbeam.record import Record, measure, never_as_nan
 from jaxbeam.rig import Rig, rig
 
 
@@ -68,29 +68,19 @@ def _check_times(times) -> None:
 
 @eqx.filter_jit
 def _record(case: Case, plan: Plan, times, error) -> Record:
-    assembled = rig(case, plan.form.layout, plan.form.coupled)
-    loads = traffic(case)
-    # From rest at the start to the first sample in steps like those between samples.
-    spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
-    lead = times[0] - spacing * jnp.arange(plan.lead, 0, -1)
-    grid, where = sampled_grid(
-        case, assembled, jnp.concatenate([lead, times]), plan.substeps, plan.even
-    )
     watched = jnp.array([sensor.position for sensor in case.sensors]).reshape(-1)
-    count = grid.counts.shape[0] * plan.substeps
-    best, states, _ = march(assembled, loads, grid, watched, slots=plan.form.slots, steps=count)
-    peaks, peak_times = best.peak()
-    samples = states[:: plan.substeps][where[plan.lead :]][:, :, 0]
-    coordinates, rates, accelerations, position, force = _outputs(
-        assembled, loads, grid.windows, times, samples
+    best, (coordinates, rates, accelerations, position, force), found, count = _trace(
+        case, plan, times, watched
     )
+    peaks, peak_times = best.peak()
+    loads = traffic(case)
     lost = never_as_nan(best.lost[:, 0])
     lost_position = jnp.array(
         [path.travel(time)[0] for path, time in zip(loads.motions, lost, strict=True)]
     ).reshape(-1)
     return Record(
         case=case,
-        modes=assembled.modes,
+        modes=found,
         times=times,
         coordinates=coordinates,
         rates=rates,
@@ -105,6 +95,31 @@ def _record(case: Case, plan: Plan, times, error) -> Record:
         error_estimate=error,
         steps=count,
     )
+
+
+def readings(case: Case, times: Float[Array, " time"], plan: Plan) -> Float[Array, "time sensor"]:
+    """What the sensors read at ascending times (s), and nothing else: `Record.measured`.
+
+    Lean in compiling and differentiating, for fits; see `simulate`, which checks and warns.
+    """
+    _, (coordinates, rates, accelerations, _, _), found, _ = _trace(case, plan, times, None)
+    return measure(case, found, coordinates, rates, accelerations)
+
+
+def _trace(case: Case, plan: Plan, times, watched):
+    """Extremes, outputs at the sample times, modes, and the number of steps."""
+    assembled = rig(case, plan.form.layout, plan.form.coupled)
+    loads = traffic(case)
+    # From rest at the start to the first sample in steps like those between samples.
+    spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
+    lead = times[0] - spacing * jnp.arange(plan.lead, 0, -1)
+    grid, where = sampled_grid(
+        case, assembled, jnp.concatenate([lead, times]), plan.substeps, plan.even
+    )
+    count = grid.counts.shape[0] * plan.substeps
+    best, states = trace(assembled, loads, grid, watched, slots=plan.form.slots, steps=count)
+    samples = states[:: plan.substeps][where[plan.lead :]][:, :, 0]
+    return best, _outputs(assembled, loads, grid.windows, times, samples), assembled.modes, count
 
 
 def _outputs(rig: Rig, loads: Traffic, windows, times, states):

@@ -25,11 +25,10 @@ from jaxbeam.checks import check
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.exponentials import LONGEST, norm
 from jaxbeam.grid import even_grid, sampled_grid
-from jaxbeam.integrate import march
+from jaxbeam.integrate import march, trace
 from jaxbeam.lanes import Tasks, arrange
 from jaxbeam.loads import motion
 from jaxbeam.modes import Layout, lay_out
-from jaxbeam.motion import NEVER
 from jaxbeam.pacing import choose_steps
 from jaxbeam.plan import TOLERANCE, Form, most_at_once, sample_times
 from jaxbeam.record import never_as_nan, sensor_labels
@@ -124,7 +123,9 @@ def _axes(case: Case, over: dict[str, Any], paired: bool, histories: bool) -> di
         if values.ndim != 1 or values.size == 0:
             raise ValueError(f"{address} takes a list of values, not one of shape {values.shape}")
         if histories and address in ("run.duration", "run.sample_rate"):
-            raise ValueError(f"histories of different length do not fit together: leave out {address}")
+            raise ValueError(
+                f"histories of different length do not fit together: leave out {address}"
+            )
         for value in {values.min(), values.max(), *values[~np.isfinite(values)]}:
             check(replace(case, {address: value}))
         axes[address] = values
@@ -222,9 +223,11 @@ def _common_layout(case: Case, tasks: Tasks) -> Layout:
     values = np.unique(tasks.heavy[:, moved], axis=0)
     names = [tasks.heavy_addresses[i] for i in moved]
     layouts = [lay_out(replace(case, dict(zip(names, row, strict=True)))) for row in values]
-    degrees = np.max([layout.degrees for layout in layouts], axis=0) if len(
-        {len(layout.degrees) for layout in layouts}
-    ) == 1 else layouts[0].degrees
+    degrees = (
+        np.max([layout.degrees for layout in layouts], axis=0)
+        if len({len(layout.degrees) for layout in layouts}) == 1
+        else layouts[0].degrees
+    )
     common = {dataclasses.replace(layout, degrees=tuple(map(int, degrees))) for layout in layouts}
     if len(common) > 1:
         raise ValueError(
@@ -268,14 +271,12 @@ def _block(case, form, addresses, times, heavy, light, longest):
         watched = jnp.stack([sensor.position for sensor in varied.sensors])
         if times is None:
             grid = even_grid(varied, assembled, longest)
-            best = march(assembled, loads, grid, watched, slots=form.slots)[0]
+            best = march(assembled, loads, grid, watched, slots=form.slots)
             history = {}
         else:
             grid, where = sampled_grid(varied, assembled, times[0], times[1], True)
             count = grid.counts.shape[0] * times[1]
-            best, states, _ = march(
-                assembled, loads, grid, watched, slots=form.slots, steps=count
-            )
+            best, states = trace(assembled, loads, grid, watched, slots=form.slots, steps=count)
             samples = states[:: times[1]][where][:, 0 : 2 * varied.beam.modes : 2]
             rows = assembled.shapes(watched, (0,))[0]
             history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}

@@ -1,20 +1,22 @@
 """Logs and the case that is to explain them, made ready for a fit."""
 
 import dataclasses
+import re
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxbeam.case import Case, replace
+from jaxbeam.case import Case, replace, value_at
 from jaxbeam.checks import check
 from jaxbeam.loads import motion
 from jaxbeam.plan import Plan, make_plan
-from jaxbeam.simulate import simulate
-from tuning.free import insert
+from jaxbeam.simulate import readings
+from tuning.free import OF_LOG
 from tuning.logs import Log
+
+OFFSET = re.compile(r"sensors\.(\d+)\.offset")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,17 +34,83 @@ class Campaign:
     measured: Float[np.ndarray, "log time channel"]
     real: Float[np.ndarray, "log time"]
 
-    def predict(self, values: dict[str, Float[Array, ""]]) -> Float[Array, "log time channel"]:
-        """What the sensors read in every log, with given values at the free addresses."""
-        cases = [insert(case, i, values) for i, case in enumerate(self.cases)]
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
+    def local(self, addresses: list[str]) -> tuple[list[str], np.ndarray]:
+        """Addresses as seen within a log, and which of the free numbers (log, address) each is.
 
-        def one(case, times):
-            return simulate(case, times, plan=self.plan).measured
+        A number of one log is -1 in the others, which keep their own.
+        """
+        inner = list(dict.fromkeys(OF_LOG.sub(r"\2", address) for address in addresses))
+        which = np.full((len(self.logs), len(inner)), -1)
+        for i, address in enumerate(addresses):
+            own = OF_LOG.fullmatch(address)
+            rows = slice(None) if own is None else int(own[1])
+            which[rows, inner.index(own[2] if own else address)] = i
+        return inner, which
 
-        if len(cases) == 1:
-            return one(cases[0], jnp.asarray(self.times[0]))[None]
-        return eqx.filter_vmap(one)(stacked, jnp.asarray(self.times))
+    def predictor(self, addresses: list[str]):
+        """Function from the values at the addresses to all samples, with cheap derivatives.
+
+        Each log is differentiated by its own few numbers only, one log after the other: side by
+        side they would not share what is equal in time.
+        """
+        inner, which = self.local(addresses)
+        moving = [address for address in inner if not OFFSET.fullmatch(address)]
+        columns = [inner.index(address) for address in moving]
+        own = jnp.array([[value_at(case, a) for a in inner] for case in self.cases])
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self.cases)
+        steady = {a: 0.0 for a in addresses_of_offsets(self.cases[0])}
+        channels = {int(OFFSET.fullmatch(a)[1]): inner.index(a) for a in inner if a not in moving}
+        constant = jnp.array([[s.offset for s in case.sensors] for case in self.cases])
+
+        def simulated(run, values):
+            case, times = run
+            case = replace(case, dict(zip(moving, values, strict=True)) | steady)
+            return readings(case, times, self.plan)
+
+        def gather(values):
+            return jnp.where(which < 0, own, values[which])
+
+        def offsets(table):
+            rows = [
+                table[:, channels[i]] if i in channels else constant[:, i]
+                for i in range(constant.shape[1])
+            ]
+            return jnp.stack(rows, axis=1)[:, None, :]
+
+        runs = (stacked, jnp.asarray(self.times))
+
+        @jax.custom_jvp
+        def predict(values):
+            table = gather(values)
+            samples = jax.lax.map(lambda part: simulated(*part), (runs, table[:, columns]))
+            return samples + offsets(table)
+
+        @predict.defjvp
+        def _(primals, tangents):
+            table, change = jax.jvp(gather, primals, tangents)
+
+            def both(part):
+                run, values = part
+                basis = jnp.eye(len(moving))
+
+                def along(direction):
+                    return jax.jvp(lambda v: simulated(run, v), (values,), (direction,))
+
+                samples, slopes = jax.vmap(along, out_axes=(None, -1))(basis)
+                return samples, slopes
+
+            samples, slopes = jax.lax.map(both, (runs, table[:, columns]))
+            moved = jnp.einsum("ltca,la->ltc", slopes, change[:, columns])
+            # Offsets only shift: their derivative is that of the shift.
+            shift = offsets(change) - offsets(jnp.zeros_like(change))
+            return samples + offsets(table), moved + shift
+
+        return predict
+
+
+def addresses_of_offsets(case: Case) -> list[str]:
+    """Addresses of the offsets of all sensors."""
+    return [f"sensors.{i}.offset" for i in range(len(case.sensors))]
 
 
 def case_of_log(case: Case, log: Log) -> Case:
@@ -139,4 +207,3 @@ def _check_loads(log: Log, case: Case) -> None:
             f"{log.source}: it ends at {end:.4g} s, before the first load has crossed at "
             f"{min(crossing):.4g} s; check the load's speed and entry time"
         )
-

@@ -26,13 +26,7 @@ class Free:
     start: float
     low: float
     high: float
-
-    @property
-    def size(self) -> float:
-        """What counts as a large change: the distance of the bounds, or the number itself."""
-        if np.isfinite(self.high - self.low):
-            return self.high - self.low
-        return abs(self.start)
+    size: float
 
     def inward(self, value: float) -> float:
         """Search variable of a value."""
@@ -61,8 +55,13 @@ class Free:
         return y
 
 
-def free_numbers(cases: list[Case], bounds: dict[str, tuple[float, float] | None]) -> list[Free]:
+def free_numbers(
+    cases: list[Case], bounds: dict[str, tuple[float, float] | None], reading: float
+) -> list[Free]:
     """Look up the free numbers in the cases of the logs.
+
+    The typical size of a number is the distance of its bounds, or else itself; that of an offset
+    is the largest `reading`, that of a time the duration.
 
     An address is that of the case, shared by all logs, or `logs.1.loads.0.speed` for a number of
     one log. Without bounds a number that stands for a size stays on its side of zero. Raises
@@ -83,7 +82,15 @@ def free_numbers(cases: list[Case], bounds: dict[str, tuple[float, float] | None
                 f"{address} starts at {start:g}, outside its bounds {low:g} to {high:g}: change "
                 "the number in the case, or the bounds"
             )
-        found.append(Free(address, start, float(low), float(high)))
+        if np.isfinite(high - low):
+            size = high - low
+        elif address.endswith(".offset"):
+            size = reading
+        elif address.endswith(".entry_time"):
+            size = float(known(cases[0].run.duration))
+        else:
+            size = abs(start) or 1.0
+        found.append(Free(address, start, float(low), float(high), float(size)))
     return found
 
 

@@ -65,7 +65,9 @@ class Fit:
                 "start": float(start),
                 "at_bound": address in self.at_bound,
             }
-        correlation = [[None if np.isnan(c) else c for c in row] for row in self.correlation.tolist()]
+        correlation = [
+            [None if np.isnan(c) else c for c in row] for row in self.correlation.tolist()
+        ]
         return {
             "numbers": numbers,
             "correlation": correlation,
@@ -113,12 +115,14 @@ def identify(
     logs = [logs] if isinstance(logs, Log) else list(logs)
     bounds = dict(free) if isinstance(free, dict) else dict.fromkeys(free)
     campaign = prepare(case, logs)
-    numbers = free_numbers(campaign.cases, bounds)
+    reading = float(np.max(np.abs(campaign.measured)))
+    numbers = free_numbers(campaign.cases, bounds, reading)
     addresses = [number.address for number in numbers]
     y = jnp.array([number.inward(number.start) for number in numbers])
     noise = first_noise(campaign)
+    search = Search(campaign, numbers)
     for _ in range(ROUNDS):
-        y, values, predicted, jacobian, verdict = solve(campaign, numbers, y, noise)
+        y, values, predicted, jacobian, verdict = search.run(y, noise)
         residuals = campaign.measured - np.asarray(predicted)
         noise = _noise(campaign, residuals, len(numbers))
     widened = noise * np.sqrt(_colours(campaign, residuals))
@@ -171,48 +175,65 @@ def _colours(campaign: Campaign, residuals) -> Float[np.ndarray, "log channel"]:
     )
 
 
-def solve(campaign: Campaign, numbers: list[Free], y, noise):
-    """Minimise the squared residuals over the noise (log, channel) from a search point on.
+class Search:
+    """Least squares over the free numbers of a campaign, compiled once for any noise levels."""
 
-    Returns the search point, values, predicted samples, their derivatives by the values, and a
-    sentence on how it ended.
-    """
-    if campaign.real.sum() * noise.shape[1] < len(numbers):
-        raise ValueError(f"{len(numbers)} free numbers need at least as many samples")
-    weights = jnp.asarray(campaign.real[..., None] / noise[:, None, :])
-    addresses = [number.address for number in numbers]
+    def __init__(self, campaign: Campaign, numbers: list[Free]):
+        if campaign.real.sum() * campaign.measured.shape[2] < len(numbers):
+            raise ValueError(f"{len(numbers)} free numbers need at least as many samples")
+        self._campaign = campaign
+        predict = campaign.predictor([number.address for number in numbers])
+        measured = jnp.asarray(campaign.measured)
 
-    def predict(values):
-        return campaign.predict(dict(zip(addresses, values, strict=True)))
+        def values_at(y):
+            return jnp.stack([number.outward(y[i]) for i, number in enumerate(numbers)])
 
-    def values_at(y):
-        return jnp.stack([number.outward(y[i]) for i, number in enumerate(numbers)])
+        def linearised(values):
+            # One pass gives samples and derivatives (see `Campaign.predictor`).
+            samples, push = jax.linearize(predict, values)
+            return samples, jax.vmap(push, out_axes=-1)(jnp.eye(values.shape[0]))
 
-    @eqx.filter_jit
-    def run(y, measured, weights):
-        def misfit(z, scale):
+        def misfit(z, args):
+            scale, weights = args
             return ((measured - predict(values_at(z * scale))) * weights).ravel()
 
-        # In units of the standard error that each would have alone, all are of one size.
-        first = jax.jacfwd(misfit)(y, 1.0)
-        strength = jnp.sqrt(jnp.sum(first**2, axis=0))
-        scale = 1 / jnp.maximum(strength, 1e-9 * jnp.max(strength))
-        solver = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-5)
-        found = optimistix.least_squares(
-            misfit, solver, y / scale, scale, max_steps=MAX_STEPS, throw=False
-        )
-        y = found.value * scale
-        values = values_at(y)
-        return y, values, predict(values), jax.jacfwd(predict)(values), found.result
+        solver = optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-3)
 
-    y, values, predicted, jacobian, result = run(y, jnp.asarray(campaign.measured), weights)
-    if not np.all(np.isfinite(values)):
-        raise RuntimeError(
-            "the fit left the range in which the case can be simulated; give bounds to its numbers"
+        def minimise(y, scale, weights):
+            found = optimistix.least_squares(
+                misfit, solver, y / scale, (scale, weights), max_steps=MAX_STEPS, throw=False
+            )
+            return found.value * scale, found.result
+
+        self._values_at = eqx.filter_jit(values_at)
+        self._slopes = eqx.filter_jit(lambda y: jnp.diag(jax.jacfwd(values_at)(y)))
+        self._linearised = eqx.filter_jit(linearised)
+        self._minimise = eqx.filter_jit(minimise)
+
+    def run(self, y, noise):
+        """Minimise the squared residuals over the noise (log, channel) from a search point on.
+
+        Returns the search point, the values, the predicted samples, their derivatives by the
+        values, and a sentence on how it ended. Raises RuntimeError if it leaves the range in which
+        the case can be simulated.
+        """
+        weights = self._campaign.real[..., None] / noise[:, None, :]
+        # In units of the standard error that each would have alone, all numbers are of one size.
+        _, jacobian = self._linearised(self._values_at(y))
+        rows = np.asarray(jacobian) * weights[..., None] * np.asarray(self._slopes(y))
+        strength = np.sqrt(np.sum(rows**2, axis=(0, 1, 2)))
+        scale = jnp.asarray(1 / np.maximum(strength, 1e-9 * strength.max()))
+        y, result = self._minimise(y, scale, jnp.asarray(weights))
+        values = self._values_at(y)
+        if not np.all(np.isfinite(values)):
+            raise RuntimeError(
+                "the fit left the range in which the case can be simulated; give its numbers bounds"
+            )
+        ended = result == optimistix.RESULTS.successful
+        verdict = (
+            "converged" if ended else f"not converged after {MAX_STEPS} steps: start elsewhere"
         )
-    ended = result == optimistix.RESULTS.successful
-    verdict = "converged" if ended else f"not converged after {MAX_STEPS} steps; start elsewhere"
-    return y, values, predicted, jacobian, verdict
+        return y, values, *self._linearised(values), verdict
 
 
 def _fitted_case(case: Case, campaign: Campaign, values: dict[str, float]) -> Case:
