@@ -12,6 +12,7 @@ forces: an embedded Runge-Kutta pair (Dopri8 of diffrax) chooses its own steps, 
 import itertools
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -54,14 +55,14 @@ def simulate_adaptive(
     assembled, loads = rig(case, lay_out(case)), traffic(case)
     windows, edges = _events(assembled, loads, float(times[-1]))
     allowed = tolerance * _size(case, assembled, loads, float(times[-1]))
-    state, histories = jnp.zeros(assembled.states), None
+    state, histories = jnp.zeros(assembled.states), []
     for start, stop in itertools.pairwise(edges):
         middle = (start + stop) / 2
         on = (windows[:, 0] < middle) & (middle < windows[:, 1])
         leg = np.array([start, stop])
         state, found = _solve(assembled, loads, state, leg, on, times, allowed)
         after = (times >= start)[:, None]
-        older = found if histories is None else histories
+        older = histories or found
         histories = [jnp.where(after, new, old) for new, old in zip(found, older, strict=True)]
     coordinates, rates, accelerations, force = histories
     places = jnp.array([sensor.position for sensor in case.sensors]).reshape(-1)
@@ -129,7 +130,7 @@ def _solve(rig: Rig, loads: Traffic, state, leg, on, times, allowed):
         max_steps=None,
         adjoint=diffrax.ForwardMode(),
     )
-    states, *histories = solution.ys
+    states, *histories = jax.tree.leaves(solution.ys)
     return states[-1], [history[:-1] for history in histories]
 
 

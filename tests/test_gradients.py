@@ -30,7 +30,7 @@ ONE_SPAN = jb.Case(
     ),
     sensors=[jb.Sensor(0.25, offset=1e-4), jb.Sensor(0.4, "strain", 2e-6, 0.0025)],
     loads=[
-        jb.MovingMass(0.4, speed=2.5, entry_time=0.013, deceleration=1.5),
+        jb.MovingMass(mass=0.4, speed=2.5, entry_time=0.013, deceleration=1.5),
         jb.MovingForce(force=3.0, times=[0.05, 0.12, 0.2, 0.31], positions=[0.1, 0.2, 0.45, 0.7]),
     ],
     run=jb.Run(0.5),
@@ -47,8 +47,8 @@ TWO_SPANS = jb.Case(
     ],
     sensors=[jb.Sensor(0.25, offset=1e-4), jb.Sensor(0.8, "velocity", offset=0.01)],
     loads=[
-        jb.MovingMass(0.4, speed=3.5, entry_time=0.013, deceleration=0.6),
-        jb.MovingMass(0.3, speed=-1.2, entry_time=0.05, deceleration=5.0),  # stops and stays
+        jb.MovingMass(mass=0.4, speed=3.5, entry_time=0.013, deceleration=0.6),
+        jb.MovingMass(mass=0.3, speed=-1.2, entry_time=0.05, deceleration=5.0),  # stops and stays
     ],
     run=jb.Run(0.5),
 )

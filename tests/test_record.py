@@ -22,7 +22,10 @@ CASE = jb.Case(
         jb.Sensor(0.3, "slope"),
         jb.Sensor(0.3, "velocity"),
     ],
-    loads=[jb.MovingMass(0.4, speed=4.0), jb.MovingForce(force=3.0, speed=-2.0, entry_time=0.1)],
+    loads=[
+        jb.MovingMass(mass=0.4, speed=4.0),
+        jb.MovingForce(force=3.0, speed=-2.0, entry_time=0.1),
+    ],
     run=jb.Run(0.4, sample_rate=250.0),
     title="a run for its record",
 )

@@ -16,7 +16,7 @@ TWO_SPANS_AND_A_STREAM = jb.Case(
     BEAM,
     supports=[jb.Support(0.55)],
     sensors=SENSORS,
-    loads=[jb.MovingMass(0.3, speed=3.0), jb.MovingMass(0.5, speed=4.0, entry_time=0.09)],
+    loads=[jb.MovingMass(mass=0.3, speed=3.0), jb.MovingMass(mass=0.5, speed=4.0, entry_time=0.09)],
     run=jb.Run(0.5),
 )
 TWO_SPANS_AND_BRAKING = jb.replace(
@@ -33,7 +33,7 @@ DAMPED_SUPPORT = jb.Case(
     supports=[jb.Support(0.55, stiffness=4e3, damping=8.0, rotational_stiffness=2.0)],
     actuators=[jb.Shaker(0.3, stiffness=0.0, damping=0.0, bandwidth=500.0)],
     sensors=SENSORS,
-    loads=[jb.MovingMass(0.4, speed=4.0, entry_time=0.01)],
+    loads=[jb.MovingMass(mass=0.4, speed=4.0, entry_time=0.01)],
     run=jb.Run(0.5),
 )
 SHAKER_SUSPENSION = jb.replace(
