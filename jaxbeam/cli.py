@@ -44,7 +44,7 @@ Output = Annotated[Path | None, Parameter(("-o", "--output"))]
 @app.command
 def demo(
     *,
-    output: Annotated[Path, Parameter(("-o", "--output"))] = Path("out/demo"),
+    output: Output = None,
     json_: Json = False,
 ) -> None:
     """Identify a rig from logged data, end to end, in under a minute.
@@ -52,7 +52,7 @@ def demo(
     Parameters
     ----------
     output
-        Folder for the figure and the record.
+        Folder for the figure and the record; a fresh one below `out` if left out.
     """
     from experiments import demo as demonstration
 

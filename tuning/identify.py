@@ -49,6 +49,12 @@ class Fit:
         reach = INTERVAL * self.errors
         return np.stack([self.values - reach, self.values + reach], axis=1)
 
+    @property
+    def cases(self) -> list[Case]:
+        """The fitted case of every log, with the loads that crossed."""
+        values = dict(zip(self.addresses, self.values, strict=True))
+        return [insert(case, i, values) for i, case in enumerate(self.campaign.cases)]
+
     def __str__(self) -> str:
         return fit_table(self)
 
@@ -197,7 +203,7 @@ class Search:
             scale, weights = args
             return ((measured - predict(values_at(z * scale))) * weights).ravel()
 
-        solver = optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-3)
+        solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-6)
 
         def minimise(y, scale, weights):
             found = optimistix.least_squares(
@@ -218,11 +224,12 @@ class Search:
         the case can be simulated.
         """
         weights = self._campaign.real[..., None] / noise[:, None, :]
-        # In units of the standard error that each would have alone, all numbers are of one size.
+        # In units of a thousand of the standard errors that each would have alone, all numbers
+        # are of one size, and the solver's first damping, one, hardly shortens its first step.
         _, jacobian = self._linearised(self._values_at(y))
         rows = np.asarray(jacobian) * weights[..., None] * np.asarray(self._slopes(y))
         strength = np.sqrt(np.sum(rows**2, axis=(0, 1, 2)))
-        scale = jnp.asarray(1 / np.maximum(strength, 1e-9 * strength.max()))
+        scale = jnp.asarray(1e3 / np.maximum(strength, 1e-9 * strength.max()))
         y, result = self._minimise(y, scale, jnp.asarray(weights))
         values = self._values_at(y)
         if not np.all(np.isfinite(values)):
