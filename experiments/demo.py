@@ -57,7 +57,7 @@ def _fresh() -> Path:
 
 def _table(fit: tuning.Fit, truth: dict[str, float]) -> str:
     """Fitted numbers with their 95 % intervals beside the truth."""
-    width = max(map(len, truth))
+    width, hits = max(map(len, truth)), 0
     lines = [
         f"{'number':{width}}  {'start':>11}  {'fitted':>11}  {'95 % interval':^25}  {'truth':>10}"
     ]
