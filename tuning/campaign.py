@@ -13,9 +13,11 @@ from jaxbeam.checks import check
 from jaxbeam.loads import motion
 from jaxbeam.plan import Plan, make_plan
 from jaxbeam.simulate import readings
-from tuning.free import OF_LOG
+from tuning.free import OF_LOG, insert
 from tuning.logs import Log
 
+TOLERANCE = 1e-5  # of the largest deflection: what logs can resolve, with room to spare
+LATEST = 10.0  # start of a log, in its own durations, that is still simulated from 0 on
 OFFSET = re.compile(r"sensors\.(\d+)\.offset")
 
 
@@ -107,6 +109,24 @@ class Campaign:
 
         return predict
 
+    def doubt(self, values: dict[str, float]) -> str:
+        """Why fitted values may be wrong although the search ended; "" if there is no doubt.
+
+        The plan was made for the starts; far from them loads may come in another order, or
+        steps be too long. And without bounds a number may end where no rig can have it.
+        """
+        for i, (case, times) in enumerate(zip(self.cases, self.times, strict=True)):
+            try:
+                plan = make_plan(insert(case, i, values), jnp.asarray(times), TOLERANCE)
+            except (ValueError, RuntimeError) as error:
+                return f", to a case that cannot be: {error}"
+            changed = (
+                plan.form.layout != self.plan.form.layout or plan.form.slots > self.plan.form.slots
+            )
+            if changed or plan.substeps > 2 * self.plan.substeps:
+                return ", but far from the start: fit once more with these values as the start"
+        return ""
+
 
 def addresses_of_offsets(case: Case) -> list[str]:
     """Addresses of the offsets of all sensors."""
@@ -120,7 +140,7 @@ def case_of_log(case: Case, log: Log) -> Case:
     return replace(case, {"run.duration": float(log.times[-1])})
 
 
-def prepare(case: Case, logs: list[Log], tolerance: float = 1e-5) -> Campaign:
+def prepare(case: Case, logs: list[Log]) -> Campaign:
     """Check logs against the case and bring them to one shape.
 
     Raises ValueError, naming the log, if its channels do not match the sensors, no load is known,
@@ -129,6 +149,8 @@ def prepare(case: Case, logs: list[Log], tolerance: float = 1e-5) -> Campaign:
     if not logs:
         raise ValueError("give at least one log")
     check(case)
+    for log in logs:
+        _check_times(log)
     cases = [case_of_log(case, log) for log in logs]
     ordered = [_at_sensors(case, log) for log in logs]
     for log, own in zip(logs, cases, strict=True):
@@ -147,7 +169,7 @@ def prepare(case: Case, logs: list[Log], tolerance: float = 1e-5) -> Campaign:
         times.append(np.append(log.times, log.times[-1] + spacing * np.arange(1, more + 1)))
         measured.append(np.pad(values, ((0, more), (0, 0))))
         real.append(np.arange(count) < log.times.size)
-    plans = [make_plan(own, jnp.asarray(t), tolerance) for own, t in zip(cases, times, strict=True)]
+    plans = [make_plan(own, jnp.asarray(t), TOLERANCE) for own, t in zip(cases, times, strict=True)]
     if len({plan.form.layout for plan in plans}) > 1:
         raise ValueError("the logs differ in the order of places along the beam; fit them apart")
     form = dataclasses.replace(
@@ -172,10 +194,14 @@ def _at_sensors(case: Case, log: Log) -> Float[np.ndarray, "time sensor"]:
         raise ValueError("the case has no sensors to compare the logs with")
     given = [i for i, sensor in enumerate(log.sensors) if sensor is not None]
     order = {log.sensors[i]: i for i in given} if given else dict(enumerate(range(len(log.names))))
+    if len(given) > len(order):
+        raise ValueError(f"{log.source}: two of its channels are of the same sensor of the case")
     if sorted(order) != list(range(len(sensors))):
+        ours = f"{len(sensors)} sensors" if len(sensors) > 1 else "one sensor"
         raise ValueError(
-            f"{log.source}: its channels {', '.join(log.names)} do not match the case's "
-            f"{len(sensors)} sensors; name `sensor` for each column in the TOML file beside it"
+            f"{log.source}: its channels {', '.join(log.names)} do not match the case's {ours}; "
+            "say in the TOML file beside it which `sensor` each column is, and leave sensors that "
+            "were not logged out of the case"
         )
     for number, channel in order.items():
         quantity = sensors[number].quantity
@@ -185,6 +211,23 @@ def _at_sensors(case: Case, log: Log) -> Float[np.ndarray, "time sensor"]:
                 f"{log.units[channel]}, but sensors.{number} measures {quantity}"
             )
     return log.values[:, [order[i] for i in range(len(sensors))]]
+
+
+def _check_times(log: Log) -> None:
+    """Runs start at t = 0 from rest, and simulate all that lies before the first sample."""
+    first, last = float(log.times[0]), float(log.times[-1])
+    if log.times.size < 3:
+        raise ValueError(f"{log.source}: a fit needs at least 3 samples, not {log.times.size}")
+    if first < 0:
+        raise ValueError(
+            f"{log.source}: it starts at {first:.4g} s, but runs start at 0, at rest; add "
+            f"{-first:.4g} s to its times and to the loads' entry times"
+        )
+    if first > LATEST * (last - first):
+        raise ValueError(
+            f"{log.source}: it starts only at {first:.6g} s, while runs start at 0; subtract the "
+            "time at which the recording began from its times and from the loads' entry times"
+        )
 
 
 def _check_loads(log: Log, case: Case) -> None:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case, replace, value_at
 from jaxbeam.fields import known
+from jaxbeam.sensors import QUANTITIES, Sensor
 
 OF_LOG = re.compile(r"logs\.(\d+)\.(.+)")
 INSIDE = 1e-3  # of the distance between bounds: a start on a bound is moved in by so much
@@ -16,33 +17,34 @@ INSIDE = 1e-3  # of the distance between bounds: a start on a bound is moved in 
 
 @dataclasses.dataclass(frozen=True)
 class Free:
-    """A free number: its address, start, bounds (either may be infinite), and a typical size.
+    """A free number: its address, unit, start, bounds (either may be infinite), and typical size.
 
     With two bounds the number is low + (high - low) (1 + sin y) / 2 in the search variable y,
     which can reach both; with one it is the bound plus or minus an exponential; else y itself.
     """
 
     address: str
+    unit: str
     start: float
     low: float
     high: float
     size: float
 
     def inward(self, value: float) -> float:
-        """Search variable of a value."""
+        """Search variable of a value; one on a bound is moved in a little."""
+        least = INSIDE * self.size
         if np.isfinite(self.high - self.low):
-            share = np.clip((value - self.low) / (self.high - self.low), INSIDE, 1 - INSIDE)
-            return float(np.arcsin(2 * share - 1))
+            inner = np.clip(value, self.low + least, self.high - least)
+            return float(np.arcsin(2 * (inner - self.low) / (self.high - self.low) - 1))
         if np.isfinite(self.low):
-            return float(np.log(value - self.low))
+            return float(np.log(max(value - self.low, least)))
         if np.isfinite(self.high):
-            return float(-np.log(self.high - value))
+            return float(-np.log(max(self.high - value, least)))
         return value
 
     def at_bound(self, value: float) -> bool:
         """Whether a value lies on a bound, as good as."""
-        reach = INSIDE * (self.high - self.low if np.isfinite(self.high - self.low) else 0.0)
-        return bool(value - self.low <= reach or self.high - value <= reach)
+        return bool(min(value - self.low, self.high - value) <= INSIDE * self.size)
 
     def outward(self, y: Float[Array, ""]) -> Float[Array, ""]:
         """Value of a search variable."""
@@ -60,57 +62,93 @@ def free_numbers(
 ) -> list[Free]:
     """Look up the free numbers in the cases of the logs.
 
-    The typical size of a number is the distance of its bounds, or else itself; that of an offset
-    is the largest `reading`, that of a time the duration.
-
     An address is that of the case, shared by all logs, or `logs.1.loads.0.speed` for a number of
-    one log. Without bounds a number that stands for a size stays on its side of zero. Raises
-    ValueError for an unknown address, a list, or bounds that do not hold the start.
+    one log. Without bounds a number stays on its side of zero, but for offsets and entry times.
+    The typical size of a number is the distance of its bounds, or else itself; that of an offset
+    is the largest `reading`, that of an entry time the duration.
+
+    Raises ValueError for an unknown address, a list, a number that is free twice, bounds that do
+    not hold the start, or a start of zero that says nothing about the size.
     """
     if not bounds:
         raise ValueError("name at least one address as free")
-    found = []
-    for address, pair in bounds.items():
-        start = _start(cases, address)
-        low, high = (-np.inf, np.inf) if pair is None else pair
-        if pair is None and start > 0 and not address.endswith((".offset", ".entry_time")):
-            low = 0.0
-        if not low < high:
-            raise ValueError(f"{address}: the lower bound {low:g} is not below the upper, {high:g}")
-        if not low <= start <= high:
-            raise ValueError(
-                f"{address} starts at {start:g}, outside its bounds {low:g} to {high:g}: change "
-                "the number in the case, or the bounds"
-            )
-        if np.isfinite(high - low):
-            size = high - low
-        elif address.endswith(".offset"):
-            size = reading
-        elif address.endswith(".entry_time"):
-            size = float(known(cases[0].run.duration))
-        else:
-            size = abs(start) or 1.0
-        found.append(Free(address, start, float(low), float(high), float(size)))
-    return found
+    _check_once(list(bounds))
+    return [_free_number(cases, address, pair, reading) for address, pair in bounds.items()]
 
 
-def _start(cases: list[Case], address: str) -> float:
-    own = OF_LOG.fullmatch(address)
-    if own:
-        number, rest = int(own[1]), own[2]
-        if number >= len(cases):
-            raise ValueError(f"{address}: there are {len(cases)} logs, counted from 0")
-        value = known(value_at(cases[number], rest))
-    else:
-        values = [known(value_at(case, address)) for case in cases]
-        value = values[0]
-        if any(np.any(other != value) for other in values):
+def _check_once(addresses: list[str]) -> None:
+    """A number cannot be shared by all logs and be that of one log as well."""
+    for address in addresses:
+        own = OF_LOG.fullmatch(address)
+        if own and own[2] in addresses:
             raise ValueError(
-                f"{address} differs between the logs; say which one, as in logs.0.{address}"
+                f"{address} is free twice, as {own[2]} is free for all logs together; "
+                "leave one of them out"
             )
+
+
+def _free_number(cases: list[Case], address: str, pair, reading: float) -> Free:
+    case, rest = _place(cases, address)
+    value = known(value_at(case, rest))
     if value.ndim:
         raise ValueError(f"{address} is a list; free its entries, {address}.0 and so on")
-    return float(value)
+    start = float(value)
+    low, high = (-np.inf, np.inf) if pair is None else (float(bound) for bound in pair)
+    signed = rest.endswith((".offset", ".entry_time"))
+    if pair is None and not signed:
+        low, high = (0.0, np.inf) if start > 0 else (-np.inf, 0.0)
+    if not low < high:
+        raise ValueError(f"{address}: the lower bound {low:g} is not below the upper, {high:g}")
+    if not low <= start <= high:
+        raise ValueError(
+            f"{address} starts at {start:g}, outside its bounds {low:g} to {high:g}: change "
+            "the number in the case, or the bounds"
+        )
+    if np.isfinite(high - low):
+        size = high - low
+    elif rest.endswith(".offset"):
+        size = reading
+    elif rest.endswith(".entry_time"):
+        size = float(known(case.run.duration))
+    else:
+        size = abs(start)
+    if size == 0.0:
+        raise ValueError(
+            f"{address} starts at 0, which does not say how large it may be: give it bounds, such "
+            f"as {address}=0:1, or another start"
+        )
+    return Free(address, unit_at(case, rest), start, low, high, size)
+
+
+def _place(cases: list[Case], address: str) -> tuple[Case, str]:
+    """The case of the log that an address is about, and the address within it."""
+    own = OF_LOG.fullmatch(address)
+    if own:
+        if int(own[1]) >= len(cases):
+            last = len(cases) - 1
+            known_ones = "the only log is logs.0" if last == 0 else f"the last log is logs.{last}"
+            raise ValueError(f"{address}: there is no such log; {known_ones}")
+        return cases[int(own[1])], own[2]
+    values = [known(value_at(case, address)) for case in cases]
+    if any(np.any(value != values[0]) for value in values):
+        raise ValueError(
+            f"{address} differs between the logs; say which one, as in logs.0.{address}"
+        )
+    return cases[0], address
+
+
+def unit_at(case: Case, address: str) -> str:
+    """The SI unit of the number at an address; "" or "1" if it has none."""
+    unit, part = "", case
+    for step in address.split("."):
+        if isinstance(part, tuple):
+            part = part[int(step)]
+        elif dataclasses.is_dataclass(part):
+            if isinstance(part, Sensor) and step == "offset":
+                return QUANTITIES[part.quantity]
+            unit = type(part).__dataclass_fields__[step].metadata.get("unit", "")
+            part = getattr(part, step)
+    return unit
 
 
 def insert(case: Case, number: int, values: dict[str, Float[Array, ""]]) -> Case:

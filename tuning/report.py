@@ -6,43 +6,69 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxbeam.sensors import QUANTITIES
+
 if TYPE_CHECKING:
     from tuning.identify import Fit
+
+CLOSE = 0.95  # correlation beyond which two numbers are said to be hard to tell apart
 
 
 def fit_table(fit: Fit) -> str:
     """A table of values with 95 % intervals, then what is unseen, correlated or at a bound."""
-    width = max(len(address) for address in fit.addresses)
-    lines = [f"{'number':{width}}  {'start':>11}  {'fitted':>11}  95 % interval"]
-    for i, address in enumerate(fit.addresses):
-        low, high = fit.intervals[i]
-        if np.isfinite(fit.errors[i]):
-            interval = f"{low:.5g} to {high:.5g}"
-        else:
-            interval = "the data cannot tell"
-        mark = "  (at its bound)" if address in fit.at_bound else ""
-        row = f"{address:{width}}  {fit.starts[i]:11.5g}  {fit.values[i]:11.5g}  {interval}{mark}"
-        lines.append(row)
-    lines += [""] + [_unseen_sentence(direction) for direction in fit.unseen]
-    pairs = np.argwhere(np.triu(np.abs(np.nan_to_num(fit.correlation)) > 0.95, 1))
-    for i, j in pairs:
-        lines.append(
+    header = ("number", "unit", "start", "fitted", "95 % interval")
+    rows = [header, *_rows(fit)]
+    a, b, c, d = (max(len(row[i]) for row in rows) for i in range(4))
+    lines = [
+        f"{name:{a}}  {unit:{b}}  {start:>{c}}  {value:>{d}}  {told}"
+        for name, unit, start, value, told in rows
+    ]
+    remarks = [*_bounds(fit), *_unseen(fit), *_pairs(fit), *_residuals(fit)]
+    return "\n".join([*lines, "", *remarks, fit.verdict])
+
+
+def _rows(fit: Fit):
+    for number, value, interval in zip(fit.numbers, fit.values, fit.intervals, strict=True):
+        told = "the data cannot tell"
+        if np.all(np.isfinite(interval)):
+            told = f"{interval[0]:.5g} to {interval[1]:.5g}"
+        yield number.address, number.unit, f"{number.start:.5g}", f"{value:.5g}", told
+
+
+def _bounds(fit: Fit):
+    for number, value in zip(fit.numbers, fit.values, strict=True):
+        if number.at_bound(value):
+            yield (
+                f"{number.address} ended at its bound ({number.low:.5g} to {number.high:.5g}): "
+                "the logs fit best there or beyond, and the intervals do not hold; "
+                "widen the bounds if they may be wrong"
+            )
+
+
+def _unseen(fit: Fit):
+    """The directions that the data cannot see, by name."""
+    units = {number.address: number.unit for number in fit.numbers}
+    for direction in fit.unseen:
+        if len(direction) == 1:
+            yield f"the data cannot see {next(iter(direction))}: give it a value known otherwise"
+            continue
+        changes = [f"{a} by {change:+.3g} {units[a]}" for a, change in direction.items()]
+        yield (
+            f"the data cannot see a change of {', '.join(changes)} together: "
+            "give one of them a value known otherwise"
+        )
+
+
+def _pairs(fit: Fit):
+    for i, j in np.argwhere(np.triu(np.abs(np.nan_to_num(fit.correlation)) > CLOSE, 1)):
+        yield (
             f"{fit.addresses[i]} and {fit.addresses[j]} are hard to tell apart: "
             f"correlation {fit.correlation[i, j]:.3f}"
         )
+
+
+def _residuals(fit: Fit):
+    units = [QUANTITIES[sensor.quantity] for sensor in fit.case.sensors]
     for log, noise in zip(fit.campaign.logs, fit.noise, strict=True):
-        levels = ", ".join(f"{level:.3g}" for level in noise)
-        lines.append(f"residual of {log.source}: {levels} (standard deviation, SI units)")
-    lines.append(fit.verdict)
-    return "\n".join(line for k, line in enumerate(lines) if line or k == len(fit.addresses) + 1)
-
-
-def _unseen_sentence(direction: dict[str, float]) -> str:
-    """One direction that the data cannot see, by name."""
-    if len(direction) == 1:
-        return f"the data cannot see {next(iter(direction))}: give it a value, or narrow bounds"
-    parts = ", ".join(f"{address} ({share:+.2f})" for address, share in direction.items())
-    return (
-        f"the data cannot see a common change of {parts} (shares of their sizes): "
-        "give one of them a value"
-    )
+        levels = [f"{level:.3g} {unit}" for level, unit in zip(noise, units, strict=True)]
+        yield f"standard deviation of the residual of {log.source}: {', '.join(levels)}"

@@ -6,15 +6,18 @@ import numpy as np
 from jaxtyping import Float
 
 BLIND = 0.5  # standard error, in typical sizes, beyond which a direction counts as unseen
-SHARE = 0.1  # of an unseen direction: addresses with less are taken to be seen
+SHARE = 0.1  # of an unseen direction: an address with more takes part in it
+FAR = 1e4  # typical sizes: the spread of a direction without any effect is taken for so much
+STEP = 0.1  # of a typical size: the largest change with which an unseen direction is reported
 INTERVAL = 1.959964  # standard errors to either side: 95 % of a normal distribution
 
 
 @dataclasses.dataclass(frozen=True)
 class Uncertainty:
-    """Standard errors (infinite where the data see nothing), correlation, unseen directions.
+    """Standard errors (infinite where the data cannot tell), correlation, unseen directions.
 
-    Each unseen direction is a dictionary from address to relative share, in typical sizes.
+    Each unseen direction is a dictionary from address to change, in SI units: made together,
+    these changes leave the readings as good as they are.
     """
 
     errors: Float[np.ndarray, " free"]
@@ -25,7 +28,9 @@ class Uncertainty:
 def colour(residuals: Float[np.ndarray, " time"]) -> float:
     """Factor by which a residual's autocorrelation raises variances: 1 + 2 sum of correlations.
 
-    Summed over the first lags up to where the correlation vanishes in its own scatter.
+    Summed over the first lags, up to where the correlation vanishes in its own scatter; this is
+    exact for slow changes of the reading and too much for fast ones (Box, Jenkins, Time Series
+    Analysis, section 2.1.5).
     """
     centred = residuals - residuals.mean()
     power = float(centred @ centred)
@@ -48,30 +53,28 @@ def uncertainty(
 ) -> Uncertainty:
     """Uncertainty of values from the Jacobian of residuals in units of their standard errors.
 
-    Singular directions of the Jacobian in typical `sizes` whose standard error exceeds `BLIND`
-    are unseen: they get names instead of numbers, and so do all addresses that take part in one.
+    The covariance is the inverse of J' J, by the singular directions of J in typical `sizes`.
+    Directions whose standard error exceeds `BLIND` are unseen: all addresses that take part in
+    one get names instead of numbers, and so does any whose own standard error exceeds it.
     """
-    scaled = jacobian * sizes
-    _, strength, directions = np.linalg.svd(scaled, full_matrices=False)
-    with np.errstate(divide="ignore"):
-        spread = 1 / strength
+    _, strength, directions = np.linalg.svd(np.linalg.qr(jacobian * sizes, mode="r"))
     # Columns in exact proportion leave a strength of rounding size.
-    blind = (spread > BLIND) | (strength < strength.max(initial=0.0) * 1e-9)
-    seen = directions[~blind]
-    covariance = (seen.T * spread[~blind] ** 2) @ seen
-    errors = np.sqrt(np.diag(covariance))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = covariance / np.outer(errors, errors)
-    touched = np.any(np.abs(directions[blind]) > SHARE, axis=0)
-    errors = np.where(touched, np.inf, errors * sizes)
-    correlation = np.where(touched[:, None] | touched[None, :], np.nan, correlation)
+    spread = np.full(len(addresses), FAR)
+    strong = strength > strength.max(initial=0.0) * 1e-9
+    spread[: strength.size][strong] = np.minimum(1 / strength[strong], FAR)
+    reach = np.abs(directions) * spread[:, None]
+    errors = np.sqrt(np.sum(reach**2, axis=0))
+    covariance = (directions.T * spread**2) @ directions
+    correlation = covariance / np.outer(errors, errors)
+    blind = spread > BLIND
+    part = blind[:, None] & ((np.abs(directions) > SHARE) | (reach > BLIND))
+    untold = part.any(axis=0) | (errors > BLIND)
     unseen = []
-    for direction in directions[blind]:
-        lead = direction[np.abs(direction).argmax()]
-        shares = {
-            address: float(share / lead)
-            for address, share in zip(addresses, direction, strict=True)
-            if abs(share) > SHARE
-        }
-        unseen.append(shares)
-    return Uncertainty(errors, correlation, unseen)
+    for direction, takes_part in zip(directions[blind], part[blind], strict=True):
+        change = direction * sizes * STEP / direction[np.abs(direction).argmax()]
+        unseen.append({addresses[i]: float(change[i]) for i in np.flatnonzero(takes_part)})
+    return Uncertainty(
+        np.where(untold, np.inf, errors * sizes),
+        np.where(untold[:, None] | untold[None, :], np.nan, correlation),
+        unseen,
+    )
