@@ -1,0 +1,127 @@
+"""Speed of a sweep against scipy and diffrax, and of derivatives against plain runs.
+
+    python -m experiments.benchmarks.sweep [--modes 3 12]
+
+4096 crossings of the one-span rig, 64 masses by 64 speeds, peaks at three sensors with free
+vibration, to one part in a million; everything timed in one run, medians, compiling apart.
+scipy is timed on twelve runs and scaled; the accuracy of all is checked against a reference.
+"""
+
+import argparse
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxbeam as jb
+from experiments.benchmarks import baselines
+from jaxbeam.plan import make_plan
+from jaxbeam.simulate import readings
+
+MASSES = np.linspace(0.1, 1.0, 64)
+SPEEDS = np.linspace(0.3, 10.0, 64)
+CHECKED = slice(0, 64, 9)  # speeds at which peaks are compared with the reference
+FREE = (
+    "beam.flexural_rigidity",
+    "beam.mass_per_length",
+    "beam.damping_ratio",
+    "loads.0.mass",
+    "loads.0.speed",
+    "loads.0.entry_time",
+)
+
+
+def rig(modes: int) -> jb.Case:
+    """The one-span rig with its three sensors, long enough for the slowest crossing."""
+    beam = jb.Beam(
+        length=0.6,
+        flexural_rigidity=11.68,
+        mass_per_length=0.535,
+        damping_ratio=0.03,
+        modes=modes,
+    )
+    return jb.Case(
+        beam,
+        sensors=[jb.Sensor(x) for x in (0.15, 0.3, 0.45)],
+        loads=[jb.MovingMass(mass=0.5, speed=1.0)],
+        run=jb.Run(duration=0.6 / SPEEDS.min() + 0.5),
+    )
+
+
+def sweep_peaks(modes: int) -> np.ndarray:
+    """Peaks of the grid by `jaxbeam.sweep`, choice of time steps included."""
+    over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
+    return jb.sweep(rig(modes), over, progress=False).peak_deflection.values
+
+
+def compare(modes: int) -> list[tuple[str, float, float, float]]:
+    """Name, seconds, ratio to jaxbeam and largest relative error of each solver."""
+    reference = baselines.reference_peaks(MASSES, SPEEDS[CHECKED], modes)
+
+    def worst(peaks):
+        return float(np.max(np.abs(peaks / reference - 1)))
+
+    ours = baselines.time_call(sweep_peaks, modes)
+    rows = [("jaxbeam", ours.run, worst(sweep_peaks(modes)[:, CHECKED]))]
+    repeat = 3 if modes < 6 else 1
+    for name, shared in (("diffrax, vmapped", False), ("diffrax, shared steps", True)):
+
+        def others(shared=shared):
+            return baselines.diffrax_peaks(MASSES, SPEEDS, modes, shared_steps=shared)
+
+        took = baselines.time_call(others, repeat=repeat)
+        rows.append((name, took.run, worst(np.asarray(others())[:, CHECKED])))
+    scaled = baselines.scipy_time(MASSES, SPEEDS, modes)
+    some = baselines.scipy_peaks(MASSES[::21], SPEEDS[CHECKED], modes)
+    rows.append(("scipy DOP853, scaled", scaled, float(np.max(np.abs(some / reference[::21] - 1)))))
+    print(f"{modes} modes: the sweep compiles in {ours.compile:.1f} s")
+    return [(name, took, took / ours.run, error) for name, took, error in rows]
+
+
+def derivatives() -> list[tuple[str, float]]:
+    """Time of a jvp and of a Jacobian over six numbers of a misfit, in plain runs."""
+    case = jb.replace(rig(3), {"run.duration": 1.2})
+    times = jnp.arange(1200) / 1000.0
+    plan = make_plan(case, times)
+    start = jnp.array([float(jb.addresses(case)[address]) for address in FREE])
+    measured = readings(case, times, plan)
+
+    def residual(values):
+        varied = jb.replace(case, dict(zip(FREE, values, strict=True)))
+        return readings(varied, times, plan) - measured
+
+    def misfit(values):
+        return jnp.sum(residual(values) ** 2)
+
+    def along(values):
+        return jax.jvp(misfit, (values,), (jnp.ones_like(values),))
+
+    plain = baselines.time_call(jax.jit(misfit), start, repeat=21).run
+    return [
+        ("jvp of a misfit", baselines.time_call(jax.jit(along), start, repeat=21).run / plain),
+        (
+            "Jacobian over six numbers",
+            baselines.time_call(jax.jit(jax.jacfwd(residual)), start, repeat=21).run / plain,
+        ),
+    ]
+
+
+def main() -> None:
+    """Run the benchmark and print its tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--modes", type=int, nargs="+", default=[3, 12])
+    began = time.perf_counter()
+    for modes in parser.parse_args().modes:
+        print(f"\n| {modes} modes, 4096 crossings | seconds | times jaxbeam | largest error |")
+        print("| --- | ---: | ---: | ---: |")
+        for name, took, ratio, error in compare(modes):
+            print(f"| {name} | {took:.3g} | {ratio:.3g} | {error:.1e} |", flush=True)
+    print("\n| derivatives | plain runs |\n| --- | ---: |")
+    for name, ratio in derivatives():
+        print(f"| {name} | {ratio:.2g} |")
+    print(f"\ntook {time.perf_counter() - began:.0f} s in all")
+
+
+if __name__ == "__main__":
+    main()
