@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -151,7 +152,7 @@ def unit_at(case: Case, address: str) -> str:
     return unit
 
 
-def insert(case: Case, number: int, values: dict[str, Float[Array, ""]]) -> Case:
+def insert(case: Case, number: int, values: dict[str, Any]) -> Case:
     """The case of one log with values at the addresses that concern it."""
     own = {}
     for address, value in values.items():

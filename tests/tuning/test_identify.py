@@ -1,0 +1,209 @@
+"""Identification: planted values come back, intervals cover them, and the blind spots are named."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.case import replace
+from tests.oracles import modal_equations
+from tests.oracles.loads import Load
+from tuning import Fit, Log, identify
+from tuning.campaign import prepare
+from tuning.free import free_numbers
+from tuning.search import Search
+
+SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)
+RATE = 500.0
+
+
+def one_span(sensors=(0.15, 0.3), **run) -> jb.Case:
+    """The rig of `SPAN` with its load, as a case."""
+    return jb.Case(
+        beam=jb.Beam(
+            length=SPAN.length,
+            flexural_rigidity=SPAN.flexural_rigidity,
+            mass_per_length=SPAN.mass_per_length,
+            damping_ratio=SPAN.damping_ratio,
+            modes=SPAN.modes,
+        ),
+        sensors=[jb.Sensor(position=position) for position in sensors],
+        loads=[jb.MovingMass(mass=0.5, speed=2.0, entry_time=0.05)],
+        run=jb.Run(duration=run.get("duration", 0.8), sample_rate=RATE),
+    )
+
+
+def log_of(times, values, **about) -> Log:
+    """A log of deflections in m."""
+    names = tuple(f"w{i}" for i in range(values.shape[1]))
+    return Log(
+        np.asarray(times), np.asarray(values), names, ("deflection",) * len(names),
+        ("m",) * len(names), **about,
+    )  # fmt: skip
+
+
+def simulated_log(case: jb.Case, noise=1e-5, seed=0, **about) -> Log:
+    """What jaxbeam says the sensors read, with white noise (m)."""
+    record = jb.simulate(case)
+    values = np.asarray(record.measured)
+    return log_of(
+        record.times,
+        values + noise * np.random.default_rng(seed).normal(size=values.shape),
+        **about,
+    )
+
+
+def oracle_log(load: Load, offsets, noise=1e-5, duration=0.8, seed=1, **about) -> Log:
+    """What the modal equations, written and integrated apart from jaxbeam, say."""
+    times = np.arange(round(duration * RATE) + 1) / RATE
+    clean = modal_equations.respond(SPAN, [load], (0.15, 0.3), times).deflection + offsets
+    values = clean + noise * np.random.default_rng(seed).normal(size=clean.shape)
+    return log_of(times, values, **about)
+
+
+def deviations(fit: Fit, truth: dict[str, float]) -> np.ndarray:
+    """Errors of the fit in its own standard errors."""
+    return (fit.values - [truth[address] for address in fit.addresses]) / fit.errors
+
+
+TRUTH = {
+    "beam.flexural_rigidity": 11.68,
+    "beam.mass_per_length": 0.535,
+    "beam.damping_ratio": 0.03,
+    "sensors.0.offset": 2e-4,
+    "sensors.1.offset": -1e-4,
+    "logs.0.loads.0.speed": 2.0,
+    "logs.0.loads.0.entry_time": 0.05,
+    "logs.1.loads.0.speed": -3.1,
+    "logs.1.loads.0.entry_time": 0.11,
+}
+
+
+@pytest.fixture(scope="module")
+def two_logs() -> Fit:
+    """Two crossings of the oracle's beam, one each way, fitted from wrong starts."""
+    loads = [Load(0.5, 2.0, 0.05), Load(0.3, -3.1, 0.11)]
+    guesses = [
+        jb.MovingMass(mass=0.5, speed=2.1, entry_time=0.04),
+        jb.MovingMass(mass=0.3, speed=-3.0, entry_time=0.1),
+    ]
+    logs = [
+        oracle_log(load, [2e-4, -1e-4], duration=end, seed=i, source=f"run {i}", loads=(guess,))
+        for i, (load, guess, end) in enumerate(zip(loads, guesses, (0.8, 0.7), strict=True))
+    ]
+    start = {
+        "beam.flexural_rigidity": 10.0,
+        "beam.mass_per_length": 0.6,
+        "beam.damping_ratio": 0.01,
+    }
+    free = dict.fromkeys(TRUTH) | {"beam.damping_ratio": (0.0, 0.2)}
+    return identify(replace(one_span(), start), logs, free)
+
+
+def test_planted_values_come_back(two_logs):
+    assert two_logs.addresses == list(TRUTH)
+    assert np.all(np.abs(deviations(two_logs, TRUTH)) < 3)
+    np.testing.assert_allclose(two_logs.noise, 1e-5, rtol=0.1)
+    errors = dict(zip(two_logs.addresses, two_logs.errors, strict=True))
+    assert errors["beam.flexural_rigidity"] < 0.01 * 11.68
+    assert errors["beam.damping_ratio"] < 0.1 * 0.03
+    assert two_logs.verdict == "converged"
+    assert not two_logs.at_bound and not two_logs.unseen
+
+
+def test_fitted_cases(two_logs):
+    value = dict(zip(two_logs.addresses, two_logs.values, strict=True))
+    assert float(two_logs.case.beam.flexural_rigidity) == value["beam.flexural_rigidity"]
+    assert float(two_logs.case.loads[0].speed) == 2.0  # that of the case, which no log used
+    assert float(two_logs.cases[1].loads[0].speed) == value["logs.1.loads.0.speed"]
+    assert float(two_logs.case.run.duration) == 0.8
+
+
+def test_correlation(two_logs):
+    correlation = two_logs.correlation
+    np.testing.assert_allclose(np.diag(correlation), 1, rtol=1e-12)
+    np.testing.assert_allclose(correlation, correlation.T, rtol=1e-12)
+    i, j = (two_logs.addresses.index(f"logs.0.loads.0.{a}") for a in ("speed", "entry_time"))
+    assert correlation[i, j] > 0.5  # later and faster: the same time at midspan
+
+
+def test_what_is_said(two_logs):
+    said = str(two_logs)
+    first = said.splitlines()[1]
+    assert first.split()[:4] == ["beam.flexural_rigidity", "N", "m^2", "10"]
+    assert "standard deviation of the residual of run 1: " in said
+    plain = json.loads(json.dumps(two_logs.to_dict()))
+    assert plain["numbers"]["sensors.0.offset"]["unit"] == "m"
+    low, high = plain["numbers"]["logs.1.loads.0.speed"]["interval_95"]
+    assert low < -3.1 < high
+    figure = two_logs.plot()
+    assert {"run 0", "run 1"} <= {axes.get_title("left") for axes in figure.axes}
+
+
+# One sensor, two modes, few samples: small enough for hundreds of fits.
+SMALL = {
+    "beam.flexural_rigidity": 11.68,
+    "beam.mass_per_length": 0.535,
+    "beam.damping_ratio": 0.03,
+    "sensors.0.offset": 0.0,
+    "loads.0.speed": 2.0,
+    "loads.0.entry_time": 0.05,
+}
+STARTS = {"beam.flexural_rigidity": 11.0, "beam.damping_ratio": 0.02, "loads.0.speed": 2.05}
+NOISE = 2e-5
+
+
+class Rehearsal:
+    """Many logs of one rig, fitted by one compiled search that starts beside the truth."""
+
+    def __init__(self):
+        beam = {"beam": dataclasses.replace(one_span().beam, modes=2)}
+        case = dataclasses.replace(one_span(sensors=(0.2,), duration=0.6), **beam)
+        self.clean = np.asarray(jb.simulate(case).measured)
+        log = simulated_log(case, NOISE)
+        campaign = prepare(replace(case, STARTS), [log])
+        numbers = free_numbers(campaign.cases, dict.fromkeys(SMALL), np.ptp(self.clean))
+        self.search = Search(campaign, numbers)
+
+    def deviations(self, noises):
+        """Errors in stated standard errors (log, free), and these standard errors."""
+        found = [self.search.estimate((self.clean + noise)[None]) for noise in noises]
+        errors = np.array([each.uncertainty.errors for each in found])
+        values = np.array([each.values for each in found])
+        assert all(each.converged for each in found)
+        return (values - list(SMALL.values())) / errors, errors
+
+
+@pytest.fixture(scope="module")
+def rehearsal() -> Rehearsal:
+    return Rehearsal()
+
+
+def coloured(white, memory: float):
+    """A first-order process of the same power as the white noise (log, time, channel)."""
+    noise = np.array(white)
+    for i in range(1, noise.shape[1]):
+        noise[:, i] = memory * noise[:, i - 1] + np.sqrt(1 - memory**2) * white[:, i]
+    return noise
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth(rehearsal):
+    noises = NOISE * np.random.default_rng(5).normal(size=(200, *rehearsal.clean.shape))
+    errors, _ = rehearsal.deviations(noises)
+    covered = np.mean(np.abs(errors) < 1.96, axis=0)
+    assert np.all((covered >= 0.90) & (covered <= 0.98)), dict(zip(SMALL, covered, strict=True))
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 3 / np.sqrt(200))
+
+
+@pytest.mark.slow
+def test_coloured_residuals_widen_intervals(rehearsal):
+    white = NOISE * np.random.default_rng(6).normal(size=(100, *rehearsal.clean.shape))
+    _, narrow = rehearsal.deviations(white[:10])
+    errors, wide = rehearsal.deviations(coloured(white, 0.6))
+    widening = np.median(wide, axis=0) / np.median(narrow, axis=0)
+    np.testing.assert_allclose(widening, 2.0, rtol=0.25)  # sqrt((1 + r) / (1 - r))
+    covered = np.mean(np.abs(errors) < 1.96, axis=0)
+    assert np.all(covered >= 0.90), dict(zip(SMALL, covered, strict=True))
