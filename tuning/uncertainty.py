@@ -37,7 +37,7 @@ def colour(residuals: Float[np.ndarray, " time"]) -> float:
     if power == 0.0:
         return 1.0
     factor = 1.0
-    limit = 2 / np.sqrt(centred.size)
+    limit = 1 / np.sqrt(centred.size)
     for lag in range(1, centred.size // 4):
         correlation = float(centred[:-lag] @ centred[lag:]) / power
         if correlation < limit:

@@ -35,6 +35,12 @@ def one_span(sensors=(0.15, 0.3), **run) -> jb.Case:
     )
 
 
+def small(sensors=(0.2,), **run) -> jb.Case:
+    """The rig with two modes only."""
+    case = one_span(sensors, **run)
+    return dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=2))
+
+
 def log_of(times, values, **about) -> Log:
     """A log of deflections in m."""
     names = tuple(f"w{i}" for i in range(values.shape[1]))
@@ -159,8 +165,7 @@ class Rehearsal:
     """Many logs of one rig, fitted by one compiled search that starts beside the truth."""
 
     def __init__(self):
-        beam = {"beam": dataclasses.replace(one_span().beam, modes=2)}
-        case = dataclasses.replace(one_span(sensors=(0.2,), duration=0.6), **beam)
+        case = small(duration=0.6)
         self.clean = np.asarray(jb.simulate(case).measured)
         log = simulated_log(case, NOISE)
         campaign = prepare(replace(case, STARTS), [log])
@@ -207,3 +212,118 @@ def test_coloured_residuals_widen_intervals(rehearsal):
     np.testing.assert_allclose(widening, 2.0, rtol=0.25)  # sqrt((1 + r) / (1 - r))
     covered = np.mean(np.abs(errors) < 1.96, axis=0)
     assert np.all(covered >= 0.90), dict(zip(SMALL, covered, strict=True))
+
+
+def test_a_common_scale_is_reported_by_name():
+    """Rigidity, mass per length and the load's mass times anything: the same deflection."""
+    scaled = ["beam.flexural_rigidity", "beam.mass_per_length", "loads.0.mass"]
+    case = small(duration=0.6)
+    fit = identify(case, simulated_log(case, NOISE), [*scaled, "sensors.0.offset"])
+    (direction,) = fit.unseen
+    assert set(direction) == set(scaled)
+    found = dict(zip(fit.addresses, fit.values, strict=True))
+    shares = [direction[address] / found[address] for address in scaled]
+    np.testing.assert_allclose(shares, shares[0], rtol=0.02)
+    assert np.isinf(fit.errors).tolist() == [True, True, True, False]
+    assert np.isinf(fit.intervals[:3]).all()
+    assert str(fit).count("the data cannot tell") == 3
+    assert fit.to_dict()["numbers"]["loads.0.mass"]["interval_95"] is None
+
+
+def test_a_log_that_ends_at_the_exit_hardly_shows_mass_and_damping():
+    """At 0.5 m/s the deflection is quasi-static: rigidity is seen, the vibration is not."""
+    case = replace(small(duration=1.26), {"loads.0.speed": 0.5})
+    log = simulated_log(case, 1e-4)
+    inertial = ["beam.mass_per_length", "beam.damping_ratio"]
+    fit = identify(case, log, ["beam.flexural_rigidity", *inertial])
+    assert fit.errors[0] < 0.01 * 11.68
+    assert np.isinf(fit.errors[1:]).all()
+    assert {name for direction in fit.unseen for name in direction} == set(inertial)
+    assert "the data cannot see" in str(fit)
+
+
+def test_bounds_hold_and_a_bound_reached_is_said():
+    case = replace(small(duration=0.6), {"beam.flexural_rigidity": 9.0})
+    log = simulated_log(small(duration=0.6), NOISE)
+    fit = identify(case, log, {"beam.flexural_rigidity": (8.0, 11.0), "beam.damping_ratio": None})
+    assert fit.at_bound == ["beam.flexural_rigidity"]
+    assert 8.0 <= fit.values[0] <= 11.0 and fit.intervals[0, 1] == 11.0
+    assert "beam.flexural_rigidity ended at its bound (8 to 11)" in str(fit)
+    assert fit.to_dict()["numbers"]["beam.flexural_rigidity"]["at_bound"]
+
+
+def test_elastic_supports_and_their_springs():
+    """The oracle of supports is the finite-element one; here jaxbeam's own log must give back."""
+    case = dataclasses.replace(
+        small(sensors=(0.15, 0.45), duration=0.6),
+        supports=(jb.Support(position=0.3, stiffness=4e4, damping=2.0),),
+    )
+    log = simulated_log(case, 1e-6)
+    start = {"supports.0.stiffness": 3e4, "beam.flexural_rigidity": 12.5}
+    fit = identify(replace(case, start), log, list(start))
+    truth = {"supports.0.stiffness": 4e4, "beam.flexural_rigidity": 11.68}
+    assert np.all(np.abs(deviations(fit, truth)) < 3)
+    assert np.all(fit.errors < 0.01 * fit.values)
+
+
+# Faulty input: what is wrong, where, and how to mend it, before anything is compiled.
+TIMES = np.arange(400) / RATE
+FLAT = np.zeros((400, 2))
+
+
+def faulty(quantities=("deflection", "deflection"), **about) -> Log:
+    given = {"times": TIMES, "values": FLAT, "source": "run.csv"} | about
+    count = given["values"].shape[1]
+    units = tuple("g" if quantity == "acceleration" else "m" for quantity in quantities)
+    names = ("w", "v", "u")[:count]
+    return Log(names=names, quantities=quantities[:count], units=units[:count], **given)
+
+
+LATE = (jb.MovingMass(mass=0.5, speed=1.0, entry_time=0.9),)
+SLOW = (jb.MovingMass(mass=0.5, speed=0.5),)
+FAULTS = {
+    "no logs": ([], "give at least one log"),
+    "too few samples": (
+        faulty(times=TIMES[:2], values=FLAT[:2]), "run.csv: a fit needs at least 3 samples, not 2"
+    ),
+    "before zero": (faulty(times=TIMES - 0.1), "run.csv: it starts at -0.1 s, but runs start at 0"),
+    "hours late": (faulty(times=TIMES + 3600), "run.csv: it starts only at 3600 s, while runs"),
+    "channels missing": (
+        faulty(values=FLAT[:, :1]),
+        "run.csv: its channels w do not match the case's 2 sensors; say in the TOML file beside",
+    ),
+    "same sensor twice": (faulty(sensors=(1, 1)), "run.csv: two of its channels are of the same"),
+    "unknown sensor": (faulty(sensors=(0, 7)), "do not match the case's 2 sensors"),
+    "other quantity": (
+        faulty(("acceleration", "deflection")),
+        "run.csv: w is a acceleration in g, but sensors.0 measures deflection",
+    ),
+    "ends before entry": (
+        faulty(loads=LATE),
+        "run.csv: it ends at 0.798 s, before the first load enters at 0.9 s",
+    ),
+    "shorter than a crossing": (
+        faulty(loads=SLOW),
+        "run.csv: it ends at 0.798 s, before the first load has crossed at 1.2 s; check the load's "
+        "speed and entry time",
+    ),
+    "no loads": (faulty(loads=()), "run.csv: no load is known, neither in the case nor in the TOML"),
+    "unlike loads": ([faulty(), faulty(loads=SLOW + SLOW)], "the logs differ in the kind or number"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("logs, words", FAULTS.values(), ids=FAULTS)
+def test_faulty_logs_are_refused(logs, words):
+    with pytest.raises(ValueError) as refused:
+        identify(one_span(), logs, ["beam.length"])
+    assert words in str(refused.value)
+
+
+def test_case_without_sensors_is_refused():
+    with pytest.raises(ValueError, match="the case has no sensors to compare the logs with"):
+        identify(one_span(sensors=()), faulty(), ["beam.length"])
+
+
+def test_one_address_may_be_given_alone():
+    with pytest.raises(ValueError, match="did you mean 'beam.flexural_rigidity'"):
+        identify(one_span(), faulty(), "beam.flexural_rigidty")
