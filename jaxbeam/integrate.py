@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.dynamics import Traffic, contact_rows, solve_contact
 from jaxbeam.exponentials import GAUSS, POINTS, Step, propagators
@@ -22,6 +22,7 @@ from jaxbeam.peaks import refine, vertex
 from jaxbeam.rig import Rig
 
 CHUNK = 16
+NEAR = 1.1  # a peak between samples is less than this above the highest of them
 
 
 class Extremes(eqx.Module):
@@ -55,7 +56,7 @@ class Tables(eqx.Module):
     watch: Float[Array, "step looked state"] | None
     watch_push: Float[Array, "step looked row"] | None
     slots: Int[Array, "step slot"]
-    active: Float[Array, "step slot"]
+    active: Bool[Array, "step slot"]
 
 
 class Rigging(eqx.Module):
@@ -115,7 +116,7 @@ def _tabulate(rig: Rig, traffic: Traffic, grid: Grid, rigging: Rigging, slots: i
 
     # Mostly all steps of a chunk are equally long, and then share their propagators.
     tables = jax.lax.cond(jnp.all(kind == kind[0]), alike, one_by_one, None)
-    return Tables(*tables, chosen, active.astype(float)), start, span
+    return Tables(*tables, chosen, active), start, span
 
 
 def _tables_of_kind(rigging: Rigging, kind, shape, rows):
@@ -153,12 +154,15 @@ def _tables_of_kind(rigging: Rigging, kind, shape, rows):
     )
 
 
-def _advance(state, tables: Tables, inertia, weight):
+def _rows(loads: Float[Array, "load lane"], tables: Tables) -> Float[Array, "step row lane"]:
+    """A property of the loads for every row of the contact equations; zero for idle slots."""
+    chosen = jnp.where(tables.active[..., None], loads[tables.slots], 0.0)
+    return jnp.repeat(chosen, len(GAUSS), axis=1)
+
+
+def _advance(state, step):
     """One step of all lanes: the contact forces at the nodes, and the state at the end."""
-    nodes = len(GAUSS)
-    on = tables.active[:, None]
-    inertia = jnp.repeat(inertia[tables.slots] * on, nodes, axis=0)
-    weight = jnp.repeat(weight[tables.slots] * on, nodes, axis=0)
+    tables, inertia, weight = step
     forces = solve_contact(tables.gains, inertia, weight + inertia * (tables.respond @ state))
     blocks, side, _ = tables.drift.shape
     split = state.reshape(blocks, side, -1)
@@ -174,28 +178,39 @@ def _reduce(best: Extremes, tables: Tables, states, forces, start, span) -> Extr
     """Fold a chunk into the extremes."""
     steps, lanes = states.shape[0], states.shape[-1]
     seen = tables.watch @ states + tables.watch_push @ forces
-    samples = seen.reshape(steps, POINTS + 1, -1, lanes)
-    score = jax.vmap(vertex)(samples)
-    top = jnp.argmax(score, axis=0)
-    score = jnp.max(score, axis=0)
-    better = score > best.score
-    chosen = jnp.take_along_axis(samples, top[None, None], axis=0)[0]
-    pressing = -forces.reshape(steps, -1, len(GAUSS), lanes)
-    loads = best.lowest.shape[0]
+    samples = jax.lax.optimization_barrier(seen.reshape(steps, POINTS + 1, -1, lanes))
+
+    def raised(best):
+        score = jax.lax.optimization_barrier(jax.vmap(vertex)(samples))
+        top = jnp.argmax(score, axis=0)
+        better = jnp.max(score, axis=0) > best.score
+        chosen = jnp.take_along_axis(samples, top[None, None], axis=0)[0]
+        return Extremes(
+            jnp.where(better, jnp.max(score, axis=0), best.score),
+            jnp.where(better, chosen, best.samples),
+            jnp.where(better, start[top], best.start),
+            jnp.where(better, span[top], best.span),
+            best.lowest,
+            best.lost,
+        )
+
+    # Most chunks come nowhere near the peak so far, or press all along: they end here.
+    highest = jnp.max(jnp.abs(samples), axis=(0, 1))
+    best = jax.lax.cond(jnp.any(highest * NEAR > best.score), raised, lambda best: best, best)
+    pressing = jnp.min(-forces.reshape(steps, -1, len(GAUSS), lanes), axis=2)
     # A load that is not on the beam, or has no slot, does not count.
-    at_slot = tables.slots[:, :, None] == np.arange(loads)
-    counts = (at_slot & (tables.active[:, :, None] > 0))[:, :, None, :, None]
-    least = jnp.where(counts, pressing[:, :, :, None], jnp.inf)
-    times = (start[:, None] + span[:, None] * GAUSS)[:, None, :, None, None]
-    lost = jnp.where(least < 0, times, NEVER)
-    return Extremes(
-        jnp.where(better, score, best.score),
-        jnp.where(better, chosen, best.samples),
-        jnp.where(better, start[top], best.start),
-        jnp.where(better, span[top], best.span),
-        jnp.minimum(best.lowest, jnp.min(least, axis=(0, 1, 2), initial=jnp.inf)),
-        jnp.minimum(best.lost, jnp.min(lost, axis=(0, 1, 2), initial=NEVER)),
-    )
+    here = (tables.slots[:, :, None] == np.arange(best.lowest.shape[0])) & tables.active[..., None]
+    least = jnp.where(here[..., None], pressing[:, :, None], jnp.inf)
+    lowest = jnp.minimum(best.lowest, jnp.min(least, axis=(0, 1), initial=jnp.inf))
+
+    def lost(first):
+        pulls = -forces.reshape(steps, -1, 1, len(GAUSS), lanes) < 0
+        times = (start[:, None] + span[:, None] * GAUSS)[:, None, None, :, None]
+        when = jnp.where(pulls & here[..., None, None], times, NEVER)
+        return jnp.minimum(first, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
+
+    first = jax.lax.cond(jnp.any(lowest < 0), lost, lambda first: first, best.lost)
+    return eqx.tree_at(lambda b: (b.lowest, b.lost), best, (lowest, first))
 
 
 def _nothing_seen(places: int, loads: int, lanes: int) -> Extremes:
@@ -214,13 +229,11 @@ def _stepper(rig: Rig, traffic: Traffic, grid: Grid, watched, slots: int):
     """Function that takes state and extremes through the chunk that begins with a given step."""
     rigging = _rigging(rig, grid, watched)
 
-    def step(state, tables):
-        return _advance(state, tables, traffic.inertia, traffic.weight)
-
     def chunk(state, best, first):
         index = first + jnp.arange(CHUNK)
         tables, start, span = _tabulate(rig, traffic, grid, rigging, slots, index)
-        state, (states, forces) = jax.lax.scan(step, state, tables)
+        steps = tables, _rows(traffic.inertia, tables), _rows(traffic.weight, tables)
+        state, (states, forces) = jax.lax.scan(_advance, state, steps)
         if watched is not None:
             best = _reduce(best, tables, states, forces, start, span)
         return state, best, states
