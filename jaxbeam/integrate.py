@@ -122,7 +122,8 @@ def _tabulate(rig: Rig, traffic: Traffic, grid: Grid, rigging: Rigging, slots: i
 def _tables_of_kind(rigging: Rigging, kind, shape, rows):
     """Tables of steps of one length, from the shape and contact rows (step, slot, node, ...)."""
     step, watch, watch_push = jax.tree.map(
-        lambda table: table[kind], (rigging.step, rigging.watch, rigging.watch_push)
+        lambda table: jax.lax.dynamic_index_in_dim(table, kind, keepdims=False),
+        (rigging.step, rigging.watch, rigging.watch_push),
     )
     steps, slots, nodes = shape.shape[:3]
     size = slots * nodes

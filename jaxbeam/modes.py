@@ -257,11 +257,15 @@ def _chebyshev_table(t, terms: int):
     Built by doubling, T_(k+j) = 2 T_k T_j - T_(k-j), which takes few steps and does not lose
     accuracy.
     """
-    table = jnp.stack([jnp.ones_like(t), t], axis=-1)
-    while table.shape[-1] < terms:
-        last = table[..., -1:]
-        table = jnp.concatenate([table, 2 * last * table[..., 1:] - table[..., -2::-1]], axis=-1)
-    return table[..., :terms]
+    axis = t.ndim
+    table = jnp.stack([jnp.ones_like(t), t], axis=axis)
+    while table.shape[axis] < terms:
+        # Plain slices: indexing would give the compiler several times as much to read.
+        last = 2 * jax.lax.slice_in_dim(table, -1, None, axis=axis)
+        lower = jax.lax.rev(jax.lax.slice_in_dim(table, 0, -1, axis=axis), (axis,))
+        higher = last * jax.lax.slice_in_dim(table, 1, None, axis=axis) - lower
+        table = jnp.concatenate([table, higher], axis=axis)
+    return jax.lax.slice_in_dim(table, 0, terms, axis=axis)
 
 
 def modes(case: Case, layout: Layout | None = None) -> Modes:

@@ -41,26 +41,27 @@ def refine(samples: Float[Array, "point *rest"]) -> tuple[Float[Array, " *rest"]
     nodes = np.linspace(-1.0, 1.0, points)
     monomials = jnp.tensordot(np.linalg.inv(nodes[:, None] ** powers), samples, axes=1)
     frozen = jax.lax.stop_gradient(monomials)
+    column = (-1,) + (1,) * (samples.ndim - 1)
 
-    def value(curve, place, order=0):
-        factor = np.array([np.prod(np.arange(p - order + 1, p + 1)) for p in powers])
-        total = jnp.zeros_like(place)
-        for p in range(points - 1, order - 1, -1):
-            total = total * place + factor[p] * curve[p]
-        return total
+    # Highest power first, as Horner's rule takes them.
+    slope = jnp.flip(frozen[1:] * powers[1:].reshape(column), 0)
+    bend = jnp.flip(frozen[2:] * (powers[2:] * powers[1:-1]).reshape(column), 0)
+    curve = jnp.flip(frozen, 0)
 
     fine = np.linspace(-1.0, 1.0, FINE + 1)
-    curve = jnp.tensordot(fine[:, None] ** powers, frozen, axes=1)
-    start = jnp.asarray(fine)[jnp.argmax(jnp.abs(curve), axis=0)]
+    looked = jnp.tensordot(fine[:, None] ** powers, frozen, axes=1)
+    start = jnp.asarray(fine)[jnp.argmax(jnp.abs(looked), axis=0)]
 
     def improve(_, place):
-        bend = value(frozen, place, 2)
-        step = value(frozen, place, 1) / jnp.where(bend == 0, 1.0, bend)
-        step = jnp.where(bend == 0, 0.0, jnp.clip(step, -2 / FINE, 2 / FINE))
+        steep = jnp.polyval(bend, place, unroll=1)
+        flat = steep == 0
+        step = jnp.polyval(slope, place, unroll=1) / jnp.where(flat, 1.0, steep)
+        step = jnp.where(flat, 0.0, jnp.clip(step, -2 / FINE, 2 / FINE))
         return jnp.clip(place - step, -1.0, 1.0)
 
     place = jax.lax.fori_loop(0, 4, improve, start)
     # Where the curve is highest at an end, Newton's method may run away to a lower place.
-    higher = jnp.abs(value(frozen, place)) > jnp.abs(value(frozen, start))
-    place = jax.lax.stop_gradient(jnp.where(higher, place, start))
-    return jnp.abs(value(monomials, place)), (place + 1) / 2
+    high, before = (jnp.abs(jnp.polyval(curve, at, unroll=1)) for at in (place, start))
+    place = jax.lax.stop_gradient(jnp.where(high > before, place, start))
+    value = jnp.polyval(jnp.flip(monomials, 0), place, unroll=1)
+    return jnp.abs(value), (place + 1) / 2
