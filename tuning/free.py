@@ -47,6 +47,17 @@ class Free:
         """Whether a value lies on a bound, as good as."""
         return bool(min(value - self.low, self.high - value) <= INSIDE * self.size)
 
+    @property
+    def search_size(self) -> float:
+        """A large change of the search variable: one, or the typical size where it is the value."""
+        return self.size if np.isinf(self.low) and np.isinf(self.high) else 1.0
+
+    def size_at(self, value: float) -> float:
+        """Typical size once a value is fitted: one that came close to zero is itself small."""
+        one_sided = np.isfinite(self.low) != np.isfinite(self.high)
+        distance = min(value - self.low, self.high - value)
+        return float(np.clip(distance, 1e-9 * self.size, self.size)) if one_sided else self.size
+
     def outward(self, y: Float[Array, ""]) -> Float[Array, ""]:
         """Value of a search variable."""
         if np.isfinite(self.high - self.low):

@@ -15,6 +15,7 @@ from tuning.uncertainty import Uncertainty, colour, uncertainty
 
 ROUNDS = 2  # of fitting with the noise levels found in the round before
 MAX_STEPS = 60
+LEASH = 2.0  # width of the weak prior around the starts: a factor of e^2, or two typical sizes
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,6 +39,8 @@ class Search:
         if campaign.real.sum() * campaign.measured.shape[2] < len(numbers):
             raise ValueError(f"{len(numbers)} free numbers need at least as many samples")
         self.campaign, self.numbers = campaign, numbers
+        self._start = jnp.array([number.inward(number.start) for number in numbers])
+        start, width = self._start, LEASH * jnp.array([number.search_size for number in numbers])
         predict = campaign.predictor([number.address for number in numbers])
 
         def values_at(y):
@@ -50,7 +53,11 @@ class Search:
 
         def misfit(z, args):
             scale, weights, measured = args
-            return ((measured - predict(values_at(z * scale))) * weights).ravel()
+            y = z * scale
+            residuals = (measured - predict(values_at(y))) * weights
+            # What the data cannot see would wander off, and spoil what they can: a prior too weak
+            # to move anything they tell holds it near the start. It has no part in the errors.
+            return jnp.append(residuals.ravel(), (y - start) / width)
 
         solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-6)
 
@@ -83,7 +90,7 @@ class Search:
         are those of the linearised fit, widened where residuals are correlated in time. Raises
         RuntimeError if the search leaves the range in which the case can be simulated.
         """
-        y = jnp.array([number.inward(number.start) for number in self.numbers])
+        y = self._start
         noise = self._first_noise(measured)
         for _ in range(ROUNDS):
             y, converged = self._search(y, noise, measured)
@@ -100,7 +107,7 @@ class Search:
         found = uncertainty(
             [number.address for number in self.numbers],
             (np.asarray(jacobian) * weights[..., None]).reshape(-1, len(self.numbers)),
-            np.array([number.size for number in self.numbers]),
+            np.array([n.size_at(float(v)) for n, v in zip(self.numbers, values, strict=True)]),
         )
         return Estimate(np.asarray(values), np.asarray(predicted), noise, found, bool(converged))
 

@@ -108,6 +108,7 @@ def two_logs() -> Fit:
     return identify(replace(one_span(), start), logs, free)
 
 
+@pytest.mark.slow
 def test_planted_values_come_back(two_logs):
     assert two_logs.addresses == list(TRUTH)
     assert np.all(np.abs(deviations(two_logs, TRUTH)) < 3)
@@ -119,6 +120,7 @@ def test_planted_values_come_back(two_logs):
     assert not two_logs.at_bound and not two_logs.unseen
 
 
+@pytest.mark.slow
 def test_fitted_cases(two_logs):
     value = dict(zip(two_logs.addresses, two_logs.values, strict=True))
     assert float(two_logs.case.beam.flexural_rigidity) == value["beam.flexural_rigidity"]
@@ -127,6 +129,7 @@ def test_fitted_cases(two_logs):
     assert float(two_logs.case.run.duration) == 0.8
 
 
+@pytest.mark.slow
 def test_correlation(two_logs):
     correlation = two_logs.correlation
     np.testing.assert_allclose(np.diag(correlation), 1, rtol=1e-12)
@@ -135,6 +138,7 @@ def test_correlation(two_logs):
     assert correlation[i, j] > 0.5  # later and faster: the same time at midspan
 
 
+@pytest.mark.slow
 def test_what_is_said(two_logs):
     said = str(two_logs)
     first = said.splitlines()[1]
@@ -214,6 +218,7 @@ def test_coloured_residuals_widen_intervals(rehearsal):
     assert np.all(covered >= 0.90), dict(zip(SMALL, covered, strict=True))
 
 
+@pytest.mark.slow
 def test_a_common_scale_is_reported_by_name():
     """Rigidity, mass per length and the load's mass times anything: the same deflection."""
     scaled = ["beam.flexural_rigidity", "beam.mass_per_length", "loads.0.mass"]
@@ -230,18 +235,22 @@ def test_a_common_scale_is_reported_by_name():
     assert fit.to_dict()["numbers"]["loads.0.mass"]["interval_95"] is None
 
 
+@pytest.mark.slow
 def test_a_log_that_ends_at_the_exit_hardly_shows_mass_and_damping():
     """At 0.5 m/s the deflection is quasi-static: rigidity is seen, the vibration is not."""
     case = replace(small(duration=1.26), {"loads.0.speed": 0.5})
     log = simulated_log(case, 1e-4)
-    inertial = ["beam.mass_per_length", "beam.damping_ratio"]
-    fit = identify(case, log, ["beam.flexural_rigidity", *inertial])
-    assert fit.errors[0] < 0.01 * 11.68
-    assert np.isinf(fit.errors[1:]).all()
-    assert {name for direction in fit.unseen for name in direction} == set(inertial)
-    assert "the data cannot see" in str(fit)
+    free = ["beam.flexural_rigidity", "beam.mass_per_length", "beam.damping_ratio"]
+    fit = identify(case, log, free)
+    assert np.all(np.abs(fit.values[:2] - [11.68, 0.535]) < 3 * fit.errors[:2])
+    assert fit.errors[0] < 0.005 * 11.68
+    assert fit.errors[1] > 0.05 * 0.535
+    assert fit.errors[2] == np.inf
+    assert fit.unseen == [{"beam.damping_ratio": pytest.approx(0.003)}]
+    assert "the data cannot see beam.damping_ratio: give it a value known otherwise" in str(fit)
 
 
+@pytest.mark.slow
 def test_bounds_hold_and_a_bound_reached_is_said():
     case = replace(small(duration=0.6), {"beam.flexural_rigidity": 9.0})
     log = simulated_log(small(duration=0.6), NOISE)
@@ -252,6 +261,7 @@ def test_bounds_hold_and_a_bound_reached_is_said():
     assert fit.to_dict()["numbers"]["beam.flexural_rigidity"]["at_bound"]
 
 
+@pytest.mark.slow
 def test_elastic_supports_and_their_springs():
     """The oracle of supports is the finite-element one; here jaxbeam's own log must give back."""
     case = dataclasses.replace(
@@ -280,6 +290,7 @@ def faulty(quantities=("deflection", "deflection"), **about) -> Log:
 
 
 LATE = (jb.MovingMass(mass=0.5, speed=1.0, entry_time=0.9),)
+SOON = (jb.MovingMass(mass=0.5, speed=2.0),)
 SLOW = (jb.MovingMass(mass=0.5, speed=0.5),)
 FAULTS = {
     "no logs": ([], "give at least one log"),
@@ -307,8 +318,8 @@ FAULTS = {
         "run.csv: it ends at 0.798 s, before the first load has crossed at 1.2 s; check the load's "
         "speed and entry time",
     ),
-    "no loads": (faulty(loads=()), "run.csv: no load is known, neither in the case nor in the TOML"),
-    "unlike loads": ([faulty(), faulty(loads=SLOW + SLOW)], "the logs differ in the kind or number"),
+    "no loads": (faulty(loads=()), "run.csv: no load is known, neither in the case nor in"),
+    "unlike loads": ([faulty(), faulty(loads=SOON + SOON)], "the logs differ in the kind"),
 }  # fmt: skip
 
 
