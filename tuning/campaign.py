@@ -25,8 +25,8 @@ OFFSET = re.compile(r"sensors\.(\d+)\.offset")
 class Campaign:
     """Logs with the case of each: logs alike in structure share one compiled simulation.
 
-    Logs are padded to the longest with equally spaced times, `counts` says how many samples are
-    real. Samples are (log, time, channel).
+    Logs are padded to the longest with equally spaced times, `real` is 1 for samples
+    that were measured and 0 for those that only fill up. Samples are (log, time, channel).
     """
 
     cases: list[Case]
@@ -34,7 +34,7 @@ class Campaign:
     plan: Plan
     times: Float[np.ndarray, "log time"]
     measured: Float[np.ndarray, "log time channel"]
-    real: Float[np.ndarray, "log time"]
+    real: Float[np.ndarray, "log time channel"]
 
     def local(self, addresses: list[str]) -> tuple[list[str], np.ndarray]:
         """Addresses as seen within a log, and which of the free numbers (log, address) each is.
@@ -164,11 +164,11 @@ def prepare(case: Case, logs: list[Log]) -> Campaign:
     spacings = [np.diff(log.times).mean() for log in logs]
     count = max(log.times.size for log in logs)
     times, measured, real = [], [], []
-    for log, values, spacing in zip(logs, ordered, spacings, strict=True):
+    for log, (values, has), spacing in zip(logs, ordered, spacings, strict=True):
         more = count - log.times.size
         times.append(np.append(log.times, log.times[-1] + spacing * np.arange(1, more + 1)))
         measured.append(np.pad(values, ((0, more), (0, 0))))
-        real.append(np.arange(count) < log.times.size)
+        real.append((np.arange(count) < log.times.size)[:, None] & has)
     plans = [make_plan(own, jnp.asarray(t), TOLERANCE) for own, t in zip(cases, times, strict=True)]
     if len({plan.form.layout for plan in plans}) > 1:
         raise ValueError("the logs differ in the order of places along the beam; fit them apart")
@@ -187,8 +187,11 @@ def prepare(case: Case, logs: list[Log]) -> Campaign:
     return Campaign(cases, logs, plan, np.array(times), np.array(measured), np.array(real, float))
 
 
-def _at_sensors(case: Case, log: Log) -> Float[np.ndarray, "time sensor"]:
-    """The channels of a log in the order of the case's sensors."""
+def _at_sensors(case: Case, log: Log):
+    """The readings of a log in the order of the case's sensors (time, sensor), and which it has.
+
+    A log that does not name its sensors has them all, in their order.
+    """
     sensors = case.sensors
     if not sensors:
         raise ValueError("the case has no sensors to compare the logs with")
@@ -196,21 +199,22 @@ def _at_sensors(case: Case, log: Log) -> Float[np.ndarray, "time sensor"]:
     order = {log.sensors[i]: i for i in given} if given else dict(enumerate(range(len(log.names))))
     if len(given) > len(order):
         raise ValueError(f"{log.source}: two of its channels are of the same sensor of the case")
-    if sorted(order) != list(range(len(sensors))):
+    if not set(order) <= set(range(len(sensors))) or (not given and len(order) < len(sensors)):
         ours = f"{len(sensors)} sensors" if len(sensors) > 1 else "one sensor"
         raise ValueError(
             f"{log.source}: its channels {', '.join(log.names)} do not match the case's {ours}; "
-            "say in the TOML file beside it which `sensor` each column is, and leave sensors that "
-            "were not logged out of the case"
+            "say in the TOML file beside it which `sensor` each column is, counted from 0"
         )
+    values, has = np.zeros((log.times.size, len(sensors))), np.zeros(len(sensors), bool)
     for number, channel in order.items():
         quantity = sensors[number].quantity
         if log.quantities[channel] != quantity:
             raise ValueError(
-                f"{log.source}: {log.names[channel]} is a {log.quantities[channel]} in "
+                f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in "
                 f"{log.units[channel]}, but sensors.{number} measures {quantity}"
             )
-    return log.values[:, [order[i] for i in range(len(sensors))]]
+        values[:, number], has[number] = log.values[:, channel], True
+    return values, has
 
 
 def _check_times(log: Log) -> None:

@@ -22,8 +22,9 @@ class Fit:
 
     An error (standard error) is infinite where the data cannot tell; `unseen` says by name why:
     each entry holds changes that, made together, leave the readings as good as they are. `noise`
-    is the standard deviation of the residuals. `case` has the fitted numbers; with several logs,
-    those of one log (`logs.1.loads.0.speed`) have no place in it, but in `cases`, one for each log.
+    is the standard deviation of the residuals, NaN for a sensor that a log lacks. `case` has the
+    fitted numbers; with several logs, those of one log (`logs.1.loads.0.speed`) have no place in
+    it, but in `cases`, one for each log.
     """
 
     numbers: list[Free]
@@ -85,14 +86,11 @@ class Fit:
                 "start": number.start,
                 "at_bound": number.at_bound(value),
             }
-        correlation = [
-            [None if np.isnan(c) else c for c in row] for row in self.correlation.tolist()
-        ]
         return {
             "numbers": numbers,
-            "correlation": correlation,
+            "correlation": _without_nan(self.correlation),
             "unseen": self.unseen,
-            "noise": self.noise.tolist(),
+            "noise": _without_nan(self.noise),
             "verdict": self.verdict,
         }
 
@@ -105,7 +103,10 @@ class Fit:
         for i, log in enumerate(self.campaign.logs):
             count = log.times.size
             for quantity in dict.fromkeys(measured):
-                channels = [n for n, other in enumerate(measured) if other == quantity]
+                has = self.campaign.real[i].any(axis=0)
+                channels = [n for n, other in enumerate(measured) if other == quantity and has[n]]
+                if not channels:
+                    continue
                 panels.append(
                     FitPanel(
                         title=log.source.rsplit("/", 1)[-1],
@@ -153,12 +154,16 @@ def identify(
         errors=found.uncertainty.errors,
         correlation=found.uncertainty.correlation,
         unseen=found.uncertainty.unseen,
-        noise=found.noise,
+        noise=np.where(campaign.real.any(axis=1), found.noise, np.nan),
         verdict=verdict + campaign.doubt(values),
         case=_fitted_case(case, campaign, values),
         campaign=campaign,
         fitted=found.predicted,
     )
+
+
+def _without_nan(table: Float[np.ndarray, "row column"]) -> list[list[float | None]]:
+    return [[None if np.isnan(entry) else entry for entry in row] for row in table.tolist()]
 
 
 def _fitted_case(case: Case, campaign: Campaign, values: dict[str, float]) -> Case:

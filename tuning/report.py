@@ -32,7 +32,8 @@ def _rows(fit: Fit):
         told = "the data cannot tell"
         if np.all(np.isfinite(interval)):
             told = f"{interval[0]:.5g} to {interval[1]:.5g}"
-        yield number.address, number.unit, f"{number.start:.5g}", f"{value:.5g}", told
+        unit = "" if number.unit == "1" else number.unit
+        yield number.address, unit, f"{number.start:.5g}", f"{value:.5g}", told
 
 
 def _bounds(fit: Fit):
@@ -70,5 +71,6 @@ def _pairs(fit: Fit):
 def _residuals(fit: Fit):
     units = [QUANTITIES[sensor.quantity] for sensor in fit.case.sensors]
     for log, noise in zip(fit.campaign.logs, fit.noise, strict=True):
-        levels = [f"{level:.3g} {unit}" for level, unit in zip(noise, units, strict=True)]
+        pairs = enumerate(zip(noise, units, strict=True))
+        levels = [f"{n:.3g} {unit} (sensor {i})" for i, (n, unit) in pairs if np.isfinite(n)]
         yield f"standard deviation of the residual of {log.source}: {', '.join(levels)}"

@@ -36,7 +36,7 @@ class Search:
     """
 
     def __init__(self, campaign: Campaign, numbers: list[Free]):
-        if campaign.real.sum() * campaign.measured.shape[2] < len(numbers):
+        if campaign.real.sum() < len(numbers):
             raise ValueError(f"{len(numbers)} free numbers need at least as many samples")
         self.campaign, self.numbers = campaign, numbers
         self._start = jnp.array([number.inward(number.start) for number in numbers])
@@ -124,7 +124,7 @@ class Search:
 
     def _weights(self, noise) -> Float[np.ndarray, "log time channel"]:
         """One over the noise for real samples, zero for those that only fill up."""
-        return self.campaign.real[..., None] / noise[:, None, :]
+        return self.campaign.real / noise[:, None, :]
 
     def _first_noise(self, measured) -> Float[np.ndarray, "log channel"]:
         """Noise guessed from the second differences, which a smooth response hardly has."""
@@ -136,10 +136,10 @@ class Search:
 
     def _noise(self, residuals) -> Float[np.ndarray, "log channel"]:
         """Standard deviation of the residuals, for the numbers fitted to them."""
-        counts = self.campaign.real.sum(axis=1)[:, None]
-        lost = len(self.numbers) / (counts.sum() * residuals.shape[2])
-        squares = np.sum((residuals * self.campaign.real[..., None]) ** 2, axis=1)
-        return np.maximum(np.sqrt(squares / counts / max(1 - lost, 1e-9)), self._floor(1e-9))
+        counts = self.campaign.real.sum(axis=1)
+        left = max(1 - len(self.numbers) / counts.sum(), 1e-9)
+        squares = np.sum((residuals * self.campaign.real) ** 2, axis=1)
+        return np.maximum(np.sqrt(squares / np.maximum(counts, 1) / left), self._floor(1e-9))
 
     def _floor(self, share: float) -> Float[np.ndarray, " channel"]:
         """Least noise of each channel: a share of its range, so that no weight is infinite."""

@@ -307,7 +307,7 @@ FAULTS = {
     "unknown sensor": (faulty(sensors=(0, 7)), "do not match the case's 2 sensors"),
     "other quantity": (
         faulty(("acceleration", "deflection")),
-        "run.csv: w is a acceleration in g, but sensors.0 measures deflection",
+        "run.csv: w holds acceleration in g, but sensors.0 measures deflection",
     ),
     "ends before entry": (
         faulty(loads=LATE),
