@@ -65,9 +65,9 @@ def rig(case: Case, layout: Layout | None = None, coupled: bool = True) -> Rig:
     """Assemble the rig of a case, eqs (2.31) to (2.36) of the thesis in mass-normalised modes.
 
     Actuators' suspensions and support dampers act on the modes, coupled and exact; non-classical
-    damping is not dropped. Without `coupled` the modes stay single blocks, which is right only where
-    nothing couples them (see `couples`) and none are repeated. `layout` (from `lay_out`) is needed
-    inside `jit`, where the numbers that decide it are not known.
+    damping is not dropped. Without `coupled` the modes stay single blocks, which is right only
+    where nothing couples them (see `couples`) and none are repeated. `layout` (from `lay_out`) is
+    needed inside `jit`, where the numbers that decide it are not known.
     """
     layout = lay_out(case) if layout is None else layout
     found = modes(case, layout)
