@@ -195,11 +195,11 @@ def _at_sensors(case: Case, log: Log):
     sensors = case.sensors
     if not sensors:
         raise ValueError("the case has no sensors to compare the logs with")
-    given = [i for i, sensor in enumerate(log.sensors) if sensor is not None]
-    order = {log.sensors[i]: i for i in given} if given else dict(enumerate(range(len(log.names))))
-    if len(given) > len(order):
+    named = [(number, i) for i, number in enumerate(log.sensors) if number is not None]
+    order = dict(named) if named else {i: i for i in range(len(log.names))}
+    if len(named) > len(order):
         raise ValueError(f"{log.source}: two of its channels are of the same sensor of the case")
-    if not set(order) <= set(range(len(sensors))) or (not given and len(order) < len(sensors)):
+    if not set(order) <= set(range(len(sensors))) or (not named and len(order) < len(sensors)):
         ours = f"{len(sensors)} sensors" if len(sensors) > 1 else "one sensor"
         raise ValueError(
             f"{log.source}: its channels {', '.join(log.names)} do not match the case's {ours}; "
