@@ -100,11 +100,19 @@ def propagators(rig: Rig, lengths: Float[Array, " *length"], points: int = 0) ->
     push = jnp.einsum("cfp,p...cbsm->...cfbsm", weights, pushes)
     push = push * spans[..., None, None, None, None] / balance[:, :, None]
     drift = drift * balance[:, None, :] / balance[:, :, None]
-    end = NODES + points
-    at = jnp.moveaxis(drift, -4, 0), jnp.moveaxis(push, -5, 0)
-    nodes = (jnp.moveaxis(part[:NODES], 0, axis) for part, axis in zip(at, (-4, -5), strict=True))
-    points = (jnp.moveaxis(part[NODES:], 0, axis) for part, axis in zip(at, (-4, -5), strict=True))
-    return Step(*nodes, at[0][end], at[1][end], *points)
+    first = jnp.moveaxis(drift, -4, 0), jnp.moveaxis(push, -5, 0)  # fractions first
+
+    def back(part, axis):
+        return jnp.moveaxis(part, 0, axis)
+
+    return Step(
+        drift_nodes=back(first[0][:NODES], -4),
+        push_nodes=back(first[1][:NODES], -5),
+        drift_end=first[0][-1],
+        push_end=first[1][-1],
+        drift_points=back(first[0][NODES:], -4),
+        push_points=back(first[1][NODES:], -5),
+    )
 
 
 def _series(x, force):

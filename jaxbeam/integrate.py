@@ -8,6 +8,8 @@ what depends on the path alone is tabulated for a chunk at once and shared by al
 loop then advances the states, and what is wanted of the chunk is reduced at once again.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -115,8 +117,8 @@ def _tabulate(rig: Rig, traffic: Traffic, grid: Grid, rigging: Rigging, slots: i
         return jax.lax.map(single, (kind, shape, rows))
 
     # Mostly all steps of a chunk are equally long, and then share their propagators.
-    tables = jax.lax.cond(jnp.all(kind == kind[0]), alike, one_by_one, None)
-    return Tables(*tables, chosen, active), start, span
+    tables: Any = jax.lax.cond(jnp.all(kind == kind[0]), alike, one_by_one, None)
+    return Tables(*tables, slots=chosen, active=active), start, span
 
 
 def _tables_of_kind(rigging: Rigging, kind, shape, rows):
@@ -261,7 +263,8 @@ def trace(
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
 
     def whole(carry, first):
-        state, best, states = chunk(*carry, first)
+        state, best = carry
+        state, best, states = chunk(state, best, first)
         return (state, best), states
 
     best = None if watched is None else _nothing_seen(watched.shape[0], loads, lanes)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 ORDER = 9  # at which errors are taken to fall with the step; the true order is higher
+FINER = 1.5  # how much finer the runs are with which others are compared
 ROUNDS = 30
 
 Measure = Callable[[Int[np.ndarray, " task"], Float[np.ndarray, " task"]], np.ndarray]
@@ -28,12 +29,12 @@ def spread(paces: Float[np.ndarray, " task"], count: int) -> Int[np.ndarray, " c
 
 
 def errors(measure: Measure, tasks, steps) -> Float[np.ndarray, " task"]:
-    """How much the results of tasks, (task, ...), change when their steps (s) are halved.
+    """How much the results of tasks, (task, ...), change with finer steps than these (s).
 
     Relative; runs that fail at any step count as exact.
     """
     with ThreadPoolExecutor(2) as pool:
-        coarse, fine = pool.map(measure, (tasks, tasks), (steps, steps / 2))
+        coarse, fine = pool.map(measure, (tasks, tasks), (steps, steps / FINER))
     size = np.abs(fine)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         change = np.abs(coarse - fine) / size

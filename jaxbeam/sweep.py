@@ -78,7 +78,7 @@ def sweep(
     if path is not None:
         state = sweep_store.prepare(path, mark, resume, overwrite)
     if path is not None and state == "complete":
-        return xarray.open_zarr(path, consolidated=False).load()
+        return sweep_store.read(path).assign_coords(sensor=("sensor", sensor_labels(case)))
 
     work = _Work(case, tasks, histories, tolerance)
     if path is None:
@@ -163,14 +163,16 @@ class _Work:
         )
         slots = max(most_at_once(window) for window in windows)
         self.form = Form(layout, couples(case), slots)
-        duration = np.asarray([_value(tasks, i, case, "run.duration") for i in range(count)])
+        duration = _values(case, tasks, "run.duration")
         spans = np.minimum(windows[:, :, 1], duration[:, None]) - windows[:, :, 0]
         spans = np.where(spans > 0, spans, duration[:, None])
         crossing = np.min(spans, axis=1, initial=np.inf)
         crossing = np.where(np.isfinite(crossing), crossing, duration)
         self.paces = 1 / crossing
         self.limits = np.minimum(LONGEST / norms, duration)
-        self.guesses = np.minimum(8 / norms, crossing / (15 * case.beam.modes + 20))
+        # As found for beams of 3 and 12 modes at fast and slow crossings.
+        modes = case.beam.modes
+        self.guesses = crossing / (15 * modes + 15 + 0.11 * norms * crossing / np.sqrt(modes))
 
     def steps(self):
         """Time steps of all tasks, and the error seen with them."""
@@ -207,11 +209,11 @@ class _Work:
         return {name: np.asarray(values) for name, values in results.items()}
 
 
-def _value(tasks: Tasks, task: int, case: Case, address: str) -> float:
-    """A number of the case in one task."""
+def _values(case: Case, tasks: Tasks, address: str) -> np.ndarray:
+    """A number of the case in every task."""
     if address in tasks.heavy_addresses:
-        return tasks.heavy[task, tasks.heavy_addresses.index(address)]
-    return float(value_at(case, address))
+        return tasks.heavy[:, tasks.heavy_addresses.index(address)]
+    return np.full(tasks.heavy.shape[0], float(value_at(case, address)))
 
 
 def _common_layout(case: Case, tasks: Tasks) -> Layout:

@@ -5,13 +5,17 @@ written before the flag that says it is done. When all are done, the labelled da
 their place. A fingerprint of everything that shapes the numbers guards against mixing sweeps.
 """
 
+from __future__ import annotations
+
 import shutil
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import xarray
-import zarr
+
+if TYPE_CHECKING:
+    import zarr  # takes long to import; only sweeps that are kept need it
 
 STATUS = "jaxbeam_sweep"
 
@@ -19,10 +23,21 @@ STATUS = "jaxbeam_sweep"
 class Keeper(Protocol):
     """Keeps finished blocks: in memory or on disk."""
 
-    def missing(self) -> list[int]: ...
-    def write(self, block: int, results: dict[str, np.ndarray]) -> None: ...
-    def collect(self) -> dict[str, np.ndarray]: ...
-    def finish(self, dataset: xarray.Dataset) -> None: ...
+    def missing(self) -> list[int]:
+        """Blocks that are not done."""
+        ...
+
+    def write(self, block: int, results: dict[str, np.ndarray]) -> None:
+        """Keep the results of a block, arrays of the same length in every block."""
+        ...
+
+    def collect(self) -> dict[str, np.ndarray]:
+        """Results of all blocks, one after the other."""
+        ...
+
+    def finish(self, dataset: xarray.Dataset) -> None:
+        """Put the labelled dataset in the place of the blocks."""
+        ...
 
 
 class Memory:
@@ -32,17 +47,20 @@ class Memory:
         self._blocks: list[dict[str, np.ndarray] | None] = [None] * blocks
 
     def missing(self) -> list[int]:
+        """Blocks that are not done."""
         return [i for i, block in enumerate(self._blocks) if block is None]
 
     def write(self, block: int, results: dict[str, np.ndarray]) -> None:
+        """Keep the results of a block."""
         self._blocks[block] = results
 
     def collect(self) -> dict[str, np.ndarray]:
+        """Results of all blocks, one after the other."""
         blocks = [block for block in self._blocks if block is not None]
         return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
 
     def finish(self, dataset: xarray.Dataset) -> None:
-        pass
+        """Nothing is left to do."""
 
 
 class Disk:
@@ -55,12 +73,14 @@ class Disk:
         self.steps = np.asarray(self._blocks["steps"][:])
 
     def missing(self) -> list[int]:
+        """Blocks that are not done."""
         return np.flatnonzero(~np.asarray(self._blocks["done"][:])).tolist()
 
     def write(self, block: int, results: dict[str, np.ndarray]) -> None:
+        """Write the results of a block, each array as one chunk, then the flag."""
         for name, values in results.items():
             if name not in self._blocks:
-                count = self._blocks["done"].shape[0]
+                count = len(self._blocks["done"][:])
                 shape = (count * values.shape[0], *values.shape[1:])
                 self._blocks.create_array(
                     name, shape=shape, chunks=values.shape, dtype=values.dtype
@@ -70,13 +90,28 @@ class Disk:
         self._blocks["done"][block] = True
 
     def collect(self) -> dict[str, np.ndarray]:
+        """Results of all blocks, one after the other."""
         names = (name for name in self._blocks.array_keys() if name not in ("done", "steps"))
         return {name: np.asarray(self._blocks[name][:]) for name in names}
 
     def finish(self, dataset: xarray.Dataset) -> None:
-        dataset.to_zarr(self._path, mode="a", consolidated=False)
+        """Write the labelled dataset, and only then drop the blocks.
+
+        The labels of the sensors are left out, as zarr has no settled way to store words; the
+        case in the attributes has them.
+        """
+        dataset.drop_vars("sensor").to_zarr(self._path, mode="a", consolidated=False)
         self._group.attrs[STATUS] = "complete"
         shutil.rmtree(self._path / "blocks")
+
+
+def read(path: Path) -> xarray.Dataset:
+    """The dataset of a complete store, without the labels of the sensors."""
+    shutil.rmtree(path / "blocks", ignore_errors=True)  # left if the end was interrupted
+    dataset = xarray.open_zarr(path, consolidated=False).load()
+    for name in (STATUS, "fingerprint"):
+        dataset.attrs.pop(name, None)
+    return dataset
 
 
 def status(path: Path) -> tuple[str, str] | None:
@@ -84,6 +119,8 @@ def status(path: Path) -> tuple[str, str] | None:
 
     Raises FileExistsError if something else is there.
     """
+    import zarr
+
     if not path.exists():
         return None
     try:
@@ -122,6 +159,8 @@ def prepare(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> str:
 
 def create(path: Path, fingerprint: str, blocks: int, steps: np.ndarray) -> Disk:
     """Start a store for a number of blocks; `steps` (s) are the time steps of the tasks."""
+    import zarr
+
     # Built aside and moved into place: a store either exists whole or not at all.
     fresh = path.with_name(path.name + ".new")
     shutil.rmtree(fresh, ignore_errors=True)
@@ -137,4 +176,6 @@ def create(path: Path, fingerprint: str, blocks: int, steps: np.ndarray) -> Disk
 
 def reopen(path: Path) -> Disk:
     """Open an unfinished store."""
+    import zarr
+
     return Disk(path, zarr.open_group(path, mode="r+"))

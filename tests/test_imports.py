@@ -18,13 +18,12 @@ jaxbeam.checks
 jaxbeam.casefile
 jaxbeam.modes
 jaxbeam.rig
-jaxbeam.exponentials  jaxbeam.peaks
-jaxbeam.duhamel  jaxbeam.sine_basis
+jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.sine_basis
 jaxbeam.grid
 jaxbeam.dynamics
 jaxbeam.integrate  jaxbeam.reference  jaxbeam.static
 jaxbeam.plan  jaxbeam.record
-jaxbeam.simulate
+jaxbeam.simulate  jaxbeam.lanes  jaxbeam.pacing  jaxbeam.sweep_store
 jaxbeam.sweep
 jaxbeam.plot
 jaxbeam.__init__

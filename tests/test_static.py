@@ -164,8 +164,8 @@ def test_peaks_of_a_stream_are_those_of_a_fine_sampling(loads):
 
 def test_loads_of_equal_speed_keep_their_distance():
     """A stream twice as fast whose members follow in half the time."""
-    slow = [MovingMass(0.3, 0.5), MovingMass(0.3, 0.5, entry_time=1.0)]
-    fast = [MovingMass(0.3, 1.0), MovingMass(0.3, 1.0, entry_time=0.5)]
+    slow = [MovingMass(0.3, 0.5), MovingMass(mass=0.3, speed=0.5, entry_time=1.0)]
+    fast = [MovingMass(0.3, 1.0), MovingMass(mass=0.3, speed=1.0, entry_time=0.5)]
     peaks = [static_peak(replace_loads(GENERAL, loads), X) for loads in (slow, fast)]
     assert_allclose(*peaks, rtol=1e-12)
 

@@ -1,0 +1,180 @@
+"""Sweeps: they agree with single runs, mark what fails, and survive being killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import xarray
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxbeam as jb
+from jaxbeam.lanes import arrange
+
+CASE = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, damping_ratio=[0.03, 0.02], modes=2),
+    supports=[jb.Support(0.4, stiffness=2e4)],
+    sensors=[jb.Sensor(0.15), jb.Sensor(0.3)],
+    loads=[jb.MovingMass(mass=0.4, speed=2.0)],
+    run=jb.Run(duration=0.5),
+)
+MASSES, SPEEDS = [0.1, 0.4, 0.9], [1.5, 4.0]
+
+
+def single(values) -> np.ndarray:
+    """Peaks by one simulation."""
+    return np.asarray(jb.simulate(jb.replace(CASE, values)).peak_deflection)
+
+
+def sweep(over, **options) -> xarray.Dataset:
+    return jb.sweep(CASE, over, progress=False, **options)
+
+
+@pytest.fixture(scope="module")
+def product():
+    return sweep({"loads.0.mass": MASSES, "loads.0.speed": SPEEDS})
+
+
+def test_a_product_is_labelled_by_address_and_agrees_with_single_runs(product):
+    assert product.peak_deflection.dims == ("loads.0.mass", "loads.0.speed", "sensor")
+    assert product.peak_deflection.units == "m"
+    assert not product.failed.any()
+    assert product.error_estimate <= 1e-7
+    for mass in MASSES[::2]:
+        for speed in SPEEDS:
+            found = product.peak_deflection.sel({"loads.0.mass": mass, "loads.0.speed": speed})
+            expected = single({"loads.0.mass": mass, "loads.0.speed": speed})
+            assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_paired_values_run_side_by_side():
+    over = {
+        "beam.flexural_rigidity": [10.0, 12.0],
+        "supports.0.position": [0.35, 0.45],
+        "supports.0.stiffness": [1e4, 1e6],
+        "beam.damping_ratio.1": [0.01, 0.05],
+        "sensors.1.position": [0.2, 0.5],
+        "loads.0.mass": [0.2, 0.3],
+        "run.gravity": [9.81, 5.0],
+    }
+    found = sweep(over, paired=True)
+    assert found.peak_deflection.dims == ("run", "sensor")
+    assert_allclose(found["run.gravity"], over["run.gravity"])
+    for i in range(2):
+        expected = single({address: values[i] for address, values in over.items()})
+        assert_allclose(found.peak_deflection[i], expected, rtol=1e-6)
+
+
+def test_histories_on_request():
+    found = sweep({"loads.0.mass": MASSES, "loads.0.speed": [2.0]}, histories=True)
+    assert found.deflection.dims == ("loads.0.mass", "loads.0.speed", "time", "sensor")
+    record = jb.simulate(jb.replace(CASE, {"loads.0.mass": MASSES[1]}))
+    assert_allclose(found.time, record.times)
+    assert_allclose(found.deflection[1, 0], record.deflection, atol=1e-10)
+
+
+def test_a_failed_run_is_marked_and_touches_no_other():
+    """A weight beyond all numbers spoils its run, and that one only."""
+    masses, gravity = [*MASSES, 100.0], [9.81, 9.81, 9.81, 1e308]
+    whole = sweep({"loads.0.mass": masses, "run.gravity": gravity}, paired=True)
+    assert whole.failed.values.tolist() == [False, False, False, True]
+    assert np.isnan(whole.peak_deflection[-1]).all()
+    sound = sweep({"loads.0.mass": MASSES, "run.gravity": gravity[:3]}, paired=True)
+    assert_allclose(whole.peak_deflection[:-1], sound.peak_deflection, rtol=1e-12)
+
+
+def test_a_store_holds_what_was_returned(product, tmp_path):
+    over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
+    path = tmp_path / "runs.zarr"
+    xarray.testing.assert_identical(sweep(over, store=path), product)
+    stored = xarray.open_zarr(path, consolidated=False)
+    assert_array_equal(stored.peak_deflection, product.peak_deflection)
+    again = sweep(over, store=path, resume=True)
+    assert_array_equal(again.peak_deflection, product.peak_deflection)
+    assert_array_equal(again.sensor, product.sensor)
+    with pytest.raises(FileExistsError, match="holds a sweep already"):
+        sweep(over, store=path)
+    with pytest.raises(ValueError, match="cannot be resumed"):
+        sweep({"loads.0.mass": [0.3]}, store=path, resume=True)
+    (tmp_path / "other").mkdir()
+    with pytest.raises(FileExistsError, match="not a sweep"):
+        sweep(over, store=tmp_path / "other", overwrite=True)
+    assert (tmp_path / "other").exists()
+
+
+KILLED = """
+import sys, numpy as np
+import jaxbeam as jb, tests.test_sweep as t
+over = {"loads.0.mass": np.linspace(0.1, 0.9, 256), "loads.0.speed": np.linspace(1, 4, 24)}
+jb.sweep(t.CASE, over, store=sys.argv[1], resume=True, progress=False)
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_sweep_resumes_to_the_same_bits(tmp_path):
+    def start(path):
+        return subprocess.Popen([sys.executable, "-c", KILLED, str(path)])
+
+    whole, cut = tmp_path / "whole.zarr", tmp_path / "cut.zarr"
+    assert start(whole).wait() == 0
+    process = start(cut)
+    flags = cut / "blocks" / "done" / "c"
+    while process.poll() is None and not (flags.exists() and len(list(flags.iterdir())) > 2):
+        time.sleep(0.001)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert (cut / "blocks").exists(), "it was killed too late to prove anything"
+    assert start(cut).wait() == 0
+    first, second = (xarray.open_zarr(path, consolidated=False).load() for path in (whole, cut))
+    xarray.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
+
+
+@pytest.mark.parametrize(
+    ("over", "message"),
+    [
+        ({}, "at least one address"),
+        ({"loads.0.speeed": [1.0]}, "did you mean 'loads.0.speed'"),
+        ({"loads.0.mass": []}, "list of values"),
+        ({"loads.0.mass": [0.1, np.nan]}, r"loads\.0\.mass"),
+        ({"loads.0.mass": [0.1, -1.0]}, r"loads\.0\.mass"),
+        ({"sensors.0.position": [0.1, 0.7]}, r"sensors\.0\.position"),
+        ({"beam.damping_ratio": [0.1]}, "is a list"),
+    ],
+)
+def test_faulty_values_are_refused(over, message):
+    with pytest.raises(ValueError, match=message):
+        sweep(over)
+
+
+def test_other_faults_are_refused():
+    with pytest.raises(ValueError, match="equally many"):
+        sweep({"loads.0.mass": [0.1], "loads.0.speed": [1.0, 2.0]}, paired=True)
+    with pytest.raises(ValueError, match="no sensors"):
+        jb.sweep(jb.Case(CASE.beam, loads=CASE.loads, run=CASE.run), {"loads.0.mass": [1.0]})
+    two = jb.Case(CASE.beam, [*CASE.supports, jb.Support(0.2)], sensors=CASE.sensors)
+    with pytest.raises(ValueError, match="change their order"):
+        jb.sweep(two, {"supports.1.position": [0.2, 0.5]}, progress=False)
+
+
+@given(st.integers(1, 400), st.integers(1, 5), st.integers(0, 10))
+def test_every_run_is_in_one_lane(count, paths, seed):
+    random = np.random.default_rng(seed)
+    speeds = random.integers(0, paths, count).astype(float)
+    masses = random.random(count)
+    tasks = arrange(["loads.0.speed", "loads.0.mass"], np.stack([speeds, masses], axis=1))
+    real = tasks.index >= 0
+    assert sorted(tasks.index[real]) == list(range(count))
+    rows = np.broadcast_to(tasks.heavy[:, None, 0], tasks.index.shape)
+    assert_array_equal(rows[real], speeds[tasks.index[real]])
+    assert_array_equal(tasks.light[..., 0][real], masses[tasks.index[real]])
+
+
+def test_the_bar_stays_out_of_standard_output(capfd):
+    jb.sweep(CASE, {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS})
+    captured = capfd.readouterr()
+    assert captured.out == "" and "run" in captured.err
