@@ -1,0 +1,185 @@
+"""The runs of a sweep, cut into blocks of equal shape that are compiled once."""
+
+import dataclasses
+import re
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case import Case, replace, value_at
+from jaxbeam.dynamics import Traffic, traffic
+from jaxbeam.exponentials import LONGEST, norm
+from jaxbeam.grid import even_grid, sampled_grid
+from jaxbeam.integrate import march, trace
+from jaxbeam.lanes import Tasks
+from jaxbeam.loads import motion
+from jaxbeam.modes import Layout, lay_out
+from jaxbeam.pacing import choose_steps
+from jaxbeam.plan import Form, most_at_once, sample_times
+from jaxbeam.record import never_as_nan
+from jaxbeam.rig import couples, rig
+
+RUNS = 256  # in a block, about: its states stay in the cache, its results are one write
+PACES = 8  # at which time steps are measured, at least
+PLACE = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
+
+
+class Work:
+    """All tasks of a sweep, cut into blocks of equal shape.
+
+    Raises ValueError if places along the beam change their order within the sweep.
+    """
+
+    def __init__(self, case: Case, tasks: Tasks, histories: bool, tolerance: float):
+        self.case, self.tasks, self.histories, self.tolerance = case, tasks, histories, tolerance
+        count, lanes = tasks.index.shape
+        self.each = min(count, max(1, RUNS // lanes))
+        self.blocks = -(-count // self.each)
+        self.size = self.each * lanes
+        self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
+        layout = _common_layout(case, tasks)
+        every = np.resize(np.arange(count), self.blocks * self.each).reshape(-1, self.each)
+        found = [_survey(case, layout, self.addresses[0], tasks.heavy[part]) for part in every]
+        norms, windows = (
+            np.concatenate([np.asarray(part[i]) for part in found])[:count] for i in range(2)
+        )
+        slots = max(most_at_once(window) for window in windows)
+        self.form = Form(layout, couples(case), slots)
+        duration = _values(case, tasks, "run.duration")
+        spans = np.minimum(windows[:, :, 1], duration[:, None]) - windows[:, :, 0]
+        spans = np.where(spans > 0, spans, duration[:, None])
+        crossing = np.min(spans, axis=1, initial=np.inf)
+        crossing = np.where(np.isfinite(crossing), crossing, duration)
+        self.paces = 1 / crossing
+        self.limits = np.minimum(LONGEST / norms, duration)
+        # As found for beams of 3 and 12 modes at fast and slow crossings.
+        modes = case.beam.modes
+        self.guesses = crossing / (15 * modes + 15 + 0.11 * norms * crossing / np.sqrt(modes))
+
+    def steps(self) -> tuple[Float[np.ndarray, " task"], float]:
+        """Time steps (s) of all tasks, and the relative error of peaks seen with them.
+
+        Raises RuntimeError if no time step meets the tolerance.
+        """
+        batches = -(-PACES // self.each)
+
+        def measure(chosen, steps):
+            parts = zip(np.split(chosen, batches), np.split(steps, batches), strict=True)
+            return np.concatenate([self._run(*part, None)["peak_deflection"] for part in parts])
+
+        count = batches * self.each
+        return choose_steps(measure, self.paces, self.guesses, self.limits, count, self.tolerance)
+
+    def block(self, number: int, steps: Float[np.ndarray, " task"]) -> dict[str, np.ndarray]:
+        """Results of a block of tasks, (task, lane, ...), with the steps (s) of all tasks."""
+        count = self.tasks.index.shape[0]
+        chosen = np.arange(number * self.each, (number + 1) * self.each) % count
+        times = None
+        if self.histories:
+            times = sample_times(self.case)
+            gap = float(times[1] - times[0])
+            times = (times, max(1, int(np.ceil(gap / steps.min()))))
+        return self._run(chosen, steps[chosen], times)
+
+    def _run(self, chosen, steps, times):
+        tasks = self.tasks
+        results = _block(
+            self.case,
+            self.form,
+            self.addresses,
+            times,
+            tasks.heavy[chosen],
+            tasks.light[chosen],
+            np.asarray(steps),
+        )
+        return {name: np.asarray(values) for name, values in results.items()}
+
+
+def _values(case: Case, tasks: Tasks, address: str) -> np.ndarray:
+    """A number of the case in every task."""
+    if address in tasks.heavy_addresses:
+        return tasks.heavy[:, tasks.heavy_addresses.index(address)]
+    return np.full(tasks.heavy.shape[0], float(value_at(case, address)))
+
+
+def _common_layout(case: Case, tasks: Tasks) -> Layout:
+    """One layout for all tasks: the same order of places, degrees high enough for each.
+
+    Raises ValueError if places change their order along the beam within the sweep.
+    """
+    moved = [i for i, name in enumerate(tasks.heavy_addresses) if PLACE.fullmatch(name)]
+    values = np.unique(tasks.heavy[:, moved], axis=0)
+    names = [tasks.heavy_addresses[i] for i in moved]
+    layouts = [lay_out(replace(case, dict(zip(names, row, strict=True)))) for row in values]
+    degrees = (
+        np.max([layout.degrees for layout in layouts], axis=0)
+        if len({len(layout.degrees) for layout in layouts}) == 1
+        else layouts[0].degrees
+    )
+    common = {dataclasses.replace(layout, degrees=tuple(map(int, degrees))) for layout in layouts}
+    if len(common) > 1:
+        raise ValueError(
+            f"places along the beam change their order over {', '.join(names)}: split the sweep "
+            "where supports or patch edges meet"
+        )
+    return common.pop()
+
+
+@eqx.filter_jit
+def _survey(case, layout, addresses, heavy):
+    """Norm of the rig (1/s) and times of entry and exit for each of some tasks."""
+
+    def task(values):
+        varied = replace(case, dict(zip(addresses, values, strict=True)))
+        paths = [motion(load, varied.beam.length) for load in varied.loads]
+        windows = jnp.array([path.window() for path in paths]).reshape(-1, 2)
+        return norm(rig(varied, layout)), windows
+
+    return jax.vmap(task)(heavy)
+
+
+@eqx.filter_jit
+def _block(case, form, addresses, times, heavy, light, longest):
+    """Results of some tasks, one after the other, their lanes side by side."""
+    heavy_addresses, light_addresses = addresses
+    moving = all(name.startswith(("loads.", "run.")) for name in heavy_addresses)
+    shared = rig(case, form.layout, form.coupled) if moving else None
+
+    def task(values):
+        heavy, light, longest = values
+        varied = replace(case, dict(zip(heavy_addresses, heavy, strict=True)))
+        assembled = rig(varied, form.layout, form.coupled) if shared is None else shared
+
+        def press(values):
+            loads = traffic(replace(varied, dict(zip(light_addresses, values, strict=True))))
+            return loads.inertia[:, 0], loads.weight[:, 0]
+
+        inertia, weight = jax.vmap(press, out_axes=1)(light)
+        loads = Traffic(traffic(varied).motions, inertia, weight)
+        watched = jnp.stack([sensor.position for sensor in varied.sensors])
+        if times is None:
+            grid = even_grid(varied, assembled, longest)
+            best = march(assembled, loads, grid, watched, slots=form.slots)
+            history = {}
+        else:
+            grid, where = sampled_grid(varied, assembled, times[0], times[1], True)
+            count = grid.counts.shape[0] * times[1]
+            best, states = trace(assembled, loads, grid, watched, slots=form.slots, steps=count)
+            samples = states[:: times[1]][where][:, 0 : 2 * varied.beam.modes : 2]
+            rows = assembled.shapes(watched, (0,))[0]
+            history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
+        peak, time = best.peak()
+        # Extremes pass over what is not a number, but for the contact forces.
+        works = ~jnp.any(jnp.isnan(best.lowest), axis=0)
+        return {
+            "peak_deflection": jnp.where(works, peak, jnp.nan).T,
+            "peak_time": time.T,
+            "lowest_contact_force": best.lowest.T,
+            "contact_lost_time": never_as_nan(best.lost).T,
+            **history,
+        }
+
+    return jax.lax.map(task, (heavy, light, longest))
