@@ -46,4 +46,4 @@ def test_a_slow_force_is_not_amplified_and_a_fast_one_is():
     fast = amplification(crossing(15.0), middle)
     assert_allclose(fast, envelope(crossing(15.0), middle) / static, rtol=1e-12)
     assert 1.6 < fast[0] < 1.8  # near its largest, at 0.62 of the critical speed
-    assert_allclose(amplification(crossing(0.02, modes=12), middle), 1.0, atol=3e-3)
+    assert_allclose(amplification(crossing(0.05, modes=6), middle), 1.0, atol=3e-3)
