@@ -38,7 +38,6 @@ class Work:
         count, lanes = tasks.index.shape
         self.each = min(count, max(1, RUNS // lanes))
         self.blocks = -(-count // self.each)
-        self.size = self.each * lanes
         self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
         layout = _common_layout(case, tasks)
         every = np.resize(np.arange(count), self.blocks * self.each).reshape(-1, self.each)
@@ -46,6 +45,7 @@ class Work:
         norms, windows = (
             np.concatenate([np.asarray(part[i]) for part in found])[:count] for i in range(2)
         )
+        norms = np.where(np.isfinite(norms), norms, 1.0)  # else the run fails with any step
         slots = max(most_at_once(window) for window in windows)
         self.form = Form(layout, couples(case), slots)
         duration = _values(case, tasks, "run.duration")
@@ -72,6 +72,11 @@ class Work:
 
         count = batches * self.each
         return choose_steps(measure, self.paces, self.guesses, self.limits, count, self.tolerance)
+
+    def runs(self, number: int) -> int:
+        """How many runs are in a block, apart from those that only fill it up."""
+        tasks = slice(number * self.each, (number + 1) * self.each)
+        return int((self.tasks.index[tasks] >= 0).sum())
 
     def block(self, number: int, steps: Float[np.ndarray, " task"]) -> dict[str, np.ndarray]:
         """Results of a block of tasks, (task, lane, ...), with the steps (s) of all tasks."""

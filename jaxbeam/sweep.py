@@ -84,8 +84,8 @@ def sweep(
             keeper = sweep_store.create(path, mark, work.blocks, kept, overwrite)
     todo = keeper.missing()
     bar = tqdm(
-        total=work.blocks * work.size,
-        initial=(work.blocks - len(todo)) * work.size,
+        total=len(runs),
+        initial=len(runs) - sum(work.runs(block) for block in todo),
         unit="run",
         disable=not progress,
         file=sys.stderr,
@@ -96,7 +96,7 @@ def sweep(
         with closing(results):  # type: ignore[type-var]
             for block, result in results:
                 keeper.write(block, result)
-                bar.update(work.size)
+                bar.update(work.runs(block))
     dataset = _label(case, axes, paired, tasks, keeper.collect())
     dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT: mark}
     keeper.finish(dataset)

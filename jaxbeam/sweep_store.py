@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import xarray
@@ -67,7 +67,7 @@ class Disk(Keeper):
 
     def __init__(self, path: Path, group: zarr.Group):
         self._path = path
-        self._blocks = group[BLOCKS]
+        self._blocks: Any = group[BLOCKS]
         self.steps = np.asarray(self._blocks["steps"][:])
 
     def missing(self) -> list[int]:
