@@ -1,5 +1,7 @@
 """Largest absolute value of a smooth curve known at a few equal points."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,25 +10,49 @@ from jaxtyping import Array, Float
 FINE = 64  # places at which the interpolant is looked at before Newton's method takes over
 
 
+@functools.cache
+def _derivatives(points: int) -> np.ndarray:
+    """Matrices (order, point, point): first to fourth derivative of the polynomial at its points.
+
+    With respect to the distance of the points, so that their spacing is one.
+    """
+    places = np.arange(points) - (points - 1) / 2
+    powers = np.arange(points)
+    monomials = np.linalg.inv(places[:, None] ** powers)
+    matrices = []
+    for _ in range(4):
+        monomials = np.concatenate([monomials[1:] * powers[1:, None], np.zeros((1, points))])
+        matrices.append((places[:, None] ** powers) @ monomials)
+    return np.array(matrices)
+
+
 def vertex(samples: Float[Array, "point *rest"]) -> Float[Array, " *rest"]:
     """Largest absolute value, closely estimated from at least five samples.
 
-    Each sample is the middle of a parabola through its neighbours, corrected at its vertex by the
-    third and fourth differences. Cheap, to tell which of many steps holds the peak; `refine` then
+    Every sample seeks the top of the curve near it, by two steps of Newton's method on its Taylor
+    series to the fourth order. Cheap, to tell which of many steps holds the peak; `refine` then
     finds it.
     """
-    before, middle, after = samples[:-2], samples[1:-1], samples[2:]
-    slope, bend = (after - before) / 2, after - 2 * middle + before
-    inside = jnp.abs(slope) < jnp.abs(bend)
-    way = jnp.where(inside, -slope / jnp.where(inside, bend, 1.0), 0.0)
-    fourth = bend[2:] - 2 * bend[1:-1] + bend[:-2]
-    third = (bend[2:] - bend[:-2]) / 2
-    # The outermost stencils lend their differences to the samples beside them.
-    third = jnp.concatenate([third[:1] - fourth[:1], third, third[-1:] + fourth[-1:]])
-    fourth = jnp.concatenate([fourth[:1], fourth, fourth[-1:]])
-    square = way**2 - 1
-    top = middle + way * (slope / 2 + square * (third / 6 + way * fourth / 24))
-    return jnp.maximum(jnp.max(jnp.abs(samples), axis=0), jnp.max(jnp.abs(top), axis=0))
+    points = samples.shape[0]
+    slope, bend, third, fourth = jnp.tensordot(_derivatives(points), samples, axes=1)
+    # Each looks halfway to the next, where the series is at its best, and not beyond the ends.
+    reach = np.full((points,) + (1,) * (samples.ndim - 1), 0.55)
+    least, most = -reach, reach.copy()
+    least[0] = most[-1] = 0.0
+
+    def newton(way, slope, bend):
+        flat = bend == 0
+        step = jnp.where(flat, 0.0, -slope / jnp.where(flat, 1.0, bend))
+        return jnp.clip(way + step, least, most)
+
+    way = newton(0.0, slope, bend)
+    way = newton(
+        way,
+        slope + way * (bend + way * (third / 2 + way * fourth / 6)),
+        bend + way * (third + way * fourth / 2),
+    )
+    top = samples + way * (slope + way / 2 * (bend + way / 3 * (third + way / 4 * fourth)))
+    return jnp.max(jnp.maximum(jnp.abs(samples), jnp.abs(top)), axis=0)
 
 
 def refine(samples: Float[Array, "point *rest"]) -> tuple[Float[Array, " *rest"], ...]:
