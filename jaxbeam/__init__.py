@@ -8,7 +8,7 @@ import jax
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
-from jaxbeam.actuators import Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
 from jaxbeam.beam import Beam, Support
 from jaxbeam.case import Case, Run, addresses, replace
 from jaxbeam.casefile import load_case, save_case
@@ -22,6 +22,7 @@ from jaxbeam.sweep import sweep
 __all__ = [
     "Beam",
     "Case",
+    "Electrodynamic",
     "MovingForce",
     "MovingMass",
     "Patch",

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.actuators import AbstractActuator, Patch
+from jaxbeam.actuators.patch import MATERIAL
 from jaxbeam.beam import ENDS, Beam, Support
 from jaxbeam.case import Case, Run
 from jaxbeam.fields import (
@@ -53,7 +54,7 @@ def check(case: Case) -> None:
     _check_supports(case.supports, case.beam.length)
     for i, actuator in enumerate(case.actuators):
         if isinstance(actuator, Patch):
-            _check_order(f"actuators.{i}", actuator)
+            _check_patch(f"actuators.{i}", actuator)
     for i, sensor in enumerate(case.sensors):
         _check_sensor(f"sensors.{i}", sensor)
     for i, load in enumerate(case.loads):
@@ -79,9 +80,16 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
     """
     if "unit" in field.metadata:
         _check_number(address, value, field)
-    elif "count" in field.metadata:
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise ValueError(f"{address} must be a whole number, 1 or more; it is {value!r}")
+    elif "least" in field.metadata:
+        least = field.metadata["least"]
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise ValueError(f"{address} must be a whole number, {least} or more; it is {value!r}")
+    elif "part" in field.metadata:
+        kind = field.metadata["part"]
+        if value is not None and not isinstance(value, kind):
+            raise ValueError(
+                f"{address} holds {_words(value)}; it takes an object of type {kind.__name__}"
+            )
     elif "meaning" in field.metadata:
         if not isinstance(value, str):
             raise ValueError(f"{address} must be a word in quotes, not {_words(value)}")
@@ -166,8 +174,9 @@ def _check_beam(beam: Beam) -> None:
         if end not in ENDS:
             raise ValueError(f"beam.ends: no end is called {end!r}; {suggestion(end, ENDS)}")
 
-    _check_section(beam, "flexural_rigidity", "youngs_modulus", ("width", "height"))
-    _check_section(beam, "mass_per_length", "density", ("width", "height"))
+    section = ("width", "height")
+    _check_described("beam", beam, "flexural_rigidity", ("youngs_modulus",), section)
+    _check_described("beam", beam, "mass_per_length", ("density",), section)
     if beam.youngs_modulus is None and beam.density is None:
         for name in ("width", "height"):
             if getattr(beam, name) is not None:
@@ -190,19 +199,26 @@ def _check_beam(beam: Beam) -> None:
         raise ValueError("beam has both damping_ratio and rayleigh_damping; leave one out")
 
 
-def _check_section(beam: Beam, direct: str, material: str, section: tuple[str, ...]) -> None:
-    """A property is given either directly or by all of material and section."""
-    if getattr(beam, direct) is not None:
-        if getattr(beam, material) is not None:
-            raise ValueError(
-                f"beam.{direct} and beam.{material} contradict each other; leave one out"
-            )
+def _check_described(
+    address: str, part: Any, direct: str, own: tuple[str, ...], shared: tuple[str, ...] = ()
+) -> None:
+    """A property is given either directly or by all that it follows from.
+
+    What is `shared` serves other properties too, so it may stand beside the direct number.
+    """
+    if getattr(part, direct) is not None:
+        for name in own:
+            if getattr(part, name) is not None:
+                raise ValueError(
+                    f"{address}.{direct} and {address}.{name} contradict each other; leave one out"
+                )
         return
-    absent = [name for name in (*section, material) if getattr(beam, name) is None]
+    sources = (*shared, *own)
+    absent = [name for name in sources if getattr(part, name) is None]
     if absent:
         raise ValueError(
-            f"beam.{direct} is missing; give it, or all of {', '.join(section)} and {material}"
-            f" (of which {', '.join(absent)} is missing)"
+            f"{address}.{direct} is missing; give it, or all of {', '.join(sources[:-1])} and"
+            f" {sources[-1]} (of which {', '.join(absent)} is missing)"
         )
 
 
@@ -220,7 +236,8 @@ def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> 
             )
 
 
-def _check_order(address: str, patch: Patch) -> None:
+def _check_patch(address: str, patch: Patch) -> None:
+    _check_described(address, patch, "moment_per_volt", MATERIAL)
     if is_known(patch.start) and is_known(patch.end):
         start, end = known(patch.start), known(patch.end)
         if start >= end:
@@ -228,6 +245,13 @@ def _check_order(address: str, patch: Patch) -> None:
                 f"{address}.end must lie to the right of {address}.start;"
                 f" {end:g} m is not beyond {start:g} m"
             )
+    limits = patch.command_limits()
+    if is_known(limits) and known(limits)[0] >= known(limits)[1]:
+        low, high = known(patch.depolarisation / patch.amplifier_gain)
+        raise ValueError(
+            f"{address}.limits leave no command that the patch takes: its depolarisation limits"
+            f" over its amplifier_gain allow {low:g} to {high:g} V"
+        )
 
 
 def _check_sensor(address: str, sensor: Sensor) -> None:

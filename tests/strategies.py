@@ -4,7 +4,7 @@ import itertools
 
 from hypothesis import strategies as st
 
-from jaxbeam.actuators import Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
 from jaxbeam.beam import ENDS, Beam, Support
 from jaxbeam.case import Case, Run
 from jaxbeam.loads import MovingForce, MovingMass
@@ -66,13 +66,23 @@ def actuators(draw, length: float):
     """An actuator of any kind."""
     place = numbers(0.0, length)
     limits = maybe(st.tuples(numbers(-10.0, -1.0), numbers(0.0, 10.0)).map(list))
-    kind = draw(st.sampled_from(["point", "shaker", "patch", "spring"]))
+    kind = draw(st.sampled_from(["point", "shaker", "electrodynamic", "patch", "spring"]))
     if kind == "point":
         return PointForce(position=draw(place), limits=draw(limits))
     if kind == "shaker":
         return Shaker(position=draw(place), stiffness=draw(numbers(0.0, 1e4)), limits=draw(limits))
     if kind == "spring":
         return SpringDamper(draw(place), draw(numbers(0.0, 1e5)), draw(numbers(0.0, 100.0)))
+    if kind == "electrodynamic":
+        return Electrodynamic(
+            position=draw(place),
+            resistance=draw(numbers(0.1, 10.0)),
+            inductance=draw(numbers(1e-5, 1e-3)),
+            force_constant=draw(numbers(-20.0, 20.0)),
+            back_emf=draw(maybe(numbers(-20.0, 20.0))),
+            mass=draw(numbers(0.0, 0.1)),
+            limits=draw(limits),
+        )
     return Patch(
         start=draw(numbers(0.0, 0.45 * length)),
         end=draw(numbers(0.5 * length, length)),

@@ -164,7 +164,11 @@ REFUSED = [
     ("[[supports]]", "[supports]", "supports must be a list of tables; write [[supports]]"),
     ("[run]", "[[run]]", "run must be one table; write [run]"),
     ("title =", "title = 3 #", "title must be text in quotes, not 3"),
-    ('kind = "shaker"', "", "actuators.0.kind is missing; it may be point, shaker, patch, spring"),
+    (
+        'kind = "shaker"',
+        "",
+        "actuators.0.kind is missing; it may be point, shaker, electrodynamic, patch",
+    ),
     ('"shaker"', '"shakr"', "actuators.0.kind cannot be 'shakr'; did you mean 'shaker'?"),
     ('"mass"', '"car"', "loads.0.kind cannot be 'car'; it may be mass, force"),
     ('"mass"', "1", "loads.0.kind cannot be 1; it may be mass, force"),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import pytest
 from hypothesis import given
 
-from jaxbeam.actuators import Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
 from jaxbeam.beam import ENDS, Beam, Support
 from jaxbeam.case import Case, Run, replace
 from jaxbeam.checks import check
@@ -26,6 +26,7 @@ CASE = Case(
         Shaker(position=0.5, limits=[-10, 10]),
         Patch(start=0.2, end=0.3, moment_per_volt=1e-3),
         PointForce(position=0.1),
+        Electrodynamic(position=0.5, resistance=0.82, inductance=5e-5, force_constant=4.2),
     ],
     sensors=[Sensor(0.25), Sensor(0.25, "strain", fibre_distance=0.002)],
     loads=[
@@ -65,6 +66,12 @@ NUMBERS = [
     ("actuators.0.limits", [10.0, -10.0], "actuators.0.limits.1 must be above the entry before"),
     ("actuators.1.end", 0.2, "actuators.1.end must lie to the right of actuators.1.start; 0.2 m"),
     ("actuators.1.end", 0.65, "actuators.1.end must lie on the beam"),
+    ("actuators.1.amplifier_gain", 0.0, "actuators.1.amplifier_gain must be positive; it is 0"),
+    ("actuators.1.depolarisation", [1500.0, -500.0], "depolarisation.1 must be above the entry"),
+    ("actuators.3.resistance", 0.0, "actuators.3.resistance must be positive; it is 0 ohm"),
+    ("actuators.3.inductance", -1e-5, "actuators.3.inductance must be positive; it is -1e-05 H"),
+    ("actuators.3.mass", -0.02, "actuators.3.mass must not be negative; it is -0.02 kg"),
+    ("actuators.3.force_constant", jnp.nan, "actuators.3.force_constant must be a finite number"),
     ("sensors.1.position", 0.61, "sensors.1.position must lie on the beam, between 0 and 0.6 m;"),
     ("loads.0.mass", -0.5, "loads.0.mass must not be negative; it is -0.5 kg"),
     ("loads.0.speed", 0.0, "loads.0.speed must not be 0: the load would never enter"),
@@ -109,6 +116,23 @@ CASES = [
     (
         Case(BEAM, [Support(0.2), Support(0.4, 10.0), Support(0.4), Support(0.2)]),
         "supports.0 and supports.3 both hold the beam rigidly at 0.2 m; remove one",
+    ),
+    (
+        Case(BEAM, actuators=[Patch(0.2, 0.3)]),
+        "actuators.0.moment_per_volt is missing; give it, or all of d33, modulus,",
+    ),
+    (
+        Case(BEAM, actuators=[Patch(0.2, 0.3, d33=460e-12, modulus=30e9)]),
+        "(of which electrode_spacing, beam_height, patch_height, patch_width is missing)",
+    ),
+    (
+        Case(BEAM, actuators=[Patch(0.2, 0.3, 1e-3, d33=460e-12)]),
+        "actuators.0.moment_per_volt and actuators.0.d33 contradict each other; leave one out",
+    ),
+    (
+        Case(BEAM, actuators=[Patch(0.2, 0.3, 1e-3, amplifier_gain=200.0, limits=[7.5, 10.0])]),
+        "actuators.0.limits leave no command that the patch takes: its depolarisation limits over"
+        " its amplifier_gain allow -2.5 to 7.5 V",
     ),
     (Case(BEAM, sensors=[Sensor(0.2, "strain")]), "sensors.0.fibre_distance is missing: strain"),
     (

@@ -60,3 +60,11 @@ class AbstractActuator(eqx.Module):
     def bonded(self) -> Bonded | None:
         """Bending stiffness (N m^2) and mass per length (kg/m) added; they shape the modes."""
         return None
+
+    def command_limits(self) -> Float[Array, "2"] | None:
+        """Smallest and largest command it takes, in the unit of a command; None if any."""
+        return self.limits
+
+    def command_rate(self) -> Float[Array, ""] | None:
+        """Fastest change of the command it can follow, per second; None if any."""
+        return None

@@ -4,7 +4,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.actuators.base import AbstractActuator, Attachment, Bonded
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
+
+# What the moment per volt follows from, where it is not given itself.
+MATERIAL = ("d33", "modulus", "electrode_spacing", "beam_height", "patch_height", "patch_width")
 
 
 class Patch(AbstractActuator):
@@ -12,16 +15,24 @@ class Patch(AbstractActuator):
 
     The moment is `moment_per_volt` x `correction` x patch voltage, and the patch voltage is
     `amplifier_gain` x command, eqs (2.43) and (2.46) of the thesis. Positive voltage lifts the
-    beam. `added_mass` and `added_rigidity` act over its length and shape the modes.
+    beam. Give either `moment_per_volt` or all that it follows from (see `moment`).
+    `added_mass` and `added_rigidity` act over its length and shape the modes.
+
+    Commands stay within `limits` and within what the patch takes without losing its
+    polarisation, `depolarisation`; `rate_limit` says how fast the amplifier can change them.
     """
 
     start: Float[Array, ""] = number("m", "left edge", ON_BEAM)
     end: Float[Array, ""] = number("m", "right edge", ON_BEAM)
-    moment_per_volt: Float[Array, ""] = number("N m/V", "moment per volt at the patch")
+    moment_per_volt: Float[Array, ""] | None = number(
+        "N m/V", "moment per volt at the patch", default=None
+    )
     correction: Float[Array, ""] = number(
         "1", "share of the moment that reaches the beam", default=1.0
     )
-    amplifier_gain: Float[Array, ""] = number("1", "patch volts per volt of command", default=1.0)
+    amplifier_gain: Float[Array, ""] = number(
+        "1", "patch volts per volt of command", POSITIVE, default=1.0
+    )
     limits: Float[Array, "2"] | None = number(
         "V", "smallest and largest command, at the amplifier's input", INCREASING, default=None
     )
@@ -31,13 +42,44 @@ class Patch(AbstractActuator):
     added_rigidity: Float[Array, ""] | None = number(
         "N m^2", "bending stiffness added", NOT_NEGATIVE, default=None
     )
+    d33: Float[Array, ""] | None = number("m/V", "piezoelectric constant", default=None)
+    modulus: Float[Array, ""] | None = number(
+        "Pa", "Young's modulus of the patch", POSITIVE, default=None
+    )
+    electrode_spacing: Float[Array, ""] | None = number(
+        "m", "distance between electrodes", POSITIVE, default=None
+    )
+    beam_height: Float[Array, ""] | None = number(
+        "m", "height of the beam under the patch", POSITIVE, default=None
+    )
+    patch_height: Float[Array, ""] | None = number(
+        "m", "height of the patch", POSITIVE, default=None
+    )
+    patch_width: Float[Array, ""] | None = number("m", "width of the patch", POSITIVE, default=None)
+    depolarisation: Float[Array, "2"] = number(
+        "V", "smallest and largest voltage at the patch", INCREASING, default=(-500.0, 1500.0)
+    )
+    rate_limit: Float[Array, ""] | None = number(
+        "V/s", "fastest change of the command", POSITIVE, default=None
+    )
+
+    @property
+    def moment(self) -> Float[Array, ""]:
+        """Moment per volt at the patch in N m/V, given or C_0 of eq. (2.43) of the thesis.
+
+        C_0 = d33 E_p / L_e x h / 2 x h_p b_p, for a thin patch: h_p much smaller than h.
+        """
+        if self.moment_per_volt is not None:
+            return self.moment_per_volt
+        stress = self.d33 * self.modulus / self.electrode_spacing
+        return stress * self.beam_height / 2 * self.patch_height * self.patch_width
 
     def stroke(self):
         return ((self.start, 1, 1.0), (self.end, 1, -1.0))
 
     def attachment(self) -> Attachment:
         none, zero = jnp.zeros(0), jnp.zeros(())
-        moment = self.moment_per_volt * self.correction * self.amplifier_gain
+        moment = self.moment * self.correction * self.amplifier_gain
         return Attachment(jnp.zeros((0, 0)), none, none, none, moment, zero, zero)
 
     def bonded(self) -> Bonded | None:
@@ -46,3 +88,13 @@ class Patch(AbstractActuator):
         mass = jnp.zeros(()) if self.added_mass is None else self.added_mass
         rigidity = jnp.zeros(()) if self.added_rigidity is None else self.added_rigidity
         return Bonded(self.start, self.end, rigidity, mass)
+
+    def command_limits(self) -> Float[Array, "2"]:
+        own = self.depolarisation / self.amplifier_gain
+        if self.limits is None:
+            return own
+        lowest, highest = jnp.maximum(own[0], self.limits[0]), jnp.minimum(own[1], self.limits[1])
+        return jnp.stack([lowest, highest])
+
+    def command_rate(self) -> Float[Array, ""] | None:
+        return self.rate_limit

@@ -1,0 +1,46 @@
+"""Electrodynamic shaker with its coil: what the voltage drives is a current, not a force."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.actuators.base import AbstractActuator, Attachment
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
+
+
+class Electrodynamic(AbstractActuator):
+    """Electrodynamic shaker: coil, moving mass and suspension, on the beam at `position`.
+
+    L I' = u - R I - K_v w',   force = K_f I - m w'' - c w' - k w, which is eqs (2.26) to (2.34)
+    of the thesis in the time domain. Its own state is the current I. Positive voltage lifts the
+    beam. A command of zero shorts the coil, whose back-EMF then brakes the beam.
+    """
+
+    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
+    resistance: Float[Array, ""] = number("ohm", "coil resistance R", POSITIVE)
+    inductance: Float[Array, ""] = number("H", "coil inductance L", POSITIVE)
+    force_constant: Float[Array, ""] = number("N/A", "coil force per current K_f")
+    back_emf: Float[Array, ""] | None = number(
+        "V s/m", "voltage per speed K_v; the force constant if left out", default=None
+    )
+    mass: Float[Array, ""] = number("kg", "moving mass", NOT_NEGATIVE, default=0.0)
+    stiffness: Float[Array, ""] = number("N/m", "suspension stiffness", NOT_NEGATIVE, default=0.0)
+    damping: Float[Array, ""] = number("N s/m", "suspension damping", NOT_NEGATIVE, default=0.0)
+    limits: Float[Array, "2"] | None = number(
+        "V", "smallest and largest voltage", INCREASING, default=None
+    )
+
+    def stroke(self):
+        return ((self.position, 0, 1.0),)
+
+    def attachment(self) -> Attachment:
+        back_emf = self.force_constant if self.back_emf is None else self.back_emf
+        return Attachment(
+            state_matrix=-(self.resistance / self.inductance)[None, None],
+            input_matrix=1 / self.inductance[None],
+            stroke_matrix=-(back_emf / self.inductance)[None],
+            output_matrix=self.force_constant[None],
+            feedthrough=jnp.zeros(()),
+            stiffness=self.stiffness,
+            damping=self.damping,
+            mass=self.mass,
+        )
