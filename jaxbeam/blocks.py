@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -11,9 +12,8 @@ from jaxtyping import Float
 
 from jaxbeam.case import Case, replace, value_at
 from jaxbeam.dynamics import Traffic, traffic
-from jaxbeam.exponentials import LONGEST, norm
 from jaxbeam.grid import even_grid, sampled_grid
-from jaxbeam.integrate import march, trace
+from jaxbeam.integrate import longest_step, march, trace
 from jaxbeam.lanes import Tasks
 from jaxbeam.loads import motion
 from jaxbeam.modes import Layout, lay_out
@@ -23,7 +23,7 @@ from jaxbeam.record import never_as_nan
 from jaxbeam.rig import couples, rig
 
 RUNS = 256  # in a block, about: its states stay in the cache, its results are one write
-PACES = 8  # at which time steps are measured, at least
+PACES = 4  # at which time steps are measured, at least
 PLACE = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
 
 
@@ -40,24 +40,37 @@ class Work:
         self.blocks = -(-count // self.each)
         self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
         layout = _common_layout(case, tasks)
-        every = np.resize(np.arange(count), self.blocks * self.each).reshape(-1, self.each)
-        found = [_survey(case, layout, self.addresses[0], tasks.heavy[part]) for part in every]
-        norms, windows = (
-            np.concatenate([np.asarray(part[i]) for part in found])[:count] for i in range(2)
-        )
-        norms = np.where(np.isfinite(norms), norms, 1.0)  # else the run fails with any step
+        # Loads and settings of the run leave the rig as it is: one serves all tasks.
+        moving = all(name.startswith(("loads.", "run.")) for name in self.addresses[0])
+        self.rig_of = np.zeros(count, int) if moving else np.arange(count)
+        parts = [[0]] if moving else np.resize(np.arange(count), (self.blocks, self.each))
+        windows = np.asarray(_windows(case, self.addresses[0], tasks.heavy))
         slots = max(most_at_once(window) for window in windows)
         self.form = Form(layout, couples(case), slots)
+
+        def rigs(heavy):
+            return _rigs(case, self.form, self.addresses[0], heavy)
+
+        with ThreadPoolExecutor(1) as pool:
+            # Compiles the blocks meanwhile; later calls from several threads find it done.
+            blank = eqx.filter_eval_shape(rigs, tasks.heavy[parts[0]])[0]
+            self.rigs = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), blank)
+            compiled = pool.submit(self._run, np.zeros(self.each, int), np.ones(self.each), None)
+            found = [rigs(tasks.heavy[part]) for part in parts]
+            compiled.result()
+        self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
+        limits = limits[self.rig_of]
+        limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
         duration = _values(case, tasks, "run.duration")
         spans = np.minimum(windows[:, :, 1], duration[:, None]) - windows[:, :, 0]
         spans = np.where(spans > 0, spans, duration[:, None])
         crossing = np.min(spans, axis=1, initial=np.inf)
         crossing = np.where(np.isfinite(crossing), crossing, duration)
         self.paces = 1 / crossing
-        self.limits = np.minimum(LONGEST / norms, duration)
+        self.limits = np.minimum(limits, duration)
         # As found for beams of 3 and 12 modes at fast and slow crossings.
         modes = case.beam.modes
-        self.guesses = crossing / (15 * modes + 15 + 0.11 * norms * crossing / np.sqrt(modes))
+        self.guesses = crossing / (15 * modes + 15 + 1.25 * crossing / limits / np.sqrt(modes))
 
     def steps(self) -> tuple[Float[np.ndarray, " task"], float]:
         """Time steps (s) of all tasks, and the relative error of peaks seen with them.
@@ -96,6 +109,7 @@ class Work:
             self.form,
             self.addresses,
             times,
+            jax.tree.map(lambda leaf: leaf[self.rig_of[chosen]], self.rigs),
             tasks.heavy[chosen],
             tasks.light[chosen],
             np.asarray(steps),
@@ -133,33 +147,44 @@ def _common_layout(case: Case, tasks: Tasks) -> Layout:
     return common.pop()
 
 
+def _varied(case, addresses, values):
+    return replace(case, dict(zip(addresses, values, strict=True)))
+
+
 @eqx.filter_jit
-def _survey(case, layout, addresses, heavy):
-    """Norm of the rig (1/s) and times of entry and exit for each of some tasks."""
+def _rigs(case, form, addresses, heavy):
+    """Rigs of some tasks, and the longest step (s) each allows."""
 
     def task(values):
-        varied = replace(case, dict(zip(addresses, values, strict=True)))
-        paths = [motion(load, varied.beam.length) for load in varied.loads]
-        windows = jnp.array([path.window() for path in paths]).reshape(-1, 2)
-        return norm(rig(varied, layout)), windows
+        assembled = rig(_varied(case, addresses, values), form.layout, form.coupled)
+        return assembled, longest_step(assembled, case.loads)
 
     return jax.vmap(task)(heavy)
 
 
 @eqx.filter_jit
-def _block(case, form, addresses, times, heavy, light, longest):
-    """Results of some tasks, one after the other, their lanes side by side."""
-    heavy_addresses, light_addresses = addresses
-    moving = all(name.startswith(("loads.", "run.")) for name in heavy_addresses)
-    shared = rig(case, form.layout, form.coupled) if moving else None
+def _windows(case, addresses, heavy):
+    """Times of entry and exit (task, load, 2) of the loads."""
 
     def task(values):
-        heavy, light, longest = values
-        varied = replace(case, dict(zip(heavy_addresses, heavy, strict=True)))
-        assembled = rig(varied, form.layout, form.coupled) if shared is None else shared
+        varied = _varied(case, addresses, values)
+        paths = [motion(load, varied.beam.length) for load in varied.loads]
+        return jnp.array([path.window() for path in paths]).reshape(-1, 2)
+
+    return jax.vmap(task)(heavy)
+
+
+@eqx.filter_jit
+def _block(case, form, addresses, times, rigs, heavy, light, longest):
+    """Results of some tasks, one after the other, their lanes side by side."""
+    heavy_addresses, light_addresses = addresses
+
+    def task(values):
+        assembled, heavy, light, longest = values
+        varied = _varied(case, heavy_addresses, heavy)
 
         def press(values):
-            loads = traffic(replace(varied, dict(zip(light_addresses, values, strict=True))))
+            loads = traffic(_varied(varied, light_addresses, values))
             return loads.inertia[:, 0], loads.weight[:, 0]
 
         inertia, weight = jax.vmap(press, out_axes=1)(light)
@@ -187,4 +212,4 @@ def _block(case, form, addresses, times, heavy, light, longest):
             **history,
         }
 
-    return jax.lax.map(task, (heavy, light, longest))
+    return jax.lax.map(task, (rigs, heavy, light, longest))

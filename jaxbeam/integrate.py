@@ -17,14 +17,27 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.dynamics import Traffic, contact_rows, solve_contact
-from jaxbeam.exponentials import GAUSS, POINTS, Step, propagators
+from jaxbeam.exponentials import GAUSS, LONGEST, NODES, POINTS, Step, norm, propagators
 from jaxbeam.grid import Grid
+from jaxbeam.loads import AbstractLoad, MovingMass
 from jaxbeam.motion import NEVER
 from jaxbeam.peaks import refine, vertex
 from jaxbeam.rig import Rig
 
 CHUNK = 16
+# Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
+# a polynomial in each step, misses that mode's oscillation and feeds it.
+RESOLVED = 1.9 * NODES
 NEAR = 1.1  # a peak between samples is less than this above the highest of them
+
+
+def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
+    """Longest step (s) with which these loads on the rig can be integrated without blowing up."""
+    limit = LONGEST / norm(rig)
+    if any(isinstance(load, MovingMass) for load in loads):
+        fastest = jnp.sqrt(jnp.max(jnp.linalg.eigvalsh(rig.stiffness())))
+        limit = jnp.minimum(limit, RESOLVED / fastest)
+    return jax.lax.stop_gradient(limit)
 
 
 class Extremes(eqx.Module):

@@ -14,10 +14,9 @@ from jaxtyping import Array, Float
 from jaxbeam.case import Case, known_case
 from jaxbeam.checks import check
 from jaxbeam.dynamics import Traffic, traffic
-from jaxbeam.exponentials import LONGEST, norm
 from jaxbeam.fields import known
 from jaxbeam.grid import even_grid
-from jaxbeam.integrate import Extremes, march
+from jaxbeam.integrate import Extremes, longest_step, march
 from jaxbeam.loads import motion
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.rig import couples, rig
@@ -46,11 +45,11 @@ def form(case: Case) -> Form:
 
 @eqx.filter_jit
 def _survey(case: Case, layout: Layout):
-    """Norm of the rig (1/s), whether modes are repeated, and when loads enter and leave."""
+    """Longest step (s), whether modes are repeated, and when loads enter and leave."""
     assembled = rig(case, layout)
     paths = [motion(load, case.beam.length) for load in case.loads]
     windows = jnp.array([path.window() for path in paths]).reshape(-1, 2)
-    return norm(assembled), assembled.modes.repeated, windows
+    return longest_step(assembled, case.loads), assembled.modes.repeated, windows
 
 
 def most_at_once(windows: np.ndarray) -> int:
@@ -128,9 +127,8 @@ def _probe(case, form, longest, lanes):
 
 
 def _longest_step(case: Case, form: Form) -> float:
-    """The longest step (s) over which the rig can be propagated."""
-    limit = LONGEST / float(_survey(case, form.layout)[0])
-    return min(limit, float(known(case.run.duration)))
+    """The longest step (s) that may be tried."""
+    return min(float(_survey(case, form.layout)[0]), float(known(case.run.duration)))
 
 
 def suitable_step(

@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.blocks import Work
 from jaxbeam.lanes import arrange
+from jaxbeam.static import static_peak
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=[0.03, 0.02], modes=2),
@@ -178,3 +180,28 @@ def test_the_bar_stays_out_of_standard_output(capfd):
     jb.sweep(CASE, {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS})
     captured = capfd.readouterr()
     assert captured.out == "" and "run" in captured.err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("modes", "damping"), [(3, 0.03), (6, 0.0), (12, 0.005)])
+def test_longest_steps_do_not_blow_up(modes, damping):
+    """They still follow the highest mode; longer ones feed its motion under a heavy load."""
+    masses, speeds = np.array([0.1, 1.0, 8.0]), np.linspace(0.1, 0.35, 7)
+    beam = jb.Beam(
+        length=0.6,
+        flexural_rigidity=11.68,
+        mass_per_length=0.535,
+        damping_ratio=damping,
+        modes=modes,
+    )
+    case = jb.Case(
+        beam,
+        sensors=[jb.Sensor(0.15), jb.Sensor(0.3)],
+        loads=[jb.MovingMass(mass=1.0, speed=1.0)],
+        run=jb.Run(duration=6.5),
+    )
+    runs = np.array([(mass, speed) for speed in speeds for mass in masses])
+    work = Work(case, arrange(["loads.0.mass", "loads.0.speed"], runs), False, 1e-3)
+    peaks = work.block(0, work.limits)["peak_deflection"]  # speed, mass, sensor
+    ratio = peaks / (masses[:, None] * np.asarray(static_peak(case, np.array([0.15, 0.3]))))
+    assert ratio.min() > 0.99 and ratio.max() < 1.15

@@ -1,0 +1,89 @@
+"""The choice of time steps, on errors that are known."""
+
+import numpy as np
+import pytest
+
+from jaxbeam.pacing import choose_steps, errors, spread
+
+ORDER = 12
+
+
+def task(paces, best, order=ORDER, failing=()):
+    """A measure whose relative error is (step / best)^order: peaks (task, lane, sensor)."""
+
+    def measure(chosen, steps):
+        error = (np.asarray(steps) / best[chosen]) ** order
+        peaks = np.repeat((1 + error)[:, None, None] * 1e-3, 2, axis=1)
+        peaks[np.isin(chosen, failing)] = np.nan
+        return np.repeat(peaks, 3, axis=2)
+
+    return measure
+
+
+@pytest.mark.parametrize("off", [0.2, 1.0, 5.0])
+def test_steps_meet_the_tolerance_and_waste_little(off):
+    paces = np.geomspace(0.5, 20, 50)
+    best = 0.3 / paces**0.7  # steps at which the error is one
+    tolerance = 1e-7
+    longest = best * tolerance ** (1 / ORDER)
+    steps, error = choose_steps(
+        task(paces, best), paces, off * longest, np.full(50, np.inf), 8, tolerance
+    )
+    assert np.all(steps <= longest * 1.05)
+    assert np.all(steps > 0.5 * longest)
+    assert 0 < error <= tolerance
+
+
+def test_limits_are_kept():
+    paces = np.geomspace(1, 10, 20)
+    limits = np.linspace(0.01, 0.02, 20)
+    steps, _ = choose_steps(task(paces, np.ones(20)), paces, np.full(20, 5.0), limits, 4, 1e-6)
+    assert np.all(steps <= limits) and np.all(steps > 0.95 * limits)
+
+
+def test_failed_runs_do_not_decide():
+    paces = np.geomspace(1, 10, 20)
+    good = task(paces, np.ones(20) * 0.1)
+    bad = task(paces, np.ones(20) * 0.1, failing=(0, 7))
+    settings = (paces, np.full(20, 0.02), np.full(20, 1.0), 8, 1e-6)
+    np.testing.assert_allclose(choose_steps(bad, *settings)[0], choose_steps(good, *settings)[0])
+    nothing = task(paces, np.ones(20), failing=range(20))
+    steps, error = choose_steps(nothing, *settings)
+    assert error == 0 and np.all(steps == 0.02)
+
+
+def test_a_wrong_measure_is_found_on_the_random_few():
+    """Steps are good at the paces that were tried, too long between them: they are shortened."""
+    paces = np.geomspace(1, 10, 64)
+    tried = np.unique(spread(paces, 4))
+    best = np.where(np.isin(np.arange(64), tried), 0.5, 0.25)
+    steps, error = choose_steps(
+        task(paces, best), paces, np.full(64, 0.1), np.full(64, np.inf), 4, 1e-6
+    )
+    assert error <= 1e-6
+    assert np.all((steps / best) ** ORDER <= 1e-5)
+
+
+def test_no_step_will_do():
+    def measure(chosen, steps):
+        return np.random.default_rng(int(1e9 * steps[0])).uniform(size=(len(chosen), 1, 1))
+
+    paces = np.geomspace(1, 10, 8)
+    with pytest.raises(RuntimeError, match="no time step makes the peaks agree to 1e-06"):
+        choose_steps(measure, paces, np.full(8, 0.1), np.full(8, 1.0), 4, 1e-6)
+
+
+def test_error_is_that_of_the_worst_lane():
+    def measure(chosen, steps):
+        peaks = np.ones((len(chosen), 2, 1))
+        peaks[:, 1] += steps[:, None]
+        return peaks
+
+    error = errors(measure, np.arange(2), np.array([0.3, 0.6]))
+    np.testing.assert_allclose(error, [0.1 / 1.2, 0.2 / 1.4])
+
+
+def test_spread_is_even_in_log_pace():
+    paces = np.geomspace(1, 1000, 31)[np.random.default_rng(1).permutation(31)]
+    np.testing.assert_allclose(paces[spread(paces, 4)], [1, 10, 100, 1000])
+    assert len(spread(np.ones(5), 3)) == 3
