@@ -49,9 +49,14 @@ def choice(meaning: str, *allowed: str, **options):
     return eqx.field(static=True, metadata=metadata, **options)
 
 
-def count(meaning: str, **options):
-    """Declare a whole number of a case; it decides array shapes, so it is static."""
-    return eqx.field(static=True, metadata={"meaning": meaning, "count": True}, **options)
+def count(meaning: str, least: int = 1, **options):
+    """Declare a whole number of a case, `least` or more; static, for it may decide shapes."""
+    return eqx.field(static=True, metadata={"meaning": meaning, "least": least}, **options)
+
+
+def part(meaning: str, kind: type):
+    """Declare a part within a part of a case, a table of its own that may be left out."""
+    return eqx.field(metadata={"meaning": meaning, "part": kind}, default=None)
 
 
 def dimensions(field) -> str:

@@ -10,15 +10,15 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for all its
 # modules, which may import each other.
 LAYERS = """
-jaxbeam.fields
-jaxbeam.beam  jaxbeam.sensors  jaxbeam.motion  jaxbeam.actuators
-jaxbeam.loads
-jaxbeam.case
+jaxbeam.fields  jaxbeam.holds
+jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators
+jaxbeam.loads  jaxbeam.sensors
+jaxbeam.case  jaxbeam.sensing
 jaxbeam.checks
 jaxbeam.casefile
 jaxbeam.modes
 jaxbeam.rig
-jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.sine_basis
+jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.sine_basis
 jaxbeam.grid
 jaxbeam.dynamics
 jaxbeam.integrate  jaxbeam.reference  jaxbeam.static

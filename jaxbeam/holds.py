@@ -1,0 +1,63 @@
+"""Exact propagation of x' = A x + B u from sample to sample, for inputs polynomial in between."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+def hold(
+    matrix: Float[Array, "state state"],
+    column: Float[Array, "state input"],
+    period: Float[Array, ""] | float,
+    degree: int = 0,
+) -> tuple[Float[Array, "state state"], Float[Array, "power state input"]]:
+    """Propagators over a period (s): x(h) = drift x(0) + sum_k push_k c_k.
+
+    The input is u(s) = sum_k c_k (s / h)^k with k up to `degree`: 0 is a zero-order hold, 1 a
+    first-order hold with c_0 = u(0) and c_1 = u(h) - u(0). Exact, by one matrix exponential
+    (Van Loan, IEEE Trans. Automatic Control 1978); states of like size serve its accuracy.
+    """
+    states, inputs = column.shape
+    powers = degree + 1
+    # The derivatives of the input by s / h are further states, each the rate of the one before.
+    block = jnp.zeros((states + inputs * powers,) * 2)
+    block = block.at[:states, :states].set(matrix * period)
+    block = block.at[:states, states : states + inputs].set(column * period)
+    block = block.at[states:, states:].set(np.kron(np.eye(powers, k=1), np.eye(inputs)))
+    whole = jax.scipy.linalg.expm(block, max_squarings=40)
+    push = whole[:states, states:].reshape(states, powers, inputs)
+    factorials = np.array([math.factorial(k) for k in range(powers)], float)
+    return whole[:states, :states], jnp.moveaxis(push, 1, 0) * factorials[:, None, None]
+
+
+def cubics(
+    times: Float[Array, " time"],
+    values: Float[Array, " time"],
+    rates: Float[Array, " time"] | None = None,
+) -> Float[Array, "interval power"]:
+    """Coefficients c_k of the cubics in s / h through samples and their rates, for each interval.
+
+    Straight lines if no rates (unit of the values per s) are given.
+    """
+    rise = jnp.diff(values)
+    start, end = (rise, rise)
+    if rates is not None:
+        span = jnp.diff(times)
+        start, end = rates[:-1] * span, rates[1:] * span
+    return jnp.stack([values[:-1], start, 3 * rise - 2 * start - end, start + end - 2 * rise], -1)
+
+
+def evaluate(
+    times: Float[Array, " time"],
+    pieces: Float[Array, "interval power"],
+    at: Float[Array, " *place"],
+) -> Float[Array, " *place"]:
+    """Values of the cubics at any times (s); before the first and after the last they are held."""
+    interval = jnp.clip(jnp.searchsorted(times, at, side="right") - 1, 0, pieces.shape[0] - 1)
+    share = (at - times[interval]) / (times[interval + 1] - times[interval])
+    share = jnp.clip(share, 0.0, 1.0)[..., None]
+    chosen = pieces[interval]
+    return jnp.sum(chosen * share ** np.arange(chosen.shape[-1]), axis=-1)

@@ -1,0 +1,153 @@
+"""Filters against scipy.signal, and their derivatives against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+from numpy.testing import assert_allclose
+
+from jaxbeam.filters import (
+    Filter,
+    analogue,
+    analogue_initial,
+    filter_history,
+    filter_step,
+    initial,
+    sections,
+)
+from jaxbeam.holds import hold
+from tests.differences import central
+
+ORDERS = [1, 2, 3, 5, 10]
+PERIOD = 1e-3
+SIGNAL = np.random.default_rng(7).normal(size=(400, 3)).cumsum(axis=0)
+
+
+def designed(order, cutoff):
+    """The same digital filter, by scipy."""
+    return scipy.signal.butter(order, cutoff, fs=1 / PERIOD, output="sos")
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("cutoff", [10.0, 120.0, 480.0])
+def test_sections_respond_as_those_of_scipy(order, cutoff):
+    frequencies = np.linspace(0.01, 499.0, 200)
+    ours = np.asarray(sections(Filter(cutoff, order), PERIOD))
+    found = scipy.signal.sosfreqz(ours, frequencies, fs=1 / PERIOD)[1]
+    expected = scipy.signal.sosfreqz(designed(order, cutoff), frequencies, fs=1 / PERIOD)[1]
+    seen = np.abs(expected) > 1e-12
+    assert_allclose(found[seen], expected[seen], rtol=1e-9)
+    at_cutoff = scipy.signal.sosfreqz(ours, [cutoff], fs=1 / PERIOD)[1]
+    assert_allclose(np.abs(at_cutoff), 1 / np.sqrt(2), rtol=1e-9)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("cutoff", [10.0, 120.0])
+def test_a_history_is_that_of_sosfilt(order, cutoff):
+    rows = sections(Filter(cutoff, order), PERIOD)
+    rest = initial(rows, np.zeros(3))
+    expected = scipy.signal.sosfilt(designed(order, cutoff), SIGNAL, axis=0)
+    found = filter_history(rows, rest, jnp.asarray(SIGNAL))
+    assert_allclose(found, expected, rtol=0, atol=1e-10 * np.max(np.abs(SIGNAL)))
+
+
+def test_steps_add_up_to_the_history():
+    rows = sections(Filter(40.0, 5), PERIOD)
+    memory = initial(rows, np.ones(3))
+    expected = filter_history(rows, memory, jnp.asarray(SIGNAL[:20]))
+    for sample, output in zip(SIGNAL[:20], expected, strict=True):
+        found, memory = filter_step(rows, memory, jnp.asarray(sample))
+        assert_allclose(found, output, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_filter_at_rest_stays_there(order):
+    rows = sections(Filter(20.0, order), PERIOD)
+    level = np.array([2.0, -3.0, 0.5])
+    found = filter_history(rows, initial(rows, level), jnp.broadcast_to(level, (50, 3)))
+    assert_allclose(found, np.broadcast_to(level, (50, 3)), rtol=1e-9)
+
+
+def test_lanes_may_have_filters_of_their_own():
+    cutoffs = jnp.array([10.0, 50.0, 200.0])
+    rows = jax.vmap(lambda c: sections(Filter(c, 3), PERIOD), out_axes=-1)(cutoffs)
+    found = filter_history(rows, initial(rows, np.zeros(3)), jnp.asarray(SIGNAL))
+    for i, cutoff in enumerate(cutoffs):
+        expected = scipy.signal.sosfilt(designed(3, float(cutoff)), SIGNAL[:, i])
+        assert_allclose(found[:, i], expected, rtol=0, atol=1e-11 * np.max(np.abs(SIGNAL)))
+
+
+def test_between_fresh_samples_the_output_is_held():
+    rows = sections(Filter(50.0, 4), 5 * PERIOD)
+    fresh = np.arange(400) % 5 == 0
+    found = filter_history(rows, initial(rows, np.zeros(3)), jnp.asarray(SIGNAL), jnp.array(fresh))
+    slow = filter_history(rows, initial(rows, np.zeros(3)), jnp.asarray(SIGNAL[::5]))
+    assert_allclose(found, np.repeat(slow, 5, axis=0), rtol=0, atol=0)
+
+
+def test_a_cutoff_above_half_the_sampling_frequency_is_refused():
+    with pytest.raises(ValueError, match="below half the sampling frequency, 500 Hz; it is 500 Hz"):
+        sections(Filter(500.0, 2), PERIOD)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_an_analogue_filter_responds_as_that_of_scipy(order):
+    cutoff = 30.0
+    matrix, column, row, direct = analogue(Filter(cutoff, order, realisation="analogue"))
+    omega = 2 * np.pi * np.logspace(-1, 3, 60)
+    inverse = np.linalg.inv(1j * omega[:, None, None] * np.eye(order) - np.asarray(matrix))
+    found = np.einsum("i,wij,j->w", row, inverse, column) + direct
+    polynomials = scipy.signal.butter(order, 2 * np.pi * cutoff, analog=True)
+    expected = scipy.signal.freqs(*polynomials, omega)[1]
+    assert_allclose(found, expected, rtol=1e-8, atol=1e-14)
+    rest = analogue_initial(Filter(cutoff, order), 2.0)
+    assert_allclose(matrix @ rest + column * 2.0, 0.0, atol=1e-12)
+    assert_allclose(row @ rest, 2.0, rtol=1e-15)
+
+
+@pytest.mark.parametrize("order", [1, 4, 7])
+def test_holds_are_exact(order):
+    """Zero order against cont2discrete, first order against lsim, cubics against both halves."""
+    matrix, column, row, direct = analogue(Filter(30.0, order))
+    system = matrix, column[:, None], row[None], direct[None, None]
+    drift, push = hold(matrix, column[:, None], PERIOD)
+    discrete = scipy.signal.cont2discrete([np.asarray(x) for x in system], PERIOD)
+    assert_allclose(drift, discrete[0], rtol=1e-12, atol=1e-13)
+    assert_allclose(push[0], discrete[1], rtol=1e-10, atol=1e-14)
+
+    drift, push = hold(matrix, column[:, None], PERIOD, degree=1)
+    times, signal = PERIOD * np.arange(400), SIGNAL[:, 0]
+    expected = scipy.signal.lsim([np.asarray(x) for x in system], signal, times)[2]
+    state, found = np.zeros(order), [np.zeros(order)]
+    for value, rise in zip(signal[:-1], np.diff(signal), strict=True):
+        state = drift @ state + push[0, :, 0] * value + push[1, :, 0] * rise
+        found.append(state)
+    assert_allclose(found, np.asarray(expected).reshape(400, order), rtol=0, atol=1e-9)
+
+    cubic = np.array([1.0, -2.0, 0.5, 3.0])  # in s / h; its halves in s / (h / 2), from the start
+    second = np.polynomial.Polynomial(cubic)(np.polynomial.Polynomial([0.5, 0.5])).coef
+    drift, push = hold(matrix, column[:, None], 0.02, degree=3)
+    half_drift, half_push = hold(matrix, column[:, None], 0.01, degree=3)
+    middle = np.tensordot(cubic * 0.5 ** np.arange(4), half_push[..., 0], axes=1)
+    expected = half_drift @ middle + np.tensordot(second, half_push[..., 0], axes=1)
+    assert_allclose(np.tensordot(cubic, push[..., 0], axes=1), expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("order", [3, 10])
+def test_derivatives_by_the_cutoff(order):
+    def digital(cutoff):
+        rows = sections(Filter(cutoff[0], order), PERIOD)
+        return filter_history(rows, initial(rows, 0.3), jnp.asarray(SIGNAL[:80, 0]))
+
+    def continuous(cutoff):
+        matrix, column, _, _ = analogue(Filter(cutoff[0], order))
+        return jnp.concatenate([part.ravel() for part in hold(matrix, column[:, None], 0.01)])
+
+    at = jnp.array([60.0])
+    for function in (digital, continuous):
+        expected = central(function, at, step=0.05)
+        size = np.max(np.abs(expected))
+        for derivative in (jax.jacfwd, jax.jacrev):
+            found = jax.jit(derivative(function))(at)
+            assert_allclose(found, expected, rtol=0, atol=1e-7 * size)
