@@ -3,6 +3,7 @@
 import abc
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
@@ -26,6 +27,12 @@ class Attachment(eqx.Module):
     stiffness: Float[Array, ""]
     damping: Float[Array, ""]
     mass: Float[Array, ""] | None = None
+
+    @property
+    def steady(self) -> Float[Array, ""]:
+        """Generalised force per unit of a steady command, the stroke at rest."""
+        held = jnp.linalg.solve(self.state_matrix, self.input_matrix)
+        return self.feedthrough - self.output_matrix @ held
 
 
 class Bonded(eqx.Module):
