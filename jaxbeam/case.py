@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.actuators import AbstractActuator
 from jaxbeam.beam import Beam, Support
-from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, choice, known, number
+from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, choice, count, known, number
 from jaxbeam.loads import AbstractLoad
 from jaxbeam.sensors import Sensor
 
@@ -25,6 +25,7 @@ class Run(eqx.Module):
     gravity: Float[Array, ""] = number(
         "m/s^2", "acceleration of gravity", NOT_NEGATIVE, default=9.81
     )
+    seed: int = count("which noise the sensors draw", least=0, default=0)
 
 
 class Case(eqx.Module):

@@ -164,7 +164,11 @@ def read_part(address: str, table: dict[str, Any], kind: Kind) -> Any:
     for key, value in values.items():
         if key not in fields:
             raise ValueError(f"{address} has no key {key!r}; {suggestion(key, fields)}")
-        _check_type(f"{address}.{key}", value, fields[key])
+        inner = fields[key].metadata.get("part")
+        if inner is not None and isinstance(value, dict):
+            values[key] = read_part(f"{address}.{key}", value, inner)
+        else:
+            _check_type(f"{address}.{key}", value, fields[key])
     for name, field in fields.items():
         if field.default is dataclasses.MISSING and name not in values:
             raise missing(f"{address}.{name}", field)
@@ -205,9 +209,13 @@ def _write_part(address: str, part: Any, kind: Kind) -> dict[str, Any]:
         table["kind"] = names[0]
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
-        if value is not None:
-            is_number = "unit" in field.metadata
-            table[field.name] = known(value).tolist() if is_number else value
+        if value is None:
+            continue
+        if "unit" in field.metadata:
+            value = known(value).tolist()
+        elif "part" in field.metadata:
+            value = _write_part(f"{address}.{field.name}", value, field.metadata["part"])
+        table[field.name] = value
     return table
 
 
@@ -229,7 +237,9 @@ def _block(header: str, part: Any, table: dict[str, Any]) -> str:
 
 
 def _line(key: str, value: Any, unit: str = "") -> str:
-    if isinstance(value, list):
+    if isinstance(value, dict):  # a part within a part, as an inline table
+        text = f"{key} = {{{', '.join(_line(k, v).rstrip() for k, v in value.items())}}}"
+    elif isinstance(value, list):
         text = f"{key} = [{', '.join(map(repr, value))}]"
     else:
         text = tomli_w.dumps({key: value}).rstrip("\n")

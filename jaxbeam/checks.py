@@ -47,8 +47,7 @@ def check(case: Case) -> None:
             raise ValueError(
                 f"{address} holds {_words(part)}; it takes objects of type {kind.__name__}"
             )
-        for field in dataclasses.fields(part):
-            check_field(f"{address}.{field.name}", getattr(part, field.name), field)
+        _check_part(address, part)
         _check_places(address, part, case.beam.length)
     _check_beam(case.beam)
     _check_supports(case.supports, case.beam.length)
@@ -57,6 +56,7 @@ def check(case: Case) -> None:
             _check_patch(f"actuators.{i}", actuator)
     for i, sensor in enumerate(case.sensors):
         _check_sensor(f"sensors.{i}", sensor)
+        _check_clock(f"sensors.{i}", sensor, case)
     for i, load in enumerate(case.loads):
         _check_load(f"loads.{i}", load)
 
@@ -88,8 +88,11 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
         kind = field.metadata["part"]
         if value is not None and not isinstance(value, kind):
             raise ValueError(
-                f"{address} holds {_words(value)}; it takes an object of type {kind.__name__}"
+                f"{address} holds {_words(value)}; it takes a table of its own, in Python a"
+                f" {kind.__name__}"
             )
+        if value is not None:
+            _check_part(address, value)
     elif "meaning" in field.metadata:
         if not isinstance(value, str):
             raise ValueError(f"{address} must be a word in quotes, not {_words(value)}")
@@ -111,6 +114,11 @@ def _parts(case: Case) -> Iterator[tuple[str, Any, type]]:
     for name, kind in lists.items():
         for i, part in enumerate(getattr(case, name)):
             yield f"{name}.{i}", part, kind
+
+
+def _check_part(address: str, part: Any) -> None:
+    for field in dataclasses.fields(part):
+        check_field(f"{address}.{field.name}", getattr(part, field.name), field)
 
 
 def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
@@ -265,6 +273,29 @@ def _check_sensor(address: str, sensor: Sensor) -> None:
             f"{address}.fibre_distance would have no effect on a sensor of {sensor.quantity};"
             " leave it out, or set quantity to 'strain'"
         )
+
+
+def _check_clock(address: str, sensor: Sensor, case: Case) -> None:
+    """The sensor samples within the run, and fast enough for its digital filter."""
+    period, run = sensor.sampling_period, case.run
+    if period is not None:
+        if is_known(period) and is_known(run.duration) and known(period) > known(run.duration):
+            raise ValueError(
+                f"{address}.sampling_period must not exceed the run's duration,"
+                f" {known(run.duration):g} s; it is {known(period):g} s"
+            )
+    elif case.controller is None:
+        period = 1 / run.sample_rate
+    filter = sensor.filter
+    if filter is None or filter.realisation != "digital" or period is None:
+        return
+    if is_known(filter.cutoff) and is_known(period):
+        highest = 0.5 / known(period)
+        if known(filter.cutoff) >= highest:
+            raise ValueError(
+                f"{address}.filter.cutoff must be below half the sampling frequency,"
+                f" {highest:g} Hz; it is {known(filter.cutoff):g} Hz: lower it, or sample faster"
+            )
 
 
 def _check_load(address: str, load: AbstractLoad) -> None:

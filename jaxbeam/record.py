@@ -14,6 +14,7 @@ from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.fields import known
 from jaxbeam.modes import Modes
 from jaxbeam.motion import NEVER
+from jaxbeam.sensing import convert, needs_times, noise_samples, sense
 from jaxbeam.sensors import QUANTITIES
 
 
@@ -88,8 +89,12 @@ class Record(eqx.Module):
 
     @property
     def measured(self) -> Float[Array, "time sensor"]:
-        """What each sensor reads, its offset included, in the SI unit of its quantity."""
-        return measure(self.case, self.modes, self.coordinates, self.rates, self.accelerations)
+        """What each sensor reads, in the SI unit of its quantity, noise and filter included.
+
+        Raises ValueError for a filter that samples at these times do not suit (see `sense`).
+        """
+        motion = self.coordinates, self.rates, self.accelerations
+        return measure(self.case, self.modes, *motion, self.times, noisy=True)
 
     @property
     def verdict(self) -> str:
@@ -236,14 +241,38 @@ def measure(
     coordinates: Float[Array, "time mode"],
     rates: Float[Array, "time mode"],
     accelerations: Float[Array, "time mode"],
+    times: Float[Array, " time"] | None = None,
+    noisy: bool = False,
 ) -> Float[Array, "time sensor"]:
-    """What the sensors of a case read, offsets included, when its modes move so (SI units)."""
+    """What the sensors of a case read when its modes move so (SI units; see `sensing`).
+
+    Only sensors with a filter, a delay or a sampling period ask for the times (s). Noise is drawn
+    by the run's seed if `noisy`; predictions to be held against logs leave it out.
+
+    Raises ValueError, naming the sensor, for what `sensing.sense` refuses and for missing times.
+    """
     motion = coordinates, rates, accelerations
-    columns = [
-        _history(modes, motion, s.position, s.quantity, s.fibre_distance) + s.offset
-        for s in case.sensors
-    ]
-    return jnp.array(columns).reshape(-1, coordinates.shape[0]).T
+    samples = coordinates.shape[0]
+    noisy = noisy and any(sensor.noise is not None for sensor in case.sensors)
+    noise = noise_samples(case.run.seed, len(case.sensors), samples) if noisy else None
+    columns = []
+    for i, sensor in enumerate(case.sensors):
+        what = sensor.position, sensor.quantity, sensor.fibre_distance
+        values = _history(modes, motion, *what)
+        drawn = None if noise is None else noise[:, i]
+        if not needs_times(sensor):
+            columns.append(convert(sensor, values, drawn))
+            continue
+        if times is None:
+            raise ValueError(f"sensors.{i} has a filter, delay or clock: its readings need times")
+        change = None
+        if sensor.quantity != "acceleration":
+            change = _history(modes, motion[1:], *what)
+        try:
+            columns.append(sense(sensor, times, values, change, drawn))
+        except ValueError as error:
+            raise ValueError(f"sensors.{i}: {error}") from None
+    return jnp.array(columns).reshape(-1, samples).T
 
 
 def sensor_labels(case: Case) -> np.ndarray:

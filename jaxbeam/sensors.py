@@ -3,7 +3,8 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import ON_BEAM, choice, number
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, number, part
+from jaxbeam.filters import Filter
 
 QUANTITIES = {
     "deflection": "m",
@@ -18,7 +19,8 @@ class Sensor(eqx.Module):
     """A point sensor on the beam.
 
     `strain` is the bending strain at the fibre `fibre_distance` above the neutral axis,
-    -z d2w/dx2; deflection is positive upwards. `offset` is added to the reading.
+    -z d2w/dx2; deflection is positive upwards. `offset` is added to the reading; noise, range,
+    resolution and a filter follow, and whatever is left out is ideal (see `sensing`).
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
@@ -26,4 +28,20 @@ class Sensor(eqx.Module):
     offset: Float[Array, ""] = number("unit of quantity", "constant added", default=0.0)
     fibre_distance: Float[Array, ""] | None = number(
         "m", "height of the strain gauge above the neutral axis", default=None
+    )
+    noise: Float[Array, ""] | None = number(
+        "unit of quantity", "standard deviation of white noise", NOT_NEGATIVE, default=None
+    )
+    range: Float[Array, "2"] | None = number(
+        "unit of quantity", "smallest and largest reading", INCREASING, default=None
+    )
+    resolution: Float[Array, ""] | None = number(
+        "unit of quantity", "step between readings", POSITIVE, default=None
+    )
+    filter: Filter | None = part("filter of the signal or of its samples", Filter)
+    sampling_period: Float[Array, ""] | None = number(
+        "s", "time between readings; that of controller or run if left out", POSITIVE, default=None
+    )
+    delay: Float[Array, ""] | None = number(
+        "s", "age of the deflection that is read", NOT_NEGATIVE, default=None
     )
