@@ -2,7 +2,8 @@
 
 import dataclasses
 import re
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from contextlib import nullcontext
 
 import equinox as eqx
 import jax
@@ -35,6 +36,7 @@ class Work:
 
     def __init__(self, case: Case, tasks: Tasks, histories: bool, tolerance: float):
         self.case, self.tasks, self.histories, self.tolerance = case, tasks, histories, tolerance
+        self._compiling, self._compiled = threading.Lock(), False
         count, lanes = tasks.index.shape
         self.each = min(count, max(1, RUNS // lanes))
         self.blocks = -(-count // self.each)
@@ -48,16 +50,7 @@ class Work:
         slots = max(most_at_once(window) for window in windows)
         self.form = Form(layout, couples(case), slots)
 
-        def rigs(heavy):
-            return _rigs(case, self.form, self.addresses[0], heavy)
-
-        with ThreadPoolExecutor(1) as pool:
-            # Compiles the blocks meanwhile; later calls from several threads find it done.
-            blank = eqx.filter_eval_shape(rigs, tasks.heavy[parts[0]])[0]
-            self.rigs = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), blank)
-            compiled = pool.submit(self._run, np.zeros(self.each, int), np.ones(self.each), None)
-            found = [rigs(tasks.heavy[part]) for part in parts]
-            compiled.result()
+        found = [_rigs(case, self.form, self.addresses[0], tasks.heavy[part]) for part in parts]
         self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
         limits = limits[self.rig_of]
         limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
@@ -104,16 +97,19 @@ class Work:
 
     def _run(self, chosen, steps, times):
         tasks = self.tasks
-        results = _block(
-            self.case,
-            self.form,
-            self.addresses,
-            times,
-            jax.tree.map(lambda leaf: leaf[self.rig_of[chosen]], self.rigs),
-            tasks.heavy[chosen],
-            tasks.light[chosen],
-            np.asarray(steps),
-        )
+        # The first call compiles: others wait for it instead of compiling the same again.
+        with nullcontext() if self._compiled else self._compiling:
+            results = _block(
+                self.case,
+                self.form,
+                self.addresses,
+                times,
+                jax.tree.map(lambda leaf: leaf[self.rig_of[chosen]], self.rigs),
+                tasks.heavy[chosen],
+                tasks.light[chosen],
+                np.asarray(steps),
+            )
+            self._compiled = True
         return {name: np.asarray(values) for name, values in results.items()}
 
 

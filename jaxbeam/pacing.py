@@ -65,11 +65,13 @@ def choose_steps(
     if not works.any():
         return np.minimum(guesses, limits), 0.0
     chosen, good = chosen[works], good[works]
-    # Of tasks with one pace, the shortest step counts.
+    # How much longer than guessed, by pace; of tasks with one pace, the least counts.
+    start = np.minimum(guesses, limits)
     unique, which = np.unique(np.log(paces[chosen]), return_inverse=True)
     lowest = np.full(unique.size, np.inf)
-    np.minimum.at(lowest, which, np.log(good))
-    steps = np.minimum(np.exp(np.interp(np.log(paces), unique, lowest)), limits)
+    np.minimum.at(lowest, which, np.log(good / start[chosen]))
+    longer = np.exp(np.interp(np.log(paces), unique, lowest))
+    steps = np.minimum(start * longer, limits)
     some = np.resize(np.random.default_rng(0).permutation(paces.size), count)
     for _ in range(ROUNDS):
         error = errors(measure, some, steps[some])

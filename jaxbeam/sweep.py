@@ -2,7 +2,6 @@
 
 import hashlib
 import importlib.metadata
-import itertools
 import json
 import os
 import re
@@ -138,8 +137,8 @@ def _axes(case: Case, over: dict[str, Any], paired: bool, histories: bool) -> di
 
 def _runs(case: Case, axes: dict[str, np.ndarray], paired: bool) -> np.ndarray:
     """The values of every run (run, address), those that depend on each other checked."""
-    combine = zip(*axes.values(), strict=True) if paired else itertools.product(*axes.values())
-    runs = np.array(list(combine), float)
+    columns = axes.values() if paired else np.meshgrid(*axes.values(), indexing="ij")
+    runs = np.stack([column.ravel() for column in columns], axis=-1)
     names = list(axes)
     joint = [i for i, name in enumerate(names) if TOGETHER.fullmatch(name)]
     for row in np.unique(runs[:, joint], axis=0):
