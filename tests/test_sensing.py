@@ -1,0 +1,228 @@
+"""Sensors: from what the beam does to what is read."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxbeam as jb
+from jaxbeam.filters import Filter
+from jaxbeam.record import measure
+from jaxbeam.sensing import convert, design, init, noise_samples, read, sense
+from jaxbeam.sensors import Sensor
+from tests.differences import central
+
+TIMES = jnp.arange(201) / 1000.0
+OMEGA = 2 * np.pi * np.array([3.0, 8.0])
+
+
+def wave(t, derivative=0):
+    """A smooth signal that starts from rest, and its derivatives by time."""
+    t = np.asarray(t)
+    if derivative:
+        return sum(w * np.sin(w * t) for w in OMEGA)
+    return sum(1 - np.cos(w * t) for w in OMEGA)
+
+
+VALUES, RATES = jnp.asarray(wave(TIMES)), jnp.asarray(wave(TIMES, 1))
+
+
+def test_offset_noise_range_and_resolution_in_this_order():
+    sensor = Sensor(0.3, offset=0.5, noise=0.1, range=[-2.0, 2.0], resolution=0.25)
+    found = convert(sensor, jnp.array([0.0, 0.0, 1.4, -9.0]), jnp.array([0.0, 2.0, 1.0, 1.0]))
+    assert_allclose(found, [0.5, 0.75, 2.0, -2.0], rtol=0, atol=0)
+    assert_allclose(convert(sensor, 0.3), 0.75)  # without noise
+
+
+def test_derivatives_pass_through_rounding_and_stop_at_the_range():
+    sensor = Sensor(0.3, range=[-2.0, 2.0], resolution=0.25)
+    slope = jax.vmap(jax.grad(lambda v: convert(sensor, v)))(jnp.array([0.3, 1.9, 2.1, -5.0]))
+    assert_allclose(slope, [1.0, 1.0, 0.0, 0.0], rtol=0, atol=0)
+
+
+def test_noise_is_that_of_the_seed_and_of_the_stated_size():
+    drawn = noise_samples(3, 2, 20000)
+    assert_array_equal(drawn, noise_samples(3, 2, 20000))
+    assert_array_equal(drawn[:, 0], noise_samples(3, 1, 20000)[:, 0])
+    assert np.max(np.abs(drawn - noise_samples(4, 2, 20000))) > 1
+    assert_allclose(np.std(drawn, axis=0), 1.0, atol=0.02)
+    assert_allclose(np.corrcoef(drawn.T)[0, 1], 0.0, atol=0.03)
+
+
+def test_reading_sample_by_sample_is_reading_at_once():
+    sensor = Sensor(0.3, offset=0.2, noise=0.01, resolution=1e-3, filter=Filter(20.0, 3))
+    noise = noise_samples(0, 1, 201)[:, 0]
+    sections = design(sensor, 1e-3)
+    memory = init(sensor, sections, jnp.zeros(()))
+    step = jax.jit(read)
+    found = []
+    for value, drawn in zip(VALUES, noise, strict=True):
+        reading, memory = step(sensor, sections, memory, value, drawn)
+        found.append(reading)
+    assert_allclose(found, sense(sensor, TIMES, VALUES, RATES, noise), rtol=0, atol=1e-13)
+    lanes = init(sensor, sections, jnp.zeros(4))
+    together, _ = read(sensor, sections, lanes, jnp.linspace(0, 1, 4), None)
+    alone, _ = read(sensor, sections, lanes[..., 2], jnp.array(2 / 3), None)
+    assert_allclose(together[2], alone, rtol=1e-14)
+
+
+def test_a_digital_filter_is_that_of_scipy_from_rest():
+    sensor = Sensor(0.3, offset=0.7, filter=Filter(15.0, 6))
+    sos = scipy.signal.butter(6, 15.0, fs=1000.0, output="sos")
+    rest = scipy.signal.sosfilt_zi(sos) * 0.7
+    expected = scipy.signal.sosfilt(sos, np.asarray(VALUES) + 0.7, zi=rest)[0]
+    assert_allclose(sense(sensor, TIMES, VALUES, RATES), expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("order", [1, 4])
+def test_an_analogue_filter_is_that_of_scipy(order):
+    sensor = Sensor(0.3, filter=Filter(15.0, order, realisation="analogue"))
+    fine = np.linspace(0.0, 0.2, 20001)  # lsim takes the signal to be straight in between
+    system = scipy.signal.butter(order, 2 * np.pi * 15.0, analog=True)
+    expected = scipy.signal.lsim(system, wave(fine), fine)[1][::100]
+    found = sense(sensor, TIMES, VALUES, RATES)
+    assert_allclose(found, expected, rtol=0, atol=1e-7)
+
+
+def test_a_delay_shows_the_past():
+    whole = sense(Sensor(0.3, delay=0.01), TIMES, VALUES, RATES)
+    assert_allclose(whole[10:], VALUES[:-10], rtol=0, atol=1e-13)
+    assert_allclose(whole[:10], 0.0, atol=1e-15)
+    between = sense(Sensor(0.3, delay=0.00437), TIMES, VALUES, RATES)
+    # Cubics are right to (omega h)^4 / 384.
+    assert_allclose(between[5:], wave(TIMES - 0.00437)[5:], rtol=0, atol=5e-8)
+
+
+def test_a_clock_holds_its_readings():
+    sensor = Sensor(0.3, sampling_period=0.004, noise=0.1)
+    noise = noise_samples(0, 1, 201)[:, 0]
+    found = sense(sensor, TIMES, VALUES, RATES, noise)
+    expected = np.repeat(VALUES[::4] + 0.1 * noise[: len(VALUES[::4])], 4)[:201]
+    assert_allclose(found, expected, rtol=0, atol=1e-13)
+    # Not a multiple of the time between samples: the readings are those at its own times.
+    odd = sense(Sensor(0.3, sampling_period=0.0033), TIMES, VALUES, RATES)
+    ticks = 0.0033 * np.floor(np.asarray(TIMES) / 0.0033 + 1e-9)
+    assert_allclose(odd, wave(ticks), rtol=0, atol=5e-8)
+
+
+def test_a_clock_drives_its_filter():
+    sensor = Sensor(0.3, sampling_period=0.004, filter=Filter(20.0, 3))
+    sos = scipy.signal.butter(3, 20.0, fs=250.0, output="sos")
+    expected = np.repeat(scipy.signal.sosfilt(sos, VALUES[::4]), 4)[:201]
+    assert_allclose(sense(sensor, TIMES, VALUES, RATES), expected, rtol=0, atol=1e-12)
+
+
+def test_unsuitable_times_are_refused():
+    uneven = TIMES.at[7].add(3e-4)
+    for realisation in ("digital", "analogue"):
+        sensor = Sensor(0.3, filter=Filter(20.0, 3, realisation=realisation))
+        with pytest.raises(ValueError, match="equal spacing"):
+            sense(sensor, uneven, VALUES, RATES)
+    fast = Sensor(0.3, sampling_period=1e-4, filter=Filter(20.0, 3))
+    with pytest.raises(ValueError, match="a reading every 0.0001 s, but .* 0.001 s apart"):
+        sense(fast, TIMES, VALUES, RATES)
+
+
+@pytest.mark.parametrize("realisation", ["digital", "analogue"])
+def test_derivatives_of_readings(realisation):
+    """By offset, cutoff and delay, through clock and filter, against differences."""
+
+    def readings(point):
+        offset, cutoff, delay = point
+        sensor = Sensor(
+            0.3,
+            offset=offset,
+            filter=Filter(20 * cutoff, 4, realisation=realisation),
+            sampling_period=2e-3,
+            delay=0.01 * delay,
+        )
+        return sense(sensor, TIMES, VALUES, RATES)
+
+    at = jnp.array([0.1, 1.0, 0.53])
+    readings = jax.jit(readings)
+    expected = central(readings, at, step=1e-3, order=4)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found = derivative(readings)(at)
+        assert_allclose(found, expected, rtol=0, atol=1e-6 * np.max(np.abs(expected)))
+
+
+QUANTITIES = [("deflection", None), ("velocity", None), ("acceleration", None), ("strain", 0.002)]
+CASE = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
+    sensors=[Sensor(0.25, quantity, fibre_distance=z) for quantity, z in QUANTITIES],
+    loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    run=jb.Run(0.4, sample_rate=2000.0, seed=11),
+)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return jb.simulate(CASE)
+
+
+def fitted_with(record, **changes):
+    """The same run, seen by sensors with other properties."""
+    sensors = tuple(dataclasses.replace(s, **changes) for s in CASE.sensors)
+    return dataclasses.replace(record, case=dataclasses.replace(CASE, sensors=sensors))
+
+
+def test_ideal_sensors_read_the_truth(record):
+    truth = [record.at(0.25, quantity, z) for quantity, z in QUANTITIES]
+    assert_array_equal(record.measured, np.array(truth).T)
+
+
+def test_a_record_reads_every_quantity_through_filter_and_delay(record):
+    filter = Filter(40.0, 4)
+    found = fitted_with(record, filter=filter, delay=0.004).measured
+    sos = scipy.signal.butter(4, 40.0, fs=2000.0, output="sos")
+    late = np.asarray(record.measured)[np.maximum(np.arange(801) - 8, 0)]
+    rest = scipy.signal.sosfilt_zi(sos)[:, :, None] * late[0]
+    expected = scipy.signal.sosfilt(sos, late, axis=0, zi=rest)[0]
+    assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected), axis=0).max())
+    analogue = Filter(40.0, 4, realisation="analogue")
+    smooth = fitted_with(record, filter=analogue, delay=0.004).measured
+    size = np.max(np.abs(expected), axis=0)
+    assert np.all(np.max(np.abs(smooth - expected), axis=0) < 0.02 * size)
+
+
+def test_noise_is_in_the_record_but_not_in_predictions(record):
+    noisy = fitted_with(record, noise=1e-3)
+    difference = np.asarray(noisy.measured - record.measured)
+    assert_allclose(difference, 1e-3 * noise_samples(11, 4, 801), rtol=0, atol=1e-12)
+    assert_array_equal(noisy.measured, noisy.measured)
+    motion = noisy.coordinates, noisy.rates, noisy.accelerations
+    assert_array_equal(measure(noisy.case, noisy.modes, *motion), record.measured)
+
+
+def test_readings_that_need_times_ask_for_them(record):
+    delayed = fitted_with(record, delay=0.1)
+    motion = delayed.coordinates, delayed.rates, delayed.accelerations
+    with pytest.raises(ValueError, match=r"sensors.0 .* its readings need times"):
+        measure(delayed.case, delayed.modes, *motion)
+    fast = fitted_with(record, filter=Filter(100.0), sampling_period=1e-4)
+    with pytest.raises(ValueError, match=r"sensors.0: its filter takes a reading every 0.0001 s"):
+        _ = fast.measured
+
+
+def test_a_sensor_lives_in_its_case_file(tmp_path):
+    filter = Filter(10.0, 10)
+    sensor = Sensor(
+        0.25, offset=1e-5, noise=1e-5, range=[-0.01, 0.01], resolution=1e-6, filter=filter,
+        sampling_period=1e-3, delay=2e-4,
+    )  # fmt: skip
+    case = dataclasses.replace(CASE, sensors=(sensor, CASE.sensors[1]))
+    jb.save_case(case, tmp_path / "case.toml")
+    back = jb.load_case(tmp_path / "case.toml")
+    assert jax.tree.structure(back) == jax.tree.structure(case)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), back, case))
+    assert jb.replace(case, {"sensors.0.filter.cutoff": 12.0}).sensors[0].filter.cutoff == 12.0
+    path = tmp_path / "table.toml"
+    path.write_text(
+        "[beam]\nlength = 0.6\nflexural_rigidity = 11.68\nmass_per_length = 0.535\n"
+        "[[sensors]]\nposition = 0.3\n[sensors.filter]\ncutoff = 10\norder = 10\n"
+    )
+    assert jb.load_case(path).sensors[0].filter == filter
