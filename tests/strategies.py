@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
 from jaxbeam.beam import ENDS, Beam, Support
 from jaxbeam.case import Case, Run
+from jaxbeam.filters import Filter
 from jaxbeam.loads import MovingForce, MovingMass
 from jaxbeam.sensors import QUANTITIES, Sensor
 
@@ -94,12 +95,30 @@ def actuators(draw, length: float):
 
 
 @st.composite
+def filters(draw) -> Filter:
+    """A filter that every sampling in use is fast enough for."""
+    realisation = draw(st.sampled_from(["digital", "analogue"]))
+    return Filter(draw(numbers(0.01, 0.4)), draw(st.integers(1, 10)), realisation=realisation)
+
+
+@st.composite
 def sensors(draw, length: float) -> Sensor:
     """A sensor of any quantity."""
     quantity = draw(st.sampled_from(list(QUANTITIES)))
     fibre = draw(numbers(-0.1, 0.1)) if quantity == "strain" else None
     offset = draw(numbers(-1.0, 1.0))
-    return Sensor(draw(numbers(0.0, length)), quantity, offset, fibre)
+    return Sensor(
+        draw(numbers(0.0, length)),
+        quantity,
+        offset,
+        fibre,
+        noise=draw(maybe(numbers(0.0, 1.0))),
+        range=draw(maybe(st.tuples(numbers(-2.0, -1.0), numbers(1.0, 2.0)).map(list))),
+        resolution=draw(maybe(numbers(1e-6, 0.1))),
+        filter=draw(maybe(filters())),
+        sampling_period=draw(maybe(numbers(1e-4, 0.01))),
+        delay=draw(maybe(numbers(0.0, 0.1))),
+    )
 
 
 @st.composite

@@ -1,6 +1,7 @@
 """Sensors: from what the beam does to what is read."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,8 @@ import scipy.signal
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.casefile import case_from_dict
+from jaxbeam.checks import check
 from jaxbeam.filters import Filter
 from jaxbeam.record import measure
 from jaxbeam.sensing import convert, design, init, noise_samples, read, sense
@@ -226,3 +229,50 @@ def test_a_sensor_lives_in_its_case_file(tmp_path):
         "[[sensors]]\nposition = 0.3\n[sensors.filter]\ncutoff = 10\norder = 10\n"
     )
     assert jb.load_case(path).sensors[0].filter == filter
+
+
+FAULTS = [
+    ({"resolution": 0.0}, "sensors.0.resolution must be positive; it is 0"),
+    ({"noise": -1.0}, "sensors.0.noise must not be negative; it is -1"),
+    ({"range": [1.0, -1.0]}, "sensors.0.range.1 must be above the entry before it; -1 follows 1"),
+    ({"delay": -0.1}, "sensors.0.delay must not be negative; it is -0.1 s"),
+    ({"sampling_period": 0.0}, "sensors.0.sampling_period must be positive; it is 0 s"),
+    ({"sampling_period": 0.5}, "must not exceed the run's duration, 0.4 s; it is 0.5 s"),
+    ({"filter": Filter(1000.0)}, "sensors.0.filter.cutoff must be below half the sampling freq"),
+    ({"filter": Filter(60.0), "sampling_period": 0.01}, "frequency, 50 Hz; it is 60 Hz: lower it"),
+    ({"filter": Filter(0.0)}, "sensors.0.filter.cutoff must be positive; it is 0 Hz"),
+    ({"filter": Filter(9.0, 0)}, "sensors.0.filter.order must be a whole number, 1 or more"),
+    ({"filter": Filter(9.0, kind="bessel")}, "sensors.0.filter.kind cannot be 'bessel'"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), FAULTS)
+def test_faulty_sensors_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        check(dataclasses.replace(CASE, sensors=(Sensor(0.25, **changes),)))
+
+
+@pytest.mark.parametrize(
+    ("filter", "message"),
+    [
+        (10.0, "sensors.0.filter holds 10.0; it takes a table of its own"),
+        ({"cutof": 10.0}, "sensors.0.filter has no key 'cutof'; did you mean 'cutoff'?"),
+        ({"order": 3}, "sensors.0.filter.cutoff is missing"),
+        ({"cutoff": "low"}, "sensors.0.filter.cutoff must be one number, not 'low'"),
+    ],
+)
+def test_faulty_tables_of_a_filter_are_refused(filter, message):
+    beam = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}
+    with pytest.raises(ValueError, match=re.escape(message)):
+        case_from_dict({"beam": beam, "sensors": [{"position": 0.3, "filter": filter}]})
+
+
+def test_a_filter_may_be_slower_than_it_seems():
+    """An analogue filter, and one whose controller decides the sampling, know no such bound."""
+    analogue = Filter(5000.0, realisation="analogue")
+    check(dataclasses.replace(CASE, sensors=(Sensor(0.25, filter=analogue),)))
+
+
+def test_seeds_are_whole_numbers():
+    with pytest.raises(ValueError, match="run.seed must be a whole number, 0 or more; it is -1"):
+        check(dataclasses.replace(CASE, run=jb.Run(0.4, seed=-1)))
