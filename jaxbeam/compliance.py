@@ -56,10 +56,13 @@ class Compliance(eqx.Module):
 
 
 def _power(x, exponent: int):
-    """<x>^n / n! of Macaulay's method, zero for negative n."""
-    if exponent < 0:
-        return jnp.zeros_like(x)
-    return jnp.where(x > 0, x**exponent / math.factorial(exponent), 0.0)
+    """x^n / n!, and zero for negative n."""
+    return jnp.zeros_like(x) if exponent < 0 else x**exponent / math.factorial(exponent)
+
+
+def _bracket(x, exponent: int):
+    """<x>^n / n! of Macaulay's method: nothing up to x = 0."""
+    return jnp.where(x > 0, _power(x, exponent), 0.0)
 
 
 def _clamped(nodes, rigidity, x, order: int, y, derivative: int):
@@ -76,7 +79,7 @@ def _clamped(nodes, rigidity, x, order: int, y, derivative: int):
     deflection = (z**2 * (3 - 2 * z), 6 * z * (1 - z), 6 - 12 * z, -12 + 0 * z)[order]
     slope = (z**2 * (z - 1), z * (3 * z - 2), 6 * z - 2, 6 + 0 * z)[order]
     bend = (
-        _power(x - y, 3 - order - derivative)
+        _bracket(x - y, 3 - order - derivative)
         - deflection / size**order * _power(beyond, 3 - derivative)
         - slope * size / size**order * _power(beyond, 2 - derivative)
     )

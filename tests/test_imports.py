@@ -23,7 +23,7 @@ jaxbeam.grid
 jaxbeam.dynamics
 jaxbeam.integrate  jaxbeam.reference  jaxbeam.static
 jaxbeam.plan  jaxbeam.record
-jaxbeam.simulate  jaxbeam.amplification  jaxbeam.lanes  jaxbeam.pacing  jaxbeam.sweep_store
+jaxbeam.simulate  jaxbeam.amplification  jaxbeam.correction  jaxbeam.lanes  jaxbeam.pacing  jaxbeam.sweep_store
 jaxbeam.blocks
 jaxbeam.sweep
 jaxbeam.plot

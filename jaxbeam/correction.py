@@ -1,0 +1,136 @@
+"""Static correction: what the modes that were left out would add to a response.
+
+A few modes carry the motion, but a force at a point and the couples of a patch also bend the beam
+locally, in high modes that follow without delay. Their share is the exact static response less
+that of the modes which were kept. The deflection hardly needs it; curvature and the third
+derivative, from which section forces follow, do.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.case import Case
+from jaxbeam.modes import Layout, lay_out
+from jaxbeam.record import Record
+from jaxbeam.rig import rig
+from jaxbeam.static import influence_line, static_lift
+
+
+def residual_lift(
+    case: Case, x, derivative: int = 0, layout: Layout | None = None
+) -> Float[Array, "actuator *place"]:
+    """What the modes of the rig miss of `static_lift` at x (m), in m/V or m/N.
+
+    `derivative` (up to 3) gives that x-derivative instead. Suspensions act on both, the exact
+    beam and the modes. Raises ValueError as `static_lift` does.
+    """
+    layout = lay_out(case) if layout is None else layout
+    exact = static_lift(case, x, derivative, layout)
+    return exact - _modal_lift(case, layout, jnp.asarray(x, float), derivative)
+
+
+@eqx.filter_jit
+def _modal_lift(case: Case, layout: Layout, x, order: int):
+    model = rig(case, layout)
+    steady = jnp.array([a.attachment().steady for a in case.actuators]).reshape(-1)
+    amplitudes = jnp.linalg.solve(model.stiffness(), model.strokes.T * steady)
+    return jnp.moveaxis(model.shapes(x, (order,))[0] @ amplitudes, -1, 0)
+
+
+def residual_line(
+    case: Case, x, positions, derivative: int = 0, layout: Layout | None = None
+) -> Float[Array, "..."]:
+    """What the modes of the rig miss of `influence_line`, in m/N: (position..., place...).
+
+    The rest is as for `residual_lift`.
+    """
+    layout = lay_out(case) if layout is None else layout
+    exact = influence_line(case, x, positions, derivative, layout)
+    x, positions = jnp.asarray(x, float), jnp.asarray(positions, float)
+    return exact - _modal_line(case, layout, x, positions, derivative)
+
+
+@eqx.filter_jit
+def _modal_line(case: Case, layout: Layout, x, positions, order: int):
+    model = rig(case, layout)
+    pressed = model.shapes(positions.reshape(-1), (0,))[0]
+    amplitudes = jnp.linalg.solve(model.stiffness(), -pressed.T)
+    line = model.shapes(x.reshape(-1), (order,))[0] @ amplitudes
+    return line.T.reshape(*positions.shape, *x.shape)
+
+
+def corrected(
+    record: Record, x, derivative: int = 0, commands=None, layout: Layout | None = None
+) -> Float[Array, "time *place"]:
+    """History of a record's deflection at x (m), statically corrected, in m.
+
+    The sum of the modes, and what they miss of the deflection under the contact forces and the
+    `commands` (time, actuator) of each instant; `derivative` (up to 3) gives that x-derivative
+    instead. Good where forces and commands change slowly beside the first mode that was left out.
+    Raises ValueError as `influence_line` does, and for commands of another shape.
+    """
+    case, x = record.case, jnp.asarray(x, float)
+    shapes = record.modes.shapes(x, derivative)
+    history = jnp.tensordot(record.coordinates, shapes, axes=[1, -1])
+    if case.loads:
+        place = jnp.where(jnp.isfinite(record.load_position), record.load_position, 0.0)
+        missed = residual_line(case, x, place, derivative, layout)
+        history = history + jnp.einsum("tl,tl...->t...", record.contact_force, missed)
+    if commands is not None:
+        commands = jnp.asarray(commands, float)
+        wanted = (record.times.shape[0], len(case.actuators))
+        if commands.shape != wanted:
+            raise ValueError(
+                f"commands must have one row a sample and one column an actuator, {wanted};"
+                f" their shape is {commands.shape}"
+            )
+        missed = residual_lift(case, x, derivative, layout)
+        history = history + jnp.tensordot(commands, missed, axes=1)
+    return history
+
+
+# Section forces
+
+
+def bending_moment(case: Case, x, curvature, commands=None) -> Float[Array, "..."]:
+    """Moment in the section at x (m), beam and patches together, in N m; sagging is positive.
+
+    M = E I w'' + the moments that patches over x make themselves, so that it balances what acts
+    on the beam from outside: a patch alone leaves none in a statically determinate beam.
+    `curvature` (..., *place) is w'' in 1/m, from `static_lift`, `corrected` or `influence_line`;
+    `commands` (..., actuator) are in V or N, zero if left out. At the edge of a patch it is the
+    moment to the right.
+    """
+    x = jnp.asarray(x, float)
+    moment = _rigidity(case, x) * curvature
+    for i, actuator in enumerate(case.actuators if commands is not None else ()):
+        # Couples come in opposite pairs, and the section between them carries them.
+        couples = [(place, factor) for place, order, factor in actuator.stroke() if order == 1]
+        inside = sum((f * _beyond(case, x, place) for place, f in couples), jnp.zeros(x.shape))
+        pushed = actuator.attachment().steady * jnp.asarray(commands, float)[..., i]
+        moment = moment + jnp.tensordot(pushed, inside, axes=0)
+    return moment
+
+
+def shear_force(case: Case, x, third) -> Float[Array, "..."]:
+    """Shear force in the section at x (m) in N: the slope of the bending moment along the beam.
+
+    `third` (..., *place) is the third x-derivative of the deflection in 1/m^2. At a point force
+    it is that to the right.
+    """
+    return _rigidity(case, jnp.asarray(x, float)) * third
+
+
+def _rigidity(case: Case, x):
+    """Bending stiffness E I at x in N m^2, patches included."""
+    rigidity = jnp.full(x.shape, case.beam.rigidity)
+    for patch in filter(None, (actuator.bonded() for actuator in case.actuators)):
+        inside = _beyond(case, x, patch.start) - _beyond(case, x, patch.end)
+        rigidity = rigidity + patch.rigidity * inside
+    return rigidity
+
+
+def _beyond(case: Case, x, place):
+    """1 from a place on, 0 before it; the right end belongs to what lies left of it."""
+    return jnp.where((x >= place) & (place < case.beam.length), 1.0, 0.0)

@@ -1,0 +1,208 @@
+"""Modes and what they miss make the exact static response, section forces included."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case import replace
+from jaxbeam.correction import (
+    bending_moment,
+    corrected,
+    residual_lift,
+    residual_line,
+    shear_force,
+)
+from jaxbeam.modes import lay_out
+from jaxbeam.rig import rig
+from jaxbeam.static import influence_line, static_lift
+from tests.as_oracle import as_oracle
+from tests.differences import central
+from tests.oracles import finite_elements
+
+PLAIN = jb.Case(jb.Beam(0.6, 13.211, 0.812), actuators=[jb.Patch(0.2, 0.35, 1e-3)])
+GENERAL = jb.Case(
+    jb.Beam(1.3, 2.0, 0.7, ends="clamped-free", modes=4),
+    supports=[jb.Support(0.3, 500.0, 0.4, 3.0), jb.Support(0.91)],
+    actuators=[
+        jb.Patch(0.2, 0.45, 1e-3, 0.5, 200.0, added_mass=0.4, added_rigidity=1.0),
+        jb.Shaker(0.7, 300.0, force_per_volt=2.0),
+        jb.Patch(0.4, 0.7, 2e-3),
+        jb.Electrodynamic(0.55, 0.8, 5e-5, 4.2, mass=0.02, stiffness=900.0, damping=0.5),
+        jb.PointForce(1.2),
+        jb.SpringDamper(0.11, 800.0),
+    ],
+)
+STEADY = np.array([1e-3 * 0.5 * 200.0, 2.0, 2e-3, 4.2 / 0.8, 1.0, 0.0])
+X = np.array([0.0, 0.05, 0.25, 0.33, 0.42, 0.6, 1.0, 1.3])
+
+
+def oracle_lifts(case: jb.Case, x, derivative: int = 0) -> np.ndarray:
+    """Finite elements: deflections per unit command, (actuator, place)."""
+    beam, lifts = as_oracle(case, elements=1), []
+    for actuator, steady in zip(case.actuators, STEADY, strict=True):
+        if isinstance(actuator, jb.Patch):
+            edges = float(actuator.start), float(actuator.end), steady
+            lifts.append(finite_elements.static_deflection(beam, x, patch_moments=[edges]))
+        else:
+            force = float(actuator.position), steady
+            lifts.append(finite_elements.static_deflection(beam, x, [force]))
+    return np.array(lifts)
+
+
+# The exact lift
+
+
+def test_a_patch_lifts_a_pinned_beam_as_the_closed_form_says():
+    """w'' = -M / E I over the patch, nothing elsewhere, so w = (M / E I) (two Macaulay terms)."""
+    a, b, length = 0.2, 0.35, 0.6
+    x = np.linspace(0.0, length, 13)
+    ramp = ((length - a) ** 2 - (length - b) ** 2) / 2
+    bent = np.maximum(x - a, 0) ** 2 / 2 - np.maximum(x - b, 0) ** 2 / 2
+    expected = 1e-3 / 13.211 * (ramp * x / length - bent)
+    found = static_lift(PLAIN, x)[0]
+    assert_allclose(found, expected, rtol=1e-12, atol=1e-20)
+    assert found[6] > 0
+
+
+def test_slope_curvature_and_third_derivative_of_a_pinned_beam():
+    x = np.array([0.1, 0.2, 0.3, 0.35, 0.5])
+    over = np.array([0, 1, 1, 0, 0])  # at the edges, what lies to the right
+    assert_allclose(static_lift(PLAIN, x, 2)[0], -1e-3 / 13.211 * over, rtol=1e-12, atol=1e-18)
+    assert_allclose(static_lift(PLAIN, x, 3)[0], 0.0, atol=1e-15)
+    slopes = central(lambda y: static_lift(PLAIN, y[0])[0], [0.3], 1e-3)
+    assert_allclose(static_lift(PLAIN, 0.3, 1)[0], slopes[0], rtol=1e-9)
+
+
+def test_lifts_of_all_kinds_as_finite_elements_have_them():
+    expected = oracle_lifts(GENERAL, X)
+    found = static_lift(GENERAL, X)
+    assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+    assert_allclose(found[-1], 0.0, atol=0)
+
+
+@pytest.mark.parametrize("ends", ["clamped-clamped", "guided-pinned", "free-clamped"])
+@pytest.mark.parametrize("supports", [[], [jb.Support(0.4)], [jb.Support(0.5, 2e4, 0.0, 30.0)]])
+def test_lift_of_a_patch_for_other_ends_and_spans(ends, supports):
+    patch = jb.Patch(0.25, 0.55, 1.0, added_mass=0.2, added_rigidity=4.0)
+    case = jb.Case(jb.Beam(1.0, 12.0, 0.8, ends=ends), supports, [patch])
+    x, beam = np.linspace(0, 1, 9), as_oracle(case, elements=1)
+    expected = finite_elements.static_deflection(beam, x, patch_moments=[(0.25, 0.55, 1.0)])
+    found = static_lift(case, x)[0]
+    assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
+def test_many_modes_approach_the_exact_lift():
+    errors = []
+    for count in (4, 12, 36):
+        case = jb.Case(dataclasses.replace(PLAIN.beam, modes=count), actuators=PLAIN.actuators)
+        errors.append(float(jnp.abs(residual_lift(case, X[2:4])).max()))
+    largest = float(static_lift(PLAIN, 0.3)[0])
+    assert errors[0] < 0.05 * largest
+    assert errors[1] < errors[0] / 5
+    assert errors[2] < errors[1] / 5
+
+
+# Truncated and corrected is exact
+
+
+@pytest.mark.parametrize("derivative", [0, 2, 3])
+def test_modes_and_residual_make_the_exact_response(derivative):
+    """The modal part is the equilibrium of the rig's own equations, found from its state space."""
+    y, model = np.array([0.07, 0.5]), rig(GENERAL)
+    matrix, modes = np.asarray(model.state_matrix[0]), GENERAL.beam.modes
+    shapes = np.asarray(model.shapes(X, (derivative,))[0])
+    states = -np.linalg.solve(matrix, np.asarray(model.command_matrix))
+    modal = (shapes @ states[: 2 * modes : 2]).T
+    exact = np.asarray(static_lift(GENERAL, X, derivative))
+    found = modal + residual_lift(GENERAL, X, derivative)
+    assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
+    pressed = np.zeros((len(matrix), y.size))
+    pressed[1 : 2 * modes : 2] = -np.asarray(model.shapes(y, (0,))[0]).T
+    modal = (shapes @ -np.linalg.solve(matrix, pressed)[: 2 * modes : 2]).T
+    exact = influence_line(GENERAL, X, y, derivative)
+    found = modal + residual_line(GENERAL, X, y, derivative)
+    assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
+
+
+def test_residuals_differentiate():
+    layout, scale = lay_out(PLAIN), np.array([1.0, 100.0])
+
+    def missed(values):
+        names = ("actuators.0.start", "beam.flexural_rigidity")
+        changed = replace(PLAIN, dict(zip(names, values * scale, strict=True)))
+        return residual_lift(changed, X[3:5], 2, layout)[0]
+
+    point = np.array([0.2, 0.13])
+    found = jax.jacobian(missed)(jnp.asarray(point))
+    expected = central(missed, point, 1e-3)
+    assert_allclose(found, expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
+
+
+# Section forces
+
+
+def test_a_patch_leaves_no_moment_in_a_determinate_beam():
+    """Its own moment and the bending of the stiffer section under it are in balance."""
+    patch = dataclasses.replace(PLAIN.actuators[0], added_rigidity=5.0, added_mass=0.1)
+    for ends in ("pinned-pinned", "clamped-free"):
+        beam = dataclasses.replace(PLAIN.beam, ends=ends)
+        case, x = jb.Case(beam, actuators=[patch]), np.linspace(0.0, 0.6, 13)
+        curvature, third = static_lift(case, x, 2)[0], static_lift(case, x, 3)[0]
+        assert_allclose(bending_moment(case, x, curvature, [1.0]), 0.0, atol=1e-14)
+        assert_allclose(shear_force(case, x, third), 0.0, atol=1e-12)
+
+
+def test_moment_of_a_patch_on_a_beam_clamped_at_both_ends():
+    """Linear along the beam, M = p + q x, so bent that both ends keep deflection and slope."""
+    patch, x = PLAIN.actuators[0], np.linspace(0.0, 0.6, 13)
+    case = jb.Case(dataclasses.replace(PLAIN.beam, ends="clamped-clamped"), actuators=[patch])
+    length, a, b, own = 0.6, 0.2, 0.35, 1e-3
+    # The integrals over the beam of the curvature, E I w'' = M - own, and of x w'' are zero.
+    system = np.array([[length, length**2 / 2], [length**2 / 2, length**3 / 3]])
+    p, q = np.linalg.solve(system, own * np.array([b - a, (b**2 - a**2) / 2]))
+    found = bending_moment(case, x, static_lift(case, x, 2)[0], [1.0])
+    assert_allclose(found, p + q * x, rtol=1e-11)
+    assert_allclose(shear_force(case, x, static_lift(case, x, 3)[0]), q, rtol=1e-10)
+
+
+@pytest.mark.parametrize("x", [0.0, 0.12, 0.6])
+def test_moments_and_shear_of_a_clamped_beam(x):
+    """P at a quarter: -P a b^2 / L^2 and -P a^2 b / L^2 at the ends, V = P b^2 (3 a + b) / L^3."""
+    case = jb.Case(dataclasses.replace(PLAIN.beam, ends="clamped-clamped"))
+    left, right = -0.15 * 0.45**2 / 0.36, -(0.15**2) * 0.45 / 0.36
+    shear = 0.45**2 * (3 * 0.15 + 0.45) / 0.216
+    moments = {0.0: left, 0.12: left + shear * 0.12, 0.6: right}
+    found = bending_moment(case, x, influence_line(case, x, 0.15, 2))
+    assert_allclose(found, moments[x], rtol=1e-11)
+    forces = {0.0: shear, 0.12: shear, 0.6: shear - 1}
+    assert_allclose(shear_force(case, x, influence_line(case, x, 0.15, 3)), forces[x], rtol=1e-11)
+
+
+def test_moment_under_a_slow_load_while_a_patch_pushes():
+    """Three modes and the correction: P a b / L within the slight motion of a slow crossing."""
+    case = jb.Case(
+        jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.1),
+        actuators=[jb.Patch(0.25, 0.35, 1e-3)],
+        loads=[jb.MovingForce(force=5.0, speed=0.05)],
+        run=jb.Run(duration=12.0, sample_rate=10.0),
+    )
+    record = jb.simulate(case)
+    x = np.array([0.15, 0.3, 0.41])
+    found = bending_moment(case, x, corrected(record, x, 2))
+    at = 0.05 * np.asarray(record.times)[1:-1, None]
+    expected = 5.0 * np.minimum(at, x) * (0.6 - np.maximum(at, x)) / 0.6
+    assert_allclose(found[1:-1], expected, atol=2e-3)
+    modal = bending_moment(case, x, record.at(x, "strain", fibre_distance=-1.0))
+    assert np.abs(modal[1:-1] - expected).max() > 0.05
+    with_patch = corrected(record, x, 2, np.full((record.times.size, 1), 100.0))
+    missed = residual_lift(case, x, 2)[0] * 100.0
+    assert_allclose(with_patch - corrected(record, x, 2), np.tile(missed, (121, 1)), atol=1e-15)
+    with pytest.raises(
+        ValueError, match=r"one row a sample and one column an actuator, \(121, 1\)"
+    ):
+        corrected(record, x, 2, np.zeros(121))
