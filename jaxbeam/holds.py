@@ -18,8 +18,10 @@ def hold(
 
     The input is u(s) = sum_k c_k (s / h)^k with k up to `degree`: 0 is a zero-order hold, 1 a
     first-order hold with c_0 = u(0) and c_1 = u(h) - u(0). Exact, by one matrix exponential
-    (Van Loan, IEEE Trans. Automatic Control 1978); states of like size serve its accuracy.
+    (Van Loan, IEEE Trans. Automatic Control 1978) of the balanced system.
     """
+    scale = _balance(matrix)
+    matrix, column = matrix * scale / scale[:, None], column / scale[:, None]
     states, inputs = column.shape
     powers = degree + 1
     # The derivatives of the input by s / h are further states, each the rate of the one before.
@@ -30,7 +32,26 @@ def hold(
     whole = jax.scipy.linalg.expm(block, max_squarings=40)
     push = whole[:states, states:].reshape(states, powers, inputs)
     factorials = np.array([math.factorial(k) for k in range(powers)], float)
-    return whole[:states, :states], jnp.moveaxis(push, 1, 0) * factorials[:, None, None]
+    drift = whole[:states, :states] * scale[:, None] / scale
+    return drift, jnp.moveaxis(push, 1, 0) * factorials[:, None, None] * scale[:, None]
+
+
+def _balance(matrix):
+    """Scale of the states with which rows and columns of the matrix are of like size.
+
+    Without it, squaring an exponential of deflections in m and their rates in m/s loses digits.
+    """
+    size = jnp.abs(matrix) * (1 - np.eye(matrix.shape[0]))
+
+    def even_out(_, scale):
+        scaled = size * scale / scale[:, None]
+        rows, columns = jnp.sum(scaled, axis=1), jnp.sum(scaled, axis=0)
+        both = (rows > 0) & (columns > 0)
+        ratio = jnp.where(both, rows, 1.0) / jnp.where(both, columns, 1.0)
+        return scale * ratio**0.25  # half the step for one state alone, as all move at once
+
+    start = jnp.ones(matrix.shape[0])
+    return jax.lax.stop_gradient(jax.lax.fori_loop(0, 20, even_out, start))
 
 
 def cubics(

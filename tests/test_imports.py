@@ -18,10 +18,10 @@ jaxbeam.checks
 jaxbeam.casefile
 jaxbeam.modes
 jaxbeam.rig
-jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.sine_basis
-jaxbeam.grid
+jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.ports  jaxbeam.sine_basis
+jaxbeam.frequency  jaxbeam.grid
 jaxbeam.dynamics
-jaxbeam.integrate  jaxbeam.reference  jaxbeam.static
+jaxbeam.integrate  jaxbeam.reference  jaxbeam.statespace  jaxbeam.static
 jaxbeam.plan  jaxbeam.record
 jaxbeam.simulate  jaxbeam.amplification  jaxbeam.correction  jaxbeam.lanes  jaxbeam.pacing  jaxbeam.sweep_store
 jaxbeam.blocks

@@ -1,0 +1,252 @@
+"""State space: against independent equations, scipy, python-control and our own simulation."""
+
+import builtins
+
+import control
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.io
+import scipy.signal
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.integrate import solve_ivp
+
+import jaxbeam as jb
+from jaxbeam.modes import lay_out
+from jaxbeam.statespace import state_space
+from tests.differences import central
+from tests.oracles.loads import GRAVITY, Load
+from tests.oracles.modal_equations import Span, _System
+
+SPAN = Span(0.6, 11.68, 0.535, 3, 0.03)
+BEAM = jb.Beam(0.6, 11.68, 0.535, 0.03, modes=3)
+SENSORS = [
+    jb.Sensor(0.25),
+    jb.Sensor(0.35, "velocity"),
+    jb.Sensor(0.2, "acceleration"),
+    jb.Sensor(0.3, "strain", fibre_distance=0.0015),
+    jb.Sensor(0.1, "slope"),
+]
+RIG = jb.Case(
+    BEAM,
+    actuators=[
+        jb.Shaker(0.5, stiffness=3500.0, damping=80.0),
+        jb.Patch(0.2575, 0.3425, 8.292e-4, correction=0.32, amplifier_gain=200.0),
+    ],
+    sensors=SENSORS,
+    loads=[jb.MovingMass(mass=0.509, speed=2.0), jb.MovingForce(force=2.0, speed=3.0)],
+    run=jb.Run(0.6, sample_rate=1000.0, gravity=GRAVITY),
+)
+
+
+@pytest.fixture(scope="module")
+def system():
+    return state_space(RIG)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return jb.simulate(RIG)
+
+
+def in_sines(states):
+    """Mass-normalised states of the oracle as amplitudes of sin(n pi x / L)."""
+    return states * np.sqrt(2 / (0.535 * 0.6))
+
+
+@pytest.mark.parametrize("t", [0.05, 0.21, 0.5])
+def test_matrices_are_those_of_the_modal_equations(t):
+    """Columns of A(t) by feeding the oracle one state at a time; B_f by feeding it none."""
+    kinds = ("mass", 0.509, 2.0, 1.5), ("force", 0.3, 3.0, 0.0), ("mass", 0.2, -2.5, 0.0)
+    loads, ours = [], []
+    for kind, mass, speed, braking in kinds:
+        make = {"mass": jb.MovingMass, "force": jb.MovingForce}[kind]
+        ours.append(make(mass=mass, speed=speed, deceleration=braking))
+        loads.append(Load(mass, speed, 0.0, braking, kind))
+    case = jb.Case(BEAM, loads=ours, run=jb.Run(1.0, gravity=GRAVITY))
+    oracle = _System(SPAN, loads, t)
+    rest = oracle.rate(t, np.zeros(6))
+    expected = np.array([oracle.rate(t, unit) - rest for unit in np.eye(6)]).T
+    system = state_space(case)
+    size = np.max(np.abs(expected))
+    assert_allclose(eqx.filter_jit(system.A)(t), expected, rtol=0, atol=1e-10 * size)
+    push = system.B_f(t) @ system.weights
+    assert_allclose(push, rest, rtol=1e-9, atol=1e-9)
+    sines = state_space(case, "sine")
+    assert_allclose(sines.A(t), expected, rtol=0, atol=1e-10 * size)  # all scaled alike
+    assert_allclose(sines.B_f(t) @ sines.weights, in_sines(rest), rtol=1e-9, atol=1e-9)
+
+
+def test_integrating_the_state_space_is_simulating(system, record):
+    """z' = A(t) z + B_f(t) W by DOP853, the thesis's (2.36), gives what `simulate` gives."""
+    rate = jax.jit(lambda t, z: system.A(t) @ z + system.B_f(t) @ system.weights)
+    times = np.asarray(record.times)
+    states, start = [np.zeros((1, 7))], 0.0
+    for end in (0.2, 0.3, 0.6):  # the force leaves, the mass leaves
+        inner = times[(times > start + 1e-9) & (times < end + 1e-9)]
+        state = states[-1][-1]
+        # Just before the end: at it the load is gone.
+        found = solve_ivp(
+            lambda t, z, end=end: np.asarray(rate(min(t, end - 1e-12), z)), (start, inner[-1]),
+            state, "DOP853", inner, rtol=1e-12, atol=1e-15,
+        )  # fmt: skip
+        states.append(found.y.T)
+        start = end
+    states = np.concatenate(states)
+    read = jax.jit(jax.vmap(lambda t, z: system.at(t).C @ z + _direct(system, t)))
+    expected = np.asarray(read(record.times, jnp.asarray(states)))
+    for i in range(len(SENSORS)):
+        size = np.max(np.abs(expected[:, i]))
+        assert_allclose(record.measured[:, i], expected[:, i], rtol=0, atol=1e-8 * size)
+
+
+def _direct(system, t):
+    """What the loads add to the outputs at once."""
+    return system.at(t).D[:, len(system.case.actuators) :] @ system.weights
+
+
+def test_free_vibration_is_that_of_python_control(system, record):
+    left = np.flatnonzero(np.asarray(record.times) > 0.3)[0]
+    modal = np.stack([record.coordinates, record.rates], axis=2).reshape(-1, 6)
+    start = system.from_rig(jnp.append(modal[left], 0.0))  # the shaker is not driven
+    model = system.unloaded.to_control()
+    times = np.asarray(record.times[left:]) - float(record.times[left])
+    found = control.initial_response(model, times, np.asarray(start)).outputs.T
+    expected = np.asarray(record.measured[left:])
+    for i in range(len(SENSORS)):
+        size = np.max(np.abs(np.asarray(record.measured[:, i])))
+        assert_allclose(found[:, i], expected[:, i], rtol=0, atol=1e-9 * size)
+    assert_allclose(system.to_rig(start), jnp.append(modal[left], 0.0), rtol=1e-15)
+
+
+def test_frequency_response_is_that_of_the_physics():
+    """Force and moment to deflection, from impedances written out here."""
+    case = jb.Case(
+        BEAM,
+        actuators=[jb.PointForce(0.5), *RIG.actuators],
+        sensors=[jb.Sensor(0.25), jb.Sensor(0.25, "velocity")],
+    )
+    model = state_space(case).unloaded.to_control()
+    omega = 2 * np.pi * np.array([0.1, 10.0, 27.5, 90.0, 400.0])
+    found = control.frequency_response(model, omega).frdata  # output, input, frequency
+    s = 1j * omega[:, None, None]
+    phi = SPAN.shapes(0.5)
+    impedance = np.eye(3) * (s**2 + 2 * 0.03 * SPAN.frequencies * s + SPAN.frequencies**2)
+    impedance = impedance + (3500.0 + 80.0 * s) * np.outer(phi, phi)
+    lag = 4.6e4 / (s[:, 0, 0] + 1e4)
+    moment = 8.292e-4 * 0.32 * 200 * (SPAN.shapes(0.2575, 1) - SPAN.shapes(0.3425, 1))
+    forces = np.array([phi * np.ones((5, 1)), phi * lag[:, None], moment * np.ones((5, 1))])
+    expected = [
+        np.linalg.solve(impedance, f[..., None])[..., 0] @ SPAN.shapes(0.25) for f in forces
+    ]
+    assert_allclose(found[0], expected, rtol=1e-9)
+    assert_allclose(found[1], expected * s[:, 0, 0], rtol=1e-9)
+
+
+def test_the_augmented_system_is_that_of_equation_5_8(system):
+    frozen, whole = system.at(0.1), system.augmented(0.1)
+    assert whole.A.shape == (9, 9) and whole.B.shape == (9, 2)
+    assert_array_equal(whole.A[:7, :7], frozen.A)
+    assert_array_equal(whole.A[:7, 7:], system.B_f(0.1))
+    assert not np.any(whole.A[7:]) and not np.any(whole.B[7:])
+    assert [s.name for s in whole.states[-2:]] == ["load_0", "load_1"]
+    assert_allclose(system.weights, [0.509 * GRAVITY, 2.0])
+    z = jnp.linspace(-1.0, 1.0, 7)
+    inputs = jnp.append(jnp.zeros(2), system.weights)
+    found = whole.C @ jnp.append(z, system.weights)
+    assert_allclose(found, frozen.C @ z + frozen.D @ inputs, rtol=1e-12)
+
+
+def test_masses_take_part_in_what_commands_cause_at_once(system):
+    """B(t) of a patch is smaller with a mass on it; that of the lagging shaker is constant."""
+    free, loaded = system.unloaded.B, system.B(0.15)
+    assert_array_equal(loaded[:, 0], free[:, 0])
+    shape = SPAN.shapes(0.3)
+    inverse = np.linalg.inv(np.eye(3) + 0.509 * np.outer(shape, shape))
+    assert_allclose(loaded[3:6, 1], inverse @ free[3:6, 1], rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.parametrize("period", [1e-4, 1e-3, 0.02])
+def test_discretisation_is_that_of_scipy(system, period):
+    for continuous in (system.unloaded, system.augmented(0.1)):
+        found = continuous.discretize(period)
+        parts = [np.asarray(getattr(continuous, name)) for name in "ABCD"]
+        expected = scipy.signal.cont2discrete(parts, period, "zoh")
+        # In states of like size, or rounding of the large ones would hide errors of the small.
+        scale = np.append(np.append(SPAN.frequencies, np.ones(3)), np.ones(len(parts[0]) - 6))
+        for name, theirs in zip("AB", expected, strict=False):
+            ours, theirs = scale[:, None] * getattr(found, name), scale[:, None] * theirs
+            if name == "A":
+                ours, theirs = ours / scale, theirs / scale
+            assert_allclose(ours, theirs, rtol=0, atol=1e-10 * np.max(np.abs(theirs)))
+        assert_array_equal(found.C, continuous.C)
+        assert float(found.period) == period and found.to_control().dt == period
+    with pytest.raises(ValueError, match="discrete time already"):
+        found.discretize(period)
+
+
+def test_signals_are_named_with_units(system):
+    assert [s.name for s in system.states[:4]] == ["q_1", "q_2", "q_3", "q_1_rate"]
+    assert [s.unit for s in system.states[2:4]] == ["m kg^0.5", "m kg^0.5/s"]
+    model = system.at(0.1).to_control()
+    assert model.input_labels == ["command_0", "command_1", "load_0", "load_1"]
+    assert [s.unit for s in system.at(0.1).inputs] == ["V", "V", "N", "N"]
+    assert model.output_labels[:2] == ["sensor_0_deflection", "sensor_1_velocity"]
+    assert state_space(RIG, "sine").states[0] == ("a_1", "m")
+
+
+def test_a_mat_file_holds_it_all(system, tmp_path):
+    path = tmp_path / "plant.mat"
+    frozen = system.at(0.1)
+    frozen.to_mat(path)
+    content = scipy.io.loadmat(path, squeeze_me=True)
+    for name in "ABCD":
+        assert_array_equal(content[name], getattr(frozen, name))
+    assert list(content["inputs"]) == ["command_0", "command_1", "load_0", "load_1"]
+    assert content["states_units"][0] == "m kg^0.5" and content["period"] == 0
+    with pytest.raises(FileExistsError, match="exists already"):
+        frozen.discretize(0.01).to_mat(path)
+    frozen.discretize(0.01).to_mat(path, overwrite=True)
+    assert scipy.io.loadmat(path)["period"] == 0.01
+
+
+def test_without_python_control_the_error_says_what_to_install(system, monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest, **more):
+        if name == "control":
+            raise ImportError(name)
+        return real(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r"pip install 'jaxbeam\[control\]'"):
+        system.unloaded.to_control()
+
+
+def test_sine_amplitudes_are_refused_where_modes_are_no_sines():
+    spans = jb.Case(BEAM, supports=[jb.Support(0.3)])
+    with pytest.raises(ValueError, match="not sin"):
+        state_space(spans, "sine")
+    with pytest.raises(ValueError, match="coordinates may be 'modal' or 'sine', not 'nodal'"):
+        state_space(RIG, "nodal")
+
+
+def test_derivatives_by_mass_speed_and_rigidity():
+    layout = lay_out(RIG)
+
+    def discrete(point):
+        names = ["loads.0.mass", "loads.0.speed", "beam.flexural_rigidity"]
+        sizes = jnp.array([0.5, 2.0, 12.0])
+        case = jb.replace(RIG, dict(zip(names, point * sizes, strict=True)))
+        found = state_space(case, layout=layout).augmented(0.1).discretize(0.01)
+        scale = jnp.array([200.0, 800.0, 1800.0, 1, 1, 1, 1, 1, 1])
+        return (found.A * scale[:, None] / scale).ravel()
+
+    discrete = jax.jit(discrete)
+    at = jnp.ones(3)
+    expected = central(discrete, at, step=1e-3)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found = derivative(discrete)(at)
+        assert_allclose(found, expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
