@@ -61,6 +61,21 @@ def check(case: Case) -> None:
         _check_load(f"loads.{i}", load)
 
 
+def check_on_beam(name: str, place: Any, length: Float[Array, ""]) -> None:
+    """Check that positions lie on a beam of a length, all in m, as far as they are known.
+
+    Raises ValueError with the name of the positions.
+    """
+    if not (is_known(place) and is_known(length)):
+        return
+    end, numbers = float(known(length)), known(place)
+    off = ~((numbers >= -ROUNDING * end) & (numbers <= (1 + ROUNDING) * end))
+    if off.any():
+        raise ValueError(
+            f"{name} must {ON_BEAM}, between 0 and {end:g} m; it is {numbers[off].flat[0]:g} m"
+        )
+
+
 def suggestion(word: str, known_words: Iterable[str]) -> str:
     """The end of a sentence about an unknown word: the nearest known one, or all of them."""
     known_words = list(known_words)
@@ -157,18 +172,9 @@ def _check_increasing(names: list[str], numbers: np.ndarray, unit: str) -> None:
 
 
 def _check_places(address: str, part: Any, length: Float[Array, ""]) -> None:
-    if not is_known(length):
-        return
-    end = known(length)
     for field in dataclasses.fields(part):
-        place = getattr(part, field.name)
-        if field.metadata.get("must") != ON_BEAM or not is_known(place):
-            continue
-        x = known(place)
-        if not -ROUNDING * end <= x <= (1 + ROUNDING) * end:
-            raise ValueError(
-                f"{address}.{field.name} must {ON_BEAM}, between 0 and {end:g} m; it is {x:g} m"
-            )
+        if field.metadata.get("must") == ON_BEAM:
+            check_on_beam(f"{address}.{field.name}", getattr(part, field.name), length)
 
 
 def _check_beam(beam: Beam) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case, known_case
-from jaxbeam.checks import ROUNDING, check
+from jaxbeam.checks import check, check_on_beam
 from jaxbeam.compliance import check_held, compliance
-from jaxbeam.fields import is_known, known
+from jaxbeam.fields import is_known
 from jaxbeam.loads import motion
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.motion import NEVER
@@ -151,19 +151,9 @@ def _checked(case: Case, layout: Layout | None, **places) -> Layout:
     """The layout of a case that is fit for statics, as far as its numbers are known."""
     check(case)
     for name, place in places.items():
-        if is_known(place) and is_known(case.beam.length):
-            _check_on_beam(name, known(place), float(known(case.beam.length)))
+        check_on_beam(name, place, case.beam.length)
     layout = lay_out(case) if layout is None else layout
     resting = Case(case.beam, case.supports, case.actuators)
     if all(is_known(leaf) for leaf in jax.tree.leaves(resting)):
         check_held(known_case(resting), layout)
     return layout
-
-
-def _check_on_beam(name: str, place: np.ndarray, length: float) -> None:
-    off = ~((place >= -ROUNDING * length) & (place <= (1 + ROUNDING) * length))
-    if off.any():
-        raise ValueError(
-            f"{name} must lie on the beam, between 0 and {length:g} m;"
-            f" found {place[off].flat[0]:g} m"
-        )
