@@ -12,17 +12,20 @@ from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringD
 from jaxbeam.beam import Beam, Support
 from jaxbeam.case import Case, Run, addresses, replace
 from jaxbeam.casefile import load_case, save_case
+from jaxbeam.filters import Filter
 from jaxbeam.loads import MovingForce, MovingMass
 from jaxbeam.modes import modes
 from jaxbeam.record import Record, read_record
 from jaxbeam.sensors import Sensor
 from jaxbeam.simulate import simulate
+from jaxbeam.statespace import state_space
 from jaxbeam.sweep import sweep
 
 __all__ = [
     "Beam",
     "Case",
     "Electrodynamic",
+    "Filter",
     "MovingForce",
     "MovingMass",
     "Patch",
@@ -40,5 +43,6 @@ __all__ = [
     "replace",
     "save_case",
     "simulate",
+    "state_space",
     "sweep",
 ]
