@@ -145,9 +145,9 @@ def _realisation(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     ratios, odd = _prototype(order)
     first = [np.array([[-1.0]])] if odd else []
     blocks = first + [np.array([[0.0, 1.0], [-1.0, -2 * ratio]]) for ratio in ratios]
-    ends = np.cumsum([len(block) for block in blocks])
-    outputs, inputs = ends - [len(block) for block in blocks], ends - 1
-    matrix = scipy.linalg.block_diag(*blocks)
+    bounds = np.cumsum([0, *map(len, blocks)])
+    outputs, inputs = bounds[:-1], bounds[1:] - 1
+    matrix = np.asarray(scipy.linalg.block_diag(*blocks))
     matrix[inputs[1:], outputs[:-1]] = 1.0
     states = np.eye(order)
     return matrix, states[inputs[0]], states[outputs[-1]], states[outputs].sum(axis=0)

@@ -1,6 +1,7 @@
 """What is measured, and where."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, number, part
@@ -45,3 +46,8 @@ class Sensor(eqx.Module):
     delay: Float[Array, ""] | None = number(
         "s", "age of the deflection that is read", NOT_NEGATIVE, default=None
     )
+
+    @property
+    def noise_covariance(self) -> Float[Array, ""]:
+        """Variance of the noise of one reading, in the square of its unit; what filters call R."""
+        return jnp.zeros(()) if self.noise is None else self.noise**2

@@ -52,6 +52,7 @@ def test_noise_is_that_of_the_seed_and_of_the_stated_size():
     assert_array_equal(drawn, noise_samples(3, 2, 20000))
     assert_array_equal(drawn[:, 0], noise_samples(3, 1, 20000)[:, 0])
     assert np.max(np.abs(drawn - noise_samples(4, 2, 20000))) > 1
+    assert Sensor(0.3, noise=0.1).noise_covariance == 0.1**2 and Sensor(0.3).noise_covariance == 0
     assert_allclose(np.std(drawn, axis=0), 1.0, atol=0.02)
     assert_allclose(np.corrcoef(drawn.T)[0, 1], 0.0, atol=0.03)
 

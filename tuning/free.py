@@ -156,9 +156,9 @@ def unit_at(case: Case, address: str) -> str:
         if isinstance(part, tuple):
             part = part[int(step)]
         elif dataclasses.is_dataclass(part):
-            if isinstance(part, Sensor) and step == "offset":
-                return QUANTITIES[part.quantity]
             unit = type(part).__dataclass_fields__[step].metadata.get("unit", "")
+            if isinstance(part, Sensor) and unit == "unit of quantity":
+                unit = QUANTITIES[part.quantity]
             part = getattr(part, step)
     return unit
 
