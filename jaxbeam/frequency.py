@@ -9,6 +9,7 @@ E is the identity but for the parked masses, eq. (2.30) of the thesis. C' takes 
 
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from jaxbeam.modes import Layout, lay_out
 from jaxbeam.ports import Pair, check_pairs, column, common_pairs, row
 from jaxbeam.rig import Rig, rig
 
-Parked = Sequence[tuple[float, float]]
+Parked = Sequence[tuple[Any, Any]]  # position (m) and mass (kg) of each
 
 
 class FrequencyResponse(eqx.Module):
@@ -230,7 +231,9 @@ def zeros(case: Case, pair: tuple[str, str], parked: Parked = ()) -> Complex[np.
 
 
 def _sorted(values):
-    return values[np.lexsort((values.imag, np.abs(values)))]
+    """By size, conjugates (whose sizes differ by rounding alone) with the negative one first."""
+    sizes = np.array([float(f"{size:.9g}") for size in np.abs(values)])
+    return values[np.lexsort((values.imag, sizes))]
 
 
 def _frequencies(frequencies):

@@ -1,0 +1,340 @@
+"""Frequency responses against the thesis's own formulas, python-control, and finite elements."""
+
+import control
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case import replace
+from jaxbeam.correction import residual_lift
+from jaxbeam.frequency import (
+    accelerance,
+    frequency_response,
+    mobility,
+    poles,
+    receptance,
+    zeros,
+)
+from jaxbeam.modes import lay_out
+from jaxbeam.ports import common_pairs, shaker_chain
+from jaxbeam.rig import rig
+from tests.as_oracle import as_oracle
+from tests.differences import central
+from tests.oracles import finite_elements
+
+V4 = jb.Electrodynamic(0.5, 0.82, 5e-5, 4.2, mass=0.02, stiffness=9700.0, damping=0.55)
+RIG_A = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=4),
+    actuators=[V4],
+    sensors=[jb.Sensor(0.25), jb.Sensor(0.35, "velocity")],
+)
+HALF_KILO = [(0.3, 0.5)]
+GENERAL = jb.Case(
+    jb.Beam(1.3, 2.0, 0.7, damping_ratio=0.02, ends="clamped-free", modes=4),
+    supports=[jb.Support(0.3, 500.0, 0.4, 3.0), jb.Support(0.91)],
+    actuators=[
+        jb.Patch(0.2, 0.45, 1e-3, 0.5, 200.0, added_mass=0.4, added_rigidity=1.0),
+        jb.Shaker(0.7, 300.0, 2.0, force_per_volt=2.0),
+        jb.Electrodynamic(0.55, 0.8, 5e-3, 4.2, 3.9, 0.02, 900.0, 0.5),
+        jb.PointForce(1.2),
+    ],
+    sensors=[
+        jb.Sensor(1.1),
+        jb.Sensor(0.5, "velocity"),
+        jb.Sensor(1.2, "acceleration"),
+        jb.Sensor(0.3, "slope"),
+        jb.Sensor(0.25, "strain", fibre_distance=0.002),
+    ],
+)
+F = np.array([0.0, 0.7, 3.0, 11.0, 26.5, 84.0, 190.0, 900.0])
+
+
+def formulas(frequencies, modes=4, ratio=0.03, parked=()):
+    """The chain as eqs (2.26) to (2.34) have it: U/I, F_c/U, F/F_c, F/U, for sine modes."""
+    wave = np.arange(1, modes + 1) * np.pi / 0.6
+    omega = wave**2 * np.sqrt(11.68 / 0.535)
+    size = np.sqrt(2 / (0.535 * 0.6))
+    at = size * np.sin(wave * 0.5)
+    chain = []
+    for s in 2j * np.pi * np.asarray(frequencies):
+        mass = np.eye(modes)
+        for place, added in parked:
+            mass += added * np.outer(np.sin(wave * place), np.sin(wave * place)) * size**2
+        beam = mass * s**2 + np.diag(2 * ratio * omega * s + omega**2)
+        mobility_beam = s * at @ np.linalg.solve(beam, at)
+        mobility_shaker = s / (s**2 * 0.02 + s * 0.55 + 9700)
+        joined = mobility_beam / (1 + mobility_beam / mobility_shaker)
+        impedance = 0.82 + s * 5e-5 + 4.2 * 4.2 * joined
+        passed = mobility_shaker / (mobility_shaker + mobility_beam)
+        chain.append([1 / impedance, 4.2 / impedance, passed, 4.2 / impedance * passed])
+    return np.array(chain)
+
+
+def extremes(frequencies, size):
+    """Frequencies and heights of the dips and of the peaks of a curve, ((dip, 2), (peak, 2))."""
+    inner = size[1:-1]
+    dips = np.flatnonzero((inner < size[:-2]) & (inner < size[2:])) + 1
+    peaks = np.flatnonzero((inner > size[:-2]) & (inner > size[2:])) + 1
+    return [np.column_stack([frequencies[i], size[i]]) for i in (dips, peaks)]
+
+
+# The electrodynamic shaker of section 2.2
+
+
+@pytest.mark.parametrize("parked", [[], HALF_KILO, [(0.1, 0.2), (0.45, 0.7)]])
+def test_the_chain_of_the_thesis(parked):
+    found = frequency_response(RIG_A, F[1:], shaker_chain(0), parked)
+    assert_allclose(found.values, formulas(F[1:], parked=parked), rtol=1e-9)
+    assert [pair.unit for pair in found.pairs] == ["A/V", "N/V", "1", "N/V"]
+
+
+def test_figures_2_15_and_2_18_without_a_mass():
+    f = np.linspace(0.5, 400.0, 40001)
+    found = frequency_response(RIG_A, f, shaker_chain(0))
+    current, _, passed, total = np.asarray(found.magnitude).T
+    assert_allclose(total[0], 2.38, atol=0.005)
+    assert np.ptp(total[f < 5]) < 0.1 * total[0]
+    dips, peaks = extremes(f, total)
+    assert_allclose(dips[:, 0], [20.3, 81.3, 184.4, 330.1], atol=0.1)
+    assert_allclose(peaks[0], [27.5, 10.2], atol=0.06)
+    # Figs 2.17 and 2.18: what resists the voltage, and what lifts the force, is one resonance.
+    impedance = extremes(f, 1 / current)[1][0]
+    assert_allclose([impedance[0], extremes(f, passed)[1][0, 0]], 26.65, atol=0.1)
+
+
+def test_figure_2_16_with_half_a_kilogram_in_the_middle():
+    f = np.linspace(0.5, 40.0, 8001)
+    total = np.asarray(frequency_response(RIG_A, f, shaker_chain(0)[3:], HALF_KILO).magnitude)[:, 0]
+    dips, peaks = extremes(f, total)
+    assert_allclose(peaks, [[13.1, 20.2]], atol=0.05)
+    # Force drops where the beam alone, with the mass, would ring: finite elements.
+    assert_allclose(dips[:, 0], loaded_frequency(), rtol=5e-3)
+    undamped = replace(RIG_A, {"beam.damping_ratio": 0.0})
+    total = np.asarray(frequency_response(undamped, f, shaker_chain(0)[3:], HALF_KILO).magnitude)
+    assert_allclose(extremes(f, total[:, 0])[1], [[13.05, 27.6]], atol=0.05)
+
+
+def loaded_frequency() -> float:
+    model = finite_elements.assemble(finite_elements.Beam(0.6, 11.68, 0.535), [0.3])
+    row, free = model.shape(0.3), model.free
+    mass = (model.mass + 0.5 * np.outer(row, row))[np.ix_(free, free)]
+    values = np.linalg.eigvals(np.linalg.solve(mass, model.stiffness[np.ix_(free, free)]))
+    return float(np.sqrt(values.real.min()) / (2 * np.pi))
+
+
+def test_figure_2_19_the_first_order_shaker():
+    case = jb.Case(RIG_A.beam, actuators=[jb.Shaker(0.5, 3500.0, 80.0)])
+    f = np.array([1.0, 100.0, 1e4 / (2 * np.pi), 1e4])
+    pair = ("actuators.0", "actuators.0.active_force")
+    found = frequency_response(case, f, [pair]).of(*pair)
+    assert_allclose(found, 4.6e4 / (2j * np.pi * f + 1e4), rtol=1e-9)
+    assert_allclose(np.abs(found[2]), 4.6 / np.sqrt(2), rtol=1e-9)  # at 1591.5 Hz
+
+
+def test_figure_2_20_a_beam_less_mobile_than_the_shaker():
+    """Coil force reaches it whole, and voltage to force is a first-order lag, R / L."""
+    stiff = jb.Case(jb.Beam(0.6, 1.022e5, 11.016, damping_ratio=0.03, modes=4), actuators=[V4])
+    f = np.array([1.0, 10.0, 30.0, 100.0])
+    *_, passed, total = np.asarray(frequency_response(stiff, f, shaker_chain(0)).values).T
+    assert_allclose(passed, 1.0, atol=2e-3)
+    assert_allclose(total, 4.2 / (0.82 + 5e-5 * 2j * np.pi * f), rtol=5e-3)
+
+
+def test_poles_and_zeros_of_the_shaker():
+    """Force drops where the bare beam is free to ring; the coil adds one fast pole."""
+    bare = jb.Case(RIG_A.beam)
+    found = zeros(RIG_A, shaker_chain(0)[3])
+    assert_allclose(found, poles(bare), rtol=1e-7)
+    assert_allclose(zeros(RIG_A, shaker_chain(0)[3], HALF_KILO), poles(bare, HALF_KILO), rtol=1e-7)
+    natural = (np.arange(1, 5) * np.pi / 0.6) ** 2 * np.sqrt(11.68 / 0.535)
+    assert_allclose(np.abs(poles(bare)), np.repeat(natural, 2), rtol=1e-9)
+    ringing = poles(RIG_A)
+    assert ringing.shape == (9,)
+    assert np.all(ringing.real < 0)
+    assert_allclose(ringing[-1], -0.82 / 5e-5, rtol=0.05)
+
+
+# Any rig
+
+
+def test_python_control_has_the_same_responses_of_the_state_space():
+    """Deflection, velocity, slope and strain are rows of the states; acceleration needs B too."""
+    model = rig(GENERAL)
+    A, B = np.asarray(model.state_matrix[0]), np.asarray(model.command_matrix)
+    rows, direct = np.zeros((5, len(A))), np.zeros((5, 4))
+    rows[0, 0:8:2] = model.shapes(1.1, (0,))[0]
+    rows[1, 1:8:2] = model.shapes(0.5, (0,))[0]
+    rows[2] = np.asarray(model.shapes(1.2, (0,))[0]) @ A[1:8:2]
+    direct[2] = np.asarray(model.shapes(1.2, (0,))[0]) @ B[1:8:2]
+    rows[3, 0:8:2] = model.shapes(0.3, (1,))[0]
+    rows[4, 0:8:2] = -0.002 * np.asarray(model.shapes(0.25, (2,))[0])
+    system = control.ss(A, B, rows, direct)
+    expected = system(2j * np.pi * F)
+    pairs = [(f"actuators.{i}", f"sensors.{j}") for i in range(4) for j in range(5)]
+    found = frequency_response(GENERAL, F, pairs).values.reshape(F.size, 4, 5)
+    scale = np.abs(expected).max(axis=-1)
+    assert_allclose(
+        np.moveaxis(found, 0, -1).swapaxes(0, 1) / scale[..., None],
+        expected / scale[..., None],
+        rtol=1e-8,
+        atol=1e-11,
+    )
+
+
+def test_receptance_of_a_pinned_beam_in_closed_form():
+    """Green's function of E I w'''' - rho A omega^2 w = delta(x - y): sines and sinh."""
+    case = jb.Case(jb.Beam(0.6, 11.68, 0.535, modes=40))
+    f, x, y = np.array([5.0, 33.0, 140.0]), np.array([0.1, 0.3]), np.array([0.3, 0.42, 0.5])
+    k = ((2 * np.pi * f) ** 2 * 0.535 / 11.68)[:, None, None] ** 0.25
+    low, high = np.minimum(x[:, None], y), 0.6 - np.maximum(x[:, None], y)
+    sines = np.sin(k * low) * np.sin(k * high) / np.sin(k * 0.6)
+    sinh = np.sinh(k * low) * np.sinh(k * high) / np.sinh(k * 0.6)
+    expected = (sines - sinh) / (2 * 11.68 * k**3)
+    found = receptance(case, f, x, y)
+    missed = 2 * 0.6**3 / (np.pi**4 * 11.68) * np.sum(1 / np.arange(41.0, 1000.0) ** 4)
+    assert_allclose(found, expected, rtol=0, atol=missed)
+    s = 2j * np.pi * f[:, None, None]
+    assert_allclose(mobility(case, f, x, y), s * found, rtol=1e-12)
+    assert_allclose(accelerance(case, f, x, y), s**2 * found, rtol=1e-12)
+    assert_allclose(mobility(case, f, 0.1, 0.3), s[:, 0, 0] * found[:, 0, 0], rtol=1e-12)
+
+
+def test_finite_elements_with_patch_coil_and_parked_masses():
+    """The full dynamic stiffness, coil eliminated, against twenty-four modes."""
+    patch = jb.Patch(0.1, 0.3, 1e-3, added_mass=0.3, added_rigidity=4.0)
+    coil = jb.Electrodynamic(0.75, 0.8, 5e-3, 4.2, 3.9, 0.02, 900.0, 0.5)
+    beam = jb.Beam(1.0, 12.0, 0.8, ends="clamped-pinned", modes=24)
+    case = jb.Case(beam, [jb.Support(0.6, 2e4, 0.0, 5.0)], [patch, coil], [jb.Sensor(0.45)])
+    model = finite_elements.assemble(as_oracle(case, elements=60), [0.4, 0.45, 0.75, 0.9])
+    free, at = model.free, model.shape(0.75)
+    inertia = model.mass + 0.02 * np.outer(at, at)
+    for place, mass in ((0.4, 0.3), (0.9, 0.1)):
+        inertia += mass * np.outer(model.shape(place), model.shape(place))
+    frequencies, expected = np.array([2.0, 17.0, 46.0, 120.0]), []
+    for s in 2j * np.pi * frequencies:
+        coupled = 900.0 + 0.5 * s + 4.2 * 3.9 * s / (0.8 + 5e-3 * s)
+        matrix = s**2 * inertia + model.stiffness + coupled * np.outer(at, at)
+        pushes = np.array([1e-3 * model.patch_row(0.1, 0.3), at * 4.2 / (0.8 + 5e-3 * s)])
+        motion = np.linalg.solve(matrix[np.ix_(free, free)], pushes[:, free].T)
+        expected.append(model.shape(0.45)[free] @ motion)
+    pairs = [("actuators.0", "sensors.0"), ("actuators.1", "deflection@0.45")]
+    found = frequency_response(case, frequencies, pairs, [(0.4, 0.3), (0.9, 0.1)])
+    assert [pair.unit for pair in found.pairs] == ["m/V", "m/V"]
+    errors = np.abs(np.asarray(found.values) - expected)
+    assert np.all(errors < 1e-3 * np.abs(expected).max(axis=0))
+    # What the other modes add to the slowly converging patch hardly depends on the frequency.
+    corrected = np.asarray(found.values)[:, 0] + float(residual_lift(case, 0.45)[0])
+    assert np.abs(corrected - np.array(expected)[:, 0]).max() < errors[:, 0].max() / 5
+
+
+def test_a_static_force_is_what_is_left_at_zero_frequency():
+    pair = ("actuators.1", "actuators.1.transmitted_force")
+    at_rest = float(frequency_response(GENERAL, [0.0], [pair]).of(*pair)[0].real)
+    lift = float(receptance(GENERAL, 0.0, 0.7, 0.7)[0].real)
+    assert_allclose(at_rest, 2.0 * (1 - 300.0 * lift), rtol=1e-9)
+
+
+def test_reciprocity():
+    x = np.array([0.1, 0.42, 1.0, 1.3])
+    found = receptance(GENERAL, F, x, x, [(0.5, 0.2)])
+    size = np.abs(found).max(axis=(1, 2), keepdims=True)
+    assert_allclose(found / size, found.swapaxes(1, 2) / size, atol=1e-10)
+
+
+def test_responses_differentiate_inside_jit():
+    names = ("beam.flexural_rigidity", "actuators.0.resistance", "sensors.0.position")
+    layout, pairs = lay_out(RIG_A), common_pairs(RIG_A)
+    point = np.array([11.68, 0.82, 0.25])
+
+    @jax.jit
+    def sizes(values):
+        case = replace(RIG_A, dict(zip(names, values * point, strict=True)))
+        response = frequency_response(case, [3.0, 25.0, 80.0], pairs, HALF_KILO, layout)
+        return jnp.log(response.magnitude).ravel()
+
+    ones = jnp.ones(3)
+    expected = central(sizes, ones, 1e-3)
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        assert_allclose(jacobian(sizes)(ones), expected, rtol=1e-6, atol=1e-7)
+
+    def moved(x):
+        return jnp.abs(receptance(RIG_A, [25.0], x, 0.2, [(x, 0.5)], layout))[0]
+
+    assert_allclose(jax.grad(moved)(0.3), central(lambda x: moved(x[0]), [0.3])[0], rtol=1e-6)
+
+
+# The record
+
+
+def test_record_has_labels_and_units(tmp_path):
+    found = frequency_response(RIG_A, np.linspace(1, 40, 40))
+    assert [str(pair) for pair in found.pairs] == [
+        "actuators.0 -> sensors.0",
+        "actuators.0 -> sensors.1",
+        "actuators.0 -> actuators.0.current",
+        "actuators.0 -> actuators.0.active_force",
+        "actuators.0.active_force -> actuators.0.transmitted_force",
+        "actuators.0 -> actuators.0.transmitted_force",
+    ]
+    assert [pair.unit for pair in found.pairs] == ["m/V", "(m/s)/V", "A/V", "N/V", "1", "N/V"]
+    assert np.abs(np.diff(found.phase, axis=0)).max() < 180
+    found.to_netcdf(tmp_path / "out.nc")
+    with xarray.open_dataset(tmp_path / "out.nc", engine="scipy") as saved:
+        values = saved["real"] + 1j * saved["imaginary"]
+        assert_allclose(values, found.values, rtol=1e-15)
+        assert_allclose(saved["magnitude"], found.magnitude)
+        assert list(saved["unit"].values) == [pair.unit for pair in found.pairs]
+    with pytest.raises(FileExistsError, match="out.nc exists already"):
+        found.to_netcdf(tmp_path / "out.nc")
+    with pytest.raises(ValueError, match="no response of sensors.1 to force@0.3; there are"):
+        found.of("force@0.3", "sensors.1")
+
+
+def test_without_actuators_a_force_at_each_sensor():
+    case = jb.Case(jb.Beam(0.6, 11.68, 0.535), sensors=[jb.Sensor(0.25), jb.Sensor(0.3)])
+    assert common_pairs(case) == (("force@0.25", "sensors.0"), ("force@0.3", "sensors.1"))
+    found = frequency_response(case, [7.0]).values[0]
+    assert_allclose(found[0], receptance(case, 7.0, 0.25, 0.25)[0], rtol=1e-12)
+
+
+BAD = [
+    ({"frequencies": [-1.0]}, "frequencies must be finite and not negative, in Hz; found -1"),
+    ({"frequencies": [np.nan]}, "found nan"),
+    ({"frequencies": [[1.0]]}, "frequencies must be a list of numbers, not of shape"),
+    ({"parked": [(0.7, 0.1)]}, "the place of a parked mass must lie on the beam, between 0 and"),
+    ({"parked": [(0.3, -0.1)]}, "a parked mass must not be negative; it is -0.1 kg"),
+    ({"pairs": []}, "name at least one pair of an input and an output"),
+    ({"pairs": [("actuators.1", "sensors.0")]}, "'actuators.1' does not exist; the case has 1"),
+    ({"pairs": [("actuators.x", "sensors.0")]}, "'actuators.x' does not exist; the case has 1"),
+    ({"pairs": [("actuators.0.current", "sensors.0")]}, "is driven by its command"),
+    ({"pairs": [("push@0.3", "sensors.0")]}, "'push@0.3' must be a force, as force@0.3"),
+    ({"pairs": [("force@0.8", "sensors.0")]}, "'force@0.8' must lie on the beam, between 0 and 0"),
+    ({"pairs": [("force@x", "sensors.0")]}, "'force@x': 'x' is not a number in m"),
+    ({"pairs": [("voltage", "sensors.0")]}, "the input 'voltage' does not exist; write, for"),
+    ({"pairs": [("force@0.3", "sensors.2")]}, "'sensors.2' does not exist; the case has 2 sensors"),
+    ({"pairs": [("force@0.3", "deflecton@0.3")]}, "did you mean 'deflection'?, as deflection@0.3"),
+    ({"pairs": [("force@0.3", "actuators.0")]}, "it may be current, active_force, transmitted_"),
+    ({"pairs": [("force@0.3", "actuators.0.curent")]}, "did you mean 'current'?"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_bad_requests_are_refused(changes, message):
+    arguments = {"frequencies": [1.0], "pairs": None, "parked": ()} | changes
+    with pytest.raises(ValueError) as caught:
+        frequency_response(RIG_A, **arguments)
+    assert message in str(caught.value)
+
+
+def test_actuators_without_what_was_asked():
+    case = jb.Case(RIG_A.beam, actuators=[jb.Shaker(0.5), jb.SpringDamper(0.2, 10.0)])
+    with pytest.raises(ValueError, match="'actuators.0.current' does not exist: a Shaker has no"):
+        frequency_response(case, [1.0], [("actuators.0", "actuators.0.current")])
+    with pytest.raises(ValueError, match="'actuators.1' takes no command"):
+        frequency_response(case, [1.0], [("actuators.1", "deflection@0.3")])
+    with pytest.raises(ValueError, match="neither sensors nor actuators"):
+        frequency_response(jb.Case(RIG_A.beam), [1.0])
