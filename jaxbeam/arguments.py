@@ -1,5 +1,6 @@
 """What the arguments of the command line mean, checked before any work is done."""
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,39 @@ def sweep_values(over: Iterable[str]) -> dict[str, list[float]]:
             )
         values[address] = np.linspace(limits[0], limits[1], int(limits[2])).tolist()
     return values
+
+
+def pair_of(text: str) -> tuple[str, str]:
+    """The two words of INPUT:OUTPUT. Raises ValueError if one is empty."""
+    source, colon, output = text.partition(":")
+    if not (source and colon and output):
+        raise ValueError(
+            f"--pair takes INPUT:OUTPUT, such as actuators.0:sensors.0 or force@0.3:velocity@0.1,"
+            f" not {text!r}"
+        )
+    return source, output
+
+
+def parked_mass(text: str) -> tuple[float, float]:
+    """The position and mass of POSITION=MASS. Raises ValueError if they are no two numbers."""
+    numbers = _numbers("--mass-at", text, text.split("="))
+    if len(numbers) != 2:
+        raise ValueError(f"--mass-at takes POSITION=MASS in m and kg, such as 0.3=0.5, not {text}")
+    return numbers[0], numbers[1]
+
+
+def frequency_range(start: float, stop: float, points: int) -> list[float]:
+    """Frequencies from start to stop (Hz) at equal ratios.
+
+    Raises ValueError unless 0 < start < stop, and for fewer than two points.
+    """
+    if not 0 < start < stop < math.inf:
+        raise ValueError(
+            f"--from and --to must increase from above 0 Hz; they are {start:g}, {stop:g}"
+        )
+    if points < 2:
+        raise ValueError(f"--points must be 2 or more; it is {points}")
+    return np.geomspace(start, stop, points).tolist()
 
 
 def split_files(files: Iterable[Path], free: Sequence[str]) -> tuple[Path | None, list[Path]]:

@@ -16,6 +16,9 @@ from jaxbeam.arguments import (
     bounds_of,
     check_outputs,
     check_suffix,
+    frequency_range,
+    pair_of,
+    parked_mass,
     picture_path,
     read_case,
     refuse,
@@ -218,6 +221,78 @@ def sweep(
     print(f"{failed.size} runs, {int(failed.sum())} failed; the largest peak at each sensor:")
     print_table(("sensor", "peak deflection (m)", *(f"at {name}" for name in values)), rows)
     print_written(output)
+
+
+@app.command
+def frf(
+    case: Path,
+    /,
+    *,
+    pair: tuple[str, ...] = (),
+    mass_at: tuple[str, ...] = (),
+    from_: Annotated[float, Parameter("--from")] = 1.0,
+    to: float = 1000.0,
+    points: int = 2000,
+    output: Output = None,
+    set_: Settings = (),
+    plot: bool = False,
+    overwrite: Overwrite = False,
+    json_: Json = False,
+) -> None:
+    """Frequency responses of a case, its loads away: where they peak and where they drop.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    pair
+        INPUT:OUTPUT, repeated for more; all commands to all sensors if left out. Inputs:
+        actuators.0, actuators.0.active_force, force@0.3. Outputs: sensors.0, deflection@0.3,
+        velocity@0.3, acceleration@0.3, slope@0.3, actuators.0.current, actuators.0.active_force,
+        actuators.0.transmitted_force. Positions are in m.
+    mass_at
+        POSITION=MASS: park a mass (kg) on the beam (m); repeat it for more.
+    from_
+        Lowest frequency in Hz, 1 if left out.
+    to
+        Highest frequency in Hz, 1000 if left out.
+    points
+        Number of frequencies, at equal ratios; 2000 if left out.
+    output
+        Write the responses to this netCDF file, OUT.nc.
+    plot
+        Draw magnitude and phase to a PNG beside the output, or to CASE_frf.png in this folder.
+    """
+    from jaxbeam.frequency import extremes, frequency_response
+
+    check_suffix(output, ".nc", "a frequency response")
+    picture = picture_path(output, case.with_stem(f"{case.stem}_frf")) if plot else None
+    check_outputs(overwrite, output, picture)
+    frequencies = frequency_range(from_, to, points)
+    pairs = [pair_of(text) for text in pair] or None
+    parked = [parked_mass(text) for text in mass_at]
+    found = frequency_response(read_case(case, set_), frequencies, pairs, parked)
+    if output:
+        found.to_netcdf(output, overwrite)
+    if picture:
+        from jaxbeam.plot import plot_frequency
+
+        plot_frequency(found).savefig(picture)
+    if json_:
+        columns = zip(found.pairs, found.magnitude.T, found.phase.T, strict=True)
+        responses = [
+            {**pair._asdict(), "magnitude": magnitude, "phase_deg": phase}
+            for pair, magnitude, phase in columns
+        ]
+        print_json({"frequencies_hz": found.frequencies, "responses": responses})
+        return
+    for i, pair in enumerate(found.pairs):
+        print(f"{pair}, in {pair.unit}" if pair.unit != "1" else str(pair))
+        print_table(
+            ("", "frequency (Hz)", "magnitude"),
+            [(word, f"{f:.5g}", f"{size:.5g}") for word, f, size in extremes(found, i)],
+        )
+    print_written(output, picture)
 
 
 @app.command

@@ -199,6 +199,25 @@ def _times_s(frequencies, response):
     return s.reshape(-1, *(1,) * (response.ndim - 1)) * response
 
 
+def extremes(response: FrequencyResponse, index: int) -> list[tuple[str, float, float]]:
+    """What stands out in the response of pair `index`: (word, frequency in Hz, magnitude).
+
+    Its first frequency and its peaks and dips in between, as parabolas through three neighbours
+    have them.
+    """
+    f, size = np.asarray(response.frequencies), np.asarray(response.magnitude)[:, index]
+    found = [("first", float(f[0]), float(size[0]))]
+    for i in range(1, f.size - 1):
+        left, rise = size[i - 1] - size[i], size[i + 1] - size[i]
+        if left * rise <= 0:
+            continue
+        curve = np.polyfit(f[i - 1 : i + 2] - f[i], size[i - 1 : i + 2], 2)
+        place = -curve[1] / (2 * curve[0])
+        word = "dip" if rise > 0 else "peak"
+        found.append((word, float(f[i] + place), float(np.polyval(curve, place))))
+    return found
+
+
 def poles(case: Case, parked: Parked = ()) -> Complex[np.ndarray, " state"]:
     """Poles of the rig in 1/s (angular, with the damping as negative real part), by size.
 

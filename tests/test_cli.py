@@ -101,6 +101,15 @@ REFUSED = [
         "--over names loads.0.speed twice",
     ),
     ("sweep case.toml --over loads.0.speed=1,2 --resume", "--resume needs the store to continue"),
+    ("frf case.toml --from 0", "--from and --to must increase from above 0 Hz; they are 0, 1000"),
+    ("frf case.toml --from 10 --to 1", "--from and --to must increase from above 0 Hz"),
+    ("frf case.toml --points 1", "--points must be 2 or more; it is 1"),
+    ("frf case.toml --pair force@0.3", "--pair takes INPUT:OUTPUT, such as actuators.0:sensors.0"),
+    ("frf case.toml --pair force@0.3:sensors.2", "'sensors.2' does not exist; the case has 2"),
+    ("frf case.toml --mass-at 0.3", "--mass-at takes POSITION=MASS in m and kg, such as 0.3=0.5"),
+    ("frf case.toml --mass-at 0.3=a", "--mass-at 0.3=a: 'a' is not a number"),
+    ("frf case.toml --mass-at 0.7=0.5", "the place of a parked mass must lie on the beam"),
+    ("frf case.toml -o out.png", "a frequency response is written to a .nc file; call it out.nc"),
     ("identify", "identify needs at least one log: jaxbeam identify [CASE.toml] LOG..."),
     ("identify case.toml", "identify needs at least one log"),
     ("identify case.toml case.toml log.csv", "identify fits one case, not 2: case.toml, case.toml"),
@@ -137,7 +146,7 @@ def test_help_names_the_commands_and_imports_nothing_heavy():
     )
     line = [sys.executable, "-c", code]
     ended = subprocess.run(line, capture_output=True, text=True, check=True)
-    for command in ("demo", "modes", "simulate", "sweep", "identify"):
+    for command in ("demo", "modes", "simulate", "sweep", "frf", "identify"):
         assert f" {command} " in ended.stdout
     assert ended.stdout.endswith("[]\n")
 
@@ -203,6 +212,25 @@ def test_sweep_agrees_with_single_runs(run, refused, folder):
     again = run(f"{line} --json -o out.zarr --resume")
     assert again == found
     assert f"{peaks[..., 0].max():.6g}" in run(line)
+
+
+def test_frequency_responses(run, folder):
+    """A light beam under a parked mass rings where the two together do."""
+    words = "frf case.toml --set beam.modes=1 --from 2 --to 60 --points 400"
+    found = run(f"{words} --json --mass-at 0.3=0.5 --pair force@0.3:velocity@0.3")
+    (response,) = found["responses"]
+    assert (response["input"], response["output"]) == ("force@0.3", "velocity@0.3")
+    assert response["unit"] == "(m/s)/N"
+    loaded = frequency(1) / math.sqrt(1 + 0.5 / (0.535 * 0.6 / 2))
+    peak = found["frequencies_hz"][int(np.argmax(response["magnitude"]))]
+    np.testing.assert_allclose(peak, loaded, rtol=1e-2)
+    assert len(response["phase_deg"]) == 400
+    printed = run(f"{words} --plot -o out.nc")
+    assert "force@0.3 -> sensors.0, in m/N" in printed
+    assert " peak " in printed
+    assert "written: out.nc" in printed
+    assert (folder / "out.nc").stat().st_size > 0
+    assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_paired_sweep(run):

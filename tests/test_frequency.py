@@ -13,6 +13,7 @@ from jaxbeam.case import replace
 from jaxbeam.correction import residual_lift
 from jaxbeam.frequency import (
     accelerance,
+    extremes,
     frequency_response,
     mobility,
     poles,
@@ -74,7 +75,7 @@ def formulas(frequencies, modes=4, ratio=0.03, parked=()):
     return np.array(chain)
 
 
-def extremes(frequencies, size):
+def turns(frequencies, size):
     """Frequencies and heights of the dips and of the peaks of a curve, ((dip, 2), (peak, 2))."""
     inner = size[1:-1]
     dips = np.flatnonzero((inner < size[:-2]) & (inner < size[2:])) + 1
@@ -98,24 +99,24 @@ def test_figures_2_15_and_2_18_without_a_mass():
     current, _, passed, total = np.asarray(found.magnitude).T
     assert_allclose(total[0], 2.38, atol=0.005)
     assert np.ptp(total[f < 5]) < 0.1 * total[0]
-    dips, peaks = extremes(f, total)
+    dips, peaks = turns(f, total)
     assert_allclose(dips[:, 0], [20.3, 81.3, 184.4, 330.1], atol=0.1)
     assert_allclose(peaks[0], [27.5, 10.2], atol=0.06)
     # Figs 2.17 and 2.18: what resists the voltage, and what lifts the force, is one resonance.
-    impedance = extremes(f, 1 / current)[1][0]
-    assert_allclose([impedance[0], extremes(f, passed)[1][0, 0]], 26.65, atol=0.1)
+    impedance = turns(f, 1 / current)[1][0]
+    assert_allclose([impedance[0], turns(f, passed)[1][0, 0]], 26.65, atol=0.1)
 
 
 def test_figure_2_16_with_half_a_kilogram_in_the_middle():
     f = np.linspace(0.5, 40.0, 8001)
     total = np.asarray(frequency_response(RIG_A, f, shaker_chain(0)[3:], HALF_KILO).magnitude)[:, 0]
-    dips, peaks = extremes(f, total)
+    dips, peaks = turns(f, total)
     assert_allclose(peaks, [[13.1, 20.2]], atol=0.05)
     # Force drops where the beam alone, with the mass, would ring: finite elements.
     assert_allclose(dips[:, 0], loaded_frequency(), rtol=5e-3)
     undamped = replace(RIG_A, {"beam.damping_ratio": 0.0})
     total = np.asarray(frequency_response(undamped, f, shaker_chain(0)[3:], HALF_KILO).magnitude)
-    assert_allclose(extremes(f, total[:, 0])[1], [[13.05, 27.6]], atol=0.05)
+    assert_allclose(turns(f, total[:, 0])[1], [[13.05, 27.6]], atol=0.05)
 
 
 def loaded_frequency() -> float:
@@ -292,6 +293,16 @@ def test_record_has_labels_and_units(tmp_path):
         found.to_netcdf(tmp_path / "out.nc")
     with pytest.raises(ValueError, match="no response of sensors.1 to force@0.3; there are"):
         found.of("force@0.3", "sensors.1")
+
+
+def test_extremes_lie_between_the_samples():
+    f = np.geomspace(5.0, 50.0, 200)
+    response = frequency_response(RIG_A, f, shaker_chain(0)[3:])
+    first, dip, peak = extremes(response, 0)
+    assert [word for word, *_ in (first, dip, peak)] == ["first", "dip", "peak"]
+    assert_allclose(first[1:], [5.0, float(response.magnitude[0, 0])])
+    assert_allclose(dip[1:], [20.325, 0.32133], rtol=2e-3)
+    assert_allclose(peak[1:], [27.54, 10.163], rtol=2e-4)
 
 
 def test_without_actuators_a_force_at_each_sensor():

@@ -15,7 +15,16 @@ from PIL import Image, ImageSequence
 
 import jaxbeam as jb
 from jaxbeam.casefile import case_to_dict
-from jaxbeam.plot import FitPanel, animate, plot_fit, plot_modes, plot_record, plot_sweep
+from jaxbeam.frequency import frequency_response
+from jaxbeam.plot import (
+    FitPanel,
+    animate,
+    plot_fit,
+    plot_frequency,
+    plot_modes,
+    plot_record,
+    plot_sweep,
+)
 from jaxbeam.plot.style import INK, digits, scale, spread
 
 CASE = jb.Case(
@@ -238,6 +247,22 @@ def test_a_perfect_fit():
     zeros = np.zeros((5, 1))
     said = words(plot_fit([FitPanel("log", np.arange(5.0), zeros, zeros, ("w",))]))
     assert "residual sd 0.00 m" in said
+
+
+def test_frequency_responses():
+    """A column a unit; the curve of each pair, without a frequency of zero."""
+    pairs = [("force@0.3", "sensors.0"), ("force@0.3", "velocity@0.1"), ("force@0.2", "sensors.1")]
+    response = frequency_response(CASE, [0.0, 2.0, 20.0, 200.0], pairs)
+    figure = plot_frequency(response)
+    grid = np.array(figure.axes).reshape(2, 2)
+    assert [len(axes.lines) for axes in grid.ravel()] == [2, 1, 2, 1]
+    assert_allclose(data(grid[0, 0].lines[1])[1], response.magnitude[1:, 2])
+    assert_allclose(data(grid[1, 1].lines[0]), [[2, 20, 200], response.phase[1:, 1]])
+    assert [axes.get_xscale() for axes in grid[1]] == ["log", "log"]
+    said = words(figure)
+    for text in ("one ball", "magnitude (m/N)", "magnitude ((m/s)/N)", "phase (°)",
+                 "frequency (Hz)", "force@0.2 → sensors.1"):  # fmt: skip
+        assert text in said
 
 
 def test_animation(record, tmp_path):

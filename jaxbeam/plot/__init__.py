@@ -1,12 +1,22 @@
-"""Pictures of records, modes, sweeps and fits. Each returns a figure, which the caller saves.
+"""Pictures of records, modes, sweeps, fits and frequency responses.
 
-The figures do not belong to pyplot: nothing is shown, and nothing has to be closed.
+Each function returns a figure, which the caller saves. The figures do not belong to pyplot:
+nothing is shown, and nothing has to be closed.
 """
 
 from jaxbeam.plot.animation import animate
 from jaxbeam.plot.fit import FitPanel, plot_fit
+from jaxbeam.plot.frequency import plot_frequency
 from jaxbeam.plot.modes import plot_modes
 from jaxbeam.plot.record import plot_record
 from jaxbeam.plot.sweep import plot_sweep
 
-__all__ = ["FitPanel", "animate", "plot_fit", "plot_modes", "plot_record", "plot_sweep"]
+__all__ = [
+    "FitPanel",
+    "animate",
+    "plot_fit",
+    "plot_frequency",
+    "plot_modes",
+    "plot_record",
+    "plot_sweep",
+]
