@@ -1,0 +1,40 @@
+"""Bode plots of frequency responses."""
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator, NullFormatter
+
+from jaxbeam.frequency import FrequencyResponse
+from jaxbeam.plot.style import FAINT, colour, name, styled
+
+
+@styled
+def plot_frequency(response: FrequencyResponse) -> Figure:
+    """Magnitude and phase over frequency: one column for each unit, one curve for each pair.
+
+    Frequencies of zero have no place on the logarithmic axis and are left out.
+    """
+    shown = np.asarray(response.frequencies) > 0
+    frequencies = np.asarray(response.frequencies)[shown]
+    magnitude, phase = (np.asarray(x)[shown] for x in (response.magnitude, response.phase))
+    units = list(dict.fromkeys(pair.unit for pair in response.pairs))
+    figure = Figure(figsize=(max(7.0, 1.0 + 4.2 * len(units)), 5.6))
+    grid = figure.subplots(2, len(units), squeeze=False, sharex=True, height_ratios=[3, 2])
+    for (top, bottom), unit in zip(grid.T, units, strict=True):
+        chosen = [i for i, pair in enumerate(response.pairs) if pair.unit == unit]
+        for number, i in enumerate(chosen):
+            label = str(response.pairs[i]).replace("->", "\N{RIGHTWARDS ARROW}")
+            top.loglog(frequencies, magnitude[:, i], color=colour(number), label=label)
+            bottom.semilogx(frequencies, phase[:, i], color=colour(number))
+        top.set_ylabel("magnitude" if unit == "1" else f"magnitude ({unit.replace('^2', '²')})")
+        top.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2)
+        top.yaxis.set_minor_formatter(NullFormatter())
+        top.grid(True, which="minor", color=FAINT, linewidth=0.3)
+        low, high = np.min(phase[:, chosen]), np.max(phase[:, chosen])
+        bottom.set_ylim(90 * np.floor(low / 90 - 0.1), 90 * np.ceil(high / 90 + 0.1))
+        bottom.yaxis.set_major_locator(MultipleLocator(90))
+        bottom.xaxis.set_major_formatter("{x:g}")
+        bottom.set(xlabel="frequency (Hz)", ylabel="phase (°)")
+        bottom.set_xlim(frequencies[0], frequencies[-1])
+    name(figure, response.title)
+    return figure
