@@ -108,19 +108,19 @@ def frequency_response(
     parked mass that is negative or off the beam.
     """
     check(case)
-    frequencies, parked = _frequencies(frequencies), _parked(case, parked)
+    frequencies, masses = _frequencies(frequencies), _parked(case, parked)
     chosen = check_pairs(case, common_pairs(case) if pairs is None else pairs)
     layout = lay_out(case) if layout is None else layout
-    values = _responses(case, layout, frequencies, parked, chosen)
+    values = _responses(case, layout, frequencies, masses, chosen)
     return FrequencyResponse(frequencies, values, chosen, case.title)
 
 
 @eqx.filter_jit
-def _responses(case: Case, layout: Layout, frequencies, parked, pairs: tuple[Pair, ...]):
+def _responses(case: Case, layout: Layout, frequencies, masses, pairs: tuple[Pair, ...]):
     model = rig(case, layout)
     inputs = [column(case, model, pair.source) for pair in pairs]
     pushes = jnp.stack([pushed for pushed, _ in inputs], axis=-1)
-    states = _states(model, parked, frequencies, pushes)
+    states = _states(model, masses, frequencies, pushes)
     s = 2j * jnp.pi * frequencies
     responses = []
     for i, (pair, (_, command)) in enumerate(zip(pairs, inputs, strict=True)):
@@ -136,20 +136,20 @@ def _read(reading, states, s, command):
     return states @ place + s * (states @ rate) + direct @ command
 
 
-def _states(model: Rig, parked, frequencies, pushes) -> Complex[Array, "frequency state input"]:
+def _states(model: Rig, masses, frequencies, pushes) -> Complex[Array, "frequency state input"]:
     """States of the rig for each column of pushes, at every frequency (Hz)."""
-    matrix, inertia = _matrices(model, parked)
+    matrix, inertia = _matrices(model, masses)
     s = 2j * jnp.pi * frequencies[:, None, None]
     return jnp.linalg.solve(s * inertia - matrix, pushes + 0j)
 
 
-def _matrices(model: Rig, parked):
-    """A and E of the rig with masses (position, mass) parked on it."""
+def _matrices(model: Rig, masses):
+    """A and E of the rig with masses parked on it: their positions (m), and what they are (kg)."""
     matrix = block_diag(*model.state_matrix)
-    positions, masses = parked
+    positions, kilograms = masses
     shapes = model.shapes(positions, (0,))[0]
     rates = np.arange(1, 2 * model.modes.stiffness.shape[0], 2)
-    added = (shapes.T * masses) @ shapes
+    added = (shapes.T * kilograms) @ shapes
     return matrix, jnp.eye(model.states).at[np.ix_(rates, rates)].add(added)
 
 
@@ -162,19 +162,19 @@ def receptance(
     differentiable in them. The rest is as there, the errors too.
     """
     check(case)
-    frequencies, parked = _frequencies(frequencies), _parked(case, parked)
+    frequencies, masses = _frequencies(frequencies), _parked(case, parked)
     layout = lay_out(case) if layout is None else layout
     x, y = _on_beam(case, "x", x), _on_beam(case, "y", y)
-    return _receptance(case, layout, frequencies, parked, x, y)
+    return _receptance(case, layout, frequencies, masses, x, y)
 
 
 @eqx.filter_jit
-def _receptance(case: Case, layout: Layout, frequencies, parked, x, y):
+def _receptance(case: Case, layout: Layout, frequencies, masses, x, y):
     model = rig(case, layout)
     modes = model.modes.stiffness.shape[0]
     pushes = jnp.zeros((model.states, y.size))
     pushes = pushes.at[1 : 2 * modes : 2].set(model.shapes(y.reshape(-1), (0,))[0].T)
-    amplitudes = _states(model, parked, frequencies, pushes)[:, : 2 * modes : 2]
+    amplitudes = _states(model, masses, frequencies, pushes)[:, : 2 * modes : 2]
     response = model.shapes(x.reshape(-1), (0,))[0] @ amplitudes
     return response.reshape(frequencies.size, *x.shape, *y.shape)
 

@@ -50,13 +50,15 @@ def test_every_number_of_a_material_has_an_address():
     ],
 )
 def test_commands_spare_the_polarisation_of_a_patch(given, gain, expected):
-    patch = jb.Patch(0.2, 0.3, 1e-3, amplifier_gain=gain, limits=given, rate_limit=50.0)
+    patch = jb.Patch(
+        start=0.2, end=0.3, moment_per_volt=1e-3, amplifier_gain=gain, limits=given, rate_limit=50.0
+    )
     assert_allclose(patch.command_limits(), expected)
     assert patch.command_rate() == 50.0
 
 
 def test_other_actuators_say_their_limits_in_the_same_way():
-    limited = [jb.PointForce(0.1, limits=[-1, 2]), jb.Shaker(0.1, limits=[-1, 2])]
+    limited = [jb.PointForce(position=0.1, limits=[-1, 2]), jb.Shaker(position=0.1, limits=[-1, 2])]
     for actuator in limited:
         assert_allclose(actuator.command_limits(), [-1, 2])
     for actuator in (jb.PointForce(0.1), jb.Shaker(0.1), V4, jb.SpringDamper(0.1)):

@@ -257,7 +257,8 @@ def test_frequency_responses():
     grid = np.array(figure.axes).reshape(2, 2)
     assert [len(axes.lines) for axes in grid.ravel()] == [2, 1, 2, 1]
     assert_allclose(data(grid[0, 0].lines[1])[1], response.magnitude[1:, 2])
-    assert_allclose(data(grid[1, 1].lines[0]), [[2, 20, 200], response.phase[1:, 1]])
+    assert_allclose(data(grid[1, 1].lines[0])[0], [2, 20, 200])
+    assert_allclose(data(grid[1, 1].lines[0])[1], response.phase[1:, 1])
     assert [axes.get_xscale() for axes in grid[1]] == ["log", "log"]
     said = words(figure)
     for text in ("one ball", "magnitude (m/N)", "magnitude ((m/s)/N)", "phase (°)",
