@@ -13,15 +13,17 @@ from jaxtyping import Float
 
 from jaxbeam.case import Case, replace, value_at
 from jaxbeam.dynamics import Traffic, traffic
-from jaxbeam.grid import even_grid, sampled_grid
+from jaxbeam.grid import even_grid, scheduled_grid
 from jaxbeam.integrate import longest_step, march, trace
 from jaxbeam.lanes import Tasks
 from jaxbeam.loads import motion
+from jaxbeam.loop import loop_schedule, make_loop
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.pacing import choose_steps
 from jaxbeam.plan import Form, most_at_once, sample_times
 from jaxbeam.record import never_as_nan
 from jaxbeam.rig import couples, rig
+from jaxbeam.schedule import sampled
 
 RUNS = 256  # in a block, about: its states stay in the cache, its results are one write
 PACES = 4  # at which time steps are measured, at least
@@ -36,6 +38,12 @@ class Work:
 
     def __init__(self, case: Case, tasks: Tasks, histories: bool, tolerance: float):
         self.case, self.tasks, self.histories, self.tolerance = case, tasks, histories, tolerance
+        samples = sample_times(case)
+        self.schedule = (
+            sampled(samples, True)
+            if case.controller is None
+            else loop_schedule(case, np.asarray(samples))
+        )
         self._compiling, self._compiled = threading.Lock(), False
         count, lanes = tasks.index.shape
         self.each = min(count, max(1, RUNS // lanes))
@@ -88,22 +96,22 @@ class Work:
         """Results of a block of tasks, (task, lane, ...), with the steps (s) of all tasks."""
         count = self.tasks.index.shape[0]
         chosen = np.arange(number * self.each, (number + 1) * self.each) % count
-        times = None
+        substeps = None
         if self.histories:
-            times = sample_times(self.case)
-            gap = float(times[1] - times[0])
-            times = (times, max(1, int(np.ceil(gap / steps.min()))))
-        return self._run(chosen, steps[chosen], times)
+            substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
+        return self._run(chosen, steps[chosen], substeps)
 
-    def _run(self, chosen, steps, times):
+    def _run(self, chosen, steps, substeps):
         tasks = self.tasks
+        scheduled = substeps is not None or self.case.controller is not None
         # The first call compiles: others wait for it instead of compiling the same again.
         with nullcontext() if self._compiled else self._compiling:
             results = _block(
                 self.case,
                 self.form,
                 self.addresses,
-                times,
+                self.schedule if scheduled else None,
+                substeps,
                 jax.tree.map(lambda leaf: leaf[self.rig_of[chosen]], self.rigs),
                 tasks.heavy[chosen],
                 tasks.light[chosen],
@@ -171,7 +179,7 @@ def _windows(case, addresses, heavy):
 
 
 @eqx.filter_jit
-def _block(case, form, addresses, times, rigs, heavy, light, longest):
+def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longest):
     """Results of some tasks, one after the other, their lanes side by side."""
     heavy_addresses, light_addresses = addresses
 
@@ -186,15 +194,28 @@ def _block(case, form, addresses, times, rigs, heavy, light, longest):
         inertia, weight = jax.vmap(press, out_axes=1)(light)
         loads = Traffic(traffic(varied).motions, inertia, weight)
         watched = jnp.stack([sensor.position for sensor in varied.sensors])
-        if times is None:
+        driver = None
+        if case.controller is not None:
+            driver = make_loop(varied, form.layout, loads, schedule)
+            assembled = driver.rig
+        slots = form.slots
+        if substeps is None and driver is None:
             grid = even_grid(varied, assembled, longest)
-            best = march(assembled, loads, grid, watched, slots=form.slots)
+            best = march(assembled, loads, grid, watched, slots=slots)
+            history = {}
+        elif substeps is None:
+            finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int)
+            grid = scheduled_grid(varied, assembled, schedule, finer)
+            best = march(assembled, loads, grid, watched, slots=slots, driver=driver)
             history = {}
         else:
-            grid, where = sampled_grid(varied, assembled, times[0], times[1], True)
-            count = grid.counts.shape[0] * times[1]
-            best, states = trace(assembled, loads, grid, watched, slots=form.slots, steps=count)
-            samples = states[:: times[1]][where][:, 0 : 2 * varied.beam.modes : 2]
+            grid = scheduled_grid(varied, assembled, schedule, substeps)
+            count = grid.counts.shape[0] * substeps
+            best, states, _ = trace(
+                assembled, loads, grid, watched, slots=slots, steps=count, driver=driver
+            )
+            edges = substeps * grid.place[schedule.samples]
+            samples = states[edges][:, 0 : 2 * varied.beam.modes : 2]
             rows = assembled.shapes(watched, (0,))[0]
             history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
         peak, time = best.peak()

@@ -6,10 +6,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.actuators import AbstractActuator
 from jaxbeam.beam import Beam, Support
+from jaxbeam.controller import AbstractController
 from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, choice, count, known, number
 from jaxbeam.loads import AbstractLoad
 from jaxbeam.sensors import Sensor
@@ -40,7 +42,7 @@ class Case(eqx.Module):
     actuators: tuple[AbstractActuator, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     loads: tuple[AbstractLoad, ...] = ()
-    controller: Any = None
+    controller: AbstractController | None = None
     run: Run | None = None
     title: str = choice("free text", default="")
 
@@ -78,14 +80,16 @@ def _leaves(case: Case) -> dict[str, Any]:
 def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
     """All numbers of a case by address; each entry of a list has its own address too.
 
-    `beam.damping_ratio` given as a list is addressed as a whole and as `beam.damping_ratio.0`, ...
+    `beam.damping_ratio` given as a list is addressed as a whole and as `beam.damping_ratio.0`, ...;
+    an entry of a matrix by row and column, `controller.gain.0.2`.
     Values are in the SI unit of the field.
     """
     found = {}
     for address, leaf in _leaves(case).items():
         found[address] = leaf
-        if jnp.ndim(leaf) == 1:
-            found |= {f"{address}.{i}": leaf[i] for i in range(leaf.shape[0])}
+        if jnp.ndim(leaf):
+            entries = np.ndindex(jnp.shape(leaf))
+            found |= {".".join([address, *map(str, entry)]): leaf[entry] for entry in entries}
     return found
 
 
@@ -118,7 +122,7 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     index = {".".join(_name(key) for key in path): i for i, (path, _) in enumerate(paths)}
     for address, value in values.items():
         value = jnp.asarray(value, float)
-        parent, _, entry = address.rpartition(".")
+        parent, entry = _entry(address, index)
         if address in index:
             old = leaves[index[address]]
             if jnp.shape(value) != jnp.shape(old):
@@ -126,13 +130,30 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
                     f"{address} takes a value of shape {jnp.shape(old)}, not {jnp.shape(value)}"
                 )
             leaves[index[address]] = value
-        elif parent in index and entry.isdigit() and int(entry) < jnp.size(leaves[index[parent]]):
+        elif parent is not None and _holds(leaves[index[parent]], entry):
             if value.shape:
                 raise ValueError(f"{address} takes one number, not {value.shape}")
-            leaves[index[parent]] = leaves[index[parent]].at[int(entry)].set(value)
+            leaves[index[parent]] = leaves[index[parent]].at[entry].set(value)
         else:
             raise unknown_address(case, address)
     return jax.tree_util.tree_unflatten(structure, leaves)
+
+
+def _entry(address: str, index: dict[str, int]) -> tuple[str | None, tuple[int, ...]]:
+    """The address of the list or matrix in which an entry is, and its place there."""
+    parent, entry = address, ()
+    while parent not in index:
+        parent, _, last = parent.rpartition(".")
+        if not last.isdigit():
+            return None, ()
+        entry = (int(last), *entry)
+    return parent, entry
+
+
+def _holds(leaf, entry: tuple[int, ...]) -> bool:
+    """Tell whether a list or matrix has an entry at a place."""
+    shape = jnp.shape(leaf)
+    return len(entry) == len(shape) and all(i < n for i, n in zip(entry, shape, strict=True))
 
 
 def known_case(case: Case) -> Case:

@@ -10,10 +10,9 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tomli_w
 
-from jaxbeam import actuators, loads
+from jaxbeam import actuators, control, loads
 from jaxbeam.beam import Beam, Support
 from jaxbeam.case import Case, Run, unknown_address
 from jaxbeam.checks import check, check_field, missing, suggestion
@@ -22,8 +21,7 @@ from jaxbeam.sensors import Sensor
 
 Kind = type | dict[str, type]  # one class, or the registry in which a `kind` is looked up
 
-CONTROLLERS: dict[str, type] = {}
-TABLES: dict[str, Kind] = {"beam": Beam, "controller": CONTROLLERS, "run": Run}
+TABLES: dict[str, Kind] = {"beam": Beam, "controller": control.KINDS, "run": Run}
 LISTS: dict[str, Kind] = {
     "supports": Support,
     "actuators": actuators.KINDS,
@@ -176,8 +174,6 @@ def read_part(address: str, table: dict[str, Any], kind: Kind) -> Any:
 
 
 def _look_up(address: str, word: Any, registry: dict[str, type]) -> type:
-    if not registry:
-        raise ValueError(f"there are no kinds of {address} yet; leave [{address}] out")
     if word is None:
         raise ValueError(f"{address}.kind is missing; it may be {', '.join(registry)}")
     if not isinstance(word, str) or word not in registry:
@@ -191,10 +187,19 @@ def _check_type(address: str, value: Any, field: dataclasses.Field) -> None:
     if "unit" not in field.metadata:
         check_field(address, value, field)
         return
-    entries = value if isinstance(value, list) else [value]
-    numeric = all(isinstance(x, int | float) and not isinstance(x, bool) for x in entries)
-    if not numeric or not fits(field, np.shape(value)):
+    shape = _shape(value)
+    if shape is None or not fits(field, shape):
         raise ValueError(f"{address} must be {shape_in_words(field)}, not {value!r}")
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    """Shape of a number or of nested lists of numbers; None for anything else."""
+    if not isinstance(value, list):
+        return () if isinstance(value, int | float) and not isinstance(value, bool) else None
+    shapes = {_shape(entry) for entry in value}
+    if len(shapes) > 1 or None in shapes:
+        return None
+    return (len(value), *(shapes.pop() if shapes else ()))
 
 
 def _write_part(address: str, part: Any, kind: Kind) -> dict[str, Any]:

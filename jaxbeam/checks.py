@@ -18,6 +18,7 @@ from jaxbeam.actuators import AbstractActuator, Patch
 from jaxbeam.actuators.patch import MATERIAL
 from jaxbeam.beam import ENDS, Beam, Support
 from jaxbeam.case import Case, Run
+from jaxbeam.controller import AbstractController
 from jaxbeam.fields import (
     INCREASING,
     NOT_NEGATIVE,
@@ -59,6 +60,8 @@ def check(case: Case) -> None:
         _check_clock(f"sensors.{i}", sensor, case)
     for i, load in enumerate(case.loads):
         _check_load(f"loads.{i}", load)
+    if case.controller is not None:
+        _check_controller(case)
 
 
 def check_on_beam(name: str, place: Any, length: Float[Array, ""]) -> None:
@@ -120,6 +123,8 @@ def _parts(case: Case) -> Iterator[tuple[str, Any, type]]:
     """The parts of a case with their addresses and the types they must have."""
     yield "beam", case.beam, Beam
     yield "run", case.run, Run
+    if case.controller is not None:
+        yield "controller", case.controller, AbstractController
     lists = {
         "supports": Support,
         "actuators": AbstractActuator,
@@ -292,6 +297,8 @@ def _check_clock(address: str, sensor: Sensor, case: Case) -> None:
             )
     elif case.controller is None:
         period = 1 / run.sample_rate
+    elif case.controller.period is not None:
+        period = case.controller.period
     filter = sensor.filter
     if filter is None or filter.realisation != "digital" or period is None:
         return
@@ -302,6 +309,52 @@ def _check_clock(address: str, sensor: Sensor, case: Case) -> None:
                 f"{address}.filter.cutoff must be below half the sampling frequency,"
                 f" {highest:g} Hz; it is {known(filter.cutoff):g} Hz: lower it, or sample faster"
             )
+
+
+def _check_controller(case: Case) -> None:
+    controller = case.controller
+    if not case.actuators:
+        raise ValueError("controller has nothing to command: add an actuator, or leave it out")
+    fault = controller.fault(case)
+    if fault is not None:
+        raise ValueError(f"controller.{fault}")
+    for i, sensor in enumerate(case.sensors):
+        smooth = sensor.filter is not None and sensor.filter.realisation == "analogue"
+        if smooth and sensor.quantity == "acceleration" and not controller.blind:
+            raise ValueError(
+                f"sensors.{i}.filter cannot be analogue on an acceleration that a controller looks"
+                " at: make it digital"
+            )
+    period, duration = controller.period, case.run.duration
+    if period is not None:
+        if is_known(period) and is_known(duration) and known(period) > known(duration):
+            raise ValueError(
+                f"controller.period must not exceed the run's duration, {known(duration):g} s;"
+                f" it is {known(period):g} s"
+            )
+        return
+    # What acts at every instant can neither wait nor remember.
+    sampled = {
+        "controller.delay": controller.delay is not None,
+        "controller.resolution": controller.resolution is not None,
+        "the controller's memory": not controller.memoryless,
+    }
+    for i, actuator in enumerate(case.actuators):
+        sampled[f"the rate limit of actuators.{i}"] = actuator.command_rate() is not None
+    if not controller.blind:
+        for i, sensor in enumerate(case.sensors):
+            digital = sensor.filter is not None and sensor.filter.realisation == "digital"
+            sampled |= {
+                f"sensors.{i}.filter, which is digital,": digital,
+                f"sensors.{i}.sampling_period": sensor.sampling_period is not None,
+                f"sensors.{i}.delay": sensor.delay is not None,
+                f"sensors.{i}.noise": sensor.noise is not None,
+                f"sensors.{i}.resolution": sensor.resolution is not None,
+                f"the acceleration of sensors.{i}": sensor.quantity == "acceleration",
+            }
+    for name, given in sampled.items():
+        if given:
+            raise ValueError(f"{name} needs a controller that samples: give controller.period")
 
 
 def _check_load(address: str, load: AbstractLoad) -> None:

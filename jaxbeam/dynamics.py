@@ -12,7 +12,7 @@ on the modes, D2w/Dt2 = (contact row) . z + (shape row) . f.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case import Case
 from jaxbeam.loads import motion
@@ -37,6 +37,12 @@ class Traffic(eqx.Module):
         paths = zip(*(path.travel(times) for path in self.motions), strict=True)
         position, speed, acceleration = (jnp.stack(parts) for parts in paths)
         return position, speed, acceleration
+
+    def on_beam(self, times: Float[Array, "*time"]) -> Bool[Array, "load *time"]:
+        """Which loads are on the beam at given times (s): from entry until just before exit."""
+        windows = [path.window() for path in self.motions]
+        on = [(entry <= times) & (times < leave) for entry, leave in windows]
+        return jnp.array(on, bool).reshape(len(on), *jnp.shape(times))
 
 
 def traffic(case: Case) -> Traffic:
@@ -69,6 +75,37 @@ def contact_rows(rig: Rig, position, speed, acceleration, active):
     added = added.reshape(*split[:-1], 2 * each)
     rows = free.at[..., : 2 * each].add(added)
     return shape, rows
+
+
+def at_instant(
+    rig: Rig,
+    traffic: Traffic,
+    time: Float[Array, ""],
+    state: Float[Array, "state lane"],
+    command: Float[Array, "actuator lane"] | None = None,
+) -> tuple[Float[Array, "load lane"], Float[Array, "mode lane"]]:
+    """Contact forces r (N, upwards on the beam) and accelerations of q at an instant (s).
+
+    At the time at which a load enters or leaves they are those just after.
+    """
+    position, speed, acceleration = traffic.travel(time)
+    active = traffic.on_beam(time)
+    shape, rows = contact_rows(rig, position, speed, acceleration, active)
+    loads, modes = position.shape[0], rig.modes.stiffness.shape[0]
+    shape, rows = shape.reshape(loads, modes), rows.reshape(loads, rig.states)
+    blocks, side, _ = rig.state_matrix.shape
+    drift = (rig.state_matrix @ state.reshape(blocks, side, -1)).reshape(state.shape)
+    free = drift[1 : 2 * modes : 2]
+    felt = rows @ state
+    if command is not None:
+        pushed = rig.command_matrix[1 : 2 * modes : 2] @ command
+        free, felt = free + pushed, felt + shape @ pushed
+    mass = jnp.where(active[:, None], traffic.inertia, 0.0)
+    weight = jnp.where(active[:, None], traffic.weight, 0.0)
+    # The contact law: (1 + m S S') r = -W - m (contact row) . z.
+    matrix = jnp.eye(loads) + mass.T[:, :, None] * (shape @ shape.T)
+    force = -jnp.linalg.solve(matrix, (weight + mass * felt).T[..., None])[..., 0].T
+    return force, free + shape.T @ force
 
 
 @jax.custom_jvp

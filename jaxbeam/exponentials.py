@@ -34,16 +34,16 @@ GAUSS = (np.polynomial.legendre.leggauss(NODES)[0] + 1) / 2
 class Step(eqx.Module):
     """Propagators over steps of given lengths: at the Gauss nodes, at the end, at equal points.
 
-    `drift_*` take the state at the start, `push_*` the modal forces at the Gauss nodes; in the
-    blocks of the rig. `points` run from the start to the end of the step, both included.
+    `drift_*` take the state at the start, `push_*` the inputs at the Gauss nodes; in the blocks of
+    the rig. `points` run from the start to the end of the step, both included.
     """
 
     drift_nodes: Float[Array, "*length node block side side"]
-    push_nodes: Float[Array, "*length node force block side mode"]
+    push_nodes: Float[Array, "*length node force block side input"]
     drift_end: Float[Array, "*length block side side"]
-    push_end: Float[Array, "*length force block side mode"]
+    push_end: Float[Array, "*length force block side input"]
     drift_points: Float[Array, "*length point block side side"]
-    push_points: Float[Array, "*length point force block side mode"]
+    push_points: Float[Array, "*length point force block side input"]
 
 
 @functools.cache
@@ -54,6 +54,12 @@ def _lagrange() -> np.ndarray:
         others = np.delete(GAUSS, k)
         polynomials.append(np.polynomial.polynomial.polyfromroots(others) / np.prod(node - others))
     return np.array(polynomials)
+
+
+def at_ends() -> np.ndarray:
+    """Weights (node, end) of the values at the Gauss nodes for those at start and end of a step."""
+    coefficients = _lagrange()
+    return np.stack([coefficients[:, 0], coefficients.sum(axis=1)], axis=1)
 
 
 def _multiply(a, b):
@@ -80,15 +86,20 @@ def _balance(rig: Rig):
     return jax.lax.stop_gradient(scale)
 
 
-def propagators(rig: Rig, lengths: Float[Array, " *length"], points: int = 0) -> Step:
+def propagators(
+    rig: Rig, lengths: Float[Array, " *length"], points: int = 0, driven: bool = False
+) -> Step:
     """Propagators of the rig over steps of the given lengths (s), zero included.
 
     `points` is the number of equal intervals at whose ends the state is wanted within a step.
+    Inputs are the forces on the modes, and after them, if the rig is `driven`, the commands.
     """
     balance = _balance(rig)
     side, each = rig.state_matrix.shape[1], rig.modes_per_block
     matrix = rig.state_matrix * balance[:, :, None] / balance[:, None, :]
-    force = np.eye(side)[:, 1 : 2 * each : 2]  # speeds are not scaled
+    force = jnp.eye(side)[:, 1 : 2 * each : 2]
+    if driven:
+        force = jnp.concatenate([force, rig.command_matrix], axis=1)
     fractions = np.concatenate([GAUSS, np.arange(points) / max(points, 1), [1.0]])
     spans = lengths[..., None] * fractions
     x = matrix * spans[..., None, None, None] / 2**DOUBLINGS
@@ -98,6 +109,7 @@ def propagators(rig: Rig, lengths: Float[Array, " *length"], points: int = 0) ->
     weights = _lagrange() * np.array([math.factorial(p) for p in powers])  # force, power
     weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
     push = jnp.einsum("cfp,p...cbsm->...cfbsm", weights, pushes)
+    # Inputs act on speeds and actuators' own states, which the balance leaves as they are.
     push = push * spans[..., None, None, None, None] / balance[:, :, None]
     drift = drift * balance[:, None, :] / balance[:, :, None]
     first = jnp.moveaxis(drift, -4, 0), jnp.moveaxis(push, -5, 0)  # fractions first

@@ -80,6 +80,8 @@ def shape_in_words(field) -> str:
         return "one number"
     if axes[0].startswith("*"):
         return "one number or a list of numbers"
+    if len(axes) == 2:
+        return "a list of lists of numbers, all equally long"
     return f"a list of {axes[0]} numbers" if axes[0].isdigit() else "a list of numbers"
 
 

@@ -14,13 +14,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxbeam.case import Case
 from jaxbeam.loads import motion
 from jaxbeam.rig import Rig
+from jaxbeam.schedule import Schedule
 
 
 class Grid(eqx.Module):
     """Panels, each with a number of equal steps; step lengths are shared among panels.
 
     `kind` says which of `lengths` (s) the steps of a panel have. The last of the lengths is zero:
-    it belongs to the steps after the end, which fill up a chunk.
+    it belongs to the steps after the end, which fill up a chunk. `opens` is the edge of the
+    schedule at which a panel starts, -1 for an event; `place` is where edges of the schedule are.
     """
 
     edges: Float[Array, " edge"]
@@ -29,6 +31,8 @@ class Grid(eqx.Module):
     lengths: Float[Array, " length"]
     active: Bool[Array, "panel load"]
     windows: Float[Array, "load 2"]
+    opens: Int[Array, " panel"] | None = None
+    place: Int[Array, " planned"] | None = None
 
     @property
     def last_exit(self) -> Float[Array, ""]:
@@ -49,6 +53,13 @@ class Grid(eqx.Module):
         kind = jnp.where(beyond, self.lengths.shape[0] - 1, self.kind[panel])
         start = self.edges[panel] + (index - first[panel]) * self.lengths[self.kind[panel]]
         return panel, jnp.where(beyond, self.edges[-1], start), kind
+
+    def edge(self, index: Int[Array, " step"]) -> Int[Array, " step"]:
+        """Edge of the schedule at which each of some steps starts, -1 for none."""
+        first = jnp.cumsum(self.counts) - self.counts
+        panel, _, _ = self.steps(index)
+        starts = (index == first[panel]) & (index < self.total)
+        return jnp.where(starts, self.opens[panel], -1)
 
 
 def _events(case: Case, rig: Rig):
@@ -82,31 +93,29 @@ def even_grid(case: Case, rig: Rig, longest: Float[Array, ""]) -> Grid:
     return Grid(edges, counts, kind, lengths, active, windows)
 
 
-def sampled_grid(
-    case: Case, rig: Rig, times: Float[Array, " time"], substeps: int, even: bool
-) -> tuple[Grid, Int[Array, " time"]]:
-    """Panels from sample to sample (or event between them), each with `substeps` steps.
+def scheduled_grid(case: Case, rig: Rig, schedule: Schedule, substeps: int) -> Grid:
+    """Panels from edge to edge of a schedule (or event between), each of `substeps` steps.
 
-    `times` (s) ascend from the start of the run; `even` promises that they are equally spaced,
-    so that nearly all panels share one step length. Also returns the edge of every sample.
+    Nearly all panels then share a few step lengths, and with them their propagators.
     """
+    times = schedule.times
     windows, events = _events(case, rig)
     where = jnp.concatenate([times, jnp.clip(events, times[0], times[-1])])
     order = jnp.argsort(where)
     edges = where[order]
     spans = jnp.diff(edges)
-    sample = order < times.shape[0]
-    if even:
-        # The others lie beside an event: at most two for each.
-        usual = sample[1:] & sample[:-1]
-        room = 2 * events.shape[0]
-    else:
-        usual = jnp.zeros(spans.shape, bool)
-        room = spans.shape[0]
-    kind = jnp.where(usual, 0, jnp.cumsum(~usual))
-    spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
-    lengths = jnp.zeros(room + 2).at[kind].set(jnp.where(usual, spacing, spans))
+    planned = order < times.shape[0]
+    # The others lie beside an event: at most two for each.
+    usual = planned[1:] & planned[:-1]
+    kinds = schedule.lengths.shape[0]
+    kind = jnp.where(
+        usual,
+        schedule.gaps[jnp.clip(jnp.cumsum(planned)[:-1] - 1, 0, schedule.gaps.shape[0] - 1)],
+        kinds - 1 + jnp.cumsum(~usual),
+    )
+    lengths = jnp.concatenate([schedule.lengths, jnp.zeros(2 * events.shape[0] + 1)])
+    lengths = lengths.at[jnp.where(usual, lengths.shape[0], kind)].set(spans, mode="drop")
     counts = jnp.full(spans.shape, substeps)
     active = _activity(windows, edges)
-    grid = Grid(edges, counts, kind, lengths / substeps, active, windows)
-    return grid, jnp.argsort(order)[: times.shape[0]]
+    opens = jnp.where(planned[:-1], order[:-1], -1)
+    return Grid(edges, counts, kind, lengths / substeps, active, windows, opens, jnp.argsort(order))

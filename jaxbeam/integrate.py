@@ -4,31 +4,32 @@ Within a step every contact force is the polynomial through its values at the Ga
 is the force it puts on each mode; the rig answers exactly (`exponentials`). Demanding the contact
 law at the nodes gives a small linear system a step. The free rig brings neither error nor
 stiffness at any step length; the order is twice the number of nodes. Steps are taken in chunks:
-what depends on the path alone is tabulated for a chunk at once and shared by all lanes, a short
-loop then advances the states, and what is wanted of the chunk is reduced at once again.
+what depends on the path alone is tabulated for a chunk at once and shared by all lanes
+(`tables`), a short loop then advances the states, and what is wanted of the chunk is reduced at
+once again (`extremes`). Commands to the actuators are polynomials at the same nodes, given by a
+driver.
 """
 
+import abc
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from jaxbeam.dynamics import Traffic, contact_rows, solve_contact
-from jaxbeam.exponentials import GAUSS, LONGEST, NODES, POINTS, Step, norm, propagators
+from jaxbeam.dynamics import Traffic, solve_contact
+from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
+from jaxbeam.extremes import Extremes, fold, nothing_seen
 from jaxbeam.grid import Grid
 from jaxbeam.loads import AbstractLoad, MovingMass
-from jaxbeam.motion import NEVER
-from jaxbeam.peaks import refine, vertex
 from jaxbeam.rig import Rig
+from jaxbeam.tables import Tables, make_rigging, tabulate
 
 CHUNK = 16
 # Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
 # a polynomial in each step, misses that mode's oscillation and feeds it.
 RESOLVED = 1.9 * NODES
-NEAR = 1.1  # a peak between samples is less than this above the highest of them
 
 
 def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
@@ -40,134 +41,82 @@ def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
     return jax.lax.stop_gradient(limit)
 
 
-class Extremes(eqx.Module):
-    """What a march keeps of a run without storing it.
+class Moment(eqx.Module):
+    """One step: when it starts (s), how long it is (s), which edge of the schedule it starts at.
 
-    `samples` are the deflections at equal points of the step with the largest absolute deflection
-    of each watched place, `start` (s) and `span` (s) that step. Contact forces are those with
-    which a load presses on the beam; `lost` (s) is the first time it would have to pull.
+    `edge` is -1 for a step that starts between two edges.
     """
 
-    score: Float[Array, "sensor lane"]
-    samples: Float[Array, "point sensor lane"]
-    start: Float[Array, "sensor lane"]
-    span: Float[Array, "sensor lane"]
-    lowest: Float[Array, "load lane"]
-    lost: Float[Array, "load lane"]
-
-    def peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
-        """Largest absolute deflection (m) of each watched place, and when (s)."""
-        value, place = refine(self.samples)
-        return value, self.start + place * self.span
+    start: Float[Array, ""]
+    span: Float[Array, ""]
+    edge: Int[Array, ""]
 
 
-class Tables(eqx.Module):
-    """What one chunk of steps needs, computed from path and rig alone."""
+class AbstractDriver(eqx.Module):
+    """What commands the actuators of a run.
 
-    respond: Float[Array, "step row state"]
-    gains: Float[Array, "step row row"]
-    drift: Float[Array, "step block side side"]
-    push: Float[Array, "step state row"]
-    watch: Float[Array, "step looked state"] | None
-    watch_push: Float[Array, "step looked row"] | None
-    slots: Int[Array, "step slot"]
-    active: Bool[Array, "step slot"]
+    With `inner`, it is told the states at the nodes within a step, and not only at the start. A
+    run is given up where a state of the rig exceeds its `bound`.
+    """
 
+    inner: eqx.AbstractVar[bool]
+    bound: eqx.AbstractVar[Float[Array, " state"]]
 
-class Rigging(eqx.Module):
-    """Propagators of the rig on a grid, and the rows that give the watched deflections."""
+    @abc.abstractmethod
+    def start(self, lanes: int) -> Any:
+        """Its memory at the start of a run, of any structure."""
 
-    step: Step
-    watch: Float[Array, "length looked block side"] | None
-    watch_push: Float[Array, "length looked force block mode"] | None
+    @abc.abstractmethod
+    def drive(self, memory, state: Float[Array, "state lane"], moment: Moment, states):
+        """Commands (node, actuator, lane) of a step from this state, and the memory after it.
 
-
-def _rigging(rig: Rig, grid: Grid, watched) -> Rigging:
-    step = propagators(rig, grid.lengths, 0 if watched is None else POINTS)
-    if watched is None:
-        return Rigging(step, None, None)
-    each = rig.modes_per_block
-    blocks = rig.state_matrix.shape[0]
-    rows = rig.shapes(watched, (0,))[0].reshape(-1, blocks, each)
-    places = np.arange(0, 2 * each, 2)
-    watch = jnp.einsum("wbm,lpbmj->lpwbj", rows, step.drift_points[..., places, :])
-    push = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, step.push_points[..., places, :])
-    flat = (grid.lengths.shape[0], -1)
-    return Rigging(
-        step, watch.reshape(*flat, *watch.shape[3:]), push.reshape(*flat, *push.shape[3:])
-    )
+        `states` takes commands to the states at the nodes (node, state, lane), if `inner`.
+        """
 
 
-def _tabulate(rig: Rig, traffic: Traffic, grid: Grid, rigging: Rigging, slots: int, index):
-    """Tables of the steps with the given indices, and their start times and lengths (s)."""
-    panel, start, kind = grid.steps(index)
-    span = grid.lengths[kind]
-    times = start[:, None] + span[:, None] * GAUSS
-    position, speed, acceleration = (jnp.moveaxis(p, 0, 1) for p in traffic.travel(times))
-    active = grid.active[panel]  # step, load
-    if slots < len(traffic.motions):
-        # Loads on the beam first; those that find no slot are off the beam.
-        chosen = jnp.argsort(~active, axis=1)[:, :slots]
-        pick = chosen[:, :, None]
-        position, speed, acceleration = (
-            jnp.take_along_axis(part, pick, axis=1) for part in (position, speed, acceleration)
-        )
-        active = jnp.take_along_axis(active, chosen, axis=1)
+def _contact(tables: Tables, inertia, weight, state, commands):
+    """Contact forces (row, lane) of a step from this state under these commands, if any."""
+    felt = tables.respond @ state
+    if commands is not None:
+        felt = felt + tables.commands.respond @ commands
+    return solve_contact(tables.gains, inertia, weight + inertia * felt)
+
+
+def _advance(state, step):
+    """One step of all lanes: the contact forces at the nodes, and the state at the end."""
+    tables, inertia, weight, commands = step
+    forces = _contact(tables, inertia, weight, state, commands)
+    blocks, side, _ = tables.drift.shape
+    split = state.reshape(blocks, side, -1)
+    if side == 2:
+        drifted = tables.drift[:, :, :1] * split[:, :1] + tables.drift[:, :, 1:] * split[:, 1:]
     else:
-        chosen = jnp.broadcast_to(jnp.arange(slots), active.shape)
-    on = jnp.broadcast_to(active[:, :, None], position.shape)
-    shape, rows = contact_rows(rig, position, speed, acceleration, on)
-
-    def alike(_):
-        return _tables_of_kind(rigging, kind[0], shape, rows)
-
-    def one_by_one(_):
-        def single(step):
-            kind, shape, rows = step
-            tables = _tables_of_kind(rigging, kind, shape[None], rows[None])
-            return jax.tree.map(lambda table: table[0], tables)
-
-        return jax.lax.map(single, (kind, shape, rows))
-
-    # Mostly all steps of a chunk are equally long, and then share their propagators.
-    tables: Any = jax.lax.cond(jnp.all(kind == kind[0]), alike, one_by_one, None)
-    return Tables(*tables, slots=chosen, active=active), start, span
+        drifted = tables.drift @ split
+    after = drifted.reshape(state.shape) + tables.push @ forces
+    if commands is not None:
+        after = after + tables.commands.push @ commands
+    return after, (state, forces)
 
 
-def _tables_of_kind(rigging: Rigging, kind, shape, rows):
-    """Tables of steps of one length, from the shape and contact rows (step, slot, node, ...)."""
-    step, watch, watch_push = jax.tree.map(
-        lambda table: jax.lax.dynamic_index_in_dim(table, kind, keepdims=False),
-        (rigging.step, rigging.watch, rigging.watch_push),
-    )
-    steps, slots, nodes = shape.shape[:3]
-    size = slots * nodes
-    states = rows.shape[3] * rows.shape[4]
-    respond = jnp.einsum("tpcbi,cbij->tpcbj", rows, step.drift_nodes)
-    felt = jnp.einsum("tpcbi,cfbim->tpcfbm", rows, step.push_nodes)
-    gains = jnp.einsum("tpcfbm,tqfbm->tpcqf", felt, shape)
-    direct = jnp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
-    gains = gains + direct[..., None] * np.eye(nodes)[:, None, :]
-    push = jnp.einsum("tqfbm,fbim->tbiqf", shape, step.push_end)
+def _driven(driver: AbstractDriver, carry, step):
+    """One step of all lanes under the commands of a driver."""
+    state, memory = carry
+    tables, inertia, weight, moment = step
 
-    def each(table):
-        return jnp.broadcast_to(table, (steps, *table.shape))
+    def states(commands):
+        commands = jax.lax.collapse(commands, 0, 2)
+        forces = _contact(tables, inertia, weight, state, commands)
+        inner = tables.inner
+        flat = inner.drift @ state + inner.push @ forces + inner.command @ commands
+        return flat.reshape(len(GAUSS), *state.shape)
 
-    tables = (
-        respond.reshape(steps, size, states),
-        gains.reshape(steps, size, size),
-        each(step.drift_end),
-        push.reshape(steps, states, size),
-    )
-    if watch is None:
-        return *tables, None, None
-    seen = jnp.einsum("lfbm,tqfbm->tlqf", watch_push, shape)
-    looked = watch.shape[0]
-    return (
-        *tables,
-        each(watch.reshape(looked, states)),
-        seen.reshape(steps, looked, size),
-    )
+    given, memory = driver.drive(memory, state, moment, states)
+    commands = jax.lax.collapse(given, 0, 2)
+    after, (state, forces) = _advance(state, (tables, inertia, weight, commands))
+    # A loop that diverges ends here, in its own lane, instead of running into overflow.
+    lost = jnp.any(~(jnp.abs(after) <= driver.bound[:, None]), axis=0)
+    after = jnp.where(lost, jnp.nan, after)
+    return (after, memory), (state, forces, commands)
 
 
 def _rows(loads: Float[Array, "load lane"], tables: Tables) -> Float[Array, "step row lane"]:
@@ -176,83 +125,28 @@ def _rows(loads: Float[Array, "load lane"], tables: Tables) -> Float[Array, "ste
     return jnp.repeat(chosen, len(GAUSS), axis=1)
 
 
-def _advance(state, step):
-    """One step of all lanes: the contact forces at the nodes, and the state at the end."""
-    tables, inertia, weight = step
-    forces = solve_contact(tables.gains, inertia, weight + inertia * (tables.respond @ state))
-    blocks, side, _ = tables.drift.shape
-    split = state.reshape(blocks, side, -1)
-    if side == 2:
-        drifted = tables.drift[:, :, :1] * split[:, :1] + tables.drift[:, :, 1:] * split[:, 1:]
-    else:
-        drifted = tables.drift @ split
-    after = drifted.reshape(state.shape) + tables.push @ forces
-    return after, (state, forces)
+def _stepper(rig: Rig, traffic: Traffic, grid: Grid, watched, slots: int, driver=None):
+    """Function that takes state, memory and extremes through the chunk from a given step on."""
+    inner = driver is not None and driver.inner
+    rigging = make_rigging(rig, grid, watched, driven=driver is not None, inner=inner)
 
-
-def _reduce(best: Extremes, tables: Tables, states, forces, start, span) -> Extremes:
-    """Fold a chunk into the extremes."""
-    steps, lanes = states.shape[0], states.shape[-1]
-    seen = tables.watch @ states + tables.watch_push @ forces
-    samples = jax.lax.optimization_barrier(seen.reshape(steps, POINTS + 1, -1, lanes))
-
-    def raised(best):
-        score = jax.lax.optimization_barrier(jax.vmap(vertex)(samples))
-        top = jnp.argmax(score, axis=0)
-        better = jnp.max(score, axis=0) > best.score
-        chosen = jnp.take_along_axis(samples, top[None, None], axis=0)[0]
-        return Extremes(
-            jnp.where(better, jnp.max(score, axis=0), best.score),
-            jnp.where(better, chosen, best.samples),
-            jnp.where(better, start[top], best.start),
-            jnp.where(better, span[top], best.span),
-            best.lowest,
-            best.lost,
-        )
-
-    # Most chunks come nowhere near the peak so far, or press all along: they end here.
-    highest = jnp.max(jnp.abs(samples), axis=(0, 1))
-    best = jax.lax.cond(jnp.any(highest * NEAR > best.score), raised, lambda best: best, best)
-    pressing = jnp.min(-forces.reshape(steps, -1, len(GAUSS), lanes), axis=2)
-    # A load that is not on the beam, or has no slot, does not count.
-    here = (tables.slots[:, :, None] == np.arange(best.lowest.shape[0])) & tables.active[..., None]
-    least = jnp.where(here[..., None], pressing[:, :, None], jnp.inf)
-    lowest = jnp.minimum(best.lowest, jnp.min(least, axis=(0, 1), initial=jnp.inf))
-
-    def lost(first):
-        pulls = -forces.reshape(steps, -1, 1, len(GAUSS), lanes) < 0
-        times = (start[:, None] + span[:, None] * GAUSS)[:, None, None, :, None]
-        when = jnp.where(pulls & here[..., None, None], times, NEVER)
-        return jnp.minimum(first, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
-
-    first = jax.lax.cond(jnp.any(lowest < 0), lost, lambda first: first, best.lost)
-    return eqx.tree_at(lambda b: (b.lowest, b.lost), best, (lowest, first))
-
-
-def _nothing_seen(places: int, loads: int, lanes: int) -> Extremes:
-    nothing = jnp.zeros((places, lanes))
-    return Extremes(
-        nothing,
-        jnp.zeros((POINTS + 1, places, lanes)),
-        nothing,
-        nothing,
-        jnp.full((loads, lanes), jnp.inf),
-        jnp.full((loads, lanes), NEVER),
-    )
-
-
-def _stepper(rig: Rig, traffic: Traffic, grid: Grid, watched, slots: int):
-    """Function that takes state and extremes through the chunk that begins with a given step."""
-    rigging = _rigging(rig, grid, watched)
-
-    def chunk(state, best, first):
+    def chunk(state, memory, best, first):
         index = first + jnp.arange(CHUNK)
-        tables, start, span = _tabulate(rig, traffic, grid, rigging, slots, index)
-        steps = tables, _rows(traffic.inertia, tables), _rows(traffic.weight, tables)
-        state, (states, forces) = jax.lax.scan(_advance, state, steps)
+        tables, start, span = tabulate(rig, traffic, grid, rigging, slots, index)
+        loads = _rows(traffic.inertia, tables), _rows(traffic.weight, tables)
+        if driver is None:
+            commands = None
+            state, (states, forces) = jax.lax.scan(_advance, state, (tables, *loads, None))
+        else:
+            moments = Moment(start, span, grid.edge(index))
+            (state, memory), (states, forces, commands) = jax.lax.scan(
+                lambda carry, step: _driven(driver, carry, step),
+                (state, memory),
+                (tables, *loads, moments),
+            )
         if watched is not None:
-            best = _reduce(best, tables, states, forces, start, span)
-        return state, best, states
+            best = fold(best, tables, states, forces, commands, start, span)
+        return state, memory, best, (states, commands)
 
     return chunk
 
@@ -265,62 +159,76 @@ def trace(
     *,
     slots: int,
     steps: int,
-) -> tuple[Extremes | None, Float[Array, "edge state lane"]]:
-    """Integrate from rest over a grid of so many steps; return extremes and all states.
+    driver: AbstractDriver | None = None,
+):
+    """Integrate from rest over a grid of so many steps; return extremes, states and commands.
 
-    States are those at the start of every step and at the end. Extremes are those at the
-    `watched` places (m), None without any. `slots` is how many loads may be on the beam at once.
-    Reverse mode stores one state a chunk.
+    States (edge, state, lane) are those at the start of every step and at the end, commands
+    (step, command, lane) those at the nodes of every step, None without a `driver`. Extremes are
+    those at the `watched` places (m), None without any. `slots` is how many loads may be on the
+    beam at once. Reverse mode stores one state a chunk.
     """
-    chunk = _stepper(rig, traffic, grid, watched, slots)
+    chunk = _stepper(rig, traffic, grid, watched, slots, driver)
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
 
     def whole(carry, first):
-        state, best = carry
-        state, best, states = chunk(state, best, first)
-        return (state, best), states
+        *carry, history = chunk(*carry, first)
+        return tuple(carry), history
 
-    best = None if watched is None else _nothing_seen(watched.shape[0], loads, lanes)
+    best = None if watched is None else nothing_seen(watched.shape[0], loads, lanes)
+    memory = None if driver is None else driver.start(lanes)
     rest = jnp.zeros((rig.states, lanes))
     firsts = jnp.arange(0, steps, CHUNK)
-    (state, best), states = jax.lax.scan(jax.checkpoint(whole), (rest, best), firsts)
-    states = jax.lax.collapse(states, 0, 2)[:steps]
-    return best, jnp.concatenate([states, state[None]])
+    (state, _, best), history = jax.lax.scan(jax.checkpoint(whole), (rest, memory, best), firsts)
+    states, commands = jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2)[:steps], history)
+    return best, jnp.concatenate([states, state[None]]), commands
 
 
 def march(
-    rig: Rig, traffic: Traffic, grid: Grid, watched: Float[Array, " sensor"], *, slots: int
+    rig: Rig,
+    traffic: Traffic,
+    grid: Grid,
+    watched: Float[Array, " sensor"],
+    *,
+    slots: int,
+    driver: AbstractDriver | None = None,
 ) -> Extremes:
     """Integrate from rest over a grid, keeping only extremes at the `watched` places (m).
 
-    The loop runs as long as it must, and ends early when the energy left after the last exit
-    cannot raise any peak. `slots` is how many loads may be on the beam at once. Forward mode only.
+    The loop runs as long as it must: without a driver it ends early when the energy left after
+    the last exit cannot raise any peak. `slots` is how many loads may be on the beam at once.
+    Forward mode only.
     """
-    chunk = _stepper(rig, traffic, grid, watched, slots)
+    chunk = _stepper(rig, traffic, grid, watched, slots, driver)
     flexibility = _flexibility(rig, watched)
     stiffness = rig.stiffness()
     size = 2 * stiffness.shape[0]
 
     def more(carry):
-        _, _, first, going = carry
+        *_, first, going = carry
         return going & (first < grid.total)
 
-    def go(carry):
-        state, best, first, _ = carry
-        state, best, _ = chunk(state, best, first)
-        first = first + CHUNK
+    def still(state, best, first):
         left = grid.steps(first[None])[1][0] >= grid.last_exit
         place, rate = state[0:size:2], state[1:size:2]
         energy = jnp.sum(rate**2, axis=0) + jnp.sum(place * (stiffness @ place), axis=0)
         reach = jnp.sqrt(flexibility[:, None] * energy)
         # A run that has blown up has nothing more to show.
         over = jnp.all((reach < best.score) | ~jnp.isfinite(energy))
-        return state, best, first, ~(left & over)
+        return ~(left & over)
+
+    def go(carry):
+        state, memory, best, first, _ = carry
+        state, memory, best, _ = chunk(state, memory, best, first)
+        first = first + CHUNK
+        going = jnp.ones((), bool) if driver is not None else still(state, best, first)
+        return state, memory, best, first, going
 
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
-    best = _nothing_seen(watched.shape[0], loads, lanes)
-    start = (jnp.zeros((rig.states, lanes)), best, jnp.zeros((), int), jnp.ones((), bool))
-    return jax.lax.while_loop(more, go, start)[1]
+    best = nothing_seen(watched.shape[0], loads, lanes)
+    memory = None if driver is None else driver.start(lanes)
+    start = jnp.zeros((rig.states, lanes)), memory, best, jnp.zeros((), int), jnp.ones((), bool)
+    return jax.lax.while_loop(more, go, start)[2]
 
 
 def _flexibility(rig: Rig, watched):

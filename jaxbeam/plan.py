@@ -5,6 +5,7 @@ code then works for any numbers for which the decisions hold.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,12 +15,15 @@ from jaxtyping import Array, Float
 from jaxbeam.case import Case, known_case
 from jaxbeam.checks import check
 from jaxbeam.dynamics import Traffic, traffic
+from jaxbeam.extremes import Extremes
 from jaxbeam.fields import known
-from jaxbeam.grid import even_grid
-from jaxbeam.integrate import Extremes, longest_step, march
+from jaxbeam.grid import even_grid, scheduled_grid
+from jaxbeam.integrate import longest_step, march
 from jaxbeam.loads import motion
+from jaxbeam.loop import loop_schedule, make_loop
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.rig import couples, rig
+from jaxbeam.schedule import Schedule
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 EVEN = 1e-6  # of the spacing: more even samples are taken for equally spaced
@@ -77,20 +81,21 @@ def run_extremes(
     return march(assembled, loads, grid, watched, slots=form.slots)
 
 
-@dataclasses.dataclass(frozen=True)
-class Plan:
+class Plan(eqx.Module):
     """How a case is to be run: its form, steps from sample to sample, and their error.
 
     Holds for cases that differ in numbers only, as long as these change neither the order of
     supports and loads nor the frequencies much; make a new one otherwise. `lead` samples are
-    added before the first one asked for, back to the start of the run.
+    added before the first one asked for, back to the start of the run. With a controller the
+    `schedule` holds its clock and the samples, which are part of the plan then.
     """
 
-    form: Form
-    substeps: int
-    lead: int
-    even: bool
-    error: float
+    form: Form = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+    lead: int = eqx.field(static=True)
+    even: bool = eqx.field(static=True)
+    error: float = eqx.field(static=True)
+    schedule: Schedule | None = None
 
 
 def make_plan(
@@ -106,6 +111,10 @@ def make_plan(
     case = known_case(case)
     shape = form(case)
     samples = np.asarray(sample_times(case) if times is None else known(times))
+    if case.controller is not None:
+        schedule = loop_schedule(case, samples)
+        substeps, error = _suitable_substeps(case, shape, schedule, tolerance)
+        return Plan(shape, substeps, 0, False, error, schedule)
     step, error = suitable_step(case, shape, tolerance)
     gaps = np.diff(samples)
     even = bool(np.all(np.abs(gaps - gaps.mean()) < EVEN * gaps.mean()))
@@ -141,22 +150,48 @@ def suitable_step(
     step down to a millionth of the run will do.
     """
     case = known_case(case)
-
-    def peaks(step):
-        return np.asarray(_probe(case, form, jnp.asarray(step), lanes))
-
     step = _longest_step(case, form)
-    shortest = step * 1e-6
-    coarse = peaks(step)
-    while step > shortest:
-        fine = peaks(step / 2)
+
+    def peaks(halvings):
+        return np.asarray(_probe(case, form, jnp.asarray(step / 2**halvings), lanes))
+
+    halvings, error = _halve(peaks, tolerance, 20)
+    return step / 2**halvings, error
+
+
+def _suitable_substeps(case: Case, form: Form, schedule: Schedule, tolerance: float):
+    """How many steps to take from edge to edge of a schedule, and the error of the peaks."""
+    fewest = max(1, int(np.ceil(float(schedule.lengths.max()) / _longest_step(case, form))))
+
+    def peaks(halvings):
+        return np.asarray(_probe_driven(case, form, schedule, jnp.asarray(fewest * 2**halvings)))
+
+    halvings, error = _halve(peaks, tolerance, 8)
+    return fewest * 2**halvings, error
+
+
+@eqx.filter_jit
+def _probe_driven(case, form, schedule, substeps):
+    places = case.beam.length * jnp.array(PROBES)
+    loads = traffic(case)
+    driver = make_loop(case, form.layout, loads, schedule)
+    grid = scheduled_grid(case, driver.rig, schedule, substeps)
+    best = march(driver.rig, loads, grid, places, slots=form.slots, driver=driver)
+    return best.peak()[0]
+
+
+def _halve(peaks: Callable[[int], np.ndarray], tolerance: float, most: int) -> tuple[int, float]:
+    """How often to halve a step until halving it again changes no peak much, and that change."""
+    coarse = peaks(0)
+    for halvings in range(most):
+        fine = peaks(halvings + 1)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             error = np.max(np.abs(coarse - fine) / np.max(np.abs(fine), axis=0), initial=0.0)
         if not np.any(fine):
             error = 0.0
         if error <= tolerance:
-            return step, float(error)
-        step, coarse = step / 2, fine
+            return halvings, float(error)
+        coarse = fine
     raise RuntimeError(
         f"no time step makes the peaks agree to {tolerance:g}; the response grows without bound, "
         "or its frequencies are too far apart: check stiffnesses, masses and damping, "

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import xarray
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case import Case
 from jaxbeam.casefile import case_from_dict, case_to_dict
@@ -25,8 +25,10 @@ class Record(eqx.Module):
     just after. `load_position` (m) and `contact_force` (N, positive where the load presses on the
     beam) are NaN and zero while a load is off the beam. Peaks are those of the deflection between
     and at samples. `contact_lost_time` (s) and `contact_lost_position` (m) tell where a load would
-    first have to pull, which the model lets it do; NaN where it never would. `error_estimate` is
-    relative to the largest deflection.
+    first have to pull, which the model lets it do; NaN where it never would. `command` is what the
+    actuators are given, within their limits; at a time at which it changes, that just after.
+    Where a control loop diverges the samples are NaN from then on. `error_estimate` is relative
+    to the largest deflection.
     """
 
     case: Case
@@ -37,6 +39,7 @@ class Record(eqx.Module):
     accelerations: Float[Array, "time mode"]
     load_position: Float[Array, "time load"]
     contact_force: Float[Array, "time load"]
+    command: Float[Array, "time actuator"]
     peak_deflection: Float[Array, " sensor"]
     peak_time: Float[Array, " sensor"]
     lowest_contact_force: Float[Array, " load"]
@@ -97,8 +100,35 @@ class Record(eqx.Module):
         return measure(self.case, self.modes, *motion, self.times, noisy=True)
 
     @property
+    def saturated(self) -> Bool[Array, "time actuator"]:
+        """Whether each command is at a limit of its actuator."""
+        columns = [jnp.zeros(self.times.shape, bool) for _ in self.case.actuators]
+        for i, actuator in enumerate(self.case.actuators):
+            limits, given = actuator.command_limits(), self.command[:, i]
+            if limits is not None:
+                columns[i] = (given <= limits[0]) | (given >= limits[1])
+        return jnp.array(columns).reshape(len(columns), -1).T
+
+    @property
+    def effort(self) -> Float[Array, " actuator"]:
+        """Integral of the squared command over the run, by the trapezoidal rule between samples."""
+        return jnp.trapezoid(self.command**2, self.times, axis=0)
+
+    @property
+    def diverged_time(self) -> Float[Array, ""]:
+        """Time (s) of the first sample after the control loop diverged, NaN if it did not."""
+        gone = jnp.any(jnp.isnan(self.coordinates), axis=1)
+        return jnp.where(jnp.any(gone), self.times[jnp.argmax(gone)], jnp.nan)
+
+    @property
     def verdict(self) -> str:
-        """In words: whether every load stays in contact, and the estimated error."""
+        """In words: whether the loop holds, every load stays in contact, the estimated error."""
+        diverged = float(known(self.diverged_time))
+        if np.isfinite(diverged):
+            return (
+                f"the control loop diverges: the deflection has grown beyond all bounds by"
+                f" t = {diverged:.4g} s; lower the gains, or shorten period and delay"
+            )
         lost = np.asarray(known(self.contact_lost_time))
         where = np.asarray(known(self.contact_lost_position))
         least = np.asarray(known(self.lowest_contact_force))
@@ -162,6 +192,7 @@ _VARIABLES = {
     "accelerations": (("time", "mode"), "m kg^0.5/s^2", "acceleration of the modal coordinate"),
     "load_position": (("time", "load"), "m", "position of the load"),
     "contact_force": (("time", "load"), "N", "force with which the load presses on the beam"),
+    "command": (("time", "actuator"), "unit of a command", "command to the actuator"),
     "peak_deflection": (("sensor",), "m", "largest absolute deflection"),
     "peak_time": (("sensor",), "s", "time of the largest absolute deflection"),
     "lowest_contact_force": (("load",), "N", "smallest contact force"),
@@ -189,7 +220,12 @@ def record_from_xarray(dataset: xarray.Dataset) -> Record:
         raise ValueError("not a record of jaxbeam: it lacks its case")
     case = case_from_dict(json.loads(dataset.attrs["case"]))
     # A file does not hold what there is no sensor or load for.
-    sizes = {"sensor": len(case.sensors), "load": len(case.loads), **dataset.sizes}
+    sizes = {
+        "sensor": len(case.sensors),
+        "load": len(case.loads),
+        "actuator": len(case.actuators),
+        **dataset.sizes,
+    }
     shapes = {name: [sizes.get(d, 0) for d in _VARIABLES[name][0]] for name in _STORED}
     empty = {
         name: (_VARIABLES[name][0], np.zeros(shape))

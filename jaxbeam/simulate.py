@@ -10,13 +10,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
-from jaxbeam.dynamics import Traffic, contact_rows, traffic
+from jaxbeam.dynamics import Traffic, at_instant, traffic
+from jaxbeam.exponentials import NODES, at_ends
 from jaxbeam.fields import is_known, known
-from jaxbeam.grid import sampled_grid
+from jaxbeam.grid import scheduled_grid
 from jaxbeam.integrate import trace
+from jaxbeam.loop import make_loop
 from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
 from jaxbeam.record import Record, measure, never_as_nan
 from jaxbeam.rig import Rig, rig
+from jaxbeam.schedule import sampled
 
 
 class ContactLossWarning(UserWarning):
@@ -69,9 +72,10 @@ def _check_times(times) -> None:
 @eqx.filter_jit
 def _record(case: Case, plan: Plan, times, error) -> Record:
     watched = jnp.array([sensor.position for sensor in case.sensors]).reshape(-1)
-    best, (coordinates, rates, accelerations, position, force), found, count = _trace(
-        case, plan, times, watched
-    )
+    best, outputs, found, count = _trace(case, plan, times, watched)
+    coordinates, rates, accelerations, position, force, commands = outputs
+    if commands is None:
+        commands = jnp.zeros((times.shape[0], len(case.actuators)))
     peaks, peak_times = best.peak()
     loads = traffic(case)
     lost = never_as_nan(best.lost[:, 0])
@@ -87,6 +91,7 @@ def _record(case: Case, plan: Plan, times, error) -> Record:
         accelerations=accelerations,
         load_position=position,
         contact_force=force,
+        command=commands,
         peak_deflection=peaks[:, 0],
         peak_time=peak_times[:, 0],
         lowest_contact_force=best.lowest[:, 0],
@@ -102,45 +107,60 @@ def readings(case: Case, times: Float[Array, " time"], plan: Plan) -> Float[Arra
 
     Lean in compiling and differentiating, for fits; see `simulate`, which checks and warns.
     """
-    _, (coordinates, rates, accelerations, _, _), found, _ = _trace(case, plan, times, None)
-    return measure(case, found, coordinates, rates, accelerations)
+    _, (coordinates, rates, accelerations, *_), found, _ = _trace(case, plan, times, None)
+    return measure(case, found, coordinates, rates, accelerations, times)
 
 
 def _trace(case: Case, plan: Plan, times, watched):
     """Extremes, outputs at the sample times, modes, and the number of steps."""
-    assembled = rig(case, plan.form.layout, plan.form.coupled)
-    loads = traffic(case)
-    # From rest at the start to the first sample in steps like those between samples.
-    spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
-    lead = times[0] - spacing * jnp.arange(plan.lead, 0, -1)
-    grid, where = sampled_grid(
-        case, assembled, jnp.concatenate([lead, times]), plan.substeps, plan.even
-    )
+    loads, layout = traffic(case), plan.form.layout
+    if case.controller is None:
+        assembled, driver = rig(case, layout, plan.form.coupled), None
+        # From rest at the start to the first sample in steps like those between samples.
+        spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
+        lead = times[0] - spacing * jnp.arange(plan.lead, 0, -1)
+        schedule = sampled(jnp.concatenate([lead, times]), plan.even, plan.lead)
+    else:
+        schedule = plan.schedule
+        driver = make_loop(case, layout, loads, schedule)
+        assembled = driver.rig
+    grid = scheduled_grid(case, assembled, schedule, plan.substeps)
     count = grid.counts.shape[0] * plan.substeps
-    best, states = trace(assembled, loads, grid, watched, slots=plan.form.slots, steps=count)
-    samples = states[:: plan.substeps][where[plan.lead :]][:, :, 0]
-    return best, _outputs(assembled, loads, grid.windows, times, samples), assembled.modes, count
+    slots = plan.form.slots
+    best, states, commands = trace(
+        assembled, loads, grid, watched, slots=slots, steps=count, driver=driver
+    )
+    edges = plan.substeps * grid.place[schedule.samples]
+    states = states[edges]
+    if commands is not None:
+        commands = _begin(case, commands, edges)
+    return best, _outputs(assembled, loads, times, states, commands), assembled.modes, count
 
 
-def _outputs(rig: Rig, loads: Traffic, windows, times, states):
-    """Modal coordinates, rates and accelerations, and the loads' places and contact forces."""
-    position, speed, acceleration = (part.T for part in loads.travel(times))
-    after = times[:, None]
-    active = (windows[:, 0] <= after) & (after < windows[:, 1])
-    shape, rows = contact_rows(rig, position, speed, acceleration, active)
-    blocks, side, _ = rig.state_matrix.shape
-    split = states.reshape(-1, blocks, side)
-    mass = jnp.where(active, loads.inertia[:, 0], 0.0)
-    weight = jnp.where(active, loads.weight[:, 0], 0.0)
-    # The contact law at one instant: (1 + m S S') r = -W - m (contact row) . z.
-    drive = weight + mass * jnp.einsum("tlbi,tbi->tl", rows, split)
-    shape = jax.lax.collapse(shape, 2)
-    matrix = jnp.eye(len(loads.motions)) + mass[:, :, None] * (shape @ shape.mT)
-    force = -jnp.linalg.solve(matrix, drive[..., None])[..., 0]
-    size = 2 * shape.shape[-1]
-    drift = jnp.einsum("bij,tbj->tbi", rig.state_matrix, split).reshape(states.shape)
-    pushed = drift[:, 1:size:2] + jnp.einsum("tl,tlm->tm", force, shape)
-    modal = (states[:, 0:size:2], states[:, 1:size:2], pushed)
+def _begin(case: Case, commands, edges):
+    """Commands (time, actuator) with which the steps at some edges begin, as they took effect."""
+    histories = commands[..., 0].reshape(commands.shape[0], NODES, -1)
+    starts = jnp.tensordot(histories, at_ends(), axes=[1, 0])  # step, actuator, end
+    last = edges == histories.shape[0]
+    begun = jnp.where(last[:, None], starts[-1, :, 1], starts[jnp.where(last, 0, edges), :, 0])
+    limits = [actuator.command_limits() for actuator in case.actuators]
+    low = jnp.array([-jnp.inf if pair is None else pair[0] for pair in limits])
+    high = jnp.array([jnp.inf if pair is None else pair[1] for pair in limits])
+    return jnp.clip(begun, low, high)
+
+
+def _outputs(rig: Rig, loads: Traffic, times, states, commands):
+    """Modal coordinates, rates and accelerations, loads' places and contact forces, commands."""
+
+    def instant(time, state, command):
+        column = None if command is None else command[:, None]
+        force, pushed = at_instant(rig, loads, time, state, column)
+        return force[:, 0], pushed[:, 0]
+
+    force, pushed = jax.vmap(instant)(times, states, commands)
+    size = 2 * pushed.shape[1]
+    modal = (states[:, 0:size:2, 0], states[:, 1:size:2, 0], pushed)
     if rig.mixing is not None:
         modal = tuple(part @ rig.mixing.T for part in modal)
-    return *modal, jnp.where(active, position, jnp.nan), -force
+    position = loads.travel(times)[0].T
+    return *modal, jnp.where(loads.on_beam(times).T, position, jnp.nan), -force, commands

@@ -178,7 +178,7 @@ REFUSED = [
     ("times = [0, 1, 2]", "times = 1", "loads.1.times must be a list of numbers, not 1"),
     ("times = [0, 1, 2]", "times = [[0]]", "loads.1.times must be a list of numbers, not [[0]]"),
     ('"deflection"', '"deflexion"', "sensors.0.quantity cannot be 'deflexion'; did you mean"),
-    ("[run]", '[controller]\nkind = "lqr"\n[run]', "there are no kinds of controller yet"),
+    ("[run]", '[controller]\nkind = "lqg"\n[run]', "controller.kind cannot be 'lqg'"),
     ("modes = 3", "modes = 3 3", "not valid TOML: "),
 ]
 

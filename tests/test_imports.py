@@ -11,19 +11,22 @@ from tests.modules import PACKAGES, module_files, parse
 # modules, which may import each other.
 LAYERS = """
 jaxbeam.fields  jaxbeam.holds
-jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators
-jaxbeam.loads  jaxbeam.sensors
+jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
+jaxbeam.loads  jaxbeam.schedule  jaxbeam.sensors
 jaxbeam.case  jaxbeam.sensing
 jaxbeam.checks
-jaxbeam.casefile
 jaxbeam.modes
 jaxbeam.rig
 jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.ports  jaxbeam.sine_basis
 jaxbeam.frequency  jaxbeam.grid
 jaxbeam.dynamics
-jaxbeam.integrate  jaxbeam.reference  jaxbeam.statespace  jaxbeam.static
-jaxbeam.plan  jaxbeam.record
-jaxbeam.simulate  jaxbeam.amplification  jaxbeam.correction  jaxbeam.lanes  jaxbeam.pacing  jaxbeam.sweep_store
+jaxbeam.reference  jaxbeam.statespace  jaxbeam.static  jaxbeam.tables
+jaxbeam.control  jaxbeam.extremes
+jaxbeam.casefile  jaxbeam.integrate
+jaxbeam.loop  jaxbeam.record
+jaxbeam.plan
+jaxbeam.lanes  jaxbeam.pacing  jaxbeam.sweep_store
+jaxbeam.simulate  jaxbeam.amplification  jaxbeam.correction
 jaxbeam.blocks
 jaxbeam.sweep
 jaxbeam.plot

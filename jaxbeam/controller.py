@@ -1,0 +1,68 @@
+"""What a controller is: something that turns measurements into commands, at its own pace.
+
+The controllers themselves are in `control`.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+
+class Measurement(eqx.Module):
+    """What a controller may look at: the readings of the sensors, each in its own SI unit.
+
+    `state` is the true state of the plant in the order of `state_space`, for laws that assume full
+    knowledge; no sensor gives it.
+    """
+
+    readings: Float[Array, " sensor"]
+    state: Float[Array, " state"]
+
+
+class AbstractController(eqx.Module):
+    """Interface of all controllers.
+
+    With a sampling `period` (s) a controller acts at 0, period, 2 period, ...; its command begins
+    `delay` (s) later and is held until the next one. Without a period it acts at every instant,
+    the limit of ever faster sampling; its memory then stays as it was at the start, so it must be
+    `memoryless`. Commands are rounded to `resolution` and kept within the actuators' limits by
+    the loop. To add a controller, write a file with a subclass and name it in
+    `jaxbeam.control.KINDS`.
+    """
+
+    period: eqx.AbstractVar[Float[Array, ""] | None]
+    delay: eqx.AbstractVar[Float[Array, ""] | None]
+    resolution: eqx.AbstractVar[Float[Array, ""] | None]
+
+    @property
+    def memoryless(self) -> bool:
+        """Whether `step` leaves the memory as it is, so that it may act at every instant."""
+        return False
+
+    @property
+    def blind(self) -> bool:
+        """Whether the command depends on time alone."""
+        return False
+
+    @abc.abstractmethod
+    def init(self, model: Any) -> Any:
+        """Memory at the start of a run, of any structure; gains may be designed here.
+
+        `model` is the `statespace.LoadedBeam` of the case.
+        """
+
+    @abc.abstractmethod
+    def step(
+        self, memory: Any, measurement: Measurement, t: Float[Array, ""]
+    ) -> tuple[Float[Array, " actuator"], Any]:
+        """Commands, in the units of the actuators, at time t (s), and the memory after it."""
+
+    def fault(self, case: Any) -> str | None:
+        """What is wrong with it in a case, as "key must ...", before anything compiles; or None."""
+        return None
+
+    def knots(self) -> Float[Array, " knot"] | None:
+        """Times (s) at which the command bends or jumps by itself; steps then end there."""
+        return None

@@ -1,0 +1,89 @@
+"""The largest deflections and smallest contact forces of a run, kept without storing it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.exponentials import GAUSS, POINTS
+from jaxbeam.motion import NEVER
+from jaxbeam.peaks import refine, vertex
+from jaxbeam.tables import Tables
+
+NEAR = 1.1  # a peak between samples is less than this above the highest of them
+
+
+class Extremes(eqx.Module):
+    """What is kept of a run.
+
+    `samples` are the deflections at equal points of the step with the largest absolute deflection
+    of each watched place, `start` (s) and `span` (s) that step. Contact forces are those with
+    which a load presses on the beam; `lost` (s) is the first time it would have to pull.
+    """
+
+    score: Float[Array, "sensor lane"]
+    samples: Float[Array, "point sensor lane"]
+    start: Float[Array, "sensor lane"]
+    span: Float[Array, "sensor lane"]
+    lowest: Float[Array, "load lane"]
+    lost: Float[Array, "load lane"]
+
+    def peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
+        """Largest absolute deflection (m) of each watched place, and when (s)."""
+        value, place = refine(self.samples)
+        return value, self.start + place * self.span
+
+
+def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) -> Extremes:
+    """Extremes of the run so far, from those up to a chunk of steps and the chunk itself."""
+    steps, lanes = states.shape[0], states.shape[-1]
+    seen = tables.watch @ states + tables.watch_push @ forces
+    if tables.commands is not None:
+        seen = seen + tables.commands.watch @ commands
+    samples = jax.lax.optimization_barrier(seen.reshape(steps, POINTS + 1, -1, lanes))
+
+    def raised(best):
+        score = jax.lax.optimization_barrier(jax.vmap(vertex)(samples))
+        top = jnp.argmax(score, axis=0)
+        better = jnp.max(score, axis=0) > best.score
+        chosen = jnp.take_along_axis(samples, top[None, None], axis=0)[0]
+        return Extremes(
+            jnp.where(better, jnp.max(score, axis=0), best.score),
+            jnp.where(better, chosen, best.samples),
+            jnp.where(better, start[top], best.start),
+            jnp.where(better, span[top], best.span),
+            best.lowest,
+            best.lost,
+        )
+
+    # Most chunks come nowhere near the peak so far, or press all along: they end here.
+    highest = jnp.max(jnp.abs(samples), axis=(0, 1))
+    best = jax.lax.cond(jnp.any(highest * NEAR > best.score), raised, lambda best: best, best)
+    pressing = jnp.min(-forces.reshape(steps, -1, len(GAUSS), lanes), axis=2)
+    # A load that is not on the beam, or has no slot, does not count.
+    here = (tables.slots[:, :, None] == np.arange(best.lowest.shape[0])) & tables.active[..., None]
+    least = jnp.where(here[..., None], pressing[:, :, None], jnp.inf)
+    lowest = jnp.minimum(best.lowest, jnp.min(least, axis=(0, 1), initial=jnp.inf))
+
+    def lost(first):
+        pulls = -forces.reshape(steps, -1, 1, len(GAUSS), lanes) < 0
+        times = (start[:, None] + span[:, None] * GAUSS)[:, None, None, :, None]
+        when = jnp.where(pulls & here[..., None, None], times, NEVER)
+        return jnp.minimum(first, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
+
+    first = jax.lax.cond(jnp.any(lowest < 0), lost, lambda first: first, best.lost)
+    return eqx.tree_at(lambda b: (b.lowest, b.lost), best, (lowest, first))
+
+
+def nothing_seen(places: int, loads: int, lanes: int) -> Extremes:
+    """Extremes of a run that has not begun."""
+    nothing = jnp.zeros((places, lanes))
+    return Extremes(
+        nothing,
+        jnp.zeros((POINTS + 1, places, lanes)),
+        nothing,
+        nothing,
+        jnp.full((loads, lanes), jnp.inf),
+        jnp.full((loads, lanes), NEVER),
+    )

@@ -1,0 +1,257 @@
+"""The closed loop: sensors, controller and actuators' limits, as the driver of the integrator.
+
+A controller with a sampling period acts at its ticks, on the readings it has by then; its command
+begins a delay later and is held, while the beam moves continuously in between. A controller
+without a period acts at every instant: its law is demanded at the Gauss nodes of each step, by
+iteration, beside the contact law.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import block_diag
+from jaxtyping import Array, Float
+
+from jaxbeam.case import Case
+from jaxbeam.controller import Measurement
+from jaxbeam.dynamics import Traffic, at_instant
+from jaxbeam.exponentials import GAUSS, NODES
+from jaxbeam.fields import known
+from jaxbeam.filters import analogue
+from jaxbeam.integrate import AbstractDriver, Moment
+from jaxbeam.modes import Layout
+from jaxbeam.rig import Rig
+from jaxbeam.schedule import Schedule, merged
+from jaxbeam.sensing import design, init, noise_samples, read
+from jaxbeam.statespace import LoadedBeam, state_space
+
+ITERATIONS = 8  # of a law at every instant; each gains digits, as steps are short for it
+
+
+def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> Schedule:
+    """When the controller of a case acts and its sensors are read, up to the last sample (s)."""
+    controller, end = case.controller, samples[-1]
+    knots = controller.knots()
+    knots = np.zeros(0) if knots is None else known(knots)
+    if controller.period is None:
+        return merged(samples, np.zeros(0), 0.0, [], [], knots)
+
+    def clock(period):
+        return np.arange(int(np.floor(end / period * (1 + 1e-12))) + 1) * period
+
+    period = float(known(controller.period))
+    own = [period if s.sampling_period is None else known(s.sampling_period) for s in case.sensors]
+    late = [0.0 if s.delay is None else float(known(s.delay)) for s in case.sensors]
+    delay = 0.0 if controller.delay is None else float(known(controller.delay))
+    return merged(samples, clock(period), delay, [clock(float(p)) for p in own], late, knots)
+
+
+def plant(model: LoadedBeam) -> tuple[Rig, Float[Array, "sensor state"]]:
+    """The rig with the states of its sensors' analogue filters, and what the sensors see of it.
+
+    Rows of acceleration sensors are zero: they see forces too.
+    """
+    case, rig = model.case, model.rig
+    states, modal = rig.states, 2 * model.scale.shape[0]
+    parts, feeds, rows = [rig.state_matrix[0]], [], []
+    for sensor in case.sensors:
+        derivative = {"slope": 1, "strain": 2}.get(sensor.quantity, 0)
+        shape = rig.shapes(sensor.position, (derivative,))[0]
+        if sensor.quantity == "strain":
+            shape = -sensor.fibre_distance * shape
+        if sensor.quantity == "acceleration":
+            shape = jnp.zeros_like(shape)
+        first = 1 if sensor.quantity == "velocity" else 0
+        row = jnp.zeros(states).at[first:modal:2].set(shape)
+        if sensor.filter is None or sensor.filter.realisation != "analogue":
+            rows.append((row, None))
+            continue
+        matrix, column, output, _ = analogue(sensor.filter)
+        rows.append((output, len(parts)))
+        parts.append(matrix)
+        feeds.append((len(parts) - 1, jnp.outer(column, row)))
+    starts = np.cumsum([0, *(part.shape[0] for part in parts)])
+    total = int(starts[-1])
+    whole = block_diag(*parts)
+    for i, feed in feeds:
+        whole = whole.at[starts[i] : starts[i + 1], :states].set(feed)
+    seen = jnp.zeros((len(rows), total))
+    for i, (row, place) in enumerate(rows):
+        start = 0 if place is None else starts[place]
+        seen = seen.at[i, start : start + row.shape[0]].set(row)
+    command = jnp.zeros((total, rig.command_matrix.shape[1])).at[:states].set(rig.command_matrix)
+    wide = eqx.tree_at(lambda r: (r.state_matrix, r.command_matrix), rig, (whole[None], command))
+    return wide, seen
+
+
+class Loop(AbstractDriver):
+    """The driver made of the controller of a case. Lanes share the controller, not its memory."""
+
+    model: LoadedBeam
+    rig: Rig
+    seen: Float[Array, "sensor state"]
+    traffic: Traffic
+    schedule: Schedule
+    sections: tuple
+    noise: Float[Array, "read sensor"] | None
+    bound: Float[Array, " state"]
+    inner: bool = eqx.field(static=True)
+
+    def start(self, lanes: int) -> Any:
+        controller, case = self.model.case.controller, self.model.case
+        memory = _every_lane(controller.init(self.model), lanes)
+        commands = jnp.zeros((len(case.actuators), lanes))
+        if controller.period is None:
+            return memory, commands
+        pairs = zip(case.sensors, self.sections, strict=True)
+        sensing = [init(sensor, sections, jnp.zeros(lanes)) for sensor, sections in pairs]
+        rest = [
+            read(sensor, sections, state, jnp.zeros(lanes))[0]
+            for sensor, sections, state in zip(case.sensors, self.sections, sensing, strict=True)
+        ]
+        rest = jnp.stack(rest) if rest else jnp.zeros((0, lanes))
+        shown = jnp.broadcast_to(rest, (self.schedule.newest + 1, *rest.shape))
+        waiting = jnp.zeros((self.schedule.waiting + 1, *commands.shape))
+        return memory, commands, sensing, shown, waiting
+
+    def drive(self, memory, state, moment: Moment, states):
+        if self.model.case.controller.period is None:
+            return self._at_every_instant(memory, state, moment, states)
+        memory = jax.lax.cond(
+            moment.edge >= 0,
+            lambda memory: self._act(memory, state, moment),
+            lambda memory: memory,
+            memory,
+        )
+        active = memory[1]
+        return jnp.broadcast_to(active, (NODES, *active.shape)), memory
+
+    def _at_every_instant(self, memory, state, moment: Moment, states):
+        own, last = memory
+        times = moment.start + moment.span * GAUSS
+        blind = self.model.case.controller.blind
+
+        def commands_for(state, time):
+            readings = self.seen @ state
+            readings = [
+                read(sensor, None, None, reading)[0]
+                for sensor, reading in zip(self.model.case.sensors, readings, strict=True)
+            ]
+            wanted, _ = self._step(own, jnp.stack(readings) if readings else readings, state, time)
+            return self._limited(wanted)
+
+        if blind:
+            commands = jax.vmap(lambda time: commands_for(state, time))(times)
+            return commands, (own, commands[-1])
+
+        def closer(commands, _):
+            return jax.vmap(commands_for)(states(commands), times), None
+
+        guess = jnp.broadcast_to(last, (NODES, *last.shape))
+        commands, _ = jax.lax.scan(closer, guess, length=ITERATIONS)
+        return commands, (own, commands[-1])
+
+    def _act(self, memory, state, moment: Moment):
+        """All that is due at an edge: readings, a new command, and commands that begin."""
+        own, active, sensing, shown, waiting = memory
+        case, schedule, edge = self.model.case, self.schedule, moment.edge
+        signals = self._signals(state, active, moment.start)
+        readings, states = [], []
+        for i, sensor in enumerate(case.sensors):
+            number = schedule.reads[edge, i]
+            noise = None if self.noise is None else self.noise[number, i]
+            reading, after = read(sensor, self.sections[i], sensing[i], signals[i], noise)
+            due = number >= 0
+            readings.append(jnp.where(due, reading, shown[0, i]))
+            states.append(_choose(due, after, sensing[i]))
+            history = jnp.where(due, jnp.roll(shown[:, i], 1, axis=0), shown[:, i])
+            shown = shown.at[:, i].set(history.at[0].set(readings[-1]))
+
+        def tick(inputs):
+            own, waiting = inputs
+            newest = [shown[schedule.age[edge, i], i] for i in range(len(case.sensors))]
+            newest = jnp.stack(newest) if newest else shown[0]
+            wanted, own = self._step(own, newest, state, moment.start)
+            command = self._limited(wanted, waiting[0])
+            return own, jnp.roll(waiting, 1, axis=0).at[0].set(command)
+
+        own, waiting = jax.lax.cond(
+            schedule.tick[edge] >= 0, tick, lambda inputs: inputs, (own, waiting)
+        )
+        begins = schedule.apply[edge]
+        active = jnp.where(begins >= 0, waiting[jnp.maximum(begins, 0)], active)
+        return own, active, states, shown, waiting
+
+    def _signals(self, state, command, time):
+        """What the sensors see at an instant (sensor, lane)."""
+        signals = self.seen @ state
+        sensors = self.model.case.sensors
+        if not any(sensor.quantity == "acceleration" for sensor in sensors):
+            return signals
+        _, moving = at_instant(self.rig, self.traffic, time, state, command)
+        for i, sensor in enumerate(sensors):
+            if sensor.quantity == "acceleration":
+                shape = self.rig.shapes(sensor.position, (0,))[0]
+                signals = signals.at[i].set(shape @ moving)
+        return signals
+
+    def _step(self, own, readings, state, time):
+        """The controller's step in every lane."""
+
+        def single(own, readings, state):
+            return self.model.case.controller.step(own, Measurement(readings, state), time)
+
+        ordered = self.model.from_rig(state[: self.model.rig.states])
+        return jax.vmap(single, in_axes=-1, out_axes=-1)(own, jnp.asarray(readings), ordered)
+
+    def _limited(self, wanted, before=None):
+        """Commands as the actuators take them: rounded, within limits and rates of change."""
+        controller, case = self.model.case.controller, self.model.case
+        if controller.resolution is not None:
+            rounded = controller.resolution * jnp.round(wanted / controller.resolution)
+            wanted = wanted + jax.lax.stop_gradient(rounded - wanted)
+        rows = []
+        for i, actuator in enumerate(case.actuators):
+            command, limits, rate = wanted[i], actuator.command_limits(), actuator.command_rate()
+            if limits is not None:
+                command = jnp.clip(command, limits[0], limits[1])
+            if rate is not None and before is not None:
+                change = rate * controller.period
+                command = jnp.clip(command, before[i] - change, before[i] + change)
+            rows.append(command)
+        return jnp.stack(rows)
+
+
+def _every_lane(memory, lanes: int):
+    """The same memory in all lanes, along a new last axis."""
+    return jax.tree.map(
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf)[..., None], (*jnp.shape(leaf), lanes)),
+        memory,
+    )
+
+
+def _choose(condition, new, old):
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def make_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) -> Loop:
+    """The driver for a case that has a controller; its `rig` is the plant to integrate."""
+    model = state_space(case, layout=layout)
+    wide, seen = plant(model)
+    controller = case.controller
+    if controller.period is None:
+        sections, noise = (None,) * len(case.sensors), None
+    else:
+        sections = tuple(design(sensor, controller.period) for sensor in case.sensors)
+        noise = None
+        if any(sensor.noise is not None for sensor in case.sensors):
+            noise = noise_samples(case.run.seed, len(case.sensors), schedule.most_reads)
+    inner = controller.period is None and not controller.blind
+    # A deflection about as large as the beam is long: modes are of the order sqrt(2 / mass).
+    beam = case.beam
+    most = beam.length * jnp.sqrt(beam.linear_density * beam.length / 2)
+    bound = jnp.full(wide.states, jnp.inf).at[0 : 2 * beam.modes : 2].set(most)
+    return Loop(model, wide, seen, loads, schedule, sections, noise, bound, inner)

@@ -1,0 +1,182 @@
+"""What a chunk of steps needs of the path and the rig alone, the same for all its lanes.
+
+Within a step every contact force is the polynomial through its values at the Gauss nodes, and so
+is every command; the rig answers both exactly (`exponentials`). Here the answers become matrices:
+what the contact law feels at the nodes, the state at the end, the watched deflections.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxbeam.dynamics import Traffic, contact_rows
+from jaxbeam.exponentials import GAUSS, POINTS, Step, propagators
+from jaxbeam.grid import Grid
+from jaxbeam.rig import Rig
+
+
+class CommandTables(eqx.Module):
+    """How commands at the nodes act: on the contact law, the state at the end, what is watched."""
+
+    respond: Float[Array, "step row command"]
+    push: Float[Array, "step state command"]
+    watch: Float[Array, "step looked command"] | None
+
+
+class InnerTables(eqx.Module):
+    """The states at the nodes, from the state at the start, contact forces and commands."""
+
+    drift: Float[Array, "step inner state"]
+    push: Float[Array, "step inner row"]
+    command: Float[Array, "step inner command"]
+
+
+class Tables(eqx.Module):
+    """Matrices of each step of a chunk. Rows are (slot, node), commands (node, actuator)."""
+
+    respond: Float[Array, "step row state"]
+    gains: Float[Array, "step row row"]
+    drift: Float[Array, "step block side side"]
+    push: Float[Array, "step state row"]
+    watch: Float[Array, "step looked state"] | None
+    watch_push: Float[Array, "step looked row"] | None
+    commands: CommandTables | None
+    inner: InnerTables | None
+    slots: Int[Array, "step slot"]
+    active: Bool[Array, "step slot"]
+
+
+class Rigging(eqx.Module):
+    """Propagators of the rig on a grid, and the rows that give the watched deflections.
+
+    `inner` asks for the states at the nodes too.
+    """
+
+    step: Step
+    watch: Float[Array, "length looked block side"] | None
+    watch_push: Float[Array, "length looked force block input"] | None
+    commands: Float[Array, "mode actuator"] | None
+    inner: bool = eqx.field(static=True)
+
+
+def make_rigging(rig: Rig, grid: Grid, watched, *, driven: bool, inner: bool) -> Rigging:
+    """Propagators for all step lengths of a grid; `watched` (m) may be None.
+
+    `driven` rigs take commands; the states at the nodes are tabulated if `inner`.
+    """
+    step = propagators(rig, grid.lengths, 0 if watched is None else POINTS, driven=driven)
+    each = rig.modes_per_block
+    commands = rig.command_matrix[1 : 2 * each : 2] if driven else None
+    if watched is None:
+        return Rigging(step, None, None, commands, inner)
+    blocks = rig.state_matrix.shape[0]
+    rows = rig.shapes(watched, (0,))[0].reshape(-1, blocks, each)
+    places = np.arange(0, 2 * each, 2)
+    watch = jnp.einsum("wbm,lpbmj->lpwbj", rows, step.drift_points[..., places, :])
+    push = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, step.push_points[..., places, :])
+    flat = (grid.lengths.shape[0], -1)
+    return Rigging(
+        step,
+        watch.reshape(*flat, *watch.shape[3:]),
+        push.reshape(*flat, *push.shape[3:]),
+        commands,
+        inner,
+    )
+
+
+def tabulate(rig: Rig, traffic: Traffic, grid: Grid, rigging: Rigging, slots: int, index):
+    """Tables of the steps with the given indices, and their start times and lengths (s)."""
+    panel, start, kind = grid.steps(index)
+    span = grid.lengths[kind]
+    times = start[:, None] + span[:, None] * GAUSS
+    position, speed, acceleration = (jnp.moveaxis(p, 0, 1) for p in traffic.travel(times))
+    active = grid.active[panel]  # step, load
+    if slots < len(traffic.motions):
+        # Loads on the beam first; those that find no slot are off the beam.
+        chosen = jnp.argsort(~active, axis=1)[:, :slots]
+        pick = chosen[:, :, None]
+        position, speed, acceleration = (
+            jnp.take_along_axis(part, pick, axis=1) for part in (position, speed, acceleration)
+        )
+        active = jnp.take_along_axis(active, chosen, axis=1)
+    else:
+        chosen = jnp.broadcast_to(jnp.arange(slots), active.shape)
+    on = jnp.broadcast_to(active[:, :, None], position.shape)
+    shape, rows = contact_rows(rig, position, speed, acceleration, on)
+
+    def alike(_):
+        return _of_one_kind(rigging, kind[0], shape, rows)
+
+    def one_by_one(_):
+        def single(step):
+            kind, shape, rows = step
+            tables = _of_one_kind(rigging, kind, shape[None], rows[None])
+            return jax.tree.map(lambda table: table[0], tables)
+
+        return jax.lax.map(single, (kind, shape, rows))
+
+    # Mostly all steps of a chunk are equally long, and then share their propagators.
+    tables: Any = jax.lax.cond(jnp.all(kind == kind[0]), alike, one_by_one, None)
+    return Tables(*tables, slots=chosen, active=active), start, span
+
+
+def _of_one_kind(rigging: Rigging, kind, shape, rows):
+    """Tables of steps of one length, from the shape and contact rows (step, slot, node, ...)."""
+    step, watch, watch_push = jax.tree.map(
+        lambda table: jax.lax.dynamic_index_in_dim(table, kind, keepdims=False),
+        (rigging.step, rigging.watch, rigging.watch_push),
+    )
+    steps, slots, nodes, _, modes = shape.shape
+    size = slots * nodes
+    states = rows.shape[3] * rows.shape[4]
+    respond = jnp.einsum("tpcbi,cbij->tpcbj", rows, step.drift_nodes)
+    felt = jnp.einsum("tpcbi,cfbim->tpcfbm", rows, step.push_nodes[..., :modes])
+    gains = jnp.einsum("tpcfbm,tqfbm->tpcqf", felt, shape)
+    direct = jnp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
+    gains = gains + direct[..., None] * np.eye(nodes)[:, None, :]
+    push = jnp.einsum("tqfbm,fbim->tbiqf", shape, step.push_end[..., :modes])
+
+    def each(table, *shape):
+        table = table.reshape(shape or table.shape)
+        return jnp.broadcast_to(table, (steps, *table.shape))
+
+    tables = (
+        respond.reshape(steps, size, states),
+        gains.reshape(steps, size, size),
+        each(step.drift_end),
+        push.reshape(steps, states, size),
+    )
+    if watch is None:
+        looked = watch_of_commands = None
+        tables = (*tables, None, None)
+    else:
+        looked = watch.shape[0]
+        seen = jnp.einsum("lfbm,tqfbm->tlqf", watch_push[..., :modes], shape)
+        tables = (*tables, each(watch, looked, states), seen.reshape(steps, looked, size))
+        watch_of_commands = watch_push[:, :, 0, modes:]
+    commands = inner = None
+    if rigging.commands is not None:
+        # A rig that takes commands is a single block.
+        orders = nodes * rigging.commands.shape[1]
+        ordered = step.push_nodes[:, :, 0, :, modes:]
+        answer = jnp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], ordered)
+        at_once = jnp.einsum("tpcm,mu->tpcu", shape[..., 0, :], rigging.commands)
+        answer = answer + at_once[:, :, :, None] * np.eye(nodes)[:, :, None]
+        commands = CommandTables(
+            answer.reshape(steps, size, orders),
+            each(jnp.moveaxis(step.push_end[:, 0, :, modes:], 1, 0), states, orders),
+            None if looked is None else each(watch_of_commands, looked, orders),
+        )
+    if rigging.inner:
+        pressed = step.push_nodes[:, :, 0, :, :modes]
+        pushed = jnp.einsum("tqfm,cfim->tciqf", shape[..., 0, :], pressed)
+        inner = InnerTables(
+            each(step.drift_nodes, nodes * states, states),
+            pushed.reshape(steps, nodes * states, size),
+            each(jnp.moveaxis(ordered, 1, 2), nodes * states, orders),
+        )
+    return *tables, commands, inner
