@@ -12,6 +12,7 @@ from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringD
 from jaxbeam.beam import Beam, Support
 from jaxbeam.case import Case, Run, addresses, replace
 from jaxbeam.casefile import load_case, save_case
+from jaxbeam.control import Feedback, Prescribed, StateFeedback
 from jaxbeam.filters import Filter
 from jaxbeam.loads import MovingForce, MovingMass
 from jaxbeam.modes import modes
@@ -25,16 +26,19 @@ __all__ = [
     "Beam",
     "Case",
     "Electrodynamic",
+    "Feedback",
     "Filter",
     "MovingForce",
     "MovingMass",
     "Patch",
     "PointForce",
+    "Prescribed",
     "Record",
     "Run",
     "Sensor",
     "Shaker",
     "SpringDamper",
+    "StateFeedback",
     "Support",
     "addresses",
     "load_case",

@@ -106,10 +106,11 @@ def value_at(case: Case, address: str) -> Float[Array, "..."]:
 
     Raises ValueError, with the nearest known address, if there is none there.
     """
-    found = addresses(case)
-    if address not in found:
+    found = _leaves(case)
+    parent, entry = _entry(address, found)
+    if parent is None or (entry and not _holds(found[parent], entry)):
         raise unknown_address(case, address)
-    return found[address]
+    return found[parent][entry] if entry else found[parent]
 
 
 def replace(case: Case, values: dict[str, Any]) -> Case:
@@ -139,7 +140,7 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     return jax.tree_util.tree_unflatten(structure, leaves)
 
 
-def _entry(address: str, index: dict[str, int]) -> tuple[str | None, tuple[int, ...]]:
+def _entry(address: str, index: dict[str, Any]) -> tuple[str | None, tuple[int, ...]]:
     """The address of the list or matrix in which an entry is, and its place there."""
     parent, entry = address, ()
     while parent not in index:

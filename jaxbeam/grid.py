@@ -93,7 +93,9 @@ def even_grid(case: Case, rig: Rig, longest: Float[Array, ""]) -> Grid:
     return Grid(edges, counts, kind, lengths, active, windows)
 
 
-def scheduled_grid(case: Case, rig: Rig, schedule: Schedule, substeps: int) -> Grid:
+def scheduled_grid(
+    case: Case, rig: Rig, schedule: Schedule, substeps: int | Int[Array, ""]
+) -> Grid:
     """Panels from edge to edge of a schedule (or event between), each of `substeps` steps.
 
     Nearly all panels then share a few step lengths, and with them their propagators.

@@ -42,14 +42,14 @@ def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
 
 
 class Moment(eqx.Module):
-    """One step: when it starts (s), how long it is (s), which edge of the schedule it starts at.
+    """A step, or several: when it starts (s), how long it is (s), which edge of the schedule it starts at.
 
     `edge` is -1 for a step that starts between two edges.
     """
 
-    start: Float[Array, ""]
-    span: Float[Array, ""]
-    edge: Int[Array, ""]
+    start: Float[Array, " *step"]
+    span: Float[Array, " *step"]
+    edge: Int[Array, " *step"]
 
 
 class AbstractDriver(eqx.Module):

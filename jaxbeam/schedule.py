@@ -4,7 +4,10 @@ The times are merged into one list of edges, so that steps end there; what is du
 noted beside it. Loads add edges of their own, whose times are numbers like any other (`grid`).
 """
 
+import dataclasses
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -108,3 +111,21 @@ def merged(
         waiting=int(apply.max(initial=0)),
         most_reads=max((clock.size for clock in clocks), default=0),
     )
+
+
+def stacked(schedules: list[Schedule]) -> Schedule:
+    """Schedules of equally many edges and samples, along a new first axis.
+
+    Raises ValueError if their numbers differ.
+    """
+    if len({(s.times.shape, s.samples.shape) for s in schedules}) > 1:
+        raise ValueError("the schedules differ in the number of their edges or samples")
+    most = max(s.lengths.shape[0] for s in schedules)
+    counts = ("newest", "waiting", "most_reads")
+    largest = {name: max(getattr(s, name) for s in schedules) for name in counts}
+
+    def alike(schedule):
+        lengths = jnp.append(schedule.lengths, jnp.zeros(most - schedule.lengths.shape[0]))
+        return dataclasses.replace(schedule, lengths=lengths, **largest)
+
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(alike, schedules))

@@ -10,14 +10,18 @@ from jaxtyping import Float
 
 from jaxbeam.case import Case, replace, value_at
 from jaxbeam.checks import check
+from jaxbeam.control import Prescribed
+from jaxbeam.fields import known
 from jaxbeam.loads import motion
 from jaxbeam.plan import Plan, make_plan
+from jaxbeam.schedule import Schedule, stacked
 from jaxbeam.simulate import readings
 from tuning.free import OF_LOG, insert
 from tuning.logs import Log
 
 TOLERANCE = 1e-5  # of the largest deflection: what logs can resolve, with room to spare
 LATEST = 10.0  # start of a log, in its own durations, that is still simulated from 0 on
+UNIT_OF = {"voltage": "V", "force": "N"}
 OFFSET = re.compile(r"sensors\.(\d+)\.offset")
 
 
@@ -26,7 +30,8 @@ class Campaign:
     """Logs with the case of each: logs alike in structure share one compiled simulation.
 
     Logs are padded to the longest with equally spaced times, `real` is 1 for samples
-    that were measured and 0 for those that only fill up. Samples are (log, time, channel).
+    that were measured and 0 for those that only fill up. Samples are (log, time, channel). Where
+    a controller takes part, its commands from a log included, `schedule` holds its clock in each.
     """
 
     cases: list[Case]
@@ -35,6 +40,7 @@ class Campaign:
     times: Float[np.ndarray, "log time"]
     measured: Float[np.ndarray, "log time channel"]
     real: Float[np.ndarray, "log time channel"]
+    schedule: Schedule | None = None
 
     def local(self, addresses: list[str]) -> tuple[list[str], np.ndarray]:
         """Addresses as seen within a log, and which of the free numbers (log, address) each is.
@@ -65,9 +71,9 @@ class Campaign:
         constant = jnp.array([[s.offset for s in case.sensors] for case in self.cases])
 
         def simulated(run, values):
-            case, times = run
+            case, times, schedule = run
             case = replace(case, dict(zip(moving, values, strict=True)) | steady)
-            return readings(case, times, self.plan)
+            return readings(case, times, dataclasses.replace(self.plan, schedule=schedule))
 
         def gather(values):
             return jnp.where(which < 0, own, values[which])
@@ -79,7 +85,7 @@ class Campaign:
             ]
             return jnp.stack(rows, axis=1)[:, None, :]
 
-        runs = (stacked, jnp.asarray(self.times))
+        runs = (stacked, jnp.asarray(self.times), self.schedule)
 
         @jax.custom_jvp
         def predict(values):
@@ -133,11 +139,54 @@ def addresses_of_offsets(case: Case) -> list[str]:
     return [f"sensors.{i}.offset" for i in range(len(case.sensors))]
 
 
-def case_of_log(case: Case, log: Log) -> Case:
-    """The case as it was during a log: with the loads that crossed, until its end."""
+def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case:
+    """The case as it was during a log: with the loads and commands of then, until its end.
+
+    Commands are joined by straight lines from sample to sample; `times` (s) are those of the log
+    and any that fill it up, for which the last commands stay.
+    """
     if log.loads is not None:
         case = dataclasses.replace(case, loads=tuple(log.loads))
+    if any(actuator is not None for actuator in log.actuators):
+        commands = np.zeros((len(case.actuators), times.size))
+        for channel, actuator in enumerate(log.actuators):
+            if actuator is not None:
+                _check_command(case, log, channel, actuator)
+                more = times.size - log.times.size
+                commands[actuator] = np.pad(log.values[:, channel], (0, more), mode="edge")
+        controller = Prescribed(offsets=np.zeros(len(commands)), times=times, values=commands)
+        case = dataclasses.replace(case, controller=controller)
     return replace(case, {"run.duration": float(log.times[-1])})
+
+
+def _check_command(case: Case, log: Log, channel: int, actuator: int) -> None:
+    if not 0 <= actuator < len(case.actuators):
+        raise ValueError(
+            f"{log.source}: {log.names[channel]} is the command to actuators.{actuator}, but the"
+            f" case has {len(case.actuators)} actuators, counted from 0"
+        )
+    if log.actuators.count(actuator) > 1:
+        raise ValueError(f"{log.source}: two of its channels are commands to actuators.{actuator}")
+    if case.controller is not None:
+        raise ValueError(
+            f"{log.source}: its commands and the controller of the case contradict each other;"
+            " leave one out"
+        )
+    device = case.actuators[actuator]
+    wanted = type(device).__dataclass_fields__["limits"].metadata["unit"]
+    if UNIT_OF.get(log.quantities[channel]) != wanted:
+        raise ValueError(
+            f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in"
+            f" {log.units[channel]}, but the command to actuators.{actuator} is in {wanted}"
+        )
+    limits = device.command_limits()
+    low, high = (-np.inf, np.inf) if limits is None else known(limits)
+    least, most = log.values[:, channel].min(), log.values[:, channel].max()
+    if least < low or most > high:
+        raise ValueError(
+            f"{log.source}: {log.names[channel]} goes from {least:g} to {most:g} {wanted}, beyond"
+            f" what actuators.{actuator} takes, {low:g} to {high:g} {wanted}: correct its limits"
+        )
 
 
 def prepare(case: Case, logs: list[Log]) -> Campaign:
@@ -151,23 +200,21 @@ def prepare(case: Case, logs: list[Log]) -> Campaign:
     check(case)
     for log in logs:
         _check_times(log)
-    cases = [case_of_log(case, log) for log in logs]
+    count = max(log.times.size for log in logs)
+    times = [_filled(log.times, count) for log in logs]
+    cases = [case_of_log(case, log, filled) for log, filled in zip(logs, times, strict=True)]
     ordered = [_at_sensors(case, log) for log in logs]
     for log, own in zip(logs, cases, strict=True):
         _check_loads(log, own)
     shapes = {jax.tree.structure(own) for own in cases}
     if len(shapes) > 1:
         raise ValueError(
-            "the logs differ in the kind or number of their loads; fit them apart, or give all "
-            "the same (a mass of 1e-9 kg does no harm)"
+            "the logs differ in the kind or number of their loads, or in what is commanded; fit "
+            "them apart, or give all the same (a mass of 1e-9 kg does no harm)"
         )
-    spacings = [np.diff(log.times).mean() for log in logs]
-    count = max(log.times.size for log in logs)
-    times, measured, real = [], [], []
-    for log, (values, has), spacing in zip(logs, ordered, spacings, strict=True):
-        more = count - log.times.size
-        times.append(np.append(log.times, log.times[-1] + spacing * np.arange(1, more + 1)))
-        measured.append(np.pad(values, ((0, more), (0, 0))))
+    measured, real = [], []
+    for log, (values, has) in zip(logs, ordered, strict=True):
+        measured.append(np.pad(values, ((0, count - log.times.size), (0, 0))))
         real.append((np.arange(count) < log.times.size)[:, None] & has)
     plans = [make_plan(own, jnp.asarray(t), TOLERANCE) for own, t in zip(cases, times, strict=True)]
     if len({plan.form.layout for plan in plans}) > 1:
@@ -183,8 +230,19 @@ def prepare(case: Case, logs: list[Log]) -> Campaign:
         substeps=max(plan.substeps for plan in plans),
         lead=max(plan.lead for plan in plans),
         even=all(plan.even for plan in plans),
+        schedule=None,
     )
-    return Campaign(cases, logs, plan, np.array(times), np.array(measured), np.array(real, float))
+    clocks = [own.schedule for own in plans]
+    schedule = None if clocks[0] is None else stacked(clocks)
+    return Campaign(
+        cases, logs, plan, np.array(times), np.array(measured), np.array(real, float), schedule
+    )
+
+
+def _filled(times: Float[np.ndarray, " time"], count: int) -> Float[np.ndarray, " filled"]:
+    """Times followed by as many more, equally spaced, as make up a count."""
+    spacing = np.diff(times).mean()
+    return np.append(times, times[-1] + spacing * np.arange(1, count - times.size + 1))
 
 
 def _at_sensors(case: Case, log: Log):
@@ -196,7 +254,8 @@ def _at_sensors(case: Case, log: Log):
     if not sensors:
         raise ValueError("the case has no sensors to compare the logs with")
     named = [(number, i) for i, number in enumerate(log.sensors) if number is not None]
-    order = dict(named) if named else {i: i for i in range(len(log.names))}
+    read = [i for i, actuator in enumerate(log.actuators) if actuator is None]
+    order = dict(named) if named else dict(enumerate(read))
     if len(named) > len(order):
         raise ValueError(f"{log.source}: two of its channels are of the same sensor of the case")
     if not set(order) <= set(range(len(sensors))) or (not named and len(order) < len(sensors)):
@@ -235,6 +294,8 @@ def _check_times(log: Log) -> None:
 
 
 def _check_loads(log: Log, case: Case) -> None:
+    if case.controller is not None and not case.loads:
+        return
     if not case.loads:
         raise ValueError(
             f"{log.source}: no load is known, neither in the case nor in the TOML file beside the "

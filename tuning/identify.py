@@ -170,6 +170,8 @@ def _fitted_case(case: Case, campaign: Campaign, values: dict[str, float]) -> Ca
     """The case with what was fitted; the loads of a single log become its own."""
     if len(campaign.logs) == 1:
         fitted = insert(campaign.cases[0], 0, values)
+        # Commands that were logged belong to the log.
+        fitted = dataclasses.replace(fitted, controller=case.controller)
         return replace(fitted, {"run.duration": case.run.duration})
     shared = {address: v for address, v in values.items() if not OF_LOG.fullmatch(address)}
     if any(log.loads is not None for log in campaign.logs):

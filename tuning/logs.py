@@ -9,6 +9,7 @@ Beside a log there may be a TOML file of the same stem, which says what the log 
     [columns]                                         # only these are read
     t = "ms"
     d1 = { unit = "mm", sensor = 0, position = 0.3 }  # which sensor of the case it is, and where
+    u = { unit = "V", actuator = 0 }                  # the command to an actuator of the case
     [[loads]]                                         # as in a case file
     kind = "mass"
     mass = 0.5
@@ -39,8 +40,9 @@ class Log:
     `times` (time,) in s, strictly increasing; `values` (time, channel) in the SI unit of each
     channel's quantity; both are read-only. `quantities` are those of `jaxbeam.sensors.QUANTITIES`,
     or force (N) or voltage (V); `units` are as read, for labels. `sensors` and `positions` (m)
-    say which sensor of a case each channel is and where, None where that is not known; `loads`
-    are those that crossed while it was logged, None if that is not known.
+    say which sensor of a case each channel is and where, None where that is not known;
+    `actuators` say to which actuator of a case a channel is the command, None for readings;
+    `loads` are those that crossed while it was logged, None if that is not known.
 
     Raises ValueError if lengths disagree, a value is not finite or times do not increase.
     """
@@ -53,14 +55,15 @@ class Log:
     source: str = "log"
     sensors: tuple[int | None, ...] = ()
     positions: tuple[float | None, ...] = ()
+    actuators: tuple[int | None, ...] = ()
     loads: tuple[AbstractLoad, ...] | None = None
 
     def __post_init__(self):
         channels = self.values.shape[1]
-        for name in ("sensors", "positions"):
+        for name in ("sensors", "positions", "actuators"):
             if not getattr(self, name):
                 object.__setattr__(self, name, (None,) * channels)
-        for name in ("names", "quantities", "units", "sensors", "positions"):
+        for name in ("names", "quantities", "units", "sensors", "positions", "actuators"):
             if len(getattr(self, name)) != channels:
                 raise ValueError(
                     f"{self.source}: {len(getattr(self, name))} {name} for {channels} channels"
@@ -139,6 +142,7 @@ def read_log(
         source=str(path),
         sensors=tuple(side.sensor(name) for name in channels),
         positions=tuple(side.position(name) for name in channels),
+        actuators=tuple(side.actuator(name) for name in channels),
         loads=side.loads,
     )
 

@@ -1,4 +1,4 @@
-"""The TOML file beside a log, of the same stem: loads, and which column is which sensor."""
+"""The TOML file beside a log, of the same stem: loads, and what each column is."""
 
 import difflib
 import tomllib
@@ -15,6 +15,7 @@ _COLUMN_KEYS = {
     "unit": (str, "a word"),
     "sensor": (int, "a whole number from 0"),
     "position": ((int, float), "a number in m"),
+    "actuator": (int, "a whole number from 0"),
 }
 
 
@@ -33,6 +34,10 @@ class Sidecar:
     def sensor(self, name: str) -> int | None:
         """Index of the sensor of the case that a column is."""
         return self.columns.get(name, {}).get("sensor")
+
+    def actuator(self, name: str) -> int | None:
+        """Index of the actuator of the case whose command a column is."""
+        return self.columns.get(name, {}).get("actuator")
 
     def position(self, name: str) -> float | None:
         """Distance of a column's sensor from the left end in m."""

@@ -1,0 +1,137 @@
+"""Identification of actuators from logs of commands: planted values come back."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import jaxbeam as jb
+from tuning import Log, identify, read_log
+
+LENGTH, RIGIDITY, DENSITY, DAMPING, MODES = 0.6, 11.68, 0.535, 0.03, 3
+SHAKER = {"position": 0.5, "stiffness": 3500.0, "damping": 80.0, "force_per_volt": 4.6}
+BANDWIDTH = 1e4
+PATCH = {"start": 0.2575, "end": 0.3425, "moment_per_volt": 8.292e-4, "correction": 0.32}
+GAIN = 200.0
+PLACES = (0.15, 0.3)
+
+
+def shapes(x, derivative=0):
+    """Mass-normalised sine modes of the pinned beam, or their slopes."""
+    waves = np.arange(1, MODES + 1) * np.pi / LENGTH
+    curve = np.sin(waves * x) if derivative == 0 else waves * np.cos(waves * x)
+    return np.sqrt(2 / (DENSITY * LENGTH)) * curve
+
+
+def respond(times, shaker_volts, patch_volts):
+    """Deflections (m) at the places, by scipy's exact response to straight lines."""
+    frequencies = (np.arange(1, MODES + 1) * np.pi / LENGTH) ** 2 * np.sqrt(RIGIDITY / DENSITY)
+    here = shapes(SHAKER["position"])
+    stiffness = np.diag(frequencies**2) + SHAKER["stiffness"] * np.outer(here, here)
+    damping = np.diag(2 * DAMPING * frequencies) + SHAKER["damping"] * np.outer(here, here)
+    lift = shapes(PATCH["start"], 1) - shapes(PATCH["end"], 1)
+    lift = lift * PATCH["moment_per_volt"] * PATCH["correction"] * GAIN
+    n = MODES
+    A = np.zeros((2 * n + 1, 2 * n + 1))
+    A[:n, n : 2 * n] = np.eye(n)
+    A[n : 2 * n] = np.hstack([-stiffness, -damping, SHAKER["force_per_volt"] * here[:, None]])
+    A[2 * n, 2 * n] = -BANDWIDTH
+    B = np.zeros((2 * n + 1, 2))
+    B[2 * n, 0], B[n : 2 * n, 1] = BANDWIDTH, lift
+    C = np.hstack([[shapes(x) for x in PLACES], np.zeros((2, n + 1))])
+    inputs = np.column_stack([shaker_volts, patch_volts])
+    return scipy.signal.lsim((A, B, C, np.zeros((2, 2))), inputs, times)[1]
+
+
+def case(**shaker):
+    """The rig, with nominal values that are wrong where the test says so."""
+    return jb.Case(
+        jb.Beam(
+            length=LENGTH,
+            flexural_rigidity=RIGIDITY,
+            mass_per_length=DENSITY,
+            damping_ratio=DAMPING,
+            modes=MODES,
+        ),
+        actuators=[
+            jb.Shaker(**{**SHAKER, **shaker}, bandwidth=BANDWIDTH),
+            jb.Patch(**{**PATCH, "correction": 0.5}, amplifier_gain=GAIN),
+        ],
+        sensors=[jb.Sensor(x) for x in PLACES],
+    )
+
+
+TIMES = np.arange(1001) / 1000.0
+SWEPT = scipy.signal.chirp(TIMES, 2.0, 1.0, 60.0)
+STEPS = 2.0 * np.sign(np.sin(2 * np.pi * 3.1 * TIMES))
+
+
+def log(shaker_volts, patch_volts, noise=2e-7, seed=0, **about):
+    """Readings with white noise (m) and the two commands, as a log."""
+    readings = respond(TIMES, shaker_volts, patch_volts)
+    readings = readings + noise * np.random.default_rng(seed).normal(size=readings.shape)
+    values = np.column_stack([readings, shaker_volts, patch_volts])
+    return Log(
+        TIMES,
+        values,
+        ("d1", "d2", "u", "v"),
+        ("deflection", "deflection", "voltage", "voltage"),
+        ("m", "m", "V", "V"),
+        actuators=(None, None, 0, 1),
+        **about,
+    )
+
+
+@pytest.mark.slow
+def test_shaker_and_patch_are_found_together():
+    free = [
+        "actuators.0.force_per_volt",
+        "actuators.0.stiffness",
+        "actuators.0.damping",
+        "actuators.1.correction",
+    ]
+    start = case(force_per_volt=3.8, stiffness=4300.0, damping=60.0)
+    logs = [log(2.0 * SWEPT, 0 * SWEPT), log(SWEPT, STEPS, seed=1)]
+    fit = identify(start, logs, free)
+    truth = np.array([4.6, 3500.0, 80.0, 0.32])
+    np.testing.assert_allclose(fit.values, truth, rtol=0.02)
+    assert np.all(np.abs(fit.values - truth) < 4 * fit.errors)
+    assert fit.verdict == "converged" and not fit.unseen
+    np.testing.assert_allclose(fit.noise, 2e-7, rtol=0.1)
+
+
+@pytest.mark.slow
+def test_a_patch_alone_from_a_file(tmp_path):
+    made = log(0 * SWEPT, STEPS)
+    table = np.column_stack([made.times, made.values[:, [0, 1, 3]]])
+    path = tmp_path / "steps.csv"
+    np.savetxt(path, table, delimiter=",", header="t [s],d1 [m],d2 [m],v [V]", comments="")
+    path.with_suffix(".toml").write_text(
+        "[columns]\nd1 = { sensor = 0 }\nd2 = { sensor = 1 }\nv = { actuator = 1 }\n"
+    )
+    fit = identify(case(), read_log(path), {"actuators.1.correction": (0.05, 1.0)})
+    assert fit.values[0] == pytest.approx(0.32, rel=5e-3)
+    assert fit.case.controller is None
+    assert fit.cases[0].controller.values.shape == (2, 1001)
+
+
+def test_faulty_commands_are_refused():
+    good = log(SWEPT, STEPS)
+
+    def refused(message, rig=None, **changes):
+        with pytest.raises(ValueError, match=message):
+            identify(rig or case(), dataclasses.replace(good, **changes), "actuators.0.stiffness")
+
+    refused("u is the command to actuators.2, but the case has 2", actuators=(None, None, 2, 1))
+    refused("two of its channels are commands to actuators.0", actuators=(None, None, 0, 0))
+    refused(
+        "u holds force in V, but the command to actuators.0 is in V",
+        quantities=("deflection", "deflection", "force", "voltage"),
+    )
+    refused(
+        "v goes from -4 to 4 V, beyond what actuators.1 takes, -2.5 to 7.5 V",
+        values=good.values * [1.0, 1.0, 1.0, 2.0],
+    )
+    driven = dataclasses.replace(case(), controller=jb.Prescribed(offsets=[0.0, 0.0]))
+    refused("its commands and the controller of the case contradict each other", driven)
