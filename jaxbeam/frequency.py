@@ -224,7 +224,7 @@ def poles(case: Case, parked: Parked = ()) -> Complex[np.ndarray, " state"]:
     Plain numbers, not differentiable. Raises ValueError as `frequency_response` does.
     """
     check(case)
-    matrix, inertia = _matrices(rig(case), _parked(case, parked))
+    matrix, inertia = _matrices(_compiled_rig(case, lay_out(case)), _parked(case, parked))
     return _sorted(eigvals(np.asarray(matrix), np.asarray(inertia)))
 
 
@@ -236,7 +236,7 @@ def zeros(case: Case, pair: tuple[str, str], parked: Parked = ()) -> Complex[np.
     """
     check(case)
     (chosen,) = check_pairs(case, [pair])
-    model = rig(case)
+    model = _compiled_rig(case, lay_out(case))
     matrix, inertia = _matrices(model, _parked(case, parked))
     pushed, command = column(case, model, chosen.source)
     place, rate, direct = row(case, model, chosen.output)
@@ -247,6 +247,9 @@ def zeros(case: Case, pair: tuple[str, str], parked: Parked = ()) -> Complex[np.
     # Zeros at infinity come out as such, or as numbers far beyond anything that moves.
     fastest = np.abs(eigvals(np.asarray(matrix))).max()
     return _sorted(found[np.abs(found) < 1e4 * fastest])
+
+
+_compiled_rig = eqx.filter_jit(rig)  # in one piece, which takes less time than step by step
 
 
 def _sorted(values):

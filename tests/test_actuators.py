@@ -1,5 +1,6 @@
 """Actuators by themselves: what they say of their limits, and the physics of coil and patch."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case import addresses, replace
+from jaxbeam.modes import lay_out
 from jaxbeam.rig import rig
 
 # Smart Material M8557-P1 on rig B of the thesis: sections 2.4.1 and 2.4.2.
@@ -71,7 +73,8 @@ def test_other_actuators_say_their_limits_in_the_same_way():
 def test_energy_into_a_coil_heats_it_moves_the_beam_or_stays(back_emf):
     """u I = R I^2 + damping + d/dt of the stored energy, of any state, where K_v is K_f."""
     shaker = jb.Electrodynamic(0.5, 0.82, 5e-5, 4.2, back_emf, 0.02, 9700.0, 0.55)
-    model = rig(jb.Case(jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03), actuators=[shaker]))
+    case = jb.Case(jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03), actuators=[shaker])
+    model = eqx.filter_jit(rig)(case, lay_out(case))
     matrix = np.asarray(model.state_matrix[0])
     state = np.random.default_rng(1).standard_normal(7)
     volts, current, rates = 3.0, state[6], state[1:6:2]
@@ -86,6 +89,7 @@ def test_energy_into_a_coil_heats_it_moves_the_beam_or_stays(back_emf):
     assert_allclose(volts * current + created, stored + lost, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_ball_crosses_a_beam_with_a_shorted_coil():
     """Coupled electromechanical equations, written out for sines and integrated by scipy."""
     beam = {"length": 0.6, "rigidity": 11.68, "density": 0.535, "ratio": 0.03}

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,7 +114,7 @@ def test_many_modes_approach_the_exact_lift():
 @pytest.mark.parametrize("derivative", [0, 2, 3])
 def test_modes_and_residual_make_the_exact_response(derivative):
     """The modal part is the equilibrium of the rig's own equations, found from its state space."""
-    y, model = np.array([0.07, 0.5]), rig(GENERAL)
+    y, model = np.array([0.07, 0.5]), eqx.filter_jit(rig)(GENERAL, lay_out(GENERAL))
     matrix, modes = np.asarray(model.state_matrix[0]), GENERAL.beam.modes
     shapes = np.asarray(model.shapes(X, (derivative,))[0])
     states = -np.linalg.solve(matrix, np.asarray(model.command_matrix))
@@ -183,6 +184,7 @@ def test_moments_and_shear_of_a_clamped_beam(x):
     assert_allclose(shear_force(case, x, influence_line(case, x, 0.15, 3)), forces[x], rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_moment_under_a_slow_load_while_a_patch_pushes():
     """Three modes and the correction: P a b / L within the slight motion of a slow crossing."""
     case = jb.Case(

@@ -1,6 +1,7 @@
 """Frequency responses against the thesis's own formulas, python-control, and finite elements."""
 
 import control
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -164,7 +165,7 @@ def test_poles_and_zeros_of_the_shaker():
 
 def test_python_control_has_the_same_responses_of_the_state_space():
     """Deflection, velocity, slope and strain are rows of the states; acceleration needs B too."""
-    model = rig(GENERAL)
+    model = eqx.filter_jit(rig)(GENERAL, lay_out(GENERAL))
     A, B = np.asarray(model.state_matrix[0]), np.asarray(model.command_matrix)
     rows, direct = np.zeros((5, len(A))), np.zeros((5, 4))
     rows[0, 0:8:2] = model.shapes(1.1, (0,))[0]
