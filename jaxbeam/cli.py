@@ -145,6 +145,12 @@ def simulate(
         names = ("peak_deflection", "lowest_contact_force", "contact_lost_time")
         summary = {name: getattr(record, name) for name in names}
         summary |= {"error_estimate": record.error_estimate, "steps": record.steps}
+        if described.controller is not None:
+            summary |= {
+                "peak_command": record.peak_command,
+                "effort": record.effort,
+                "saturated": record.saturated.mean(axis=0),
+            }
         print_json(summary | {"verdict": record.verdict})
         return
     print(record.verdict)
@@ -157,6 +163,15 @@ def simulate(
         ("load", "lowest contact force (N)"),
         [(i, f"{force:.6g}") for i, force in enumerate(record.lowest_contact_force)],
     )
+    if described.controller is not None:
+        rows = zip(record.peak_command, record.effort, record.saturated.mean(axis=0), strict=True)
+        print_table(
+            ("actuator", "largest command", "effort (command^2 s)", "saturated"),
+            [
+                (i, f"{peak:.6g}", f"{effort:.6g}", f"{share:.1%}")
+                for i, (peak, effort, share) in enumerate(rows)
+            ],
+        )
     print(f"{record.steps} steps")
     print_written(output, picture)
 

@@ -42,7 +42,7 @@ def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
 
 
 class Moment(eqx.Module):
-    """A step, or several: when it starts (s), how long it is (s), which edge of the schedule it starts at.
+    """A step, or several: start (s), length (s), and the edge of the schedule it starts at.
 
     `edge` is -1 for a step that starts between two edges.
     """

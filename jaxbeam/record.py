@@ -106,8 +106,14 @@ class Record(eqx.Module):
         for i, actuator in enumerate(self.case.actuators):
             limits, given = actuator.command_limits(), self.command[:, i]
             if limits is not None:
-                columns[i] = (given <= limits[0]) | (given >= limits[1])
+                rounding = 1e-9 * (limits[1] - limits[0])
+                columns[i] = (given <= limits[0] + rounding) | (given >= limits[1] - rounding)
         return jnp.array(columns).reshape(len(columns), -1).T
+
+    @property
+    def peak_command(self) -> Float[Array, " actuator"]:
+        """Largest absolute command among the samples."""
+        return jnp.max(jnp.abs(self.command), axis=0, initial=0.0)
 
     @property
     def effort(self) -> Float[Array, " actuator"]:

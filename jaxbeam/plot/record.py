@@ -1,4 +1,4 @@
-"""One run: deflection at the sensors and contact forces over time."""
+"""One run: deflection at the sensors, contact forces and commands over time."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ from jaxbeam.record import Record
 
 @styled
 def plot_record(record: Record) -> Figure:
-    """Deflection at the sensors (dots: peaks), and below it the contact forces of the loads.
+    """Deflection at the sensors (dots: peaks), below it contact forces, and commands if any.
 
     The times with loads on the beam are shaded. On top, the rig shows where the sensors are.
     Raises ValueError if the record has neither sensors nor loads.
@@ -37,6 +37,7 @@ def plot_record(record: Record) -> Figure:
             (0.7, _draw_rig, True),
             (3.2, _draw_deflection, case.sensors),
             (1.7, _draw_forces, case.loads),
+            (1.7, _draw_commands, case.controller is not None),
         )
         if wanted
     ]
@@ -153,3 +154,28 @@ def _draw_forces(axes, record):
         axes.axhline(weight, color=tint, linewidth=0.9, linestyle=":")
     names = [f"weight {digits(weight)} {unit}" for weight in weights]
     margin_labels(axes, list(weights), names, list(weights.values()))
+
+
+def _draw_commands(axes, record):
+    times, command = np.asarray(record.times), np.asarray(record.command)
+    actuators = record.case.actuators
+    units = {type(a).__dataclass_fields__["limits"].metadata["unit"] for a in actuators}
+    _shade(axes, record)
+    axes.axhline(0, color=GREY, linewidth=0.8)
+    ends, names, tints = [], [], []
+    for i, actuator in enumerate(actuators):
+        # Commands of a sampled controller are held, not joined.
+        held = record.case.controller.period is not None
+        style = "steps-post" if held else "default"
+        axes.plot(times, command[:, i], color=load_colour(i), linewidth=1.1, drawstyle=style)
+        limits = actuator.command_limits()
+        if limits is None or not np.any(np.asarray(record.saturated)[:, i]):
+            continue
+        for limit in np.asarray(known(limits)):
+            if np.any(np.isclose(command[:, i], limit)):
+                axes.axhline(limit, color=load_colour(i), linewidth=0.9, linestyle=":")
+                ends.append(limit)
+                names.append(f"limit {digits(limit)}")
+                tints.append(load_colour(i))
+    axes.set_ylabel(f"command ({', '.join(sorted(units))})")
+    margin_labels(axes, ends, names, tints)
