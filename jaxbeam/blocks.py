@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from jaxbeam.case import Case, replace, value_at
 from jaxbeam.dynamics import Traffic, traffic
+from jaxbeam.exponentials import NODES
 from jaxbeam.grid import even_grid, scheduled_grid
 from jaxbeam.integrate import longest_step, march, trace
 from jaxbeam.lanes import Tasks
@@ -69,9 +70,10 @@ class Work:
         crossing = np.where(np.isfinite(crossing), crossing, duration)
         self.paces = 1 / crossing
         self.limits = np.minimum(limits, duration)
-        # As found for beams of 3 and 12 modes at fast and slow crossings.
+        # As found for beams of 3 and 12 modes at fast and slow crossings, errors of 1e-7.
         modes = case.beam.modes
         self.guesses = crossing / (15 * modes + 15 + 1.25 * crossing / limits / np.sqrt(modes))
+        self.guesses *= (tolerance / 1e-7) ** (1 / (2 * NODES))
 
     def steps(self) -> tuple[Float[np.ndarray, " task"], float]:
         """Time steps (s) of all tasks, and the relative error of peaks seen with them.

@@ -61,14 +61,14 @@ def _modal_line(case: Case, layout: Layout, x, positions, order: int):
 
 
 def corrected(
-    record: Record, x, derivative: int = 0, commands=None, layout: Layout | None = None
+    record: Record, x, derivative: int = 0, layout: Layout | None = None
 ) -> Float[Array, "time *place"]:
     """History of a record's deflection at x (m), statically corrected, in m.
 
     The sum of the modes, and what they miss of the deflection under the contact forces and the
-    `commands` (time, actuator) of each instant; `derivative` (up to 3) gives that x-derivative
-    instead. Good where forces and commands change slowly beside the first mode that was left out.
-    Raises ValueError as `influence_line` does, and for commands of another shape.
+    commands of each instant; `derivative` (up to 3) gives that x-derivative instead. Good where
+    forces and commands change slowly beside the first mode that was left out. Raises ValueError
+    as `influence_line` does.
     """
     case, x = record.case, jnp.asarray(x, float)
     shapes = record.modes.shapes(x, derivative)
@@ -77,16 +77,9 @@ def corrected(
         place = jnp.where(jnp.isfinite(record.load_position), record.load_position, 0.0)
         missed = residual_line(case, x, place, derivative, layout)
         history = history + jnp.einsum("tl,tl...->t...", record.contact_force, missed)
-    if commands is not None:
-        commands = jnp.asarray(commands, float)
-        wanted = (record.times.shape[0], len(case.actuators))
-        if commands.shape != wanted:
-            raise ValueError(
-                f"commands must have one row a sample and one column an actuator, {wanted};"
-                f" their shape is {commands.shape}"
-            )
+    if case.controller is not None:
         missed = residual_lift(case, x, derivative, layout)
-        history = history + jnp.tensordot(commands, missed, axes=1)
+        history = history + jnp.tensordot(record.command, missed, axes=1)
     return history
 
 

@@ -26,7 +26,7 @@ from jaxbeam.loads import AbstractLoad, MovingMass
 from jaxbeam.rig import Rig
 from jaxbeam.tables import Tables, make_rigging, tabulate
 
-CHUNK = 16
+CHUNK = 8
 # Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
 # a polynomial in each step, misses that mode's oscillation and feeds it.
 RESOLVED = 1.9 * NODES

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 ORDER = 9  # at which errors are taken to fall with the step; the true order is higher
-FINER = 1.5  # how much finer the runs are with which others are compared
+FINER = 1.25  # how much finer the runs are with which others are compared
 ROUNDS = 12
 SMALL = 1e-6  # of a run's largest peak: smaller ones need not be right to the tolerance
 

@@ -80,7 +80,7 @@ def test_error_is_that_of_the_worst_lane():
         return peaks
 
     error = errors(measure, np.arange(2), np.array([0.3, 0.6]))
-    np.testing.assert_allclose(error, [0.1 / 1.2, 0.2 / 1.4])
+    np.testing.assert_allclose(error, [0.06 / 1.24, 0.12 / 1.48])
 
 
 def test_spread_is_even_in_log_pace():

@@ -21,6 +21,7 @@ from jaxbeam.simulate import readings
 
 MASSES = np.linspace(0.1, 1.0, 64)
 SPEEDS = np.linspace(0.3, 10.0, 64)
+TOLERANCE = 5e-7  # of every peak; checked below against a reference
 CHECKED = slice(0, 64, 9)  # speeds at which peaks are compared with the reference
 FREE = (
     "beam.flexural_rigidity",
@@ -52,7 +53,8 @@ def rig(modes: int) -> jb.Case:
 def sweep_peaks(modes: int) -> np.ndarray:
     """Peaks of the grid by `jaxbeam.sweep`, choice of time steps included."""
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
-    return jb.sweep(rig(modes), over, progress=False).peak_deflection.values
+    found = jb.sweep(rig(modes), over, progress=False, tolerance=TOLERANCE)
+    return found.peak_deflection.values
 
 
 def compare(modes: int) -> list[tuple[str, float, float, float]]:
