@@ -30,6 +30,12 @@ TOGETHER = re.compile(
     r"beam\.length|(supports|actuators|sensors)\.\d+\.(position|start|end)|.*\.\d+"
 )
 
+# What decides when a controller acts and its sensors are read.
+CLOCK = re.compile(
+    r"run\.(duration|sample_rate)|controller\.(period|delay|times\.\d+)"
+    r"|sensors\.\d+\.(sampling_period|delay)"
+)
+
 
 def sweep(
     case: Case,
@@ -119,6 +125,11 @@ def _axes(case: Case, over: dict[str, Any], paired: bool, histories: bool) -> di
             raise ValueError(f"{address} takes a list of numbers, not {given!r}") from None
         if values.ndim != 1 or values.size == 0:
             raise ValueError(f"{address} takes a list of values, not one of shape {values.shape}")
+        if case.controller is not None and CLOCK.fullmatch(address):
+            raise ValueError(
+                f"{address} sets the clock of the run, which all runs with a controller share:"
+                " make a sweep for each of its values"
+            )
         if histories and address in ("run.duration", "run.sample_rate"):
             raise ValueError(
                 f"histories of different length do not fit together: leave out {address}"

@@ -1,5 +1,6 @@
 """Sweeps: they agree with single runs, mark what fails, and survive being killed."""
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -161,6 +162,13 @@ def test_other_faults_are_refused():
     two = jb.Case(CASE.beam, [*CASE.supports, jb.Support(0.2)], sensors=CASE.sensors)
     with pytest.raises(ValueError, match="change their order"):
         jb.sweep(two, {"supports.1.position": [0.2, 0.5]}, progress=False)
+    driven = dataclasses.replace(
+        CASE,
+        actuators=(jb.PointForce(0.2),),
+        controller=jb.Feedback(gains=[1.0], period=0.01),
+    )
+    with pytest.raises(ValueError, match="controller.period sets the clock of the run"):
+        jb.sweep(driven, {"controller.period": [0.01, 0.02]}, progress=False)
 
 
 @given(st.integers(1, 400), st.integers(1, 5), st.integers(0, 10))
