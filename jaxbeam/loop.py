@@ -3,7 +3,7 @@
 A controller with a sampling period acts at its ticks, on the readings it has by then; its command
 begins a delay later and is held, while the beam moves continuously in between. A controller
 without a period acts at every instant: its law is demanded at the Gauss nodes of each step, by
-iteration, beside the contact law.
+Newton's method, beside the contact law.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
 from jaxbeam.controller import Measurement
-from jaxbeam.dynamics import Traffic, at_instant
+from jaxbeam.dynamics import Traffic, at_instant, eliminate
 from jaxbeam.exponentials import GAUSS, NODES
 from jaxbeam.fields import known
 from jaxbeam.filters import analogue
@@ -28,7 +28,7 @@ from jaxbeam.schedule import Schedule, merged
 from jaxbeam.sensing import design, init, noise_samples, read
 from jaxbeam.statespace import LoadedBeam, state_space
 
-ITERATIONS = 8  # of a law at every instant; each gains digits, as steps are short for it
+ITERATIONS = 4  # of Newton's method for a law at every instant; one would do for a linear law
 
 
 def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> Schedule:
@@ -132,27 +132,30 @@ class Loop(AbstractDriver):
     def _at_every_instant(self, memory, state, moment: Moment, states):
         own, last = memory
         times = moment.start + moment.span * GAUSS
-        blind = self.model.case.controller.blind
-
-        def commands_for(state, time):
-            readings = self.seen @ state
-            readings = [
-                read(sensor, None, None, reading)[0]
-                for sensor, reading in zip(self.model.case.sensors, readings, strict=True)
-            ]
-            wanted, _ = self._step(own, jnp.stack(readings) if readings else readings, state, time)
-            return self._limited(wanted)
-
-        if blind:
-            commands = jax.vmap(lambda time: commands_for(state, time))(times)
+        if not self.inner:
+            commands = jax.vmap(lambda time: self._answer(own, state, time))(times)
             return commands, (own, commands[-1])
 
-        def closer(commands, _):
-            return jax.vmap(commands_for)(states(commands), times), None
+        def wanted(commands):
+            return jax.vmap(lambda *at: self._answer(own, *at))(states(commands), times)
 
         guess = jnp.broadcast_to(last, (NODES, *last.shape))
-        commands, _ = jax.lax.scan(closer, guess, length=ITERATIONS)
+        commands = newton(wanted, guess, ITERATIONS)
         return commands, (own, commands[-1])
+
+    def at_instants(self, states: Float[Array, "time state"], times: Float[Array, " time"]):
+        """Commands (time, actuator) of a law at every instant, for a single lane."""
+        own = _every_lane(self.model.case.controller.init(self.model), 1)
+        return jax.vmap(lambda state, time: self._answer(own, state[:, None], time)[:, 0])(
+            states, times
+        )
+
+    def _answer(self, own, state, time):
+        """Commands (actuator, lane) of a law at every instant, to a state."""
+        sensors, seen = self.model.case.sensors, self.seen @ state
+        readings = [read(s, None, None, value)[0] for s, value in zip(sensors, seen, strict=True)]
+        wanted, _ = self._step(own, jnp.stack(readings) if readings else seen, state, time)
+        return self._limited(wanted)
 
     def _act(self, memory, state, moment: Moment):
         """All that is due at an edge: readings, a new command, and commands that begin."""
@@ -223,6 +226,22 @@ class Loop(AbstractDriver):
                 command = jnp.clip(command, before[i] - change, before[i] + change)
             rows.append(command)
         return jnp.stack(rows)
+
+
+def newton(wanted, guess: Float[Array, "*shape lane"], iterations: int):
+    """Find what a function gives back unchanged, in each lane by itself, by Newton's method."""
+    lanes = guess.shape[-1]
+    size = guess.size // lanes
+    units = jnp.broadcast_to(jnp.eye(size)[..., None], (size, size, lanes))
+
+    def closer(value, _):
+        found, change = jax.linearize(wanted, value)
+        slopes = jax.vmap(change)(units.reshape(size, *guess.shape)).reshape(units.shape)
+        short = (found - value).reshape(size, lanes)
+        step = eliminate(units - jnp.swapaxes(slopes, 0, 1), short)
+        return value + step.reshape(guess.shape), None
+
+    return jax.lax.scan(closer, guess, length=iterations)[0]
 
 
 def _every_lane(memory, lanes: int):
