@@ -51,8 +51,9 @@ class Work:
         self.blocks = -(-count // self.each)
         self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
         layout = _common_layout(case, tasks)
-        # Loads and settings of the run leave the rig as it is: one serves all tasks.
-        moving = all(name.startswith(("loads.", "run.")) for name in self.addresses[0])
+        # Loads, settings of the run and controllers leave the rig as it is: one serves all tasks.
+        outside = ("loads.", "run.", "controller.")
+        moving = all(name.startswith(outside) for name in self.addresses[0])
         self.rig_of = np.zeros(count, int) if moving else np.arange(count)
         parts = [[0]] if moving else np.resize(np.arange(count), (self.blocks, self.each))
         windows = np.asarray(_windows(case, self.addresses[0], tasks.heavy))
@@ -221,10 +222,8 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
             rows = assembled.shapes(watched, (0,))[0]
             history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
         peak, time = best.peak()
-        # Extremes pass over what is not a number, but for the contact forces.
-        works = ~jnp.any(jnp.isnan(best.lowest), axis=0)
         return {
-            "peak_deflection": jnp.where(works, peak, jnp.nan).T,
+            "peak_deflection": peak.T,
             "peak_time": time.T,
             "lowest_contact_force": best.lowest.T,
             "contact_lost_time": never_as_nan(best.lost).T,

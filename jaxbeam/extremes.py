@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbeam.exponentials import GAUSS, POINTS
 from jaxbeam.motion import NEVER
@@ -28,11 +28,13 @@ class Extremes(eqx.Module):
     span: Float[Array, "sensor lane"]
     lowest: Float[Array, "load lane"]
     lost: Float[Array, "load lane"]
+    sound: Bool[Array, " lane"]
 
     def peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
-        """Largest absolute deflection (m) of each watched place, and when (s)."""
+        """Largest absolute deflection (m) of each watched place, and when (s); NaN if not sound."""
         value, place = refine(self.samples)
-        return value, self.start + place * self.span
+        time = self.start + place * self.span
+        return jnp.where(self.sound, value, jnp.nan), jnp.where(self.sound, time, jnp.nan)
 
 
 def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) -> Extremes:
@@ -55,6 +57,7 @@ def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) 
             jnp.where(better, span[top], best.span),
             best.lowest,
             best.lost,
+            best.sound,
         )
 
     # Most chunks come nowhere near the peak so far, or press all along: they end here.
@@ -73,7 +76,8 @@ def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) 
         return jnp.minimum(first, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
 
     first = jax.lax.cond(jnp.any(lowest < 0), lost, lambda first: first, best.lost)
-    return eqx.tree_at(lambda b: (b.lowest, b.lost), best, (lowest, first))
+    sound = best.sound & jnp.all(jnp.isfinite(highest), axis=0)
+    return eqx.tree_at(lambda b: (b.lowest, b.lost, b.sound), best, (lowest, first, sound))
 
 
 def nothing_seen(places: int, loads: int, lanes: int) -> Extremes:
@@ -86,4 +90,5 @@ def nothing_seen(places: int, loads: int, lanes: int) -> Extremes:
         nothing,
         jnp.full((loads, lanes), jnp.inf),
         jnp.full((loads, lanes), NEVER),
+        jnp.ones(lanes, bool),
     )

@@ -195,9 +195,9 @@ def march(
 ) -> Extremes:
     """Integrate from rest over a grid, keeping only extremes at the `watched` places (m).
 
-    The loop runs as long as it must: without a driver it ends early when the energy left after
-    the last exit cannot raise any peak. `slots` is how many loads may be on the beam at once.
-    Forward mode only.
+    The loop runs as long as it must: it ends early when all lanes are given up, and without a
+    driver when the energy left after the last exit cannot raise any peak. `slots` is how many
+    loads may be on the beam at once. Forward mode only.
     """
     chunk = _stepper(rig, traffic, grid, watched, slots, driver)
     flexibility = _flexibility(rig, watched)
@@ -221,7 +221,7 @@ def march(
         state, memory, best, first, _ = carry
         state, memory, best, _ = chunk(state, memory, best, first)
         first = first + CHUNK
-        going = jnp.ones((), bool) if driver is not None else still(state, best, first)
+        going = jnp.any(best.sound) if driver is not None else still(state, best, first)
         return state, memory, best, first, going
 
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)

@@ -5,6 +5,7 @@ code then works for any numbers for which the decisions hold.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -27,6 +28,7 @@ from jaxbeam.schedule import Schedule
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 EVEN = 1e-6  # of the spacing: more even samples are taken for equally spaced
+SURE = 3  # halvings of the step after which a loop that still diverges is taken to do so
 PROBES = (0.13, 0.29, 0.47, 0.62, 0.88)  # of the length: where errors are looked for
 
 
@@ -163,9 +165,13 @@ def _suitable_substeps(case: Case, form: Form, schedule: Schedule, tolerance: fl
     """How many steps to take from edge to edge of a schedule, and the error of the peaks."""
     fewest = max(1, int(np.ceil(float(schedule.lengths.max()) / _longest_step(case, form))))
 
+    @functools.cache
     def peaks(halvings):
         return np.asarray(_probe_driven(case, form, schedule, jnp.asarray(fewest * 2**halvings)))
 
+    # A loop that diverges does so with any step; how far it has come by then is not the question.
+    if np.isnan(peaks(1)).any() and np.isnan(peaks(SURE)).any():
+        return 2 * fewest, np.nan
     halvings, error = _halve(peaks, tolerance, 8)
     return fewest * 2**halvings, error
 

@@ -52,7 +52,7 @@ def simulate(
     record = _record(case, dataclasses.replace(plan, error=0.0), times, jnp.asarray(plan.error))
     if is_known(record.contact_lost_time):
         lost = np.isfinite(known(record.contact_lost_time))
-        if lost.any():
+        if lost.any() and np.isnan(known(record.diverged_time)):
             warnings.warn(record.verdict, ContactLossWarning, stacklevel=2)
     return record
 
@@ -132,8 +132,13 @@ def _trace(case: Case, plan: Plan, times, watched):
     )
     edges = plan.substeps * grid.place[schedule.samples]
     states = states[edges]
-    if commands is not None:
-        commands = _begin(case, commands, edges)
+    if driver is not None:
+        # A law at every instant is asked itself: its polynomials are less exact at their ends.
+        commands = (
+            driver.at_instants(states[..., 0], times)
+            if driver.inner
+            else _begin(case, commands, edges)
+        )
     return best, _outputs(assembled, loads, times, states, commands), assembled.modes, count
 
 
