@@ -1,0 +1,110 @@
+"""A case with a controller in the words of the independent closed loop."""
+
+import numpy as np
+
+from jaxbeam.actuators import Shaker
+from jaxbeam.case import Case
+from jaxbeam.control import Feedback, StateFeedback
+from jaxbeam.loads import MovingMass
+from tests.oracles import closed_loop
+from tests.oracles.loads import Load
+from tests.oracles.modal_equations import Span
+
+
+def span_of(case: Case) -> Span:
+    beam = case.beam
+    numbers = beam.length, beam.rigidity, beam.linear_density
+    return Span(*map(float, numbers), beam.modes, float(beam.damping_ratio))
+
+
+def expected(case: Case, times) -> closed_loop.Motion:
+    """The motion of a case at times (s) by the oracle; loads must travel at given speeds."""
+    loads = [
+        Load(
+            float(load.mass),
+            float(load.speed),
+            float(load.entry_time),
+            kind="mass" if isinstance(load, MovingMass) else "force",
+        )
+        for load in case.loads
+    ]
+    controller, clock = case.controller, None
+    if controller.period is not None:
+        delay = _number(controller.delay) or 0.0
+        period = float(controller.period)
+        clock = closed_loop.Clock(period, delay, _number(controller.resolution))
+    knots = [] if controller.knots() is None else np.asarray(controller.knots()).tolist()
+    return closed_loop.respond(
+        span_of(case),
+        loads,
+        [_actuator(actuator) for actuator in case.actuators],
+        [_sensor(sensor) for sensor in case.sensors],
+        _law(controller),
+        np.asarray(times).tolist(),
+        clock,
+        knots,
+    )
+
+
+def _actuator(actuator) -> closed_loop.Actuator:
+    device, limits = actuator.attachment(), actuator.command_limits()
+    gain, lag = device.feedthrough, None
+    if isinstance(actuator, Shaker):
+        gain, lag = actuator.force_per_volt, float(actuator.bandwidth)
+    return closed_loop.Actuator(
+        [(float(x), order, factor) for x, order, factor in actuator.stroke()],
+        float(gain),
+        lag,
+        float(device.stiffness),
+        float(device.damping),
+        None if limits is None else tuple(np.asarray(limits).tolist()),
+        _number(actuator.command_rate()),
+    )
+
+
+def _sensor(sensor) -> closed_loop.Sensor:
+    filter = {}
+    if sensor.filter is not None:
+        analogue = sensor.filter.realisation == "analogue"
+        cutoff = float(sensor.filter.cutoff)
+        filter = {"order": sensor.filter.order, "cutoff": cutoff, "analogue": analogue}
+    return closed_loop.Sensor(
+        float(sensor.position),
+        sensor.quantity,
+        _number(sensor.fibre_distance) or 0.0,
+        float(sensor.offset),
+        None if sensor.range is None else tuple(np.asarray(sensor.range).tolist()),
+        _number(sensor.resolution),
+        period=_number(sensor.sampling_period),
+        delay=_number(sensor.delay) or 0.0,
+        **filter,
+    )
+
+
+def _law(controller) -> closed_loop.Law:
+    if isinstance(controller, Feedback):
+        gains, power = np.asarray(controller.gains), controller.power
+        heard = slice(0, gains.size)
+        return lambda readings, *_: (
+            -gains * readings[heard] * np.abs(readings[heard]) ** (power - 1)
+        )
+    if isinstance(controller, StateFeedback):
+        gain = np.asarray(controller.gain)
+        return lambda _, state, t: -gain @ state
+
+    def prescribed(_, state, t):
+        command = np.array(controller.offsets)
+        if controller.amplitudes is not None:
+            turn = 2 * np.pi * np.asarray(controller.frequencies) * t
+            turn = turn + (0.0 if controller.phases is None else np.asarray(controller.phases))
+            command = command + (np.asarray(controller.amplitudes) * np.sin(turn)).sum(axis=1)
+        if controller.times is not None:
+            for i, row in enumerate(np.asarray(controller.values)):
+                command[i] += np.interp(t, controller.times, row, left=0.0, right=0.0)
+        return command
+
+    return prescribed
+
+
+def _number(value) -> float | None:
+    return None if value is None else float(value)

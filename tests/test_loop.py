@@ -1,0 +1,311 @@
+"""Closed loops against an independent one, python-control, energy, and reference numbers.
+
+Every test compiles a loop or two of its own, hence plans made by hand, which compile nothing.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import control
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.loop import loop_schedule
+from jaxbeam.plan import Plan, form
+from tests.loop_as_oracle import expected, span_of
+
+TIMES = np.linspace(0.0, 0.4, 81)
+BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
+MASS = jb.MovingMass(mass=0.4, speed=2.0)  # leaves at 0.3 s
+SHAKER = jb.Shaker(0.5, stiffness=3500.0, damping=8.0, force_per_volt=4.6, bandwidth=400.0)
+PATCH = jb.Patch(0.2575, 0.3425, 8.3e-4, correction=0.32, amplifier_gain=200.0)
+PLACE = jb.Sensor(0.25)
+
+
+def loop(actuators, sensors, controller, beam=BEAM, loads=(MASS,), duration=0.4) -> jb.Case:
+    return jb.Case(beam, (), actuators, sensors, loads, controller, jb.Run(duration))
+
+
+def planned(case: jb.Case, times, substeps: int) -> Plan:
+    """A plan of so many steps between edges, whose error nobody measured."""
+    return Plan(form(case), substeps, 0, False, 0.0, loop_schedule(case, np.asarray(times)))
+
+
+def run(case: jb.Case, times=TIMES, substeps: int = 2) -> jb.Record:
+    return jb.simulate(case, jnp.asarray(times), planned(case, times, substeps))
+
+
+ALL_STATES = [[300.0, 10.0, 20.0, 2.0, 0.1, -0.1, 0.02]]
+SIGNALS = {
+    "offsets": [0.1, 0.2],
+    "amplitudes": [[0.3, 0.1], [0.4, 0.0]],
+    "frequencies": [7.0, 23.0],
+    "phases": [[0.0, 1.0], [2.0, 0.0]],
+    "times": [0.0123, 0.1, 0.2347],  # neither of them a sample, the last one a jump
+    "values": [[1.0, 2.0, -1.0], [0.0, 3.0, 1.0]],
+}
+LOOPS = {
+    "state held, delay within a period": loop(
+        [SHAKER], [PLACE], jb.StateFeedback(ALL_STATES, period=1e-3, delay=4e-4)
+    ),
+    "delay beyond two periods, filter at the sensor's own clock": loop(
+        [SHAKER],
+        [jb.Sensor(0.25, sampling_period=0.0033, filter=jb.Filter(50.0, 2))],
+        jb.Feedback([300.0], period=0.0021, delay=0.0048),
+    ),
+    "two actuators, two sensors": loop(
+        [SHAKER, PATCH],
+        [
+            jb.Sensor(
+                0.25, offset=1e-4, filter=jb.Filter(60.0, 3), sampling_period=1e-3, delay=0.0013
+            ),
+            jb.Sensor(0.3, "velocity", delay=0.003, resolution=1e-3, range=[-0.01, 0.02]),
+        ],
+        jb.Feedback([200.0, 0.3], period=2e-3, delay=5e-4),
+    ),
+    "saturation and quantisation": loop(
+        [dataclasses.replace(SHAKER, limits=jnp.array([-0.3, 0.4]))],
+        [PLACE],
+        jb.Feedback([500.0], period=2e-3, resolution=0.01),
+    ),
+    "rate limit": loop(
+        [dataclasses.replace(PATCH, rate_limit=jnp.array(3.0))],
+        [PLACE],
+        jb.Feedback([500.0], period=2e-3, delay=1e-3),
+    ),
+    "acceleration through a digital filter": loop(
+        [PATCH],
+        [jb.Sensor(0.25, "acceleration", filter=jb.Filter(80.0, 2), delay=7e-4)],
+        jb.Feedback([0.005], period=2e-3),
+    ),
+    "strain through an analogue filter, sampled": loop(
+        [PATCH],
+        [
+            jb.Sensor(
+                0.25,
+                "strain",
+                fibre_distance=1.65e-3,
+                filter=jb.Filter(20.0, 4, realisation="analogue"),
+                delay=1e-3,
+            )
+        ],
+        jb.Feedback([5e3], period=2e-3),
+    ),
+    "prescribed at every instant": loop([SHAKER, PATCH], [PLACE], jb.Prescribed(**SIGNALS)),
+    "prescribed and held": loop(
+        [SHAKER, PATCH], [PLACE], jb.Prescribed(**SIGNALS, period=5e-3, delay=1e-3)
+    ),
+    "linear law at every instant": loop([SHAKER], [PLACE], jb.StateFeedback(ALL_STATES)),
+    "cubic law at every instant": loop([PATCH], [PLACE], jb.Feedback([2e8], power=3)),
+    "law through an analogue filter": loop(
+        [PATCH],
+        [jb.Sensor(0.25, filter=jb.Filter(20.0, 4, realisation="analogue"))],
+        jb.Feedback([1000.0]),
+    ),
+    "strong damping at every instant": loop(
+        [jb.PointForce(0.3)], [jb.Sensor(0.3, "velocity")], jb.Feedback([200.0])
+    ),
+}
+QUICK = ("saturation and quantisation", "linear law at every instant")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in LOOPS],
+)
+def test_loops_are_those_of_the_oracle(name):
+    case = LOOPS[name]
+    record = run(case, substeps=4 if case.controller.period is None else 2)
+    truth = expected(case, TIMES)
+    for found, true in ((record.deflection, truth.deflection), (record.command, truth.command)):
+        size = np.max(np.abs(true), axis=0)
+        assert np.all(size > 0)
+        assert np.all(np.abs(found - true) <= 1e-9 * size)
+
+
+@pytest.mark.slow
+def test_a_law_that_saturates_meets_the_tolerance():
+    """Where the command bends within a step the order is lost; the plan sees it."""
+    limited = dataclasses.replace(SHAKER, limits=jnp.array([-0.3, 0.4]))
+    case = loop([limited], [PLACE], jb.Feedback([500.0]))
+    record = jb.simulate(case, jnp.asarray(TIMES))
+    assert 0 < record.error_estimate <= 1e-7
+    truth = expected(case, TIMES)
+    assert_allclose(record.deflection, truth.deflection, rtol=0, atol=2e-7 * 1e-3)
+    assert np.max(record.command) == 0.4 and 0 < np.sum(record.saturated) < TIMES.size
+
+
+@pytest.mark.slow
+def test_fast_sampling_converges_to_the_law_at_every_instant():
+    """At first order: the hold is late by half a period on average."""
+    case = loop([PATCH], [PLACE], jb.Feedback([1000.0]))
+    law = expected(case, TIMES[::2]).modal
+    errors = []
+    for period in (4e-3, 2e-3, 1e-3):
+        held = dataclasses.replace(case, controller=jb.Feedback([1000.0], period=period))
+        errors.append(np.max(np.abs(run(held, TIMES[::2], 1).coordinates - law)))
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert_allclose(orders, 1.0, atol=0.05)
+    assert errors[-1] < 2e-3 * np.max(np.abs(law))
+
+
+PARKED = jb.MovingMass(mass=0.2, times=[0.0, 9.0], positions=[0.2, 0.2])
+
+
+def parked_plant() -> control.StateSpace:
+    """Beam and parked mass, from patch voltage and the mass's weight to deflection at 0.25 m."""
+    span = span_of(loop([PATCH], [PLACE], jb.Feedback([1.0])))
+    patch = 8.3e-4 * 0.32 * 200.0 * (span.shapes(0.2575, 1) - span.shapes(0.3425, 1))
+    under, n = span.shapes(0.2), span.modes
+    mobility = np.linalg.inv(np.eye(n) + 0.2 * np.outer(under, under))
+    damping = 2 * span.damping_ratio * np.diag(span.frequencies)
+    stiffness = np.diag(span.frequencies**2)
+    upper = np.hstack([np.zeros((n, n)), np.eye(n)])
+    a = np.vstack([upper, -mobility @ np.hstack([stiffness, damping])])
+    b = np.vstack([np.zeros((n, 2)), mobility @ np.stack([patch, -under], axis=1)])
+    c = np.hstack([span.shapes(0.25), np.zeros(n)])[None]
+    return control.ss(a, b, c, np.zeros((1, 2)), inputs=["u", "weight"], outputs=["w"])
+
+
+@pytest.mark.slow
+def test_a_time_invariant_sampled_loop_is_that_of_python_control():
+    """Zero-order hold of the plant, filter and delay of one period in the feedback path."""
+    period, gain = 2e-3, 800.0
+    sensor = jb.Sensor(0.25, filter=jb.Filter(40.0, 2))
+    law = jb.Feedback([gain], period=period, delay=period)
+    case = loop([PATCH], [sensor], law, loads=(PARKED,))
+    times = period * np.arange(201)
+    record = run(case, times, substeps=3)
+
+    plant = control.c2d(parked_plant(), period, "zoh")
+    filter = control.tf(*scipy.signal.butter(2, 40.0, fs=1 / period), period)
+    late = control.tf([1.0], [1.0, 0.0], period)
+    back = control.ss(gain * late * filter, inputs=["w"], outputs=["u_back"])
+    minus = control.summing_junction(["-u_back"], "u")
+    whole = control.interconnect([plant, back, minus], inputs=["weight"], outputs=["w", "u"])
+    weight = np.full((1, times.size), 0.2 * 9.81)
+    response = control.forced_response(whole, times, weight).outputs
+    size = np.max(np.abs(response), axis=1)
+    assert_allclose(record.deflection[:, 0], response[0], rtol=0, atol=1e-9 * size[0])
+    # The command printed at a tick is the one that begins there.
+    assert_allclose(record.command[:, 0], response[1], rtol=0, atol=1e-9 * size[1])
+
+
+@pytest.mark.slow
+def test_poles_of_a_law_at_every_instant_are_those_of_python_control():
+    """Seen in the motion after the load has left."""
+    case = LOOPS["strong damping at every instant"]
+    times = np.concatenate([[0.0], 0.301 + 1e-3 * np.arange(100)])
+    record = run(case, times, substeps=8)
+    states = np.hstack([record.coordinates, record.rates])[1:].T
+
+    span = span_of(case)
+    n, push = span.modes, span.shapes(0.3)
+    damping, stiffness = 2 * span.damping_ratio * span.frequencies, span.frequencies**2
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(stiffness), -np.diag(damping)]])
+    see = np.append(np.zeros(n), push)[None]
+    plant = control.ss(a, np.append(np.zeros(n), push)[:, None], see, 0.0)
+    whole = control.feedback(plant, 200.0)
+    step = scipy.linalg.expm(whole.A * 1e-3)
+    later = np.stack(
+        [np.linalg.matrix_power(step, k) @ states[:, 0] for k in range(states.shape[1])], axis=1
+    )
+    assert_allclose(states, later, rtol=0, atol=1e-9 * np.abs(states).max(axis=1).max())
+
+
+@pytest.mark.slow
+def test_energy_is_conserved():
+    """Work of actuators and load = change of the beam's energy + dissipation.
+
+    Integrated by Gauss's rule from one change of the commands to the next; the shaker's force
+    follows from its own equation under the held commands.
+    """
+    period, delay = 2e-3, 5e-4
+    law = jb.Feedback([300.0, 0.5], period=period, delay=delay)
+    sensors = [jb.Sensor(0.25, filter=jb.Filter(60.0, 2)), jb.Sensor(0.3, "velocity")]
+    case = loop([SHAKER, PATCH], sensors, law)
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    starts = np.append(0.0, delay + period * np.arange(149))  # the load leaves at 0.3
+    spans = np.diff(np.append(starts, 0.3))
+    inner = starts[:, None] + spans[:, None] * (1 + nodes) / 2
+    times = np.append(np.append(0.0, inner.ravel()), 0.3)
+    record = run(case, times, substeps=1)
+    held = np.asarray(record.command)[1:-1].reshape(len(starts), 6, 2)
+    assert np.ptp(held, axis=1).max() == 0.0
+
+    def at(positions, quantity):
+        return np.asarray(record.at(jnp.asarray(positions), quantity))[1:-1]
+
+    z, drive = 0.0, np.zeros((len(starts), 6))
+    for k, command in enumerate(held[:, 0, 0]):
+        drive[k] = command + (z - command) * np.exp(-400.0 * (inner[k] - starts[k]))
+        z = command + (z - command) * np.exp(-400.0 * spans[k])
+    q, rates = np.asarray(record.coordinates), np.asarray(record.rates)
+    span = span_of(case)
+    slopes = span.shapes(0.2575, 1) - span.shapes(0.3425, 1)
+    at_shaker = at([0.5], "velocity")[:, 0]
+    power = drive.ravel() * 4.6 * at_shaker
+    power = power + 8.3e-4 * 0.32 * 200.0 * held[:, :, 1].ravel() * (rates[1:-1] @ slopes)
+    supplied = power.reshape(-1, 6)
+    under = np.array(
+        [span.shapes(x) @ u for x, u in zip(2.0 * inner.ravel(), rates[1:-1], strict=True)]
+    )
+    work = (-np.asarray(record.contact_force)[1:-1, 0] * under).reshape(-1, 6)
+    lost = 8.0 * at_shaker**2 + rates[1:-1] ** 2 @ (2 * 0.03 * span.frequencies)
+
+    def total(rate):
+        return float(np.sum(rate.reshape(-1, 6) @ weights * spans / 2))
+
+    end = (rates[-1] ** 2).sum() + (q[-1] ** 2) @ span.frequencies**2
+    stored = (end + 3500.0 * (span.shapes(0.5) @ q[-1]) ** 2) / 2
+    size = total(np.abs(supplied)) + total(np.abs(work))
+    assert abs(total(supplied)) > 0.02 * size
+    assert_allclose(total(supplied) + total(work), stored + total(lost), rtol=0, atol=1e-8 * size)
+
+
+REFERENCE = json.loads((Path(__file__).parent / "data" / "reference_control.json").read_text())
+
+
+def of_reference(name: str) -> jb.Case:
+    """Rig A under its time-invariant gain, rig B under a constant voltage or proportional laws."""
+    known = REFERENCE[name]
+    if name == "time-invariant gain":
+        beam = jb.Beam(0.6, 11.68, 0.535, 0.03, modes=3)
+        shaker = jb.Shaker(0.5, stiffness=12000.0, damping=80.0, force_per_volt=2.5, bandwidth=1e4)
+        # The gain is for amplitudes of sines, the states are mass-normalised.
+        scale = np.full(6, np.sqrt(2 / (0.535 * 0.6)))
+        gain = np.array(known["gain"]) * np.array(known["used"]) * np.append(scale, 1.0)
+        law, sensor, duration = jb.StateFeedback(gain[None]), jb.Sensor(0.25), 1.5
+        return loop([shaker], [sensor], law, beam, [jb.MovingMass(0.509, 0.55)], duration)
+    beam = jb.Beam(0.6, 13.211, 0.812, 0.03, modes=5)
+    patch = jb.Patch(0.2575, 0.3425, known["moment_per_volt"], amplifier_gain=200.0)
+    filter = None
+    if name == "constant voltage":
+        law = jb.Prescribed([7.5])
+    elif name == "linear law":
+        law = jb.Feedback([2e3])
+    else:
+        law, filter = jb.Feedback([2e9], 3), jb.Filter(10.0, 10, realisation="analogue")
+    load = jb.MovingMass(known["mass"], known["speed"])
+    return loop([patch], [jb.Sensor(0.3, filter=filter)], law, beam, [load], 1.21)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REFERENCE)
+def test_reference_numbers(name):
+    known = REFERENCE[name]
+    record = run(of_reference(name), np.append(0.0, known["time_s"]), known["substeps"])
+    for found, true in (
+        (record.deflection[1:, 0], known["deflection_m"]),
+        (record.command[1:, 0], known["command"]),
+    ):
+        # Twelve digits of a deflection in mm are given, and 1e-6 is promised.
+        assert_allclose(found, true, rtol=0, atol=1e-8 * np.max(np.abs(true)))
+    peak = known["largest_deflection_m"]
+    assert_allclose(record.peak_deflection[0], peak, rtol=known["peak_tolerance"])
