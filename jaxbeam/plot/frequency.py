@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator, NullFormatter
+from matplotlib.ticker import LogFormatter, MultipleLocator, NullFormatter
 
 from jaxbeam.frequency import FrequencyResponse
 from jaxbeam.plot.style import FAINT, colour, name, styled
@@ -28,7 +28,10 @@ def plot_frequency(response: FrequencyResponse) -> Figure:
             bottom.semilogx(frequencies, phase[:, i], color=colour(number))
         top.set_ylabel("magnitude" if unit == "1" else f"magnitude ({unit.replace('^2', '²')})")
         top.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2)
-        top.yaxis.set_minor_formatter(NullFormatter())
+        # Within one decade the powers of ten alone would leave the axis without numbers.
+        least, most = top.get_ylim()
+        few = most < 20 * least
+        top.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False) if few else NullFormatter())
         top.grid(True, which="minor", color=FAINT, linewidth=0.3)
         low, high = np.min(phase[:, chosen]), np.max(phase[:, chosen])
         bottom.set_ylim(90 * np.floor(low / 90 - 0.1), 90 * np.ceil(high / 90 + 0.1))
