@@ -196,10 +196,9 @@ def _shape(value: Any) -> tuple[int, ...] | None:
     """Shape of a number or of nested lists of numbers; None for anything else."""
     if not isinstance(value, list):
         return () if isinstance(value, int | float) and not isinstance(value, bool) else None
-    shapes = {_shape(entry) for entry in value}
-    if len(shapes) > 1 or None in shapes:
-        return None
-    return (len(value), *(shapes.pop() if shapes else ()))
+    shapes = {_shape(entry) for entry in value} or {()}
+    inner = shapes.pop()
+    return None if shapes or inner is None else (len(value), *inner)
 
 
 def _write_part(address: str, part: Any, kind: Kind) -> dict[str, Any]:

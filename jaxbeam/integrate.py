@@ -67,7 +67,9 @@ class AbstractDriver(eqx.Module):
         """Its memory at the start of a run, of any structure."""
 
     @abc.abstractmethod
-    def drive(self, memory, state: Float[Array, "state lane"], moment: Moment, states):
+    def drive(
+        self, memory, state: Float[Array, "state lane"], moment: Moment, states
+    ) -> tuple[Float[Array, "node actuator lane"], Any]:
         """Commands (node, actuator, lane) of a step from this state, and the memory after it.
 
         `states` takes commands to the states at the nodes (node, state, lane), if `inner`.
@@ -172,8 +174,9 @@ def trace(
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
 
     def whole(carry, first):
-        *carry, history = chunk(*carry, first)
-        return tuple(carry), history
+        state, memory, best = carry
+        state, memory, best, history = chunk(state, memory, best, first)
+        return (state, memory, best), history
 
     best = None if watched is None else nothing_seen(watched.shape[0], loads, lanes)
     memory = None if driver is None else driver.start(lanes)

@@ -56,7 +56,7 @@ def merged(
     samples: Float[np.ndarray, " time"],
     ticks: Float[np.ndarray, " tick"],
     delay: float,
-    clocks: list[Float[np.ndarray, " read"]],
+    clocks: list[Float[np.ndarray, "_"]],
     late: list[float],
     knots: Float[np.ndarray, " knot"],
 ) -> Schedule:
@@ -104,9 +104,14 @@ def merged(
         return jnp.asarray(np.array(parts).reshape(len(parts), times.size).T, int)
 
     return Schedule(
-        *(jnp.asarray(part) for part in (times, kind, means, edges(samples), tick, apply)),
-        columns(reads),
-        columns(age),
+        jnp.asarray(times),
+        jnp.asarray(kind),
+        jnp.asarray(means),
+        jnp.asarray(edges(samples)),
+        tick=jnp.asarray(tick),
+        apply=jnp.asarray(apply),
+        reads=columns(reads),
+        age=columns(age),
         newest=int(max((part.max() for part in age), default=0)),
         waiting=int(apply.max(initial=0)),
         most_reads=max((clock.size for clock in clocks), default=0),
