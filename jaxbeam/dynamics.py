@@ -122,7 +122,7 @@ def solve_contact(gains, inertia, drive):
     rows = [inertia[i] * gains[i][:, None] for i in range(size)]
     rows = [row.at[i].add(1.0) for i, row in enumerate(rows)] if size > 8 else rows
     if size > 8:
-        return eliminate(jnp.stack(rows), -drive)
+        return _eliminate(jnp.stack(rows), -drive)
     matrix = [[rows[i][j] + (i == j) for j in range(size)] for i in range(size)]
     right = [-drive[i] for i in range(size)]
     for i in range(size):
@@ -148,8 +148,8 @@ def _solve_contact_jvp(primals, tangents):
     return forces, solve_contact(gains, inertia, change)
 
 
-def eliminate(matrix, right):
-    """Solve matrix (row, row, lane) x = right (row, lane) by Gauss-Jordan, without pivoting."""
+def _eliminate(matrix, right):
+    """Gauss-Jordan elimination of (row, row, lane), a whole pivot at a time."""
     size = right.shape[0]
     for i in range(size):
         row, value = matrix[i] / matrix[i, i], right[i] / matrix[i, i]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
 from jaxbeam.controller import Measurement
-from jaxbeam.dynamics import Traffic, at_instant, eliminate
+from jaxbeam.dynamics import Traffic, at_instant
 from jaxbeam.exponentials import GAUSS, NODES
 from jaxbeam.fields import known
 from jaxbeam.filters import analogue
@@ -238,8 +238,8 @@ def newton(wanted, guess: Float[Array, "*shape lane"], iterations: int):
         found, change = jax.linearize(wanted, value)
         slopes = jax.vmap(change)(units.reshape(size, *guess.shape)).reshape(units.shape)
         short = (found - value).reshape(size, lanes)
-        step = eliminate(units - jnp.swapaxes(slopes, 0, 1), short)
-        return value + step.reshape(guess.shape), None
+        step = jnp.linalg.solve((units - slopes).T, short.T[..., None])
+        return value + step[..., 0].T.reshape(guess.shape), None
 
     return jax.lax.scan(closer, guess, length=iterations)[0]
 
