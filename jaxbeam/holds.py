@@ -20,7 +20,7 @@ def hold(
     first-order hold with c_0 = u(0) and c_1 = u(h) - u(0). Exact, by one matrix exponential
     (Van Loan, IEEE Trans. Automatic Control 1978) of the balanced system.
     """
-    scale = _balance(matrix)
+    scale = balance(matrix)
     matrix, column = matrix * scale / scale[:, None], column / scale[:, None]
     states, inputs = column.shape
     powers = degree + 1
@@ -36,7 +36,7 @@ def hold(
     return drift, jnp.moveaxis(push, 1, 0) * factorials[:, None, None] * scale[:, None]
 
 
-def _balance(matrix):
+def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
     """Scale of the states with which rows and columns of the matrix are of like size.
 
     Without it, squaring an exponential of deflections in m and their rates in m/s loses digits.
