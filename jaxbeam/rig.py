@@ -70,7 +70,11 @@ def rig(case: Case, layout: Layout | None = None, coupled: bool = True) -> Rig:
     needed inside `jit`, where the numbers that decide it are not known.
     """
     layout = lay_out(case) if layout is None else layout
-    found = modes(case, layout)
+    return assemble(case, modes(case, layout), coupled)
+
+
+def assemble(case: Case, found: Modes, coupled: bool = True) -> Rig:
+    """The rig of a case whose modes are known already; see `rig`."""
     count = case.beam.modes
     if not coupled:
         zero, one = jnp.zeros(count), jnp.ones(count)

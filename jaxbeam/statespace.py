@@ -269,7 +269,14 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
 
     Raises ValueError for other coordinates, and if the modes are no sines.
     """
-    model = rig(case, layout)
+    return loaded_beam(case, rig(case, layout), coordinates)
+
+
+def loaded_beam(case: Case, model: Rig, coordinates: str = "modal") -> LoadedBeam:
+    """The state space of a case whose rig is assembled already; see `state_space`.
+
+    Raises ValueError as that does.
+    """
     if coordinates == "modal":
         scale, coordinate = jnp.ones(case.beam.modes), Signal("q", "m kg^0.5")
     elif coordinates == "sine":
