@@ -1,0 +1,73 @@
+"""What a controller is designed for, where that differs from the rig it is used on."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.fields import NOT_NEGATIVE, number
+from jaxbeam.rig import assemble
+from jaxbeam.statespace import LoadedBeam, loaded_beam
+
+OF_ACTUATORS = ("force_per_volt", "stiffness", "damping", "correction")
+OF_LOADS = ("mass", "speed")
+
+
+class Beliefs(eqx.Module):
+    """Numbers of actuators and loads as the designer believes them to be.
+
+    Each is one number for all that have it, or a list with one for each actuator (or load).
+    What is left out is as in the case. `stiffness = 0` leaves the suspension of shakers out of
+    the design.
+    """
+
+    force_per_volt: Float[Array, " *actuator"] | None = number(
+        "N/V", "steady force of shakers per volt", default=None
+    )
+    stiffness: Float[Array, " *actuator"] | None = number(
+        "N/m", "suspension of shakers and springs", NOT_NEGATIVE, default=None
+    )
+    damping: Float[Array, " *actuator"] | None = number(
+        "N s/m", "damping of suspensions", NOT_NEGATIVE, default=None
+    )
+    correction: Float[Array, " *actuator"] | None = number(
+        "1", "share of the moment of patches that reaches the beam", default=None
+    )
+    mass: Float[Array, " *load"] | None = number(
+        "kg", "masses of loads", NOT_NEGATIVE, default=None
+    )
+    speed: Float[Array, " *load"] | None = number("m/s", "speeds of loads", default=None)
+
+    def fault(self, case: Any) -> str | None:
+        """What is wrong with them in a case, as "key must ...", or None."""
+        for names, parts in ((OF_ACTUATORS, case.actuators), (OF_LOADS, case.loads)):
+            for name in names:
+                value = getattr(self, name)
+                if value is None:
+                    continue
+                if value.shape not in ((), (len(parts),)):
+                    return f"{name} must be one number or {len(parts)}, not {value.shape[0]}"
+                if not any(getattr(part, name, None) is not None for part in parts):
+                    return f"{name} has no effect: no part of the case has a {name}"
+        return None
+
+    def applied(self, model: LoadedBeam, coordinates: str) -> LoadedBeam:
+        """The state space of the case as believed, on the same modes of the beam."""
+        case = model.case
+        for key, names in (("actuators", OF_ACTUATORS), ("loads", OF_LOADS)):
+            parts = getattr(case, key)
+            for name in names:
+                value = getattr(self, name)
+                if value is None:
+                    continue
+                values = jnp.broadcast_to(value, (len(parts),))
+                parts = tuple(_changed(part, name, values[i]) for i, part in enumerate(parts))
+            case = eqx.tree_at(lambda c, key=key: getattr(c, key), case, parts)
+        return loaded_beam(case, assemble(case, model.rig.modes), coordinates)
+
+
+def _changed(part, name, value):
+    if getattr(part, name, None) is None:
+        return part
+    return eqx.tree_at(lambda p: getattr(p, name), part, value)

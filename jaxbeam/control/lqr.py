@@ -1,0 +1,279 @@
+"""Linear-quadratic regulators, fed by the true state: one gain, or gains over the crossing.
+
+    J = x(end)' F x(end) + integral of x'Qx + u'Ru,     u = -K x        (thesis, eqs 3.3 and 3.7)
+
+The weights are on the states of `state_space` in the chosen coordinates.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.gains import GainTable, crossing, edges_between, finite_time, step_by_step
+from jaxbeam.control.riccati import lqr
+from jaxbeam.controller import AbstractController
+from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, is_known, known, number
+from jaxbeam.fields import part as inner
+from jaxbeam.statespace import LoadedBeam, loaded_beam
+
+TURN = 3.0  # rad by which the fastest mode may turn within a stretch of a table
+
+
+class AbstractRegulator(AbstractController):
+    """What all linear-quadratic regulators share: weights, coordinates, and the model designed for.
+
+    `state_weight` is the diagonal of Q, `command_weight` that of R. With `places`, deflections
+    there are weighted too, eq. (3.2) of the thesis. `feedback` says which share of each state is
+    fed back (1 or 0; all if left out): the gain is designed for all of them.
+    """
+
+    state_weight: Float[Array, " state"] = number(
+        "1/unit of the state^2", "weight of each state", NOT_NEGATIVE
+    )
+    command_weight: Float[Array, " actuator"] = number(
+        "1/unit of a command^2", "weight of each command", POSITIVE
+    )
+    coordinates: str = choice("coordinates of the states", "modal", "sine", default="modal")
+    places: Float[Array, " place"] | None = number(
+        "m", "where deflections are weighted", ON_BEAM, default=None
+    )
+    place_weight: Float[Array, " place"] | None = number(
+        "1/m^2", "weight of the deflection at each place", NOT_NEGATIVE, default=None
+    )
+    feedback: Float[Array, " state"] | None = number(
+        "1", "share of each state that is fed back", default=None
+    )
+    design: Beliefs | None = inner("what is believed of actuators and loads", Beliefs)
+    period: Float[Array, ""] | None = number(
+        "s", "sampling period; at every instant if left out", POSITIVE, default=None
+    )
+    delay: Float[Array, ""] | None = number(
+        "s", "from measurement to command", NOT_NEGATIVE, default=None
+    )
+    resolution: Float[Array, ""] | None = number(
+        "unit of a command", "step between commands", POSITIVE, default=None
+    )
+
+    @property
+    def memoryless(self) -> bool:
+        return True
+
+    @abc.abstractmethod
+    def gains(self, model: LoadedBeam) -> Any:
+        """The gains designed for a model, in the states of that model."""
+
+    def fault(self, case):
+        own = sum(actuator.attachment().state_matrix.shape[0] for actuator in case.actuators)
+        states, commands = 2 * case.beam.modes + own, len(case.actuators)
+        wanted = {"state_weight": states, "feedback": states, "command_weight": commands}
+        for name in ("state_weight", "command_weight", "feedback", "terminal_weight"):
+            value = getattr(self, name, None)
+            size = wanted.get(name, states)
+            if value is not None and value.shape[0] != size:
+                return f"{name} must have {size} entries, not {value.shape[0]}"
+        if (self.places is None) != (self.place_weight is None):
+            return "places and place_weight belong together; give both or neither"
+        if self.places is not None and self.places.shape != self.place_weight.shape:
+            return "place_weight must have an entry for each of the places"
+        bonded = any(actuator.bonded() is not None for actuator in case.actuators)
+        if self.coordinates == "sine" and (
+            case.beam.ends != "pinned-pinned" or case.supports or bonded
+        ):
+            return (
+                "coordinates must be 'modal': the modes of this beam are not sin(n pi x / L);"
+                " only a uniform pinned-pinned beam without supports in between has those"
+            )
+        fault = None if self.design is None else self.design.fault(case)
+        return None if fault is None else f"design.{fault}"
+
+    def believed(self, model: LoadedBeam) -> LoadedBeam:
+        """The model that the gains are designed for, in the coordinates of the weights."""
+        if self.design is None:
+            return loaded_beam(model.case, model.rig, self.coordinates)
+        return self.design.applied(model, self.coordinates)
+
+    def weights(self, model: LoadedBeam) -> tuple[Array, Array]:
+        """Q and R for the states of a model."""
+        Q = jnp.diag(self.state_weight)
+        if self.places is not None:
+            shape = model.rig.shapes(self.places, (0,))[0] / model.scale
+            rows = jnp.zeros((shape.shape[0], Q.shape[0])).at[:, : shape.shape[1]].set(shape)
+            Q = Q + rows.T @ (self.place_weight[:, None] * rows)
+        return Q, jnp.diag(self.command_weight)
+
+    def fed_back(self, model: LoadedBeam, designed: LoadedBeam) -> Float[Array, "state state"]:
+        """The states of the design that are fed back, from the states of `model`."""
+        change = designed.from_rig(model.to_rig(jnp.eye(self.state_weight.shape[0])))
+        return change if self.feedback is None else self.feedback[:, None] * change
+
+
+class LQR(AbstractRegulator):
+    """The time-invariant regulator for the rig without loads, eq. (5.7) of the thesis."""
+
+    def gains(self, model):
+        plant = model.unloaded
+        return lqr(plant.A, plant.B, *self.weights(model))[0]
+
+    def init(self, model):
+        designed = self.believed(model)
+        return self.gains(designed) @ self.fed_back(model, designed)
+
+    def step(self, memory, measurement, t):
+        return -memory @ measurement.state, memory
+
+
+class Schedule(eqx.Module):
+    """Gains over a crossing from `start` to `end` (s), and the gain from then on.
+
+    `known` are the weights of the loads (N), which have columns of their own behind the states.
+    """
+
+    table: GainTable
+    rest: Float[Array, "actuator column"]
+    known: Float[Array, " load"]
+    start: Float[Array, ""]
+    end: Float[Array, ""]
+
+    def gain(self, t: Float[Array, ""]) -> Float[Array, "actuator column"]:
+        """The gain at a time (s); zero before the first load enters."""
+        share = (t - self.start) / (self.end - self.start)
+        gain = jnp.where(t < self.end, self.table(share), self.rest)
+        return jnp.where(t < self.start, 0.0, gain)
+
+
+class AbstractScheduledRegulator(AbstractRegulator):
+    """A regulator whose gain changes while loads cross, tabulated over the share of the crossing.
+
+    The crossing lasts from the first entry to the last exit; where the design believes in another
+    speed, its table is stretched. From then on the command is "none", or the last gain is on
+    "hold", or the "time-invariant" regulator takes over. A table has `points` stretches from each
+    entry or exit to the next.
+    """
+
+    after: str = choice(
+        "gain after the last exit", "none", "hold", "time-invariant", default="none"
+    )
+    points: int = count("stretches of the table from event to event", default=800)
+
+    def fault(self, case):
+        if not case.loads:
+            return "kind needs loads to be designed for; add one, or take kind 'lqr'"
+        return super().fault(case)
+
+    @property
+    def knows_loads(self) -> bool:
+        """Whether the weights of the loads are fed forward."""
+        return False
+
+    def init(self, model):
+        designed = self.believed(model)
+        table = self.gains(designed)
+        loads = designed.weights if self.knows_loads else jnp.zeros(0)
+        last = table(jnp.ones(()))
+        states = self.state_weight.shape[0]
+        if self.after == "time-invariant":
+            plant = designed.unloaded
+            last = lqr(plant.A, plant.B, *self.weights(designed))[0]
+        seen = self.fed_back(model, designed)
+        rest = jnp.zeros((last.shape[0], states + loads.shape[0]))
+        if self.after != "none":
+            rest = rest.at[:, :states].set(last[:, :states] @ seen)
+        known_loads = jnp.eye(loads.shape[0])
+        whole = jnp.block([[seen, jnp.zeros((states, loads.shape[0]))],
+                           [jnp.zeros((loads.shape[0], states)), known_loads]])  # fmt: skip
+        table = GainTable(table.edges, table.pieces @ whole)
+        events = crossing(model)
+        return Schedule(table, rest, loads, events[0], events[-1])
+
+    def step(self, memory, measurement, t):
+        column = jnp.concatenate([measurement.state, memory.known])
+        return -memory.gain(t) @ column, memory
+
+
+class StepLQR(AbstractScheduledRegulator):
+    """At each time the regulator of the plant frozen then, eqs (3.10) and (3.11) of the thesis."""
+
+    def gains(self, model):
+        def plant(t):
+            return model.A(t), model.B(t)
+
+        return step_by_step(
+            plant, edges_between(crossing(model), self.points), *self.weights(model)
+        )
+
+
+class FiniteLQR(AbstractScheduledRegulator):
+    """The optimal regulator over the crossing, backward from the `terminal_weight` at its end.
+
+    `terminal_weight` is the diagonal of F, eqs (3.3) to (3.9) of the thesis; Q if left out.
+    """
+
+    terminal_weight: Float[Array, " state"] | None = number(
+        "s/unit of the state^2", "weight of each state at the end", NOT_NEGATIVE, default=None
+    )
+
+    def fault(self, case):
+        return super().fault(case) or _too_coarse(self, case)
+
+    def gains(self, model):
+        return optimal(self, model)[0]
+
+
+class AugmentedLQR(AbstractScheduledRegulator):
+    """The optimal regulator over the crossing that knows the loads, eq. (5.8) of the thesis.
+
+    The weights of all loads are constant states of the model: the command answers those on the
+    beam, and, as the times of entry are known, those still to come.
+    """
+
+    terminal_weight: Float[Array, " state"] | None = number(
+        "s/unit of the state^2", "weight of each state at the end", NOT_NEGATIVE, default=None
+    )
+
+    @property
+    def knows_loads(self) -> bool:
+        return True
+
+    def fault(self, case):
+        return super().fault(case) or _too_coarse(self, case)
+
+    def gains(self, model):
+        return optimal(self, model)[0]
+
+
+def optimal(
+    regulator: FiniteLQR | AugmentedLQR, model: LoadedBeam
+) -> tuple[GainTable, Float[Array, "edge state state"]]:
+    """Table of optimal gains for a model, and P at its edges, load states included."""
+    Q, R = regulator.weights(model)
+    F = Q if regulator.terminal_weight is None else jnp.diag(regulator.terminal_weight)
+    loads = len(model.case.loads) if regulator.knows_loads else 0
+
+    def plant(t):
+        system = model.augmented(t) if loads else model.at(t)
+        return system.A, system.B[:, : len(model.case.actuators)]
+
+    Q, F = (jnp.pad(weight, (0, loads)) for weight in (Q, F))
+    return finite_time(plant, edges_between(crossing(model), regulator.points), Q, R, F)
+
+
+def _too_coarse(regulator, case) -> str | None:
+    """Whether the fastest mode turns too far within a stretch, by the formula for pinned ends."""
+    beam = case.beam
+    numbers = (beam.length, beam.rigidity, beam.linear_density, *(x.speed for x in case.loads))
+    if not all(value is not None and is_known(value) for value in numbers):
+        return None
+    length, rigidity, density, *speeds = (float(known(value)) for value in numbers)
+    fastest = (beam.modes * jnp.pi / length) ** 2 * (rigidity / density) ** 0.5
+    span = length / max(min(abs(speed) for speed in speeds), 1e-300)
+    needed = int(jnp.ceil(fastest * min(span, float(known(case.run.duration))) / TURN))
+    if regulator.points >= needed:
+        return None
+    return (
+        f"points must be at least {needed} for {beam.modes} modes and a crossing of {span:.3g} s:"
+        " in each stretch the fastest mode may turn by some radians only"
+    )
