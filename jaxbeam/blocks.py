@@ -214,7 +214,7 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
         else:
             grid = scheduled_grid(varied, assembled, schedule, substeps)
             count = grid.counts.shape[0] * substeps
-            best, states, _ = trace(
+            best, states, *_ = trace(
                 assembled, loads, grid, watched, slots=slots, steps=count, driver=driver
             )
             edges = substeps * grid.place[schedule.samples]

@@ -295,10 +295,10 @@ def _check_clock(address: str, sensor: Sensor, case: Case) -> None:
                 f"{address}.sampling_period must not exceed the run's duration,"
                 f" {known(run.duration):g} s; it is {known(period):g} s"
             )
-    elif case.controller is None:
-        period = 1 / run.sample_rate
-    elif case.controller.period is not None:
+    elif case.controller is not None and case.controller.period is not None:
         period = case.controller.period
+    elif case.controller is None or case.controller.blind:
+        period = 1 / run.sample_rate
     filter = sensor.filter
     if filter is None or filter.realisation != "digital" or period is None:
         return

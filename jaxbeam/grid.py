@@ -102,6 +102,9 @@ def scheduled_grid(
     """
     times = schedule.times
     windows, events = _events(case, rig)
+    if schedule.tick is not None:
+        # A step of no length after the end lets the controller act there once more.
+        events = jnp.append(events, times[-1])
     where = jnp.concatenate([times, jnp.clip(events, times[0], times[-1])])
     order = jnp.argsort(where)
     edges = where[order]

@@ -75,6 +75,10 @@ class AbstractDriver(eqx.Module):
         `states` takes commands to the states at the nodes (node, state, lane), if `inner`.
         """
 
+    @abc.abstractmethod
+    def shows(self, memory, moment: Moment) -> Float[Array, "sensor lane"] | None:
+        """What the sensors show at the start of a step that starts at an edge, if they sample."""
+
 
 def _contact(tables: Tables, inertia, weight, state, commands):
     """Contact forces (row, lane) of a step from this state under these commands, if any."""
@@ -118,7 +122,7 @@ def _driven(driver: AbstractDriver, carry, step):
     # A loop that diverges ends here, in its own lane, instead of running into overflow.
     lost = jnp.any(~(jnp.abs(after) <= driver.bound[:, None]), axis=0)
     after = jnp.where(lost, jnp.nan, after)
-    return (after, memory), (state, forces, commands)
+    return (after, memory), (state, forces, commands, driver.shows(memory, moment))
 
 
 def _rows(loads: Float[Array, "load lane"], tables: Tables) -> Float[Array, "step row lane"]:
@@ -137,18 +141,18 @@ def _stepper(rig: Rig, traffic: Traffic, grid: Grid, watched, slots: int, driver
         tables, start, span = tabulate(rig, traffic, grid, rigging, slots, index)
         loads = _rows(traffic.inertia, tables), _rows(traffic.weight, tables)
         if driver is None:
-            commands = None
+            commands = shown = None
             state, (states, forces) = jax.lax.scan(_advance, state, (tables, *loads, None))
         else:
             moments = Moment(start, span, grid.edge(index))
-            (state, memory), (states, forces, commands) = jax.lax.scan(
+            (state, memory), (states, forces, commands, shown) = jax.lax.scan(
                 lambda carry, step: _driven(driver, carry, step),
                 (state, memory),
                 (tables, *loads, moments),
             )
         if watched is not None:
             best = fold(best, tables, states, forces, commands, start, span)
-        return state, memory, best, (states, commands)
+        return state, memory, best, (states, commands, shown)
 
     return chunk
 
@@ -163,12 +167,13 @@ def trace(
     steps: int,
     driver: AbstractDriver | None = None,
 ):
-    """Integrate from rest over a grid of so many steps; return extremes, states and commands.
+    """Integrate from rest over a grid; return extremes, states, commands, and what sensors show.
 
     States (edge, state, lane) are those at the start of every step and at the end, commands
-    (step, command, lane) those at the nodes of every step, None without a `driver`. Extremes are
-    those at the `watched` places (m), None without any. `slots` is how many loads may be on the
-    beam at once. Reverse mode stores one state a chunk.
+    (step, command, lane) those at the nodes of every step, None without a `driver`; readings
+    (step, sensor, lane) are those that have arrived where a step starts at an edge, None if none
+    are sampled. Extremes are those at the `watched` places (m), None without any. `slots` is how
+    many loads may be on the beam at once. Reverse mode stores one state a chunk.
     """
     chunk = _stepper(rig, traffic, grid, watched, slots, driver)
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
@@ -183,8 +188,9 @@ def trace(
     rest = jnp.zeros((rig.states, lanes))
     firsts = jnp.arange(0, steps, CHUNK)
     (state, _, best), history = jax.lax.scan(jax.checkpoint(whole), (rest, memory, best), firsts)
-    states, commands = jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2)[:steps], history)
-    return best, jnp.concatenate([states, state[None]]), commands
+    history = jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2)[:steps], history)
+    states, commands, shown = history
+    return best, jnp.concatenate([states, state[None]]), commands, shown
 
 
 def march(

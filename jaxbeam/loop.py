@@ -175,9 +175,7 @@ class Loop(AbstractDriver):
 
         def tick(inputs):
             own, waiting = inputs
-            newest = [shown[schedule.age[edge, i], i] for i in range(len(case.sensors))]
-            newest = jnp.stack(newest) if newest else shown[0]
-            wanted, own = self._step(own, newest, state, moment.start)
+            wanted, own = self._step(own, self._arrived(shown, edge), state, moment.start)
             command = self._limited(wanted, waiting[0])
             return own, jnp.roll(waiting, 1, axis=0).at[0].set(command)
 
@@ -187,6 +185,18 @@ class Loop(AbstractDriver):
         begins = schedule.apply[edge]
         active = jnp.where(begins >= 0, waiting[jnp.maximum(begins, 0)], active)
         return own, active, states, shown, waiting
+
+    def shows(self, memory, moment: Moment):
+        return (
+            None
+            if self.model.case.controller.period is None
+            else self._arrived(memory[3], moment.edge)
+        )
+
+    def _arrived(self, shown, edge):
+        """The newest readings (sensor, lane) that have arrived by an edge."""
+        newest = [shown[self.schedule.age[edge, i], i] for i in range(shown.shape[1])]
+        return jnp.stack(newest) if newest else shown[0]
 
     def _signals(self, state, command, time):
         """What the sensors see at an instant (sensor, lane)."""

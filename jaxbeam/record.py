@@ -27,8 +27,9 @@ class Record(eqx.Module):
     and at samples. `contact_lost_time` (s) and `contact_lost_position` (m) tell where a load would
     first have to pull, which the model lets it do; NaN where it never would. `command` is what the
     actuators are given, within their limits; at a time at which it changes, that just after.
-    Where a control loop diverges the samples are NaN from then on. `error_estimate` is relative
-    to the largest deflection.
+    Where a control loop diverges the samples are NaN from then on, and the peaks are NaN.
+    `error_estimate` is relative to the largest deflection. `shown` is what the sensors have told
+    a controller that samples by then, None without one.
     """
 
     case: Case
@@ -47,6 +48,7 @@ class Record(eqx.Module):
     contact_lost_position: Float[Array, " load"]
     error_estimate: Float[Array, ""]
     steps: int = eqx.field(static=True)
+    shown: Float[Array, "time sensor"] | None = None
 
     def at(self, x, quantity: str = "deflection", fibre_distance=None) -> Float[Array, "time ..."]:
         """History of a quantity at positions x (m) of any shape, in SI units.
@@ -94,8 +96,13 @@ class Record(eqx.Module):
     def measured(self) -> Float[Array, "time sensor"]:
         """What each sensor reads, in the SI unit of its quantity, noise and filter included.
 
+        With a controller that samples these are the readings it had; without, the sensors sample
+        at these times where they have no clock of their own.
+
         Raises ValueError for a filter that samples at these times do not suit (see `sense`).
         """
+        if self.shown is not None:
+            return self.shown
         motion = self.coordinates, self.rates, self.accelerations
         return measure(self.case, self.modes, *motion, self.times, noisy=True)
 
@@ -232,7 +239,8 @@ def record_from_xarray(dataset: xarray.Dataset) -> Record:
         "actuator": len(case.actuators),
         **dataset.sizes,
     }
-    shapes = {name: [sizes.get(d, 0) for d in _VARIABLES[name][0]] for name in _STORED}
+    possible = *_STORED, "measured"
+    shapes = {name: [sizes.get(d, 0) for d in _VARIABLES[name][0]] for name in possible}
     empty = {
         name: (_VARIABLES[name][0], np.zeros(shape))
         for name, shape in shapes.items()
@@ -253,8 +261,13 @@ def record_from_xarray(dataset: xarray.Dataset) -> Record:
         times=jnp.asarray(dataset["time"].values),
         error_estimate=jnp.asarray(float(dataset.attrs["error_estimate"])),
         steps=int(dataset.attrs["steps"]),
+        shown=jnp.asarray(dataset["measured"].values) if _samples(case) else None,
         **values,
     )
+
+
+def _samples(case: Case) -> bool:
+    return case.controller is not None and case.controller.period is not None
 
 
 def read_record(path: str | os.PathLike) -> Record:

@@ -73,7 +73,7 @@ def _check_times(times) -> None:
 def _record(case: Case, plan: Plan, times, error) -> Record:
     watched = jnp.array([sensor.position for sensor in case.sensors]).reshape(-1)
     best, outputs, found, count = _trace(case, plan, times, watched)
-    coordinates, rates, accelerations, position, force, commands = outputs
+    coordinates, rates, accelerations, position, force, commands, shown = outputs
     if commands is None:
         commands = jnp.zeros((times.shape[0], len(case.actuators)))
     peaks, peak_times = best.peak()
@@ -92,6 +92,7 @@ def _record(case: Case, plan: Plan, times, error) -> Record:
         load_position=position,
         contact_force=force,
         command=commands,
+        shown=shown,
         peak_deflection=peaks[:, 0],
         peak_time=peak_times[:, 0],
         lowest_contact_force=best.lowest[:, 0],
@@ -127,11 +128,12 @@ def _trace(case: Case, plan: Plan, times, watched):
     grid = scheduled_grid(case, assembled, schedule, plan.substeps)
     count = grid.counts.shape[0] * plan.substeps
     slots = plan.form.slots
-    best, states, commands = trace(
+    best, states, commands, shown = trace(
         assembled, loads, grid, watched, slots=slots, steps=count, driver=driver
     )
     edges = plan.substeps * grid.place[schedule.samples]
     states = states[edges]
+    shown = None if shown is None else shown[edges, :, 0]
     if driver is not None:
         # A law at every instant is asked itself: its polynomials are less exact at their ends.
         commands = (
@@ -139,15 +141,14 @@ def _trace(case: Case, plan: Plan, times, watched):
             if driver.inner
             else _begin(case, commands, edges)
         )
-    return best, _outputs(assembled, loads, times, states, commands), assembled.modes, count
+    outputs = *_outputs(assembled, loads, times, states, commands), shown
+    return best, outputs, assembled.modes, count
 
 
 def _begin(case: Case, commands, edges):
     """Commands (time, actuator) with which the steps at some edges begin, as they took effect."""
     histories = commands[..., 0].reshape(commands.shape[0], NODES, -1)
-    starts = jnp.tensordot(histories, at_ends(), axes=[1, 0])  # step, actuator, end
-    last = edges == histories.shape[0]
-    begun = jnp.where(last[:, None], starts[-1, :, 1], starts[jnp.where(last, 0, edges), :, 0])
+    begun = jnp.tensordot(histories, at_ends()[:, 0], axes=[1, 0])[edges]
     limits = [actuator.command_limits() for actuator in case.actuators]
     low = jnp.array([-jnp.inf if pair is None else pair[0] for pair in limits])
     high = jnp.array([jnp.inf if pair is None else pair[1] for pair in limits])
