@@ -18,6 +18,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.loop import loop_schedule
 from jaxbeam.plan import Plan, form
+from jaxbeam.sensing import noise_samples
 from tests.loop_as_oracle import expected, span_of
 
 TIMES = np.linspace(0.0, 0.4, 81)
@@ -123,10 +124,26 @@ def test_loops_are_those_of_the_oracle(name):
     case = LOOPS[name]
     record = run(case, substeps=4 if case.controller.period is None else 2)
     truth = expected(case, TIMES)
-    for found, true in ((record.deflection, truth.deflection), (record.command, truth.command)):
+    pairs = [(record.deflection, truth.deflection), (record.command, truth.command)]
+    if case.controller.period is not None:
+        pairs.append((record.measured, truth.shown))
+    for found, true in pairs:
         size = np.max(np.abs(true), axis=0)
         assert np.all(size > 0)
         assert np.all(np.abs(found - true) <= 1e-9 * size)
+
+
+@pytest.mark.slow
+def test_noise_is_what_the_controller_hears_and_the_record_keeps():
+    """One sample of it for every reading; a loop without loads moves by it alone."""
+    sensor = jb.Sensor(0.25, noise=1e-4, sampling_period=4e-3)
+    case = loop([PATCH], [sensor], jb.Feedback([1000.0], period=2e-3), loads=())
+    record = run(case, 2e-3 * np.arange(101))
+    drawn = 1e-4 * np.asarray(noise_samples(case.run.seed, 1, 101))[np.arange(101) // 2]
+    read = record.deflection[::2] + drawn[::2]
+    assert_allclose(record.measured, np.repeat(read, 2, axis=0)[:101], rtol=1e-12)
+    # The last command too is that just after the controller acted.
+    assert_allclose(record.command, -1000.0 * record.measured, rtol=1e-12)
 
 
 @pytest.mark.slow

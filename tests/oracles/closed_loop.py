@@ -85,6 +85,7 @@ class Motion:
     times: np.ndarray  # (time,) s
     deflection: np.ndarray  # (time, sensor) m
     command: np.ndarray  # (time, actuator), just after a change
+    shown: np.ndarray  # (time, sensor) newest reading that has arrived; 0 without a clock
     modal: np.ndarray  # (time, mode) sqrt(kg) m
     modal_rate: np.ndarray  # (time, mode)
 
@@ -113,6 +114,7 @@ def respond(
                     if 0.0 <= t <= times[-1] + 10.0**-DIGITS})  # fmt: skip
     samples = {round(t, DIGITS): k for k, t in enumerate(times)}
     states, commands = np.zeros((len(times), plant.size)), np.zeros((len(times), len(actuators)))
+    shown = np.zeros((len(times), len(sensors)))
 
     state = np.zeros(plant.size)
     for start, end in zip(marks, [*marks[1:], None], strict=True):
@@ -123,6 +125,8 @@ def respond(
         if start in samples:
             states[samples[start]] = state
             commands[samples[start]] = loop.command(start, state)
+            if clock is not None:
+                shown[samples[start]] = loop.shown(start)
         if end is None:
             break
         solution = solve_ivp(
@@ -134,9 +138,8 @@ def respond(
         state = solution.y[:, -1]
     n = span.modes
     rows = np.array([span.shapes(s.position) for s in sensors]).reshape(-1, n)
-    return Motion(
-        np.asarray(times), states[:, :n] @ rows.T, commands, states[:, :n], states[:, n : 2 * n]
-    )
+    deflection, modal, rates = states[:, :n] @ rows.T, states[:, :n], states[:, n : 2 * n]
+    return Motion(np.asarray(times), deflection, commands, shown, modal, rates)
 
 
 class _Plant:
@@ -241,11 +244,14 @@ class _Loop:
             if t in self.seen[i]:
                 self._read(i, sensor, self.seen[i][t], t, state, active)
         if t in self.acts:
-            shown = [max(r for r in each if r[0] <= t + 1e-11)[1] for each in self.arrives]
-            wanted = self.law(np.array(shown), state[: self.plant.controlled], t)
+            wanted = self.law(self.shown(t), state[: self.plant.controlled], t)
             self.given = self._limited(wanted, self.given)
             self.waiting[round(t + self.clock.delay, DIGITS)] = self.given
         self.held = self.waiting.pop(t, self.held)
+
+    def shown(self, t):
+        """The newest reading of each sensor that has arrived."""
+        return np.array([max(r for r in each if r[0] <= t + 1e-11)[1] for each in self.arrives])
 
     def _read(self, i, sensor, number, t, state, active):
         if sensor.quantity == "acceleration":
