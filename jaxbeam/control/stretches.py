@@ -73,7 +73,12 @@ def stretches(
     unit = even_units(reach[0, 0], Q * outer)
     arguments = (A @ inner / scale[:, None], reach / unit, lengths)
     toll = Q * outer * unit
-    parts = jax.lax.map(lambda each: _collocated(*each, toll), arguments, batch_size=64)
+
+    def part(each):
+        matrix, reach, length = each
+        return _collocated(matrix, reach, length, toll)
+
+    parts = jax.lax.map(part, arguments)
     return Stretch(
         drift=parts.drift * scale[:, None] / scale,
         reach=parts.reach * outer * unit,
