@@ -1,14 +1,27 @@
 """Controllers, one family a file, behind the interface in `controller`."""
 
 from jaxbeam.control.feedback import Feedback
+from jaxbeam.control.lqr import LQR, AugmentedLQR, FiniteLQR, StepLQR
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.state_feedback import StateFeedback
 
-KINDS = {"feedback": Feedback, "prescribed": Prescribed, "state": StateFeedback}
+KINDS = {
+    "feedback": Feedback,
+    "lqr": LQR,
+    "lqr-augmented": AugmentedLQR,
+    "lqr-finite": FiniteLQR,
+    "lqr-step": StepLQR,
+    "prescribed": Prescribed,
+    "state": StateFeedback,
+}
 
 __all__ = [
     "KINDS",
+    "LQR",
+    "AugmentedLQR",
     "Feedback",
+    "FiniteLQR",
     "Prescribed",
     "StateFeedback",
+    "StepLQR",
 ]

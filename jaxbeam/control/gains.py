@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.control.riccati import lqr
-from jaxbeam.control.stretches import NODES, Square, costs_to_go, riccati_rate, stretches
+from jaxbeam.control.stretches import NODES, Commands, Square, costs_to_go, riccati_rate, stretches
+from jaxbeam.motion import NEVER
 from jaxbeam.statespace import LoadedBeam
 
 LAYER = 12  # times the stretch before an event is halved, for the fast layer of P there
@@ -39,7 +40,8 @@ def crossing(model: LoadedBeam) -> Float[Array, " event"]:
     """Times (s) at which loads enter and leave, ascending; the run's end for loads that stay."""
     windows = [path.window() for path in model.traffic.motions]
     events = jnp.sort(jnp.array(windows).reshape(-1))
-    return jnp.minimum(events, jnp.maximum(model.case.run.duration, events[0]))
+    last = jnp.max(jnp.where(events < NEVER, events, model.case.run.duration))
+    return jnp.minimum(events, last)
 
 
 def edges_between(events: Float[Array, " event"], count: int) -> Float[Array, " edge"]:
@@ -55,7 +57,7 @@ def edges_between(events: Float[Array, " event"], count: int) -> Float[Array, " 
 
 
 def finite_time(
-    plant: Plant, edges: Float[Array, " edge"], Q: Square, R: Square, terminal: Square
+    plant: Plant, edges: Float[Array, " edge"], Q: Square, R: Commands, terminal: Square
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """Gains that minimise x'Fx at the last edge plus the integral of x'Qx + u'Ru, and P at edges.
 
@@ -76,7 +78,7 @@ def finite_time(
     return _table(edges, with_rate, costs), costs
 
 
-def step_by_step(plant: Plant, edges: Float[Array, " edge"], Q: Square, R: Square) -> GainTable:
+def step_by_step(plant: Plant, edges: Float[Array, " edge"], Q: Square, R: Commands) -> GainTable:
     """Gains for the plant frozen at each time, eqs (3.10) and (3.11) of the thesis."""
 
     def with_rate(time, _):

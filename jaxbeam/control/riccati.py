@@ -9,16 +9,19 @@ it runs on every device, in batches; derivatives are implicit, forward and in re
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from jaxbeam.control.stretches import Inputs, Square, Stretch, even_units, symmetric
+from jaxbeam.control.stretches import Commands, Inputs, Square, Stretch, even_units, symmetric
 from jaxbeam.fields import is_known, known
 from jaxbeam.holds import balance
+
+Gain = tuple[Float[Array, "input state"], Square]
 
 DOUBLINGS = 60  # at most, before an equation is taken for unsolvable
 VANISHED = 1e-9  # norm of a drift whose square does not count
 
 
-def care(A: Square, B: Inputs, Q: Square, R: Square, N: Inputs | None = None) -> Square:
+def care(A: Square, B: Inputs, Q: Square, R: Commands, N: Inputs | None = None) -> Square:
     """The stabilising P of A'P + P A - (P B + N) R^-1 (B'P + N') + Q = 0, eq. (3.10) of the thesis.
 
     Differentiable. Raises ValueError for matrices of wrong size, an R that is
@@ -30,7 +33,7 @@ def care(A: Square, B: Inputs, Q: Square, R: Square, N: Inputs | None = None) ->
     return _solved(_care(drift, reach, toll))
 
 
-def lqr(A: Square, B: Inputs, Q: Square, R: Square, N: Inputs | None = None):
+def lqr(A: Square, B: Inputs, Q: Square, R: Commands, N: Inputs | None = None) -> Gain:
     """Gain K (input, state) of u = -K x with the least integral of x'Qx + u'Ru + 2x'Nu, and P.
 
     K = R^-1 (B'P + N'), eqs (3.7) and (3.11) of the thesis. Raises as `care`.
@@ -40,7 +43,7 @@ def lqr(A: Square, B: Inputs, Q: Square, R: Square, N: Inputs | None = None):
     return jnp.linalg.solve(R, cross), cost
 
 
-def dare(A: Square, B: Inputs, Q: Square, R: Square, N: Inputs | None = None) -> Square:
+def dare(A: Square, B: Inputs, Q: Square, R: Commands, N: Inputs | None = None) -> Square:
     """The stabilising P of A'PA - (A'PB + N) (R + B'PB)^-1 (B'PA + N') + Q = P.
 
     Differentiable. Raises as `care`.
@@ -50,7 +53,7 @@ def dare(A: Square, B: Inputs, Q: Square, R: Square, N: Inputs | None = None) ->
     return _solved(_dare(drift, reach, toll))
 
 
-def dlqr(A: Square, B: Inputs, Q: Square, R: Square, N: Inputs | None = None):
+def dlqr(A: Square, B: Inputs, Q: Square, R: Commands, N: Inputs | None = None) -> Gain:
     """Gain K (input, state) of u = -K x with the least sum of x'Qx + u'Ru + 2x'Nu, and P.
 
     Raises as `care`.

@@ -20,6 +20,7 @@ from jaxbeam.holds import balance
 
 Square = Float[Array, "state state"]
 Inputs = Float[Array, "state input"]
+Commands = Float[Array, "input input"]
 
 STAGES = 6  # Gauss nodes of a stretch; order 12
 NODES = (np.polynomial.legendre.leggauss(STAGES)[0] + 1) / 2
@@ -55,7 +56,7 @@ def stretches(
     A: Float[Array, "stretch stage state state"],
     B: Float[Array, "stretch stage state input"],
     Q: Square,
-    R: Square,
+    R: Commands,
     lengths: Float[Array, " stretch"],
 ) -> Stretch:
     """Stretches of given lengths (s) along a plant known at their Gauss nodes, `NODES`.
@@ -111,7 +112,7 @@ def costs_to_go(
     return jnp.concatenate([costs, terminal[None]])
 
 
-def riccati_rate(cost: Square, A: Square, B: Inputs, Q: Square, R: Square) -> Square:
+def riccati_rate(cost: Square, A: Square, B: Inputs, Q: Square, R: Commands) -> Square:
     """dP/dt = -P A - A'P - Q + P B R^-1 B'P, eq. (3.8) of the thesis with its sign corrected."""
     seen = B.T @ cost
     return -(cost @ A) - A.T @ cost - Q + seen.T @ jnp.linalg.solve(R, seen)
