@@ -8,15 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.checks import check
 from jaxbeam.control import LQR, AugmentedLQR, FiniteLQR, StepLQR
 from jaxbeam.control.beliefs import Beliefs
-from jaxbeam.modes import lay_out
 
 REFERENCE = json.loads((Path(__file__).parent / "data" / "optimal_control.json").read_text())
 SHARES = np.array(REFERENCE["fractions_of_crossing"])
@@ -59,8 +55,8 @@ def test_time_invariant_gain(model):
     ("kind", "points", "name"),
     [
         (StepLQR, 200, "step_by_step_gains"),
-        (FiniteLQR, 800, "finite_time_gains"),
-        (AugmentedLQR, 800, "augmented_finite_time_gains"),
+        (FiniteLQR, 1200, "finite_time_gains"),
+        (AugmentedLQR, 1200, "augmented_finite_time_gains"),
     ],
 )
 def test_gains_over_the_crossing(model, kind, points, name):

@@ -157,7 +157,7 @@ class AbstractScheduledRegulator(AbstractRegulator):
     after: str = choice(
         "gain after the last exit", "none", "hold", "time-invariant", default="none"
     )
-    points: int = count("stretches of the table from event to event", default=800)
+    points: int = count("stretches of the table from event to event", default=1200)
 
     def fault(self, case):
         if not case.loads:
