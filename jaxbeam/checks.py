@@ -178,8 +178,9 @@ def _check_increasing(names: list[str], numbers: np.ndarray, unit: str) -> None:
 
 def _check_places(address: str, part: Any, length: Float[Array, ""]) -> None:
     for field in dataclasses.fields(part):
-        if field.metadata.get("must") == ON_BEAM:
-            check_on_beam(f"{address}.{field.name}", getattr(part, field.name), length)
+        value = getattr(part, field.name)
+        if field.metadata.get("must") == ON_BEAM and value is not None:
+            check_on_beam(f"{address}.{field.name}", value, length)
 
 
 def _check_beam(beam: Beam) -> None:
