@@ -11,8 +11,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.checks import check
 from jaxbeam.control import LQR, AugmentedLQR, FiniteLQR, StepLQR
 from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.lqr import optimal
 
 REFERENCE = json.loads((Path(__file__).parent / "data" / "optimal_control.json").read_text())
 SHARES = np.array(REFERENCE["fractions_of_crossing"])
@@ -82,3 +85,67 @@ def test_closed_loops(controller, name):
     most = np.max(np.abs(expected["voltage"]))
     assert_allclose(record.command[1:, 0], expected["voltage"], rtol=0, atol=1e-6 * most)
     assert_allclose(jnp.max(jnp.abs(record.peak_deflection)), peak, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_predicted_cost_is_the_cost_simulated_and_the_gain_is_optimal(model):
+    """z0' P z0 is the cost of the run from z0, and no change of the gains lowers it."""
+    regulator = FiniteLQR(**WEIGHTS, points=400)
+    Q, R = regulator.weights(model)
+    start = jnp.array([1e-3, -2e-4, 1e-4, 0.02, 0.01, -0.03, 0.3])
+    table, costs = eqx.filter_jit(lambda m: optimal(regulator, m))(model)
+    end = 0.6 / 0.55
+    times = jnp.linspace(0.0, end, 40001)  # a lag of 0.1 ms, by Runge and Kutta's method
+    step = times[1]
+    bump = jnp.asarray(np.random.default_rng(0).normal(size=(2, 7))) * table(jnp.ones(()) / 2)
+
+    @jax.jit
+    def cost(change):
+        def rate(t, state):
+            share = t / end
+            gain = table(share) + change[0] * bump[0] + change[1] * share * bump[1]
+            command, system = -gain @ state[:7], model.at(jnp.minimum(t, end - 1e-9))
+            spent = state[:7] @ Q @ state[:7] + command @ R @ command
+            return jnp.append(system.A @ state[:7] + system.B[:, :1] @ command, spent)
+
+        def advance(state, t):
+            a = rate(t, state)
+            b = rate(t + step / 2, state + step / 2 * a)
+            c = rate(t + step / 2, state + step / 2 * b)
+            d = rate(t + step, state + step * c)
+            return state + step / 6 * (a + 2 * b + 2 * c + d), None
+
+        last, _ = jax.lax.scan(advance, jnp.append(start, 0.0), times[:-1])
+        return last[7] + last[:7] @ Q @ last[:7]
+
+    predicted = start @ costs[0] @ start
+    assert_allclose(cost(jnp.zeros(2)), predicted, rtol=1e-6)
+    slope, bend = jax.jit(jax.jacfwd(cost))(jnp.zeros(2)), cost(jnp.ones(2)) - predicted
+    assert bend > 1e-3 * predicted
+    assert_allclose(slope, 0.0, atol=1e-6 * predicted)
+
+
+def test_case_files_hold_regulators():
+    controller = AugmentedLQR(**WEIGHTS, feedback=FEW, design=DESIGN, after="hold")
+    case = rig(controller, 2.5)
+    check(case)
+    again = case_from_dict(case_to_dict(case))
+    assert eqx.tree_equal(case, again)
+
+
+@pytest.mark.parametrize(
+    ("controller", "message"),
+    [
+        (LQR([1.0] * 6, [1.0]), "state_weight must have 7 entries, not 6"),
+        (LQR([1.0] * 7, [0.0]), "command_weight.0 must be positive"),
+        (LQR([-1.0] * 7, [1.0]), "state_weight.0 must not be negative"),
+        (LQR([1.0] * 7, [1.0, 1.0]), "command_weight must have 1 entries"),
+        (LQR([1.0] * 7, [1.0], places=[0.3]), "places and place_weight belong together"),
+        (LQR([1.0] * 7, [1.0], places=[0.9], place_weight=[1.0]), "places must lie on the beam"),
+        (LQR([1.0] * 7, [1.0], design=Beliefs(correction=0.3)), "design.correction has no effect"),
+        (FiniteLQR([1.0] * 7, [1.0], points=100), "points must be at least"),
+    ],
+)
+def test_faults_are_named(controller, message):
+    with pytest.raises(ValueError, match=message):
+        check(rig(controller))
