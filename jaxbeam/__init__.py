@@ -12,7 +12,15 @@ from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringD
 from jaxbeam.beam import Beam, Support
 from jaxbeam.case import Case, Run, addresses, replace
 from jaxbeam.casefile import load_case, save_case
-from jaxbeam.control import Feedback, Prescribed, StateFeedback
+from jaxbeam.control import (
+    LQR,
+    AugmentedLQR,
+    Feedback,
+    FiniteLQR,
+    Prescribed,
+    StateFeedback,
+    StepLQR,
+)
 from jaxbeam.filters import Filter
 from jaxbeam.loads import MovingForce, MovingMass
 from jaxbeam.modes import modes
@@ -23,11 +31,14 @@ from jaxbeam.statespace import state_space
 from jaxbeam.sweep import sweep
 
 __all__ = [
+    "LQR",
+    "AugmentedLQR",
     "Beam",
     "Case",
     "Electrodynamic",
     "Feedback",
     "Filter",
+    "FiniteLQR",
     "MovingForce",
     "MovingMass",
     "Patch",
@@ -39,6 +50,7 @@ __all__ = [
     "Shaker",
     "SpringDamper",
     "StateFeedback",
+    "StepLQR",
     "Support",
     "addresses",
     "load_case",
