@@ -6,6 +6,7 @@ The weights are on the states of `state_space` in the chosen coordinates.
 """
 
 import abc
+import math
 from typing import Any
 
 import equinox as eqx
@@ -268,9 +269,9 @@ def _too_coarse(regulator, case) -> str | None:
     if not all(value is not None and is_known(value) for value in numbers):
         return None
     length, rigidity, density, *speeds = (float(known(value)) for value in numbers)
-    fastest = (beam.modes * jnp.pi / length) ** 2 * (rigidity / density) ** 0.5
+    fastest = (beam.modes * math.pi / length) ** 2 * (rigidity / density) ** 0.5
     span = length / max(min(abs(speed) for speed in speeds), 1e-300)
-    needed = int(jnp.ceil(fastest * min(span, float(known(case.run.duration))) / TURN))
+    needed = math.ceil(fastest * span / TURN)
     if regulator.points >= needed:
         return None
     return (
