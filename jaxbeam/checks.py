@@ -100,14 +100,17 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
         _check_number(address, value, field)
     elif "least" in field.metadata:
         least = field.metadata["least"]
+        if value is None and field.default is None:
+            return
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
             raise ValueError(f"{address} must be a whole number, {least} or more; it is {value!r}")
     elif "part" in field.metadata:
         kind = field.metadata["part"]
-        if value is not None and not isinstance(value, kind):
+        kinds = tuple(kind.values()) if isinstance(kind, dict) else (kind,)
+        if value is not None and not isinstance(value, kinds):
+            names = " or ".join(made.__name__ for made in kinds)
             raise ValueError(
-                f"{address} holds {_words(value)}; it takes a table of its own, in Python a"
-                f" {kind.__name__}"
+                f"{address} holds {_words(value)}; it takes a table of its own, in Python a {names}"
             )
         if value is not None:
             _check_part(address, value)

@@ -9,16 +9,20 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, number
+
 
 class Measurement(eqx.Module):
     """What a controller may look at: the readings of the sensors, each in its own SI unit.
 
     `state` is the true state of the plant in the order of `state_space`, for laws that assume full
-    knowledge; no sensor gives it.
+    knowledge; no sensor gives it. `command` is what the actuators have been given until now,
+    limits and resolution applied.
     """
 
     readings: Float[Array, " sensor"]
     state: Float[Array, " state"]
+    command: Float[Array, " actuator"]
 
 
 class AbstractController(eqx.Module):
@@ -32,9 +36,15 @@ class AbstractController(eqx.Module):
     `jaxbeam.control.KINDS`.
     """
 
-    period: eqx.AbstractVar[Float[Array, ""] | None]
-    delay: eqx.AbstractVar[Float[Array, ""] | None]
-    resolution: eqx.AbstractVar[Float[Array, ""] | None]
+    period: Float[Array, ""] | None = number(
+        "s", "sampling period; at every instant if left out", POSITIVE, default=None, kw_only=True
+    )
+    delay: Float[Array, ""] | None = number(
+        "s", "from measurement to command", NOT_NEGATIVE, default=None, kw_only=True
+    )
+    resolution: Float[Array, ""] | None = number(
+        "unit of a command", "step between commands", POSITIVE, default=None, kw_only=True
+    )
 
     @property
     def memoryless(self) -> bool:

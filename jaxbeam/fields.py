@@ -54,9 +54,12 @@ def count(meaning: str, least: int = 1, **options):
     return eqx.field(static=True, metadata={"meaning": meaning, "least": least}, **options)
 
 
-def part(meaning: str, kind: type):
-    """Declare a part within a part of a case, a table of its own that may be left out."""
-    return eqx.field(metadata={"meaning": meaning, "part": kind}, default=None)
+def part(meaning: str, kind: type | dict[str, type], **options):
+    """Declare a part within a part of a case, a table of its own that may be left out.
+
+    `kind` is its class, or the registry in which its key `kind` is looked up.
+    """
+    return eqx.field(metadata={"meaning": meaning, "part": kind}, default=None, **options)
 
 
 def dimensions(field) -> str:

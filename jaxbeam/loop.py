@@ -154,7 +154,9 @@ class Loop(AbstractDriver):
         """Commands (actuator, lane) of a law at every instant, to a state."""
         sensors, seen = self.model.case.sensors, self.seen @ state
         readings = [read(s, None, None, value)[0] for s, value in zip(sensors, seen, strict=True)]
-        wanted, _ = self._step(own, jnp.stack(readings) if readings else seen, state, time)
+        shown = jnp.stack(readings) if readings else seen
+        none = jnp.zeros((len(self.model.case.actuators), state.shape[-1]))
+        wanted, _ = self._step(own, shown, state, none, time)
         return self._limited(wanted)
 
     def _act(self, memory, state, moment: Moment):
@@ -175,7 +177,8 @@ class Loop(AbstractDriver):
 
         def tick(inputs):
             own, waiting = inputs
-            wanted, own = self._step(own, self._arrived(shown, edge), state, moment.start)
+            arrived = self._arrived(shown, edge)
+            wanted, own = self._step(own, arrived, state, active, moment.start)
             command = self._limited(wanted, waiting[0])
             return own, jnp.roll(waiting, 1, axis=0).at[0].set(command)
 
@@ -211,14 +214,14 @@ class Loop(AbstractDriver):
                 signals = signals.at[i].set(shape @ moving)
         return signals
 
-    def _step(self, own, readings, state, time):
+    def _step(self, own, readings, state, command, time):
         """The controller's step in every lane."""
 
-        def single(own, readings, state):
-            return self.model.case.controller.step(own, Measurement(readings, state), time)
+        def single(own, *seen):
+            return self.model.case.controller.step(own, Measurement(*seen), time)
 
         ordered = self.model.from_rig(state[: self.model.rig.states])
-        return jax.vmap(single, in_axes=-1, out_axes=-1)(own, jnp.asarray(readings), ordered)
+        return jax.vmap(single, in_axes=-1, out_axes=-1)(own, readings, ordered, command)
 
     def _limited(self, wanted, before=None):
         """Commands as the actuators take them: rounded, within limits and rates of change."""

@@ -174,6 +174,19 @@ class Modes(eqx.Module):
     series: Float[Array, "segment degree mode"]
     unit: Float[Array, ""]
 
+    def first(self, count: int) -> "Modes":
+        """The lowest modes alone."""
+        kept = slice(0, count)
+        return Modes(
+            stiffness=self.stiffness[kept],
+            damping=self.damping[kept],
+            coupling=self.coupling[kept, kept],
+            damping_coupling=self.damping_coupling[kept, kept],
+            nodes=self.nodes,
+            series=self.series[..., kept],
+            unit=self.unit,
+        )
+
     @property
     def angular_frequencies(self) -> Float[Array, " mode"]:
         """Natural angular frequencies in rad/s, ascending; zero for rigid-body modes."""

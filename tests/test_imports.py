@@ -12,7 +12,7 @@ from tests.modules import PACKAGES, module_files, parse
 LAYERS = """
 jaxbeam.fields  jaxbeam.holds
 jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
-jaxbeam.loads  jaxbeam.schedule  jaxbeam.sensors
+jaxbeam.estimator  jaxbeam.loads  jaxbeam.schedule  jaxbeam.sensors
 jaxbeam.case  jaxbeam.sensing
 jaxbeam.checks
 jaxbeam.modes
@@ -21,6 +21,7 @@ jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.ports  jaxbeam.
 jaxbeam.frequency  jaxbeam.grid
 jaxbeam.dynamics
 jaxbeam.reference  jaxbeam.statespace  jaxbeam.static  jaxbeam.tables
+jaxbeam.estimation
 jaxbeam.control  jaxbeam.extremes
 jaxbeam.casefile  jaxbeam.integrate
 jaxbeam.loop  jaxbeam.record

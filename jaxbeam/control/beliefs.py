@@ -1,12 +1,13 @@
 """What a controller is designed for, where that differs from the rig it is used on."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import NOT_NEGATIVE, number
+from jaxbeam.fields import NOT_NEGATIVE, count, number
 from jaxbeam.rig import assemble
 from jaxbeam.statespace import LoadedBeam, loaded_beam
 
@@ -15,11 +16,11 @@ OF_LOADS = ("mass", "speed")
 
 
 class Beliefs(eqx.Module):
-    """Numbers of actuators and loads as the designer believes them to be.
+    """Numbers of actuators and loads as the designer believes them to be, and how many modes.
 
     Each is one number for all that have it, or a list with one for each actuator (or load).
     What is left out is as in the case. `stiffness = 0` leaves the suspension of shakers out of
-    the design.
+    the design; `modes` keeps only the lowest modes of the beam in it.
     """
 
     force_per_volt: Float[Array, " *actuator"] | None = number(
@@ -38,9 +39,12 @@ class Beliefs(eqx.Module):
         "kg", "masses of loads", NOT_NEGATIVE, default=None
     )
     speed: Float[Array, " *load"] | None = number("m/s", "speeds of loads", default=None)
+    modes: int | None = count("modes of the beam that are modelled", default=None)
 
     def fault(self, case: Any) -> str | None:
         """What is wrong with them in a case, as "key must ...", or None."""
+        if self.modes is not None and self.modes > case.beam.modes:
+            return f"modes must be at most {case.beam.modes}, the modes of the beam: raise those"
         for names, parts in ((OF_ACTUATORS, case.actuators), (OF_LOADS, case.loads)):
             for name in names:
                 value = getattr(self, name)
@@ -53,8 +57,11 @@ class Beliefs(eqx.Module):
         return None
 
     def applied(self, model: LoadedBeam, coordinates: str) -> LoadedBeam:
-        """The state space of the case as believed, on the same modes of the beam."""
-        case = model.case
+        """The state space of the case as believed, on the same modes of the beam or the first."""
+        case, modes = model.case, model.rig.modes
+        if self.modes is not None:
+            case = eqx.tree_at(lambda c: c.beam, case, _with_modes(case.beam, self.modes))
+            modes = modes.first(self.modes)
         for key, names in (("actuators", OF_ACTUATORS), ("loads", OF_LOADS)):
             parts = getattr(case, key)
             for name in names:
@@ -64,7 +71,15 @@ class Beliefs(eqx.Module):
                 values = jnp.broadcast_to(value, (len(parts),))
                 parts = tuple(_changed(part, name, values[i]) for i, part in enumerate(parts))
             case = eqx.tree_at(lambda c, key=key: getattr(c, key), case, parts)
-        return loaded_beam(case, assemble(case, model.rig.modes), coordinates)
+        return loaded_beam(case, assemble(case, modes), coordinates)
+
+
+def _with_modes(beam, count):
+    """The beam with fewer modes, for which a list of damping ratios loses its last ones."""
+    ratio = beam.damping_ratio
+    if ratio is not None and ratio.ndim:
+        ratio = ratio[:count]
+    return dataclasses.replace(beam, modes=count, damping_ratio=ratio)
 
 
 def _changed(part, name, value):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.controller import AbstractController
-from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, count, number
+from jaxbeam.fields import count, number
 
 
 class Feedback(AbstractController):
@@ -19,15 +19,6 @@ class Feedback(AbstractController):
         "command per reading^power", "one gain for each actuator"
     )
     power: int = count("power of the reading", default=1)
-    period: Float[Array, ""] | None = number(
-        "s", "sampling period; at every instant if left out", POSITIVE, default=None
-    )
-    delay: Float[Array, ""] | None = number(
-        "s", "from measurement to command", NOT_NEGATIVE, default=None
-    )
-    resolution: Float[Array, ""] | None = number(
-        "unit of a command", "step between commands", POSITIVE, default=None
-    )
 
     @property
     def memoryless(self) -> bool:

@@ -2,7 +2,7 @@
 
     J = x(end)' F x(end) + integral of x'Qx + u'Ru,     u = -K x        (thesis, eqs 3.3 and 3.7)
 
-The weights are on the states of `state_space` in the chosen coordinates.
+The weights are on the states of the design model in the chosen coordinates.
 """
 
 import abc
@@ -13,19 +13,17 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.control.gains import GainTable, crossing, edges_between, finite_time, step_by_step
 from jaxbeam.control.riccati import lqr
-from jaxbeam.controller import AbstractController
+from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, is_known, known, number
-from jaxbeam.fields import part as inner
-from jaxbeam.statespace import LoadedBeam, loaded_beam
+from jaxbeam.statespace import LoadedBeam
 
 TURN = 3.0  # rad by which the fastest mode may turn within a stretch of a table
 
 
-class AbstractRegulator(AbstractController):
-    """What all linear-quadratic regulators share: weights, coordinates, and the model designed for.
+class AbstractRegulator(AbstractStateLaw):
+    """What all linear-quadratic regulators share: their weights.
 
     `state_weight` is the diagonal of Q, `command_weight` that of R. With `places`, deflections
     there are weighted too, eq. (3.2) of the thesis. `feedback` says which share of each state is
@@ -38,7 +36,6 @@ class AbstractRegulator(AbstractController):
     command_weight: Float[Array, " actuator"] = number(
         "1/unit of a command^2", "weight of each command", POSITIVE
     )
-    coordinates: str = choice("coordinates of the states", "modal", "sine", default="modal")
     places: Float[Array, " place"] | None = number(
         "m", "where deflections are weighted", ON_BEAM, default=None
     )
@@ -48,54 +45,28 @@ class AbstractRegulator(AbstractController):
     feedback: Float[Array, " state"] | None = number(
         "1", "share of each state that is fed back", default=None
     )
-    design: Beliefs | None = inner("what is believed of actuators and loads", Beliefs)
-    period: Float[Array, ""] | None = number(
-        "s", "sampling period; at every instant if left out", POSITIVE, default=None
-    )
-    delay: Float[Array, ""] | None = number(
-        "s", "from measurement to command", NOT_NEGATIVE, default=None
-    )
-    resolution: Float[Array, ""] | None = number(
-        "unit of a command", "step between commands", POSITIVE, default=None
-    )
-
-    @property
-    def memoryless(self) -> bool:
-        return True
 
     @abc.abstractmethod
     def gains(self, model: LoadedBeam) -> Any:
         """The gains designed for a model, in the states of that model."""
 
     def fault(self, case):
-        own = sum(actuator.attachment().state_matrix.shape[0] for actuator in case.actuators)
-        states, commands = 2 * case.beam.modes + own, len(case.actuators)
-        wanted = {"state_weight": states, "feedback": states, "command_weight": commands}
-        for name in ("state_weight", "command_weight", "feedback", "terminal_weight"):
+        states, commands = self.states(case), len(case.actuators)
+        sizes = {
+            "state_weight": states,
+            "command_weight": commands,
+            "feedback": states,
+            "terminal_weight": states,
+        }
+        for name, size in sizes.items():
             value = getattr(self, name, None)
-            size = wanted.get(name, states)
             if value is not None and value.shape[0] != size:
                 return f"{name} must have {size} entries, not {value.shape[0]}"
         if (self.places is None) != (self.place_weight is None):
             return "places and place_weight belong together; give both or neither"
         if self.places is not None and self.places.shape != self.place_weight.shape:
             return "place_weight must have an entry for each of the places"
-        bonded = any(actuator.bonded() is not None for actuator in case.actuators)
-        if self.coordinates == "sine" and (
-            case.beam.ends != "pinned-pinned" or case.supports or bonded
-        ):
-            return (
-                "coordinates must be 'modal': the modes of this beam are not sin(n pi x / L);"
-                " only a uniform pinned-pinned beam without supports in between has those"
-            )
-        fault = None if self.design is None else self.design.fault(case)
-        return None if fault is None else f"design.{fault}"
-
-    def believed(self, model: LoadedBeam) -> LoadedBeam:
-        """The model that the gains are designed for, in the coordinates of the weights."""
-        if self.design is None:
-            return loaded_beam(model.case, model.rig, self.coordinates)
-        return self.design.applied(model, self.coordinates)
+        return super().fault(case)
 
     def weights(self, model: LoadedBeam) -> tuple[Array, Array]:
         """Q and R for the states of a model."""
@@ -106,10 +77,10 @@ class AbstractRegulator(AbstractController):
             Q = Q + rows.T @ (self.place_weight[:, None] * rows)
         return Q, jnp.diag(self.command_weight)
 
-    def fed_back(self, model: LoadedBeam, designed: LoadedBeam) -> Float[Array, "state state"]:
-        """The states of the design that are fed back, from the states of `model`."""
-        change = designed.from_rig(model.to_rig(jnp.eye(self.state_weight.shape[0])))
-        return change if self.feedback is None else self.feedback[:, None] * change
+    @property
+    def shares(self) -> Float[Array, " state"]:
+        """The share of each state that is fed back."""
+        return jnp.ones_like(self.state_weight) if self.feedback is None else self.feedback
 
 
 class LQR(AbstractRegulator):
@@ -119,12 +90,11 @@ class LQR(AbstractRegulator):
         plant = model.unloaded
         return lqr(plant.A, plant.B, *self.weights(model))[0]
 
-    def init(self, model):
-        designed = self.believed(model)
-        return self.gains(designed) @ self.fed_back(model, designed)
+    def prepare(self, model, designed):
+        return self.gains(designed) * self.shares
 
-    def step(self, memory, measurement, t):
-        return -memory @ measurement.state, memory
+    def command(self, memory, estimate, measurement, t):
+        return -memory @ estimate.state, memory
 
 
 class Schedule(eqx.Module):
@@ -170,29 +140,26 @@ class AbstractScheduledRegulator(AbstractRegulator):
         """Whether the weights of the loads are fed forward."""
         return False
 
-    def init(self, model):
-        designed = self.believed(model)
+    def prepare(self, model, designed):
         table = self.gains(designed)
         loads = designed.weights if self.knows_loads else jnp.zeros(0)
         last = table(jnp.ones(()))
-        states = self.state_weight.shape[0]
         if self.after == "time-invariant":
             plant = designed.unloaded
             last = lqr(plant.A, plant.B, *self.weights(designed))[0]
-        seen = self.fed_back(model, designed)
-        rest = jnp.zeros((last.shape[0], states + loads.shape[0]))
+        rest = jnp.zeros((last.shape[0], self.shares.shape[0] + loads.shape[0]))
         if self.after != "none":
-            rest = rest.at[:, :states].set(last[:, :states] @ seen)
-        known_loads = jnp.eye(loads.shape[0])
-        whole = jnp.block([[seen, jnp.zeros((states, loads.shape[0]))],
-                           [jnp.zeros((loads.shape[0], states)), known_loads]])  # fmt: skip
-        table = GainTable(table.edges, table.pieces @ whole)
+            rest = rest.at[:, : self.shares.shape[0]].set(last[:, : self.shares.shape[0]])
+        shares = jnp.concatenate([self.shares, jnp.ones_like(loads)])
+        table = GainTable(table.edges, table.pieces * shares)
         events = crossing(model)
-        return Schedule(table, rest, loads, events[0], events[-1])
+        return Schedule(table, rest * shares, loads, events[0], events[-1])
 
-    def step(self, memory, measurement, t):
-        column = jnp.concatenate([measurement.state, memory.known])
-        return -memory.gain(t) @ column, memory
+    def command(self, memory, estimate, measurement, t):
+        loads = memory.known
+        if self.knows_loads and estimate.weights is not None:
+            loads = estimate.weights
+        return -memory.gain(t) @ jnp.concatenate([estimate.state, loads]), memory
 
 
 class StepLQR(AbstractScheduledRegulator):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.controller import AbstractController
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, POSITIVE, number
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, number
 
 
 class Prescribed(AbstractController):
@@ -28,18 +28,6 @@ class Prescribed(AbstractController):
     times: Float[Array, " point"] | None = number("s", "table: times", INCREASING, default=None)
     values: Float[Array, "actuator point"] | None = number(
         "unit of a command", "table: a list of commands for each actuator", default=None
-    )
-    period: Float[Array, ""] | None = number(
-        "s",
-        "time for which a command is held; follows the signal if left out",
-        POSITIVE,
-        default=None,
-    )
-    delay: Float[Array, ""] | None = number(
-        "s", "from signal to command", NOT_NEGATIVE, default=None
-    )
-    resolution: Float[Array, ""] | None = number(
-        "unit of a command", "step between commands", POSITIVE, default=None
     )
 
     @property

@@ -1,0 +1,165 @@
+"""The limit nobody can beat: the least peak deflection that commands within limits leave.
+
+For known loads the deflection is linear in the commands (`reach`), so the least peak over all
+histories of commands is a linear program,
+
+    minimise p   subject to   |free(x, t) + sum_k response_k(x, t) u_k| <= p,
+                              u_min <= u_k <= u_max,   |u_k - u_(k-1)| <= rate x period,
+
+at every place x and instant t. No controller that holds its commands over the same period gets
+below p, however it measures, estimates or predicts.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case import Case
+from jaxbeam.checks import check, check_on_beam
+from jaxbeam.control.least_peak import least_peak
+from jaxbeam.control.prescribed import Prescribed
+from jaxbeam.control.reach import TOLERANCE, reach
+from jaxbeam.plan import form, run_extremes, suitable_step
+from jaxbeam.record import Record
+
+HELD = 0.01  # s: over which commands are held, where no controller says
+
+
+class Binding(NamedTuple):
+    """Where and when the peak cannot be lowered: places (m), instants (s), weights that add to 1.
+
+    The weights are the multipliers of the linear program. They prove the bound: for any commands,
+    the weighted deflection at these instants, and so the largest of them, is at least as much.
+    """
+
+    places: Float[np.ndarray, " binding"]
+    instants: Float[np.ndarray, " binding"]
+    weights: Float[np.ndarray, " binding"]
+
+
+class Bound(eqx.Module):
+    """The least achievable peak deflection of a case, and commands that attain it.
+
+    `peak` (m) is the largest absolute deflection at the `places` (m), at instants at most `spacing`
+    (s) apart; that in between may be a little larger. `uncontrolled` (m) is the peak without
+    commands. `commands` start at `times` (s) and are held over `period` (s); of all that attain
+    the peak (to a millionth) they are those that change least.
+    """
+
+    peak: float
+    uncontrolled: float
+    places: Float[np.ndarray, " place"]
+    times: Float[np.ndarray, " hold"]
+    commands: Float[np.ndarray, "hold actuator"]
+    period: float
+    spacing: float
+    binding: Binding
+
+    @property
+    def reduction(self) -> float:
+        """Attainable share of the uncontrolled peak that control can take away, 0 to 1."""
+        return 1 - self.peak / self.uncontrolled
+
+    def share(self, record: Record) -> float:
+        """Share of the attainable reduction that a run achieves: 0 without control, 1 at best.
+
+        It is negative for a run that control makes worse, NaN for one that diverges. Its peak is
+        that at the places of the bound; where these are not the sensors of the run, among samples.
+        """
+        sensors = np.array([float(sensor.position) for sensor in record.case.sensors])
+        if np.array_equal(sensors, self.places):
+            peak = np.max(np.asarray(record.peak_deflection))
+        else:
+            peak = np.max(np.abs(np.asarray(record.at(self.places))))
+        attainable = self.uncontrolled - self.peak
+        return float(self.uncontrolled - peak) / attainable if attainable > 0 else np.nan
+
+    def controller(self) -> Prescribed:
+        """The controller that gives the commands, whatever the beam does."""
+        end = self.times[-1] + self.period
+        values = np.concatenate([self.commands, self.commands[-1:]]).T
+        nothing = np.zeros(self.commands.shape[1])
+        table = {"times": np.append(self.times, end), "values": values}
+        return Prescribed(offsets=nothing, period=self.period, **table)
+
+
+def bound(
+    case: Case,
+    places: Float[np.ndarray, " place"] | None = None,
+    period: float | None = None,
+    spacing: float | None = None,
+) -> Bound:
+    """The least peak deflection of a case that any controller can achieve, and how.
+
+    The peak is that at the sensors, or at given `places` (m from the left end); take many for the
+    whole beam. Commands are held over `period` (s): by default that of the case's controller, or
+    0.01 s. They stay within the limits and rates of the actuators, and are free where there are
+    none; resolution, delay, and the controller of the case play no part. The deflection is looked
+    at every `spacing` (s), by default at the run's sample rate, and wherever commands change.
+
+    Raises ValueError for a faulty case, one without actuators that take commands, loads or places,
+    for times that are not positive, for limits that rates cannot reach from zero, and under
+    differentiation (it has no derivatives); RuntimeError if the linear program fails.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(case)):
+        raise ValueError("a bound cannot be differentiated or compiled; call it on plain numbers")
+    check(case)
+    own = None if case.controller is None else case.controller.period
+    period = float(HELD if own is None else own) if period is None else float(period)
+    spacing = 1 / float(case.run.sample_rate) if spacing is None else float(spacing)
+    places = _places(case, places)
+    if not case.loads:
+        raise ValueError("without loads nothing deflects the beam; add one for a bound")
+    if not (np.isfinite([period, spacing]).all() and min(period, spacing) > 0):
+        raise ValueError(f"period and spacing must be positive; they are {period:g}, {spacing:g} s")
+    if period > float(case.run.duration):
+        raise ValueError(f"period {period:g} s is longer than the run, {case.run.duration:g} s")
+    found = reach(case, period, spacing)
+    if not np.any(found.response):
+        raise ValueError("no actuator of the case takes commands that move the beam; add one")
+    uncontrolled = _uncontrolled(case, places)
+    peak, commands, weights = least_peak(found, found.rows(places), *_ranges(case, period))
+    when, where = np.nonzero(weights)
+    return Bound(
+        peak=peak,
+        uncontrolled=_uncontrolled(case, places),
+        places=places,
+        times=found.holds,
+        commands=commands,
+        period=period,
+        spacing=spacing,
+        binding=Binding(places[where], found.instants[when], weights[when, where]),
+    )
+
+
+def _places(case: Case, places) -> Float[np.ndarray, " place"]:
+    if places is None:
+        places = [sensor.position for sensor in case.sensors]
+    places = np.asarray(places, float).ravel()
+    if places.size == 0:
+        raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")
+    for i, place in enumerate(places):
+        check_on_beam(f"places.{i}", place, case.beam.length)
+    return places
+
+
+def _uncontrolled(case: Case, places) -> float:
+    """The largest deflection (m) at some places without commands, at all times."""
+    plain = eqx.tree_at(lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None)
+    shape = form(plain)
+    step, _ = suitable_step(plain, shape, TOLERANCE)
+    best = eqx.filter_jit(run_extremes)(plain, shape, jnp.asarray(step), jnp.asarray(places))
+    return float(jnp.max(best.peak()[0]))
+
+
+def _ranges(case: Case, period: float):
+    """Smallest and largest command to each actuator, and its largest change between holds."""
+    limits = [actuator.command_limits() for actuator in case.actuators]
+    rates = [actuator.command_rate() for actuator in case.actuators]
+    pairs = [(-np.inf, np.inf) if pair is None else np.asarray(pair) for pair in limits]
+    low, high = np.array(pairs).T
+    return low, high, np.array([np.inf if r is None else float(r) * period for r in rates])

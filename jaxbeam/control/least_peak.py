@@ -1,0 +1,125 @@
+"""The linear program behind `bound`: the least peak, and the calmest commands that attain it.
+
+The unknowns are the commands, their changes from hold to hold, and the peak. Of the rows that keep
+the deflection below the peak only those are taken that would be violated without them: they are
+added until none is, so that a close look at the whole beam costs little.
+"""
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float
+from scipy.optimize import linprog
+
+from jaxbeam.control.reach import Reach
+
+EXACT = 1e-9  # of the largest deflection without commands: how far a row may be violated
+SLACK = 1e-6  # of the peak: given up for calm commands
+ROUNDS = 200  # of adding rows; about ten are usual
+
+
+def least_peak(
+    found: Reach,
+    rows: Float[np.ndarray, "place mode"],
+    low: Float[np.ndarray, " actuator"],
+    high: Float[np.ndarray, " actuator"],
+    change: Float[np.ndarray, " actuator"],
+) -> tuple[float, Float[np.ndarray, "hold actuator"], Float[np.ndarray, "instant place"]]:
+    """The least peak (m), commands that attain it, and the multipliers of the deflections.
+
+    `rows` take the coordinates of `found` to the deflection; commands stay between `low` and
+    `high` and change by no more than `change` from hold to hold, beginning at zero. Of all
+    commands that attain the peak to a millionth, these have the least total change.
+
+    Raises ValueError if no commands meet the limits, RuntimeError if the solver fails.
+    """
+    program = _Program(found, rows, low, high, change)
+    peak, _, weights = program.solve(calm=False)
+    _, commands, _ = program.solve(calm=True, most=peak * (1 + SLACK))
+    return peak * program.size, commands, weights
+
+
+class _Program:
+    """The program in scaled unknowns, and the rows taken into it so far."""
+
+    def __init__(self, found, rows, low, high, change):
+        self.found, self.rows = found, rows
+        self.shape = found.response.shape[2:]
+        self.size = np.max(np.abs(found.free @ rows.T))
+        self.unit = _units(found, rows, low, high, self.size)
+        self.low, self.high, self.change = (part / self.unit for part in (low, high, change))
+        self.taken = np.zeros((3, 0), int)  # instant, place, sign of the deflection
+
+    def solve(self, calm: bool, most: float = np.inf):
+        """Peak, commands and multipliers; least in the peak, or `calm` below a given peak."""
+        count = int(np.prod(self.shape))
+        cost = np.repeat([0.0, 1.0, 0.0] if calm else [0.0, 0.0, 1.0], [count, count, 1])
+        for _ in range(ROUNDS):
+            matrix, right = self._matrix()
+            found = linprog(
+                cost,
+                matrix,
+                right,
+                bounds=self._bounds(most),
+                method="highs",
+                options={"primal_feasibility_tolerance": EXACT, "dual_feasibility_tolerance": EXACT},
+            )
+            if found.status == 2:
+                raise ValueError(
+                    "no commands, starting from zero, stay within limits and rates of the actuators"
+                )
+            if found.status != 0:
+                raise RuntimeError(f"the linear program for the bound failed: {found.message}")
+            commands, peak = found.x[:count].reshape(self.shape) * self.unit, found.x[-1]
+            deflection = self.found.motion(commands) @ self.rows.T / self.size
+            if not self._take(deflection, peak):
+                weights = np.zeros(deflection.shape)
+                np.add.at(
+                    weights,
+                    tuple(self.taken[:2]),
+                    -found.ineqlin.marginals[2 * count :] * self.taken[2],
+                )
+                return peak, commands, weights
+        raise RuntimeError(f"the linear program for the bound did not settle in {ROUNDS} rounds")
+
+    def _take(self, deflection, peak) -> bool:
+        """Take in where the deflection most exceeds the peak, if it does anywhere."""
+        size = np.abs(deflection)
+        around = np.pad(size, 1, constant_values=-1.0)
+        highest = (
+            (size >= around[:-2, 1:-1])
+            & (size > around[2:, 1:-1])
+            & (size >= around[1:-1, :-2])
+            & (size > around[1:-1, 2:])
+        )
+        when, where = np.nonzero(highest & (size > peak + 2 * EXACT))
+        new = np.stack([when, where, np.sign(deflection[when, where]).astype(int)])
+        self.taken = np.concatenate([self.taken, new], axis=1)
+        return when.size > 0
+
+    def _matrix(self):
+        """Rows for the changes of the commands, then for the deflections taken in so far."""
+        holds, actuators = self.shape
+        step = sp.kron(sp.eye(holds) - sp.eye(holds, k=-1), sp.eye(actuators))
+        one = sp.eye(holds * actuators)
+        when, where, sign = self.taken
+        response = self.found.response[when] * (self.unit / self.size)
+        response = np.einsum("im,imka->ika", self.rows[where], response) * sign[:, None, None]
+        free = sign * np.sum(self.rows[where] * self.found.free[when], axis=1) / self.size
+        felt = sp.csr_array(response.reshape(sign.size, holds * actuators))
+        peak = -np.ones((sign.size, 1))
+        matrix = sp.block_array([[step, -one, None], [-step, -one, None], [felt, None, peak]])
+        return matrix.tocsr(), np.concatenate([np.zeros(2 * holds * actuators), -free])
+
+    def _bounds(self, most):
+        holds = self.shape[0]
+        low = np.concatenate([np.tile(self.low, holds), np.zeros(holds * self.low.size), [0.0]])
+        high = [np.tile(self.high, holds), np.tile(self.change, holds), [most]]
+        return np.stack([low, np.concatenate(high)], axis=1)
+
+
+def _units(found, rows, low, high, size):
+    """What each command is measured in: its larger limit, or what moves the beam as its loads do."""
+    moved = np.abs(rows).max(axis=0) @ np.abs(found.response).max(axis=(0, 2))
+    sized = np.where(moved > 0, size / np.where(moved > 0, moved, 1.0), 1.0)
+    largest = np.maximum(np.abs(low), np.abs(high))
+    return np.where(np.isfinite(largest) & (largest > 0), largest, sized)
