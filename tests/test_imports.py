@@ -11,8 +11,9 @@ from tests.modules import PACKAGES, module_files, parse
 # modules, which may import each other.
 LAYERS = """
 jaxbeam.fields  jaxbeam.holds
+jaxbeam.stretches
 jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
-jaxbeam.estimator  jaxbeam.loads  jaxbeam.schedule  jaxbeam.sensors
+jaxbeam.estimator  jaxbeam.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.sensors
 jaxbeam.case  jaxbeam.sensing
 jaxbeam.checks
 jaxbeam.modes

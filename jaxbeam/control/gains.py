@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.control.riccati import lqr
-from jaxbeam.control.stretches import NODES, Commands, Square, costs_to_go, riccati_rate, stretches
 from jaxbeam.motion import NEVER
+from jaxbeam.riccati import lqr
 from jaxbeam.statespace import LoadedBeam
+from jaxbeam.stretches import NODES, Commands, Square, costs_to_go, riccati_rate, stretches
 
 LAYER = 12  # times the stretch before an event is halved, for the fast layer of P there
 INSIDE = 1e-9  # of a stretch: how far within it its ends are looked at

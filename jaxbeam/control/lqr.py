@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.control.gains import GainTable, crossing, edges_between, finite_time, step_by_step
-from jaxbeam.control.riccati import lqr
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, is_known, known, number
+from jaxbeam.riccati import lqr
 from jaxbeam.statespace import LoadedBeam
 
 TURN = 3.0  # rad by which the fastest mode may turn within a stretch of a table

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.control.stretches import Commands, Inputs, Square, Stretch, even_units, symmetric
 from jaxbeam.fields import is_known, known
 from jaxbeam.holds import balance
+from jaxbeam.stretches import Commands, Inputs, Square, Stretch, even_units, symmetric
 
 Gain = tuple[Float[Array, "input state"], Square]
 
