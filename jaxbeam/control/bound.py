@@ -30,10 +30,11 @@ HELD = 0.01  # s: over which commands are held, where no controller says
 
 
 class Binding(NamedTuple):
-    """Where and when the peak cannot be lowered: places (m), instants (s), weights that add to 1.
+    """Where and when the peak cannot be lowered: places (m), instants (s), and weights.
 
-    The weights are the multipliers of the linear program. They prove the bound: for any commands,
-    the weighted deflection at these instants, and so the largest of them, is at least as much.
+    The weights, multipliers of the linear program, have the sign of the deflection, and their sizes
+    add to 1. They prove the bound: whatever the commands, the sum of weights times deflections is
+    no less than it, and the largest of these deflections no less than their sum.
     """
 
     places: Float[np.ndarray, " binding"]
@@ -46,8 +47,8 @@ class Bound(eqx.Module):
 
     `peak` (m) is the largest absolute deflection at the `places` (m), at instants at most `spacing`
     (s) apart; that in between may be a little larger. `uncontrolled` (m) is the peak without
-    commands. `commands` start at `times` (s) and are held over `period` (s); of all that attain
-    the peak (to a millionth) they are those that change least.
+    commands. `commands` start at `times` (s) and are held over `period` (s); of the many that
+    attain the peak (to 1e-5) they are calm ones.
     """
 
     peak: float
