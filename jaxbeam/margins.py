@@ -1,0 +1,165 @@
+"""How far a time-invariant loop is from instability, and what it can reach and see.
+
+Gain, phase and delay margins of the loop broken at one command while the others stay closed;
+Gramians and Hankel singular values of a state space.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from jaxtyping import Array, Float
+
+from jaxbeam.fields import known
+from jaxbeam.holds import balance
+from jaxbeam.linear_loop import LinearLoop
+from jaxbeam.statespace import StateSpace
+
+POINTS = 400  # frequencies around each pole
+BELOW = 1e-3  # lowest frequency looked at, relative to the lowest pole
+DOUBLINGS = 60
+
+
+class Margins(NamedTuple):
+    """Margins of a loop broken at one command; infinite (or zero, `gain_down`) if there is none.
+
+    The loop stays stable while its gain is multiplied by less than `gain` and more than
+    `gain_down`, its phase lags by less than `phase` (rad) more, or its delay grows by less than
+    `delay` (s). `distance` is the least distance of the Nyquist curve from the critical point.
+    """
+
+    gain: float
+    gain_down: float
+    phase: float
+    delay: float
+    distance: float
+
+
+def margins(loop: LinearLoop, actuator: int = 0) -> Margins:
+    """Margins at one command of a loop that is stable, from its frequency response L(i omega).
+
+    u = K (s - A)^-1 B u: the critical point is L = K (s - A)^-1 B = 1; s is exp(i omega period)
+    in a sampled loop. Raises ValueError if the loop is not stable as it is.
+    """
+    if np.any(loop.poles().real >= 0):
+        raise ValueError("the loop is unstable as it is; margins belong to a stable one")
+    A, B, K = (np.asarray(known(part)) for part in (loop.A, loop.B, loop.K))
+    others = np.arange(B.shape[1]) != actuator
+    A = A + B[:, others] @ K[others]
+    column, row = B[:, actuator], K[actuator]
+    values, vectors = np.linalg.eig(A)
+    # In its eigenvectors: one division for each frequency and pole.
+    parts = (row @ vectors) * np.linalg.solve(vectors, column.astype(complex))
+
+    def response(omega):
+        s = 1j * np.atleast_1d(omega)
+        s = s if loop.period is None else np.exp(s * loop.period)
+        return (parts / (s[:, None] - values)).sum(axis=1)
+
+    omega = _frequencies(values, loop.period)
+    curve = response(omega)
+
+    def crossings(function):
+        signs = np.sign(function(curve))
+        for i in np.flatnonzero(signs[:-1] * signs[1:] < 0):
+            yield scipy.optimize.brentq(
+                lambda w: function(response(w))[0], omega[i], omega[i + 1], rtol=1e-13
+            )
+
+    gains = [1 / response(w)[0].real for w in crossings(np.imag)]
+    gains += [1 / value.real for value in (curve[0], curve[-1]) if abs(value.imag) < 1e-9]
+    phases, delays = [np.inf], [np.inf]
+    for w in crossings(lambda z: np.abs(z) - 1):
+        # What lags by its own angle meets the critical point at angle zero.
+        lag = np.angle(response(w)[0]) % (2 * np.pi)
+        phases.append(min(lag, 2 * np.pi - lag))
+        delays.append(lag / w)
+    return Margins(
+        gain=min((g for g in gains if g > 1), default=np.inf),
+        gain_down=max((g for g in gains if 0 < g < 1), default=0.0),
+        phase=min(phases),
+        delay=min(delays),
+        distance=float(np.min(np.abs(1 - curve))),
+    )
+
+
+def _frequencies(poles, period) -> np.ndarray:
+    """Frequencies (rad/s) that resolve every peak of a response with these poles."""
+    if period is not None:
+        poles = np.log(np.where(poles == 0, np.finfo(float).tiny, poles)) / period
+    size = np.abs(poles[poles != 0])
+    top = 1e3 * size.max() if period is None else np.pi / period
+    found = [np.geomspace(min(BELOW * size.min(), top / 2), top, 4 * POINTS)]
+    for pole in poles:
+        # Densest within its half-width.
+        found.append(pole.imag + abs(pole.real) * np.sinh(np.linspace(-6, 6, POINTS)))
+    omega = np.unique(np.concatenate(found))
+    return omega[(omega > 0) & (omega <= top)]
+
+
+class Gramians(NamedTuple):
+    """Triangular factors of the Gramians of a stable state space, and what follows from them.
+
+    The states that unit commands of any shape reach are Lc w with |w| <= 1; those that give
+    outputs of unit energy are Lo'^-1 w. `hankel` are the singular values of the two together, in
+    output per input, descending: directions with small ones are hardly reached or hardly seen.
+    """
+
+    controllability: Float[Array, "state state"]
+    observability: Float[Array, "state state"]
+    hankel: Float[Array, " state"]
+
+    @property
+    def reached(self) -> Float[Array, " state"]:
+        """The root of each state's entry in the Gramian of controllability."""
+        return jnp.linalg.norm(self.controllability, axis=1)
+
+    @property
+    def seen(self) -> Float[Array, " state"]:
+        """The root of each state's entry in the Gramian of observability."""
+        return jnp.linalg.norm(self.observability, axis=1)
+
+
+def gramians(system: StateSpace) -> Gramians:
+    """Factors of the Gramians: A X + X A' + B B' = 0 with X = Lc Lc', and dually with C.
+
+    The factors are found without forming the Gramians, whose small directions would drown in
+    rounding (Hammarling, IMA Journal of Numerical Analysis 2, 1982, gives the reason; here by
+    doubling with orthogonal factors). Differentiable where singular values differ.
+    Raises ValueError if the system is not stable.
+    """
+    A, B, C = system.A, system.B, system.C
+    scale = balance(A)
+    A, B, C = A * scale / scale[:, None], B / scale[:, None], C * scale
+    if system.period is None:
+        # Cayley's transform keeps the Gramians.
+        pole = jnp.max(jnp.sum(jnp.abs(A), axis=1))
+        inverse = jnp.linalg.inv(pole * jnp.eye(A.shape[0]) - A)
+        A, root = inverse @ (pole * jnp.eye(A.shape[0]) + A), jnp.sqrt(2 * pole)
+        B, C = root * inverse @ B, root * C @ inverse
+    reach, view = _factor(A, B), _factor(A.T, C.T)
+    if not bool(jnp.all(jnp.isfinite(reach)) & jnp.all(jnp.isfinite(view))):
+        raise ValueError("Gramians need a stable system; damp every mode, rigid ones too")
+    hankel = jnp.linalg.svd(view.T @ reach, compute_uv=False)
+    return Gramians(reach * scale[:, None], view / scale[:, None], hankel)
+
+
+def _factor(A, B):
+    """L with L L' = sum of A^k B B' A'^k, twice as many terms at a time; nan if it grows."""
+    size = A.shape[0]
+    factor = jnp.zeros((size, size))
+    factor = factor.at[:, : min(size, B.shape[1])].set(_narrow(B)[:, : min(size, B.shape[1])])
+    for _ in range(DOUBLINGS):
+        factor = _narrow(jnp.concatenate([factor, A @ factor], axis=1))
+        A = A @ A
+        if not float(jnp.max(jnp.abs(A))) < 1e100:
+            return jnp.full((size, size), jnp.nan)
+        if float(jnp.max(jnp.abs(A))) < 1e-18:
+            return factor
+    return jnp.full((size, size), jnp.nan)
+
+
+def _narrow(wide):
+    """A square (or narrower) L with L L' = wide wide'."""
+    return jnp.linalg.qr(wide.T, mode="r").T
