@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jaxbeam.case import Case
 from jaxbeam.checks import check, check_on_beam
@@ -90,7 +91,7 @@ class Bound(eqx.Module):
 
 def bound(
     case: Case,
-    places: Float[np.ndarray, " place"] | None = None,
+    places: ArrayLike | None = None,
     period: float | None = None,
     spacing: float | None = None,
 ) -> Bound:
@@ -113,17 +114,19 @@ def bound(
     period = float(HELD if own is None else own) if period is None else float(period)
     spacing = 1 / float(case.run.sample_rate) if spacing is None else float(spacing)
     places = _places(case, places)
-    if not case.loads:
-        raise ValueError("without loads nothing deflects the beam; add one for a bound")
+    if not case.actuators:
+        raise ValueError("without actuators there is nothing to command; add one for a bound")
     if not (np.isfinite([period, spacing]).all() and min(period, spacing) > 0):
         raise ValueError(f"period and spacing must be positive; they are {period:g}, {spacing:g} s")
     if period > float(case.run.duration):
         raise ValueError(f"period {period:g} s is longer than the run, {case.run.duration:g} s")
     found = reach(case, period, spacing)
+    rows = found.rows(places)
+    if not np.any(found.free @ rows.T):
+        raise ValueError("nothing deflects the beam at these places during the run; add a load")
     if not np.any(found.response):
         raise ValueError("no actuator of the case takes commands that move the beam; add one")
-    uncontrolled = _uncontrolled(case, places)
-    peak, commands, weights = least_peak(found, found.rows(places), *_ranges(case, period))
+    peak, commands, weights = least_peak(found, rows, *_ranges(case, period))
     when, where = np.nonzero(weights)
     return Bound(
         peak=peak,

@@ -115,7 +115,7 @@ class _Program:
 
 
 def _units(found, rows, low, high, size):
-    """What each command is measured in: its larger limit, or what moves the beam as its loads do."""
+    """What each command is measured in: its larger limit, or what bends the beam as loads do."""
     moved = np.abs(rows).max(axis=0) @ np.abs(found.response).max(axis=(0, 2))
     sized = np.where(moved > 0, size / np.where(moved > 0, moved, 1.0), 1.0)
     largest = np.maximum(np.abs(low), np.abs(high))

@@ -9,7 +9,6 @@ Both are found with the integrator of `simulate`, one lane a unit command, all o
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int

@@ -1,0 +1,235 @@
+"""The least achievable peak: proofs of optimality, another solver, runs that attain it or try."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import clarabel
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.control.bound import bound
+from jaxbeam.control.reach import reach
+from jaxbeam.plan import make_plan
+
+DATA = json.loads((Path(__file__).parent / "data" / "bounds.json").read_text())
+PATCH = jb.Patch(
+    0.2575,
+    0.3425,
+    moment_per_volt=DATA["one span, one mass"]["moment_per_volt"],
+    amplifier_gain=200.0,
+    limits=[-2.5, 7.5],
+)
+
+
+def patched(modes=5, mass=0.509, speed=1.0, duration=0.6, controller=None) -> jb.Case:
+    """The one-span rig with a patch."""
+    beam = jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.03, modes=modes)
+    load = jb.MovingMass(mass=mass, speed=speed)
+    return jb.Case(beam, (), [PATCH], [jb.Sensor(0.3)], [load], controller, jb.Run(duration))
+
+
+def shaken(volts: float, damping=0.0) -> jb.Case:
+    """The one-span rig with a shaker."""
+    beam = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
+    shaker = jb.Shaker(
+        0.5, 3500.0, damping, force_per_volt=4.6, bandwidth=1e4, limits=[-volts, volts]
+    )
+    sensors = [jb.Sensor(place) for place in (0.15, 0.25, 0.35)]
+    load = jb.MovingMass(mass=0.509, speed=0.55)
+    return jb.Case(beam, (), [shaker], sensors, [load], run=jb.Run(0.6 / 0.55))
+
+
+def with_rate(case: jb.Case, rate: float) -> jb.Case:
+    patch = dataclasses.replace(case.actuators[0], rate_limit=jnp.asarray(rate))
+    return dataclasses.replace(case, actuators=(patch,))
+
+
+@pytest.fixture(scope="module")
+def best():
+    return bound(patched())
+
+
+@pytest.fixture(scope="module")
+def numbers():
+    """Free deflection (instant,) and responses (instant, hold) at the sensor of the rig."""
+    found = reach(patched(), 0.01, 0.001)
+    row = found.rows(np.array([0.3]))[0]
+    return found.free @ row, np.einsum("m,tmk->tk", row, found.response[..., 0])
+
+
+def test_reference_numbers():
+    for name, modes in (("one span, one mass", 5), ("one span, one mass, eight modes", 8)):
+        expected, case = DATA[name], patched(modes)
+        found = reach(case, 0.01, 0.01)
+        free = np.max(np.abs(found.free @ found.rows(np.array([0.3])).T))
+        assert_allclose(free, expected["uncontrolled_m"], rtol=2e-9)
+        # Programs in metres whose rows hold to 1e-7 (m), as the solver's default is.
+        assert_allclose(bound(case, spacing=0.01).peak, expected["least_peak_m"], atol=1.1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", DATA["attainable_reduction_percent"])
+def test_published_reductions(row):
+    if row["rig"] == "patch":
+        case = patched(8, row["mass"], row["speed"], 0.6 / row["speed"])
+    else:
+        case = shaken(row["volts"], row["damping"])
+    # Voltages are given to three digits, percentages to one place.
+    assert_allclose(100 * bound(case).reduction, row["percent"], atol=0.25)
+
+
+def test_multipliers_prove_the_bound(best, numbers):
+    """Weak duality, which needs no solver: no commands within limits bring the sum below it."""
+    free, response = numbers
+    weights = np.zeros(free.size)
+    instants = np.searchsorted(np.arange(601) / 1000, best.binding.instants - 1e-9)
+    np.add.at(weights, instants, best.binding.weights)
+    assert np.sum(np.abs(weights)) <= 1 + 1e-9
+    slopes = weights @ response
+    least = weights @ free + np.sum(np.minimum(-2.5 * slopes, 7.5 * slopes))
+    assert_allclose(least, best.peak, rtol=1e-8)
+    # What the proof leaves open: how much more than the bound the commands given need.
+    deflection = free + response @ best.commands[:, 0]
+    assert best.peak <= np.max(np.abs(deflection)) < best.peak * (1 + 1e-5)
+    assert np.min(best.commands) >= -2.5 and np.max(best.commands) <= 7.5
+
+
+def test_another_solver_finds_the_same(best, numbers):
+    free, response = numbers
+    count = response.shape[1]
+    one, scale = np.ones((free.size, 1)), 1e3  # mm
+    rows = np.block([[scale * response, -one], [-scale * response, -one]])
+    box = np.block([[np.eye(count), np.zeros((count, 1))], [-np.eye(count), np.zeros((count, 1))]])
+    right = np.concatenate([-scale * free, scale * free, np.full(count, 7.5), np.full(count, 2.5)])
+    options = clarabel.DefaultSettings()
+    options.verbose = False
+    solver = clarabel.DefaultSolver(
+        sp.csc_matrix((count + 1, count + 1)),
+        np.append(np.zeros(count), 1.0),
+        sp.csc_matrix(np.concatenate([rows, box])),
+        right,
+        [clarabel.NonnegativeConeT(right.size)],
+        options,
+    )
+    assert_allclose(best.peak, solver.solve().x[-1] / scale, rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+def test_a_run_attains_it(best):
+    case = dataclasses.replace(patched(), controller=best.controller())
+    record = jb.simulate(case, tolerance=1e-9)
+    sampled = np.max(np.abs(record.deflection))
+    assert_allclose(sampled, best.peak, rtol=1e-5)
+    # Between the instants, a millisecond apart, it is a little more.
+    assert_allclose(record.peak_deflection[0], best.peak, rtol=1e-3)
+    assert best.peak < record.peak_deflection[0]
+    assert_allclose(best.share(record), 1.0, atol=4e-3)
+    assert_allclose(record.command[:-1, 0], np.repeat(best.commands[:, 0], 10), rtol=1e-12)
+
+
+def test_shares(best):
+    free = jb.simulate(patched(), tolerance=1e-9)
+    assert_allclose(best.uncontrolled, free.peak_deflection[0], rtol=1e-8)
+    assert_allclose(best.share(free), 0.0, atol=1e-7)
+    assert_allclose(best.reduction, 1 - best.peak / best.uncontrolled)
+    nearby = dataclasses.replace(best, places=np.array([0.3, 0.31]))
+    middle = np.max(np.abs(free.at(np.array([0.3, 0.31]))))
+    wanted = (best.uncontrolled - middle) / (best.uncontrolled - best.peak)
+    assert_allclose(nearby.share(free), wanted, rtol=1e-12)
+
+
+RIVALS = patched(controller=jb.StateFeedback(np.zeros((1, 10)), period=0.01))
+
+
+@pytest.fixture(scope="module")
+def rivals_plan():
+    return make_plan(jb.replace(RIVALS, {"controller.gain": np.ones((1, 10))}))
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+@settings(max_examples=40)
+@given(
+    mass=st.floats(0.1, 1.0),
+    speed=st.floats(0.5, 3.0),
+    strength=st.floats(1.0, 6.0),
+    seed=st.integers(0, 10**6),
+)
+def test_no_controller_beats_it(rivals_plan, mass, speed, strength, seed):
+    """Full state feedback of any sense and strength, saturated by the actuator's limits."""
+    gain = np.random.default_rng(seed).standard_normal((1, 10)) * 10**strength
+    gain[0, 5:] *= 0.01  # rates in m/s beside deflections in m
+    numbers = {"loads.0.mass": mass, "loads.0.speed": speed, "controller.gain": gain}
+    case = jb.replace(RIVALS, numbers)
+    record = jb.simulate(case, plan=rivals_plan)
+    least = bound(case)
+    assert least.period == 0.01
+    assert np.max(np.abs(record.deflection)) >= least.peak * (1 - 1e-6)
+    assert least.share(record) <= 1 + 1e-6
+
+
+def test_more_places_and_slower_actuators_raise_it(best):
+    whole = bound(patched(), places=np.linspace(0.0, 0.6, 61))
+    assert best.peak < whole.peak < best.uncontrolled < whole.uncontrolled
+    slow = bound(with_rate(patched(), 20.0))
+    assert best.peak < slow.peak < best.uncontrolled
+    changes = np.diff(slow.commands[:, 0], prepend=0.0)
+    assert np.max(np.abs(changes)) <= 20.0 * 0.01 * (1 + 1e-9)
+
+
+def test_shorter_holds_lower_it(best):
+    shorter = bound(patched(controller=jb.Feedback([0.0], period=0.005)))
+    assert shorter.period == 0.005
+    assert shorter.commands.shape == (120, 1)
+    assert best.peak * 0.98 < shorter.peak < best.peak
+
+
+def test_without_limits_one_place_can_be_held_still():
+    free = jb.PointForce(0.3)
+    case = dataclasses.replace(patched(), actuators=(free,))
+    found = bound(case, spacing=0.01)
+    assert found.peak < 1e-6 * found.uncontrolled
+
+
+def test_two_actuators_and_a_hold_cut_short():
+    """The last hold ends with the run; every actuator has its own commands."""
+    case = dataclasses.replace(
+        patched(duration=0.333), actuators=(PATCH, jb.PointForce(0.2, [0.0, 1.0]))
+    )
+    found = bound(case)
+    assert found.commands.shape == (34, 2)
+    assert found.peak < bound(patched(duration=0.333)).peak
+    assert np.all((found.commands[:, 1] >= 0) & (found.commands[:, 1] <= 1))
+
+
+FAULTS = {
+    "without actuators": lambda: bound(dataclasses.replace(patched(), actuators=())),
+    "add a load": lambda: bound(dataclasses.replace(patched(), loads=())),
+    "takes commands that move the beam": lambda: bound(
+        dataclasses.replace(patched(), actuators=(jb.SpringDamper(0.2, 100.0),))
+    ),
+    "add a sensor, or give places": lambda: bound(dataclasses.replace(patched(), sensors=())),
+    "places.1 must lie on the beam": lambda: bound(patched(), places=[0.1, 0.7]),
+    "must be positive": lambda: bound(patched(), period=-0.01),
+    "longer than the run": lambda: bound(patched(), period=1.0),
+    "too many to keep": lambda: bound(patched(), period=1e-4, spacing=1e-5),
+    "cannot be differentiated": lambda: jax.grad(
+        lambda mass: bound(jb.replace(patched(), {"loads.0.mass": mass})).peak
+    )(0.5),
+    "limits and rates": lambda: bound(
+        with_rate(jb.replace(patched(), {"actuators.0.limits": [1.0, 7.5]}), 20.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("words", FAULTS)
+def test_faults_are_named(words):
+    with pytest.raises(ValueError, match=words):
+        FAULTS[words]()
