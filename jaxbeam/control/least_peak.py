@@ -22,20 +22,19 @@ ROUNDS = 100  # of adding rows; about ten are usual
 
 def least_peak(
     found: Reach,
-    rows: Float[np.ndarray, "place mode"],
     low: Float[np.ndarray, " actuator"],
     high: Float[np.ndarray, " actuator"],
     change: Float[np.ndarray, " actuator"],
 ) -> tuple[float, Float[np.ndarray, "hold actuator"], Float[np.ndarray, "instant place"]]:
     """The least peak (m), commands that attain it, and the multipliers of the deflections.
 
-    `rows` take the coordinates of `found` to the deflection; commands stay between `low` and
-    `high` and change by no more than `change` from hold to hold, beginning at zero. No commands
-    have a smaller peak; these have one that is larger by a hundred-thousandth at most.
+    Commands stay between `low` and `high` and change by no more than `change` from hold to hold,
+    beginning at zero. None have a smaller peak; these have one that is larger by a
+    hundred-thousandth at most.
 
     Raises ValueError if no commands meet the limits, RuntimeError if the solver fails.
     """
-    program = _Program(found, rows, low, high, change)
+    program = _Program(found, low, high, change)
     commands, peak = np.zeros(found.response.shape[2:]), 0.0
     for _ in range(ROUNDS):
         if not program.take(commands, peak):
@@ -51,17 +50,17 @@ def least_peak(
 class _Program:
     """The program in scaled unknowns, and the rows taken into it so far."""
 
-    def __init__(self, found, rows, low, high, change):
-        self.found, self.rows = found, rows
+    def __init__(self, found, low, high, change):
+        self.found = found
         self.shape = found.response.shape[2:]
-        self.size = np.max(np.abs(found.free @ rows.T))
-        self.unit = _units(found, rows, low, high, self.size)
+        self.size = np.max(np.abs(found.free @ found.rows.T))
+        self.unit = _units(found, low, high, self.size)
         self.low, self.high, self.change = (part / self.unit for part in (low, high, change))
         self.taken = np.zeros((3, 0), int)  # instant, place, sign of the deflection
 
     def take(self, commands, peak) -> bool:
         """Take in where the deflection under some commands most exceeds a peak, if it does."""
-        deflection = self.found.motion(commands) @ self.rows.T / self.size
+        deflection = self.found.deflection(commands) / self.size
         size = np.abs(deflection)
         around = np.pad(size, 1, constant_values=-1.0)
         highest = (
@@ -88,7 +87,7 @@ class _Program:
             )
         if best.status != 0:
             raise RuntimeError(f"the linear program for the bound failed: {best.message}")
-        weights = np.zeros((self.found.instants.size, self.rows.shape[0]))
+        weights = np.zeros((self.found.instants.size, self.found.rows.shape[0]))
         when, where, sign = self.taken
         np.add.at(weights, (when, where), -sign * best.ineqlin.marginals[2 * count :])
         return best.x[-1], best.x[:count].reshape(self.shape) * self.unit, weights
@@ -99,9 +98,9 @@ class _Program:
         step = sp.kron(sp.eye(holds) - sp.eye(holds, k=-1), sp.eye(actuators))
         one = sp.eye(holds * actuators)
         when, where, sign = self.taken
-        response = self.found.response[when] * (self.unit / self.size)
-        response = np.einsum("im,imka->ika", self.rows[where], response) * sign[:, None, None]
-        free = sign * np.sum(self.rows[where] * self.found.free[when], axis=1) / self.size
+        rows = self.found.rows[where] * sign[:, None] / self.size
+        response = np.einsum("im,imka->ika", rows, self.found.response[when]) * self.unit
+        free = np.sum(rows * self.found.free[when], axis=1)
         felt = sp.csr_array(response.reshape(sign.size, holds * actuators))
         peak = -np.ones((sign.size, 1))
         matrix = sp.block_array([[step, -one, None], [-step, -one, None], [felt, None, peak]])
@@ -114,9 +113,9 @@ class _Program:
         return np.stack([low, np.concatenate(high)], axis=1)
 
 
-def _units(found, rows, low, high, size):
+def _units(found, low, high, size):
     """What each command is measured in: its larger limit, or what bends the beam as loads do."""
-    moved = np.abs(rows).max(axis=0) @ np.abs(found.response).max(axis=(0, 2))
+    moved = np.abs(found.rows).max(axis=0) @ np.abs(found.response).max(axis=(0, 2))
     sized = np.where(moved > 0, size / np.where(moved > 0, moved, 1.0), 1.0)
     largest = np.maximum(np.abs(low), np.abs(high))
     return np.where(np.isfinite(largest) & (largest > 0), largest, sized)

@@ -19,7 +19,7 @@ from jaxbeam.exponentials import NODES
 from jaxbeam.grid import scheduled_grid
 from jaxbeam.integrate import AbstractDriver, trace
 from jaxbeam.plan import Form, form, suitable_step
-from jaxbeam.rig import Rig, rig
+from jaxbeam.rig import rig
 from jaxbeam.schedule import Schedule, merged
 
 TOLERANCE = 1e-9  # relative to the largest deflection
@@ -30,26 +30,22 @@ MOST = 3e8  # numbers in a response: some gigabytes
 class Reach(eqx.Module):
     """Motion without commands, and what a unit command during each hold adds to it.
 
-    Commands are held over `period` (s), from `holds` (s) on; motion is that at the `instants` (s),
-    in coordinates of the rig. `free` and `response` are right to about 1e-9.
+    Commands are held from one of the `holds` (s) to the next. Motion is that at the `instants` (s)
+    in coordinates of the rig, which `rows` take to the deflection (m) at some places; it is right
+    to about 1e-9.
     """
 
-    rig: Rig
-    period: float
+    rows: Float[np.ndarray, "place mode"]
     holds: Float[np.ndarray, " hold"]
     instants: Float[np.ndarray, " instant"]
     free: Float[np.ndarray, "instant mode"]
     response: Float[np.ndarray, "instant mode hold actuator"]
 
-    def rows(self, places: Float[np.ndarray, " place"]) -> Float[np.ndarray, "place mode"]:
-        """What takes the coordinates to the deflection at some places (m)."""
-        return np.asarray(self.rig.shapes(jnp.asarray(places), (0,))[0])
-
-    def motion(
+    def deflection(
         self, commands: Float[np.ndarray, "hold actuator"]
-    ) -> Float[np.ndarray, "instant mode"]:
-        """Coordinates at the instants under a history of commands."""
-        return self.free + np.tensordot(self.response, commands, axes=2)
+    ) -> Float[np.ndarray, "instant place"]:
+        """Deflection (m) under a history of commands."""
+        return (self.free + np.tensordot(self.response, commands, axes=2)) @ self.rows.T
 
 
 class _Units(AbstractDriver):
@@ -76,8 +72,8 @@ class _Units(AbstractDriver):
         return None
 
 
-def reach(case: Case, period: float, spacing: float) -> Reach:
-    """Free motion and responses of a case for commands held over a period (s).
+def reach(case: Case, places: Float[np.ndarray, " place"], period: float, spacing: float) -> Reach:
+    """Free motion of a case, and responses to commands held over a period (s), for some places (m).
 
     The controller of the case, if any, plays no part. Instants are at most `spacing` (s) apart;
     the starts of all holds and the end of the run are among them.
@@ -118,13 +114,17 @@ def reach(case: Case, period: float, spacing: float) -> Reach:
     )
     response = found[..., 1 : count * actuators + 1]
     return Reach(
-        rig(plain, shape.layout),
-        period,
+        np.asarray(_rows(plain, shape, jnp.asarray(places))),
         holds,
         instants,
         found[..., 0],
         response.reshape(*response.shape[:2], count, actuators),
     )
+
+
+@eqx.filter_jit
+def _rows(case: Case, form: Form, places):
+    return rig(case, form.layout).shapes(places, (0,))[0]
 
 
 @eqx.filter_jit
