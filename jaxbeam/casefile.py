@@ -16,6 +16,7 @@ from jaxbeam import actuators, control, loads
 from jaxbeam.beam import Beam, Support
 from jaxbeam.case import Case, Run, unknown_address
 from jaxbeam.checks import check, check_field, missing, suggestion
+from jaxbeam.controller import AbstractController
 from jaxbeam.fields import fits, known, shape_in_words
 from jaxbeam.sensors import Sensor
 
@@ -37,8 +38,37 @@ def load_case(path: str | os.PathLike) -> Case:
     Raises ValueError, naming the file and the address or line, for invalid TOML, unknown keys or
     kinds, wrong types and whatever `check` refuses; OSError if the file cannot be read.
     """
+    content = _read_toml(path)
     try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+        case = case_from_dict(content)
+        check(case)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return case
+
+
+def load_controller(path: str | os.PathLike) -> AbstractController:
+    """Read a controller from a TOML file: a case file that has one, or its [controller] alone.
+
+    Whether it suits a case is not asked. Raises ValueError, naming the file and the address or
+    line, for invalid TOML and unknown keys or kinds; OSError if the file cannot be read.
+    """
+    content = _read_toml(path)
+    try:
+        if "controller" not in content:
+            raise ValueError("has no controller; write a table [controller]")
+        if set(content) - {"title", "controller"}:
+            return case_from_dict(content).controller
+        if not isinstance(content["controller"], dict):
+            raise ValueError("controller must be one table; write [controller]")
+        return read_part("controller", content["controller"], control.KINDS)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _read_toml(path: str | os.PathLike) -> dict[str, Any]:
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise type(error)(f"cannot read the case file {path}: {reason}") from None
@@ -46,12 +76,6 @@ def load_case(path: str | os.PathLike) -> Case:
         raise ValueError(f"{path}: a case file is text in UTF-8, which this is not") from None
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from None
-    try:
-        case = case_from_dict(content)
-        check(case)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return case
 
 
 def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> None:

@@ -1,10 +1,11 @@
-"""Pictures of records, modes, sweeps, fits and frequency responses.
+"""Pictures of records, comparisons, modes, sweeps, fits and frequency responses.
 
 Each function returns a figure, which the caller saves. The figures do not belong to pyplot:
 nothing is shown, and nothing has to be closed.
 """
 
 from jaxbeam.plot.animation import animate
+from jaxbeam.plot.compare import plot_comparison
 from jaxbeam.plot.fit import FitPanel, plot_fit
 from jaxbeam.plot.frequency import plot_frequency
 from jaxbeam.plot.modes import plot_modes
@@ -14,6 +15,7 @@ from jaxbeam.plot.sweep import plot_sweep
 __all__ = [
     "FitPanel",
     "animate",
+    "plot_comparison",
     "plot_fit",
     "plot_frequency",
     "plot_modes",

@@ -68,7 +68,8 @@ def _draw_rig(axes, record):
     draw_rig(axes, record.case)
 
 
-def _shade(axes, record):
+def shade(axes, record: Record) -> None:
+    """Shade the times at which loads are on the beam, in axes over the time of a record."""
     times = np.asarray(record.times)
     axes.set_xlim(times[0], times[-1])
     for _, entry, leaves in load_windows(record):
@@ -77,7 +78,7 @@ def _shade(axes, record):
             axes.axvline(edge, color=GREY, linewidth=0.7, linestyle=(0, (4, 3)), zorder=0.6)
 
 
-def _name_loads(axes, record):
+def name_loads(axes, record: Record) -> None:
     """Write at its entry what a load is; several are numbered."""
     loads = record.case.loads
     for i, entry, _ in load_windows(record):
@@ -107,7 +108,7 @@ def _described(load) -> str:
 def _draw_deflection(axes, record):
     times, deflection = np.asarray(record.times), np.asarray(record.deflection)
     factor, unit = scale(deflection, "m")
-    _shade(axes, record)
+    shade(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.8)
     peaks = []
     for i, when in enumerate(np.asarray(record.peak_time)):
@@ -119,7 +120,7 @@ def _draw_deflection(axes, record):
     axes.set_ylabel(f"deflection ({unit})")
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.07 * (high - low))  # room for the names
-    _name_loads(axes, record)
+    name_loads(axes, record)
     names = [f"peak {digits(peak)} {unit}" for peak in peaks]
     margin_labels(axes, peaks, names, [colour(i) for i in range(len(peaks))])
 
@@ -128,7 +129,7 @@ def _draw_forces(axes, record):
     times, force = np.asarray(record.times), np.asarray(record.contact_force)
     on = np.isfinite(np.asarray(record.load_position))
     factor, unit = scale(force[on], "N")
-    _shade(axes, record)
+    shade(axes, record)
     weights = {}
     for i, load in enumerate(record.case.loads):
         pressing = np.where(on[:, i], force[:, i], np.nan) / factor
@@ -160,7 +161,7 @@ def _draw_commands(axes, record):
     times, command = np.asarray(record.times), np.asarray(record.command)
     actuators = record.case.actuators
     units = {type(a).__dataclass_fields__["limits"].metadata["unit"] for a in actuators}
-    _shade(axes, record)
+    shade(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.8)
     ends, names, tints = [], [], []
     for i, actuator in enumerate(actuators):
