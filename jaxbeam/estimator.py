@@ -44,6 +44,10 @@ class AbstractEstimator(eqx.Module):
     ) -> tuple[Estimate, Any]:
         """The estimate at time t (s), and the memory after it; `measurement.state` is not used."""
 
-    def fault(self, case: Any) -> str | None:
-        """What is wrong with it in a case, as "key must ...", before anything compiles; or None."""
+    def fault(self, case: Any, plant: Any) -> str | None:
+        """What is wrong with it in a case, as "key must ...", before a run compiles; or None.
+
+        `plant` is the design model without loads, a `statespace.StateSpace`; None if its numbers
+        are not known, as inside `jit`.
+        """
         return None

@@ -3,14 +3,17 @@
 import abc
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.controller import AbstractController
 from jaxbeam.estimation import KINDS
 from jaxbeam.estimator import AbstractEstimator, Estimate
-from jaxbeam.fields import choice, part
-from jaxbeam.statespace import LoadedBeam, loaded_beam
+from jaxbeam.fields import choice, is_known, known, part
+from jaxbeam.modes import lay_out
+from jaxbeam.statespace import LoadedBeam, StateSpace, loaded_beam, state_space
 
 
 class AbstractStateLaw(AbstractController):
@@ -70,12 +73,17 @@ class AbstractStateLaw(AbstractController):
                 "coordinates must be 'modal': the modes of this beam are not sin(n pi x / L);"
                 " only a uniform pinned-pinned beam without supports in between has those"
             )
-        for name in ("design", "estimator"):
-            inner = getattr(self, name)
-            fault = None if inner is None else inner.fault(case)
-            if fault is not None:
-                return f"{name}.{fault}"
-        return None
+        fault = None if self.design is None else self.design.fault(case)
+        if fault is not None:
+            return f"design.{fault}"
+        if self.estimator is None or self.period is None:
+            return None
+        plant = None
+        if all(is_known(leaf) for leaf in jax.tree.leaves((self, case))):
+            law, plain = jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), (self, case))
+            plant = _plant(law, plain, lay_out(plain))
+        fault = self.estimator.fault(case, plant)
+        return None if fault is None else f"estimator.{fault}"
 
     def modes(self, case: Any) -> int:
         """How many modes the law is designed for."""
@@ -86,6 +94,12 @@ class AbstractStateLaw(AbstractController):
         """How many states the law is fed."""
         own = sum(actuator.attachment().state_matrix.shape[0] for actuator in case.actuators)
         return 2 * self.modes(case) + own
+
+
+@eqx.filter_jit
+def _plant(law: AbstractStateLaw, case, layout) -> StateSpace:
+    """What the law is designed for, without loads."""
+    return law.believed(state_space(case, layout=layout)).unloaded
 
 
 def _seen(model: LoadedBeam, designed: LoadedBeam):

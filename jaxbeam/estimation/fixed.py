@@ -1,0 +1,46 @@
+"""An estimator with a gain that does not change: predict from tick to tick, then correct."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.controller import Measurement
+from jaxbeam.estimation.sampled import Transition
+from jaxbeam.statespace import LoadedBeam, StateSpace
+
+
+class FixedGain(eqx.Module):
+    """Memory of such an estimator: its design, the state it believes in, the command before.
+
+    The reading expected of a state is C x + D u + offset.
+    """
+
+    transition: Transition
+    C: Float[Array, "sensor state"]
+    D: Float[Array, "sensor actuator"]
+    offset: Float[Array, " sensor"]
+    gain: Float[Array, "state sensor"]
+    state: Float[Array, " state"]
+    command: Float[Array, " actuator"]
+
+    def corrected(self, measurement: Measurement) -> "FixedGain":
+        """The memory after the next tick."""
+        now = measurement.command
+        state = self.transition.mean(self.state, self.command, now)
+        surprise = measurement.readings - self.offset - self.C @ state - self.D @ now
+        return dataclasses.replace(self, state=state + self.gain @ surprise, command=now)
+
+
+def at_rest(
+    model: LoadedBeam, plant: StateSpace, transition: Transition, gain: Float[Array, "..."]
+) -> FixedGain:
+    """The memory at the start of a run, from rest."""
+    state, command = jnp.zeros(plant.A.shape[0]), jnp.zeros(plant.B.shape[1])
+    return FixedGain(transition, plant.C, plant.D, offsets(model), gain, state, command)
+
+
+def offsets(model: LoadedBeam) -> Float[Array, " sensor"]:
+    """The constants that sensors add to what they read."""
+    return jnp.array([sensor.offset for sensor in model.case.sensors]).reshape(-1)
