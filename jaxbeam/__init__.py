@@ -14,6 +14,7 @@ from jaxbeam.case import Case, Run, addresses, replace
 from jaxbeam.casefile import load_case, save_case
 from jaxbeam.control import (
     LQR,
+    MPC,
     AugmentedLQR,
     Feedback,
     FiniteLQR,
@@ -32,6 +33,7 @@ from jaxbeam.sweep import sweep
 
 __all__ = [
     "LQR",
+    "MPC",
     "AugmentedLQR",
     "Beam",
     "Case",

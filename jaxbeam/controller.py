@@ -7,6 +7,7 @@ import abc
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, number
@@ -72,6 +73,10 @@ class AbstractController(eqx.Module):
     def fault(self, case: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", before anything compiles; or None."""
         return None
+
+    def failures(self, memory: Any) -> Float[Array, ""]:
+        """How many steps until now found no solution and fell back, for what solves at each."""
+        return jnp.zeros(())
 
     def knots(self) -> Float[Array, " knot"] | None:
         """Times (s) at which the command bends or jumps by itself; steps then end there."""

@@ -76,8 +76,8 @@ class AbstractDriver(eqx.Module):
         """
 
     @abc.abstractmethod
-    def shows(self, memory, moment: Moment) -> Float[Array, "sensor lane"] | None:
-        """What the sensors show at the start of a step that starts at an edge, if they sample."""
+    def shows(self, memory, moment: Moment) -> Any:
+        """What is to be kept of the start of a step that starts at an edge, lanes last, or None."""
 
 
 def _contact(tables: Tables, inertia, weight, state, commands):
@@ -167,13 +167,12 @@ def trace(
     steps: int,
     driver: AbstractDriver | None = None,
 ):
-    """Integrate from rest over a grid; return extremes, states, commands, and what sensors show.
+    """Integrate from rest over a grid; return extremes, states, commands, and what is shown.
 
     States (edge, state, lane) are those at the start of every step and at the end, commands
-    (step, command, lane) those at the nodes of every step, None without a `driver`; readings
-    (step, sensor, lane) are those that have arrived where a step starts at an edge, None if none
-    are sampled. Extremes are those at the `watched` places (m), None without any. `slots` is how
-    many loads may be on the beam at once. Reverse mode stores one state a chunk.
+    (step, command, lane) those at the nodes of every step, None without a `driver`; what it shows
+    is kept for every step. Extremes are those at the `watched` places (m), None without any.
+    `slots` is how many loads may be on the beam at once. Reverse mode stores one state a chunk.
     """
     chunk = _stepper(rig, traffic, grid, watched, slots, driver)
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)

@@ -190,11 +190,12 @@ class Loop(AbstractDriver):
         return own, active, states, shown, waiting
 
     def shows(self, memory, moment: Moment):
-        return (
-            None
-            if self.model.case.controller.period is None
-            else self._arrived(memory[3], moment.edge)
-        )
+        """Readings (sensor, lane) that have arrived, and failures (lane) of the controller."""
+        controller = self.model.case.controller
+        if controller.period is None:
+            return None
+        failures = jax.vmap(controller.failures, in_axes=-1, out_axes=-1)(memory[0])
+        return self._arrived(memory[3], moment.edge), failures
 
     def _arrived(self, shown, edge):
         """The newest readings (sensor, lane) that have arrived by an edge."""

@@ -27,6 +27,8 @@ class Record(eqx.Module):
     and at samples. `contact_lost_time` (s) and `contact_lost_position` (m) tell where a load would
     first have to pull, which the model lets it do; NaN where it never would. `command` is what the
     actuators are given, within their limits; at a time at which it changes, that just after.
+    `failures` counts the steps until then in which the controller found no solution of what it
+    solves at each, and fell back.
     Where a control loop diverges the samples are NaN from then on, and the peaks are NaN.
     `error_estimate` is relative to the largest deflection. `shown` is what the sensors have told
     a controller that samples by then, None without one.
@@ -41,6 +43,7 @@ class Record(eqx.Module):
     load_position: Float[Array, "time load"]
     contact_force: Float[Array, "time load"]
     command: Float[Array, "time actuator"]
+    failures: Float[Array, " time"]
     peak_deflection: Float[Array, " sensor"]
     peak_time: Float[Array, " sensor"]
     lowest_contact_force: Float[Array, " load"]
@@ -135,7 +138,7 @@ class Record(eqx.Module):
 
     @property
     def verdict(self) -> str:
-        """In words: whether the loop holds, every load stays in contact, the estimated error."""
+        """In words: whether the loop holds, contact, steps without a solution, the error."""
         diverged = float(known(self.diverged_time))
         if np.isfinite(diverged):
             return (
@@ -150,8 +153,12 @@ class Record(eqx.Module):
             f"(smallest contact force {least[i]:.4g} N)"
             for i in np.flatnonzero(np.isfinite(lost))
         ]
-        contact = "; ".join(pulls) if pulls else "every load presses on the beam throughout"
-        return f"{contact}; estimated error {float(known(self.error_estimate)):.1e} of the peak"
+        parts = ["; ".join(pulls) if pulls else "every load presses on the beam throughout"]
+        failures = int(known(self.failures)[-1])
+        if failures:
+            parts.append(f"the controller found no solution in {failures} of its steps")
+        parts.append(f"estimated error {float(known(self.error_estimate)):.1e} of the peak")
+        return "; ".join(parts)
 
     def to_xarray(self) -> xarray.Dataset:
         """Labelled dataset with units; `from_xarray` restores the record exactly."""
@@ -206,6 +213,7 @@ _VARIABLES = {
     "load_position": (("time", "load"), "m", "position of the load"),
     "contact_force": (("time", "load"), "N", "force with which the load presses on the beam"),
     "command": (("time", "actuator"), "unit of a command", "command to the actuator"),
+    "failures": (("time",), "1", "steps of the controller without a solution until then"),
     "peak_deflection": (("sensor",), "m", "largest absolute deflection"),
     "peak_time": (("sensor",), "s", "time of the largest absolute deflection"),
     "lowest_contact_force": (("load",), "N", "smallest contact force"),

@@ -73,9 +73,11 @@ def _check_times(times) -> None:
 def _record(case: Case, plan: Plan, times, error) -> Record:
     watched = jnp.array([sensor.position for sensor in case.sensors]).reshape(-1)
     best, outputs, found, count = _trace(case, plan, times, watched)
-    coordinates, rates, accelerations, position, force, commands, shown = outputs
+    coordinates, rates, accelerations, position, force, commands, shown, failures = outputs
     if commands is None:
         commands = jnp.zeros((times.shape[0], len(case.actuators)))
+    if failures is None:
+        failures = jnp.zeros(times.shape)
     peaks, peak_times = best.peak()
     loads = traffic(case)
     lost = never_as_nan(best.lost[:, 0])
@@ -92,6 +94,7 @@ def _record(case: Case, plan: Plan, times, error) -> Record:
         load_position=position,
         contact_force=force,
         command=commands,
+        failures=failures,
         shown=shown,
         peak_deflection=peaks[:, 0],
         peak_time=peak_times[:, 0],
@@ -133,7 +136,7 @@ def _trace(case: Case, plan: Plan, times, watched):
     )
     edges = plan.substeps * grid.place[schedule.samples]
     states = states[edges]
-    shown = None if shown is None else shown[edges, :, 0]
+    shown, failures = (None, None) if shown is None else (part[edges, ..., 0] for part in shown)
     if driver is not None:
         # A law at every instant is asked itself: its polynomials are less exact at their ends.
         commands = (
@@ -141,7 +144,7 @@ def _trace(case: Case, plan: Plan, times, watched):
             if driver.inner
             else _begin(case, commands, edges)
         )
-    outputs = *_outputs(assembled, loads, times, states, commands), shown
+    outputs = *_outputs(assembled, loads, times, states, commands), shown, failures
     return best, outputs, assembled.modes, count
 
 

@@ -2,6 +2,7 @@
 
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.lqr import LQR, AugmentedLQR, FiniteLQR, StepLQR
+from jaxbeam.control.mpc import MPC
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.state_feedback import StateFeedback
 
@@ -11,6 +12,7 @@ KINDS = {
     "lqr-augmented": AugmentedLQR,
     "lqr-finite": FiniteLQR,
     "lqr-step": StepLQR,
+    "mpc": MPC,
     "prescribed": Prescribed,
     "state": StateFeedback,
 }
@@ -18,6 +20,7 @@ KINDS = {
 __all__ = [
     "KINDS",
     "LQR",
+    "MPC",
     "AugmentedLQR",
     "Feedback",
     "FiniteLQR",

@@ -28,7 +28,7 @@ WORDS = {
     UNFINISHED: "not solved within the permitted number of steps",
 }
 
-TOLERANCE = 1e-10  # of limits, stationarity and complementarity
+TOLERANCE = 1e-12  # of limits, stationarity and complementarity
 CREEP = 1e-13  # the same for Hildreth's procedure, whose last sweeps change little
 ROUNDING = 1e-13  # share of limits and minimiser by which a limit may be passed and not be felt
 FARTHEST = 1e8  # distance beyond which no point within the limits is looked for
