@@ -8,13 +8,33 @@ from typing import Any
 import numpy as np
 
 from jaxbeam.case import Case
-from jaxbeam.casefile import load_case, with_settings
+from jaxbeam.casefile import load_case, load_controller, with_settings
+from jaxbeam.controller import AbstractController
 
 
 def read_case(path: Path, settings: Iterable[str]) -> Case:
     """The case in a file, with the entries changed that the command line sets."""
     changes = dict(assignment("--set", text) for text in settings)
     return with_settings(load_case(path), {a: value_of(text) for a, text in changes.items()})
+
+
+def read_controllers(
+    path: Path, case: Case, files: Iterable[Path]
+) -> dict[str, AbstractController]:
+    """The controllers in some files, called after them, and first that of the case, if any.
+
+    Raises ValueError if two files are of one name, or if there are no controllers at all.
+    """
+    found = {} if case.controller is None else {path.stem: case.controller}
+    for file in files:
+        if file.stem in found:
+            raise ValueError(
+                f"two controllers are called {file.stem}; rename a file"
+            )
+        found[file.stem] = load_controller(file)
+    if not found:
+        raise ValueError(f"{path} has no controller; name some with --controllers FILE ...")
+    return found
 
 
 def assignment(option: str, text: str) -> tuple[str, str]:

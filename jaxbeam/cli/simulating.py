@@ -1,19 +1,12 @@
-"""The command line: reads arguments, calls the library, prints what it returns.
+"""Commands that simulate a case: modes, one run, many runs, frequency responses."""
 
-Libraries are imported inside the commands, so that help and complaints come at once.
-"""
-
-import os
-import sys
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import Parameter
 
 from jaxbeam.arguments import (
-    bounds_of,
     check_outputs,
     check_suffix,
     frequency_range,
@@ -22,45 +15,10 @@ from jaxbeam.arguments import (
     picture_path,
     read_case,
     refuse,
-    split_files,
     sweep_values,
 )
+from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
 from jaxbeam.printing import print_json, print_table, print_written
-
-app = App(
-    name="jaxbeam",
-    help="Beams under moving loads: simulate, sweep, and identify from measured logs.",
-    help_format="plaintext",
-    result_action="return_value",
-    default_parameter=Parameter(negative=(), show_default=False),
-)
-
-Settings = Annotated[
-    tuple[str, ...],
-    Parameter("--set", help="ADDRESS=VALUE: change an entry of the case."),
-]
-Json = Annotated[bool, Parameter("--json", help="Print JSON on standard output, for programs.")]
-Overwrite = Annotated[bool, Parameter("--overwrite", help="Replace output files that exist.")]
-
-Output = Annotated[Path | None, Parameter(("-o", "--output"))]
-
-
-@app.command
-def demo(
-    *,
-    output: Output = None,
-    json_: Json = False,
-) -> None:
-    """Identify a rig from logged data, end to end, in under a minute.
-
-    Parameters
-    ----------
-    output
-        Folder for the figure and the record; a fresh one below `out` if left out.
-    """
-    from experiments import demo as demonstration
-
-    demonstration.run(output, json=json_)
 
 
 @app.command
@@ -308,108 +266,3 @@ def frf(
             [(word, f"{f:.5g}", f"{size:.5g}") for word, f, size in extremes(found, i)],
         )
     print_written(output, picture)
-
-
-@app.command
-def identify(
-    *files: Path,
-    free: tuple[str, ...] = (),
-    output: Output = None,
-    plot: bool = False,
-    set_: Settings = (),
-    overwrite: Overwrite = False,
-    json_: Json = False,
-) -> None:
-    """Identify numbers of a case from logs; without --free, the modes seen in a free decay.
-
-    Parameters
-    ----------
-    files
-        [CASE.toml] LOG...: the case to fit, if any, and the logs.
-    free
-        ADDRESS[=LOW:HIGH]: a number to identify, between bounds; repeat it for more.
-    output
-        Write the fitted case to this file, FIT.toml.
-    plot
-        Draw measured and fitted to a PNG beside the output, or named after the log.
-    """
-    case, logs = split_files(files, free)
-    if case and free:
-        picture = picture_path(output, logs[0]) if plot else None
-        check_outputs(overwrite, output, picture)
-        _identify_case(read_case(case, set_), logs, free, output, picture, json_)
-        return
-    refuse(
-        bool(output or set_),
-        "-o and --set are for fitting a case; name what is free with --free ADDRESS",
-    )
-    if case:
-        _say(f"nothing is named with --free, so {case} is not used; modes of the free decay:")
-    pictures = [picture_path(None, log) if plot else None for log in logs]
-    check_outputs(overwrite, *pictures)
-    _identify_modes(logs, pictures, json_)
-
-
-def _identify_case(case, logs, free, output, picture, json_) -> None:
-    import tuning
-    from jaxbeam.casefile import save_case
-
-    bounds = dict(bounds_of(text) for text in free)
-    fit = tuning.identify(case, [tuning.read_log(path) for path in logs], bounds)
-    if output:
-        save_case(fit.case, output, overwrite=True)  # checked before the work
-    if picture:
-        fit.plot().savefig(picture)
-    if json_:
-        print_json(fit.to_dict())
-    else:
-        print(fit)
-        print_written(output, picture)
-
-
-def _identify_modes(logs, pictures, json_) -> None:
-    import tuning
-
-    found = {}
-    for log, picture in zip(logs, pictures, strict=True):
-        fit = found[str(log)] = tuning.identify_modes(tuning.read_log(log))
-        if picture:
-            fit.plot().savefig(picture)
-        if not json_:
-            print(f"{log}\n{fit}")
-            print_written(picture)
-    if json_:
-        print_json({log: fit.to_dict() for log, fit in found.items()})
-
-
-def _say(sentence: str) -> None:
-    print(f"jaxbeam: {sentence}", file=sys.stderr)
-
-
-def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command line (that of the process by default) and exit: 0, or 1 where it is wrong.
-
-    A mistake of the user ends in one sentence on standard error, a warning is one as well.
-    """
-    warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
-    if arguments is None:
-        _keep_compiled()
-    try:
-        app(arguments, exit_on_error=False, print_error=False)
-    except (ValueError, OSError, RuntimeError, CycloptsError) as error:
-        _say(" ".join(str(error).split()))
-        sys.exit(1)
-    sys.exit(0)
-
-
-def _keep_compiled() -> None:
-    """Keep compiled programs from one command to the next, in the user's cache folder.
-
-    JAX_COMPILATION_CACHE_DIR names another folder; empty, it keeps nothing.
-    """
-    import jax
-
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(cache / "jaxbeam"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

@@ -1,0 +1,48 @@
+"""The command line: reads arguments, calls the library, prints what it returns.
+
+Commands are in one file for each kind of work. Libraries are imported inside the commands, so that
+help and complaints come at once.
+"""
+
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from cyclopts import CycloptsError
+
+from jaxbeam.cli import comparing, identifying, simulating
+from jaxbeam.cli.app import app, say
+
+__all__ = ["comparing", "identifying", "main", "simulating"]
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run a command line (that of the process by default) and exit: 0, or 1 where it is wrong.
+
+    A mistake of the user ends in one sentence on standard error, a warning is one as well.
+    """
+    warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
+    if arguments is None:
+        _keep_compiled()
+    try:
+        app(arguments, exit_on_error=False, print_error=False)
+    except (ValueError, OSError, RuntimeError, CycloptsError) as error:
+        say(" ".join(str(error).split()))
+        sys.exit(1)
+    sys.exit(0)
+
+
+def _keep_compiled() -> None:
+    """Keep compiled programs from one command to the next, in the user's cache folder.
+
+    JAX_COMPILATION_CACHE_DIR names another folder; empty, it keeps nothing.
+    """
+    import jax
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(cache / "jaxbeam"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

@@ -1,0 +1,95 @@
+"""The command that compares controllers."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from jaxbeam.arguments import check_outputs, check_suffix, read_case, read_controllers
+from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
+from jaxbeam.printing import print_json, print_table, print_written
+
+
+@app.command
+def compare(
+    case: Path,
+    /,
+    *,
+    controllers: Annotated[tuple[Path, ...], Parameter(consume_multiple=True)] = (),
+    period: float | None = None,
+    output: Output = None,
+    set_: Settings = (),
+    overwrite: Overwrite = False,
+    json_: Json = False,
+) -> None:
+    """Compare controllers on a case, beside the least peak that any controller could achieve.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML; its own controller, if it has one, takes part.
+    controllers
+        More controllers: files with a table [controller], or case files of which only that is
+        used. They are called after their files.
+    period
+        The least peak is for commands held this long (s); the shortest period of the
+        controllers, or 0.01, if left out.
+    output
+        Draw deflections and commands to this file, OUT.png.
+    """
+    from jaxbeam.compare import compare
+
+    check_suffix(output, ".png", "a comparison")
+    check_outputs(overwrite, output)
+    described = read_case(case, set_)
+    found = compare(described, read_controllers(case, described, controllers), period)
+    if output:
+        from jaxbeam.plot import plot_comparison
+
+        plot_comparison(found).savefig(output)
+    limit = found.bound
+    if json_:
+        print_json(
+            {
+                "uncontrolled_peak": limit.uncontrolled,
+                "least_peak": limit.peak,
+                "held_for": limit.period,
+                "controllers": {
+                    name: merits._asdict() | {"verdict": found.records[name].verdict}
+                    for name, merits in found.merits.items()
+                },
+            }
+        )
+        return
+    print(
+        f"no control: peak {limit.uncontrolled:.6g} m; no controller that holds its commands for "
+        f"{limit.period:g} s gets below {limit.peak:.6g} m, {limit.reduction:.1%} less"
+    )
+    print_table(
+        (
+            "controller",
+            "peak (m)",
+            "share of the bound",
+            "RMS (m)",
+            "after exit (m)",
+            "effort (command^2 s)",
+            "saturated",
+            "time per step (s)",
+        ),
+        [
+            (
+                name,
+                f"{merits.peak:.6g}",
+                f"{merits.share:.1%}",
+                f"{merits.rms:.4g}",
+                f"{merits.after_exit:.4g}",
+                " ".join(f"{effort:.4g}" for effort in merits.effort),
+                " ".join(f"{share:.1%}" for share in merits.saturated),
+                f"{merits.step_time:.2g}",
+            )
+            for name, merits in found.merits.items()
+        ],
+    )
+    for name, record in found.records.items():
+        print(f"{name}: {record.verdict}")
+    print_written(output)
