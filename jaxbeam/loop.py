@@ -194,7 +194,10 @@ class Loop(AbstractDriver):
         controller = self.model.case.controller
         if controller.period is None:
             return None
-        failures = jax.vmap(controller.failures, in_axes=-1, out_axes=-1)(memory[0])
+        own, commands = memory[:2]
+        failures = jax.vmap(
+            controller.failures, in_axes=-1, out_axes=-1, axis_size=commands.shape[-1]
+        )(own)
         return self._arrived(memory[3], moment.edge), failures
 
     def _arrived(self, shown, edge):
