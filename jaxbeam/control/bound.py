@@ -120,9 +120,11 @@ def bound(
         raise ValueError(f"period and spacing must be positive; they are {period:g}, {spacing:g} s")
     if period > float(case.run.duration):
         raise ValueError(f"period {period:g} s is longer than the run, {case.run.duration:g} s")
+    if not case.loads:
+        raise ValueError("without loads nothing deflects the beam; add one for a bound")
     found = reach(case, places, period, spacing)
     if not np.any(found.free @ found.rows.T):
-        raise ValueError("nothing deflects the beam at these places during the run; add a load")
+        raise ValueError("no load deflects the beam at these places during the run")
     if not np.any(found.response):
         raise ValueError("no actuator of the case takes commands that move the beam; add one")
     peak, commands, weights = least_peak(found, *_ranges(case, period))

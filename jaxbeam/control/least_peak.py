@@ -1,10 +1,10 @@
 """The linear program behind `bound`: the least peak, and calm commands that attain it.
 
-The unknowns are the commands, their changes from hold to hold, and the peak. Of the rows that keep
+The unknowns are the commands, their changes from hold to hold, their sizes, and the peak. Of the rows that keep
 the deflection below the peak only those are taken that would be violated without them: they are
 added until none is, so that a close look at the whole beam costs little. Many commands attain the
-least peak, most of them restless where nothing is at stake; a trifle of a price on changes makes
-one of the calm ones best, and the rows settle in few rounds.
+least peak, most of them restless where nothing is at stake; a trifle of a price on changes and
+sizes makes one of the calm ones best, and the rows settle in few rounds.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from jaxbeam.control.reach import Reach
 
 EXACT = 1e-9  # of the largest deflection without commands: how exactly a program is solved
 VIOLATED = 1e-7  # of the same: rows that are violated by less are left out
-CALM = 1e-6  # of the same: price of a change of command by its largest value
+CALM = 1e-6  # of the same: price of a change of command by its largest value, or of its average
 ROUNDS = 100  # of adding rows; about ten are usual
 
 
@@ -75,9 +75,14 @@ class _Program:
         return when.size > 0
 
     def solve(self, price: float):
-        """Least peak plus price of all changes: peak, commands, multipliers (instant, place)."""
-        count = int(np.prod(self.shape))
-        cost = np.repeat([0.0, price, 1.0], [count, count, 1])
+        """Least peak plus a price of restless commands: peak, commands, multipliers.
+
+        Raises ValueError if no commands meet the limits, RuntimeError if the solver fails.
+        """
+        holds, actuators = self.shape
+        count = holds * actuators
+        prices = [0.0, price, price / holds, 1.0]
+        cost = np.repeat(prices, [count, count + actuators, count, 1])
         matrix, right = self._matrix()
         exact = {"primal_feasibility_tolerance": EXACT, "dual_feasibility_tolerance": EXACT}
         best = linprog(cost, matrix, right, bounds=self._bounds(), method="highs", options=exact)
@@ -89,28 +94,39 @@ class _Program:
             raise RuntimeError(f"the linear program for the bound failed: {best.message}")
         weights = np.zeros((self.found.instants.size, self.found.rows.shape[0]))
         when, where, sign = self.taken
-        np.add.at(weights, (when, where), -sign * best.ineqlin.marginals[2 * count :])
+        felt = best.ineqlin.marginals[right.size - sign.size :]
+        np.add.at(weights, (when, where), -sign * felt)
         return best.x[-1], best.x[:count].reshape(self.shape) * self.unit, weights
 
     def _matrix(self):
-        """Rows for the changes of the commands, then for the deflections taken in so far."""
+        """Rows for changes and sizes of the commands, then for the deflections taken in so far."""
         holds, actuators = self.shape
-        step = sp.kron(sp.eye(holds) - sp.eye(holds, k=-1), sp.eye(actuators))
-        one = sp.eye(holds * actuators)
+        # Commands begin at zero and, for the sake of calm, end there.
+        step = sp.eye(holds + 1, holds) - sp.eye(holds + 1, holds, k=-1)
+        step, one = sp.kron(step, sp.eye(actuators)), sp.eye(holds * actuators)
+        change = sp.eye(step.shape[0])
         when, where, sign = self.taken
         rows = self.found.rows[where] * sign[:, None] / self.size
         response = np.einsum("im,imka->ika", rows, self.found.response[when]) * self.unit
         free = np.sum(rows * self.found.free[when], axis=1)
         felt = sp.csr_array(response.reshape(sign.size, holds * actuators))
-        peak = -np.ones((sign.size, 1))
-        matrix = sp.block_array([[step, -one, None], [-step, -one, None], [felt, None, peak]])
-        return matrix.tocsr(), np.concatenate([np.zeros(2 * holds * actuators), -free])
+        blocks = [
+            [step, -change, None, None],
+            [-step, -change, None, None],
+            [one, None, -one, None],
+            [-one, None, -one, None],
+            [felt, None, None, -np.ones((sign.size, 1))],
+        ]
+        matrix = sp.block_array(blocks).tocsr()
+        return matrix, np.concatenate([np.zeros(matrix.shape[0] - sign.size), -free])
 
     def _bounds(self):
-        holds = self.shape[0]
-        low = np.concatenate([np.tile(self.low, holds), np.zeros(holds * self.low.size), [0.0]])
-        high = [np.tile(self.high, holds), np.tile(self.change, holds), [np.inf]]
-        return np.stack([low, np.concatenate(high)], axis=1)
+        holds, actuators = self.shape
+        free = np.full(actuators, np.inf), np.full(holds * actuators, np.inf), [np.inf]
+        high = np.concatenate([np.tile(self.high, holds), np.tile(self.change, holds), *free])
+        low = np.zeros(high.size)
+        low[: holds * actuators] = np.tile(self.low, holds)
+        return np.stack([low, high], axis=1)
 
 
 def _units(found, low, high, size):

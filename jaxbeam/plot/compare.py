@@ -16,9 +16,8 @@ BEST = {"color": INK, "linewidth": 1.0, "linestyle": (0, (5, 2))}
 def plot_comparison(comparison: Comparison) -> Figure:
     """Deflection where it is largest without control, and the commands, of all controllers.
 
-    Dashed: the commands that attain the bound, and what comes of them; the band is what no
-    controller can keep the deflection within any further. Labels tell peaks, and the share of the
-    attainable reduction.
+    Dashed: commands that attain the bound, and what comes of them. The thin line is the bound: every
+    controller gets there somewhere. Labels tell peaks, and shares of the attainable reduction.
     """
     actuators = len(comparison.case.actuators)
     heights = [4.2] + [1.9] * actuators
@@ -49,23 +48,24 @@ def _draw_deflection(axes, comparison):
     histories = [np.asarray(record.deflection)[:, sensor] for _, record, _ in runs]
     factor, unit = scale(histories[0], "m")
     shade(axes, comparison.free)
-    least = comparison.bound.peak / factor
-    axes.axhspan(-least, least, color=INK, alpha=0.05, linewidth=0, zorder=0.7)
     axes.axhline(0, color=GREY, linewidth=0.8)
-    peaks, words = [], []
+    peaks, words, merits = [], [], comparison.merits
     for (word, record, look), history in zip(runs, histories, strict=True):
         axes.plot(np.asarray(record.times), history / factor, label=word, **look)
         peak = float(record.peak_deflection[sensor]) / factor
-        share = comparison.bound.share(record)
         if not np.isfinite(peak):
             peaks.append(0.0)
-            words.append(f"{word}: diverges")
+            words.append(f"{word} diverges")
             continue
         when = float(record.peak_time[sensor])
-        signed = np.sign(np.interp(when, np.asarray(record.times), history)) * peak
-        peaks.append(signed)
-        words.append(f"{word} {digits(signed)} {unit}" + ("" if share is None else ""))
-        axes.plot([when], [signed], "o", color=look["color"], markeredgecolor="white", zorder=3)
+        peaks.append(np.sign(np.interp(when, np.asarray(record.times), history)) * peak)
+        share = f" ({merits[word].share:.0%})" if word in merits else ""
+        words.append(f"{word} {digits(peaks[-1])} {unit}{share}")
+        axes.plot([when], peaks[-1:], "o", color=look["color"], markeredgecolor="white", zorder=3)
+    low, high = min(peaks), max(peaks)
+    for least in (-comparison.bound.peak / factor, comparison.bound.peak / factor):
+        if low <= least <= high:
+            axes.axhline(least, color=INK, linewidth=0.7)
     place = float(known(comparison.case.sensors[sensor].position))
     axes.set_ylabel(f"deflection at {place:.4g} m ({unit})")
     name_loads(axes, comparison.free)
