@@ -82,8 +82,9 @@ def _stretch(plant: Plant, intensity, scale, start, span):
     turn = late @ early - early @ late
     matrix = span / 2 * (early + late) + span * reach / 2 * turn
     states, outer = intensity.shape[0], scale * scale[:, None]
-    inputs = matrix.shape[0] - states
-    noise = jnp.pad(intensity / outer * span, (0, inputs))
+    noise = jnp.pad(intensity / outer, (0, matrix.shape[0] - states))
+    bend = (late - early) @ noise
+    noise = span * noise + span * reach / 2 * (bend + bend.T)
     flow, noise = _exponential(matrix, noise)
     drift = flow[:states, :states] * scale[:, None] / scale
     return drift, flow[:states, states:] * scale[:, None], noise[:states, :states] * outer
