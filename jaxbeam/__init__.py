@@ -22,6 +22,7 @@ from jaxbeam.control import (
     StateFeedback,
     StepLQR,
 )
+from jaxbeam.control.bound import bound
 from jaxbeam.filters import Filter
 from jaxbeam.loads import MovingForce, MovingMass
 from jaxbeam.modes import modes
@@ -55,6 +56,7 @@ __all__ = [
     "StepLQR",
     "Support",
     "addresses",
+    "bound",
     "load_case",
     "modes",
     "read_record",

@@ -146,7 +146,7 @@ def test_help_names_the_commands_and_imports_nothing_heavy():
     )
     line = [sys.executable, "-c", code]
     ended = subprocess.run(line, capture_output=True, text=True, check=True)
-    for command in ("demo", "modes", "simulate", "sweep", "frf", "identify"):
+    for command in ("demo", "modes", "simulate", "sweep", "frf", "compare", "identify"):
         assert f" {command} " in ended.stdout
     assert ended.stdout.endswith("[]\n")
 

@@ -78,7 +78,7 @@ class Bound(eqx.Module):
         else:
             peak = np.max(np.abs(np.asarray(record.at(self.places))))
         attainable = self.uncontrolled - self.peak
-        return float(self.uncontrolled - peak) / attainable if attainable > 0 else np.nan
+        return float((self.uncontrolled - peak) / attainable) if attainable > 0 else np.nan
 
     def controller(self) -> Prescribed:
         """The controller that gives the commands, whatever the beam does."""

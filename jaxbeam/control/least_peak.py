@@ -1,10 +1,10 @@
 """The linear program behind `bound`: the least peak, and calm commands that attain it.
 
-The unknowns are the commands, their changes from hold to hold, their sizes, and the peak. Of the rows that keep
-the deflection below the peak only those are taken that would be violated without them: they are
-added until none is, so that a close look at the whole beam costs little. Many commands attain the
-least peak, most of them restless where nothing is at stake; a trifle of a price on changes and
-sizes makes one of the calm ones best, and the rows settle in few rounds.
+The unknowns are the commands, their changes from hold to hold, their sizes, and the peak. Of the
+rows that keep the deflection below the peak only those are taken that would be violated without
+them: they are added until none is, so that a close look at the whole beam costs little. Many
+commands attain the least peak, most of them restless where nothing is at stake; a trifle of a price
+on changes and sizes makes one of the calm ones best, and the rows settle in few rounds.
 """
 
 import numpy as np

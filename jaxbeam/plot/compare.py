@@ -16,8 +16,8 @@ BEST = {"color": INK, "linewidth": 1.0, "linestyle": (0, (5, 2))}
 def plot_comparison(comparison: Comparison) -> Figure:
     """Deflection where it is largest without control, and the commands, of all controllers.
 
-    Dashed: commands that attain the bound, and what comes of them. The thin line is the bound: every
-    controller gets there somewhere. Labels tell peaks, and shares of the attainable reduction.
+    Dashed: commands that attain the bound, and what comes of them. The thin line is the bound,
+    which no controller stays within. Labels tell peaks, and shares of the attainable reduction.
     """
     actuators = len(comparison.case.actuators)
     heights = [4.2] + [1.9] * actuators
@@ -62,7 +62,7 @@ def _draw_deflection(axes, comparison):
         share = f" ({merits[word].share:.0%})" if word in merits else ""
         words.append(f"{word} {digits(peaks[-1])} {unit}{share}")
         axes.plot([when], peaks[-1:], "o", color=look["color"], markeredgecolor="white", zorder=3)
-    low, high = min(peaks), max(peaks)
+    low, high = min(*peaks, 0.0), max(*peaks, 0.0)
     for least in (-comparison.bound.peak / factor, comparison.bound.peak / factor):
         if low <= least <= high:
             axes.axhline(least, color=INK, linewidth=0.7)

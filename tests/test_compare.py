@@ -1,0 +1,173 @@
+"""Controllers compared: merits against the records, the picture, the command."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.casefile import load_controller
+from jaxbeam.cli import main
+from jaxbeam.compare import compare, step_time
+from jaxbeam.plot import plot_comparison
+from tests.test_plot import words
+
+CASE = """
+title = "one span, one patch"
+[beam]
+length = 0.6
+flexural_rigidity = 13.211
+mass_per_length = 0.812
+damping_ratio = 0.03
+modes = 2
+[[actuators]]
+kind = "patch"
+start = 0.2575
+end = 0.3425
+moment_per_volt = 8.292e-4
+correction = 0.32
+amplifier_gain = 200.0
+limits = [-2.5, 7.5]
+[[sensors]]
+position = 0.3
+[[loads]]
+kind = "mass"
+mass = 0.509
+speed = 2.0
+[run]
+duration = 0.4
+sample_rate = 500.0
+"""
+WEAK = """
+[controller]
+kind = "feedback"
+gains = [2000.0]
+period = 0.01
+"""
+WILD = """
+[controller]
+kind = "feedback"
+gains = [-8000.0]
+period = 0.01
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a case that has a controller, and a controller alone."""
+    path = tmp_path_factory.mktemp("compare")
+    (path / "weak.toml").write_text(CASE + WEAK)
+    (path / "wild.toml").write_text(WILD)
+    return path
+
+
+@pytest.fixture(scope="module")
+def found(folder):
+    case = jb.load_case(folder / "weak.toml")
+    return compare(case, {"weak": case.controller, "wild": load_controller(folder / "wild.toml")})
+
+
+def test_merits_are_those_of_the_records(found):
+    assert list(found.records) == list(found.merits) == ["weak", "wild"]
+    assert found.case.controller is None
+    assert found.free.case.controller is None
+    for name, record in found.records.items():
+        merits, deflection = found.merits[name], np.asarray(record.deflection)[:, 0]
+        assert merits.peak == record.peak_deflection[0]
+        assert_allclose(merits.rms**2, np.mean(deflection**2), rtol=1e-12)
+        assert merits.after_exit == np.max(np.abs(deflection[np.asarray(record.times) > 0.3]))
+        assert merits.saturated.shape == merits.effort.shape == (1,)
+        assert_allclose(merits.effort[0], np.trapezoid(record.command[:, 0] ** 2, record.times))
+        taken = found.bound.uncontrolled - merits.peak
+        whole = found.bound.uncontrolled - found.bound.peak
+        assert_allclose(merits.share, taken / whole, rtol=1e-12)
+        assert 1e-9 < merits.step_time < 1e-2
+    assert 0 < found.merits["weak"].share < 1
+    assert found.merits["wild"].share < 0
+    assert found.merits["wild"].saturated[0] > 0.1 > found.merits["weak"].saturated[0]
+    assert found.bound.share(found.best) > 0.99
+    assert np.isnan(step_time(found.free))
+
+
+def test_the_picture_names_every_run(found):
+    figure = plot_comparison(found)
+    written = words(figure)
+    for part in ("no control", "weak", "wild", "best possible", "limit 7.50", "command (V)"):
+        assert part in written
+    assert f"({found.merits['weak'].share:.0%})" in written
+    top = figure.axes[0]
+    lines = {line.get_label(): line.get_ydata() for line in top.get_lines()}
+    assert_allclose(lines["weak"], 1e3 * found.records["weak"].deflection[:, 0])
+    assert any(np.allclose(y, -1e3 * found.bound.peak) for y in lines.values() if len(y) == 2)
+
+
+def test_diverging_controllers_are_said_to(found):
+    gone = jnp.full(found.free.deflection.shape[:1] + (2,), jnp.nan)
+    lost = jnp.full(1, jnp.nan)
+    parts = {"coordinates": gone, "peak_deflection": lost, "peak_time": lost}
+    record = dataclasses.replace(found.records["wild"], **parts)
+    comparison = dataclasses.replace(found, records={"wild": record})
+    assert "wild diverges" in words(plot_comparison(comparison))
+
+
+def test_nothing_to_compare_is_refused(found):
+    with pytest.raises(ValueError, match="give at least one controller"):
+        compare(found.case, {})
+
+
+def test_a_controller_that_does_not_fit_is_named(found):
+    with pytest.raises(ValueError, match="two: controller.gains must list one gain for each of 1"):
+        compare(found.case, {"two": jb.Feedback([1.0, 2.0], period=0.01)})
+
+
+def run(line: str, folder, monkeypatch, capsys) -> tuple[int, str, str]:
+    monkeypatch.chdir(folder)
+    with pytest.raises(SystemExit) as ended:
+        main(line.split())
+    printed = capsys.readouterr()
+    return ended.value.code, printed.out, printed.err
+
+
+@pytest.mark.slow
+def test_the_command_prints_and_draws(found, folder, monkeypatch, capsys):
+    line = "compare weak.toml --controllers wild.toml"
+    code, printed, wrong = run(f"{line} -o out.png", folder, monkeypatch, capsys)
+    assert code == 0, wrong
+    assert f"below {found.bound.peak:.6g} m" in printed
+    assert f"{found.merits['weak'].share:.1%}" in printed
+    assert "wild: every load presses on the beam throughout" in printed
+    assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
+    code, printed, wrong = run(f"{line} --json --period 0.02", folder, monkeypatch, capsys)
+    assert code == 0, wrong
+    answer = json.loads(printed)
+    assert answer["held_for"] == 0.02
+    assert answer["least_peak"] >= found.bound.peak * (1 - 1e-6)
+    assert answer["controllers"]["weak"]["peak"] == found.merits["weak"].peak
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("compare bare.toml", "bare.toml has no controller; name some with --controllers FILE"),
+        (
+            "compare weak.toml --controllers bare.toml",
+            "bare.toml: has no controller; write a table",
+        ),
+        (
+            "compare bare.toml --controllers ./weak.toml weak.toml",
+            "two controllers are called weak",
+        ),
+        ("compare weak.toml --controllers none.toml", "cannot read the case file none.toml"),
+        ("compare weak.toml --controllers odd.toml", "odd.toml: controller must be one table"),
+        ("compare weak.toml -o out.pdf", "a comparison is written to a .png file"),
+    ],
+)
+def test_wrong_lines_are_refused(folder, monkeypatch, capsys, line, message):
+    (folder / "bare.toml").write_text(CASE)
+    (folder / "odd.toml").write_text("controller = 1")
+    code, printed, wrong = run(line, folder, monkeypatch, capsys)
+    assert (code, printed) == (1, "")
+    assert message in wrong
