@@ -17,8 +17,8 @@ def span_of(case: Case) -> Span:
     return Span(*map(float, numbers), beam.modes, float(beam.damping_ratio))
 
 
-def expected(case: Case, times) -> closed_loop.Motion:
-    """The motion of a case at times (s) by the oracle; loads must travel at given speeds."""
+def parts_of(case: Case) -> tuple[Span, list, list, list]:
+    """Span, loads, actuators and sensors; loads must travel at given speeds."""
     loads = [
         Load(
             float(load.mass),
@@ -28,6 +28,12 @@ def expected(case: Case, times) -> closed_loop.Motion:
         )
         for load in case.loads
     ]
+    actuators = [_actuator(actuator) for actuator in case.actuators]
+    return span_of(case), loads, actuators, [_sensor(sensor) for sensor in case.sensors]
+
+
+def expected(case: Case, times, law: closed_loop.Law | None = None) -> closed_loop.Motion:
+    """The motion of a case at times (s) by the oracle, under its own law or another."""
     controller, clock = case.controller, None
     if controller.period is not None:
         delay = _number(controller.delay) or 0.0
@@ -35,11 +41,8 @@ def expected(case: Case, times) -> closed_loop.Motion:
         clock = closed_loop.Clock(period, delay, _number(controller.resolution))
     knots = [] if controller.knots() is None else np.asarray(controller.knots()).tolist()
     return closed_loop.respond(
-        span_of(case),
-        loads,
-        [_actuator(actuator) for actuator in case.actuators],
-        [_sensor(sensor) for sensor in case.sensors],
-        _law(controller),
+        *parts_of(case),
+        _law(controller) if law is None else law,
         np.asarray(times).tolist(),
         clock,
         knots,
