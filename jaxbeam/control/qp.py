@@ -33,9 +33,9 @@ CREEP = 1e-13  # the same for Hildreth's procedure, whose last sweeps change lit
 ROUNDING = 1e-13  # share of limits and minimiser by which a limit may be passed and not be felt
 FARTHEST = 1e8  # distance beyond which no point within the limits is looked for
 SMOOTHING = 1e-14
-STEPS = 50  # of the interior-point method
+STEPS = 100  # of the interior-point method
 SWEEPS = 20000  # of Hildreth's procedure
-DAMPING = 1e-9  # of the multipliers in a step, so that dependent rows do no harm
+DAMPING = 1e-12  # of the multipliers in a step, so that dependent rows do no harm
 
 Rows = Float[Array, "row variable"]
 
@@ -47,13 +47,13 @@ class Solution(eqx.Module):
     method or the sweeps of Hildreth's procedure, 0 if no limit is felt.
     """
 
-    x: Float[Array, " variable"]
-    multipliers: Float[Array, " row"]
-    verdict: Int[Array, ""]
-    steps: Int[Array, ""]
+    x: Float[Array, "*batch variable"]
+    multipliers: Float[Array, "*batch row"]
+    verdict: Int[Array, " *batch"]
+    steps: Int[Array, " *batch"]
 
     @property
-    def solved(self) -> Bool[Array, ""]:
+    def solved(self) -> Bool[Array, " *batch"]:
         """Whether x solves the problem."""
         return self.verdict == SOLVED
 
@@ -103,7 +103,7 @@ def _nearest(H, f, M, gamma) -> _Nearest:
     h = gamma / length - G @ centre
     beyond = jnp.max(-h, initial=0.0)
     size = jnp.max(jnp.abs(gamma / length), initial=0.0) + jnp.max(jnp.abs(centre))
-    felt = ~(beyond <= ROUNDING * size)
+    felt = ~(beyond <= ROUNDING * size) | ~jnp.isfinite(size)
     unit = jnp.where(felt, beyond, 1.0)
     return _Nearest(G, h / unit, unit, length, inverse, centre, felt)
 
