@@ -180,14 +180,15 @@ def test_no_controller_beats_it(rivals_plan, mass, speed, strength, seed):
 
 def test_more_places_raise_it(best):
     whole = bound(patched(), places=np.linspace(0.0, 0.6, 61))
-    assert best.peak < whole.peak < best.uncontrolled < whole.uncontrolled
+    assert best.peak < whole.peak < best.uncontrolled
+    assert whole.uncontrolled >= best.uncontrolled * (1 - 1e-9)
 
 
 def test_slower_actuators_raise_it(best, found):
-    low, high, change = np.array([[-2.5], [7.5], [0.3]])
+    low, high, change = np.array([[-2.5], [7.5], [0.1]])
     peak, commands, _ = least_peak(found, low, high, change)
     assert best.peak * 1.001 < peak < best.uncontrolled
-    assert np.max(np.abs(np.diff(commands[:, 0], prepend=0.0))) <= 0.3 * (1 + 1e-9)
+    assert np.max(np.abs(np.diff(commands[:, 0], prepend=0.0))) <= 0.1 * (1 + 1e-9)
     with pytest.raises(ValueError, match="no commands, starting from zero, stay within limits"):
         least_peak(found, low + 3.0, high, change)
 
@@ -223,7 +224,7 @@ def test_two_actuators_and_a_hold_cut_short():
 
 FAULTS = {
     "without actuators": lambda: bound(dataclasses.replace(patched(), actuators=())),
-    "add a load": lambda: bound(dataclasses.replace(patched(), loads=())),
+    "without loads": lambda: bound(dataclasses.replace(patched(), loads=())),
     "takes commands that move the beam": lambda: bound(
         dataclasses.replace(patched(), actuators=(jb.SpringDamper(0.2, 100.0),))
     ),

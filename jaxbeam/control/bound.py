@@ -130,7 +130,7 @@ def bound(
     peak, commands, weights = least_peak(found, *_ranges(case, period))
     when, where = np.nonzero(weights)
     return Bound(
-        peak=peak,
+        peak=float(peak),
         uncontrolled=_uncontrolled(case, places),
         places=places,
         times=found.holds,
