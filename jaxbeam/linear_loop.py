@@ -24,8 +24,9 @@ from jaxbeam.fields import known
 from jaxbeam.loop import plant
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.motion import NEVER, AbstractMotion
+from jaxbeam.rig import rig
 from jaxbeam.sensing import design, init, read
-from jaxbeam.statespace import LoadedBeam, state_space
+from jaxbeam.statespace import LoadedBeam, loaded_beam
 
 SETTLING = 8  # steps of Newton's method towards the state about which a law is made linear
 ROUNDING = 1e-9  # of a period: shorter differences are none
@@ -100,7 +101,7 @@ def linear_loop(case: Case, t: float) -> LinearLoop:
     controller, and one whose sensors are not read at the controller's own ticks.
     """
     clock = prepared(case)
-    return frozen_loop(case, lay_out(known_case(case)), clock, jnp.asarray(float(t)))
+    return linear(open_loop(case, lay_out(known_case(case))), clock, jnp.asarray(float(t)))
 
 
 def prepared(case: Case) -> Clock | None:
@@ -128,24 +129,13 @@ def prepared(case: Case) -> Clock | None:
 
 
 @eqx.filter_jit
-def frozen_loop(case: Case, layout: Layout, clock: Clock | None, t) -> LinearLoop:
-    """`linear_loop` for a case that is `prepared`; may be traced and batched."""
-    loop = open_loop(case, layout)
-    return linear(loop.frozen(t), clock, t)
-
-
 def linear(loop: "OpenLoop", clock: Clock | None, t) -> LinearLoop:
-    """A loop with frozen loads, linear about the rest under their weights."""
-    modal = 2 * loop.model.scale.shape[0]
+    """A loop with its loads frozen at t (s), linear about the rest under their weights."""
+    loop, modal = loop.frozen(t), 2 * loop.model.scale.shape[0]
     if clock is None:
-        system, command = loop.wide.at(t), loop.law_of(t)
-        held = len(loop.model.case.actuators)
-        push, load = system.B[:, :held], system.B[:, held:] @ loop.wide.weights
-        about = _rest(
-            lambda state: system.A @ state + push @ command(state) + load,
-            jnp.zeros(system.A.shape[0]),
-        )
-        return LinearLoop(system.A, push, jax.jacfwd(command)(about), None, modal)
+        A, push, load, command = loop.parts(t)
+        about = _rest(lambda state: A @ state + push @ command(state) + load, jnp.zeros(A.shape[0]))
+        return LinearLoop(A, push, jax.jacfwd(command)(about), None, modal)
     start, rebuild = loop.at_rest(clock)
 
     def onward(state, given):
@@ -179,9 +169,10 @@ class OpenLoop(eqx.Module):
         )
         return eqx.tree_at(lambda loop: loop.wide.traffic.motions, self, motions)
 
-    def law_of(self, t):
-        """Commands as a function of the state, for a law at every instant."""
-        none = jnp.zeros(len(self.model.case.actuators))
+    def parts(self, t):
+        """A, B, the rates that the weights cause, and commands as a function of the state."""
+        system, held = self.wide.at(t), len(self.model.case.actuators)
+        none = jnp.zeros(held)
 
         def command(state):
             signals = self._signals(state, none, t)
@@ -190,7 +181,8 @@ class OpenLoop(eqx.Module):
             readings = jnp.stack(readings) if readings else signals
             return self._law(self.memory, readings, state, none, t)[0]
 
-        return command
+        push, load = system.B[:, :held], system.B[:, held:] @ self.wide.weights
+        return system.A, push, load, command
 
     def at_rest(self, clock: Clock):
         """State of the sampled loop at rest as one vector, and the function that unpacks it."""
@@ -297,10 +289,19 @@ class OpenLoop(eqx.Module):
 
 
 def open_loop(case: Case, layout: Layout) -> OpenLoop:
-    """The opened loop of a case with a controller."""
-    model = state_space(case, layout=layout)
-    rig, seen = plant(model)
-    wide = eqx.tree_at(lambda m: m.rig, model, rig)
+    """The opened loop of a case with a controller. May be traced and batched."""
+    # Cases that differ in their controllers share what is compiled of the rig.
+    return _opened(case, _rig(eqx.tree_at(lambda c: c.controller, case, None), layout))
+
+
+_rig = eqx.filter_jit(rig)
+
+
+@eqx.filter_jit
+def _opened(case, assembled):
+    model = loaded_beam(case, assembled)
+    wide_rig, seen = plant(model)
+    wide = eqx.tree_at(lambda m: m.rig, model, wide_rig)
     return OpenLoop(model, wide, seen, case.controller.init(model))
 
 

@@ -6,6 +6,7 @@ Gramians and Hankel singular values of a state space.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
@@ -19,6 +20,7 @@ from jaxbeam.statespace import StateSpace
 POINTS = 400  # frequencies around each pole
 BELOW = 1e-3  # lowest frequency looked at, relative to the lowest pole
 DOUBLINGS = 60
+VANISHED = 1e-9  # norm of a power of the state matrix that adds nothing any more
 
 
 class Margins(NamedTuple):
@@ -75,13 +77,19 @@ def margins(loop: LinearLoop, actuator: int = 0) -> Margins:
         lag = np.angle(response(w)[0]) % (2 * np.pi)
         phases.append(min(lag, 2 * np.pi - lag))
         delays.append(lag / w)
-    return Margins(
+    near = int(np.argmin(np.abs(1 - curve)))
+    around = omega[max(near - 1, 0)], omega[min(near + 1, omega.size - 1)]
+    least = scipy.optimize.minimize_scalar(
+        lambda w: abs(1 - response(w)[0]), bounds=around, options={"xatol": 1e-9 * around[1]}
+    )
+    found = Margins(
         gain=min((g for g in gains if g > 1), default=np.inf),
         gain_down=max((g for g in gains if 0 < g < 1), default=0.0),
         phase=min(phases),
         delay=min(delays),
-        distance=float(np.min(np.abs(1 - curve))),
+        distance=min(least.fun, abs(1 - curve[near])),
     )
+    return Margins(*map(float, found))
 
 
 def _frequencies(poles, period) -> np.ndarray:
@@ -126,8 +134,7 @@ def gramians(system: StateSpace) -> Gramians:
 
     The factors are found without forming the Gramians, whose small directions would drown in
     rounding (Hammarling, IMA Journal of Numerical Analysis 2, 1982, gives the reason; here by
-    doubling with orthogonal factors). Differentiable where singular values differ.
-    Raises ValueError if the system is not stable.
+    doubling with orthogonal factors). Raises ValueError if the system is not stable.
     """
     A, B, C = system.A, system.B, system.C
     scale = balance(A)
@@ -148,16 +155,15 @@ def gramians(system: StateSpace) -> Gramians:
 def _factor(A, B):
     """L with L L' = sum of A^k B B' A'^k, twice as many terms at a time; nan if it grows."""
     size = A.shape[0]
-    factor = jnp.zeros((size, size))
-    factor = factor.at[:, : min(size, B.shape[1])].set(_narrow(B)[:, : min(size, B.shape[1])])
-    for _ in range(DOUBLINGS):
-        factor = _narrow(jnp.concatenate([factor, A @ factor], axis=1))
-        A = A @ A
-        if not float(jnp.max(jnp.abs(A))) < 1e100:
-            return jnp.full((size, size), jnp.nan)
-        if float(jnp.max(jnp.abs(A))) < 1e-18:
-            return factor
-    return jnp.full((size, size), jnp.nan)
+    first = _narrow(B)
+    factor = jnp.zeros((size, size)).at[:, : first.shape[1]].set(first)
+
+    def double(_, state):
+        factor, power = state
+        return _narrow(jnp.concatenate([factor, power @ factor], axis=1)), power @ power
+
+    factor, power = jax.lax.fori_loop(0, DOUBLINGS, double, (factor, A))
+    return jnp.where(jnp.max(jnp.abs(power)) < VANISHED, factor, jnp.nan)
 
 
 def _narrow(wide):

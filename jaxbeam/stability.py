@@ -21,9 +21,9 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.case import Case, known_case, replace
 from jaxbeam.fields import known
-from jaxbeam.linear_loop import Clock, linear, open_loop, prepared, through
+from jaxbeam.linear_loop import Clock, OpenLoop, linear, open_loop, prepared, through
 from jaxbeam.loads import motion
-from jaxbeam.modes import Layout, lay_out
+from jaxbeam.modes import lay_out
 from jaxbeam.motion import NEVER
 
 TURN = 0.15  # rad by which the fastest mode may turn in a step along a transition
@@ -87,34 +87,33 @@ def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) ->
     if times is None:
         times = np.linspace(*_crossing(case), 101)[:-1] if case.loads else np.zeros(1)
     times = np.asarray(times, float)
-    loops = _frozen_loops(case, lay_out(known_case(case)), clock, jnp.asarray(times))
+    loop = open_loop(case, lay_out(known_case(case)))
+    loops = _frozen_loops(loop, clock, jnp.asarray(times))
     each = [jax.tree.map(lambda part, i=i: part[i], loops).poles() for i in range(times.size)]
     return FrozenPoles(times, _followed(np.stack(each)))
 
 
 @eqx.filter_jit
-def _frozen_loops(case, layout, clock, times):
-    loop = open_loop(case, layout)
-    return jax.lax.map(lambda t: linear(loop.frozen(t), clock, t), times)
+def _frozen_loops(loop, clock, times):
+    return jax.lax.map(lambda t: linear(loop, clock, t), times)
 
 
 def growth(case: Case, points: int = 100) -> Growth:
     """The growth of deviations over a crossing, in energy, at some times from start to end.
 
-    The loop is linear about rest (a power law then has no gain), or about the rest under the
-    frozen loads at every instant if it acts without a sampling period. Raises ValueError as
-    `linear_loop`.
+    The loop is linear about rest, where a cubic law has no gain. Raises ValueError as
+    `linear_loop`, and for a case without loads.
     """
     clock = prepared(case)
     start, end = _crossing(case)
-    layout = lay_out(known_case(case))
+    loop = open_loop(case, lay_out(known_case(case)))
     if clock is None:
         times = np.linspace(start, end, points + 1)
     else:
         ticks = np.arange(math.ceil(start / clock.period), math.floor(end / clock.period) + 1)
         times = ticks * clock.period
-    steps = _substeps(case, layout, clock, times)
-    whole, energy = _transitions(case, layout, clock, jnp.asarray(times), steps)
+    steps = _substeps(loop, clock, times)
+    whole, energy = _transitions(loop, clock, jnp.asarray(times), steps)
     whole, energy = np.asarray(whole), np.asarray(energy)
     size = energy.shape[0]
     root = np.linalg.cholesky(energy).T
@@ -154,11 +153,11 @@ def stream(case: Case, spacing: float) -> Stream:
             eqx.tree_at(lambda x: x.times, load, load.times - i * spacing) for i in range(count)
         ]
     many = dataclasses.replace(case, loads=tuple(loads))
-    layout = lay_out(known_case(case))
+    loop = open_loop(many, lay_out(known_case(case)))
     cuts = 1 if clock is None else round(spacing / clock.period)
     times = start + np.linspace(0.0, spacing, max(cuts, 20 if clock is None else 1) + 1)
-    steps = _substeps(case, layout, clock, times)
-    whole, _ = _transitions(many, layout, clock, jnp.asarray(times), steps)
+    steps = _substeps(loop, clock, times)
+    whole, _ = _transitions(loop, clock, jnp.asarray(times), steps)
     return Stream(np.linalg.eigvals(np.asarray(whole[-1])), float(spacing))
 
 
@@ -213,17 +212,16 @@ def _crossing(case: Case) -> tuple[float, float]:
     return float(entries.min()), last
 
 
-def _substeps(case, layout, clock, times) -> int:
+def _substeps(loop, clock, times) -> int:
     """Substeps between any two of the times in which the fastest mode turns a little only."""
-    fastest = float(jnp.max(open_loop(case, layout).model.rig.modes.angular_frequencies))
+    fastest = float(jnp.max(loop.model.rig.modes.angular_frequencies))
     longest = float(np.max(np.diff(times))) if clock is None else clock.period
     return max(1, math.ceil(fastest * longest / TURN))
 
 
 @eqx.filter_jit
-def _transitions(case: Case, layout: Layout, clock: Clock | None, times, substeps: int):
+def _transitions(loop: OpenLoop, clock: Clock | None, times, substeps: int):
     """Transition matrices from the first time to each, and the energy's matrix of q and q'."""
-    loop = open_loop(case, layout)
     model, modes = loop.model, loop.model.scale.shape[0]
     stiffness = model.rig.stiffness() / jnp.outer(model.scale, model.scale)
     mass = jnp.diag(1 / model.scale**2)
@@ -232,7 +230,8 @@ def _transitions(case: Case, layout: Layout, clock: Clock | None, times, substep
     if clock is None:
 
         def matrix(t):
-            return linear(loop.frozen(t), None, t).closed
+            A, push, _, command = loop.parts(t)
+            return A + push @ jax.jacfwd(command)(jnp.zeros(A.shape[0]))
 
         def onward(whole, t):
             whole = through(matrix, t[0], t[1] - t[0], substeps, whole)

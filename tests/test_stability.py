@@ -1,0 +1,277 @@
+"""Poles, growth and Floquet multipliers against matrices written out and integrated by scipy."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+
+import jaxbeam as jb
+from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.linear_loop import linear_loop
+from jaxbeam.margins import gramians, margins
+from jaxbeam.stability import _followed, frozen_poles, growth, limit, stream
+from jaxbeam.statespace import state_space
+
+REFERENCE = json.loads((Path(__file__).parent / "data/optimal_control.json").read_text())
+LENGTH, RIGIDITY, DENSITY, RATIO = 0.6, 11.68, 0.535, 0.03
+SPRING, DAMPER, PLACE, LAG = 12000.0, 80.0, 0.5, 1e4
+MASS, SPEED = 0.509, 0.55
+
+
+def rig(controller, modes=3, force_per_volt=4.6, loads=None, sensors=1):
+    beam = jb.Beam(
+        length=LENGTH,
+        flexural_rigidity=RIGIDITY,
+        mass_per_length=DENSITY,
+        damping_ratio=RATIO,
+        modes=modes,
+    )
+    shaker = jb.Shaker(
+        position=PLACE,
+        stiffness=SPRING,
+        damping=DAMPER,
+        force_per_volt=force_per_volt,
+        bandwidth=LAG,
+    )
+    loads = [jb.MovingMass(mass=MASS, speed=SPEED)] if loads is None else loads
+    return jb.Case(
+        beam=beam,
+        actuators=[shaker],
+        sensors=[jb.Sensor(0.25)] * sensors,
+        loads=loads,
+        controller=controller,
+        run=jb.Run(duration=1.4, sample_rate=500.0),
+    )
+
+
+def written_out(x, speed, mass, force_per_volt, modes=3):
+    """State and command matrices in amplitudes of sines, eqs (2.11) and (2.36) corrected."""
+    n = np.arange(1, modes + 1) * np.pi / LENGTH
+    half = DENSITY * LENGTH / 2
+    omega = n**2 * np.sqrt(RIGIDITY / DENSITY)
+    shaker, here = np.sin(n * PLACE), np.sin(n * x)
+    slope, bend = n * np.cos(n * x), -(n**2) * np.sin(n * x)
+    M = half * np.eye(modes) + mass * np.outer(here, here)
+    C = half * np.diag(2 * RATIO * omega) + DAMPER * np.outer(shaker, shaker)
+    C += 2 * mass * speed * np.outer(here, slope)
+    K = half * np.diag(omega**2) + SPRING * np.outer(shaker, shaker)
+    K += mass * speed**2 * np.outer(here, bend)
+    A = np.zeros((2 * modes + 1,) * 2)
+    A[:modes, modes:-1] = np.eye(modes)
+    A[modes:-1, :modes] = -np.linalg.solve(M, K)
+    A[modes:-1, modes:-1] = -np.linalg.solve(M, C)
+    A[modes:-1, -1] = np.linalg.solve(M, shaker)
+    A[-1, -1] = -LAG
+    B = np.zeros((2 * modes + 1, 1))
+    B[-1] = LAG * force_per_volt
+    return A, B
+
+
+def regulator(**options):
+    weights = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]
+    return jb.LQR(
+        state_weight=weights, command_weight=[9e-5], coordinates="sine",
+        design=Beliefs(force_per_volt=4.6), **options,
+    )  # fmt: skip
+
+
+def test_frozen_poles_of_the_published_regulator():
+    case = rig(regulator())
+    times = np.array([0.05, 0.25, 0.44]) / SPEED
+    found = frozen_poles(case, times)
+    A, B = written_out(0.0, 0.0, 0.0, 4.6)
+    Q = np.diag([1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0])
+    P = scipy.linalg.solve_continuous_are(A, B, Q, [[9e-5]])
+    for i, t in enumerate(times):
+        A, _ = written_out(SPEED * t, SPEED, MASS, 4.6)
+        poles = np.linalg.eigvals(A - B @ B.T @ P / 9e-5)
+        np.testing.assert_allclose(
+            np.sort_complex(found.poles[i]), np.sort_complex(poles), rtol=1e-7
+        )
+    printed = REFERENCE["frozen_closed_loop_poles_time_invariant_all_states_mass_at_0.25m"]
+    printed = np.array([complex(*pole) for pole in printed])
+    np.testing.assert_allclose(np.sort_complex(found.poles[1]), np.sort_complex(printed), rtol=1e-6)
+    assert found.largest[2] == pytest.approx(found.poles[2].real.max())
+
+
+def test_branches_are_followed_through_a_crossing():
+    t = np.linspace(-1, 1, 21)
+    up, down = -1 + 0.5 * t + 3j, -1 - 0.4 * t + 3j + 0.05j
+    sorted_by_size = np.sort(np.stack([up, down], axis=1), axis=1)
+    followed = _followed(sorted_by_size)
+    np.testing.assert_array_equal(followed[:, 0], np.where(followed[0, 0] == up[0], up, down))
+
+
+def test_sampled_poles_are_those_of_the_simulated_decay():
+    # A delay of one and a half periods, a late sensor and a digital filter, all in the loop.
+    filter = jb.Filter(cutoff=60.0, order=2)
+    case = rig(
+        jb.Feedback([200.0], period=0.004, delay=0.006),
+        modes=2,
+        loads=[jb.MovingForce(force=2.0, speed=3.0)],
+    )
+    case = jb.Case(
+        beam=case.beam,
+        actuators=case.actuators,
+        sensors=[jb.Sensor(0.25, delay=0.002, filter=filter)],
+        loads=case.loads,
+        controller=case.controller,
+        run=jb.Run(duration=1.0, sample_rate=250.0),
+    )
+    poles = linear_loop(case, 0.9).poles()
+    record = jb.simulate(case)
+    z = np.exp(poles[0] * 0.004)
+    assert poles[1] == pytest.approx(poles[0].conj()) and poles[2].real < poles[0].real - 5
+    decay = np.asarray(record.deflection)[150:, 0]
+    ahead = 2 * z.real * decay[1:-1] - abs(z) ** 2 * decay[:-2]
+    np.testing.assert_allclose(ahead, decay[2:], atol=3e-5 * np.abs(decay).max())
+
+
+GAIN = np.array([[300.0, -800.0, 12.0, 0.5, 0.0]])
+
+
+def closed(x, speed, mass):
+    A, B = written_out(x, speed, mass, 4.6, modes=2)
+    return A - B @ GAIN
+
+
+def over_crossing(speed, end):
+    """Transition matrix of the loop over the first part of a crossing."""
+
+    def rate(t, y):
+        return (closed(speed * t, speed, MASS) @ y.reshape(5, 5)).ravel()
+
+    solved = scipy.integrate.solve_ivp(
+        rate, (0, end), np.eye(5).ravel(), method="Radau", rtol=1e-9, atol=1e-12
+    )
+    return solved.y[:, -1].reshape(5, 5)
+
+
+def test_growth_against_scipy():
+    found = growth(rig(jb.StateFeedback(gain=GAIN, coordinates="sine"), modes=2), points=20)
+    end = 0.05 * LENGTH / SPEED
+    assert found.times[1] == pytest.approx(end, rel=1e-12) and found.factor[0] == 1.0
+    n = np.array([1, 2]) * np.pi / LENGTH
+    shaker, half = np.sin(n * PLACE), DENSITY * LENGTH / 2
+    stiffness = half * np.diag(n**4 * RIGIDITY / DENSITY) + SPRING * np.outer(shaker, shaker)
+    root = np.linalg.cholesky(scipy.linalg.block_diag(stiffness, half * np.eye(2))).T
+    part = root @ over_crossing(SPEED, end)[:4, :4] @ np.linalg.inv(root)
+    assert found.factor[1] == pytest.approx(np.linalg.norm(part, ord=2), rel=1e-4)
+
+
+def test_multipliers_of_a_stream_against_scipy():
+    case = rig(jb.StateFeedback(gain=GAIN, coordinates="sine"), modes=2)
+    found = stream(jb.replace(case, {"loads.0.speed": 20.0}), 0.04)
+    alone = scipy.linalg.expm(0.01 * closed(0.0, 0.0, 0.0))
+    expected = np.linalg.eigvals(alone @ over_crossing(20.0, 0.03))
+    order = np.argsort(-np.abs(expected))[:3]
+    np.testing.assert_allclose(
+        np.sort(np.abs(found.multipliers))[::-1][:3], np.abs(expected)[order], rtol=1e-4
+    )
+    assert found.stable and found.period == 0.04
+
+
+def test_sampled_stream_comes_to_the_continuous_one():
+    def largest(period):
+        law = jb.StateFeedback(gain=GAIN, coordinates="sine", period=period)
+        return stream(jb.replace(rig(law, modes=2), {"loads.0.speed": 20.0}), 0.04).largest
+
+    # A hold is late by half a period: the difference is of first order.
+    exact = largest(None)
+    far, near = (largest(period) - exact for period in (4e-4, 2e-4))
+    assert far / near == pytest.approx(2.0, abs=0.15)
+
+
+def test_limit_of_a_gain_is_its_gain_margin():
+    # A feather of a load leaves the loop as it is.
+    case = rig(
+        jb.Feedback([100.0], period=0.004), modes=2, loads=[jb.MovingMass(mass=1e-9, speed=SPEED)]
+    )
+
+    def worst(case):
+        return frozen_poles(case, np.array([0.5])).largest.max()
+
+    found = limit(case, "controller.gains.0", 100.0, 1e5, worst, points=8)
+    margin = margins(linear_loop(case, 0.5))
+    assert found == pytest.approx(100.0 * margin.gain, rel=1e-5)
+    assert margin.gain_down == 0.0
+    with pytest.raises(ValueError, match="unstable already at controller.gains.0 = 20000"):
+        limit(case, "controller.gains.0", 2e4, 1e5, worst)
+    assert limit(case, "controller.gains.0", 100.0, 200.0, worst, points=2) is None
+
+
+def test_margins_against_python_control():
+    control = pytest.importorskip("control")
+    loop = linear_loop(rig(jb.Feedback([3000.0]), modes=2), 0.0)
+    found = margins(loop)
+    system = control.ss(*(np.asarray(part) for part in (loop.A, loop.B, -loop.K)), 0)
+    gain, phase, distance, _, crossover, _ = control.stability_margins(system)
+    assert found.gain == pytest.approx(gain, rel=1e-6)
+    assert found.phase == pytest.approx(np.radians(phase), rel=1e-6)
+    assert found.delay == pytest.approx(np.radians(phase) / crossover, rel=1e-6)
+    assert found.distance == pytest.approx(distance, rel=1e-6)
+
+
+def test_at_the_gain_margin_a_pole_is_on_the_limit():
+    # Here it leaves through -1, at half the sampling frequency.
+    loop = linear_loop(rig(regulator(period=0.002)), 0.0)
+    A, B, K = (np.asarray(part) for part in (loop.A, loop.B, loop.K))
+    gain = margins(loop).gain
+    assert np.abs(np.linalg.eigvals(A + gain * B @ K)).max() == pytest.approx(1.0, abs=1e-9)
+    for share in (0.2, 0.5, 0.99):
+        assert np.abs(np.linalg.eigvals(A + (1 + share * (gain - 1)) * B @ K)).max() < 1
+
+
+def test_delay_margin_is_the_delay_that_destabilises():
+    found = margins(linear_loop(rig(jb.Feedback([1500.0], period=0.002), modes=2), 0.0))
+    for share, stable in ((0.98, True), (1.02, False)):
+        later = jb.Feedback([1500.0], period=0.002, delay=share * found.delay)
+        poles = linear_loop(rig(later, modes=2), 0.0).poles()
+        assert (poles.real.max() < 0) == stable
+
+
+def test_gramians_against_scipy():
+    plant = state_space(rig(regulator(), sensors=1)).unloaded
+    A, B, C = (np.asarray(part) for part in (plant.A, plant.B, plant.C))
+    reach = scipy.linalg.solve_continuous_lyapunov(A, -B @ B.T)
+    view = scipy.linalg.solve_continuous_lyapunov(A.T, -C.T @ C)
+    found = gramians(plant)
+    scale = np.sqrt(np.outer(np.diag(reach), np.diag(reach)))
+    product = np.asarray(found.controllability @ found.controllability.T)
+    np.testing.assert_allclose(product / scale, reach / scale, atol=1e-10)
+    np.testing.assert_allclose(found.reached, np.sqrt(np.diag(reach)), rtol=1e-9)
+    np.testing.assert_allclose(found.seen, np.sqrt(np.diag(view)), rtol=1e-6)
+    expected = np.sort(np.sqrt(np.abs(np.linalg.eigvals(reach @ view))))[::-1]
+    np.testing.assert_allclose(found.hankel[:6], expected[:6], rtol=1e-6)
+    sampled = plant.discretize(0.003)
+    A, B = np.asarray(sampled.A), np.asarray(sampled.B)
+    reach = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
+    np.testing.assert_allclose(gramians(sampled).reached, np.sqrt(np.diag(reach)), rtol=1e-8)
+
+
+def test_what_has_no_answer_is_refused():
+    case = rig(jb.Feedback([1.0], period=0.01))
+    with pytest.raises(ValueError, match="there is no loop: the case has no controller"):
+        linear_loop(rig(None), 0.0)
+    with pytest.raises(ValueError, match="spacing must be a whole number of the controller's"):
+        stream(case, 0.0155)
+    with pytest.raises(ValueError, match="a stream repeats the one load of a case; this has 0"):
+        stream(rig(jb.Feedback([1.0]), loads=[]), 1.0)
+    with pytest.raises(ValueError, match="there is no crossing: the case has no loads"):
+        growth(rig(jb.Feedback([1.0]), loads=[]))
+    with pytest.raises(ValueError, match="low and high must be positive and ascend"):
+        limit(case, "loads.0.mass", 2.0, 1.0)
+    with pytest.raises(ValueError, match="the loop is unstable as it is"):
+        margins(linear_loop(rig(jb.Feedback([-1e6], period=0.01)), 0.0))
+    slow = jb.Case(
+        beam=case.beam, actuators=case.actuators, controller=case.controller,
+        sensors=[jb.Sensor(0.25, sampling_period=0.02)], run=case.run,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="sensors.0.sampling_period must be the controller's"):
+        linear_loop(slow, 0.0)
+    free = jb.Case(beam=jb.Beam(1.0, 1.0, 1.0, modes=2), sensors=[jb.Sensor(0.2)])
+    with pytest.raises(ValueError, match="Gramians need a stable system"):
+        gramians(state_space(free).unloaded)
