@@ -1,0 +1,129 @@
+"""Gains against python-control, scipy and each other; transitions against scipy's integrals."""
+
+import control
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+from numpy.testing import assert_allclose
+
+from jaxbeam.estimation import kalman_gain, placed_gain, sampled_kalman_gain
+from jaxbeam.estimation.sampled import Ticks
+from tests.differences import central
+
+FREQUENCIES = np.array([128.0, 512.0, 1153.0])
+SHAPES = np.array([[1.76, 2.47, 1.75], [2.4, 1.2, -1.8]])
+A = jnp.block(
+    [
+        [np.zeros((3, 3)), np.eye(3)],
+        [-np.diag(FREQUENCIES**2), -np.diag(2 * 0.03 * FREQUENCIES)],
+    ]
+)
+C = jnp.hstack([1e5 * SHAPES, np.zeros((2, 3))])  # readings in units of 10 um
+Q = jnp.diag(jnp.array([0.0, 0.0, 0.0, 0.01, 0.02, 0.03]))
+R = jnp.diag(jnp.array([1.0, 4.0]))
+
+
+def transition(period, late=None):
+    ticks = Ticks(jnp.asarray(period), None if late is None else jnp.asarray(late))
+    return ticks.transition(lambda t: (A, jnp.eye(6, 1)), Q)
+
+
+def test_kalman_gain_in_continuous_time():
+    """In units in which python-control loses no digits: coordinates times frequencies."""
+    units = np.concatenate([FREQUENCIES, np.ones(3)])[:, None]
+    gain, covariance, _ = control.lqe(A * units / units.T, np.eye(6), C / units.T, Q, R)
+    found = kalman_gain(A, C, Q, R)
+    scale = np.sqrt(np.diag(covariance))[:, None]
+    outer = scale * scale.T
+    assert_allclose(found[1] * units * units.T / outer, covariance / outer, rtol=0, atol=1e-9)
+    assert_allclose(found[0] * units / scale, gain / scale, rtol=1e-8)
+
+
+def test_sampled_kalman_gain():
+    step = transition(2e-3)
+    drift, noise = step.drift, step.noise
+    gain, covariance, _ = control.dlqe(drift, np.eye(6), C, noise, R)
+    found = sampled_kalman_gain(drift, C, noise, R)
+    scale = np.sqrt(np.diag(covariance))
+    outer = scale * scale[:, None]
+    assert_allclose(found[1] / outer, covariance / outer, rtol=0, atol=1e-9)
+    # Its gain is for the prediction of the next state.
+    assert_allclose(drift @ found[0] / scale[:, None], gain / scale[:, None], rtol=0, atol=1e-9)
+    direct = scipy.linalg.solve_discrete_are(drift.T, C.T, noise, R)
+    assert_allclose(direct / outer, covariance / outer, rtol=0, atol=1e-9)
+
+
+def test_sampled_gains_become_the_continuous_one():
+    """A reading each period with noise of covariance R / period is noise of intensity R."""
+    whole, covariance = kalman_gain(A, C, Q, R)
+    scale = np.sqrt(np.diag(covariance))[:, None]
+    short = []
+    for period in (2e-5, 1e-5):
+        step = transition(period)
+        gain, _ = sampled_kalman_gain(step.drift, C, step.noise, R / period)
+        short.append(
+            np.max(np.abs((gain / period - whole) / scale)) / np.max(np.abs(whole / scale))
+        )
+    assert short[1] < 0.01
+    assert short[1] / short[0] == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("late", [None, 7e-4])
+def test_transitions_of_a_plant_that_stays_as_it_is(late):
+    """Noise by Van Loan's block exponential, pushes by differences of held inputs."""
+    period, step = 2e-3, transition(2e-3, late)
+    drift = scipy.linalg.expm(A * period)
+    block = scipy.linalg.expm(np.block([[-A, Q], [np.zeros((6, 6)), A.T]]) * period)
+    noise = block[6:, 6:].T @ block[:6, 6:]
+    push = {
+        s: np.linalg.solve(A, (scipy.linalg.expm(A * s) - np.eye(6)) @ np.eye(6, 1))
+        for s in (period, 0.0 if late is None else period - late)
+    }
+    after = push[period] if late is None else push[period - late]
+    scale = np.sqrt(np.diag(noise))
+    outer = scale * scale[:, None]
+    assert_allclose(step.drift * scale / scale[:, None], drift * scale / scale[:, None], atol=1e-11)
+    assert_allclose(step.noise / outer, noise / outer, rtol=0, atol=1e-10)
+    assert_allclose(step.after / scale[:, None], after / scale[:, None], rtol=1e-9, atol=1e-9)
+    whole = (step.before + step.after) / scale[:, None]
+    assert_allclose(whole, push[period] / scale[:, None], rtol=1e-9, atol=1e-9)
+
+
+def test_one_output_leaves_one_choice_of_gain():
+    poles = np.array([-100 + 80j, -150 + 500j, -200 + 1100j])
+    poles = np.concatenate([poles, poles.conj()])
+    wanted = jnp.block(
+        [
+            [np.zeros((3, 3)), np.eye(3)],
+            [-np.diag(np.abs(poles[:3]) ** 2), np.diag(2 * poles[:3].real)],
+        ]
+    )
+    gain = placed_gain(A, C[:1], wanted)
+    scale = np.concatenate([np.ones(3), FREQUENCIES])[:, None]
+    expected = scipy.signal.place_poles(A.T, C[:1].T, poles).gain_matrix.T
+    assert_allclose(gain / scale, expected / scale, rtol=1e-7)
+    both = placed_gain(A, C, wanted)
+    assert_allclose(np.sort_complex(np.linalg.eigvals(A - both @ C)), np.sort_complex(poles))
+
+
+def test_gradients_of_gains():
+    step = transition(2e-3)
+    drift, noise = step.drift, step.noise
+
+    @jax.jit
+    def gains(point):
+        rows = C * jnp.array([[1.0], [point[0]]])
+        found = (
+            placed_gain(drift, rows, point[1] * drift),
+            sampled_kalman_gain(drift, rows, point[2] * noise, R)[0],
+            kalman_gain(A, rows, point[2] * Q, R)[0],
+        )
+        return jnp.stack([gain[:3] for gain in found]).reshape(3, -1)
+
+    at = jnp.array([1.0, 0.8, 1.0])
+    size = np.max(np.abs(gains(at)), axis=1)[:, None, None]
+    differences = central(gains, at, 1e-2) / size
+    assert_allclose(jax.jacrev(gains)(at) / size, differences, rtol=0, atol=1e-7)
