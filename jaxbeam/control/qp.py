@@ -33,7 +33,8 @@ CREEP = 1e-13  # the same for Hildreth's procedure, whose last sweeps change lit
 ROUNDING = 1e-13  # share of limits and minimiser by which a limit may be passed and not be felt
 FARTHEST = 1e8  # distance beyond which no point within the limits is looked for
 SMOOTHING = 1e-14
-STEPS = 100  # of the interior-point method
+STEPS = 100  # of the interior-point method, at most
+PATIENCE = 20  # steps after which every other one is calm
 SWEEPS = 20000  # of Hildreth's procedure
 DAMPING = 1e-12  # of the multipliers in a step, so that dependent rows do no harm
 
@@ -194,10 +195,12 @@ def _interior(G, h, felt):
         _, weight_change, slack_change = newton(weight * slack)
         length = _feasible(weight, weight_change, slack, slack_change, 1.0)
         left = (weight + length * weight_change) @ (slack + length * slack_change)
-        centre = (left / gap) ** 3 * gap / rows
+        calm = (steps > PATIENCE) & (steps % 2 == 0)
+        centre = jnp.where(calm, 0.3, (left / gap) ** 3) * gap / rows
         # The predictor's own error counts only as far as the predictor can be followed: taken in
-        # full, it makes the method cycle where limits nearly exclude each other.
-        curved = length * weight_change * slack_change
+        # full, it makes the method cycle where limits nearly exclude each other. A calm step
+        # without it ends the rare cycles that are left.
+        curved = jnp.where(calm, 0.0, length) * weight_change * slack_change
         z_change, weight_change, slack_change = newton(weight * slack + curved - centre)
         length = _feasible(weight, weight_change, slack, slack_change, 0.995)
         z, slack = z + length * z_change, slack + length * slack_change

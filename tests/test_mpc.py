@@ -1,0 +1,417 @@
+"""Predictive control: its matrices, reference runs, limits, what it knows, derivatives, faults.
+
+Most loops here run on a plant frozen anew in the middle of every millisecond, which compiles fast.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxbeam as jb
+from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.checks import check
+from jaxbeam.control.prediction import Sampled, incremental, moves, predict, pulses, sample
+from jaxbeam.controller import Measurement
+from jaxbeam.loop import loop_schedule
+from jaxbeam.modes import lay_out
+from jaxbeam.plan import Plan, form
+from jaxbeam.riccati import dlqr
+from tests.differences import central
+
+REFERENCE = json.loads((Path(__file__).parent / "data" / "predictive_control.json").read_text())
+PERIOD = 0.01
+PATCH = jb.Patch(
+    0.2575, 0.3425, 8.292438504838157e-4, correction=0.32, amplifier_gain=200.0, limits=[-2.5, 7.5]
+)
+THESIS = {"horizon": 6, "moves": 4, "move_weight": 1e-11, "period": PERIOD}
+
+
+def rig(controller=None, modes=3, patch=PATCH, **run) -> jb.Case:
+    """The one-span rig with a patch, and the heaviest mass at 1 m/s."""
+    return jb.Case(
+        jb.Beam(0.6, 13.211, 0.812, 0.03, modes=modes),
+        actuators=[patch],
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.MovingMass(mass=0.509, speed=1.0)],
+        controller=controller,
+        run=jb.Run(**({"duration": 0.8, "sample_rate": 100.0} | run)),
+    )
+
+
+def mpc(**settings) -> jb.MPC:
+    return jb.MPC(**(THESIS | settings))
+
+
+def run(case: jb.Case, substeps: int) -> jb.Record:
+    """A run sampled at its ticks, in so many steps from tick to tick."""
+    times = np.arange(round(float(case.run.duration) / PERIOD) + 1) * PERIOD
+    plan = Plan(form(case), substeps, 0, False, 0.0, loop_schedule(case, times))
+    return jb.simulate(case, jnp.asarray(times), plan)
+
+
+# Prediction
+
+
+def plant(states=4, inputs=2, outputs=2, seed=0):
+    rng = np.random.default_rng(seed)
+    A = 0.9 * scipy.linalg.orth(rng.normal(size=(states, states)))
+    B, C = rng.normal(size=(states, inputs)), rng.normal(size=(outputs, states))
+    return jnp.asarray(A), jnp.asarray(B), jnp.asarray(C)
+
+
+def test_prediction_is_that_of_the_incremental_model():
+    """F and Phi as eq. (7.5) spells them, from the matrices of eq. (7.1)."""
+    A, B, C = plant()
+    wide, push, seen = map(np.asarray, incremental(A, B, C))
+    steps = moves(pulses(5, 3), 2)
+    many = Sampled(*(jnp.stack([part] * 5) for part in (A, B, jnp.zeros((4, 0)))))
+    found = predict(many, C, steps, jnp.zeros(0))
+    power = [np.linalg.matrix_power(wide, n) for n in range(6)]
+    F = np.stack([seen @ power[n] for n in range(1, 6)])
+    Phi = np.zeros((5, 2, 6))
+    for i in range(5):
+        for j in range(min(i + 1, 3)):
+            Phi[i, :, 2 * j : 2 * j + 2] = seen @ power[i - j] @ push
+    assert_allclose(found.Phi, Phi, atol=1e-14)
+    before, now, command = np.random.default_rng(1).normal(size=(3, 4))
+    command = command[:2]
+    rest = now - A @ before - B @ command
+    free = found.F @ np.concatenate([now, rest, command, [1.0]])
+    assert_allclose(free, F @ np.concatenate([now - before, C @ now]), atol=1e-13)
+    assert_allclose(found.end[4:], found.F[-1], atol=1e-14)
+
+
+def test_sampling_with_a_delay():
+    rng = np.random.default_rng(2)
+    A, B, E = (jnp.asarray(rng.normal(size=s)) for s in ((3, 3), (3, 1), (3, 2)))
+    found = sample(A, B, E, jnp.array(0.3), jnp.array(0.1))
+    state, before, command, weights = rng.normal(size=3), *rng.normal(size=2), rng.normal(size=2)
+    for span, u in ((0.1, before), (0.2, command)):  # by the exponential of the forced system
+        rate = np.block([[A, (B[:, 0] * u + E @ weights)[:, None]], [np.zeros((1, 4))]])
+        if span == 0.1:
+            after = (scipy.linalg.expm(span * rate) @ np.append(state, 1.0))[:3]
+        else:
+            after = (scipy.linalg.expm(span * rate) @ np.append(after, 1.0))[:3]
+    wide = found.A @ np.append(state, before) + found.B @ np.array([command]) + found.E @ weights
+    assert_allclose(wide, np.append(after, command), rtol=1e-12)
+
+
+def test_laguerre_functions():
+    """Orthonormal; the first moves at pole 0; as many as there are periods span all moves."""
+    found = pulses(200, 5, jnp.array(0.7))
+    assert_allclose(found.T @ found, np.eye(5), atol=1e-12)
+    assert_array_equal(pulses(6, 4, jnp.array(0.0)), pulses(6, 4))
+    states = jnp.asarray(np.random.default_rng(0).normal(size=(3, 6))) * 1e-3
+    plain, spun = (
+        commands(mpc(horizon=4, laguerre_pole=pole, solver="unconstrained"), states)
+        for pole in (None, 0.5)
+    )
+    assert_allclose(spun, plain, rtol=1e-6)
+
+
+def commands(controller, states):
+    """What a controller wants at successive ticks in given states; it is given all it wants."""
+    case = rig(controller)
+    model = jb.state_space(case)
+
+    @eqx.filter_jit
+    def asked(controller, model):
+        memory, given, wanted = controller.init(model), jnp.zeros(1), []
+        for n, state in enumerate(states):
+            seen = Measurement(jnp.zeros(1), state, given)
+            given, memory = controller.step(memory, seen, jnp.array(n * PERIOD))
+            wanted.append(given)
+        return jnp.stack(wanted)
+
+    return asked(controller, model)
+
+
+def incremental_plant(case):
+    model = jb.state_space(case)
+    system = model.unloaded.discretize(PERIOD)
+    return system.A, system.B, system.C
+
+
+def test_the_unconstrained_law():
+    """Eq. (7.9), with weights, by its formula."""
+    output, ahead = 3.0, np.linspace(1.0, 2.0, 6)
+    controller = mpc(output_weight=output, horizon_weight=ahead, solver="unconstrained")
+    states = np.random.default_rng(0).normal(size=(2, 6)) * 1e-3
+    wide, push, seen = map(np.asarray, incremental(*incremental_plant(rig(controller))))
+    power = [np.linalg.matrix_power(wide, n) for n in range(7)]
+    F = np.concatenate([seen @ power[n] for n in range(1, 7)])
+    Phi = np.array(
+        [[(seen @ power[i - j] @ push).item() if i >= j else 0 for j in range(4)] for i in range(6)]
+    )
+    weight = np.diag(output * ahead)
+    gain = np.linalg.solve(Phi.T @ weight @ Phi + 1e-11 * np.eye(4), Phi.T @ weight @ F)[0]
+    given, before = 0.0, np.zeros(6)
+    C = incremental_plant(rig(controller))[2]
+    for state, command in zip(states, commands(controller, jnp.asarray(states)), strict=True):
+        given = given - gain @ np.concatenate([state - before, C @ state])
+        assert_allclose(command, [given], rtol=1e-9)
+        before = state
+
+
+def test_the_terminal_cost_makes_it_the_regulator():
+    """Dual mode, eq. (7.31): with it at any horizon, and without at a long one."""
+    states = np.random.default_rng(0).normal(size=(2, 6)) * 1e-3
+    A, B, C = incremental_plant(rig())
+    wide, push, seen = incremental(A, B, C)
+    gain = dlqr(wide, push, seen.T @ seen, 1e-11 * jnp.eye(1))[0]
+    first = -gain @ np.concatenate([states[0], C @ states[0]])
+    second = first - gain @ np.concatenate([states[1] - states[0], C @ states[1]])
+    expected = np.stack([first, second])
+    dual = mpc(horizon=4, terminal="riccati", solver="unconstrained")
+    assert_allclose(commands(dual, jnp.asarray(states)), expected, rtol=1e-6)
+    far = mpc(horizon=60, moves=60, solver="unconstrained")
+    assert_allclose(commands(far, jnp.asarray(states)), expected, rtol=1e-6)
+
+
+# Reference runs
+
+
+@pytest.fixture(scope="module")
+def one_span():
+    return run(rig(mpc(), modes=5), 16)
+
+
+@pytest.mark.slow
+def test_the_one_span_rig(one_span):
+    expected = REFERENCE["one span"]
+    deflection, command = 1e3 * one_span.deflection[:, 0], one_span.command[:, 0]
+    assert_allclose(command[:10], np.ravel(expected["u_amp_first10"]), rtol=0, atol=1e-6 * 7.5)
+    assert_allclose(np.min(command), expected["u_amp_min"][0], rtol=0, atol=1e-5)
+    at = np.round(np.array(expected["t"]) / PERIOD).astype(int)
+    peak = expected["peak_down_on_grid_mm"][0]
+    assert_allclose(deflection[at], np.ravel(expected["w_mm"]), rtol=0, atol=1e-6 * peak)
+    assert_allclose(-np.min(deflection), peak, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_limits_are_kept_and_reached_as_published(one_span):
+    """7.5 V from 0.05 s on; 21.5 % off the largest deflection, between 20.8 and 21.7 %."""
+    command = np.asarray(one_span.command[:, 0])
+    assert np.max(command) <= 7.5 and np.min(command) >= -2.5
+    assert one_span.times[np.argmax(one_span.saturated[:, 0])] == 0.05
+    still = REFERENCE["one span"]["peak_down_open_on_grid_mm"][0]
+    reduction = 100 * (1 + 1e3 * np.min(one_span.deflection) / still)
+    assert_allclose(reduction, REFERENCE["one span"]["reduction_percent"], atol=1e-3)
+    assert_array_equal(one_span.failures, 0.0)
+
+
+@pytest.mark.slow
+def test_the_two_span_rig():
+    """Within what exact modes differ by from the projected sines of the reference."""
+    expected = REFERENCE["two spans"]
+    patches = [
+        dataclasses.replace(PATCH, start=x, end=x + 0.085, correction=jnp.array(0.39))
+        for x in (jnp.array(0.2575), jnp.array(0.8575))
+    ]
+    case = jb.Case(
+        jb.Beam(1.2, 12.11, 0.5411, 0.03, modes=7),
+        [jb.Support(0.6)],
+        patches,
+        [jb.Sensor(0.3), jb.Sensor(0.9)],
+        [jb.MovingMass(mass=0.509, speed=1.0)],
+        mpc(horizon=4, moves=3),
+        jb.Run(1.2, sample_rate=100.0),
+    )
+    record = run(case, 16)
+    peaks = 1 + 1e3 * np.min(record.deflection, axis=0) / expected["peak_down_open_on_grid_mm"]
+    assert_allclose(100 * peaks, expected["reduction_percent"], atol=0.3)
+    assert_allclose(record.command[:10], expected["u_amp_first10"], rtol=0, atol=0.1)
+
+
+# Loops on a plant frozen anew every millisecond
+
+FINE = 10
+TICKS = 62
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    """Matrices (tick, fine step, ...) and push of the loads; the sensor's row; the modes' layout."""
+    model = jb.state_space(rig())
+    middles = (jnp.arange(TICKS * FINE) + 0.5) * PERIOD / FINE
+
+    @jax.jit
+    def tabulated():
+        system = jax.vmap(lambda t: model.at(t).discretize(PERIOD / FINE))(middles)
+        push = system.B[:, :, 1:] @ model.weights
+        return tuple(
+            p.reshape(TICKS, FINE, *p.shape[1:]) for p in (system.A, system.B[..., :1], push)
+        )
+
+    return *tabulated(), model.unloaded.C, lay_out(rig())
+
+
+def closed(case, crossing):
+    """Deflections and commands at the ticks, and how often no solution was found."""
+    A, B, push, C, layout = crossing
+    model = jb.state_space(case, layout=layout)
+    controller, states = case.controller, A.shape[-1]
+    limits = case.actuators[0].command_limits()
+
+    def tick(carry, now):
+        state, given, memory = carry
+        t, *fine = now
+        wanted, memory = controller.step(memory, Measurement(C @ state, state, given), t)
+        wanted = jnp.clip(wanted, *limits)
+
+        def onward(state, part):
+            return part[0] @ state + part[1] @ wanted + part[2], None
+
+        after, _ = jax.lax.scan(onward, state, tuple(fine))
+        return (after, wanted, memory), (C @ state, wanted)
+
+    start = jnp.zeros(states), jnp.zeros(1), controller.init(model)
+    times = jnp.arange(TICKS) * PERIOD
+    (*_, memory), (deflection, command) = jax.lax.scan(tick, start, (times, A, B, push))
+    return deflection[:, 0], command[:, 0], controller.failures(memory)
+
+
+def looped(case, crossing):
+    return eqx.filter_jit(closed)(case, crossing)
+
+
+@pytest.fixture(scope="module")
+def plain(crossing):
+    return looped(rig(mpc()), crossing)
+
+
+@pytest.fixture(scope="module")
+def uncontrolled(crossing):
+    A, _, push, C = (np.asarray(part) for part in crossing[:4])
+    state, deflection = np.zeros(6), []
+    for a, e in zip(A.reshape(-1, 6, 6), push.reshape(-1, 6), strict=True):
+        deflection.append((C @ state).item())
+        state = a @ state + e
+    return np.array(deflection)[::FINE]
+
+
+def test_three_modes(plain, uncontrolled):
+    """20.8 % off the largest deflection with three modes, as computed independently."""
+    deflection, command, failures = plain
+    reduction = 100 * (1 - np.max(-deflection) / np.max(-uncontrolled))
+    assert_allclose(reduction, 20.8, atol=0.1)
+    assert np.max(command) <= 7.5 + 1e-9 and np.min(command) >= -2.5 - 1e-9 and failures == 0
+
+
+def test_hildreth_in_the_loop(plain, crossing):
+    deflection, command, failures = looped(rig(mpc(solver="hildreth")), crossing)
+    assert_allclose(command, plain[1], rtol=0, atol=1e-8)
+    assert_allclose(deflection, plain[0], rtol=0, atol=1e-11)
+    assert failures == 0
+
+
+@pytest.mark.parametrize("prediction", ["time-invariant", "time-varying"])
+def test_knowing_the_loads_helps(prediction, plain, crossing):
+    known, command, _ = looped(rig(mpc(loads="known", prediction=prediction)), crossing)
+    assert np.max(command) <= 7.5 + 1e-9
+    # Before the limit is reached the deflection is smaller by far, and so is the largest.
+    before = slice(0, 6)
+    assert np.max(np.abs(known[before])) < 0.5 * np.max(np.abs(plain[0][before]))
+    assert np.max(-known) < np.max(-plain[0]) * (1 - 1e-4)
+    assert np.linalg.norm(known) < 0.999 * np.linalg.norm(plain[0])
+
+
+def test_rates_and_soft_limits_are_kept(plain, crossing):
+    slow = dataclasses.replace(PATCH, rate_limit=jnp.array(40.0))
+    _, command, failures = looped(rig(mpc(), patch=slow), crossing)
+    assert np.max(np.abs(np.diff(command, prepend=0.0))) <= 40.0 * PERIOD + 1e-9
+    assert failures == 0
+    # A free beam: only what exceeds 0.5 mm costs much, moves are dear.
+    easy = {"move_weight": 1e-8, "output_weight": 1e-4}
+    at_will, softly = (
+        looped(rig(mpc(**easy, soft_limit=limit)), crossing)[0] for limit in (None, 5e-4)
+    )
+    assert np.max(np.abs(softly)) < np.max(np.abs(at_will))
+    assert np.sum(np.abs(softly) > 5.2e-4) < np.sum(np.abs(at_will) > 5.2e-4)
+
+
+def test_constant_loads_leave_no_offset(crossing):
+    """The beam at rest under a constant force that the controller does not know of."""
+    A, B, _, *rest = crossing
+    parked = tuple(jnp.broadcast_to(part[-1, -1], part.shape) for part in (A, B))
+    push = jnp.broadcast_to(B[-1, -1, :, 0] * -3.0, (*A.shape[:2], 6))
+    deflection, command, _ = looped(rig(mpc()), (*parked, push, *rest))
+    assert np.max(np.abs(deflection)) > 1e-5
+    assert_allclose(deflection[-1], 0.0, atol=1e-9)
+    assert_allclose(command[-1], 3.0, rtol=1e-5)
+
+
+def test_no_solution_holds_the_last_command_and_is_counted(crossing):
+    """From 0 V, 1 V cannot be reached as fast as the limits ask."""
+    stuck = dataclasses.replace(PATCH, limits=jnp.array([1.0, 2.0]), rate_limit=jnp.array(10.0))
+    case = rig(mpc(), patch=stuck)
+    memory = case.controller.init(jb.state_space(case))
+    for n in range(2):
+        seen = Measurement(jnp.zeros(1), jnp.zeros(6), jnp.zeros(1))
+        command, memory = case.controller.step(memory, seen, jnp.array(n * PERIOD))
+        assert_array_equal(command, 0.0)
+        assert case.controller.failures(memory) == n + 1
+
+
+@pytest.mark.slow
+def test_records_count_steps_without_a_solution():
+    stuck = dataclasses.replace(PATCH, limits=jnp.array([1.0, 2.0]), rate_limit=jnp.array(10.0))
+    record = run(rig(mpc(), modes=1, patch=stuck, duration=0.05), 1)
+    assert_array_equal(record.failures, np.arange(1, 7))
+    assert "no solution in 6 of its steps" in record.verdict
+    assert record.to_xarray().failures.dims == ("time",)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_closed_loop(crossing):
+    """By r_w and the weights of the horizon, forward and in reverse; limits are felt throughout."""
+
+    def cost(change):
+        weights = {"move_weight": 1e-8 * jnp.exp(change[0]), "horizon_weight": jnp.exp(change[1:])}
+        deflection, command, _ = closed(rig(mpc(horizon=3, moves=2, **weights)), crossing)
+        return jnp.sum(deflection**2) * 1e6 + jnp.sum(command**2) * 1e-3
+
+    point = jnp.zeros(4)
+    expected = central(jax.jit(cost), point, 1e-3, order=4)
+    size = np.max(np.abs(expected))
+    assert size > 1e-3
+    for derivative in (jax.jacfwd, jax.jacrev):
+        assert_allclose(jax.jit(derivative(cost))(point), expected, rtol=0, atol=1e-6 * size)
+
+
+# Cases
+
+
+def test_case_files_hold_it():
+    case = rig(mpc(places=[0.2, 0.4], soft_limit=1e-3, loads="known", delay=0.002))
+    check(case)
+    assert eqx.tree_equal(case, case_from_dict(case_to_dict(case)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"period": None}, "period must be given"),
+        ({"delay": 0.01}, "delay must be less than the period"),
+        ({"moves": 7}, "moves must be at most the horizon, 6, not 7"),
+        ({"move_weight": [1.0, 1.0]}, "move_weight must have one number or 1 entries, not 2"),
+        ({"output_weight": [1.0, 1.0]}, "output_weight must have one number or 1 entries, not 2"),
+        ({"horizon_weight": [1.0]}, "horizon_weight must have 6 entries, not 1"),
+        ({"move_weight": 0.0}, "move_weight must be positive"),
+        ({"laguerre_pole": 1.0}, "laguerre_pole must be below 1"),
+        ({"places": []}, "places must be given"),
+        ({"places": [0.1, 0.5], "terminal": "riccati"}, "terminal must be 'none': 1 actuators"),
+        ({"solver": "simplex"}, "solver"),
+    ],
+)
+def test_faulty_settings_are_refused(settings, words):
+    with pytest.raises(ValueError, match=words):
+        check(rig(mpc(**settings)))
