@@ -205,7 +205,7 @@ class LoadedBeam(eqx.Module):
         shape, rows = contact_rows(self.rig, position, speed, acceleration, active)
         count = len(loads.motions)
         mass = jnp.where(active, loads.inertia[:, 0], 0.0)
-        return shape.reshape(count, -1), rows.reshape(count, -1), mass
+        return shape.reshape(count, self.scale.size), rows.reshape(count, self.rig.states), mass
 
     def _frozen(self, shape, rows, mass) -> StateSpace:
         """The system while loads of these masses, shape and contact rows are on the beam."""
