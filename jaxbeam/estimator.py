@@ -47,7 +47,8 @@ class AbstractEstimator(eqx.Module):
     def fault(self, case: Any, plant: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", before a run compiles; or None.
 
-        `plant` is the design model without loads, a `statespace.StateSpace`; None if its numbers
-        are not known, as inside `jit`.
+        Asked twice: with None for the plant, before that is computed; then, if its numbers are
+        known (they are not inside `jit`), with the design model without loads, a
+        `statespace.StateSpace`.
         """
         return None

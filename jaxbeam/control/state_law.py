@@ -78,11 +78,10 @@ class AbstractStateLaw(AbstractController):
             return f"design.{fault}"
         if self.estimator is None or self.period is None:
             return None
-        plant = None
-        if all(is_known(leaf) for leaf in jax.tree.leaves((self, case))):
+        fault = self.estimator.fault(case, None)
+        if fault is None and all(is_known(leaf) for leaf in jax.tree.leaves((self, case))):
             law, plain = jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), (self, case))
-            plant = _plant(law, plain, lay_out(plain))
-        fault = self.estimator.fault(case, plant)
+            fault = self.estimator.fault(case, _plant(law, plain, lay_out(plain)))
         return None if fault is None else f"estimator.{fault}"
 
     def modes(self, case: Any) -> int:

@@ -26,16 +26,24 @@ Q = jnp.diag(jnp.array([0.0, 0.0, 0.0, 0.01, 0.02, 0.03]))
 R = jnp.diag(jnp.array([1.0, 4.0]))
 
 
-def transition(period, late=None):
-    ticks = Ticks(jnp.asarray(period), None if late is None else jnp.asarray(late))
+CONTINUOUS, SAMPLED, PLACED = map(jax.jit, (kalman_gain, sampled_kalman_gain, placed_gain))
+
+
+@jax.jit
+def _transition(ticks):
     return ticks.transition(lambda t: (A, jnp.eye(6, 1)), Q)
+
+
+def transition(period, late=None):
+    """Over a period (s) whose command begins late by some s."""
+    return _transition(Ticks(jnp.asarray(period), None if late is None else jnp.asarray(late)))
 
 
 def test_kalman_gain_in_continuous_time():
     """In units in which python-control loses no digits: coordinates times frequencies."""
     units = np.concatenate([FREQUENCIES, np.ones(3)])[:, None]
     gain, covariance, _ = control.lqe(A * units / units.T, np.eye(6), C / units.T, Q, R)
-    found = kalman_gain(A, C, Q, R)
+    found = CONTINUOUS(A, C, Q, R)
     scale = np.sqrt(np.diag(covariance))[:, None]
     outer = scale * scale.T
     assert_allclose(found[1] * units * units.T / outer, covariance / outer, rtol=0, atol=1e-9)
@@ -46,7 +54,7 @@ def test_sampled_kalman_gain():
     step = transition(2e-3)
     drift, noise = step.drift, step.noise
     gain, covariance, _ = control.dlqe(drift, np.eye(6), C, noise, R)
-    found = sampled_kalman_gain(drift, C, noise, R)
+    found = SAMPLED(drift, C, noise, R)
     scale = np.sqrt(np.diag(covariance))
     outer = scale * scale[:, None]
     assert_allclose(found[1] / outer, covariance / outer, rtol=0, atol=1e-9)
@@ -58,12 +66,12 @@ def test_sampled_kalman_gain():
 
 def test_sampled_gains_become_the_continuous_one():
     """A reading each period with noise of covariance R / period is noise of intensity R."""
-    whole, covariance = kalman_gain(A, C, Q, R)
+    whole, covariance = CONTINUOUS(A, C, Q, R)
     scale = np.sqrt(np.diag(covariance))[:, None]
     short = []
     for period in (2e-5, 1e-5):
         step = transition(period)
-        gain, _ = sampled_kalman_gain(step.drift, C, step.noise, R / period)
+        gain, _ = SAMPLED(step.drift, C, step.noise, R / period)
         short.append(
             np.max(np.abs((gain / period - whole) / scale)) / np.max(np.abs(whole / scale))
         )
@@ -101,11 +109,11 @@ def test_one_output_leaves_one_choice_of_gain():
             [-np.diag(np.abs(poles[:3]) ** 2), np.diag(2 * poles[:3].real)],
         ]
     )
-    gain = placed_gain(A, C[:1], wanted)
+    gain = PLACED(A, C[:1], wanted)
     scale = np.concatenate([np.ones(3), FREQUENCIES])[:, None]
     expected = scipy.signal.place_poles(A.T, C[:1].T, poles).gain_matrix.T
     assert_allclose(gain / scale, expected / scale, rtol=1e-7)
-    both = placed_gain(A, C, wanted)
+    both = PLACED(A, C, wanted)
     assert_allclose(np.sort_complex(np.linalg.eigvals(A - both @ C)), np.sort_complex(poles))
 
 
@@ -117,9 +125,9 @@ def test_gradients_of_gains():
     def gains(point):
         rows = C * jnp.array([[1.0], [point[0]]])
         found = (
-            placed_gain(drift, rows, point[1] * drift),
-            sampled_kalman_gain(drift, rows, point[2] * noise, R)[0],
-            kalman_gain(A, rows, point[2] * Q, R)[0],
+            PLACED(drift, rows, point[1] * drift),
+            SAMPLED(drift, rows, point[2] * noise, R)[0],
+            CONTINUOUS(A, rows, point[2] * Q, R)[0],
         )
         return jnp.stack([gain[:3] for gain in found]).reshape(3, -1)
 

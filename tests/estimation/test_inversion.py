@@ -40,10 +40,12 @@ def loop(places, estimator=None, modes=3, quantity="deflection", design=None):
 
 def estimates(case, readings, commands):
     """States (tick, state) found from readings and commands (tick, ...)."""
-    inversion = case.controller.estimator
+    inversion, layout = case.controller.estimator, lay_out(case)
 
     @jax.jit
-    def run(model):
+    def run(case):
+        model = jb.state_space(case, layout=layout)
+
         def tick(memory, at):
             measurement = Measurement(at[0], jnp.zeros(0), at[1])
             estimate, memory = inversion.step(memory, measurement, jnp.zeros(()))
@@ -52,7 +54,7 @@ def estimates(case, readings, commands):
         signals = jnp.asarray(readings), jnp.asarray(commands)
         return jax.lax.scan(tick, inversion.init(model), signals)[1]
 
-    return np.asarray(run(jb.state_space(case)))
+    return np.asarray(run(case))
 
 
 @pytest.mark.parametrize(

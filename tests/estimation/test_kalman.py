@@ -139,7 +139,7 @@ def test_surprises_and_errors_are_as_large_as_stated():
     squares = np.einsum("ri,ri->r", error, np.linalg.solve(covariance, error[..., None])[..., 0])
     low, high = chi2.interval(0.999, 5 * runs)
     assert low < np.sum(squares) < high
-    assert np.all(np.sqrt(covariance[:, 4, 4]) < DEVIATION / 2)  # it has learnt something
+    assert np.all(np.sqrt(covariance[:, 4, 4]) < 0.6 * DEVIATION)  # it has learnt something
     assert_allclose(estimate.weights[:, -1, 0], memory.state[:, -1])
 
 
@@ -147,18 +147,15 @@ def test_gradients():
     commands, readings = signals(8)
 
     @jax.jit
+    @jax.value_and_grad
     def misfit(point):
         case = jb.replace(CASE, {"loads.0.mass": point[0], "sensors.0.noise": 1e-5 * point[1]})
-        changed = {"process_noise": point[2] * FORCES, "weight_deviation": point[3]}
-        total = 0.0
-        for loads in ("ignored", "estimated"):
-            if loads == "ignored":
-                changed["weight_deviation"] = None
-            kalman = dataclasses.replace(ESTIMATED, loads=loads, **changed)
-            estimate = filtered(kalman, case, commands, readings)[1][0]
-            changed["weight_deviation"] = point[3]
-            total = total + jnp.sum((estimate.state[:, 2:4] * 100) ** 2)
-        return total
+        kalman = dataclasses.replace(
+            ESTIMATED, process_noise=point[2] * FORCES, weight_deviation=point[3]
+        )
+        estimate = filtered(kalman, case, commands, readings)[1][0]
+        return jnp.sum((estimate.state[:, 2:4] * 100) ** 2)
 
     at = jnp.array([0.4, 1.0, 1.0, 2.0])
-    assert_allclose(jax.jit(jax.grad(misfit))(at), central(misfit, at, 1e-3), rtol=1e-6)
+    differences = central(lambda point: misfit(point)[0], at, 1e-3)
+    assert_allclose(misfit(at)[1], differences, rtol=1e-6)

@@ -11,6 +11,7 @@ from jaxbeam.checks import check
 from jaxbeam.controller import Measurement
 from jaxbeam.estimation import Observer
 from jaxbeam.linear_loop import linear_loop
+from jaxbeam.modes import lay_out
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant
 
@@ -44,7 +45,8 @@ def matrices(case):
 def test_poles(observer):
     """exp(p period) for every pole p asked for, and the shaker's own, which stays."""
     case = loop(observer)
-    memory = jax.jit(lambda model: observer.init(model))(jb.state_space(case))
+    layout = lay_out(case)
+    memory = jax.jit(lambda c: observer.init(jb.state_space(c, layout=layout)))(case)
     A, drift, _, C, _ = matrices(case)
     if observer.poles is None:
         wanted = 2.5 * np.linalg.eigvals(A[:4, :4])
@@ -69,7 +71,7 @@ def test_an_observer_does_not_shift_the_poles_of_the_regulator():
 
 def test_the_error_dies_away_as_the_poles_say():
     case = loop(Observer(poles=POLES), delay=4e-4)
-    observer = case.controller.estimator
+    observer, layout = case.controller.estimator, lay_out(case)
     plant = SampledPlant(*parts_of(case))
     step = plant.step(0.0, PERIOD, 4e-4, np.zeros((5, 5)))
     _, _, C, D = plant.matrices(0.0)
@@ -82,7 +84,9 @@ def test_the_error_dies_away_as_the_poles_say():
         before = now
 
     @jax.jit
-    def estimates(model):
+    def estimates(case):
+        model = jb.state_space(case, layout=layout)
+
         def tick(memory, at):
             estimate, memory = observer.step(
                 memory, Measurement(at[0], jnp.zeros(5), at[1]), jnp.zeros(())
@@ -92,7 +96,7 @@ def test_the_error_dies_away_as_the_poles_say():
         signals = jnp.asarray(readings), jnp.asarray(commands)
         return jax.lax.scan(tick, observer.init(model), signals)[1]
 
-    error = np.abs(estimates(jb.state_space(case)) - np.array(states)) / np.max(np.abs(states), 0)
+    error = np.abs(estimates(case) - np.array(states)) / np.max(np.abs(states), 0)
     decay = np.exp(-100 * PERIOD * np.arange(60))[:, None]
     assert np.all(error < 30 * decay + 1e-12)
     assert np.all(error[0, :4] > 1e-2)
