@@ -117,21 +117,23 @@ def test_laguerre_functions():
     assert_allclose(spun, plain, rtol=1e-6)
 
 
-def commands(controller, states):
+def commands(controller, states, patch=PATCH, failing=False):
     """What a controller wants at successive ticks in given states; it is given all it wants."""
-    case = rig(controller)
+    case = rig(controller, patch=patch)
     model = jb.state_space(case)
 
     @eqx.filter_jit
     def asked(controller, model):
-        memory, given, wanted = controller.init(model), jnp.zeros(1), []
-        for n, state in enumerate(states):
-            seen = Measurement(jnp.zeros(1), state, given)
-            given, memory = controller.step(memory, seen, jnp.array(n * PERIOD))
-            wanted.append(given)
-        return jnp.stack(wanted)
+        def tick(carry, state):
+            given, memory, t = carry
+            given, memory = controller.step(memory, Measurement(jnp.zeros(1), state, given), t)
+            return (given, memory, t + PERIOD), (given, controller.failures(memory))
 
-    return asked(controller, model)
+        start = jnp.zeros(1), controller.init(model), jnp.zeros(())
+        return jax.lax.scan(tick, start, states)[1]
+
+    wanted, failures = asked(controller, model)
+    return (wanted, failures) if failing else wanted
 
 
 def incremental_plant(case):
@@ -188,8 +190,10 @@ def one_span():
 def test_the_one_span_rig(one_span):
     expected = REFERENCE["one span"]
     deflection, command = 1e3 * one_span.deflection[:, 0], one_span.command[:, 0]
-    assert_allclose(command[:10], np.ravel(expected["u_amp_first10"]), rtol=0, atol=1e-6 * 7.5)
-    assert_allclose(np.min(command), expected["u_amp_min"][0], rtol=0, atol=1e-5)
+    # States as exact as 1e-6 of the peak are turned into commands by some 2e4 V/m.
+    exact = 1e-9 * expected["peak_down_on_grid_mm"][0] * 2e4
+    assert_allclose(command[:10], np.ravel(expected["u_amp_first10"]), rtol=0, atol=exact)
+    assert_allclose(np.min(command), expected["u_amp_min"][0], rtol=0, atol=exact)
     at = np.round(np.array(expected["t"]) / PERIOD).astype(int)
     peak = expected["peak_down_on_grid_mm"][0]
     assert_allclose(deflection[at], np.ravel(expected["w_mm"]), rtol=0, atol=1e-6 * peak)
@@ -226,7 +230,9 @@ def test_the_two_span_rig():
         jb.Run(1.2, sample_rate=100.0),
     )
     record = run(case, 16)
-    peaks = 1 + 1e3 * np.min(record.deflection, axis=0) / expected["peak_down_open_on_grid_mm"]
+    peaks = 1 + 1e3 * np.min(record.deflection, axis=0) / np.array(
+        expected["peak_down_open_on_grid_mm"]
+    )
     assert_allclose(100 * peaks, expected["reduction_percent"], atol=0.3)
     assert_allclose(record.command[:10], expected["u_amp_first10"], rtol=0, atol=0.1)
 
@@ -237,21 +243,24 @@ FINE = 10
 TICKS = 62
 
 
-@pytest.fixture(scope="module")
-def crossing():
-    """Matrices (tick, fine step, ...) and push of the loads; the sensor's row; the modes' layout."""
-    model = jb.state_space(rig())
+def tabulated(case):
+    """Matrices (tick, fine step, ...), push of the loads; the sensor's row; layout of the modes."""
+    model = jb.state_space(case)
     middles = (jnp.arange(TICKS * FINE) + 0.5) * PERIOD / FINE
 
-    @jax.jit
-    def tabulated():
+    @eqx.filter_jit
+    def parts(model):
         system = jax.vmap(lambda t: model.at(t).discretize(PERIOD / FINE))(middles)
         push = system.B[:, :, 1:] @ model.weights
-        return tuple(
-            p.reshape(TICKS, FINE, *p.shape[1:]) for p in (system.A, system.B[..., :1], push)
-        )
+        every = system.A, system.B[..., :1], push
+        return tuple(part.reshape(TICKS, FINE, *part.shape[1:]) for part in every)
 
-    return *tabulated(), model.unloaded.C, lay_out(rig())
+    return *parts(model), model.unloaded.C, lay_out(case)
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    return tabulated(rig())
 
 
 def closed(case, crossing):
@@ -279,8 +288,7 @@ def closed(case, crossing):
     return deflection[:, 0], command[:, 0], controller.failures(memory)
 
 
-def looped(case, crossing):
-    return eqx.filter_jit(closed)(case, crossing)
+looped = eqx.filter_jit(closed)
 
 
 @pytest.fixture(scope="module")
@@ -313,26 +321,29 @@ def test_hildreth_in_the_loop(plain, crossing):
     assert failures == 0
 
 
-@pytest.mark.parametrize("prediction", ["time-invariant", "time-varying"])
-def test_knowing_the_loads_helps(prediction, plain, crossing):
-    known, command, _ = looped(rig(mpc(loads="known", prediction=prediction)), crossing)
-    assert np.max(command) <= 7.5 + 1e-9
-    # Before the limit is reached the deflection is smaller by far, and so is the largest.
-    before = slice(0, 6)
-    assert np.max(np.abs(known[before])) < 0.5 * np.max(np.abs(plain[0][before]))
-    assert np.max(-known) < np.max(-plain[0]) * (1 - 1e-4)
-    assert np.linalg.norm(known) < 0.999 * np.linalg.norm(plain[0])
+@pytest.mark.slow
+def test_knowing_the_loads_helps():
+    """A light mass, for which the patch is strong enough: what is left falls to less than half."""
+    light = jb.replace(rig(mpc()), {"loads.0.mass": 0.1})
+    crossing = tabulated(light)
+    unknown, command, _ = looped(light, crossing)
+    assert np.max(command) < 7.5
+    for prediction in ("time-invariant", "time-varying"):
+        knowing = mpc(loads="known", prediction=prediction)
+        known, *_ = looped(dataclasses.replace(light, controller=knowing), crossing)
+        assert np.linalg.norm(known) < 0.5 * np.linalg.norm(unknown)
+        assert np.max(np.abs(known)) < 0.8 * np.max(np.abs(unknown))
 
 
-def test_rates_and_soft_limits_are_kept(plain, crossing):
+def test_rates_and_soft_limits_are_kept(crossing):
     slow = dataclasses.replace(PATCH, rate_limit=jnp.array(40.0))
     _, command, failures = looped(rig(mpc(), patch=slow), crossing)
     assert np.max(np.abs(np.diff(command, prepend=0.0))) <= 40.0 * PERIOD + 1e-9
     assert failures == 0
-    # A free beam: only what exceeds 0.5 mm costs much, moves are dear.
+    # Moves are dear, and only what exceeds 0.5 mm costs much.
     easy = {"move_weight": 1e-8, "output_weight": 1e-4}
     at_will, softly = (
-        looped(rig(mpc(**easy, soft_limit=limit)), crossing)[0] for limit in (None, 5e-4)
+        looped(rig(mpc(**easy, soft_limit=limit)), crossing)[0] for limit in (1.0, 5e-4)
     )
     assert np.max(np.abs(softly)) < np.max(np.abs(at_will))
     assert np.sum(np.abs(softly) > 5.2e-4) < np.sum(np.abs(at_will) > 5.2e-4)
@@ -349,16 +360,12 @@ def test_constant_loads_leave_no_offset(crossing):
     assert_allclose(command[-1], 3.0, rtol=1e-5)
 
 
-def test_no_solution_holds_the_last_command_and_is_counted(crossing):
+def test_no_solution_holds_the_last_command_and_is_counted():
     """From 0 V, 1 V cannot be reached as fast as the limits ask."""
     stuck = dataclasses.replace(PATCH, limits=jnp.array([1.0, 2.0]), rate_limit=jnp.array(10.0))
-    case = rig(mpc(), patch=stuck)
-    memory = case.controller.init(jb.state_space(case))
-    for n in range(2):
-        seen = Measurement(jnp.zeros(1), jnp.zeros(6), jnp.zeros(1))
-        command, memory = case.controller.step(memory, seen, jnp.array(n * PERIOD))
-        assert_array_equal(command, 0.0)
-        assert case.controller.failures(memory) == n + 1
+    wanted, failures = commands(mpc(), jnp.zeros((2, 6)), stuck, failing=True)
+    assert_array_equal(wanted, 0.0)
+    assert_array_equal(failures, [1.0, 2.0])
 
 
 @pytest.mark.slow
@@ -377,10 +384,12 @@ def test_derivatives_of_a_closed_loop(crossing):
     def cost(change):
         weights = {"move_weight": 1e-8 * jnp.exp(change[0]), "horizon_weight": jnp.exp(change[1:])}
         deflection, command, _ = closed(rig(mpc(horizon=3, moves=2, **weights)), crossing)
-        return jnp.sum(deflection**2) * 1e6 + jnp.sum(command**2) * 1e-3
+        total = jnp.sum(deflection**2) * 1e6 + jnp.sum(command**2) * 1e-3
+        return jnp.stack([total, jnp.max(command)])
 
     point = jnp.zeros(4)
-    expected = central(jax.jit(cost), point, 1e-3, order=4)
+    assert_allclose(jax.jit(cost)(point)[1], 7.5, rtol=1e-9)
+    expected = central(jax.jit(cost), point, 1e-4, order=4)
     size = np.max(np.abs(expected))
     assert size > 1e-3
     for derivative in (jax.jacfwd, jax.jacrev):
