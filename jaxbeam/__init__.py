@@ -23,6 +23,7 @@ from jaxbeam.control import (
     StepLQR,
 )
 from jaxbeam.control.bound import bound
+from jaxbeam.estimation import Inversion, Kalman, Observer
 from jaxbeam.filters import Filter
 from jaxbeam.loads import MovingForce, MovingMass
 from jaxbeam.modes import modes
@@ -42,8 +43,11 @@ __all__ = [
     "Feedback",
     "Filter",
     "FiniteLQR",
+    "Inversion",
+    "Kalman",
     "MovingForce",
     "MovingMass",
+    "Observer",
     "Patch",
     "PointForce",
     "Prescribed",
