@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -113,6 +114,25 @@ def readings(case: Case, times: Float[Array, " time"], plan: Plan) -> Float[Arra
     """
     _, (coordinates, rates, accelerations, *_), found, _ = _trace(case, plan, times, None)
     return measure(case, found, coordinates, rates, accelerations, times)
+
+
+class Histories(NamedTuple):
+    """Deflection (m) at some places, commands, and contact forces (N) of a run, at sample times."""
+
+    deflection: Float[Array, "time place"]
+    command: Float[Array, "time actuator"]
+    contact_force: Float[Array, "time load"]
+
+
+def histories(
+    case: Case, times: Float[Array, " time"], plan: Plan, places: Float[Array, " place"]
+) -> Histories:
+    """Histories at ascending times (s) and places (m), and nothing else; as `readings`, lean."""
+    _, outputs, found, _ = _trace(case, plan, times, None)
+    coordinates, _, _, _, force, commands, *_ = outputs
+    if commands is None:
+        commands = jnp.zeros((times.shape[0], len(case.actuators)))
+    return Histories(coordinates @ found.shapes(places).T, commands, force)
 
 
 def _trace(case: Case, plan: Plan, times, watched):

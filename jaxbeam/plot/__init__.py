@@ -1,4 +1,4 @@
-"""Pictures of records, comparisons, modes, sweeps, fits and frequency responses.
+"""Pictures of records, comparisons, modes, sweeps, fits, tunings and frequency responses.
 
 Each function returns a figure, which the caller saves. The figures do not belong to pyplot:
 nothing is shown, and nothing has to be closed.
@@ -11,9 +11,11 @@ from jaxbeam.plot.frequency import plot_frequency
 from jaxbeam.plot.modes import plot_modes
 from jaxbeam.plot.record import plot_record
 from jaxbeam.plot.sweep import plot_sweep
+from jaxbeam.plot.tuning import TuningPanel, plot_tuning
 
 __all__ = [
     "FitPanel",
+    "TuningPanel",
     "animate",
     "plot_comparison",
     "plot_fit",
@@ -21,4 +23,5 @@ __all__ = [
     "plot_modes",
     "plot_record",
     "plot_sweep",
+    "plot_tuning",
 ]

@@ -1,0 +1,72 @@
+"""A tuning: peaks of all runs before and after, beside no control and the bound, and the search."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from jaxbeam.plot.style import GREY, INK, colour, name, styled
+
+
+@dataclasses.dataclass(frozen=True)
+class TuningPanel:
+    """Runs in a picture of a tuning, each with its label and its peaks (m); `least` may be NaN."""
+
+    title: str
+    labels: Sequence[str]
+    uncontrolled: Float[np.ndarray, " run"]
+    before: Float[np.ndarray, " run"]
+    after: Float[np.ndarray, " run"]
+    least: Float[np.ndarray, " run"]
+
+
+@styled
+def plot_tuning(
+    panels: Sequence[TuningPanel], history: Float[np.ndarray, "step start"], title: str = ""
+) -> Figure:
+    """Peaks of every run relative to no control, and below them the objective step by step.
+
+    The shaded part is out of reach: no controller gets below the bound. Raises ValueError without
+    panels.
+    """
+    if not panels:
+        raise ValueError("there is nothing to draw: give at least one panel")
+    most = max(len(panel.labels) for panel in panels)
+    figure = Figure(figsize=(max(7.0, 4.2 * len(panels)), 3.4 + 0.26 * most))
+    grid = figure.subplots(2, len(panels), squeeze=False, height_ratios=[1.2 + 0.22 * most, 1.2])
+    for axes, panel in zip(grid[0], panels, strict=True):
+        _draw(axes, panel)
+    grid[0, 0].legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), ncols=3, handlelength=1.2)
+    left, right = min(a.get_xlim()[0] for a in grid[0]), max(a.get_xlim()[1] for a in grid[0])
+    for axes in grid[0]:
+        axes.set_xlim(left, right)
+    for axes in grid[1, 1:]:
+        axes.axis("off")
+    below = grid[1, 0]
+    below.plot(history, color=GREY, linewidth=0.7)
+    below.plot(np.fmin.accumulate(np.nanmin(history, axis=1)), color=INK, linewidth=1.4)
+    below.set(xlabel="step", ylabel="objective", title="search: every start, and the best so far")
+    name(figure, title)
+    return figure
+
+
+def _draw(axes, panel):
+    """One line a run: from before to after, with what is out of reach shaded."""
+    rows = np.arange(len(panel.labels))
+    whole = 100 / panel.uncontrolled
+    axes.hlines(rows, panel.before * whole, panel.after * whole, color=GREY, linewidth=1.0)
+    axes.plot(panel.before * whole, rows, "o", color=colour(1), label="before", markersize=5)
+    axes.plot(panel.after * whole, rows, "o", color=colour(0), label="after", markersize=5)
+    if np.isfinite(panel.least).all():
+        axes.plot(panel.least * whole, rows, "|", color=INK, label="least possible", markersize=10)
+        axes.barh(rows, panel.least * whole, height=0.9, color="#eef2f5", zorder=0)
+    lowest = np.nanmin([panel.least, panel.after, panel.before], axis=0) * whole
+    axes.set_xlim(
+        max(0.0, 0.9 * np.nanmin(lowest)), 1.02 * max(100.0, (panel.before * whole).max())
+    )
+    axes.axvline(100, color=GREY, linewidth=0.8, linestyle=":")
+    axes.set_yticks(rows, panel.labels)
+    axes.invert_yaxis()
+    axes.set(xlabel="peak, % of that without control", title=panel.title)

@@ -1,0 +1,114 @@
+"""All runs of a tuning, simulated side by side and compiled once."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.case import Case, replace
+from jaxbeam.dynamics import traffic
+from jaxbeam.plan import Plan, make_plan, sample_times
+from jaxbeam.record import Record
+from jaxbeam.simulate import histories, simulate
+from tuning.load_cases import Values, apply
+from tuning.objective import run_merits
+
+TOLERANCE = 1e-4  # of the largest deflection: what tuning needs; verdicts are simulated finer
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bench:
+    """Runs of one case that differ in numbers only, and what they are without control.
+
+    `places` (m) are where deflections count: the sensors', or given ones.
+    """
+
+    runs: Sequence[Values]
+    cases: list[Case]
+    plan: Plan
+    times: Float[Array, " time"]
+    places: Float[Array, " place"]
+    free: dict[str, Float[np.ndarray, " run"]]
+    after: Float[np.ndarray, "run time"]
+    ranges: Float[np.ndarray, " actuator"]
+
+    def merits(self, values: dict[str, Array], sharpness=None) -> dict[str, Float[Array, " run"]]:
+        """Figures of merit of all runs with other numbers at some addresses; differentiable."""
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self.cases)
+
+        def single(run):
+            case, free, after = run
+            case = replace(case, values)
+            found = histories(case, self.times, self.plan, self.places)
+            weights = traffic(case).weight[:, 0]
+            return run_merits(found, free, after, jnp.asarray(self.ranges), weights, sharpness)
+
+        return jax.vmap(single)((stacked, self.free, jnp.asarray(self.after)))
+
+    def records(self, values: dict[str, float]) -> list[Record]:
+        """Records of all runs, with true peaks between and at samples."""
+        return [simulate(replace(case, values), plan=self.plan) for case in self.cases]
+
+
+def make_bench(case: Case, runs: Sequence[Values], places=None) -> Bench:
+    """Prepare the runs of a case; peaks without control are simulated once.
+
+    Raises ValueError for an address that is not there, a run that is too short or faulty, and
+    without a controller or anywhere to look at the deflection.
+    """
+    if case.controller is None:
+        raise ValueError("there is no controller to tune: give the case one")
+    if places is None:
+        places = [float(sensor.position) for sensor in case.sensors]
+    places = jnp.asarray(places, float).reshape(-1)
+    if places.size == 0:
+        raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")
+    cases = [apply(case, run) for run in runs]
+    times = sample_times(case)
+    plan = common_plan(cases)
+    plain = [dataclasses.replace(own, controller=None) for own in cases]
+    still = common_plan(plain)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *plain)
+    found = eqx.filter_jit(jax.vmap(lambda own: histories(own, times, still, places).deflection))
+    deflection = np.asarray(found(stacked))
+    leaves = np.array([_last_exit(own) for own in cases])
+    limits = [actuator.command_limits() for actuator in case.actuators]
+    return Bench(
+        runs=runs,
+        cases=cases,
+        plan=plan,
+        times=times,
+        places=places,
+        free={
+            "peak": np.abs(deflection).max(axis=(1, 2)),
+            "rms": np.sqrt((deflection**2).mean(axis=(1, 2))),
+        },
+        after=(np.asarray(times) > leaves[:, None]).astype(float),
+        ranges=np.array([1.0 if pair is None else np.abs(pair).max() for pair in limits]),
+    )
+
+
+def common_plan(cases: list[Case]) -> Plan:
+    """One plan for cases alike in structure, fine enough for each.
+
+    Raises ValueError if they differ in more than numbers.
+    """
+    plans = [make_plan(own, tolerance=TOLERANCE) for own in cases]
+    if len({plan.form.layout for plan in plans}) > 1:
+        raise ValueError("the runs differ in the order of places along the beam; tune them apart")
+    slots = max(plan.form.slots for plan in plans)
+    return dataclasses.replace(
+        plans[0],
+        form=dataclasses.replace(plans[0].form, slots=slots),
+        substeps=max(plan.substeps for plan in plans),
+        error=max(plan.error for plan in plans),
+    )
+
+
+def _last_exit(case: Case) -> float:
+    windows = [path.window()[1] for path in traffic(case).motions]
+    return max((float(leave) for leave in windows), default=0.0)

@@ -1,0 +1,86 @@
+"""What a controller is tuned for: figures of merit of runs, each smooth, and true."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.simulate import Histories
+
+MERITS = ("peak", "rms", "after_exit", "effort", "contact")
+OVER = ("mean", "worst", "cvar")
+
+
+@dataclasses.dataclass(frozen=True)
+class Objective:
+    """A weighted sum of figures of merit, and how runs are taken together.
+
+    Every figure is relative to the same run without control: the largest deflection (`peak`), its
+    root mean square (`rms`), the largest `after_exit` of the last load (relative to the peak);
+    the root mean square of the commands, relative to the largest within their limits (`effort`);
+    and the largest change of a contact force, relative to the weight (`contact`). Runs count by
+    their "mean", their "worst", or ("cvar") the mean of the worst `share` of them.
+    """
+
+    weights: dict[str, float] = dataclasses.field(default_factory=lambda: {"peak": 1.0})
+    over: str = "worst"
+    share: float = 0.25
+
+    def __post_init__(self):
+        unknown = set(self.weights) - set(MERITS)
+        if unknown:
+            raise ValueError(
+                f"there is no merit {min(unknown)!r} to tune for; it may be {', '.join(MERITS)}"
+            )
+        if not self.weights or any(not 0 < value < float("inf") for value in self.weights.values()):
+            raise ValueError("an objective needs merits with positive, finite weights")
+        if self.over not in OVER:
+            raise ValueError(f"over may be {', '.join(OVER)}, not {self.over!r}")
+        if not 0 < self.share <= 1:
+            raise ValueError(f"share must be above 0 and at most 1; it is {self.share:g}")
+
+    def of_run(self, merits: dict[str, Float[Array, "..."]]) -> Float[Array, "..."]:
+        """The weighted sum for runs whose merits are known."""
+        return sum(weight * merits[name] for name, weight in self.weights.items())
+
+    def of_runs(self, values: Float[Array, " run"], sharpness=None) -> Float[Array, ""]:
+        """One number for the values of all runs; smooth if a sharpness is given."""
+        if self.over == "mean":
+            return jnp.mean(values)
+        if self.over == "worst":
+            return largest(values, sharpness)
+        count = max(1, round(self.share * values.shape[0]))
+        return jnp.mean(jnp.sort(values)[-count:])
+
+
+def largest(values: Float[Array, "..."], sharpness: float | None) -> Float[Array, ""]:
+    """The largest of some values, or a smooth bound from above that is log(count)/sharpness off."""
+    if sharpness is None:
+        return jnp.max(values)
+    return jax.nn.logsumexp(sharpness * values) / sharpness
+
+
+def run_merits(
+    found: Histories,
+    free: dict[str, Float[Array, ""]],
+    after: Float[Array, " time"],
+    ranges: Float[Array, " actuator"],
+    weights: Float[Array, " load"],
+    sharpness: float | None = None,
+) -> dict[str, Float[Array, ""]]:
+    """Figures of merit of one run (see `Objective`); `free` holds those without control, in m.
+
+    `after` is 1 at samples after the last exit and 0 before; `ranges` are the largest commands
+    within limits, `weights` those of the loads (N). With a `sharpness` maxima are smooth.
+    """
+    size = jnp.abs(found.deflection)
+    change = jnp.abs(found.contact_force - weights) * (found.contact_force != 0)
+    heavy = jnp.where(weights > 0, weights, 1.0)
+    return {
+        "peak": largest(size / free["peak"], sharpness),
+        "rms": jnp.sqrt(jnp.mean(found.deflection**2)) / free["rms"],
+        "after_exit": largest(size * after[:, None] / free["peak"], sharpness),
+        "effort": jnp.sqrt(jnp.mean((found.command / ranges) ** 2) + 1e-30),
+        "contact": largest(change / heavy, sharpness),
+    }
