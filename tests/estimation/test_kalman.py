@@ -18,7 +18,7 @@ from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant, conditioned
 
 PERIOD = 1e-3
-NOISE = np.array([1e-5, 2e-4, 0.05])
+NOISE = np.array([1e-5, 2e-4, 0.05, 5e-7])
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=2),
     actuators=[jb.Shaker(0.4, stiffness=500.0, damping=8.0, bandwidth=400.0)],
@@ -26,11 +26,12 @@ CASE = jb.Case(
         jb.Sensor(0.15, noise=1e-5, offset=1e-4),
         jb.Sensor(0.25, "velocity", noise=2e-4),
         jb.Sensor(0.35, "acceleration", noise=0.05),
+        jb.Sensor(0.45, "strain", fibre_distance=1.65e-3, noise=5e-7),
     ],
-    loads=[jb.MovingMass(mass=0.4, speed=1.0, entry_time=-0.2)],
+    loads=[jb.MovingMass(mass=0.4, speed=0.5, entry_time=-0.4)],
     controller=jb.Prescribed([0.0], period=PERIOD),
 )
-OFFSET = np.array([1e-4, 0.0, 0.0])
+OFFSET = np.array([1e-4, 0.0, 0.0, 0.0])
 FORCES = np.array([1e-2, 2e-2])
 DEVIATION = 2.0
 ESTIMATED = Kalman(FORCES, loads="estimated", weight_deviation=DEVIATION)
@@ -74,7 +75,7 @@ def oracle(case, ticks, delay=0.0, loaded=True):
 def signals(ticks):
     """Some commands and readings; no filter cares whether they fit."""
     random = np.random.default_rng(1)
-    return random.normal(size=(ticks, 1)), NOISE * random.normal(size=(ticks, 3)) * 10
+    return random.normal(size=(ticks, 1)), NOISE * random.normal(size=(ticks, 4)) * 10
 
 
 @pytest.mark.parametrize(
@@ -119,7 +120,7 @@ def test_surprises_and_errors_are_as_large_as_stated():
     steps, rows = oracle(CASE, ticks)
     state = np.zeros((runs, 6))
     state[:, -1] = 0.4 * 9.81 + DEVIATION * random.normal(size=runs)
-    commands, readings = random.normal(size=(runs, ticks, 1)), np.zeros((runs, ticks, 3))
+    commands, readings = random.normal(size=(runs, ticks, 1)), np.zeros((runs, ticks, 4))
     before = np.zeros((runs, 1))
     for k, (step, (C, D)) in enumerate(zip(steps, rows, strict=True)):
         values, vectors = np.linalg.eigh(step.noise)
@@ -127,10 +128,10 @@ def test_surprises_and_errors_are_as_large_as_stated():
         now = commands[:, k]
         state = state @ step.drift.T + before @ step.before.T + now @ step.after.T
         state, before = state + random.normal(size=(runs, 6)) @ root.T, now
-        readings[:, k] = state @ C.T + now @ D.T + OFFSET + NOISE * random.normal(size=(runs, 3))
+        readings[:, k] = state @ C.T + now @ D.T + OFFSET + NOISE * random.normal(size=(runs, 4))
     each = jax.vmap(filtered, in_axes=(None, None, 0, 0))
     memory, (estimate, surprise) = each(ESTIMATED, CASE, commands, readings)
-    low, high = chi2.interval(0.999, 3 * runs * ticks)
+    low, high = chi2.interval(0.999, 4 * runs * ticks)
     assert low < np.sum(surprise) < high
     # The state of the shaker is known for certain.
     kept = np.array([0, 1, 2, 3, 5])
