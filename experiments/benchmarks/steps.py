@@ -30,20 +30,22 @@ PERIOD, MODES, STEPS, BATCH, REPEATS = 0.01, 5, 200, 1000, 30
 WEIGHTS = {"state_weight": [1e6] * (2 * MODES), "command_weight": [1.0], "period": PERIOD}
 PREDICTIVE = {"move_weight": 1e-11, "period": PERIOD}
 CONTROLLERS = {
-    "feedback, linear": jb.Feedback([2000.0], period=PERIOD),
-    "feedback, cubic": jb.Feedback([2e9], power=3, period=PERIOD),
-    "state": jb.StateFeedback([[1e3] * (2 * MODES)], period=PERIOD),
+    "feedback, linear": jb.Feedback(gains=[2000.0], period=PERIOD),
+    "feedback, cubic": jb.Feedback(gains=[2e9], power=3, period=PERIOD),
+    "state": jb.StateFeedback(gain=[[1e3] * (2 * MODES)], period=PERIOD),
     "lqr": jb.LQR(**WEIGHTS),
     "lqr-step": jb.StepLQR(**WEIGHTS, points=100),
-    "mpc, unconstrained": jb.MPC(6, 4, solver="unconstrained", **PREDICTIVE),
-    "mpc, 4 variables": jb.MPC(6, 4, **PREDICTIVE),
-    "mpc, 6 variables": jb.MPC(8, 6, **PREDICTIVE),
-    "mpc, 8 variables": jb.MPC(10, 8, **PREDICTIVE),
-    "mpc, 4 variables, Hildreth": jb.MPC(6, 4, solver="hildreth", **PREDICTIVE),
-    "mpc, 8 variables, Hildreth": jb.MPC(10, 8, solver="hildreth", **PREDICTIVE),
-    "mpc, 4 variables, soft limit": jb.MPC(6, 4, soft_limit=1e-3, **PREDICTIVE),
-    "mpc, 4 variables, loads known": jb.MPC(6, 4, loads="known", **PREDICTIVE),
-    "mpc, 4 variables, time-varying": jb.MPC(6, 4, prediction="time-varying", **PREDICTIVE),
+    "mpc, unconstrained": jb.MPC(horizon=6, moves=4, solver="unconstrained", **PREDICTIVE),
+    "mpc, 4 variables": jb.MPC(horizon=6, moves=4, **PREDICTIVE),
+    "mpc, 6 variables": jb.MPC(horizon=8, moves=6, **PREDICTIVE),
+    "mpc, 8 variables": jb.MPC(horizon=10, moves=8, **PREDICTIVE),
+    "mpc, 4 variables, Hildreth": jb.MPC(horizon=6, moves=4, solver="hildreth", **PREDICTIVE),
+    "mpc, 8 variables, Hildreth": jb.MPC(horizon=10, moves=8, solver="hildreth", **PREDICTIVE),
+    "mpc, 4 variables, soft limit": jb.MPC(horizon=6, moves=4, soft_limit=1e-3, **PREDICTIVE),
+    "mpc, 4 variables, loads known": jb.MPC(horizon=6, moves=4, loads="known", **PREDICTIVE),
+    "mpc, 4 variables, time-varying": jb.MPC(
+        horizon=6, moves=4, prediction="time-varying", **PREDICTIVE
+    ),
 }
 
 
@@ -62,7 +64,14 @@ def rig(controller: AbstractController) -> jb.Case:
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=MODES),
         actuators=[
-            jb.Patch(0.2575, 0.3425, 8.292e-4, 0.32, amplifier_gain=200.0, limits=[-2.5, 7.5])
+            jb.Patch(
+                start=0.2575,
+                end=0.3425,
+                moment_per_volt=8.292e-4,
+                correction=0.32,
+                amplifier_gain=200.0,
+                limits=[-2.5, 7.5],
+            )
         ],
         sensors=[jb.Sensor(0.3)],
         loads=[jb.MovingMass(mass=0.509, speed=1.0)],
