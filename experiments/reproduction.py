@@ -1,0 +1,105 @@
+"""The thesis, reproduced: all experiments by name, run and written up in one report."""
+
+import importlib
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jaxbeam as jb
+from experiments import writeup
+from experiments.verdicts import VERDICTS, Experiment, Judged, Outcome, judge
+from jaxbeam import rigs
+
+MODULES = ("frequencies", "patches")
+FOLDER = "out/reproduce"
+
+
+class Run(NamedTuple):
+    """An experiment, what it found, the verdicts on its numbers, and the seconds it took."""
+
+    experiment: Experiment
+    outcome: Outcome
+    judged: list[Judged]
+    seconds: float
+
+
+def experiments() -> dict[str, Experiment]:
+    """All experiments by name, in the order of the thesis."""
+    found = (importlib.import_module(f"experiments.{name}").EXPERIMENT for name in MODULES)
+    return {one.name: one for one in found}
+
+
+def chosen(names: Sequence[str]) -> list[Experiment]:
+    """The experiments of these names. Raises ValueError for a name that none has."""
+    known = experiments()
+    for name in names:
+        if name not in known:
+            raise ValueError(f"there is no experiment {name!r}; there are {', '.join(known)}")
+    return [known[name] for name in names]
+
+
+def perform(experiment: Experiment, load: Callable[[str], jb.Case] = rigs.load) -> Run:
+    """Run one experiment on the published rigs, or on what is loaded in their place."""
+    start = time.perf_counter()
+    outcome = experiment.run(load)
+    return Run(experiment, outcome, judge(outcome.findings), time.perf_counter() - start)
+
+
+def reproduce(
+    names: Sequence[str],
+    folder: str | Path = FOLDER,
+    overwrite: bool = False,
+    tell: Callable[[str], None] = print,
+) -> list[Run]:
+    """Run experiments and write figures, numbers and one report into a folder.
+
+    Each is told as text as soon as it is done. Raises ValueError for an unknown name,
+    FileExistsError if the folder is not empty and may not be overwritten.
+    """
+    wanted, folder = chosen(names), Path(folder)
+    if folder.exists() and any(folder.iterdir()) and not overwrite:
+        raise FileExistsError(f"the folder {folder} is not empty; choose another, or --overwrite")
+    folder.mkdir(parents=True, exist_ok=True)
+    runs = []
+    for experiment in wanted:
+        run = perform(experiment)
+        for name, figure in run.outcome.figures.items():
+            figure.savefig(folder / f"{experiment.name}-{name}.png")
+        tell(writeup.text(run))
+        runs.append(run)
+    (folder / "report.md").write_text(writeup.markdown(runs), encoding="utf-8")
+    (folder / "report.html").write_text(writeup.html(runs), encoding="utf-8")
+    (folder / "report.json").write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
+    return runs
+
+
+def as_dict(runs: Sequence[Run]) -> dict:
+    """All numbers and verdicts as plain lists and words."""
+    return {
+        "summary": {word: writeup.count(runs, word) for word in VERDICTS},
+        "experiments": {
+            run.experiment.name: {
+                "claim": run.experiment.claim,
+                "seconds": run.seconds,
+                "remarks": list(run.outcome.remarks),
+                "findings": [
+                    {
+                        "where": one.printed.where,
+                        "what": one.printed.what,
+                        "unit": one.printed.unit,
+                        "kind": one.printed.kind,
+                        "tolerance": str(one.printed.tolerance),
+                        "labels": one.printed.names,
+                        "published": one.printed.numbers.tolist(),
+                        "readings": {k: list(map(float, v)) for k, v in one.readings.items()},
+                        "verdicts": judged.words,
+                        "obstacle": one.obstacle,
+                    }
+                    for one, judged in zip(run.outcome.findings, run.judged, strict=True)
+                ],
+            }
+            for run in runs
+        },
+    }

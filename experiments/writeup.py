@@ -1,0 +1,149 @@
+"""Runs of experiments as text, Markdown and HTML: one account, three dresses."""
+
+import html as escaping
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments.verdicts import IMPOSSIBLE, VERDICTS, Finding, Judged
+
+if TYPE_CHECKING:
+    from experiments.reproduction import Run
+
+HEADER = ("number", "published", "ours", "difference", "tolerance", "verdict")
+MEASURED = (
+    "The thesis's figures and measured curves are not available: comparisons are with printed"
+    " numbers, and figures have the thesis's axes. Tolerances were chosen by the kind of number"
+    " before the experiments were run; verdicts are computed from them."
+)
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
+       color: #22282e }
+table { border-collapse: collapse; font-size: 0.85rem; margin: 1rem 0 }
+th, td { text-align: left; padding: 0.2rem 0.8rem 0.2rem 0; border-bottom: 1px solid #dfe3e6 }
+td { font-variant-numeric: tabular-nums }
+img { max-width: 100% }
+.reproduced { color: #00694c } .explained { color: #0072b2 } .not, .cannot { color: #b34700 }
+"""
+
+
+def count(runs: Sequence["Run"], word: str) -> int:
+    """How many numbers got a verdict."""
+    return sum(one.words.count(word) for run in runs for one in run.judged)
+
+
+def text(run: "Run") -> str:
+    """One experiment for the terminal."""
+    lines = [f"{run.experiment.name}: {run.experiment.covers}", f"  {run.experiment.claim}"]
+    for one, judged in zip(run.outcome.findings, run.judged, strict=True):
+        lines += ["", f"  {_title(one)}"]
+        rows = [HEADER, *_rows(one, judged)]
+        widths = [max(len(row[i]) for row in rows) for i in range(len(HEADER))]
+        lines += ["    " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        lines += [f"    {sentence}" for sentence in _comments(one, judged.words)]
+    lines += [f"  {remark}" for remark in run.outcome.remarks]
+    tally = ", ".join(f"{number} {word}" for word, number in _tally([run]) if number)
+    return "\n".join([*lines, "", f"  {tally}; {run.seconds:.0f} s", ""])
+
+
+def markdown(runs: Sequence["Run"]) -> str:
+    """The report in Markdown, figures beside it."""
+    lines = ["# The thesis, reproduced", "", MEASURED, ""]
+    lines += _markdown_table(*_summary(runs))
+    for run in runs:
+        lines += [f"## {run.experiment.name}: {run.experiment.covers}", "", run.experiment.claim]
+        for one, judged in zip(run.outcome.findings, run.judged, strict=True):
+            lines += ["", f"**{_title(one)}**", "", *_markdown_table(HEADER, _rows(one, judged))]
+            lines += [f"{sentence}\n" for sentence in _comments(one, judged.words)]
+        lines += ["", *(f"{remark}\n" for remark in run.outcome.remarks)]
+        lines += [f"![{name}]({_picture(run, name)})\n" for name in run.outcome.figures]
+    return "\n".join(lines)
+
+
+def html(runs: Sequence["Run"]) -> str:
+    """The report as a page, figures beside it."""
+    safe = escaping.escape
+    parts = [f"<h1>The thesis, reproduced</h1><p>{MEASURED}</p>", _html_table(*_summary(runs))]
+    for run in runs:
+        title = safe(f"{run.experiment.name}: {run.experiment.covers}")
+        parts.append(f"<h2>{title}</h2><p>{safe(run.experiment.claim)}</p>")
+        for one, judged in zip(run.outcome.findings, run.judged, strict=True):
+            parts.append(f"<h4>{safe(_title(one))}</h4>")
+            parts.append(_html_table(HEADER, _rows(one, judged)))
+            parts += [f"<p>{safe(sentence)}</p>" for sentence in _comments(one, judged.words)]
+        parts += [f"<p>{safe(remark)}</p>" for remark in run.outcome.remarks]
+        parts += [f'<img src="{_picture(run, n)}" alt="{safe(n)}">' for n in run.outcome.figures]
+    head = f'<meta charset="utf-8"><title>The thesis, reproduced</title><style>{STYLE}</style>'
+    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(parts)}</body></html>'
+
+
+def _title(one: Finding) -> str:
+    printed = one.printed
+    unit = "" if printed.unit in ("", "1") else f", {printed.unit}"
+    return f"{printed.where}: {printed.what}{unit} ({printed.kind})"
+
+
+def _rows(one: Finding, judged: Judged) -> list[tuple[str, ...]]:
+    """One row for each number: ours is that of the reading which the verdict rests on."""
+    rows = []
+    columns = one.printed.names, one.printed.values.split(), judged.words, judged.by
+    for i, (label, published, word, reading) in enumerate(zip(*columns, strict=True)):
+        ours = float(one.readings[reading][i])
+        difference = f"{ours - float(published):+.2g}"
+        allowed = str(one.printed.tolerance)
+        rows.append((label.replace(",", ", "), published, f"{ours:.6g}", difference, allowed, word))
+    return rows
+
+
+def _comments(one: Finding, words: Sequence[str]) -> list[str]:
+    """What further readings give, and why numbers cannot be reproduced."""
+    sentences = [f"Reading: {one.printed.reading}."] if one.printed.reading else []
+    if len(one.readings) > 1:
+        for name, values in one.readings.items():
+            numbers = " ".join(f"{value:.5g}" for value in np.asarray(values))
+            hits = int(one.within(name).sum())
+            sentences.append(f"{name}: {numbers} ({hits} of {len(words)} within the tolerance)")
+    if IMPOSSIBLE in words:
+        sentences.append(f"Cannot be reproduced because {one.obstacle}.")
+    return sentences
+
+
+def _tally(runs: Sequence["Run"]) -> list[tuple[str, int]]:
+    return [(word, count(runs, word)) for word in VERDICTS]
+
+
+def _summary(runs: Sequence["Run"]):
+    """Header and rows of the table that says how many numbers got which verdict."""
+    header = ("experiment", "numbers", *VERDICTS, "seconds")
+    rows = [_counted(run.experiment.name, [run], run.seconds) for run in runs]
+    return header, [*rows, _counted("all", runs, sum(run.seconds for run in runs))]
+
+
+def _counted(name, runs, seconds) -> tuple[str, ...]:
+    numbers = [number for _, number in _tally(runs)]
+    return (name, str(sum(numbers)), *map(str, numbers), f"{seconds:.0f}")
+
+
+def _picture(run: "Run", name: str) -> str:
+    return f"{run.experiment.name}-{name}.png"
+
+
+def _markdown_table(header, rows) -> list[str]:
+    lines = [header, ["---"] * len(header), *rows]
+    return [f"| {' | '.join(line)} |" for line in lines] + [""]
+
+
+def _html_table(header, rows) -> str:
+    def line(tag, cells):
+        marked = (
+            f'<{tag} class="{cell.split()[0]}">' if cell in VERDICTS and tag == "td" else f"<{tag}>"
+            for cell in cells
+        )
+        inner = (
+            f"{start}{escaping.escape(cell)}</{tag}>"
+            for start, cell in zip(marked, cells, strict=True)
+        )
+        return f"<tr>{''.join(inner)}</tr>"
+
+    return f"<table>{line('th', header)}{''.join(line('td', row) for row in rows)}</table>"

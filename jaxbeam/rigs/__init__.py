@@ -1,0 +1,21 @@
+"""Published rigs as case files, each number with its source in a comment beside it.
+
+A and B: one span, with a shaker and with a patch; C: two spans with two patches; D: an example
+from the literature. Where the thesis contradicts itself a comment names the reading chosen. The
+files may be copied and changed like any other case file.
+"""
+
+from importlib import resources
+
+from jaxbeam.case import Case
+from jaxbeam.casefile import load_case
+
+NAMES = ("A", "B", "C", "D")
+
+
+def load(name: str) -> Case:
+    """The case of a published rig, "A", "B", "C" or "D". Raises ValueError for other names."""
+    if name not in NAMES:
+        raise ValueError(f"there is no published rig {name!r}; there are {', '.join(NAMES)}")
+    with resources.as_file(resources.files(__name__) / f"{name}.toml") as path:
+        return load_case(path)
