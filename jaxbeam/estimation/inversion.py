@@ -20,6 +20,7 @@ from jaxbeam.estimation.observability import (
 from jaxbeam.estimation.sampled import Transition, ticks
 from jaxbeam.estimator import AbstractEstimator, Estimate
 from jaxbeam.fields import POSITIVE, known, number
+from jaxbeam.holds import balance
 
 WORST = 100.0  # conditioning beyond which there is a warning
 
@@ -47,8 +48,9 @@ class Inversion(AbstractEstimator):
         if plant.A.shape[0] > size:
             # The states of actuators see the beam's, held, and then the commands, as inputs.
             inputs = jnp.concatenate([plant.A[size:, :size], plant.B[size:]], axis=1)
-            still = jnp.zeros((plant.A.shape[0] - size,) * 2)
-            own = clock.transition(lambda t: (plant.A[size:, size:], inputs), still)
+            inner = plant.A[size:, size:]
+            still, scale = jnp.zeros_like(inner), balance(inner)
+            own = clock.transition(lambda t: (inner, inputs), still, scale)
         lag = 0.0 if self.time_constant is None else jnp.exp(-clock.period / self.time_constant)
         share = (1 - jnp.asarray(lag, float)) / clock.period
         state, command = jnp.zeros(plant.A.shape[0]), jnp.zeros(plant.B.shape[1])

@@ -14,6 +14,7 @@ from jaxbeam.estimation.observability import modes_of, unseen_fault
 from jaxbeam.estimation.sampled import Ticks, ticks
 from jaxbeam.estimator import AbstractEstimator, Estimate
 from jaxbeam.fields import POSITIVE, choice, is_known, known, number
+from jaxbeam.holds import balance
 from jaxbeam.statespace import LoadedBeam
 from jaxbeam.stretches import symmetric
 
@@ -52,7 +53,7 @@ class Kalman(AbstractEstimator):
         clock = ticks(model.case.controller)
         if self.loads == "ignored":
             plant = model.unloaded
-            transition = clock.transition(lambda t: (plant.A, plant.B), intensity)
+            transition = clock.transition(lambda t: (plant.A, plant.B), intensity, balance(plant.A))
             gain, _ = sampled_kalman_gain(transition.drift, plant.C, transition.noise, covariance)
             return at_rest(model, plant, transition, gain)
         states, loads = intensity.shape[0], len(model.case.loads)
@@ -62,6 +63,7 @@ class Kalman(AbstractEstimator):
         return Crossing(
             model,
             clock,
+            jnp.append(balance(model.unloaded.A), jnp.ones(loads)),
             jnp.pad(intensity, (0, loads)),
             covariance,
             jnp.concatenate([jnp.zeros(states), model.weights]),
@@ -127,12 +129,13 @@ class Prediction(NamedTuple):
 class Crossing(eqx.Module):
     """Memory of a filter along a crossing; the weights of the loads are its last states.
 
-    `intensity` is that of the white noise in the rates of the states, `noise` the covariance of
-    that in the readings.
+    `scale` is the size of the states, `intensity` that of the white noise in their rates, `noise`
+    the covariance of that in the readings.
     """
 
     model: LoadedBeam
     clock: Ticks
+    scale: Float[Array, " state"]
     intensity: Square
     noise: Float[Array, "sensor sensor"]
     state: Float[Array, " state"]
@@ -146,7 +149,7 @@ class Crossing(eqx.Module):
             system = self.model.augmented(time)
             return system.A, system.B
 
-        transition = self.clock.transition(plant, self.intensity, t)
+        transition = self.clock.transition(plant, self.intensity, self.scale, t)
         state = transition.mean(self.state, self.command, command)
         covariance = transition.covariance(self.covariance)
         now = self.model.augmented(t)

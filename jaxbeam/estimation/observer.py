@@ -10,7 +10,7 @@ from jaxbeam.estimation.observability import modes_of, unseen_fault
 from jaxbeam.estimation.sampled import Ticks, ticks
 from jaxbeam.estimator import AbstractEstimator, Estimate
 from jaxbeam.fields import POSITIVE, known, number
-from jaxbeam.holds import hold
+from jaxbeam.holds import balance, hold
 from jaxbeam.statespace import StateSpace
 
 
@@ -33,7 +33,7 @@ class Observer(AbstractEstimator):
     def init(self, model):
         plant, clock = model.unloaded, ticks(model.case.controller)
         still = jnp.zeros_like(plant.A)
-        transition = clock.transition(lambda t: (plant.A, plant.B), still)
+        transition = clock.transition(lambda t: (plant.A, plant.B), still, balance(plant.A))
         return at_rest(model, plant, transition, self.gain(plant, transition.drift, clock))
 
     def step(self, memory: FixedGain, measurement, t):

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.controller import AbstractController
-from jaxbeam.holds import balance
 
 DOUBLINGS = 14  # of a short part of a period, until it is the whole
 TERMS = 10  # of the series for that part: it is right to rounding while its norm is below 0.05
@@ -49,21 +48,30 @@ class Ticks(eqx.Module):
     period: Number
     late: Number | None
 
-    def transition(self, plant: Plant, intensity: Square, t: Number | float = 0.0) -> Transition:
+    def transition(
+        self,
+        plant: Plant,
+        intensity: Square,
+        scale: Float[Array, " state"],
+        t: Number | float = 0.0,
+    ) -> Transition:
         """From the tick before t (s) to that at t, white noise of this intensity acting on x'.
 
         Exact for a plant that stays as it is; else by Magnus' method of order 4, with
-        one exponential between any two changes of the command.
+        one exponential between any two changes of the command. In states over their `scale`, from
+        `holds.balance`, numbers should be of like size.
         """
-        start = t - self.period
-        scale = balance(plant(start)[0] * self.period)
+        start = jnp.asarray(t - self.period)
+        starts, spans = start[None], self.period[None]
+        if self.late is not None:
+            starts = jnp.stack([start, start + self.late])
+            spans = jnp.stack([self.late, self.period - self.late])
+        parts = jax.vmap(lambda *at: _stretch(plant, intensity, scale, *at))(starts, spans)
+        drift, push, noise = (part[-1] for part in parts)
         if self.late is None:
-            drift, push, noise = _stretch(plant, intensity, scale, start, self.period)
             return Transition(drift, jnp.zeros_like(push), push, noise)
-        first, push, early = _stretch(plant, intensity, scale, start, self.late)
-        rest = self.period - self.late
-        last, after, noise = _stretch(plant, intensity, scale, start + self.late, rest)
-        return Transition(last @ first, last @ push, after, noise + last @ early @ last.T)
+        first, before, early = (part[0] for part in parts)
+        return Transition(drift @ first, drift @ before, push, noise + drift @ early @ drift.T)
 
 
 def ticks(controller: AbstractController) -> Ticks:
@@ -78,7 +86,8 @@ def ticks(controller: AbstractController) -> Ticks:
 def _stretch(plant: Plant, intensity, scale, start, span):
     """Drift of the state, push of a held input and covariance of the noise over a span (s)."""
     middle, reach = start + span / 2, math.sqrt(3) / 6 * span
-    early, late = _matrix(plant, middle - reach, scale), _matrix(plant, middle + reach, scale)
+    nodes = jnp.stack([middle - reach, middle + reach])
+    early, late = jax.vmap(lambda time: _matrix(plant, time, scale))(nodes)
     turn = late @ early - early @ late
     matrix = span / 2 * (early + late) + span * reach / 2 * turn
     states, outer = intensity.shape[0], scale * scale[:, None]

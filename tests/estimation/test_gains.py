@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 from jaxbeam.estimation import kalman_gain, placed_gain, sampled_kalman_gain
 from jaxbeam.estimation.sampled import Ticks
+from jaxbeam.holds import balance
 from tests.differences import central
 
 FREQUENCIES = np.array([128.0, 512.0, 1153.0])
@@ -31,7 +32,7 @@ CONTINUOUS, SAMPLED, PLACED = map(jax.jit, (kalman_gain, sampled_kalman_gain, pl
 
 @jax.jit
 def _transition(ticks):
-    return ticks.transition(lambda t: (A, jnp.eye(6, 1)), Q)
+    return ticks.transition(lambda t: (A, jnp.eye(6, 1)), Q, balance(A))
 
 
 def transition(period, late=None):
