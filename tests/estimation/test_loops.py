@@ -134,6 +134,7 @@ def sampled_loop(case, modes):
     )
 
 
+@pytest.mark.slow
 def test_modes_that_are_not_modelled_spill_over():
     """A hasty loop, stable on the beam of the design, is unstable on the richer one."""
     radius = {}  # of the loops on both beams, for two weights of the command
