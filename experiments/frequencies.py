@@ -1,12 +1,11 @@
 """Natural frequencies and critical speeds: Tables 2.1 and 2.2, Fig. 2.4, eqs (2.38) and (2.39)."""
 
-import dataclasses
-
 import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments import published
+from experiments.beams import one_span, two_spans
 from experiments.verdicts import Experiment, Outcome, finding
 from jaxbeam.modes import lay_out
 from jaxbeam.plot.style import colour, name, styled
@@ -18,12 +17,7 @@ BESIDE = {"beam.flexural_rigidity": 12.11, "beam.mass_per_length": 0.5411}  # Ta
 
 def run(load) -> Outcome:
     """Frequencies of two spans, exactly and in sine modes, and the speeds that follow."""
-    one = dataclasses.replace(load("A"), actuators=())
-    # The beam of rig A over two of its spans: the text has its rigidity "stay unchanged".
-    two = jb.Case(
-        dataclasses.replace(one.beam, length=2 * one.beam.length, modes=8),
-        supports=[jb.Support(one.beam.length)],
-    )
+    one, two = one_span(load), two_spans(load)
     beside = jb.replace(two, BESIDE)
     exact, printed_exact = (np.asarray(jb.modes(case).frequencies) for case in (two, beside))
     scale = (two.beam.rigidity / two.beam.linear_density) ** 0.25 / one.beam.length

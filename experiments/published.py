@@ -145,7 +145,7 @@ ONE_SPAN = Printed(
     CURVE,
     "1.6 2.0 2.2",
     "force,0.7 0.26kg,0.5 0.5kg,0.75",
-    "at the speed ratio v / v_cr; rig A without or with its shaker",
+    "at the speed ratio v / v_cr, without the shaker",
 )
 TWO_SPANS = Printed(
     "Fig. 2.27",
@@ -165,7 +165,7 @@ YANG = Printed(
     CURVE,
     "1.5 3.25",
     "1st-midspan 2nd-midspan",
-    "largest over the speed; first span as Yang's simply supported beam",
+    "largest over the speed, undamped; first span as Yang's simply supported beam",
 )
 
 # Chapter 2: frequency responses with the electrodynamic shaker.
