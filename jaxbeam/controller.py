@@ -57,6 +57,11 @@ class AbstractController(eqx.Module):
         """Whether the command depends on time alone."""
         return False
 
+    @property
+    def knows_loads(self) -> bool:
+        """Whether what `init` prepares depends on masses and weights of the loads."""
+        return True
+
     @abc.abstractmethod
     def init(self, model: Any) -> Any:
         """Memory at the start of a run, of any structure; gains may be designed here.

@@ -28,9 +28,15 @@ class Tasks:
     index: Int[np.ndarray, "task lane"]
 
 
-def arrange(addresses: list[str], runs: Float[np.ndarray, "run address"]) -> Tasks:
-    """Arrange runs, given by their values at the addresses (SI units), into tasks and lanes."""
-    is_light = np.array([bool(LIGHT.fullmatch(address)) for address in addresses])
+def arrange(
+    addresses: list[str], runs: Float[np.ndarray, "run address"], alone: bool = False
+) -> Tasks:
+    """Arrange runs, given by their values at the addresses (SI units), into tasks and lanes.
+
+    Runs on one path share a task unless they are to be `alone`: a controller that is designed for
+    the loads is another one in each.
+    """
+    is_light = np.array([bool(LIGHT.fullmatch(address)) and not alone for address in addresses])
     heavy, light = runs[:, ~is_light], runs[:, is_light]
     _, group = np.unique(heavy, axis=0, return_inverse=True)
     if heavy.shape[1] == 0:

@@ -75,7 +75,8 @@ def sweep(
     if path is not None and state == "complete":
         return sweep_store.read(path)
 
-    tasks = arrange(list(axes), runs)
+    alone = case.controller is not None and case.controller.knows_loads
+    tasks = arrange(list(axes), runs, alone)
     work = Work(case, tasks, histories, tolerance)
     if path is not None and state == "resume":
         keeper = sweep_store.reopen(path)

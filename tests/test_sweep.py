@@ -171,6 +171,19 @@ def test_other_faults_are_refused():
         jb.sweep(driven, {"controller.period": [0.01, 0.02]}, progress=False)
 
 
+def test_each_run_has_the_controller_designed_for_its_loads():
+    beam = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=1)
+    law = jb.StepLQR(state_weight=[1e3, 1.0], command_weight=[1e-2], points=40)
+    case = jb.Case(
+        beam, actuators=[jb.PointForce(0.3)], sensors=[jb.Sensor(0.3)],
+        loads=[jb.MovingMass(mass=0.2, speed=2.0)], controller=law,
+        run=jb.Run(duration=0.4, sample_rate=200.0),
+    )  # fmt: skip
+    found = jb.sweep(case, {"loads.0.mass": [0.2, 0.8]}, progress=False)
+    alone = jb.simulate(jb.replace(case, {"loads.0.mass": 0.8}))
+    np.testing.assert_allclose(found.peak_deflection[1], alone.peak_deflection, rtol=1e-6)
+
+
 @given(st.integers(1, 400), st.integers(1, 5), st.integers(0, 10))
 def test_every_run_is_in_one_lane(count, paths, seed):
     random = np.random.default_rng(seed)

@@ -1,7 +1,8 @@
 """All runs of a tuning, simulated side by side and compiled once."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,9 +14,9 @@ from jaxbeam.case import Case, replace
 from jaxbeam.dynamics import traffic
 from jaxbeam.plan import Plan, make_plan, sample_times
 from jaxbeam.record import Record
-from jaxbeam.simulate import histories, simulate
+from jaxbeam.simulate import Histories, histories, simulate
 from tuning.load_cases import Values, apply
-from tuning.objective import run_merits
+from tuning.objective import Sharpness, run_merits
 
 TOLERANCE = 1e-4  # of the largest deflection: what tuning needs; verdicts are simulated finer
 
@@ -36,20 +37,34 @@ class Bench:
     after: Float[np.ndarray, "run time"]
     ranges: Float[np.ndarray, " actuator"]
 
-    def merits(self, values: dict[str, Array], sharpness=None) -> dict[str, Float[Array, " run"]]:
-        """Figures of merit of all runs with other numbers at some addresses; differentiable."""
+    def histories(self, values: Mapping[str, Any]) -> Histories:
+        """Histories of all runs, along a first axis, with other numbers at some addresses."""
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self.cases)
 
-        def single(run):
-            case, free, after = run
-            case = replace(case, values)
-            found = histories(case, self.times, self.plan, self.places)
-            weights = traffic(case).weight[:, 0]
-            return run_merits(found, free, after, jnp.asarray(self.ranges), weights, sharpness)
+        def single(case):
+            return histories(replace(case, values), self.times, self.plan, self.places)
 
-        return jax.vmap(single)((stacked, self.free, jnp.asarray(self.after)))
+        return jax.vmap(single)(stacked)
 
-    def records(self, values: dict[str, float]) -> list[Record]:
+    def judge(
+        self, found: Histories, sharpness: Sharpness = None
+    ) -> dict[str, Float[Array, " run"]]:
+        """Figures of merit of all runs; differentiable."""
+        weights = jnp.stack([traffic(case).weight[:, 0] for case in self.cases])
+        ranges = jnp.asarray(self.ranges)
+
+        def single(found, free, after, weights):
+            return run_merits(found, free, after, ranges, weights, sharpness)
+
+        return jax.vmap(single)(found, self.free, jnp.asarray(self.after), weights)
+
+    def merits(
+        self, values: Mapping[str, Any], sharpness: Sharpness = None
+    ) -> dict[str, Float[Array, " run"]]:
+        """Figures of merit of all runs with other numbers at some addresses."""
+        return self.judge(self.histories(values), sharpness)
+
+    def records(self, values: Mapping[str, Any]) -> list[Record]:
         """Records of all runs, with true peaks between and at samples."""
         return [simulate(replace(case, values), plan=self.plan) for case in self.cases]
 

@@ -28,7 +28,7 @@ def save(path: Path, mark: str, arrays: dict[str, np.ndarray]) -> None:
 def load(path: Path, mark: str) -> dict[str, np.ndarray]:
     """Read what `save` wrote. Raises ValueError if it is damaged, or of another search."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError):
         raise ValueError(f"{path} is damaged: delete it to start anew") from None

@@ -10,6 +10,7 @@ from jaxbeam.simulate import Histories
 
 MERITS = ("peak", "rms", "after_exit", "effort", "contact")
 OVER = ("mean", "worst", "cvar")
+Sharpness = Float[Array, ""] | float | None  # of smooth maxima; None for true ones
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +45,9 @@ class Objective:
         """The weighted sum for runs whose merits are known."""
         return sum(weight * merits[name] for name, weight in self.weights.items())
 
-    def of_runs(self, values: Float[Array, " run"], sharpness=None) -> Float[Array, ""]:
+    def of_runs(
+        self, values: Float[Array, " run"], sharpness: Sharpness = None
+    ) -> Float[Array, ""]:
         """One number for the values of all runs; smooth if a sharpness is given."""
         if self.over == "mean":
             return jnp.mean(values)
@@ -54,7 +57,7 @@ class Objective:
         return jnp.mean(jnp.sort(values)[-count:])
 
 
-def largest(values: Float[Array, "..."], sharpness: float | None) -> Float[Array, ""]:
+def largest(values: Float[Array, "..."], sharpness: Sharpness) -> Float[Array, ""]:
     """The largest of some values, or a smooth bound from above that is log(count)/sharpness off."""
     if sharpness is None:
         return jnp.max(values)
@@ -67,7 +70,7 @@ def run_merits(
     after: Float[Array, " time"],
     ranges: Float[Array, " actuator"],
     weights: Float[Array, " load"],
-    sharpness: float | None = None,
+    sharpness: Sharpness = None,
 ) -> dict[str, Float[Array, ""]]:
     """Figures of merit of one run (see `Objective`); `free` holds those without control, in m.
 

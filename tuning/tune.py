@@ -91,9 +91,11 @@ def tune(
             bar.set_postfix_str(f"objective {state.best_value.min():.4g}")
             if file is not None and (state.step % EVERY == 0 or state.step == steps):
                 save(file, mark, state.arrays())
-    best = int(np.argmin(state.best_value))
-    values = np.array([float(n.outward(y)) for n, y in zip(numbers, state.best[best], strict=True)])
-    if best == 0 and state.best_value[0] == state.history[0, 0]:
+    best = state.best[np.argmin(state.best_value)]
+    values = np.array(
+        [float(n.outward(jnp.asarray(y))) for n, y in zip(numbers, best, strict=True)]
+    )
+    if np.array_equal(best, search.own):
         values = np.array([number.start for number in numbers])
     before = {number.address: number.start for number in numbers}
     after = dict(zip(before, map(float, values), strict=True))
@@ -138,17 +140,20 @@ class _Search:
 
     def __init__(self, bench: Bench, numbers: list[Free], objective: Objective, steps: int):
         self.numbers, self.steps = numbers, steps
+        self.own = np.array([number.inward(number.start) for number in numbers])
         self.adam = optax.adam(optax.cosine_decay_schedule(RATE, steps, alpha=0.05))
 
-        def value(point, sharpness):
+        def smooth_and_true(point, sharpness):
             pairs = zip(numbers, point, strict=True)
-            merits = bench.merits({n.address: n.outward(y) for n, y in pairs}, sharpness)
-            return objective.of_runs(objective.of_run(merits), sharpness)
+            found = bench.histories({n.address: n.outward(y) for n, y in pairs})
+            smooth, true = (
+                objective.of_runs(objective.of_run(bench.judge(found, sharp)), sharp)
+                for sharp in (sharpness, None)
+            )
+            return smooth, true
 
-        def both(point, sharpness):
-            return jax.value_and_grad(value)(point, sharpness), value(point, None)
-
-        self._both = jax.jit(jax.vmap(both, in_axes=(0, None)))
+        slope = jax.value_and_grad(smooth_and_true, has_aux=True)
+        self._slope = jax.jit(jax.vmap(slope, in_axes=(0, None)))
 
         def onward(point, gradient, moments, scale):
             change, moments = self.adam.update(gradient, moments)
@@ -158,7 +163,6 @@ class _Search:
 
     def first(self, starts: int, seed: int) -> _State:
         """The case's own numbers, and random ones within bounds or a factor of three."""
-        own = np.array([number.inward(number.start) for number in self.numbers])
         rng = np.random.default_rng(seed)
         spread = [
             rng.uniform(-np.pi / 2, np.pi / 2, starts - 1)
@@ -166,19 +170,19 @@ class _Search:
             else n.inward(n.start) + np.log(3) * n.search_size * rng.uniform(-1, 1, starts - 1)
             for n in self.numbers
         ]
-        point = np.concatenate([own[None], np.array(spread).T])
+        point = np.concatenate([self.own[None], np.array(spread).reshape(len(self.own), -1).T])
         moments = jax.vmap(self.adam.init)(jnp.asarray(point))
-        value = np.asarray(self._both(jnp.asarray(point), SHARPNESS[0])[1])
-        value = np.where(np.isfinite(value), value, np.inf)
+        (_, true), _ = self._slope(jnp.asarray(point), SHARPNESS[0])
+        value = np.where(np.isfinite(true), true, np.inf)
         none = np.zeros(starts)
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(moments)]
-        return _State(0, point, leaves, none + 1, point, value, value[None], none)
+        return _State(0, point, leaves, none + 1, point, value, np.zeros((0, starts)), none)
 
     def next(self, state: _State) -> _State:
         """One step of every start; those that came to a diverging loop go back, and go slower."""
         share = state.step / max(self.steps - 1, 1)
         sharpness = SHARPNESS[0] * (SHARPNESS[1] / SHARPNESS[0]) ** share
-        (_, gradient), true = self._both(jnp.asarray(state.point), sharpness)
+        (_, true), gradient = self._slope(jnp.asarray(state.point), sharpness)
         gradient, true = np.asarray(gradient), np.asarray(true)
         sound = np.isfinite(true) & np.isfinite(gradient).all(axis=1)
         better = sound & (true < state.best_value)

@@ -24,6 +24,10 @@ class Feedback(AbstractController):
     def memoryless(self) -> bool:
         return True
 
+    @property
+    def knows_loads(self) -> bool:
+        return False
+
     def fault(self, case):
         count = self.gains.shape[0]
         if count != len(case.actuators):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.control.gains import GainTable, crossing, edges_between, finite_time, step_by_step
+from jaxbeam.control.sampling import warn_if_slow
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, is_known, known, number
 from jaxbeam.riccati import lqr
@@ -68,6 +69,9 @@ class AbstractRegulator(AbstractStateLaw):
             return "place_weight must have an entry for each of the places"
         return super().fault(case)
 
+    def look_at(self, plant, case):
+        warn_if_slow(plant, float(known(self.period)), float(known(case.run.duration)))
+
     def weights(self, model: LoadedBeam) -> tuple[Array, Array]:
         """Q and R for the states of a model."""
         Q = jnp.diag(self.state_weight)
@@ -85,6 +89,10 @@ class AbstractRegulator(AbstractStateLaw):
 
 class LQR(AbstractRegulator):
     """The time-invariant regulator for the rig without loads, eq. (5.7) of the thesis."""
+
+    @property
+    def knows_loads(self) -> bool:
+        return self.estimator is not None
 
     def gains(self, model):
         plant = model.unloaded
@@ -136,13 +144,13 @@ class AbstractScheduledRegulator(AbstractRegulator):
         return super().fault(case)
 
     @property
-    def knows_loads(self) -> bool:
+    def feeds_loads_forward(self) -> bool:
         """Whether the weights of the loads are fed forward."""
         return False
 
     def prepare(self, model, designed):
         table = self.gains(designed)
-        loads = designed.weights if self.knows_loads else jnp.zeros(0)
+        loads = designed.weights if self.feeds_loads_forward else jnp.zeros(0)
         last = table(jnp.ones(()))
         if self.after == "time-invariant":
             plant = designed.unloaded
@@ -157,7 +165,7 @@ class AbstractScheduledRegulator(AbstractRegulator):
 
     def command(self, memory, estimate, measurement, t):
         loads = memory.known
-        if self.knows_loads and estimate.weights is not None:
+        if self.feeds_loads_forward and estimate.weights is not None:
             loads = estimate.weights
         return -memory.gain(t) @ jnp.concatenate([estimate.state, loads]), memory
 
@@ -203,7 +211,7 @@ class AugmentedLQR(AbstractScheduledRegulator):
     )
 
     @property
-    def knows_loads(self) -> bool:
+    def feeds_loads_forward(self) -> bool:
         return True
 
     def fault(self, case):
@@ -219,7 +227,7 @@ def optimal(
     """Table of optimal gains for a model, and P at its edges, load states included."""
     Q, R = regulator.weights(model)
     F = Q if regulator.terminal_weight is None else jnp.diag(regulator.terminal_weight)
-    loads = len(model.case.loads) if regulator.knows_loads else 0
+    loads = len(model.case.loads) if regulator.feeds_loads_forward else 0
 
     def plant(t):
         system = model.augmented(t) if loads else model.at(t)

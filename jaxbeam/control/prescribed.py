@@ -35,6 +35,10 @@ class Prescribed(AbstractController):
         return True
 
     @property
+    def knows_loads(self) -> bool:
+        return False
+
+    @property
     def blind(self) -> bool:
         return True
 

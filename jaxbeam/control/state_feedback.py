@@ -13,6 +13,10 @@ class StateFeedback(AbstractStateLaw):
         "unit of a command per state", "gain, a row for each actuator"
     )
 
+    @property
+    def knows_loads(self) -> bool:
+        return self.estimator is not None
+
     def fault(self, case):
         wanted = (len(case.actuators), self.states(case))
         if self.gain.shape != wanted:

@@ -38,7 +38,8 @@ def plot_tuning(
     grid = figure.subplots(2, len(panels), squeeze=False, height_ratios=[1.2 + 0.22 * most, 1.2])
     for axes, panel in zip(grid[0], panels, strict=True):
         _draw(axes, panel)
-    grid[0, 0].legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), ncols=3, handlelength=1.2)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower right", ncols=3, handlelength=1.2)
     left, right = min(a.get_xlim()[0] for a in grid[0]), max(a.get_xlim()[1] for a in grid[0])
     for axes in grid[0]:
         axes.set_xlim(left, right)
