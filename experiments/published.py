@@ -195,3 +195,134 @@ PARKED_PEAK = Printed("Fig. 2.16", "peak with 0.5 kg at 0.3 m", "N/V", "computed
 PARKED_PLACE = Printed(
     "Fig. 2.16", "the peak with 0.5 kg at 0.3 m is at", HZ, "computed", CURVE, "27"
 )
+
+# Chapter 6: displacement feedback, masses m1 to m4.
+FOUR = "m1 m2 m3 m4"
+FREE_S1 = Printed(
+    "Table 6.1", "s1, no control", "mm", "measured", MEASURED, "0.676 0.833 0.959 1.331", FOUR
+)
+CUBIC_S1 = Printed(
+    "Table 6.1", "s1, cubic", "mm", "measured", MEASURED, "0.653 0.782 0.895 1.160", FOUR
+)
+CUBIC_LESS_S1 = Printed(
+    "Table 6.1", "s1, less by cubic", "%", "measured", RUNS, "3.40 6.12 6.67 12.84", FOUR
+)
+LINEAR_S1 = Printed(
+    "Table 6.1", "s1, linear", "mm", "computed", SAME_MODEL, "0.605 0.752 0.8607 1.196", FOUR
+)
+LINEAR_LESS_S1 = Printed(
+    "Table 6.1", "s1, less by linear", "%", "computed", POINTS, "10.51 9.72 10.25 10.14", FOUR
+)
+FREE_S3 = Printed(
+    "Table 6.2", "s3, no control", "mm", "measured", MEASURED, "0.701 0.873 0.997 1.383", FOUR
+)
+FREE_S3_COMPUTED = Printed(
+    "Table 6.2", "s3, no control", "mm", "computed", SAME_MODEL, "0.669 0.836 0.959 1.320", FOUR
+)
+CUBIC_S3 = Printed(
+    "Table 6.2", "s3, cubic", "mm", "measured", MEASURED, "0.683 0.816 0.917 1.200", FOUR
+)
+CUBIC_LESS_S3 = Printed(
+    "Table 6.2", "s3, less by cubic", "%", "measured", RUNS, "2.56 6.53 8.02 13.23", FOUR
+)
+LINEAR_S3 = Printed(
+    "Table 6.2", "s3, linear", "mm", "computed", SAME_MODEL, "0.607 0.755 0.864 1.188", FOUR
+)
+LINEAR_LESS_S3 = Printed(
+    "Table 6.2", "s3, less by linear", "%", "computed", POINTS, "9.26 9.67 9.91 10", FOUR
+)
+FREE_UP = Printed(
+    "Table 6.3",
+    "s3 upwards, no control",
+    "mm",
+    "measured",
+    MEASURED,
+    "0.277 0.338 0.394 0.536",
+    FOUR,
+)
+CUBIC_UP = Printed(
+    "Table 6.3", "s3 upwards, cubic", "mm", "measured", MEASURED, "0.264 0.322 0.377 0.489", FOUR
+)
+CUBIC_LESS_UP = Printed(
+    "Table 6.3", "s3 upwards, less by cubic", "%", "measured", RUNS, "4.69 4.73 4.31 8.77", FOUR
+)
+FEEDBACK_VOLTS = Printed(
+    "Fig. 6.9", "largest voltage at a patch", "V", "measured", VOLTS, "111 680", "m1,span1 m4,span2"
+)
+TWO_MASSES = Printed("Fig. 6.11", "s3, less by cubic for two masses", "%", "measured", RUNS, "10.5")
+ONE_SPAN_LINEAR = Printed(
+    "Fig. 6.6",
+    "one span, less by linear, least and most",
+    "%",
+    "measured",
+    RUNS,
+    "9 11",
+    "least most",
+)
+ONE_SPAN_CUBIC = Printed(
+    "Fig. 6.6",
+    "one span, less by cubic, least and most",
+    "%",
+    "measured",
+    RUNS,
+    "5.5 18.5",
+    "least most",
+)
+AFTER_EXIT = Printed("6.1", "one span, vibration after the exit", HZ, "measured", CURVE, "17")
+SUMMARY_ONE = Printed(
+    "Table 8.1",
+    "one span, 0.509 kg, less by feedback",
+    "%",
+    "measured",
+    RUNS,
+    "11 18",
+    "linear cubic",
+)
+SUMMARY_TWO = Printed(
+    "Table 8.1",
+    "two spans, 0.509 kg, less by feedback",
+    "%",
+    "measured",
+    RUNS,
+    "10 13",
+    "linear cubic",
+)
+
+# Chapter 5: optimal control of one span with a shaker, peaks at 0.25 m in percent of no control.
+THREE = "0.261kg 0.371kg 0.509kg"
+INVARIANT_SLOW = Printed(
+    "Table 5.1", "time-invariant, 0.3 m/s", "%", "measured", RUNS, "96.9 97.7 96.6", THREE
+)
+VARYING_SLOW = Printed(
+    "Tables 5.1, 5.3", "time-varying, 0.3 m/s", "%", "measured", RUNS, "88 85.7 83.2", THREE
+)
+INVARIANT_FAST = Printed(
+    "Table 5.2", "time-invariant, 0.55 m/s", "%", "measured", RUNS, "99.2 97.1 92", THREE
+)
+VARYING_FAST = Printed(
+    "Tables 5.2, 5.4", "time-varying, 0.55 m/s", "%", "measured", RUNS, "87.2 83 82.1", THREE
+)
+AUGMENTED_SLOW = Printed(
+    "Table 5.3", "augmented, 0.3 m/s", "%", "measured", RUNS, "67.12 67.85 66.29", THREE
+)
+AUGMENTED_FAST = Printed(
+    "Table 5.4", "augmented, 0.55 m/s", "%", "measured", RUNS, "62.83 61.82 62.43", THREE
+)
+SUMMARY_OPTIMAL = Printed(
+    "Table 8.1",
+    "one span, 0.509 kg, less by optimal control",
+    "%",
+    "measured",
+    RUNS,
+    "18 38",
+    "time-varying augmented",
+)
+FEWER_STATES = Printed(
+    "Fig. 5.13",
+    "0.261 kg at 0.55 m/s, less with q1 alone",
+    "%",
+    "measured",
+    RUNS,
+    "15 20",
+    "time-invariant time-varying",
+)

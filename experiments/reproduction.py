@@ -12,7 +12,7 @@ from experiments import writeup
 from experiments.verdicts import VERDICTS, Experiment, Judged, Outcome, judge
 from jaxbeam import rigs
 
-MODULES = ("frequencies", "patches", "amplification", "shaker")
+MODULES = ("frequencies", "patches", "amplification", "shaker", "feedback")
 FOLDER = "out/reproduce"
 
 

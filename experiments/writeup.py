@@ -90,9 +90,11 @@ def _rows(one: Finding, judged: Judged) -> list[tuple[str, ...]]:
     columns = one.printed.names, one.printed.values.split(), judged.words, judged.by
     for i, (label, published, word, reading) in enumerate(zip(*columns, strict=True)):
         ours = float(one.readings[reading][i])
-        difference = f"{ours - float(published):+.2g}"
+        shown, difference = f"{ours:.6g}", f"{ours - float(published):+.2g}"
+        if np.isnan(ours):
+            shown = difference = "\N{EM DASH}"
         allowed = str(one.printed.tolerance)
-        rows.append((label.replace(",", ", "), published, f"{ours:.6g}", difference, allowed, word))
+        rows.append((label.replace(",", ", "), published, shown, difference, allowed, word))
     return rows
 
 
