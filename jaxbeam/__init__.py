@@ -16,11 +16,13 @@ from jaxbeam.control import (
     LQR,
     MPC,
     AugmentedLQR,
+    DiscreteLQR,
     Feedback,
     FiniteLQR,
     Prescribed,
     StateFeedback,
     StepLQR,
+    sampling_limit,
 )
 from jaxbeam.control.bound import bound
 from jaxbeam.estimation import Inversion, Kalman, Observer
@@ -39,6 +41,7 @@ __all__ = [
     "AugmentedLQR",
     "Beam",
     "Case",
+    "DiscreteLQR",
     "Electrodynamic",
     "Feedback",
     "Filter",
@@ -65,6 +68,7 @@ __all__ = [
     "modes",
     "read_record",
     "replace",
+    "sampling_limit",
     "save_case",
     "simulate",
     "state_space",

@@ -24,7 +24,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
     A mistake of the user ends in one sentence on standard error, a warning is one as well.
     """
-    warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
+    said = set()  # what is checked twice warns twice
+
+    def warn(message, *_, **__):
+        if str(message) not in said:
+            said.add(str(message))
+            say(f"warning: {message}")
+
+    warnings.showwarning = warn
     if arguments is None:
         _keep_compiled()
     try:

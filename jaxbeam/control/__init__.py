@@ -1,12 +1,15 @@
 """Controllers, one family a file, behind the interface in `controller`."""
 
+from jaxbeam.control.discrete import DiscreteLQR
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.lqr import LQR, AugmentedLQR, FiniteLQR, StepLQR
 from jaxbeam.control.mpc import MPC
 from jaxbeam.control.prescribed import Prescribed
+from jaxbeam.control.sampling import SamplingWarning, sampling_limit
 from jaxbeam.control.state_feedback import StateFeedback
 
 KINDS = {
+    "dlqr": DiscreteLQR,
     "feedback": Feedback,
     "lqr": LQR,
     "lqr-augmented": AugmentedLQR,
@@ -22,9 +25,12 @@ __all__ = [
     "LQR",
     "MPC",
     "AugmentedLQR",
+    "DiscreteLQR",
     "Feedback",
     "FiniteLQR",
     "Prescribed",
+    "SamplingWarning",
     "StateFeedback",
     "StepLQR",
+    "sampling_limit",
 ]

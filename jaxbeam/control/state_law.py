@@ -76,13 +76,18 @@ class AbstractStateLaw(AbstractController):
         fault = None if self.design is None else self.design.fault(case)
         if fault is not None:
             return f"design.{fault}"
-        if self.estimator is None or self.period is None:
+        if self.period is None:
             return None
-        fault = self.estimator.fault(case, None)
+        fault = None if self.estimator is None else self.estimator.fault(case, None)
         if fault is None and all(is_known(leaf) for leaf in jax.tree.leaves((self, case))):
             law, plain = jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), (self, case))
-            fault = self.estimator.fault(case, _plant(law, plain, lay_out(plain)))
+            plant = _plant(law, plain, lay_out(plain))
+            self.look_at(plant, case)
+            fault = None if self.estimator is None else self.estimator.fault(case, plant)
         return None if fault is None else f"estimator.{fault}"
+
+    def look_at(self, plant: StateSpace, case: Any) -> None:
+        """Warn of what may go wrong on the plant it is designed for, before a sampled run."""
 
     def modes(self, case: Any) -> int:
         """How many modes the law is designed for."""

@@ -94,7 +94,7 @@ def _stretch(plant: Plant, intensity, scale, start, span):
     noise = jnp.pad(intensity / outer, (0, matrix.shape[0] - states))
     bend = (late - early) @ noise
     noise = span * noise + span * reach / 2 * (bend + bend.T)
-    flow, noise = _exponential(matrix, noise)
+    flow, noise = whole_and_sum(matrix, noise)
     drift = flow[:states, :states] * scale[:, None] / scale
     return drift, flow[:states, states:] * scale[:, None], noise[:states, :states] * outer
 
@@ -106,7 +106,7 @@ def _matrix(plant: Plant, time, scale):
     return jnp.pad(top, ((0, B.shape[1]), (0, 0)))
 
 
-def _exponential(matrix, noise):
+def whole_and_sum(matrix: Square, noise: Square) -> tuple[Square, Square]:
     """exp(M) and the integral of exp(M s) N exp(M's) over s from 0 to 1.
 
     Summed as series of a small fraction of M, which is joined to itself: unlike the blocks of one
