@@ -240,11 +240,13 @@ class OpenLoop(eqx.Module):
         inputs = jnp.concatenate([command, self.wide.weights])
 
         def matrix(time):
+            # Inputs are further states that stay: so the matrix is the same for all of them.
             system = self.wide.at(time)
-            top = jnp.concatenate([system.A, (system.B @ inputs)[:, None]], axis=1)
-            return jnp.concatenate([top, jnp.zeros((1, top.shape[1]))])
+            top = jnp.concatenate([system.A, system.B], axis=1)
+            return jnp.pad(top, ((0, inputs.shape[0]), (0, 0)))
 
-        return through(matrix, t, span, substeps, jnp.append(state, 1.0))[:-1]
+        start = jnp.concatenate([state, inputs])
+        return through(matrix, t, span, substeps, start)[: state.shape[0]]
 
     def _signals(self, state, command, t):
         """What the sensors see of the plant with their analogue filters."""

@@ -13,10 +13,10 @@ from typing import NoReturn
 
 from cyclopts import CycloptsError
 
-from jaxbeam.cli import comparing, identifying, reproducing, simulating, tuning
+from jaxbeam.cli import checking, comparing, identifying, reproducing, simulating, tuning
 from jaxbeam.cli.app import app, say
 
-__all__ = ["comparing", "identifying", "main", "reproducing", "simulating", "tuning"]
+__all__ = ["checking", "comparing", "identifying", "main", "reproducing", "simulating", "tuning"]
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:

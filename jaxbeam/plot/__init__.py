@@ -9,6 +9,7 @@ from jaxbeam.plot.compare import plot_comparison
 from jaxbeam.plot.fit import FitPanel, plot_fit
 from jaxbeam.plot.frequency import plot_frequency
 from jaxbeam.plot.modes import plot_modes
+from jaxbeam.plot.poles import plot_poles
 from jaxbeam.plot.record import plot_record
 from jaxbeam.plot.sweep import plot_sweep
 from jaxbeam.plot.tuning import TuningPanel, plot_tuning
@@ -21,6 +22,7 @@ __all__ = [
     "plot_fit",
     "plot_frequency",
     "plot_modes",
+    "plot_poles",
     "plot_record",
     "plot_sweep",
     "plot_tuning",

@@ -1,0 +1,83 @@
+"""The command that tells whether a closed loop is stable."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxbeam.arguments import check_outputs, picture_path, read_case
+from jaxbeam.cli.app import Json, Overwrite, Settings, app
+from jaxbeam.printing import print_json, print_table, print_written
+
+
+@app.command
+def stability(
+    case: Path,
+    /,
+    *,
+    set_: Settings = (),
+    plot: bool = False,
+    overwrite: Overwrite = False,
+    json_: Json = False,
+) -> None:
+    """Tell whether the closed loop is stable: margins, frozen poles, growth over the crossing.
+
+    Parameters
+    ----------
+    case
+        Case file with a controller, TOML.
+    plot
+        Draw the poles along the crossing to CASE_poles.png in this folder.
+    """
+    from jaxbeam.linear_loop import linear_loop
+    from jaxbeam.margins import margins
+    from jaxbeam.stability import frozen_poles, growth
+
+    picture = picture_path(None, case.with_stem(f"{case.stem}_poles")) if plot else None
+    check_outputs(overwrite, picture)
+    described = read_case(case, set_)
+    # Before the first load: loads off the beam leave the loop as it is.
+    alone = linear_loop(described, -1.0)
+    settled = bool(alone.poles().real.max() < 0)
+    each = [margins(alone, i) for i in range(len(described.actuators))] if settled else []
+    poles = frozen_poles(described)
+    grown = growth(described) if described.loads else None
+    if picture:
+        from jaxbeam.plot import plot_poles
+
+        plot_poles(poles, grown, described.title).savefig(picture)
+    worst = int(np.argmax(poles.largest))
+    if json_:
+        print_json(
+            {
+                "stable_without_loads": settled,
+                "margins": [entry._asdict() for entry in each],
+                "largest_real_part": poles.largest[worst],
+                "at_time": poles.times[worst],
+                "largest_growth": None if grown is None else grown.factor.max(),
+            }
+        )
+        return
+    print("without loads the loop is", "stable" if settled else "unstable")
+    print_table(
+        ("actuator", "gain margin", "phase margin (deg)", "delay margin (s)", "distance"),
+        [
+            (
+                i,
+                f"{entry.gain:.4g}",
+                f"{np.degrees(entry.phase):.4g}",
+                f"{entry.delay:.4g}",
+                f"{entry.distance:.4g}",
+            )
+            for i, entry in enumerate(each)
+        ],
+    )
+    if grown is not None:
+        print(
+            f"with the loads frozen where they are worst, at {poles.times[worst]:.4g} s, the"
+            f" largest real part of a pole is {poles.largest[worst]:.4g} 1/s"
+        )
+        print(
+            "over the crossing a deviation grows at most by a factor of"
+            f" {grown.factor.max():.4g}, to {grown.factor[-1]:.3g} at its end"
+        )
+    print_written(picture)
