@@ -12,7 +12,14 @@ from experiments import writeup
 from experiments.verdicts import VERDICTS, Experiment, Judged, Outcome, judge
 from jaxbeam import rigs
 
-MODULES = ("frequencies", "patches", "amplification", "shaker", "feedback")
+MODULES = (
+    "frequencies",
+    "patches",
+    "amplification",
+    "shaker",
+    "feedback",
+    "predictive_control",
+)
 FOLDER = "out/reproduce"
 
 
