@@ -5,7 +5,9 @@ from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.lqr import LQR, AugmentedLQR, FiniteLQR, StepLQR
 from jaxbeam.control.mpc import MPC
 from jaxbeam.control.prescribed import Prescribed
+from jaxbeam.control.recognition import Recognised, Recognition, recognised
 from jaxbeam.control.sampling import SamplingWarning, sampling_limit
+from jaxbeam.control.scheduled import ScheduledLQR
 from jaxbeam.control.state_feedback import StateFeedback
 
 KINDS = {
@@ -14,6 +16,7 @@ KINDS = {
     "lqr": LQR,
     "lqr-augmented": AugmentedLQR,
     "lqr-finite": FiniteLQR,
+    "lqr-scheduled": ScheduledLQR,
     "lqr-step": StepLQR,
     "mpc": MPC,
     "prescribed": Prescribed,
@@ -29,8 +32,12 @@ __all__ = [
     "Feedback",
     "FiniteLQR",
     "Prescribed",
+    "Recognised",
+    "Recognition",
     "SamplingWarning",
+    "ScheduledLQR",
     "StateFeedback",
     "StepLQR",
+    "recognised",
     "sampling_limit",
 ]

@@ -108,7 +108,8 @@ class LQR(AbstractRegulator):
 class Schedule(eqx.Module):
     """Gains over a crossing from `start` to `end` (s), and the gain from then on.
 
-    `known` are the weights of the loads (N), which have columns of their own behind the states.
+    That dies away with a time constant `fade` (s), or does not if that is None. `known` are the
+    weights of the loads (N), which have columns of their own behind the states.
     """
 
     table: GainTable
@@ -116,31 +117,42 @@ class Schedule(eqx.Module):
     known: Float[Array, " load"]
     start: Float[Array, ""]
     end: Float[Array, ""]
+    fade: Float[Array, ""] | None = None
 
     def gain(self, t: Float[Array, ""]) -> Float[Array, "actuator column"]:
         """The gain at a time (s); zero before the first load enters."""
         share = (t - self.start) / (self.end - self.start)
-        gain = jnp.where(t < self.end, self.table(share), self.rest)
+        rest = self.rest
+        if self.fade is not None:
+            rest = rest * jnp.exp(-jnp.maximum(t - self.end, 0.0) / self.fade)
+        gain = jnp.where(t < self.end, self.table(share), rest)
         return jnp.where(t < self.start, 0.0, gain)
 
 
 class AbstractScheduledRegulator(AbstractRegulator):
     """A regulator whose gain changes while loads cross, tabulated over the share of the crossing.
 
-    The crossing lasts from the first entry to the last exit; where the design believes in another
+    The crossing lasts from the first entry to the last exit, and the share is that of its time: the
+    share of the way only while a single load keeps its speed. Where the design believes in another
     speed, its table is stretched. From then on the command is "none", or the last gain is on
-    "hold", or the "time-invariant" regulator takes over. A table has `points` stretches from each
+    "hold", or it fades ("fade", with the time constant `fade_time`), or the "time-invariant"
+    regulator takes over. A table has `points` stretches from each
     entry or exit to the next.
     """
 
     after: str = choice(
-        "gain after the last exit", "none", "hold", "time-invariant", default="none"
+        "gain after the last exit", "none", "hold", "fade", "time-invariant", default="none"
+    )
+    fade_time: Float[Array, ""] | None = number(
+        "s", "time constant with which the last gain fades", POSITIVE, default=None
     )
     points: int = count("stretches of the table from event to event", default=1200)
 
     def fault(self, case):
         if not case.loads:
             return "kind needs loads to be designed for; add one, or take kind 'lqr'"
+        if (self.after == "fade") != (self.fade_time is not None):
+            return "fade_time belongs to after = 'fade'; give both or neither"
         return super().fault(case)
 
     @property
@@ -161,7 +173,7 @@ class AbstractScheduledRegulator(AbstractRegulator):
         shares = jnp.concatenate([self.shares, jnp.ones_like(loads)])
         table = GainTable(table.edges, table.pieces * shares)
         events = crossing(model)
-        return Schedule(table, rest * shares, loads, events[0], events[-1])
+        return Schedule(table, rest * shares, loads, events[0], events[-1], self.fade_time)
 
     def command(self, memory, estimate, measurement, t):
         loads = memory.known
@@ -193,7 +205,7 @@ class FiniteLQR(AbstractScheduledRegulator):
     )
 
     def fault(self, case):
-        return super().fault(case) or _too_coarse(self, case)
+        return super().fault(case) or too_coarse(self, case)
 
     def gains(self, model):
         return optimal(self, model)[0]
@@ -215,7 +227,7 @@ class AugmentedLQR(AbstractScheduledRegulator):
         return True
 
     def fault(self, case):
-        return super().fault(case) or _too_coarse(self, case)
+        return super().fault(case) or too_coarse(self, case)
 
     def gains(self, model):
         return optimal(self, model)[0]
@@ -237,10 +249,14 @@ def optimal(
     return finite_time(plant, edges_between(crossing(model), regulator.points), Q, R, F)
 
 
-def _too_coarse(regulator, case) -> str | None:
-    """Whether the fastest mode turns too far within a stretch, by the formula for pinned ends."""
+def too_coarse(regulator: AbstractScheduledRegulator, case: Any, slowest=None) -> str | None:
+    """Whether the fastest mode turns too far within a stretch, by the formula for pinned ends.
+
+    A sentence, or None. Loads are as fast as in the case, or have the `slowest` speed (m/s).
+    """
     beam = case.beam
-    numbers = (beam.length, beam.rigidity, beam.linear_density, *(x.speed for x in case.loads))
+    speeds = [load.speed for load in case.loads] if slowest is None else [slowest]
+    numbers = (beam.length, beam.rigidity, beam.linear_density, *speeds)
     if not all(value is not None and is_known(value) for value in numbers):
         return None
     length, rigidity, density, *speeds = (float(known(value)) for value in numbers)

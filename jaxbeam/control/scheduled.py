@@ -1,0 +1,139 @@
+"""A family of gain tables over masses and speeds, for loads that are told or recognised."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.control.lqr import FiniteLQR, Schedule, too_coarse
+from jaxbeam.control.recognition import Recogniser, Recognition
+from jaxbeam.dynamics import traffic
+from jaxbeam.fields import INCREASING, choice, is_known, known, number, part
+from jaxbeam.statespace import LoadedBeam
+
+
+class Family(eqx.Module):
+    """Schedules for each mass and speed, and what is known of the load.
+
+    `told` are its mass (kg), speed (m/s) and time of entry (s) if they are given beforehand.
+    """
+
+    schedules: Schedule
+    masses: Float[Array, " mass"]
+    speeds: Float[Array, " speed"]
+    length: Float[Array, ""]
+    told: Float[Array, "3"]
+    recogniser: Recogniser | None
+
+
+class ScheduledLQR(FiniteLQR):
+    """Optimal gains k(m) or k(m, v) over the crossing, section 5.3 of the thesis.
+
+    `FiniteLQR` is designed for each of the `masses` and `speeds` (magnitudes; that of the load, as
+    believed, if left out), at constant speed. Between them commands are "interpolated" linearly, or
+    those of the "nearest" design are given; outside, the mass or speed is clamped to the grid. The
+    tables are stretched to the speed of the load, also outside the grid. With loads "known" their
+    weights are fed forward, as in `AugmentedLQR`.
+
+    Mass, speed and time of entry are those of the load as believed, or found by the `recognition`:
+    then there is no command before the second gate, and the lightest mass is assumed until the
+    mass is told.
+    """
+
+    masses: Float[Array, " mass"] = number(
+        "kg", "masses that are designed for", INCREASING, kw_only=True
+    )
+    speeds: Float[Array, " speed"] | None = number(
+        "m/s", "speeds that are designed for", INCREASING, default=None
+    )
+    between: str = choice("between designs", "interpolated", "nearest", default="interpolated")
+    loads: str = choice("weights of the loads", "ignored", "known", default="ignored")
+    recognition: Recognition | None = part("how mass and speed are found", Recognition)
+
+    @property
+    def memoryless(self) -> bool:
+        return super().memoryless and self.recognition is None
+
+    @property
+    def feeds_loads_forward(self) -> bool:
+        return self.loads == "known"
+
+    def prepare(self, model, designed):
+        load = designed.case.loads[0]
+        speeds = jnp.abs(load.speed)[None] if self.speeds is None else self.speeds
+        single = super().prepare
+
+        def member(mass, speed):
+            return single(model, _crossed_by(designed, mass, speed))
+
+        members = jax.vmap(jax.vmap(member, (None, 0)), (0, None))(self.masses, speeds)
+        heard = None if self.recognition is None else self.recognition.init(model, designed)
+        told = jnp.stack([load.mass, jnp.abs(load.speed), load.entry_time])
+        return Family(members, self.masses, speeds, model.case.beam.length, told, heard)
+
+    def command(self, memory, estimate, measurement, t):
+        mass, speed, entry = memory.told
+        begun = jnp.ones((), bool)
+        if memory.recogniser is not None:
+            heard = memory.recogniser.hear(measurement, t)
+            memory = eqx.tree_at(lambda m: m.recogniser.fit, memory, heard.fit)
+            begun, weighed = heard.told(t)
+            mass = jnp.where(weighed, heard.mass, memory.masses[0])
+            speed, entry = jnp.abs(heard.speed), heard.entry
+        end = entry + memory.length / speed
+
+        def answer(schedule):
+            stretched = dataclasses.replace(schedule, start=entry, end=end)
+            return super(ScheduledLQR, self).command(stretched, estimate, measurement, t)[0]
+
+        answers = jax.vmap(jax.vmap(answer))(memory.schedules)
+        shares = self._shares(memory.masses, mass), self._shares(memory.speeds, speed)
+        command = jnp.einsum("m,v,mva->a", *shares, answers)
+        return jnp.where(begun, command, 0.0), memory
+
+    def _shares(self, grid, value) -> Float[Array, " design"]:
+        """What each design of a grid contributes at a value."""
+        if self.between == "nearest":
+            return jax.nn.one_hot(jnp.argmin(jnp.abs(grid - value)), grid.shape[0], dtype=float)
+        ones = jnp.eye(grid.shape[0])
+        return jax.vmap(lambda one: jnp.interp(value, grid, one))(ones)
+
+    def fault(self, case):
+        if len(case.loads) != 1 or any(
+            getattr(load, name) is None for load in case.loads for name in ("mass", "speed")
+        ):
+            return "kind needs a single load, with a mass and a speed; or take another kind"
+        for name in ("masses", "speeds"):
+            values = getattr(self, name)
+            if values is not None and (values.size == 0 or _not_positive(values)):
+                return f"{name} must list at least one, and positive ones"
+        if self.recognition is not None:
+            if self.period is None:
+                return "period must be given: the recognition of loads remembers"
+            fault = self.recognition.fault(case)
+            if fault is not None:
+                return f"recognition.{fault}"
+        if self.speeds is not None:
+            fault = too_coarse(self, case, self.speeds[0])
+            if fault is not None:
+                return fault
+        return super().fault(case)
+
+
+def _not_positive(values) -> bool:
+    return is_known(values) and bool(np.any(known(values) <= 0))
+
+
+def _crossed_by(model: LoadedBeam, mass, speed) -> LoadedBeam:
+    """The model with another mass, which keeps another speed, in the direction of its load."""
+    load = model.case.loads[0]
+    changed = eqx.tree_at(
+        lambda x: (x.mass, x.speed, x.deceleration),
+        load,
+        (mass, jnp.sign(load.speed) * speed, jnp.zeros(())),
+    )
+    case = eqx.tree_at(lambda c: c.loads, model.case, (changed,))
+    return dataclasses.replace(model, case=case, traffic=traffic(case))
