@@ -25,7 +25,7 @@ jaxbeam.reference  jaxbeam.statespace  jaxbeam.static  jaxbeam.tables
 jaxbeam.estimation
 jaxbeam.control  jaxbeam.extremes
 jaxbeam.casefile  jaxbeam.integrate
-jaxbeam.loop  jaxbeam.record  jaxbeam.rigs
+jaxbeam.export  jaxbeam.loop  jaxbeam.record  jaxbeam.rigs
 jaxbeam.linear_loop  jaxbeam.plan
 jaxbeam.margins  jaxbeam.stability
 jaxbeam.control.reach

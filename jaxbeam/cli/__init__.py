@@ -13,10 +13,19 @@ from typing import NoReturn
 
 from cyclopts import CycloptsError
 
-from jaxbeam.cli import checking, comparing, identifying, reproducing, simulating, tuning
+from jaxbeam.cli import checking, comparing, exporting, identifying, reproducing, simulating, tuning
 from jaxbeam.cli.app import app, say
 
-__all__ = ["checking", "comparing", "identifying", "main", "reproducing", "simulating", "tuning"]
+__all__ = [
+    "checking",
+    "comparing",
+    "exporting",
+    "identifying",
+    "main",
+    "reproducing",
+    "simulating",
+    "tuning",
+]
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -36,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         _keep_compiled()
     try:
         app(arguments, exit_on_error=False, print_error=False)
-    except (ValueError, OSError, RuntimeError, CycloptsError) as error:
+    except (ValueError, OSError, RuntimeError, ImportError, CycloptsError) as error:
         say(" ".join(str(error).split()))
         sys.exit(1)
     sys.exit(0)

@@ -1,0 +1,201 @@
+"""Gains in files: they come back bit for bit, a C program gives the same commands, damage shows."""
+
+import dataclasses
+import importlib.util
+import json
+import shutil
+import subprocess
+import zlib
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.io
+import scipy.signal
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxbeam as jb
+from jaxbeam.cli import main
+from jaxbeam.control import DiscreteLQR, Feedback, FiniteLQR
+from jaxbeam.export import Gains, export_gains, read_gains, write_gains
+from jaxbeam.modes import lay_out
+
+RANDOM = np.random.default_rng(0)
+SIGNALS = (tuple((f"q_{i}", "m kg^0.5") for i in range(4)), (("u_0", "V"), ("u_1", "N")))
+TABLE = Gains(
+    np.sort(np.append(RANDOM.uniform(0, 1, 9), [0.0, 1.0])),
+    1e3 * RANDOM.normal(size=(11, 2, 4)),
+    RANDOM.normal(size=(2, 4)),
+    np.insert(scipy.signal.butter(3, 0.1, output="sos"), 0, 1.0, axis=1),
+    2e-3,
+    0.6,
+    *SIGNALS,
+)
+CONSTANT = dataclasses.replace(
+    TABLE,
+    shares=np.zeros(1),
+    table=TABLE.rest[None],
+    filters=np.zeros((0, 7)),
+    crossing=0.0,
+)
+SHARES = [-0.1, 0.0, 0.37, 0.5, float(TABLE.shares[4]), 0.999, 1.0, 1.7]
+STATES = RANDOM.normal(size=(len(SHARES), 4))
+WEIGHTS = {"state_weight": [1e3, 1e2, 0.1, 0.01, 0.0], "command_weight": [9e-5], "period": 2e-3}
+TDMS = pytest.mark.skipif(importlib.util.find_spec("nptdms") is None, reason="needs npTDMS")
+COMPILER = shutil.which("gcc") or shutil.which("cc")
+
+
+def same(found, expected):
+    for field in dataclasses.fields(Gains):
+        assert_array_equal(getattr(found, field.name), getattr(expected, field.name))
+
+
+@pytest.mark.parametrize("gains", [TABLE, CONSTANT])
+@pytest.mark.parametrize("ending", [".csv", ".mat", pytest.param(".tdms", marks=TDMS)])
+def test_what_is_read_back_runs_identically(gains, ending, tmp_path):
+    path = tmp_path / f"gains{ending}"
+    write_gains(gains, path)
+    back = read_gains(path)
+    same(back, gains)
+    for share, state in zip(SHARES, STATES, strict=True):
+        assert_array_equal(back.command(state, share), gains.command(state, share))
+    with pytest.raises(FileExistsError, match="exists already"):
+        write_gains(gains, path)
+
+
+def test_commands_are_interpolated():
+    """As numpy interpolates; nothing before the entry, the last gain after the exit."""
+    for share, state in zip(SHARES, STATES, strict=True):
+        every = TABLE.table.reshape(11, -1).T
+        gain = np.array([np.interp(share, TABLE.shares, one) for one in every]).reshape(2, 4)
+        gain = np.zeros((2, 4)) if share < 0 else TABLE.rest if share >= 1 else gain
+        assert_allclose(TABLE.command(state, share), -gain @ state, rtol=1e-11, atol=1e-12)
+
+
+def test_other_programs_can_read_them(tmp_path):
+    write_gains(TABLE, tmp_path / "gains.mat")
+    content = scipy.io.loadmat(tmp_path / "gains.mat")
+    assert_array_equal(content["table"], TABLE.table)
+    assert content["period"].item() == 2e-3
+    write_gains(TABLE, tmp_path / "gains.csv")
+    first, heading, *rows = (tmp_path / "gains.csv").read_text().splitlines()
+    about = json.loads(first[2:])
+    assert about["period_s"] == 2e-3 and about["columns"][0] == ["q_0", "m kg^0.5"]
+    assert heading.split(",")[2] == "K u_0/q_0 [V/(m kg^0.5)]"
+    numbers = [float(x) for row in rows if row.startswith("gain") for x in row.split(",")[1:]]
+    shares, table = np.array(numbers).reshape(11, 9)[:, 0], np.array(numbers).reshape(11, 9)[:, 1:]
+    parts = [[2e-3, 0.6], shares, table, TABLE.rest, TABLE.filters]
+    whole = np.concatenate([np.ravel(part) for part in parts]).astype("<f8").tobytes()
+    assert about["crc32"] == zlib.crc32(whole)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".mat"])
+def test_damage_is_noticed(ending, tmp_path):
+    path = tmp_path / f"gains{ending}"
+    write_gains(TABLE, path)
+    number = TABLE.table[3, 1, 2]
+    if ending == ".csv":
+        path.write_text(path.read_text().replace(repr(float(number)), repr(float(number) + 1e-9)))
+    else:
+        content = scipy.io.loadmat(path)
+        content["table"][3, 1, 2] += 1e-9
+        scipy.io.savemat(path, {k: v for k, v in content.items() if not k.startswith("__")})
+    with pytest.raises(ValueError, match="do not give the check values"):
+        read_gains(path)
+
+
+@pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
+@pytest.mark.parametrize("gains", [TABLE, CONSTANT])
+def test_a_c_program_gives_the_same_commands(gains, tmp_path):
+    write_gains(gains, tmp_path / "gains.h")
+    calls = "".join(
+        f"{{ double z[] = {{{', '.join(map(repr, state.tolist()))}}};\n"
+        f'jaxbeam_command({share!r}, z, u); printf("%a %a\\n", u[0], u[1]); }}\n'
+        for share, state in zip(SHARES, STATES, strict=True)
+    )
+    (tmp_path / "run.c").write_text(
+        '#include <stdio.h>\n#include "gains.h"\n'
+        f"int main(void) {{ double u[JAXBEAM_ACTUATORS];\n{calls}"
+        'printf("%a %a\\n", jaxbeam_test_command[0], jaxbeam_test_command[1]); return 0; }\n'
+    )
+    build = [COMPILER, "-std=c99", "-O2", "-ffp-contract=off", "-o", "run", "run.c"]
+    subprocess.run(build, cwd=tmp_path, check=True)
+    printed = subprocess.run(
+        [tmp_path / "run"], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    found = [[float.fromhex(word) for word in line.split()] for line in printed]
+    expected = [gains.command(z, share) for share, z in zip(SHARES, STATES, strict=True)]
+    assert_array_equal(found, [*expected, gains.test_command])
+
+
+def rig(controller):
+    return jb.Case(
+        jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
+        actuators=[jb.Shaker(0.25, 2000.0, 5.0)],
+        sensors=[jb.Sensor(0.2), jb.Sensor(0.45, filter=jb.Filter(60.0, 3))],
+        loads=[jb.MovingMass(mass=0.4, speed=1.0)],
+        controller=controller,
+    )
+
+
+@pytest.fixture(scope="module")
+def sampled():
+    case = rig(DiscreteLQR(**WEIGHTS, delay=1e-3))
+    return case, export_gains(case)
+
+
+def test_the_command_line_writes_what_was_designed(sampled, tmp_path, capsys):
+    case, gains = sampled
+    jb.save_case(case, tmp_path / "case.toml")
+    path = tmp_path / "gains.csv"
+    with pytest.raises(SystemExit) as ended:
+        main(["export", str(tmp_path / "case.toml"), "-o", str(path), "--json"])
+    assert ended.value.code == 0
+    assert json.loads(capsys.readouterr().out)["crc32"] == gains.checksum
+    same(read_gains(path), gains)
+    assert gains.columns[-1] == ("last_command_0", "V") and gains.commands == (("command_0", "V"),)
+    assert_array_equal(gains.filters[:, 0], [1.0, 1.0])
+    b, a = scipy.signal.butter(3, 60.0, fs=500.0)
+    _, expected = scipy.signal.freqz(b, a, [10.0, 60.0], fs=500.0)
+    _, found = scipy.signal.freqz_sos(gains.filters[:, 1:], [10.0, 60.0], fs=500.0)
+    assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_tables_are_those_of_the_design():
+    case = rig(FiniteLQR(**WEIGHTS, points=210, after="hold"))
+    gains, layout = export_gains(case, 51), lay_out(case)
+
+    @eqx.filter_jit
+    def designed(case):
+        table = case.controller.gains(jb.state_space(case, layout=layout))
+        return jnp.stack([table(jnp.asarray(share)) for share in (0.0, 0.5, 0.98, 1.0)])
+
+    found = gains.table[[0, 25, 49, 50]]
+    assert_allclose(found, designed(case), rtol=1e-9, atol=1e-9 * np.max(np.abs(found)))
+    assert gains.crossing == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize(
+    ("controller", "message"),
+    [
+        (Feedback([1.0], period=1e-3), "controller.kind cannot be exported"),
+        (jb.StateFeedback([[0.0] * 5]), "controller.period is missing"),
+        (FiniteLQR(**WEIGHTS, after="fade", fade_time=0.1), "controller.after cannot be 'fade'"),
+    ],
+)
+def test_what_cannot_be_exported(controller, message):
+    case = dataclasses.replace(rig(controller), sensors=(jb.Sensor(0.2),))
+    with pytest.raises(ValueError, match=message):
+        export_gains(case)
+
+
+def test_unknown_endings_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"gains are written to .csv, .mat, .tdms, .h"):
+        write_gains(TABLE, tmp_path / "gains.txt")
+    with pytest.raises(ValueError, match=r"gains are read from .csv, .mat, .tdms"):
+        read_gains(tmp_path / "gains.h")
+    (tmp_path / "other.csv").write_text("time [s]\n1.0\n")
+    with pytest.raises(ValueError, match="this is no file of gains"):
+        read_gains(tmp_path / "other.csv")
