@@ -278,7 +278,7 @@ def _from_tdms(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _nptdms():
     try:
-        import nptdms
+        import nptdms  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ImportError(
             "npTDMS is not installed; install jaxbeam with the extra 'tdms':"

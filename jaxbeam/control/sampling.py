@@ -87,7 +87,8 @@ def _kept(pole: complex, push: np.ndarray, period: float, horizon: float) -> flo
 
 def _oscillations(plant: StateSpace) -> tuple[np.ndarray, np.ndarray]:
     """Oscillating poles (1/s, those with positive imaginary part) and their left eigenvectors."""
-    poles, ways = scipy.linalg.eig(known(plant.A), left=True, right=False)
+    found = scipy.linalg.eig(known(plant.A), left=True, right=False)
+    poles, ways = found[0], found[1]
     chosen = np.flatnonzero(poles.imag > 1e-6 * np.abs(poles))
     chosen = chosen[np.argsort(poles[chosen].imag)]
     return poles[chosen], ways[:, chosen].conj().T
