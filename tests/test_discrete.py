@@ -249,6 +249,7 @@ def test_faults_are_named(options, message):
         check(rig(DiscreteLQR(**WEIGHTS, **options)))
 
 
+@pytest.mark.slow
 def test_in_the_loop_it_is_what_was_designed(model):
     """The poles of the loop from tick to tick are those of the problem of its design, closed."""
     law = DiscreteLQR(**WEIGHTS, period=2e-3, delay=5e-4, input_rate_weight=[1e-8])
