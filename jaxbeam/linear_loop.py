@@ -29,6 +29,7 @@ from jaxbeam.sensing import design, init, read
 from jaxbeam.statespace import LoadedBeam, loaded_beam
 
 SETTLING = 8  # steps of Newton's method towards the state about which a law is made linear
+NEAR = 1e-10  # to an eigenvalue, relative: where inverse iteration is centred
 ROUNDING = 1e-9  # of a period: shorter differences are none
 
 
@@ -50,6 +51,23 @@ class LinearLoop(eqx.Module):
     def closed(self) -> Float[Array, "state state"]:
         """The state matrix of the closed loop."""
         return self.A + self.B @ self.K
+
+    def rate(self) -> Float[Array, ""]:
+        """The largest real part of the poles in 1/s; differentiable to first order, on a CPU.
+
+        Other poles may coincide, as those of a delay do; the rightmost must be a simple one.
+        """
+        fixed = jax.lax.stop_gradient(self.closed)
+        values, vectors = jnp.linalg.eig(fixed)
+        first = jnp.argmax(values.real if self.period is None else jnp.abs(values))
+        value, right = values[first], vectors[:, first]
+        # The left eigenvector by inverse iteration: those of other poles may not exist.
+        shifted = fixed.T - value * (1 + NEAR) * jnp.eye(fixed.shape[0])
+        left = jnp.ones_like(right)
+        for _ in range(2):
+            left = jnp.linalg.solve(shifted, left / jnp.linalg.norm(left))
+        value = value + left @ ((self.closed - fixed) @ right) / (left @ right)
+        return value.real if self.period is None else jnp.log(jnp.abs(value)) / self.period
 
     def poles(self) -> np.ndarray:
         """Poles of the closed loop in 1/s, by largest real part first.
@@ -349,4 +367,5 @@ def _rest(change, start):
         return state + step, None
 
     found = jax.lax.scan(closer, start, length=SETTLING)[0]
-    return jnp.where(jnp.all(jnp.isfinite(found)), found, start)
+    # Where it lies moves the poles of a law that is not linear; derivatives pass over that.
+    return jax.lax.stop_gradient(jnp.where(jnp.all(jnp.isfinite(found)), found, start))

@@ -97,6 +97,23 @@ def test_frozen_poles_of_the_published_regulator():
     assert found.largest[2] == pytest.approx(found.poles[2].real.max())
 
 
+def test_pole_of_the_published_filtered_loop():
+    # `frozen_eig` of the reference numbers: 0.509 kg parked in the middle, filter of 10 Hz.
+    beam = jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.03, modes=5)
+    patch = jb.Patch(start=0.2575, end=0.3425, moment_per_volt=0.000265358032154821)
+    filter = jb.Filter(cutoff=10.0, order=10, realisation="analogue")
+    case = jb.Case(
+        beam, actuators=[patch], sensors=[jb.Sensor(0.3, filter=filter)],
+        loads=[jb.MovingMass(mass=0.509, times=[0.0, 1.0], positions=[0.3, 0.3])],
+        controller=jb.Feedback([2000.0 * 200.0]),
+    )  # fmt: skip
+    loop = linear_loop(case, 0.5)
+    rightmost = loop.poles()[0]
+    assert rightmost.real == pytest.approx(0.6891684603605122, rel=1e-6)
+    assert abs(rightmost.imag) == pytest.approx(62.83126204745206, rel=1e-8)
+    assert loop.rate() == pytest.approx(rightmost.real, rel=1e-9)
+
+
 def test_branches_are_followed_through_a_crossing():
     t = np.linspace(-1, 1, 21)
     up, down = -1 + 0.5 * t + 3j, -1 - 0.4 * t + 3j + 0.05j

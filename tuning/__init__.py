@@ -6,6 +6,7 @@ from tuning.logs import Log, read_log
 from tuning.modal import ModalFit, identify_modes
 from tuning.objective import Objective
 from tuning.proof import Tuned
+from tuning.stable import Stable
 from tuning.tune import tune
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "Log",
     "ModalFit",
     "Objective",
+    "Stable",
     "Tuned",
     "grid",
     "identify",

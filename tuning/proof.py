@@ -40,7 +40,8 @@ class Tuned:
     """Result of a tuning: the tuned case, and what it does to training and held-out runs.
 
     `history` holds the true objective by step and start, NaN where the loop diverged, which
-    happened `rejected` times.
+    happened `rejected` times. `violation` (1/s) is by how much a pole lies too far right for the
+    constraint on stability, zero if it is met or was not asked for.
     """
 
     case: Case
@@ -50,6 +51,7 @@ class Tuned:
     history: Float[np.ndarray, "step start"]
     rejected: int
     outcomes: list[Outcome]
+    violation: float = 0.0
 
     @property
     def verdict(self) -> str:
@@ -70,6 +72,10 @@ class Tuned:
             words += (
                 f"; of the attainable reduction at least {shares.min():.1%},"
                 f" {shares.mean():.1%} in the mean"
+            )
+        if self.violation > 0:
+            words += (
+                f"; not as stable as asked for: a pole lies {self.violation:.3g} 1/s too far right"
             )
         if judged.name == "training":
             words += "; nothing was held out, so this proves nothing for other loads"
@@ -115,6 +121,7 @@ class Tuned:
                 for outcome in self.outcomes
             },
             "rejected_steps": self.rejected,
+            "stability_violation": self.violation,
             "verdict": self.verdict,
         }
 

@@ -23,6 +23,7 @@ from tuning.free import Free, free_numbers
 from tuning.load_cases import LoadCases
 from tuning.objective import Objective
 from tuning.proof import Outcome, Tuned
+from tuning.stable import STEEP, Stable
 
 RATE = 0.1  # first step of the search variables, each of which is of order one
 SHARPNESS = (30.0, 1000.0)  # of smooth maxima, at the first step and the last
@@ -36,6 +37,7 @@ def tune(
     cases: LoadCases,
     objective: Objective | None = None,
     *,
+    stable: Stable | None = None,
     places: Sequence[float] | None = None,
     steps: int = 80,
     starts: int = 1,
@@ -53,7 +55,9 @@ def tune(
     maxima are smooth at first and ever sharper, for a number of `steps`, from the case's own
     numbers and from `starts` - 1 random ones at once. What is kept is the best that was met by the
     true objective, the start included. `places` (m) are where deflections count, the sensors' if
-    left out. With `bounds` every run is also held against the least peak that is possible.
+    left out. `stable` asks for a loop that stays stable along the crossings, with room to spare
+    (what violates it is kept only where nothing met satisfies it, and the result says so). With
+    `bounds` every run is also held against the least peak that is possible.
 
     With a `checkpoint` file the search can be stopped at any time, and taken up with `resume`: the
     result is the same. A step to where a loop diverges is taken back, and later ones are shorter.
@@ -71,6 +75,7 @@ def tune(
             "free": {n.address: [n.low, n.high] for n in numbers},
             "cases": dataclasses.asdict(cases),
             "objective": dataclasses.asdict(objective),
+            "stable": None if stable is None else dataclasses.asdict(stable),
             "settings": [places, steps, starts, seed],
         }
     )
@@ -78,7 +83,8 @@ def tune(
     if file is not None and file.exists() and not resume:
         raise FileExistsError(f"{file} exists; resume the search, or name another file")
     bench = make_bench(case, cases.training, places)
-    search = _Search(bench, numbers, objective, steps)
+    violation = None if stable is None else stable.violation(bench.cases)
+    search = _Search(bench, numbers, objective, violation, steps)
     state = search.first(starts, seed)
     if not np.isfinite(state.best_value[0]):
         raise ValueError("the loop diverges as it is: start from a controller that does not")
@@ -112,6 +118,7 @@ def tune(
         history=state.history,
         rejected=int(state.rejected.sum()),
         outcomes=outcomes,
+        violation=0.0 if violation is None else float(jax.jit(violation)(after)),
     )
 
 
@@ -138,16 +145,21 @@ class _State:
 class _Search:
     """Steps of a search, compiled once for all starts."""
 
-    def __init__(self, bench: Bench, numbers: list[Free], objective: Objective, steps: int):
+    def __init__(
+        self, bench: Bench, numbers: list[Free], objective: Objective, violation, steps: int
+    ):
         self.numbers, self.steps = numbers, steps
         self.own = np.array([number.inward(number.start) for number in numbers])
         self.adam = optax.adam(optax.cosine_decay_schedule(RATE, steps, alpha=0.05))
 
         def smooth_and_true(point, sharpness):
             pairs = zip(numbers, point, strict=True)
-            found = bench.histories({n.address: n.outward(y) for n, y in pairs})
+            values = {n.address: n.outward(y) for n, y in pairs}
+            found = bench.histories(values)
+            # So steep that what violates it is never the best, unless everything does.
+            price = 0.0 if violation is None else STEEP * violation(values)
             smooth, true = (
-                objective.of_runs(objective.of_run(bench.judge(found, sharp)), sharp)
+                objective.of_runs(objective.of_run(bench.judge(found, sharp)), sharp) + price
                 for sharp in (sharpness, None)
             )
             return smooth, true

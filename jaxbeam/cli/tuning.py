@@ -5,7 +5,14 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.arguments import bounds_of, check_outputs, check_suffix, picture_path, read_case
+from jaxbeam.arguments import (
+    bounds_of,
+    check_outputs,
+    check_suffix,
+    picture_path,
+    read_case,
+    refuse,
+)
 from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
 from jaxbeam.printing import print_json, print_written
 
@@ -19,6 +26,9 @@ def tune(
     cases: Path,
     objective: tuple[str, ...] = (),
     over: str = "worst",
+    stable: float | None = None,
+    reserve: float = 0.0,
+    spread: tuple[str, ...] = (),
     steps: int = 80,
     starts: int = 1,
     seed: int = 0,
@@ -44,6 +54,13 @@ def tune(
         MERIT=WEIGHT: peak, rms, after_exit, effort or contact; the peak alone if left out.
     over
         How runs are taken together: worst, mean, or cvar (the mean of the worst quarter).
+    stable
+        Largest real part (1/s) that a pole may have with loads frozen along the crossings.
+    reserve
+        With --stable: delay (s) more than the controller's that must not bring it down.
+    spread
+        With --stable: ADDRESS=SHARE by which a number may be off, such as
+        beam.flexural_rigidity=0.1; repeat it for more.
     steps
         Steps of the search.
     starts
@@ -63,6 +80,9 @@ def tune(
     from jaxbeam.casefile import save_case
 
     weights = dict(_weight(text) for text in objective)
+    shares = dict(_weight(text) for text in spread)
+    refuse(stable is None and bool(reserve or shares), "--reserve and --spread need --stable")
+    limits = None if stable is None else tuning.Stable(stable, reserve, shares)
     picture = picture_path(output, case.with_suffix(".tuned")) if plot else None
     check_suffix(output, ".toml", "a tuned case")
     check_outputs(overwrite, output, picture)
@@ -74,6 +94,7 @@ def tune(
         dict(bounds_of(text) for text in free),
         tuning.read_load_cases(cases),
         tuning.Objective(weights or {"peak": 1.0}, over),
+        stable=limits,
         steps=steps,
         starts=starts,
         seed=seed,
@@ -96,9 +117,9 @@ def tune(
 
 
 def _weight(text: str) -> tuple[str, float]:
-    """The merit and the weight of MERIT=WEIGHT. Raises ValueError if the weight is no number."""
+    """The two sides of NAME=NUMBER. Raises ValueError if the number is none."""
     merit, _, weight = text.partition("=")
     try:
         return merit, float(weight)
     except ValueError:
-        raise ValueError(f"--objective takes MERIT=WEIGHT, such as peak=1, not {text!r}") from None
+        raise ValueError(f"a name and a number are needed, such as peak=1, not {text!r}") from None

@@ -1,5 +1,6 @@
 """Tuning against searches without gradients, and what becomes of it when it is stopped."""
 
+import dataclasses
 import importlib
 
 import jax
@@ -10,6 +11,7 @@ import scipy.optimize
 
 import jaxbeam as jb
 import tuning
+from jaxbeam.stability import frozen_poles
 from tests.differences import central
 from tuning.bench import make_bench
 from tuning.checkpoint import load, save
@@ -167,7 +169,34 @@ def test_the_start_is_kept_where_nothing_better_is_met():
 
 
 PLAIN = jb.Case(rig().beam, loads=rig().loads, sensors=rig().sensors)
+
+
+def test_a_loop_that_is_to_stay_stable():
+    # A light load: heavy ones have frozen poles to the right on the far half even without control.
+    light = {"loads.0.mass": 0.05}
+    cases, free = tuning.LoadCases((light,)), {GAIN: (50.0, 40000.0)}
+    stable = tuning.Stable(largest=-0.5, delay=0.005, spread={"beam.flexural_rigidity": 0.1})
+    found = tuning.tune(
+        rig(100.0), free, cases, stable=stable, steps=20, bounds=False, progress=False
+    )
+    assert found.violation == 0.0 and found.values[0] > 100.0
+    # Held against eigenvalues, with the delay and each change in the case itself.
+    late = jb.Feedback(found.case.controller.gains, period=0.01, delay=0.005)
+    for factor in (0.9, 1.0, 1.1):
+        case = dataclasses.replace(apply(found.case, light), controller=late)
+        case = jb.replace(case, {"beam.flexural_rigidity": 13.211 * factor})
+        assert frozen_poles(case, np.linspace(0.0, 0.4, 30)).largest.max() <= -0.5 + 0.1
+
+
+def test_slope_of_the_violation():
+    violation = jax.jit(tuning.Stable(largest=-50.0, places=2).violation([apply(rig(), RUNS[0])]))
+    slope = jax.grad(lambda gain: violation({GAIN: gain}))(3000.0)
+    expected = central(lambda point: violation({GAIN: point[0]}), [3000.0], step=3.0)[0]
+    assert slope == pytest.approx(expected, rel=1e-4)
+
+
 BAD = [
+    ({"stable": tuning.Stable(spread={"beam.stiffness": 0.1})}, "no number at address"),
     ({"free": {}}, "name at least one address as free"),
     ({"free": {"controller.gain": None}}, "did you mean 'controller.gains"),
     ({"free": {GAIN: (5000.0, 9000.0)}}, f"{GAIN} starts at 2000, outside its bounds"),

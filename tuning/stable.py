@@ -1,0 +1,87 @@
+"""A constraint on tuning: the loop is to stay stable while loads cross, with room to spare."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.case import Case, known_case, replace, value_at
+from jaxbeam.linear_loop import linear, open_loop, prepared
+from jaxbeam.loads import motion
+from jaxbeam.modes import lay_out
+
+STEEP = 1.0  # of the objective, for each 1/s of too large a real part
+
+
+@dataclasses.dataclass(frozen=True)
+class Stable:
+    """Frozen poles of all training runs are to have real parts of at most `largest` (1/s).
+
+    They are looked at without loads and at `places` instants along each crossing; also with each
+    of the numbers in `spread` changed by its share up and down, and, for a controller that
+    samples, with a `delay` (s) on top of its own.
+    """
+
+    largest: float = 0.0
+    delay: float = 0.0
+    spread: dict[str, float] = dataclasses.field(default_factory=dict)
+    places: int = 7
+
+    def __post_init__(self):
+        if self.delay < 0 or self.places < 1 or any(not 0 < s < 1 for s in self.spread.values()):
+            raise ValueError(
+                "stable takes a delay that is not negative, at least one place, and spreads"
+                " between 0 and 1"
+            )
+
+    def violation(self, cases: list[Case]):
+        """Function of values by address: by how much (1/s) the worst pole is too far right.
+
+        Raises ValueError as `linear_loop` does, and for a delay without a sampling period.
+        """
+        clock = prepared(cases[0])
+        if clock is None and self.delay:
+            raise ValueError("stable.delay needs a controller that samples: give it a period")
+        clocks = [clock]
+        if self.delay:
+            clocks.append(clock._replace(delay=clock.delay + self.delay))
+        layout = lay_out(known_case(cases[0]))
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
+        instants = jnp.asarray(np.array([self._instants(case) for case in cases]))
+        # One row as it is, and two for each number in the spread.
+        shares = np.diag(list(self.spread.values()))
+        factors = 1 + np.concatenate([np.zeros((1, len(shares))), shares, -shares])
+
+        def violation(values: Mapping[str, Any]) -> Float[Array, ""]:
+            def varied(case, times, factor):
+                pairs = zip(self.spread, factor, strict=True)
+                loop = open_loop(
+                    replace(case, {a: f * value_at(case, a) for a, f in pairs}), layout
+                )
+                return jnp.stack(
+                    [
+                        jax.vmap(lambda t, own=own: linear(loop, own, t).rate())(times)
+                        for own in clocks
+                    ]
+                )
+
+            def single(run):
+                case, times = run
+                case = replace(case, values)
+                return jax.lax.map(lambda factor: varied(case, times, factor), jnp.asarray(factors))
+
+            worst = jnp.max(jax.lax.map(single, (stacked, instants)))
+            return jnp.maximum(worst - self.largest, 0.0)
+
+        return violation
+
+    def _instants(self, case: Case) -> Float[np.ndarray, " time"]:
+        """Before the first load, and evenly along the crossing of the first."""
+        entry, leave = (float(t) for t in motion(case.loads[0], case.beam.length).window())
+        leave = min(leave, float(case.run.duration))
+        shares = (np.arange(self.places) + 0.5) / self.places
+        return np.append(entry - 1.0, entry + (leave - entry) * shares)
