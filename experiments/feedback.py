@@ -28,7 +28,8 @@ def controlled(case: jb.Case, power: int, cutoff: float) -> jb.Case:
         return case
     filtered = jb.Filter(cutoff, order=10, realisation="analogue")
     sensors = tuple(dataclasses.replace(sensor, filter=filtered) for sensor in case.sensors)
-    law = jb.Feedback([GAIN * 1e3**power] * len(case.actuators), power=power, period=PERIOD)
+    gains = [GAIN * 1e3**power] * len(case.actuators)
+    law = jb.Feedback(gains=gains, power=power, period=PERIOD)
     return dataclasses.replace(case, sensors=sensors, controller=law)
 
 

@@ -43,8 +43,8 @@ REFITTED = "full model, 12000 N/m and 80 N s/m with its back-EMF"
 class Prepared(AbstractController):
     """A law whose memory was made beforehand, for another plant than it is used on."""
 
-    law: AbstractController
-    memory: Any
+    law: AbstractController = eqx.field(kw_only=True)
+    memory: Any = eqx.field(kw_only=True)
 
     @property
     def memoryless(self):
@@ -148,7 +148,7 @@ class _Runs:
             _, effort, _, own = READINGS.get(name, READINGS["as printed"])
             law_here = law(kind, effort, own if shares is None else shares)
             memory = _designed(law_here, design, self.layout)
-            plant = dataclasses.replace(plant, controller=Prepared(law_here, memory))
+            plant = dataclasses.replace(plant, controller=Prepared(law=law_here, memory=memory))
         key = kind, type(actuator)
         if key not in self.plans:
             self.plans[key] = make_plan(plant, None, TOLERANCE)

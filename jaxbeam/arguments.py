@@ -28,9 +28,7 @@ def read_controllers(
     found = {} if case.controller is None else {path.stem: case.controller}
     for file in files:
         if file.stem in found:
-            raise ValueError(
-                f"two controllers are called {file.stem}; rename a file"
-            )
+            raise ValueError(f"two controllers are called {file.stem}; rename a file")
         found[file.stem] = load_controller(file)
     if not found:
         raise ValueError(f"{path} has no controller; name some with --controllers FILE ...")

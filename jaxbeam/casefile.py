@@ -58,7 +58,9 @@ def load_controller(path: str | os.PathLike) -> AbstractController:
         if "controller" not in content:
             raise ValueError("has no controller; write a table [controller]")
         if set(content) - {"title", "controller"}:
-            return case_from_dict(content).controller
+            found = case_from_dict(content).controller
+            assert found is not None  # the table is there
+            return found
         if not isinstance(content["controller"], dict):
             raise ValueError("controller must be one table; write [controller]")
         return read_part("controller", content["controller"], control.KINDS)

@@ -180,13 +180,12 @@ def limit(
     """
     if not 0 < low < high:
         raise ValueError(f"low and high must be positive and ascend; they are {low:g}, {high:g}")
-    if measure is None:
-
-        def measure(case):
-            return float(frozen_poles(case).largest.max())
 
     def at(value):
-        return measure(replace(case, {address: float(value)}))
+        changed = replace(case, {address: float(value)})
+        if measure is None:
+            return float(frozen_poles(changed).largest.max())
+        return measure(changed)
 
     values = np.geomspace(low, high, points)
     before = at(values[0])

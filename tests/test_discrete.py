@@ -182,7 +182,7 @@ def test_control_is_lost_at_the_limit():
         whole = scipy.linalg.solve_continuous_lyapunov(A, -B @ B.T)
         held = scipy.linalg.solve_discrete_lyapunov(drift, push @ push.T) / period
         # The coordinates of the mode itself, without what its lag adds.
-        values, rows = scipy.linalg.eig(A, left=True, right=False)
+        values, rows, *_ = scipy.linalg.eig(A, left=True, right=False)
         row = rows[:, np.argmax(values.imag)].conj()
         rows = np.stack([row.real, row.imag])
         return scipy.linalg.eigvalsh(rows @ held @ rows.T, rows @ whole @ rows.T)[0]
@@ -198,7 +198,7 @@ def test_control_is_lost_at_the_limit():
     assert shares[2] < 0.5 and shares[4] < 0.5
 
     sampled = plant.discretize(limit)
-    values, rows = scipy.linalg.eig(plant.A, left=True, right=False)
+    values, rows, *_ = scipy.linalg.eig(plant.A, left=True, right=False)
     row = rows[:, np.argmax(values.imag)].conj()
     turned = np.stack([row, row.conj()]) @ np.hstack([sampled.B, sampled.A @ sampled.B])
     sizes = np.linalg.svd(turned)[1]

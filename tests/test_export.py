@@ -156,8 +156,8 @@ def test_the_command_line_writes_what_was_designed(sampled, tmp_path, capsys):
     same(read_gains(path), gains)
     assert gains.columns[-1] == ("last_command_0", "V") and gains.commands == (("command_0", "V"),)
     assert_array_equal(gains.filters[:, 0], [1.0, 1.0])
-    b, a = scipy.signal.butter(3, 60.0, fs=500.0)
-    _, expected = scipy.signal.freqz(b, a, [10.0, 60.0], fs=500.0)
+    taps = scipy.signal.butter(3, 60.0, fs=500.0, output="sos")
+    _, expected = scipy.signal.freqz_sos(taps, [10.0, 60.0], fs=500.0)
     _, found = scipy.signal.freqz_sos(gains.filters[:, 1:], [10.0, 60.0], fs=500.0)
     assert_allclose(found, expected, rtol=1e-9)
 

@@ -43,7 +43,7 @@ class Objective:
 
     def of_run(self, merits: dict[str, Float[Array, "..."]]) -> Float[Array, "..."]:
         """The weighted sum for runs whose merits are known."""
-        return sum(weight * merits[name] for name, weight in self.weights.items())
+        return sum((w * merits[name] for name, w in self.weights.items()), jnp.zeros(()))
 
     def of_runs(
         self, values: Float[Array, " run"], sharpness: Sharpness = None

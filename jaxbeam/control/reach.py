@@ -138,7 +138,9 @@ def _answers(case: Case, form: Form, schedule: Schedule, substeps: int, hold, wh
         jnp.where(hold == -1, jnp.broadcast_to(own.weight, size), 0.0),
     )
     endless = jnp.full(assembled.states, jnp.inf)
-    driver = _Units(schedule, hold, which, endless, actuators=len(case.actuators))
+    driver = _Units(
+        schedule=schedule, hold=hold, which=which, bound=endless, actuators=len(case.actuators)
+    )
     grid = scheduled_grid(case, assembled, schedule, substeps)
     steps = grid.counts.shape[0] * substeps
     _, states, _, _ = trace(

@@ -82,7 +82,7 @@ def name_loads(axes, record: Record) -> None:
     """Write at its entry what a load is; several are numbered."""
     loads = record.case.loads
     for i, entry, _ in load_windows(record):
-        label = f"load {i}" if len(loads) > 1 else _described(loads[0])
+        label = f"load {i}" if len(loads) > 1 else _described(loads[i])
         axes.annotate(
             label,
             (entry, 1.0),
