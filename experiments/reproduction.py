@@ -17,6 +17,7 @@ MODULES = (
     "patches",
     "amplification",
     "shaker",
+    "optimal_control",
     "feedback",
     "predictive_control",
 )
