@@ -16,6 +16,7 @@ import jaxbeam as jb
 from experiments import published
 from experiments.shaker import data_physics_v4
 from experiments.verdicts import Experiment, Outcome, finding
+from jaxbeam.compiling import compiled
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.controller import AbstractController
 from jaxbeam.modes import lay_out
@@ -158,7 +159,7 @@ class _Runs:
         return float(record.peak_deflection[SENSOR])
 
 
-@eqx.filter_jit
+@compiled
 def _designed(law: AbstractController, case: jb.Case, layout):
     """The memory of a law for a case."""
     return law.init(jb.state_space(case, layout=layout))

@@ -1,11 +1,11 @@
 """Envelopes of the deflection along the beam, and how far they exceed static loading."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
 from jaxbeam.checks import check
+from jaxbeam.compiling import compiled
 from jaxbeam.plan import TOLERANCE, form, run_extremes, suitable_step
 from jaxbeam.static import static_peak
 
@@ -22,7 +22,7 @@ def envelope(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, " plac
     return _peaks(case, shape, jnp.asarray(step), jnp.asarray(x, float))
 
 
-@eqx.filter_jit
+@compiled
 def _peaks(case, shape, step, x):
     return run_extremes(case, shape, step, x).peak()[0][:, 0]
 

@@ -5,13 +5,13 @@ import re
 import threading
 from contextlib import nullcontext
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case import Case, replace, value_at
+from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.exponentials import NODES
 from jaxbeam.grid import even_grid, scheduled_grid
@@ -158,7 +158,7 @@ def _varied(case, addresses, values):
     return replace(case, dict(zip(addresses, values, strict=True)))
 
 
-@eqx.filter_jit
+@compiled
 def _rigs(case, form, addresses, heavy):
     """Rigs of some tasks, and the longest step (s) each allows."""
 
@@ -169,7 +169,7 @@ def _rigs(case, form, addresses, heavy):
     return jax.vmap(task)(heavy)
 
 
-@eqx.filter_jit
+@compiled
 def _windows(case, addresses, heavy):
     """Times of entry and exit (task, load, 2) of the loads."""
 
@@ -181,7 +181,7 @@ def _windows(case, addresses, heavy):
     return jax.vmap(task)(heavy)
 
 
-@eqx.filter_jit
+@compiled
 def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longest):
     """Results of some tasks, one after the other, their lanes side by side."""
     heavy_addresses, light_addresses = addresses

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
+from jaxbeam.compiling import compiled
 from jaxbeam.control.bound import HELD, Bound, bound
 from jaxbeam.controller import AbstractController, Measurement
 from jaxbeam.loads import motion
@@ -130,7 +131,7 @@ def step_time(record: Record) -> float:
     return float(np.median(durations[1:])) / few[0].shape[0]
 
 
-@eqx.filter_jit
+@compiled
 def _steps(
     controller: AbstractController, memory, readings, states, commands, times
 ) -> Float[Array, "time actuator"]:

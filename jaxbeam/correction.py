@@ -6,11 +6,11 @@ that of the modes which were kept. The deflection hardly needs it; curvature and
 derivative, from which section forces follow, do.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
+from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.record import Record
 from jaxbeam.rig import rig
@@ -30,7 +30,7 @@ def residual_lift(
     return exact - _modal_lift(case, layout, jnp.asarray(x, float), derivative)
 
 
-@eqx.filter_jit
+@compiled
 def _modal_lift(case: Case, layout: Layout, x, order: int):
     model = rig(case, layout)
     steady = jnp.array([a.attachment().steady for a in case.actuators]).reshape(-1)
@@ -51,7 +51,7 @@ def residual_line(
     return exact - _modal_line(case, layout, x, positions, derivative)
 
 
-@eqx.filter_jit
+@compiled
 def _modal_line(case: Case, layout: Layout, x, positions, order: int):
     model = rig(case, layout)
     pressed = model.shapes(positions.reshape(-1), (0,))[0]

@@ -13,13 +13,13 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 import scipy.io
 
 from jaxbeam.case import Case
 from jaxbeam.checks import check
+from jaxbeam.compiling import compiled
 from jaxbeam.control import DiscreteLQR, StateFeedback
 from jaxbeam.control.lqr import LQR, AbstractScheduledRegulator, Schedule
 from jaxbeam.control.scheduled import ScheduledLQR
@@ -132,7 +132,7 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
     )
 
 
-@eqx.filter_jit
+@compiled
 def _designed(case: Case, layout, shares):
     """The plant designed for, gains at shares of the crossing and after, and how long it is (s)."""
     model, law = state_space(case, layout=layout), case.controller

@@ -21,6 +21,7 @@ from scipy.linalg import eigvals
 
 from jaxbeam.case import Case
 from jaxbeam.checks import check, check_on_beam
+from jaxbeam.compiling import compiled
 from jaxbeam.fields import is_known, known
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.ports import Pair, check_pairs, column, common_pairs, row
@@ -115,7 +116,7 @@ def frequency_response(
     return FrequencyResponse(frequencies, values, chosen, case.title)
 
 
-@eqx.filter_jit
+@compiled
 def _responses(case: Case, layout: Layout, frequencies, masses, pairs: tuple[Pair, ...]):
     model = rig(case, layout)
     inputs = [column(case, model, pair.source) for pair in pairs]
@@ -168,7 +169,7 @@ def receptance(
     return _receptance(case, layout, frequencies, masses, x, y)
 
 
-@eqx.filter_jit
+@compiled
 def _receptance(case: Case, layout: Layout, frequencies, masses, x, y):
     model = rig(case, layout)
     modes = model.modes.stiffness.shape[0]
@@ -249,7 +250,7 @@ def zeros(case: Case, pair: tuple[str, str], parked: Parked = ()) -> Complex[np.
     return _sorted(found[np.abs(found) < 1e4 * fastest])
 
 
-_compiled_rig = eqx.filter_jit(rig)  # in one piece, which takes less time than step by step
+_compiled_rig = compiled(rig)  # in one piece, which takes less time than step by step
 
 
 def _sorted(values):

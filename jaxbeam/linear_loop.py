@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case, known_case
 from jaxbeam.checks import check
+from jaxbeam.compiling import compiled
 from jaxbeam.controller import Measurement
 from jaxbeam.fields import known
 from jaxbeam.loop import plant
@@ -146,7 +147,7 @@ def prepared(case: Case) -> Clock | None:
     return Clock(period, delay, lags)
 
 
-@eqx.filter_jit
+@compiled
 def linear(loop: "OpenLoop", clock: Clock | None, t) -> LinearLoop:
     """A loop with its loads frozen at t (s), linear about the rest under their weights."""
     loop, modal = loop.frozen(t), 2 * loop.model.scale.shape[0]
@@ -314,10 +315,10 @@ def open_loop(case: Case, layout: Layout) -> OpenLoop:
     return _opened(case, _rig(eqx.tree_at(lambda c: c.controller, case, None), layout))
 
 
-_rig = eqx.filter_jit(rig)
+_rig = compiled(rig)
 
 
-@eqx.filter_jit
+@compiled
 def _opened(case, assembled):
     model = loaded_beam(case, assembled)
     wide_rig, seen = plant(model)

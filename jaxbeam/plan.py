@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case, known_case
 from jaxbeam.checks import check
+from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.extremes import Extremes
 from jaxbeam.fields import known
@@ -48,7 +49,7 @@ def form(case: Case) -> Form:
     return Form(layout, couples(case) or bool(repeated), most_at_once(np.asarray(windows)))
 
 
-@eqx.filter_jit
+@compiled
 def _survey(case: Case, layout: Layout):
     """Longest step (s), whether modes are repeated, and when loads enter and leave."""
     assembled = rig(case, layout)
@@ -130,7 +131,7 @@ def sample_times(case: Case) -> Float[Array, " time"]:
     return jnp.arange(max(2, int(np.floor(duration * rate * (1 + 1e-12))) + 1)) / rate
 
 
-@eqx.filter_jit
+@compiled
 def _probe(case, form, longest, lanes):
     places = case.beam.length * jnp.array(PROBES)
     return run_extremes(case, form, longest, places, lanes).peak()[0]
@@ -177,7 +178,7 @@ def _suitable_substeps(case: Case, form: Form, schedule: Schedule, tolerance: fl
     return fewest * 2**halvings, error
 
 
-@eqx.filter_jit
+@compiled
 def _probe_driven(case, form, schedule, substeps):
     places = case.beam.length * jnp.array(PROBES)
     loads = traffic(case)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case, known_case
 from jaxbeam.checks import check
+from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.modes import lay_out
 from jaxbeam.rig import Rig, rig
@@ -83,7 +84,7 @@ def _events(rig: Rig, loads: Traffic, end: float) -> tuple[np.ndarray, np.ndarra
     return windows, edges[np.append(True, np.diff(edges) > 10 * BREATH * end)]
 
 
-@eqx.filter_jit
+@compiled
 def _solve(rig: Rig, loads: Traffic, state, leg, on, times, allowed):
     """State at the end of a leg, and coordinates, rates, accelerations and forces at the times.
 

@@ -4,13 +4,13 @@ import dataclasses
 import warnings
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
+from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, at_instant, traffic
 from jaxbeam.exponentials import NODES, at_ends
 from jaxbeam.fields import is_known, known
@@ -70,7 +70,7 @@ def _check_times(times) -> None:
         raise ValueError("times must be finite and ascend, in s from the start of the run")
 
 
-@eqx.filter_jit
+@compiled
 def _record(case: Case, plan: Plan, times, error) -> Record:
     watched = jnp.array([sensor.position for sensor in case.sensors]).reshape(-1)
     best, outputs, found, count = _trace(case, plan, times, watched)

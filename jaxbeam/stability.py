@@ -20,6 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 
 from jaxbeam.case import Case, known_case, replace
+from jaxbeam.compiling import compiled
 from jaxbeam.fields import known
 from jaxbeam.linear_loop import Clock, OpenLoop, linear, open_loop, prepared, through
 from jaxbeam.loads import motion
@@ -93,7 +94,7 @@ def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) ->
     return FrozenPoles(times, _followed(np.stack(each)))
 
 
-@eqx.filter_jit
+@compiled
 def _frozen_loops(loop, clock, times):
     return jax.lax.map(lambda t: linear(loop, clock, t), times)
 
@@ -218,7 +219,7 @@ def _substeps(loop, clock, times) -> int:
     return max(1, math.ceil(fastest * longest / TURN))
 
 
-@eqx.filter_jit
+@compiled
 def _transitions(loop: OpenLoop, clock: Clock | None, times, substeps: int):
     """Transition matrices from the first time to each, and the energy's matrix of q and q'."""
     model, modes = loop.model, loop.model.scale.shape[0]

@@ -2,7 +2,6 @@
 travel slowly. No modes here; see `compliance`.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case, known_case
 from jaxbeam.checks import check, check_on_beam
+from jaxbeam.compiling import compiled
 from jaxbeam.compliance import check_held, compliance
 from jaxbeam.fields import is_known
 from jaxbeam.loads import motion
@@ -20,7 +20,7 @@ from jaxbeam.peaks import refine
 POINTS = 10  # on a stretch of a crossing: a cubic of a cubic is known exactly by so many
 
 
-@eqx.filter_jit
+@compiled
 def _influence(case: Case, layout: Layout, x, positions, order: int):
     found = compliance(case, layout, x.reshape(-1), order)
     length = case.beam.length
@@ -92,7 +92,7 @@ def static_lift(
     return _lift(case, layout, x, derivative)
 
 
-@eqx.filter_jit
+@compiled
 def _lift(case: Case, layout: Layout, x, order: int):
     length = case.beam.length
     found = compliance(case, layout, x.reshape(-1), order)  # by reciprocity, forces at x
@@ -123,7 +123,7 @@ def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*p
     return _peak(case, layout, x)
 
 
-@eqx.filter_jit
+@compiled
 def _peak(case: Case, layout: Layout, x):
     length = case.beam.length
     found = compliance(case, layout, x.reshape(-1), 0)

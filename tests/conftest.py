@@ -10,6 +10,8 @@ import sys
 os.environ["MPLBACKEND"] = "Agg"
 # On a machine with a GPU, several test processes share it: none may take most of the memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+# As `jaxbeam.compiling` does for the library itself: most of the time of the tests is compiling.
+os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false " + os.environ.get("XLA_FLAGS", "")
 
 import hypothesis
 import pytest

@@ -4,13 +4,13 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case, replace
+from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import traffic
 from jaxbeam.plan import Plan, make_plan, sample_times
 from jaxbeam.record import Record
@@ -88,7 +88,7 @@ def make_bench(case: Case, runs: Sequence[Values], places=None) -> Bench:
     plain = [dataclasses.replace(own, controller=None) for own in cases]
     still = common_plan(plain)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *plain)
-    found = eqx.filter_jit(jax.vmap(lambda own: histories(own, times, still, places).deflection))
+    found = compiled(jax.vmap(lambda own: histories(own, times, still, places).deflection))
     deflection = np.asarray(found(stacked))
     leaves = np.array([_last_exit(own) for own in cases])
     limits = [actuator.command_limits() for actuator in case.actuators]

@@ -9,6 +9,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
+from jaxbeam.compiling import compiled, options
 from tuning.campaign import Campaign
 from tuning.free import Free
 from tuning.uncertainty import Uncertainty, colour, uncertainty
@@ -72,8 +73,8 @@ class Search:
             )
             return found.value * scale, found.result == optimistix.RESULTS.successful
 
-        self._values_at = jax.jit(values_at)
-        self._slopes = jax.jit(lambda y: jnp.diag(jax.jacfwd(values_at)(y)))
+        self._values_at = compiled(values_at)
+        self._slopes = compiled(lambda y: jnp.diag(jax.jacfwd(values_at)(y)))
         # Compiling takes most of the time of a small fit: both at once, each on its own core.
         point, samples = jnp.zeros(len(numbers)), jnp.zeros(campaign.measured.shape)
         lowered = (
@@ -81,7 +82,9 @@ class Search:
             jax.jit(minimise).lower(point, point, samples, samples),
         )
         with ThreadPoolExecutor(2) as pool:
-            self._linearised, self._minimise = pool.map(lambda program: program.compile(), lowered)
+            self._linearised, self._minimise = pool.map(
+                lambda program: program.compile(options()), lowered
+            )
 
     def estimate(self, measured: Float[np.ndarray, "log time channel"]) -> Estimate:
         """Fit the numbers to samples like those of the campaign, from their starts on.

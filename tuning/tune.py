@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from jaxbeam.case import Case, replace
 from jaxbeam.casefile import case_to_dict
+from jaxbeam.compiling import compiled
 from jaxbeam.control.bound import HELD, bound
 from jaxbeam.simulate import ContactLossWarning
 from tuning.bench import Bench, make_bench
@@ -118,7 +119,7 @@ def tune(
         history=state.history,
         rejected=int(state.rejected.sum()),
         outcomes=outcomes,
-        violation=0.0 if violation is None else float(jax.jit(violation)(after)),
+        violation=0.0 if violation is None else float(compiled(violation)(after)),
     )
 
 
@@ -165,13 +166,13 @@ class _Search:
             return smooth, true
 
         slope = jax.value_and_grad(smooth_and_true, has_aux=True)
-        self._slope = jax.jit(jax.vmap(slope, in_axes=(0, None)))
+        self._slope = compiled(jax.vmap(slope, in_axes=(0, None)))
 
         def onward(point, gradient, moments, scale):
             change, moments = self.adam.update(gradient, moments)
             return point + scale * change, moments
 
-        self._onward = jax.jit(jax.vmap(onward))
+        self._onward = compiled(jax.vmap(onward))
 
     def first(self, starts: int, seed: int) -> _State:
         """The case's own numbers, and random ones within bounds or a factor of three."""
@@ -230,7 +231,7 @@ def _outcome(name, bench: Bench, objective, before, after, bounds) -> Outcome:
         warnings.simplefilter("ignore", ContactLossWarning)
         pairs = [bench.records(values) for values in (before, after)]
     peaks = [_peaks(bench, records) for records in pairs]
-    merits = jax.jit(bench.merits)
+    merits = compiled(bench.merits)
     values = [np.asarray(objective.of_run(merits(v))) for v in (before, after)]
     least = np.full(len(bench.runs), np.nan)
     if bounds:

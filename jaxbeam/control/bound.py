@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from jaxbeam.case import Case
 from jaxbeam.checks import check, check_on_beam
+from jaxbeam.compiling import compiled
 from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.reach import TOLERANCE, reach
@@ -157,7 +158,7 @@ def _uncontrolled(case: Case, places) -> float:
     plain = eqx.tree_at(lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None)
     shape = form(plain)
     step, _ = suitable_step(plain, shape, TOLERANCE)
-    best = eqx.filter_jit(run_extremes)(plain, shape, jnp.asarray(step), jnp.asarray(places))
+    best = compiled(run_extremes)(plain, shape, jnp.asarray(step), jnp.asarray(places))
     return float(jnp.max(best.peak()[0]))
 
 

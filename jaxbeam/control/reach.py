@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.case import Case
+from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.exponentials import NODES
 from jaxbeam.grid import scheduled_grid
@@ -122,12 +123,12 @@ def reach(case: Case, places: Float[np.ndarray, " place"], period: float, spacin
     )
 
 
-@eqx.filter_jit
+@compiled
 def _rows(case: Case, form: Form, places):
     return rig(case, form.layout).shapes(places, (0,))[0]
 
 
-@eqx.filter_jit
+@compiled
 def _answers(case: Case, form: Form, schedule: Schedule, substeps: int, hold, which):
     """Coordinates (instant, mode, lane) under the weights where `hold` is -1, else under a unit."""
     assembled, own = rig(case, form.layout), traffic(case)

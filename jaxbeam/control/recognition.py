@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
+from jaxbeam.compiling import compiled
 from jaxbeam.controller import Measurement
 from jaxbeam.estimation.fixed import offsets
 from jaxbeam.estimation.observability import deflections
@@ -157,7 +158,7 @@ def recognised(record: Any, settings: Recognition) -> Recognised:
     return Recognised(*found, *errors)
 
 
-@eqx.filter_jit
+@compiled
 def _replayed(settings: Recognition, case: Case, layout, record):
     model = state_space(case, layout=layout)
     start = settings.init(model, model)

@@ -3,10 +3,10 @@
 import abc
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxbeam.compiling import compiled
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.controller import AbstractController
 from jaxbeam.estimation import KINDS
@@ -100,7 +100,7 @@ class AbstractStateLaw(AbstractController):
         return 2 * self.modes(case) + own
 
 
-@eqx.filter_jit
+@compiled
 def _plant(law: AbstractStateLaw, case, layout) -> StateSpace:
     """What the law is designed for, without loads."""
     return law.believed(state_space(case, layout=layout)).unloaded
