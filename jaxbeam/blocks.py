@@ -1,6 +1,7 @@
 """The runs of a sweep, cut into blocks of equal shape that are compiled once."""
 
 import dataclasses
+import math
 import re
 import threading
 from contextlib import nullcontext
@@ -25,8 +26,10 @@ from jaxbeam.plan import Form, most_at_once, sample_times
 from jaxbeam.record import never_as_nan
 from jaxbeam.rig import couples, rig
 from jaxbeam.schedule import sampled
+from jaxbeam.tables import make_rigging
 
 RUNS = 256  # in a block, about: its states stay in the cache, its results are one write
+TOGETHER = 4  # tasks prepared at once, or fewer
 PACES = 4  # at which time steps are measured, at least
 PLACE = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
 
@@ -186,8 +189,18 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
     """Results of some tasks, one after the other, their lanes side by side."""
     heavy_addresses, light_addresses = addresses
 
+    def prepare(assembled, heavy, longest, driver=None):
+        varied = _varied(case, heavy_addresses, heavy)
+        if schedule is None:
+            grid = even_grid(varied, assembled, longest)
+        else:
+            finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int)
+            grid = scheduled_grid(varied, assembled, schedule, substeps or finer)
+        watched = jnp.stack([sensor.position for sensor in varied.sensors])
+        return make_rigging(assembled, grid, watched, driver)
+
     def task(values):
-        assembled, heavy, light, longest = values
+        rigging, assembled, heavy, light, longest = values
         varied = _varied(case, heavy_addresses, heavy)
 
         def press(values):
@@ -196,30 +209,21 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
 
         inertia, weight = jax.vmap(press, out_axes=1)(light)
         loads = Traffic(traffic(varied).motions, inertia, weight)
-        watched = jnp.stack([sensor.position for sensor in varied.sensors])
         driver = None
-        if case.controller is not None:
+        if rigging is None:
             driver = make_loop(varied, form.layout, loads, schedule)
-            assembled = driver.rig
-        slots = form.slots
-        if substeps is None and driver is None:
-            grid = even_grid(varied, assembled, longest)
-            best = march(assembled, loads, grid, watched, slots=slots)
-            history = {}
-        elif substeps is None:
-            finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int)
-            grid = scheduled_grid(varied, assembled, schedule, finer)
-            best = march(assembled, loads, grid, watched, slots=slots, driver=driver)
+            rigging = prepare(driver.rig, heavy, longest, driver)
+        if substeps is None:
+            best = march(rigging, loads, slots=form.slots, driver=driver)
             history = {}
         else:
-            grid = scheduled_grid(varied, assembled, schedule, substeps)
-            count = grid.counts.shape[0] * substeps
-            best, states, *_ = trace(
-                assembled, loads, grid, watched, slots=slots, steps=count, driver=driver
-            )
+            grid, assembled = rigging.grid, rigging.rig
+            steps = grid.counts.shape[0] * substeps
+            best, states, *_ = trace(rigging, loads, slots=form.slots, steps=steps, driver=driver)
             edges = substeps * grid.place[schedule.samples]
             samples = states[edges][:, 0 : 2 * varied.beam.modes : 2]
-            rows = assembled.shapes(watched, (0,))[0]
+            places = jnp.stack([sensor.position for sensor in varied.sensors])
+            rows = assembled.shapes(places, (0,))[0]
             history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
         peak, time = best.peak()
         return {
@@ -230,4 +234,17 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
             **history,
         }
 
-    return jax.lax.map(task, (rigs, heavy, light, longest))
+    def group(values):
+        assembled, heavy, light, longest = values
+        # Propagators are little work, done for several tasks at once; a loop has its own.
+        alike = case.controller is None
+        rigging = jax.vmap(prepare)(assembled, heavy, longest) if alike else None
+        return jax.lax.map(task, (rigging, assembled, heavy, light, longest))
+
+    count = longest.shape[0]
+    split = count // math.gcd(TOGETHER, count), math.gcd(TOGETHER, count)
+    parts = jax.tree.map(
+        lambda part: part.reshape(*split, *part.shape[1:]), (rigs, heavy, light, longest)
+    )
+    results = jax.lax.map(group, parts)
+    return jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2), results)

@@ -42,14 +42,8 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
 
 def _tracing(given) -> bool:
     """Whether a call with these arguments is part of a function being traced."""
-    return any(
-        isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(given), _something())
-    )
-
-
-def _something():
-    """The result of some operation: a tracer where operations are being traced."""
-    return jnp.negative(jnp.zeros(()))
+    leaves = [*jax.tree.leaves(given), jnp.zeros(())]  # zeros, too, where all that is done is
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
 
 
 @functools.cache

@@ -12,6 +12,7 @@ on the modes, D2w/Dt2 = (contact row) . z + (shape row) . f.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case import Case
@@ -110,32 +111,16 @@ def at_instant(
 
 @jax.custom_jvp
 def solve_contact(gains, inertia, drive):
-    """Solve (1 + m_i G_ij) r_j = -d_i for every lane, by elimination without pivoting.
+    """Solve (1 + m_i G_ij) r_j = -d_i for every lane.
 
     `gains` (row, row) are shared, `inertia` and `drive` are (row, lane). The matrix is close to
-    the identity plus a positive matrix for the step lengths in use, so pivots stay away from
-    zero. Spelt out, because the compiler then keeps small systems in registers.
+    the identity plus a positive matrix for the step lengths in use: no pivots are sought.
     """
     size = gains.shape[0]
     if size == 0:
         return drive
-    rows = [inertia[i] * gains[i][:, None] for i in range(size)]
-    rows = [row.at[i].add(1.0) for i, row in enumerate(rows)] if size > 8 else rows
-    if size > 8:
-        return _eliminate(jnp.stack(rows), -drive)
-    matrix = [[rows[i][j] + (i == j) for j in range(size)] for i in range(size)]
-    right = [-drive[i] for i in range(size)]
-    for i in range(size):
-        for k in range(i + 1, size):
-            factor = matrix[k][i] / matrix[i][i]
-            for j in range(i + 1, size):
-                matrix[k][j] = matrix[k][j] - factor * matrix[i][j]
-            right[k] = right[k] - factor * right[i]
-    forces = list(right)
-    for i in reversed(range(size)):
-        rest = sum((matrix[i][j] * forces[j] for j in range(i + 1, size)), jnp.zeros_like(right[i]))
-        forces[i] = (right[i] - rest) / matrix[i][i]
-    return jnp.stack(forces)
+    matrix = inertia[:, None] * gains[:, :, None] + np.eye(size)[:, :, None]
+    return _solve(matrix, -drive[:, None])[:, 0]
 
 
 @solve_contact.defjvp
@@ -148,12 +133,42 @@ def _solve_contact_jvp(primals, tangents):
     return forces, solve_contact(gains, inertia, change)
 
 
-def _eliminate(matrix, right):
-    """Gauss-Jordan elimination of (row, row, lane), a whole pivot at a time."""
-    size = right.shape[0]
-    for i in range(size):
-        row, value = matrix[i] / matrix[i, i], right[i] / matrix[i, i]
-        factor = matrix[:, i].at[i].set(0.0)
-        matrix = (matrix - factor[:, None] * row[None]).at[i].set(row)
-        right = (right - factor * value).at[i].set(value)
-    return right
+def _solve(matrix, right):
+    """Solve systems (row, row, lane) by halves: few operations, each on all lanes at once."""
+    size = matrix.shape[0]
+    if size <= 3:
+        return _times(_inverse(matrix), right)
+    half = size // 2
+    upper = _solve(
+        matrix[:half, :half], jnp.concatenate([matrix[:half, half:], right[:half]], axis=1)
+    )
+    lower = jnp.concatenate([matrix[half:, half:], right[half:]], axis=1)
+    lower = lower - _times(matrix[half:, :half], upper)
+    rest = size - half
+    last = _solve(lower[:, :rest], lower[:, rest:])
+    return jnp.concatenate([upper[:, rest:] - _times(upper[:, :rest], last), last])
+
+
+def _times(a, b):
+    """Product of small matrices (row, row, lane), spelt out."""
+    return sum(a[:, k, None] * b[k] for k in range(1, b.shape[0])) + a[:, 0, None] * b[0]
+
+
+def _inverse(matrix):
+    """Inverse of up to three rows, by cofactors."""
+    size = matrix.shape[0]
+    if size == 1:
+        return 1 / matrix
+    if size == 2:
+        (a, b), (c, d) = matrix
+        return jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)
+    minors = [
+        [
+            matrix[i - 2, j - 2] * matrix[i - 1, j - 1]
+            - matrix[i - 2, j - 1] * matrix[i - 1, j - 2]
+            for i in range(3)
+        ]
+        for j in range(3)
+    ]
+    adjugate = jnp.stack([jnp.stack(row) for row in minors])
+    return adjugate / jnp.sum(matrix[0] * adjugate[:, 0], axis=0)

@@ -40,18 +40,19 @@ class Extremes(eqx.Module):
 def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) -> Extremes:
     """Extremes of the run so far, from those up to a chunk of steps and the chunk itself."""
     steps, lanes = states.shape[0], states.shape[-1]
-    seen = tables.watch @ states + tables.watch_push @ forces
-    if tables.commands is not None:
-        seen = seen + tables.commands.watch @ commands
+    parts = (states, forces) if commands is None else (states, forces, commands)
+    seen = tables.watch @ jnp.concatenate(parts, axis=1)
     samples = jax.lax.optimization_barrier(seen.reshape(steps, POINTS + 1, -1, lanes))
 
     def raised(best):
         score = jax.lax.optimization_barrier(jax.vmap(vertex)(samples))
-        top = jnp.argmax(score, axis=0)
-        better = jnp.max(score, axis=0) > best.score
+        highest = jnp.max(score, axis=0)
+        # Found so, and not by argmax, which looks at one number after the other.
+        top = jnp.max(jnp.where(score == highest, np.arange(steps)[:, None, None], 0), axis=0)
+        better = highest > best.score
         chosen = jnp.take_along_axis(samples, top[None, None], axis=0)[0]
         return Extremes(
-            jnp.where(better, jnp.max(score, axis=0), best.score),
+            jnp.where(better, highest, best.score),
             jnp.where(better, chosen, best.samples),
             jnp.where(better, start[top], best.start),
             jnp.where(better, span[top], best.span),

@@ -10,21 +10,19 @@ once again (`extremes`). Commands to the actuators are polynomials at the same n
 driver.
 """
 
-import abc
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
+from jaxbeam.driver import AbstractDriver, Moment
 from jaxbeam.dynamics import Traffic, solve_contact
 from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
 from jaxbeam.extremes import Extremes, fold, nothing_seen
-from jaxbeam.grid import Grid
 from jaxbeam.loads import AbstractLoad, MovingMass
 from jaxbeam.rig import Rig
-from jaxbeam.tables import Tables, make_rigging, tabulate
+from jaxbeam.tables import Rigging, Tables, tabulate
 
 CHUNK = 8
 # Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
@@ -39,45 +37,6 @@ def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
         fastest = jnp.sqrt(jnp.max(jnp.linalg.eigvalsh(rig.stiffness())))
         limit = jnp.minimum(limit, RESOLVED / fastest)
     return jax.lax.stop_gradient(limit)
-
-
-class Moment(eqx.Module):
-    """A step, or several: start (s), length (s), and the edge of the schedule it starts at.
-
-    `edge` is -1 for a step that starts between two edges.
-    """
-
-    start: Float[Array, " *step"]
-    span: Float[Array, " *step"]
-    edge: Int[Array, " *step"]
-
-
-class AbstractDriver(eqx.Module):
-    """What commands the actuators of a run.
-
-    With `inner`, it is told the states at the nodes within a step, and not only at the start. A
-    run is given up where a state of the rig exceeds its `bound`.
-    """
-
-    inner: eqx.AbstractVar[bool]
-    bound: eqx.AbstractVar[Float[Array, " state"]]
-
-    @abc.abstractmethod
-    def start(self, lanes: int) -> Any:
-        """Its memory at the start of a run, of any structure."""
-
-    @abc.abstractmethod
-    def drive(
-        self, memory, state: Float[Array, "state lane"], moment: Moment, states
-    ) -> tuple[Float[Array, "node actuator lane"], Any]:
-        """Commands (node, actuator, lane) of a step from this state, and the memory after it.
-
-        `states` takes commands to the states at the nodes (node, state, lane), if `inner`.
-        """
-
-    @abc.abstractmethod
-    def shows(self, memory, moment: Moment) -> Any:
-        """What is to be kept of the start of a step that starts at an edge, lanes last, or None."""
 
 
 def _contact(tables: Tables, inertia, weight, state, commands):
@@ -131,37 +90,36 @@ def _rows(loads: Float[Array, "load lane"], tables: Tables) -> Float[Array, "ste
     return jnp.repeat(chosen, len(GAUSS), axis=1)
 
 
-def _stepper(rig: Rig, traffic: Traffic, grid: Grid, watched, slots: int, driver=None):
-    """Function that takes state, memory and extremes through the chunk from a given step on."""
-    inner = driver is not None and driver.inner
-    rigging = make_rigging(rig, grid, watched, driven=driver is not None, inner=inner)
+def _stepper(rigging: Rigging, traffic: Traffic, slots: int, driver: AbstractDriver | None):
+    """Function that takes state, memory and extremes through the chunk from a given step on.
 
-    def chunk(state, memory, best, first):
+    It returns them with the time (s) at its end, and with what may be kept of it.
+    """
+
+    def chunk(state, memory, best: Any, first):
         index = first + jnp.arange(CHUNK)
-        tables, start, span = tabulate(rig, traffic, grid, rigging, slots, index)
+        tables, start, span = tabulate(rigging, traffic, slots, index)
         loads = _rows(traffic.inertia, tables), _rows(traffic.weight, tables)
         if driver is None:
             commands = shown = None
             state, (states, forces) = jax.lax.scan(_advance, state, (tables, *loads, None))
         else:
-            moments = Moment(start, span, grid.edge(index))
+            moments = Moment(start, span, rigging.grid.edge(index))
             (state, memory), (states, forces, commands, shown) = jax.lax.scan(
                 lambda carry, step: _driven(driver, carry, step),
                 (state, memory),
                 (tables, *loads, moments),
             )
-        if watched is not None:
+        if best is not None:
             best = fold(best, tables, states, forces, commands, start, span)
-        return state, memory, best, (states, commands, shown)
+        return state, memory, best, start[-1] + span[-1], (states, commands, shown)
 
     return chunk
 
 
 def trace(
-    rig: Rig,
+    rigging: Rigging,
     traffic: Traffic,
-    grid: Grid,
-    watched: Float[Array, " sensor"] | None,
     *,
     slots: int,
     steps: int,
@@ -171,20 +129,20 @@ def trace(
 
     States (edge, state, lane) are those at the start of every step and at the end, commands
     (step, command, lane) those at the nodes of every step, None without a `driver`; what it shows
-    is kept for every step. Extremes are those at the `watched` places (m), None without any.
+    is kept for every step. Extremes are those at the watched places, None if there are none.
     `slots` is how many loads may be on the beam at once. Reverse mode stores one state a chunk.
     """
-    chunk = _stepper(rig, traffic, grid, watched, slots, driver)
+    chunk = _stepper(rigging, traffic, slots, driver)
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
 
     def whole(carry, first):
         state, memory, best = carry
-        state, memory, best, history = chunk(state, memory, best, first)
+        state, memory, best, _, history = chunk(state, memory, best, first)
         return (state, memory, best), history
 
-    best = None if watched is None else nothing_seen(watched.shape[0], loads, lanes)
+    best = None if rigging.watch is None else nothing_seen(rigging.places, loads, lanes)
     memory = None if driver is None else driver.start(lanes)
-    rest = jnp.zeros((rig.states, lanes))
+    rest = jnp.zeros((rigging.rig.states, lanes))
     firsts = jnp.arange(0, steps, CHUNK)
     (state, _, best), history = jax.lax.scan(jax.checkpoint(whole), (rest, memory, best), firsts)
     history = jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2)[:steps], history)
@@ -193,53 +151,51 @@ def trace(
 
 
 def march(
-    rig: Rig,
+    rigging: Rigging,
     traffic: Traffic,
-    grid: Grid,
-    watched: Float[Array, " sensor"],
     *,
     slots: int,
     driver: AbstractDriver | None = None,
 ) -> Extremes:
-    """Integrate from rest over a grid, keeping only extremes at the `watched` places (m).
+    """Integrate from rest over a grid, keeping only extremes at the watched places.
 
     The loop runs as long as it must: it ends early when all lanes are given up, and without a
     driver when the energy left after the last exit cannot raise any peak. `slots` is how many
     loads may be on the beam at once. Forward mode only.
     """
-    chunk = _stepper(rig, traffic, grid, watched, slots, driver)
-    flexibility = _flexibility(rig, watched)
-    stiffness = rig.stiffness()
+    chunk = _stepper(rigging, traffic, slots, driver)
+    grid, stiffness = rigging.grid, rigging.rig.stiffness()
     size = 2 * stiffness.shape[0]
 
     def more(carry):
         *_, first, going = carry
         return going & (first < grid.total)
 
-    def still(state, best, first):
-        left = grid.steps(first[None])[1][0] >= grid.last_exit
+    def still(state, best, time):
+        left = time >= grid.last_exit
         place, rate = state[0:size:2], state[1:size:2]
         energy = jnp.sum(rate**2, axis=0) + jnp.sum(place * (stiffness @ place), axis=0)
-        reach = jnp.sqrt(flexibility[:, None] * energy)
+        reach = jnp.sqrt(rigging.flexibility[:, None] * energy)
         # A run that has blown up has nothing more to show.
         over = jnp.all((reach < best.score) | ~jnp.isfinite(energy))
         return ~(left & over)
 
     def go(carry):
         state, memory, best, first, _ = carry
-        state, memory, best, _ = chunk(state, memory, best, first)
+        state, memory, best, time, _ = chunk(state, memory, best, first)
         first = first + CHUNK
-        going = jnp.any(best.sound) if driver is not None else still(state, best, first)
+        going = jnp.any(best.sound) if driver is not None else still(state, best, time)
         return state, memory, best, first, going
 
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
-    best = nothing_seen(watched.shape[0], loads, lanes)
+    best = nothing_seen(rigging.places, loads, lanes)
     memory = None if driver is None else driver.start(lanes)
-    start = jnp.zeros((rig.states, lanes)), memory, best, jnp.zeros((), int), jnp.ones((), bool)
-    return jax.lax.while_loop(more, go, start)[2]
-
-
-def _flexibility(rig: Rig, watched):
-    """Static deflection at each place under a unit force there: bounds |w|^2 by the energy."""
-    rows = rig.shapes(watched, (0,))[0]
-    return jnp.sum(rows * jnp.linalg.solve(rig.stiffness(), rows.T).T, axis=-1)
+    start = (
+        jnp.zeros((rigging.rig.states, lanes)),
+        memory,
+        best,
+        jnp.zeros((), int),
+        jnp.ones((), bool),
+    )
+    ended: Any = jax.lax.while_loop(more, go, start)
+    return ended[2]

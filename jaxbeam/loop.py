@@ -17,11 +17,11 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
 from jaxbeam.controller import Measurement
+from jaxbeam.driver import AbstractDriver, Moment
 from jaxbeam.dynamics import Traffic, at_instant
 from jaxbeam.exponentials import GAUSS, NODES
 from jaxbeam.fields import known
 from jaxbeam.filters import analogue
-from jaxbeam.integrate import AbstractDriver, Moment
 from jaxbeam.modes import Layout
 from jaxbeam.rig import Rig
 from jaxbeam.schedule import Schedule, merged

@@ -26,6 +26,7 @@ from jaxbeam.loop import loop_schedule, make_loop
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.rig import couples, rig
 from jaxbeam.schedule import Schedule
+from jaxbeam.tables import make_rigging
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 EVEN = 1e-6  # of the spacing: more even samples are taken for equally spaced
@@ -80,7 +81,7 @@ def run_extremes(
     assembled = rig(case, form.layout, form.coupled)
     grid = even_grid(case, assembled, longest)
     loads = traffic(case) if lanes is None else lanes
-    return march(assembled, loads, grid, watched, slots=form.slots)
+    return march(make_rigging(assembled, grid, watched), loads, slots=form.slots)
 
 
 class Plan(eqx.Module):
@@ -184,7 +185,8 @@ def _probe_driven(case, form, schedule, substeps):
     loads = traffic(case)
     driver = make_loop(case, form.layout, loads, schedule)
     grid = scheduled_grid(case, driver.rig, schedule, substeps)
-    best = march(driver.rig, loads, grid, places, slots=form.slots, driver=driver)
+    rigging = make_rigging(driver.rig, grid, places, driver)
+    best = march(rigging, loads, slots=form.slots, driver=driver)
     return best.peak()[0]
 
 

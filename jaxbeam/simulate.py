@@ -21,6 +21,7 @@ from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
 from jaxbeam.record import Record, measure, never_as_nan
 from jaxbeam.rig import Rig, rig
 from jaxbeam.schedule import sampled
+from jaxbeam.tables import make_rigging
 
 
 class ContactLossWarning(UserWarning):
@@ -151,9 +152,8 @@ def _trace(case: Case, plan: Plan, times, watched):
     grid = scheduled_grid(case, assembled, schedule, plan.substeps)
     count = grid.counts.shape[0] * plan.substeps
     slots = plan.form.slots
-    best, states, commands, shown = trace(
-        assembled, loads, grid, watched, slots=slots, steps=count, driver=driver
-    )
+    rigging = make_rigging(assembled, grid, watched, driver)
+    best, states, commands, shown = trace(rigging, loads, slots=slots, steps=count, driver=driver)
     edges = plan.substeps * grid.place[schedule.samples]
     states = states[edges]
     shown, failures = (None, None) if shown is None else (part[edges, ..., 0] for part in shown)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxbeam.driver import AbstractDriver
 from jaxbeam.dynamics import Traffic, contact_rows
 from jaxbeam.exponentials import GAUSS, POINTS, Step, propagators
 from jaxbeam.grid import Grid
@@ -20,11 +21,10 @@ from jaxbeam.rig import Rig
 
 
 class CommandTables(eqx.Module):
-    """How commands at the nodes act: on the contact law, the state at the end, what is watched."""
+    """How commands at the nodes act: on the contact law, and on the state at the end."""
 
     respond: Float[Array, "step row command"]
     push: Float[Array, "step state command"]
-    watch: Float[Array, "step looked command"] | None
 
 
 class InnerTables(eqx.Module):
@@ -36,14 +36,17 @@ class InnerTables(eqx.Module):
 
 
 class Tables(eqx.Module):
-    """Matrices of each step of a chunk. Rows are (slot, node), commands (node, actuator)."""
+    """Matrices of each step of a chunk. Rows are (slot, node), commands (node, actuator).
+
+    What is watched follows from state at the start, contact forces and commands, one after the
+    other.
+    """
 
     respond: Float[Array, "step row state"]
     gains: Float[Array, "step row row"]
     drift: Float[Array, "step block side side"]
     push: Float[Array, "step state row"]
-    watch: Float[Array, "step looked state"] | None
-    watch_push: Float[Array, "step looked row"] | None
+    watch: Float[Array, "step looked all"] | None
     commands: CommandTables | None
     inner: InnerTables | None
     slots: Int[Array, "step slot"]
@@ -51,45 +54,63 @@ class Tables(eqx.Module):
 
 
 class Rigging(eqx.Module):
-    """Propagators of the rig on a grid, and the rows that give the watched deflections.
+    """A rig on a grid: its propagators, and the rows that give the watched deflections.
 
-    `inner` asks for the states at the nodes too.
+    `flexibility` is the static deflection at each watched place under a unit force there, which
+    bounds the deflection by the energy. `inner` asks for the states at the nodes too.
     """
 
+    rig: Rig
+    grid: Grid
     step: Step
     watch: Float[Array, "length looked block side"] | None
     watch_push: Float[Array, "length looked force block input"] | None
+    flexibility: Float[Array, " place"] | None
     commands: Float[Array, "mode actuator"] | None
     inner: bool = eqx.field(static=True)
 
+    @property
+    def places(self) -> int:
+        """How many places are watched."""
+        return 0 if self.flexibility is None else self.flexibility.shape[0]
 
-def make_rigging(rig: Rig, grid: Grid, watched, *, driven: bool, inner: bool) -> Rigging:
-    """Propagators for all step lengths of a grid; `watched` (m) may be None.
 
-    `driven` rigs take commands; the states at the nodes are tabulated if `inner`.
-    """
+def make_rigging(
+    rig: Rig,
+    grid: Grid,
+    watched: Float[Array, " place"] | None,
+    driver: AbstractDriver | None = None,
+) -> Rigging:
+    """Propagators for all step lengths of a grid; deflections are watched at some places (m)."""
+    driven = driver is not None
+    inner = driver is not None and driver.inner
     step = propagators(rig, grid.lengths, 0 if watched is None else POINTS, driven=driven)
     each = rig.modes_per_block
     commands = rig.command_matrix[1 : 2 * each : 2] if driven else None
     if watched is None:
-        return Rigging(step, None, None, commands, inner)
+        return Rigging(rig, grid, step, None, None, None, commands, inner)
     blocks = rig.state_matrix.shape[0]
-    rows = rig.shapes(watched, (0,))[0].reshape(-1, blocks, each)
+    shapes = rig.shapes(watched, (0,))[0]
+    rows = shapes.reshape(-1, blocks, each)
     places = np.arange(0, 2 * each, 2)
     watch = jnp.einsum("wbm,lpbmj->lpwbj", rows, step.drift_points[..., places, :])
     push = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, step.push_points[..., places, :])
     flat = (grid.lengths.shape[0], -1)
     return Rigging(
+        rig,
+        grid,
         step,
         watch.reshape(*flat, *watch.shape[3:]),
         push.reshape(*flat, *push.shape[3:]),
+        jnp.sum(shapes * jnp.linalg.solve(rig.stiffness(), shapes.T).T, axis=-1),
         commands,
         inner,
     )
 
 
-def tabulate(rig: Rig, traffic: Traffic, grid: Grid, rigging: Rigging, slots: int, index):
+def tabulate(rigging: Rigging, traffic: Traffic, slots: int, index: Int[Array, " step"]):
     """Tables of the steps with the given indices, and their start times and lengths (s)."""
+    rig, grid = rigging.rig, rigging.grid
     panel, start, kind = grid.steps(index)
     span = grid.lengths[kind]
     times = start[:, None] + span[:, None] * GAUSS
@@ -151,13 +172,14 @@ def _of_one_kind(rigging: Rigging, kind, shape, rows):
         push.reshape(steps, states, size),
     )
     if watch is None:
-        looked = watch_of_commands = None
-        tables = (*tables, None, None)
+        tables = (*tables, None)
     else:
         looked = watch.shape[0]
         seen = jnp.einsum("lfbm,tqfbm->tlqf", watch_push[..., :modes], shape)
-        tables = (*tables, each(watch, looked, states), seen.reshape(steps, looked, size))
-        watch_of_commands = watch_push[:, :, 0, modes:]
+        parts = [each(watch, looked, states), seen.reshape(steps, looked, size)]
+        if rigging.commands is not None:
+            parts.append(each(watch_push[:, :, 0, modes:], looked, -1))
+        tables = (*tables, jnp.concatenate(parts, axis=2))
     commands = inner = None
     if rigging.commands is not None:
         # A rig that takes commands is a single block.
@@ -169,7 +191,6 @@ def _of_one_kind(rigging: Rigging, kind, shape, rows):
         commands = CommandTables(
             answer.reshape(steps, size, orders),
             each(jnp.moveaxis(step.push_end[:, 0, :, modes:], 1, 0), states, orders),
-            None if looked is None else each(watch_of_commands, looked, orders),
         )
     if rigging.inner:
         pressed = step.push_nodes[:, :, 0, :, :modes]

@@ -23,6 +23,7 @@ from jaxbeam.integrate import trace
 from jaxbeam.plan import Plan, form
 from jaxbeam.rig import rig
 from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.tables import make_rigging
 from tests.oracles import crossing, finite_elements, modal_equations
 from tests.oracles.closed_forms import (
     cancellation_speed,
@@ -477,7 +478,8 @@ def test_the_integrator_converges_with_twice_the_order_of_its_nodes():
     def end(longest):
         assembled = rig(case, shape.layout, shape.coupled)
         grid = even_grid(case, assembled, longest)
-        return trace(assembled, traffic(case), grid, None, slots=1, steps=64)[1][-1, :, 0]
+        rigging = make_rigging(assembled, grid, None)
+        return trace(rigging, traffic(case), slots=1, steps=64)[1][-1, :, 0]
 
     counts = np.array([24, 32, 48, 64])
     expected = modal_equations.respond(span, [load], SENSORS, np.array([0.0, 0.32])).modal[1]

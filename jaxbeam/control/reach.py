@@ -15,13 +15,15 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam.case import Case
 from jaxbeam.compiling import compiled
+from jaxbeam.driver import AbstractDriver
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.exponentials import NODES
 from jaxbeam.grid import scheduled_grid
-from jaxbeam.integrate import AbstractDriver, trace
+from jaxbeam.integrate import trace
 from jaxbeam.plan import Form, form, suitable_step
 from jaxbeam.rig import rig
 from jaxbeam.schedule import Schedule, merged
+from jaxbeam.tables import make_rigging
 
 TOLERANCE = 1e-9  # relative to the largest deflection
 LANES = 256  # at once; more fall out of the cache
@@ -144,8 +146,7 @@ def _answers(case: Case, form: Form, schedule: Schedule, substeps: int, hold, wh
     )
     grid = scheduled_grid(case, assembled, schedule, substeps)
     steps = grid.counts.shape[0] * substeps
-    _, states, _, _ = trace(
-        assembled, loads, grid, None, slots=form.slots, steps=steps, driver=driver
-    )
+    rigging = make_rigging(assembled, grid, None, driver)
+    _, states, _, _ = trace(rigging, loads, slots=form.slots, steps=steps, driver=driver)
     edges = substeps * grid.place[schedule.samples]
     return states[edges][:, : 2 * case.beam.modes : 2]
