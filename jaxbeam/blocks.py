@@ -76,7 +76,7 @@ class Work:
         self.limits = np.minimum(limits, duration)
         # As found for beams of 3 and 12 modes at fast and slow crossings, errors of 1e-7.
         modes = case.beam.modes
-        self.guesses = crossing / (15 * modes + 15 + 1.25 * crossing / limits / np.sqrt(modes))
+        self.guesses = crossing / (14 * modes + 13 + 1.25 * crossing / limits / np.sqrt(modes))
         self.guesses *= (tolerance / 1e-7) ** (1 / (2 * NODES))
 
     def steps(self) -> tuple[Float[np.ndarray, " task"], float]:

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 ORDER = 9  # at which errors are taken to fall with the step; the true order is higher
 FINER = 1.25  # how much finer the runs are with which others are compared
 ROUNDS = 12
+MARGIN = 4  # how much smaller errors must be where they are looked for than they may be elsewhere
 SMALL = 1e-6  # of a run's largest peak: smaller ones need not be right to the tolerance
 
 Measure = Callable[[Int[np.ndarray, " task"], Float[np.ndarray, " task"]], np.ndarray]
@@ -76,7 +77,7 @@ def choose_steps(
     for _ in range(ROUNDS):
         error = errors(measure, some, steps[some])
         worst = float(np.max(np.where(np.isnan(error), 0.0, error)))
-        if worst <= tolerance:
+        if worst <= tolerance / MARGIN:
             return steps, worst
         steps = steps * 0.7
     raise _hopeless(tolerance)

@@ -21,7 +21,7 @@ from jaxbeam.simulate import readings
 
 MASSES = np.linspace(0.1, 1.0, 64)
 SPEEDS = np.linspace(0.3, 10.0, 64)
-TOLERANCE = 5e-7  # of every peak; checked below against a reference
+TOLERANCE = 9e-7  # of every peak; checked below against a reference
 CHECKED = slice(0, 64, 9)  # speeds at which peaks are compared with the reference
 FREE = (
     "beam.flexural_rigidity",
