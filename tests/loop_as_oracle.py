@@ -86,11 +86,16 @@ def _sensor(sensor) -> closed_loop.Sensor:
 
 def _law(controller) -> closed_loop.Law:
     if isinstance(controller, Feedback):
-        gains, power = np.asarray(controller.gains), controller.power
-        heard = slice(0, gains.size)
-        return lambda readings, *_: (
-            -gains * readings[heard] * np.abs(readings[heard]) ** (power - 1)
-        )
+        rows = [controller.gains]
+        rows += [] if controller.higher_gains is None else list(controller.higher_gains)
+        powers = controller.power + 2 * np.arange(len(rows))
+
+        def feedback(readings, *_):
+            heard = readings[: len(controller.gains)]
+            terms = zip(np.asarray(rows), powers, strict=True)
+            return -sum(gains * heard * np.abs(heard) ** (power - 1) for gains, power in terms)
+
+        return feedback
     if isinstance(controller, StateFeedback):
         gain = np.asarray(controller.gain)
         return lambda _, state, t: -gain @ state

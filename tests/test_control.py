@@ -211,6 +211,14 @@ FAULTS = [
     ({"controller": jb.Feedback([1.0, 2.0])}, "controller.gains must list one gain for each of 1"),
     ({"sensors": ()}, "controller.gains has 1 entries, but there are only 0 sensors"),
     (
+        {"controller": jb.Feedback([1.0], higher_gains=[[1.0, 2.0]])},
+        "controller.higher_gains must have in each row a gain for each of 1 actuators, not 2",
+    ),
+    (
+        {"controller": jb.Feedback([1.0], higher_gains=[1.0])},
+        "controller.higher_gains must be a list of lists of numbers",
+    ),
+    (
         {"controller": jb.Feedback([1.0], period=0.5), "sensors": (jb.Sensor(0.3),)},
         "controller.period must not exceed the run's duration, 0.3 s; it is 0.5 s",
     ),
@@ -330,6 +338,7 @@ def test_faulty_tables_are_refused(table, message):
 CONTROLLERS = [
     HELD.controller,
     jb.Feedback([1.0], 3, resolution=0.1, period=0.01),
+    jb.Feedback([1.0], higher_gains=[[2.0], [3.0]], period=0.01),
     jb.StateFeedback([[1.0, 2.0, 3.0, 4.0, 5.0]], period=1e-3, delay=2e-3),
     jb.Prescribed(
         [0.1],

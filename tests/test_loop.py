@@ -104,6 +104,11 @@ LOOPS = {
     ),
     "linear law at every instant": loop([SHAKER], [PLACE], jb.StateFeedback(ALL_STATES)),
     "cubic law at every instant": loop([PATCH], [PLACE], jb.Feedback([2e8], power=3)),
+    "linear, cubic and quintic, two loops that are not collocated": loop(
+        [SHAKER, PATCH],
+        [jb.Sensor(0.15), jb.Sensor(0.45)],
+        jb.Feedback([100.0, 500.0], higher_gains=[[0.0, 1e8], [5e13, 3e13]], period=2e-3),
+    ),
     "law through an analogue filter": loop(
         [PATCH],
         [jb.Sensor(0.25, filter=jb.Filter(20.0, 4, realisation="analogue"))],

@@ -1,5 +1,6 @@
 """Controllers, one family a file, behind the interface in `controller`."""
 
+from jaxbeam.control.compensators import PD, Lead, PositivePositionFeedback
 from jaxbeam.control.discrete import DiscreteLQR
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.lqr import LQR, AugmentedLQR, FiniteLQR, StepLQR
@@ -13,12 +14,15 @@ from jaxbeam.control.state_feedback import StateFeedback
 KINDS = {
     "dlqr": DiscreteLQR,
     "feedback": Feedback,
+    "lead": Lead,
     "lqr": LQR,
     "lqr-augmented": AugmentedLQR,
     "lqr-finite": FiniteLQR,
     "lqr-scheduled": ScheduledLQR,
     "lqr-step": StepLQR,
     "mpc": MPC,
+    "pd": PD,
+    "ppf": PositivePositionFeedback,
     "prescribed": Prescribed,
     "state": StateFeedback,
 }
@@ -27,10 +31,13 @@ __all__ = [
     "KINDS",
     "LQR",
     "MPC",
+    "PD",
     "AugmentedLQR",
     "DiscreteLQR",
     "Feedback",
     "FiniteLQR",
+    "Lead",
+    "PositivePositionFeedback",
     "Prescribed",
     "Recognised",
     "Recognition",

@@ -1,0 +1,151 @@
+"""Feedback of readings through a filter of each loop's own: PD, lead, positive position feedback.
+
+Each is given by its continuous transfer function and made sampled by the bilinear transform, so a
+stable filter stays stable at every period. To add one, write a subclass with its `transfer`.
+"""
+
+import abc
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.polynomial import polynomial
+
+from jaxbeam.control.feedback import pairing_fault
+from jaxbeam.controller import AbstractController
+from jaxbeam.fields import POSITIVE, dimensions, is_known, known, number
+from jaxbeam.filters import filter_step
+
+Polynomials = Float[Array, "power actuator"]  # in s (rad/s), the coefficients ascending
+
+
+class AbstractCompensator(AbstractController):
+    """Each actuator answers the readings y of its own sensor through a filter: u(s) = H(s) y(s).
+
+    The first actuator listens to the first sensor, the second to the second, and so on. It needs
+    a period; before its first tick the filters have seen nothing but zero.
+    """
+
+    gains: Float[Array, " actuator"] = number("command per reading", "one gain for each actuator")
+
+    @property
+    def knows_loads(self) -> bool:
+        return False
+
+    @abc.abstractmethod
+    def transfer(self) -> tuple[Polynomials, Polynomials]:
+        """Numerators and denominators of H(s), all of one degree, 1 or 2."""
+
+    def stretch(self) -> Float[Array, " *actuator"]:
+        """The factor c (1/s) of the bilinear transform s = c (z - 1) / (z + 1)."""
+        return 2 / self.period
+
+    def fault(self, case):
+        wrong = pairing_fault(self.gains, case)
+        if wrong is not None:
+            return wrong
+        loops = self.gains.shape[0]
+        for field in dataclasses.fields(self):
+            if "unit" in field.metadata and dimensions(field) == "*actuator":
+                shape = jnp.shape(getattr(self, field.name))
+                if shape not in ((), (loops,)):
+                    return (
+                        f"{field.name} must be one number for all {loops} loops or one for each,"
+                        f" not {shape[0]}"
+                    )
+        return None
+
+    def init(self, model):
+        numerator, denominator = (_bilinear(part, self.stretch()) for part in self.transfer())
+        section = jnp.concatenate([numerator, denominator]) / denominator[0]
+        return section[None], jnp.zeros((1, 2, self.gains.shape[0]))
+
+    def step(self, memory, measurement, t):
+        sections, passed = memory
+        readings = measurement.readings[: self.gains.shape[0]]
+        command, passed = filter_step(sections, passed, readings)
+        return command, (sections, passed)
+
+    def _rows(self, *coefficients) -> Polynomials:
+        """Coefficients, each one number or one for each loop, as rows of such for each."""
+        return jnp.stack([jnp.broadcast_to(row, self.gains.shape) for row in coefficients])
+
+
+class PD(AbstractCompensator):
+    """Proportional feedback and a rate that is smoothed: u = -(g + r s / (lag s + 1)) y."""
+
+    rate_gains: Float[Array, " *actuator"] = number(
+        "command per reading per s", "gain of the rate of the reading"
+    )
+    lag: Float[Array, " *actuator"] = number(
+        "s", "time constant with which the rate is smoothed", POSITIVE
+    )
+
+    def transfer(self):
+        rise = self.gains * self.lag + self.rate_gains
+        return self._rows(-self.gains, -rise), self._rows(1.0, self.lag)
+
+
+class Lead(AbstractCompensator):
+    """Phase lead: u = -g (1 + s / z) / (1 + s / p) y; a phase lag if the zero z is above p."""
+
+    zero: Float[Array, " *actuator"] = number("Hz", "where the gain starts to rise", POSITIVE)
+    pole: Float[Array, " *actuator"] = number("Hz", "where it stops to rise", POSITIVE)
+
+    def transfer(self):
+        rise, stop = 1 / (2 * jnp.pi * self.zero), 1 / (2 * jnp.pi * self.pole)
+        return self._rows(-self.gains, -self.gains * rise), self._rows(1.0, stop)
+
+
+class PositivePositionFeedback(AbstractCompensator):
+    """A damped oscillator, driven by the reading, that pushes with it.
+
+        u = g w^2 / (s^2 + 2 zeta w s + w^2) y
+
+    (Goh and Caughey, International Journal of Control 41, 1985). Tuned to a mode it damps that,
+    and adds nothing to the gain above it; at rest it lowers the stiffness. The bilinear transform
+    is warped to meet it at its frequency.
+    """
+
+    frequency: Float[Array, " *actuator"] = number("Hz", "frequency of the oscillator", POSITIVE)
+    damping_ratio: Float[Array, " *actuator"] = number(
+        "1", "damping ratio of the oscillator", POSITIVE
+    )
+
+    def transfer(self):
+        turn = 2 * jnp.pi * self.frequency
+        rest = turn**2
+        resonant = self._rows(rest, 2 * self.damping_ratio * turn, 1.0)
+        return self._rows(self.gains * rest, 0.0, 0.0), resonant
+
+    def stretch(self):
+        turn = 2 * jnp.pi * self.frequency
+        return turn / jnp.tan(turn * self.period / 2)
+
+    def fault(self, case):
+        frequency, period = self.frequency, self.period
+        if period is not None and is_known(frequency) and is_known(period):
+            highest, nyquist = float(known(frequency).max()), 0.5 / float(known(period))
+            if highest >= nyquist:
+                return (
+                    f"frequency must be below half the sampling frequency, {nyquist:g} Hz;"
+                    f" it is {highest:g} Hz: lower it, or sample faster"
+                )
+        return super().fault(case)
+
+
+def _bilinear(coefficients: Polynomials, stretch) -> Float[Array, "3 actuator"]:
+    """Coefficients in 1/z of (1 + 1/z)^degree times a polynomial at s = c (z - 1) / (z + 1)."""
+    degree = coefficients.shape[0] - 1
+    powers = np.arange(degree + 1)
+    terms = np.stack(
+        [
+            polynomial.polymul(
+                polynomial.polypow([1, -1], n), polynomial.polypow([1, 1], degree - n)
+            )
+            for n in powers
+        ]
+    )
+    scaled = coefficients * jnp.asarray(stretch) ** powers[:, None]
+    return jnp.pad(terms.T @ scaled, ((0, 2 - degree), (0, 0)))

@@ -1,0 +1,204 @@
+"""Laws that answer readings: odd polynomials, and compensators against python-control and scipy."""
+
+import dataclasses
+import re
+
+import control
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.checks import check
+from jaxbeam.controller import Measurement
+from jaxbeam.linear_loop import linear_loop
+from jaxbeam.loop import loop_schedule
+from jaxbeam.plan import Plan, form
+from tests.loop_as_oracle import expected, span_of
+
+PERIOD = 2e-3
+READINGS = np.random.default_rng(4).normal(size=(60, 2)) * 1e-3
+CASE = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.01, modes=2),
+    actuators=[
+        jb.Patch(0.15, 0.235, 8.3e-4, correction=0.32, amplifier_gain=200.0),
+        jb.PointForce(0.4),
+    ],
+    sensors=[jb.Sensor(0.19), jb.Sensor(0.4)],
+    loads=[jb.MovingMass(mass=0.4, speed=2.0)],
+    run=jb.Run(0.2),
+)
+
+# Polynomials
+
+
+def test_an_odd_polynomial_of_each_reading_and_its_slope():
+    law = jb.Feedback([2.0, -1.0], higher_gains=[[3.0, 0.5], [4.0, -2.0]])
+    batch = jnp.array([[0.3, -0.7], [0.0, 0.0], [-1.2, 0.4], [0.9, 2.0]])
+
+    def answer(readings):
+        return law.step(None, seen(readings), jnp.zeros(()))[0]
+
+    for loop, row in enumerate(np.array([[2.0, 3.0, 4.0], [-1.0, 0.5, -2.0]])):
+        polynomial = np.polynomial.Polynomial([0, -row[0], 0, -row[1], 0, -row[2]])
+        assert_allclose(
+            jax.vmap(answer)(batch)[:, loop], polynomial(batch[:, loop]), rtol=1e-14, atol=0
+        )
+        slopes = jax.vmap(jax.jacrev(answer))(batch)[:, loop]
+        assert_allclose(slopes[:, loop], polynomial.deriv()(batch[:, loop]), rtol=1e-14)
+        assert not slopes[:, 1 - loop].any()
+
+
+def test_even_powers_are_odd_in_sign():
+    law = jb.Feedback([2.0], power=2, higher_gains=[[3.0]])
+    found, _ = law.step(None, seen(jnp.array([-0.5])), jnp.zeros(()))
+    assert_allclose(found, 2.0 * 0.5**2 + 3.0 * 0.5**4, rtol=1e-14)
+
+
+def seen(readings) -> Measurement:
+    return Measurement(readings, jnp.zeros(0), jnp.zeros(readings.shape))
+
+
+# Compensators: the law, and for each of its two loops numerator and denominator in s, and the
+# frequency (rad/s) at which sampling does not bend it.
+W = 2 * np.pi * np.array([12.0, 45.0])
+COMPENSATORS = {
+    "pd": (
+        jb.PD([300.0, 20.0], rate_gains=[4.0, 0.5], lag=3e-3, period=PERIOD),
+        [([-300.0 * 3e-3 - 4.0, -300.0], [3e-3, 1.0]), ([-20.0 * 3e-3 - 0.5, -20.0], [3e-3, 1.0])],
+        (None, None),
+    ),
+    "lead": (
+        jb.Lead([300.0, 20.0], zero=[5.0, 8.0], pole=[60.0, 90.0], period=PERIOD),
+        [
+            (-g * np.array([1 / (2 * np.pi * z), 1.0]), [1 / (2 * np.pi * p), 1.0])
+            for g, z, p in ((300.0, 5.0, 60.0), (20.0, 8.0, 90.0))
+        ],
+        (None, None),
+    ),
+    "ppf": (
+        jb.PositivePositionFeedback(
+            [300.0, 20.0], frequency=[12.0, 45.0], damping_ratio=0.3, period=PERIOD
+        ),
+        [([g * w**2], [1.0, 0.6 * w, w**2]) for g, w in zip((300.0, 20.0), W, strict=True)],
+        W,
+    ),
+}
+
+
+def sampled(name: str, period: float = PERIOD) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Coefficients of each loop's sampled filter, by python-control."""
+    _, loops, matched = COMPENSATORS[name]
+    found = []
+    for (above, below), at in zip(loops, matched, strict=True):
+        bent = control.c2d(control.tf(above, below), period, "tustin", prewarp_frequency=at)
+        found.append((bent.num[0][0], bent.den[0][0]))
+    return found
+
+
+@pytest.mark.parametrize("name", COMPENSATORS)
+def test_compensators_are_those_of_python_control_and_scipy(name):
+    law = COMPENSATORS[name][0]
+    memory, commands = law.init(None), []
+    for readings in READINGS:
+        command, memory = law.step(memory, seen(jnp.asarray(readings)), jnp.zeros(()))
+        commands.append(command)
+    for loop, coefficients in enumerate(sampled(name)):
+        truth = scipy.signal.lfilter(*coefficients, READINGS[:, loop])
+        found = np.array(commands)[:, loop]
+        assert_allclose(found, truth, rtol=0, atol=1e-12 * np.max(np.abs(truth)))
+
+
+def test_a_quick_compensator_is_its_continuous_transfer_function():
+    """At 5 Hz and a hundredth of the period: the order of the bilinear transform is two."""
+    s = 2j * np.pi * 5.0
+    for law, loops, _ in COMPENSATORS.values():
+        errors = []
+        for period in (PERIOD, PERIOD / 10):
+            quick = dataclasses.replace(law, period=jnp.asarray(period))
+            z = np.exp(s * period)
+            b0, b1, b2, _, a1, a2 = np.asarray(quick.init(None)[0])[0]
+            found = (b0 + b1 / z + b2 / z**2) / (1 + a1 / z + a2 / z**2)
+            truth = np.array([np.polyval(top, s) / np.polyval(low, s) for top, low in loops])
+            errors.append(np.abs(found / truth - 1).max())
+        assert_allclose(errors[0] / errors[1], 100.0, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_a_loop_with_compensators_is_that_of_the_oracle():
+    times = np.linspace(0.0, 0.2, 41)
+    case = dataclasses.replace(CASE, controller=COMPENSATORS["ppf"][0])
+    plan = Plan(form(case), 2, 0, False, 0.0, loop_schedule(case, times))
+    record = jb.simulate(case, jnp.asarray(times), plan)
+    filters = sampled("ppf")
+    memories = [np.zeros(len(low) - 1) for _, low in filters]
+
+    def law(readings, state, t):
+        command = np.zeros(2)
+        for i, coefficients in enumerate(filters):
+            (command[i],), memories[i] = scipy.signal.lfilter(
+                *coefficients, readings[i : i + 1], zi=memories[i]
+            )
+        return command
+
+    truth = expected(case, times, law)
+    for found, true in ((record.deflection, truth.deflection), (record.command, truth.command)):
+        assert np.all(np.abs(found - true) <= 1e-9 * np.max(np.abs(true), axis=0))
+
+
+def test_positive_position_feedback_damps_the_mode_it_is_tuned_to():
+    """Poles of the loop, sampled fast, are those of python-control's continuous one."""
+    span = span_of(CASE)
+    first = span.frequencies[0]
+    gain, ratio = 100.0, 0.3
+    law = jb.PositivePositionFeedback(
+        [gain], frequency=first / (2 * np.pi), damping_ratio=ratio, period=1e-5
+    )
+    case = dataclasses.replace(
+        CASE, actuators=[jb.PointForce(0.4)], sensors=[jb.Sensor(0.4)], loads=[], controller=law
+    )
+    n, push = span.modes, span.shapes(0.4)
+    stiffness, damping = np.diag(span.frequencies**2), 0.02 * np.diag(span.frequencies)
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -damping]])
+    plant = control.ss(a, np.append(np.zeros(n), push)[:, None], np.append(push, np.zeros(n)), 0.0)
+    oscillator = control.tf([gain * first**2], [1.0, 2 * ratio * first, first**2])
+    truth = control.feedback(plant, oscillator, sign=1).poles()
+    found = linear_loop(case, 0.0).poles()[: truth.size]
+    near = np.abs(found[:, None] - truth).min(axis=1)
+    assert np.all(near < 1e-3 * np.abs(found))
+    assert truth.real.max() < -2 * 0.01 * first  # twice the damping of the beam's own
+
+
+FAULTS = [
+    ({"gains": jnp.ones(1)}, "controller.gains must list one gain for each of 2 actuators, not 1"),
+    ({"lag": jnp.ones(3)}, "controller.lag must be one number for all 2 loops or one for each"),
+    ({"lag": jnp.asarray(0.0)}, "controller.lag must be positive"),
+    ({"period": None}, "the controller's memory needs a controller that samples: give controller."),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), FAULTS)
+def test_faulty_compensators_are_refused(change, message):
+    law = dataclasses.replace(COMPENSATORS["pd"][0], **change)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        check(dataclasses.replace(CASE, controller=law))
+
+
+def test_an_oscillator_too_quick_for_the_sampling_is_refused():
+    law = dataclasses.replace(COMPENSATORS["ppf"][0], period=jnp.asarray(0.012))
+    with pytest.raises(
+        ValueError, match=r"below half the sampling frequency, 41.6667 Hz; it is 45"
+    ):
+        check(dataclasses.replace(CASE, controller=law))
+
+
+@pytest.mark.parametrize("name", COMPENSATORS)
+def test_a_case_file_keeps_the_compensator(name, tmp_path):
+    case = dataclasses.replace(CASE, controller=COMPENSATORS[name][0])
+    jb.save_case(case, tmp_path / "case.toml")
+    assert f'kind = "{name}"' in (tmp_path / "case.toml").read_text()
+    assert eqx.tree_equal(jb.load_case(tmp_path / "case.toml"), case)
