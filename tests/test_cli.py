@@ -86,6 +86,7 @@ REFUSED = [
     ("simulate case.toml -o out.txt", "a record is written to a .nc file; call it out.nc"),
     ("simulate case.toml -o none/out.nc", "there is no folder none to write out.nc to"),
     ("simulate case.toml -o old.nc", "old.nc exists; choose another name or add --overwrite"),
+    ("simulate case.toml --animate out.mp4", "a moving picture is written to a .gif file"),
     ("simulate case.toml --set loads.0.speed", "--set takes ADDRESS=VALUE, such as"),
     ("simulate case.toml --set loads.0.sped=1", "loads.0 has no key 'sped'; did you mean 'speed'?"),
     ("simulate case.toml --set loads.1.speed=1", "no number at address 'loads.1.speed'; did you"),
@@ -180,11 +181,12 @@ def test_simulate_prints_and_writes_the_same(run, folder):
         "steps",
         "verdict",
     }
-    printed = run("simulate case.toml -o out.nc --plot")
+    printed = run("simulate case.toml -o out.nc --plot --animate out.gif")
     assert f"{float(record.peak_deflection[0]):.6g}" in printed
     assert "written: out.nc" in printed
     assert (folder / "out.nc").stat().st_size > 0
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "out.gif").read_bytes().startswith(b"GIF89a")
 
 
 def test_simulate_overwrites_only_when_told(run, refused, folder):

@@ -280,6 +280,25 @@ def test_animation(record, tmp_path):
     assert path.read_bytes() != before
 
 
+def test_animation_of_a_controlled_rig(tmp_path):
+    """Shaker and patch, commands, supports of both kinds: a picture as high as its rows."""
+    loop = jb.Feedback(gains=[1e3, 1e3], period=0.005)
+    case = dataclasses.replace(MANY, controller=loop, loads=CASE.loads)
+    record = jb.simulate(case)
+    heights = []
+    for name, shown in (("controlled", record), ("plain", jb.simulate(CASE))):
+        animate(shown, tmp_path / f"{name}.gif", frames=3)
+        with Image.open(tmp_path / f"{name}.gif") as picture:
+            heights.append(picture.size[1])
+            frames = [np.asarray(f.convert("L")) for f in ImageSequence.Iterator(picture)]
+        assert len(frames) == 3 and not np.array_equal(frames[0], frames[1])
+    assert heights[0] > heights[1]
+    diverged = dataclasses.replace(record, coordinates=record.coordinates.at[9:].set(jnp.nan))
+    with pytest.raises(ValueError, match="diverges"):
+        animate(diverged, tmp_path / "diverged.gif")
+    assert not (tmp_path / "diverged.gif").exists()
+
+
 def test_style_stays_in_the_figure():
     before = dict(matplotlib.rcParams)
     figure = plot_sweep(swept(loads_0_speed=[1.0, 2.0]))

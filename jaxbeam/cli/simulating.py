@@ -69,6 +69,7 @@ def simulate(
     output: Output = None,
     set_: Settings = (),
     plot: bool = False,
+    animate: Path | None = None,
     overwrite: Overwrite = False,
     json_: Json = False,
 ) -> None:
@@ -82,13 +83,16 @@ def simulate(
         Write the record to this netCDF file, OUT.nc.
     plot
         Draw the record to a PNG beside the output, or named after the case.
+    animate
+        Write the run as a moving picture to this file, OUT.gif.
     """
     import jaxbeam as jb
     from jaxbeam.simulate import ContactLossWarning
 
     check_suffix(output, ".nc", "a record")
+    check_suffix(animate, ".gif", "a moving picture")
     picture = picture_path(output, case) if plot else None
-    check_outputs(overwrite, output, picture)
+    check_outputs(overwrite, output, picture, animate)
     described = read_case(case, set_)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)  # the verdict says it
@@ -99,6 +103,10 @@ def simulate(
         from jaxbeam.plot import plot_record
 
         plot_record(record).savefig(picture)
+    if animate:
+        from jaxbeam.plot import animate as write_moving
+
+        write_moving(record, animate, overwrite=overwrite)
     if json_:
         names = ("peak_deflection", "lowest_contact_force", "contact_lost_time")
         summary = {name: getattr(record, name) for name in names}
@@ -131,7 +139,7 @@ def simulate(
             ],
         )
     print(f"{record.steps} steps")
-    print_written(output, picture)
+    print_written(output, picture, animate)
 
 
 @app.command
