@@ -1,0 +1,317 @@
+"""Checks of jaxbeam against sources that share no code with it, each with the error found now.
+
+The closed forms, the finite elements and the scipy solutions are those of `tests/oracles`.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import clarabel
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+import scipy.signal
+import scipy.sparse
+
+import jaxbeam as jb
+from jaxbeam import rigs
+from jaxbeam.control.reach import reach
+from jaxbeam.estimation import kalman_gain, sampled_kalman_gain
+from jaxbeam.filters import filter_history, initial, sections
+from jaxbeam.plan import make_plan
+from jaxbeam.reference import simulate_adaptive
+from jaxbeam.static import static_peak
+from tests import loop_as_oracle
+from tests.as_oracle import as_oracle
+from tests.differences import central
+from tests.oracles import crossing, modal_equations
+from tests.oracles.closed_forms import (
+    CHARACTERISTIC,
+    critical_speed,
+    influence_line,
+    moving_force,
+    single_span_parameters,
+    two_span_parameters,
+)
+from tests.oracles.exact_frequencies import exact_frequencies
+from tests.oracles.loads import GRAVITY, Load
+from tests.oracles.modal_equations import Span
+
+SPAN = Span(0.6, 11.68, 0.535, 4, 0.03)
+SENSORS = np.array([0.15, 0.25, 0.35])
+LOAD = jb.MovingMass(mass=0.4, speed=2.0)
+
+
+class Check(NamedTuple):
+    """One comparison: what, with what, and its error (relative) beside what is allowed."""
+
+    what: str
+    source: str
+    error: float
+    allowed: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is within what is allowed; NaN is not."""
+        return self.error <= self.allowed
+
+
+def off(found, expected) -> float:
+    """Largest difference, relative to the largest expected value."""
+    found, expected = np.asarray(found), np.asarray(expected)
+    return float(np.max(np.abs(found - expected)) / np.max(np.abs(expected)))
+
+
+def each_off(found, expected) -> float:
+    """Largest difference of any entry, relative to that entry."""
+    return float(np.max(np.abs(np.asarray(found) / np.asarray(expected) - 1)))
+
+
+def crossed(load=LOAD, span: Span = SPAN, duration: float = 0.6) -> jb.Case:
+    """A span on two pins with three sensors, crossed by a load."""
+    beam = jb.Beam(
+        span.length,
+        span.flexural_rigidity,
+        span.mass_per_length,
+        damping_ratio=span.damping_ratio,
+        modes=span.modes,
+    )
+    sensors = [jb.Sensor(x) for x in SENSORS]
+    return jb.Case(beam, sensors=sensors, loads=[load], run=jb.Run(duration, gravity=GRAVITY))
+
+
+def frequencies() -> Iterator[Check]:
+    """Natural frequencies of spans, on all ends and supports."""
+    unit = np.sqrt(11.68 / 0.535) / 0.6**2 / (2 * np.pi)
+    ends = {"-".join(sorted(pair) * (3 - len(pair))) for pair in CHARACTERISTIC}
+    worst = 0.0
+    for name in sorted(ends):
+        parameters = single_span_parameters(name, 8)
+        bending = parameters > 0
+        found = jb.modes(jb.Case(jb.Beam(0.6, 11.68, 0.535, ends=name, modes=8))).frequencies
+        worst = max(worst, each_off(found[bending], unit * parameters[bending] ** 2))
+        worst = max(worst, float(np.max(found[~bending], initial=0.0)))
+    yield Check(
+        f"8 frequencies of one span, {len(ends)} pairs of ends",
+        "roots of the characteristic equations",
+        worst,
+        1e-9,
+    )
+    errors = []
+    for ratio in (0.37, 0.45):
+        case = jb.Case(jb.Beam(0.6, 11.68, 0.535, modes=8), [jb.Support(0.6 * ratio)])
+        errors.append(
+            each_off(jb.modes(case).frequencies, unit * two_span_parameters(ratio, 8) ** 2)
+        )
+    yield Check(
+        "8 frequencies of two unequal spans",
+        "roots of the three-moment condition",
+        max(errors),
+        1e-9,
+    )
+    supports = [jb.Support(0.3, stiffness=8000.0, rotational_stiffness=3.0), jb.Support(0.8)]
+    patch = jb.Patch(0.45, 0.6, 1e-3, added_mass=0.1, added_rigidity=3.0)
+    case = jb.Case(jb.Beam(1.2, 12.0, 0.7, ends="clamped-free", modes=8), supports, [patch])
+    exact = exact_frequencies(as_oracle(case), 8) / (2 * np.pi)
+    yield Check(
+        "8 frequencies of a stepped beam with an elastic and a rigid support",
+        "dynamic stiffness matrix, counted by Wittrick and Williams",
+        each_off(jb.modes(case).frequencies, exact),
+        1e-9,
+    )
+
+
+def statics() -> Iterator[Check]:
+    """Static deflection under travelling weights."""
+    case = crossed()
+    places = np.linspace(0, SPAN.length, 6001)
+    line = [influence_line(SPAN.length, 11.68, "pinned-pinned", x, places) for x in SENSORS]
+    expected = 0.4 * GRAVITY * np.max(np.abs(line), axis=1)
+    yield Check(
+        "largest static deflection at three places",
+        "Macaulay's method",
+        each_off(static_peak(case, SENSORS), expected),
+        1e-6,  # the source looks at 6001 positions of the load
+    )
+
+
+def runs() -> Iterator[Check]:
+    """Crossings: deflection and contact force."""
+    undamped = dataclasses.replace(SPAN, damping_ratio=0.0)
+    case = crossed(jb.MovingForce(force=3.0, speed=1.0), undamped)
+    errors = []
+    for ratio in (0.05, 0.3, 1.0, 2.0, 3.7):
+        speed = ratio * critical_speed(undamped)
+        times = np.linspace(0, 2 * SPAN.length / speed, 201)
+        one = jb.replace(case, {"loads.0.speed": speed, "run.duration": times[-1]})
+        record = jb.simulate(one, jnp.asarray(times))
+        q, _ = moving_force(undamped, 3.0, speed, times)
+        errors.append(off(record.deflection, q @ undamped.shapes(SENSORS).T))
+    yield Check(
+        "moving force, 5 speeds from 0.05 to 3.7 of the critical one (it included)",
+        "closed form",
+        max(errors),
+        1e-7,
+    )
+    times = np.linspace(0, 0.6, 301)
+    case = crossed()
+    record = jb.simulate(case, jnp.asarray(times))
+    solved = modal_equations.respond(SPAN, [Load(0.4, 2.0)], SENSORS, times)
+    source = "modal equations with the whole mass matrix, scipy DOP853"
+    for what in ("deflection", "contact_force"):
+        error = off(getattr(record, what), getattr(solved, what))
+        yield Check(f"moving mass, {what.replace('_', ' ')}", source, error, 1e-5)
+    reference = simulate_adaptive(case, jnp.asarray(times))
+    yield Check(
+        "moving mass, deflection",
+        "other equations and another integrator inside jaxbeam (diffrax Dopri8)",
+        off(record.deflection, reference.deflection),
+        1e-6,
+    )
+    beam = jb.Beam(1.2, 12.0, 0.7, ends="clamped-free", modes=4, damping_ratio=0.02)
+    supports = [jb.Support(0.4, stiffness=3000.0, damping=5.0), jb.Support(0.9)]
+    sensors = [jb.Sensor(x) for x in (0.2, 0.6, 1.15)]
+    loads = [
+        jb.MovingMass(mass=0.3, speed=2.5, entry_time=0.02, deceleration=2.0),
+        jb.MovingMass(mass=0.2, speed=-3.0, entry_time=0.1),
+    ]
+    case = jb.Case(beam, supports, (), sensors, loads, run=jb.Run(0.8, gravity=GRAVITY))
+    times = np.linspace(0, 0.8, 161)
+    same = [Load(0.3, 2.5, 0.02, 2.0), Load(0.2, -3.0, 0.1)]
+    elements = as_oracle(case, elements=80)
+    elements = dataclasses.replace(elements, damping_ratio=0.02)
+    where = [0.2, 0.6, 1.15]
+    solved = crossing.respond(elements, same, where, times, modes=4, rtol=1e-9)
+    yield Check(
+        "two masses at once, one braking, one from the right, over an elastic support and a tip",
+        "80 Hermite elements, scipy DOP853",
+        off(jb.simulate(case, jnp.asarray(times)).deflection, solved.deflection),
+        1e-4,
+    )
+
+
+def energy() -> Iterator[Check]:
+    """What the load does to the beam is stored or dissipated."""
+    pieces = np.linspace(0, 0.3, 31)
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    half = np.diff(pieces) / 2
+    inner = (pieces[:-1] + half)[:, None] + half[:, None] * nodes
+    times = np.concatenate([[0.0], inner.ravel(), [0.3 - 1e-12]])
+    quadrature = np.concatenate([[0.0], np.outer(half, weights).ravel(), [0.0]])
+    record = jb.simulate(crossed(duration=0.3), jnp.asarray(times), tolerance=1e-9)
+    q, u = np.asarray(record.coordinates), np.asarray(record.rates)
+    stored = np.sum(u**2 + SPAN.frequencies**2 * q**2, axis=1)[-1] / 2
+    under = np.sum(u * record.modes.shapes(record.load_position[:, 0]), axis=1)
+    work = quadrature @ (-record.contact_force[:, 0] * under)
+    lost = quadrature @ np.sum(2 * SPAN.damping_ratio * SPAN.frequencies * u**2, axis=1)
+    yield Check(
+        f"stored and dissipated energy of a crossing (dissipated: {lost / work:.0%})",
+        "work of the contact force, by Gauss quadrature",
+        each_off(stored + lost, work),
+        1e-7,
+    )
+
+
+def gradients() -> Iterator[Check]:
+    """Derivatives of peaks by all sorts of numbers."""
+    case = crossed()
+    free = ("beam.flexural_rigidity", "beam.damping_ratio", "loads.0.mass", "loads.0.speed",
+            "sensors.0.position")  # fmt: skip
+    sizes = jnp.array([jb.addresses(case)[address] for address in free])
+    plan = make_plan(case, None, 1e-9)
+
+    @jax.jit
+    def peaks(point):
+        changed = jb.replace(case, dict(zip(free, point * sizes, strict=True)))
+        return jb.simulate(changed, plan=plan).peak_deflection
+
+    one = jnp.ones(len(free))
+    expected = central(peaks, one)
+    yield Check(
+        "derivatives of 3 peaks by 5 numbers",
+        "central differences of order 6",
+        off(jax.jit(jax.jacfwd(peaks))(one), expected),
+        1e-6,
+    )
+
+
+def loops() -> Iterator[Check]:
+    """Sampled closed loops, their gains and filters."""
+    case = rigs.load("B")
+    law = jb.Feedback(gains=[1e10], power=3, period=0.002, delay=0.001)
+    case = dataclasses.replace(case, controller=law)
+    changes = {"loads.0.speed": 1.5, "run.duration": 0.5}
+    case = jb.replace(case, changes)
+    times = np.linspace(0, 0.5, 126)[:-1] + 1e-4  # between the ticks
+    found = jb.simulate(case, jnp.asarray(times)).deflection
+    yield Check(
+        "cubic feedback, sampled, delayed, saturated: deflection",
+        "event by event with scipy DOP853",
+        off(found, loop_as_oracle.expected(case, times).deflection),
+        1e-5,
+    )
+    model = jb.state_space(dataclasses.replace(case, controller=None))
+    A, B = np.asarray(model.unloaded.A), np.asarray(model.unloaded.B)
+    Q, R = np.diag([1e6] * 3 + [1.0] * 3), np.array([[1e-4]])
+    weights = {"state_weight": np.diag(Q), "command_weight": np.diag(R)}
+    P = scipy.linalg.solve_continuous_are(A, B, Q, R)
+    gain = jb.LQR(**weights).gains(model)
+    yield Check("gain of the regulator", "scipy, algebraic Riccati equation",
+                off(gain, np.linalg.solve(R, B.T @ P)), 1e-6)  # fmt: skip
+    noise, C = np.diag([0.0] * 3 + [0.01, 0.02, 0.03]), np.eye(1, 6) * 1e3
+    P = scipy.linalg.solve_continuous_are(A.T, C.T, noise, R)
+    filtering = kalman_gain(*map(jnp.asarray, (A, C, noise, R)))
+    yield Check("gain of the Kalman filter", "scipy, algebraic Riccati equation",
+                off(filtering[0], P @ C.T / R), 1e-6)  # fmt: skip
+    held = scipy.signal.cont2discrete((A, B, C, np.zeros((1, 1))), 0.002)[0]
+    sampled = model.unloaded.discretize(0.002)
+    yield Check("plant sampled at 500 Hz", "scipy cont2discrete", off(sampled.A, held), 1e-9)
+    P = scipy.linalg.solve_discrete_are(held.T, C.T, noise, R)
+    gain = P @ C.T / (C @ P @ C.T + R)
+    found = sampled_kalman_gain(*map(jnp.asarray, (held, C, noise, R)))[0]
+    yield Check("gain of the sampled Kalman filter", "scipy, discrete Riccati equation",
+                off(found, gain), 1e-6)  # fmt: skip
+    signal = np.random.default_rng(7).normal(size=(2000, 1)).cumsum(axis=0)
+    rows = sections(jb.Filter(40.0, 5), 1e-3)
+    filtered = filter_history(rows, initial(rows, np.zeros(1)), jnp.asarray(signal))
+    butter = scipy.signal.butter(5, 40.0, fs=1000.0, output="sos")
+    yield Check("Butterworth filter of order 5, output", "scipy butter and sosfilt",
+                off(filtered, scipy.signal.sosfilt(butter, signal, axis=0)), 1e-9)  # fmt: skip
+
+
+def bounds() -> Iterator[Check]:
+    """The least peak that any controller leaves."""
+    case = jb.replace(rigs.load("B"), {"loads.0.speed": 1.0, "run.duration": 0.8})
+    best = jb.bound(case)
+    found = reach(case, best.places, best.period, best.spacing)
+    free = found.free @ found.rows[0]
+    response = np.einsum("m,tmk->tk", found.rows[0], found.response[..., 0])
+    count, scale = response.shape[1], 1e3
+    one = np.ones((free.size, 1))
+    rows = np.block([[scale * response, -one], [-scale * response, -one]])
+    box = np.block([[np.eye(count), np.zeros((count, 1))], [-np.eye(count), np.zeros((count, 1))]])
+    low, high = map(float, case.actuators[0].limits)
+    right = np.concatenate(
+        [-scale * free, scale * free, np.full(count, high), np.full(count, -low)]
+    )
+    options = clarabel.DefaultSettings()
+    options.verbose = False
+    solver = clarabel.DefaultSolver(
+        scipy.sparse.csc_matrix((count + 1, count + 1)),
+        np.append(np.zeros(count), 1.0),
+        scipy.sparse.csc_matrix(np.concatenate([rows, box])),
+        right,
+        [clarabel.NonnegativeConeT(right.size)],
+        options,
+    )
+    other = solver.solve().x[-1] / scale
+    yield Check("least peak of rig B", "the whole linear program, by Clarabel",
+                each_off(best.peak, other), 1e-6)  # fmt: skip
+    record = jb.simulate(dataclasses.replace(case, controller=best.controller()))
+    yield Check("least peak of rig B", "a run with the commands that are said to attain it",
+                each_off(np.max(np.abs(record.deflection)), best.peak), 1e-4)  # fmt: skip
+
+
+CHECKS = (frequencies, statics, runs, energy, gradients, loops, bounds)
