@@ -67,14 +67,16 @@ def test_merits_are_those_of_the_simulated_runs(bench):
         assert merits["contact"][i] == pytest.approx(change, rel=1e-3)
 
 
-@pytest.mark.parametrize("over", ["mean", "worst", "cvar"])
-def test_gradient_of_the_objective(bench, over):
-    objective = tuning.Objective({"peak": 1.0, "rms": 0.3, "effort": 0.1, "contact": 0.2}, over)
+def test_gradients_of_the_objectives(bench):
+    """Of a mix of all, which share the runs, and so what is compiled for them."""
+    weights = {"peak": 1.0, "rms": 0.3, "effort": 0.1, "contact": 0.2}
+    objectives = [tuning.Objective(weights, over) for over in ("mean", "worst", "cvar")]
 
     @jax.jit
     def value(gain):
         merits = bench.merits({GAIN: gain}, 80.0)
-        return objective.of_runs(objective.of_run(merits), 80.0)
+        parts = [each.of_runs(each.of_run(merits), 80.0) for each in objectives]
+        return parts[0] + 0.7 * parts[1] + 0.4 * parts[2]
 
     expected = central(lambda point: value(point[0]), [4000.0], step=1.0)[0]
     assert jax.jit(jax.grad(value))(4000.0) == pytest.approx(expected, rel=1e-6)
