@@ -159,7 +159,7 @@ def rivals_plan():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
-@settings(max_examples=25)
+@settings(max_examples=8)
 @given(
     mass=st.floats(0.1, 1.0),
     speed=st.floats(0.5, 3.0),
@@ -219,7 +219,9 @@ def test_two_actuators_and_a_hold_cut_short():
     case = dataclasses.replace(patched(duration=0.333), actuators=(PATCH, force))
     both = bound(case)
     assert both.commands.shape == (34, 2)
-    assert both.peak < bound(patched(duration=0.333)).peak
+    # With next to no force, which compiles nothing anew, the patch is on its own.
+    alone = bound(jb.replace(case, {"actuators.1.limits.1": 1e-9}))
+    assert both.peak < alone.peak * (1 - 1e-6)
     assert np.all((both.commands[:, 1] >= 0) & (both.commands[:, 1] <= 1))
 
 
