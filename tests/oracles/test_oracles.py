@@ -289,7 +289,7 @@ def test_a_suspension_of_all_modes_is_an_elastic_support():
     """Seen twice: as a coupling of the pinned beam's modes, and inside the modes."""
     plain = Beam(0.6, 11.68, 0.535, elements=6)
     spring = {"position": 0.5, "stiffness": 3500.0, "damping": 20.0}
-    times, load = np.linspace(0.0, 0.2, 21), Load(0.5, 4.0)
+    times, load = np.linspace(0.0, 0.1, 21), Load(0.5, 8.0)
     first, second = (
         crossing.respond(Beam(**(vars(plain) | extra)), [load], [0.2], times, rtol=1e-9).deflection
         for extra in ({"suspensions": [Suspension(**spring)]}, {"supports": [Support(**spring)]})
