@@ -1,6 +1,7 @@
 """Several controllers on the same case, beside no control and the best that is possible.
 
-To add a figure of merit, give `Merits` a field, `_merits` its value and `printing` a column.
+To add a figure of merit, give `Merits` a field, `merits_of` its value and the table of
+`jaxbeam compare` (in `cli.comparing`) a column.
 """
 
 import dataclasses
@@ -14,16 +15,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case import Case, known_case
 from jaxbeam.compiling import compiled
+from jaxbeam.control import MPC
 from jaxbeam.control.bound import HELD, Bound, bound
 from jaxbeam.controller import AbstractController, Measurement
+from jaxbeam.fields import known
+from jaxbeam.linear_loop import LinearLoop, OpenLoop, linear, open_loop, prepared
 from jaxbeam.loads import motion
+from jaxbeam.margins import margins
+from jaxbeam.modes import lay_out
 from jaxbeam.record import Record
 from jaxbeam.simulate import ContactLossWarning, simulate
 from jaxbeam.statespace import state_space
 
 REPEATS = 5  # of timing a controller
+PLACES = 13  # of the loads along a crossing, at which margins are looked for
+STILL = 1e-6  # 1/s: what moves at a smaller rate neither grows nor dies out
 
 
 class Merits(NamedTuple):
@@ -32,7 +40,8 @@ class Merits(NamedTuple):
     Peak (m), at samples and in between; root mean square (m) over the run; largest deflection (m)
     after the last load has left, NaN if the run ends before; effort of each actuator (the integral
     of its squared command); share of the run that each spends at a limit; median time (s) a step
-    takes to compute, NaN without steps; share of the attainable reduction of the peak.
+    takes to compute, NaN without steps; share of the attainable reduction of the peak; stability
+    margins as `Reserve` has them.
     """
 
     peak: float
@@ -42,6 +51,20 @@ class Merits(NamedTuple):
     saturated: Float[np.ndarray, " actuator"]
     step_time: float
     share: float
+    reserve: "Reserve"
+
+
+class Reserve(NamedTuple):
+    """How much more gain (a factor) and delay (s) a loop bears at any one of its commands.
+
+    The loads are parked, in several places along the crossing, of which the worst counts; limits
+    of the actuators are left out. Both are zero where the loop is unstable as it is, and NaN
+    where `obstacle` says why there are none.
+    """
+
+    gain: float
+    delay: float
+    obstacle: str = ""
 
 
 class Comparison(eqx.Module):
@@ -105,7 +128,74 @@ def merits_of(record: Record, limit: Bound) -> Merits:
         saturated=np.asarray(record.saturated).mean(axis=0),
         step_time=step_time(record),
         share=limit.share(record),
+        reserve=reserve(record.case),
     )
+
+
+def reserve(case: Case) -> Reserve:
+    """The stability margins of the loop of a case, the worst along the crossing.
+
+    Parked loads lack the terms of their motion, which act as damping of either sign: what those do
+    within a crossing is for `stability.growth` to tell, a margin belongs to a loop that stays.
+    """
+    controller = case.controller
+    if controller is None or controller.blind:
+        return _without("commands that do not depend on readings close no loop")
+    if isinstance(controller, MPC) and controller.solver != "unconstrained":
+        return _without("a law that heeds limits bends at them: no linear loop stands for it")
+    try:
+        clock = prepared(case)
+    except ValueError as error:
+        return _without(str(error))
+    loop = open_loop(case, lay_out(known_case(case)))
+    least = Reserve(np.inf, np.inf)
+    for t in _along(case):
+        parked = _changing(linear(_parked(loop, t), clock, jnp.asarray(t)))
+        if not np.all(np.isfinite(parked.closed)):
+            return _without("the law finds no rest under loads that are parked")
+        rightmost = float(parked.poles().real[0])
+        if abs(rightmost) < STILL:
+            return _without("a part of the loop, as a mode without damping, never comes to rest")
+        if rightmost > 0:
+            return Reserve(0.0, 0.0)
+        with np.errstate(divide="ignore"):  # a loop without gain bears any
+            each = [margins(parked, i) for i in range(len(case.actuators))]
+        gain, delay = min(one.gain for one in each), min(one.delay for one in each)
+        least = Reserve(min(least.gain, gain), min(least.delay, delay))
+    return least
+
+
+def _without(obstacle: str) -> Reserve:
+    return Reserve(np.nan, np.nan, obstacle)
+
+
+def _parked(loop: OpenLoop, t: float) -> OpenLoop:
+    """The loop with its loads at rest where they are at t (s)."""
+    loop, none = loop.frozen(jnp.asarray(t)), jnp.zeros(())
+    still = tuple(
+        dataclasses.replace(load, speed=none, acceleration=none)
+        for load in loop.wide.traffic.motions
+    )
+    return eqx.tree_at(lambda loop: loop.wide.traffic.motions, loop, still)
+
+
+def _changing(loop: LinearLoop) -> LinearLoop:
+    """A sampled loop without what stays as it is from tick to tick, such as a law's counters."""
+    if loop.period is None:
+        return loop
+    size = loop.A.shape[0]
+    stays = np.all(np.asarray(loop.A) == np.eye(size), axis=1) & ~np.any(loop.B, axis=1)
+    kept = ~stays
+    return LinearLoop(loop.A[kept][:, kept], loop.B[kept], loop.K[:, kept], loop.period, loop.modal)
+
+
+def _along(case: Case) -> np.ndarray:
+    """Instants (s) from the first entry to the last exit, or the end of the run."""
+    if not case.loads:
+        return np.zeros(1)
+    windows = [motion(load, case.beam.length).window() for load in case.loads]
+    entries, exits = known(jnp.array(windows)).T
+    return np.linspace(entries.min(), min(exits.max(), known(case.run.duration)), PLACES)
 
 
 def step_time(record: Record) -> float:

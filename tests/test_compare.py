@@ -6,13 +6,16 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
+import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.casefile import load_controller
 from jaxbeam.cli import main
-from jaxbeam.compare import compare, step_time
+from jaxbeam.compare import PLACES, compare, reserve, step_time
 from jaxbeam.plot import plot_comparison
+from tests.loop_as_oracle import span_of
 from tests.test_plot import words
 
 CASE = """
@@ -53,6 +56,11 @@ kind = "feedback"
 gains = [-8000.0]
 period = 0.01
 """
+TOLD = """
+[controller]
+kind = "prescribed"
+offsets = [1.0]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +69,7 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("compare")
     (path / "weak.toml").write_text(CASE + WEAK)
     (path / "wild.toml").write_text(WILD)
+    (path / "told.toml").write_text(TOLD)
     return path
 
 
@@ -90,6 +99,47 @@ def test_merits_are_those_of_the_records(found):
     assert found.merits["wild"].saturated[0] > 0.1 > found.merits["weak"].saturated[0]
     assert found.bound.share(found.best) > 0.99
     assert np.isnan(step_time(found.free))
+
+
+def critical_gain(case: jb.Case, place: float) -> float:
+    """The gain with which the sampled loop turns unstable while the mass is parked at a place."""
+    span, mass, period = span_of(case), 0.509, 0.01
+    n, under, seen = span.modes, span.shapes(place), span.shapes(0.3)
+    pull = 8.292e-4 * 0.32 * 200.0 * (span.shapes(0.2575, 1) - span.shapes(0.3425, 1))
+    mobility = np.linalg.inv(np.eye(n) + mass * np.outer(under, under))
+    damping = np.diag(2 * 0.03 * span.frequencies)
+    lower = -mobility @ np.hstack([np.diag(span.frequencies**2), damping])
+    a = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+    b, c = np.append(np.zeros(n), mobility @ pull)[:, None], np.append(seen, np.zeros(n))[None]
+    drift, push, *_ = scipy.signal.cont2discrete((a, b, c, np.zeros((1, 1))), period)
+
+    def beyond(gain):
+        return np.abs(np.linalg.eigvals(drift - gain * push @ c)).max() - 1
+
+    return scipy.optimize.brentq(beyond, 0.0, 2e4)
+
+
+def test_the_margin_is_that_of_the_worst_place_of_the_parked_mass(found):
+    gains = [critical_gain(found.records["weak"].case, x) for x in np.linspace(0, 0.6, PLACES)]
+    assert_allclose(found.merits["weak"].reserve.gain, min(gains) / 2000.0, rtol=1e-9)
+    assert 0 < found.merits["weak"].reserve.delay < 0.01
+    assert found.merits["weak"].reserve.obstacle == ""
+
+
+def test_what_is_no_linear_loop_has_no_margin(found, folder):
+    slow = dataclasses.replace(found.case.sensors[0], sampling_period=jnp.asarray(0.02))
+    told = load_controller(folder / "told.toml")
+    for changes, obstacle in (
+        ({"controller": told}, "do not depend on readings"),
+        ({"controller": jb.MPC(4, 2, 1e-9, period=0.01)}, "heeds limits"),
+        (
+            {"controller": found.records["weak"].case.controller, "sensors": (slow,)},
+            "sensors.0.sampling_period must be the controller's",
+        ),
+    ):
+        missing = reserve(dataclasses.replace(found.case, **changes))
+        assert np.isnan(missing.gain) and np.isnan(missing.delay)
+        assert obstacle in missing.obstacle
 
 
 def test_the_picture_names_every_run(found):
@@ -133,12 +183,14 @@ def run(line: str, folder, monkeypatch, capsys) -> tuple[int, str, str]:
 
 @pytest.mark.slow
 def test_the_command_prints_and_draws(found, folder, monkeypatch, capsys):
-    line = "compare weak.toml --controllers wild.toml"
+    line = "compare weak.toml --controllers wild.toml told.toml"
     code, printed, wrong = run(f"{line} -o out.png", folder, monkeypatch, capsys)
     assert code == 0, wrong
     assert f"below {found.bound.peak:.6g} m" in printed
     assert f"{found.merits['weak'].share:.1%}" in printed
     assert "wild: every load presses on the beam throughout" in printed
+    assert f"{found.merits['weak'].reserve.gain:.3g}" in printed
+    assert "no margin of told: commands that do not depend on readings close no loop" in printed
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
     code, printed, wrong = run(f"{line} --json --period 0.02", folder, monkeypatch, capsys)
     assert code == 0, wrong
@@ -146,6 +198,7 @@ def test_the_command_prints_and_draws(found, folder, monkeypatch, capsys):
     assert answer["held_for"] == 0.02
     assert answer["least_peak"] >= found.bound.peak * (1 - 1e-6)
     assert answer["controllers"]["weak"]["peak"] == found.merits["weak"].peak
+    assert answer["controllers"]["wild"]["reserve"]["gain"] is None  # any: it is infinite
 
 
 @pytest.mark.parametrize(

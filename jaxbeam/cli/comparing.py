@@ -55,7 +55,8 @@ def compare(
                 "least_peak": limit.peak,
                 "held_for": limit.period,
                 "controllers": {
-                    name: merits._asdict() | {"verdict": found.records[name].verdict}
+                    name: merits._asdict()
+                    | {"reserve": merits.reserve._asdict(), "verdict": found.records[name].verdict}
                     for name, merits in found.merits.items()
                 },
             }
@@ -74,6 +75,8 @@ def compare(
             "after exit (m)",
             "effort (command^2 s)",
             "saturated",
+            "gain margin",
+            "delay margin (s)",
             "time per step (s)",
         ),
         [
@@ -85,11 +88,22 @@ def compare(
                 f"{merits.after_exit:.4g}",
                 " ".join(f"{effort:.4g}" for effort in merits.effort),
                 " ".join(f"{share:.1%}" for share in merits.saturated),
+                *(_margin(merits.reserve, number) for number in merits.reserve[:2]),
                 f"{merits.step_time:.2g}",
             )
             for name, merits in found.merits.items()
         ],
     )
+    obstacles = {name: merits.reserve.obstacle for name, merits in found.merits.items()}
+    for obstacle in dict.fromkeys(filter(None, obstacles.values())):
+        names = [name for name, met in obstacles.items() if met == obstacle]
+        print(f"no margin of {', '.join(names)}: {obstacle}")
     for name, record in found.records.items():
         print(f"{name}: {record.verdict}")
     print_written(output)
+
+
+def _margin(reserve, number: float) -> str:
+    if reserve.obstacle:
+        return "-"
+    return "unstable" if reserve.gain == 0 else f"{number:.3g}"
