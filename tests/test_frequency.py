@@ -260,8 +260,7 @@ def test_responses_differentiate_inside_jit():
 
     ones = jnp.ones(3)
     expected = central(sizes, ones, 1e-3)
-    for jacobian in (jax.jacfwd, jax.jacrev):
-        assert_allclose(jacobian(sizes)(ones), expected, rtol=1e-6, atol=1e-7)
+    assert_allclose(jax.jacrev(sizes)(ones), expected, rtol=1e-6, atol=1e-7)
 
     def moved(x):
         return jnp.abs(receptance(RIG_A, [25.0], x, 0.2, [(x, 0.5)], layout))[0]
