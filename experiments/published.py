@@ -250,6 +250,27 @@ FEEDBACK_VOLTS = Printed(
     "Fig. 6.9", "largest voltage at a patch", "V", "measured", VOLTS, "111 680", "m1,span1 m4,span2"
 )
 TWO_MASSES = Printed("Fig. 6.11", "s3, less by cubic for two masses", "%", "measured", RUNS, "10.5")
+UNSTABLE_MASS = Printed(
+    "Fig. 6.10",
+    "two spans, lightest mass with which the cubic law of k = 3 is unstable",
+    "kg",
+    "measured",
+    FORMULA,
+    "0.322",
+    reading="of the masses tried; unstable is what drives the commands to their limits",
+)
+SWITCHED_MASSES = Printed(
+    "Fig. 6.7",
+    "one span, masses from which cubic k = 2 beats linear k = 2 and 3",
+    "kg",
+    "computed",
+    CURVE,
+    "0.345 0.45",
+    "k2 k3",
+)
+LAST_GAIN = Printed(
+    "Fig. 6.7", "one span, linear gain as good as cubic k = 2", "V/mm", "computed", CURVE, "3.6"
+)
 ONE_SPAN_LINEAR = Printed(
     "Fig. 6.6",
     "one span, less by linear, least and most",
