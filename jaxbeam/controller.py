@@ -83,6 +83,6 @@ class AbstractController(eqx.Module):
         """How many steps until now found no solution and fell back, for what solves at each."""
         return jnp.zeros(())
 
-    def knots(self) -> Float[Array, " knot"] | None:
-        """Times (s) at which the command bends or jumps by itself; steps then end there."""
+    def knots(self, case: Any) -> Float[Array, " knot"] | None:
+        """Times (s) at which the command bends or jumps by itself in a run; steps end there."""
         return None

@@ -34,7 +34,7 @@ ITERATIONS = 4  # of Newton's method for a law at every instant; one would do fo
 def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> Schedule:
     """When the controller of a case acts and its sensors are read, up to the last sample (s)."""
     controller, end = case.controller, samples[-1]
-    knots = controller.knots()
+    knots = controller.knots(case)
     knots = np.zeros(0) if knots is None else known(knots)
     if controller.period is None:
         return merged(samples, np.zeros(0), 0.0, [], [], knots)

@@ -39,7 +39,7 @@ def expected(case: Case, times, law: closed_loop.Law | None = None) -> closed_lo
         delay = _number(controller.delay) or 0.0
         period = float(controller.period)
         clock = closed_loop.Clock(period, delay, _number(controller.resolution))
-    knots = [] if controller.knots() is None else np.asarray(controller.knots()).tolist()
+    knots = [] if controller.knots(case) is None else np.asarray(controller.knots(case)).tolist()
     return closed_loop.respond(
         *parts_of(case),
         _law(controller) if law is None else law,

@@ -13,7 +13,9 @@ from jaxbeam.riccati import lqr
 from jaxbeam.statespace import LoadedBeam
 from jaxbeam.stretches import NODES, Commands, Square, costs_to_go, riccati_rate, stretches
 
-LAYER = 12  # times the stretch before an event is halved, for the fast layer of P there
+# Backward in time P hastens, right before an event, to what the plant from then on demands: in the
+# last stretches, so many of them, edges come ever closer, each by a factor, so many times.
+LAST, CLOSER, LAYER = 8, 0.8, 50
 INSIDE = 1e-9  # of a stretch: how far within it its ends are looked at
 
 # State matrix and command matrix at a time (s).
@@ -44,16 +46,27 @@ def crossing(model: LoadedBeam) -> Float[Array, " event"]:
     return jnp.minimum(events, last)
 
 
-def edges_between(events: Float[Array, " event"], count: int) -> Float[Array, " edge"]:
-    """Edges of stretches from event to event, `count` equal ones and finer ones before the event.
-
-    Backward in time P hastens, right before an event, to what the plant from then on demands.
-    """
-    even, layer = np.arange(count) / count, 1 - 0.5 ** np.arange(1, LAYER + 1)
-    shares = jnp.asarray(np.concatenate([even, 1 - 1 / count + layer / count]))
-    spans = jnp.diff(events)
-    inner = events[:-1, None] + spans[:, None] * shares
+def edges_between(
+    events: Float[Array, " event"], shares: Float[np.ndarray, " share"]
+) -> Float[Array, " edge"]:
+    """Edges (s) of stretches: at these shares, from 0 on, of the time from event to event."""
+    inner = events[:-1, None] + jnp.diff(events)[:, None] * shares
     return jnp.append(inner.reshape(-1), events[-1])
+
+
+def even(count: int) -> Float[np.ndarray, " share"]:
+    """Shares for so many equal stretches."""
+    return np.arange(count) / count
+
+
+def hastening(count: int) -> Float[np.ndarray, " share"]:
+    """Shares for so many equal stretches, but for the fine layer at the end."""
+    return np.concatenate([even(count)[: -min(LAST, count)], 1 - layer(count)])
+
+
+def layer(count: int) -> Float[np.ndarray, " edge"]:
+    """Edges of the fine layer before an event, as shares of the time since the one before."""
+    return min(LAST, count) / count * CLOSER ** np.arange(LAYER + 1)
 
 
 def finite_time(

@@ -11,12 +11,23 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.control.gains import GainTable, crossing, edges_between, finite_time, step_by_step
+from jaxbeam.control.gains import (
+    GainTable,
+    crossing,
+    edges_between,
+    even,
+    finite_time,
+    hastening,
+    layer,
+    step_by_step,
+)
 from jaxbeam.control.sampling import warn_if_slow
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, is_known, known, number
+from jaxbeam.loads import motion
 from jaxbeam.riccati import lqr
 from jaxbeam.statespace import LoadedBeam
 
@@ -182,6 +193,32 @@ class AbstractScheduledRegulator(AbstractRegulator):
         return -memory.gain(t) @ jnp.concatenate([estimate.state, loads]), memory
 
 
+class AbstractForesighted(AbstractScheduledRegulator):
+    """What those regulators share that are found backward in time.
+
+    `terminal_weight` is the diagonal of F, eq. (3.3) of the thesis; Q if left out.
+    """
+
+    terminal_weight: Float[Array, " state"] | None = number(
+        "s/unit of the state^2", "weight of each state at the end", NOT_NEGATIVE, default=None
+    )
+
+    def fault(self, case):
+        return super().fault(case) or too_coarse(self, case)
+
+    def gains(self, model):
+        return optimal(self, model)[0]
+
+    def knots(self, case):
+        """At every instant, the fast layer of the gains before each event must be resolved."""
+        if self.period is not None:
+            return None
+        windows = [known(motion(load, case.beam.length).window()) for load in case.loads]
+        events = np.sort(np.ravel(windows))
+        spans = np.diff(events[events < known(case.run.duration)])
+        return (events[1 : spans.size + 1, None] - spans[:, None] * layer(self.points)).ravel()
+
+
 class StepLQR(AbstractScheduledRegulator):
     """At each time the regulator of the plant frozen then, eqs (3.10) and (3.11) of the thesis."""
 
@@ -190,51 +227,28 @@ class StepLQR(AbstractScheduledRegulator):
             return model.A(t), model.B(t)
 
         return step_by_step(
-            plant, edges_between(crossing(model), self.points), *self.weights(model)
+            plant, edges_between(crossing(model), even(self.points)), *self.weights(model)
         )
 
 
-class FiniteLQR(AbstractScheduledRegulator):
-    """The optimal regulator over the crossing, backward from the `terminal_weight` at its end.
-
-    `terminal_weight` is the diagonal of F, eqs (3.3) to (3.9) of the thesis; Q if left out.
-    """
-
-    terminal_weight: Float[Array, " state"] | None = number(
-        "s/unit of the state^2", "weight of each state at the end", NOT_NEGATIVE, default=None
-    )
-
-    def fault(self, case):
-        return super().fault(case) or too_coarse(self, case)
-
-    def gains(self, model):
-        return optimal(self, model)[0]
+class FiniteLQR(AbstractForesighted):
+    """The optimal regulator over the crossing, eqs (3.3) to (3.9) of the thesis."""
 
 
-class AugmentedLQR(AbstractScheduledRegulator):
+class AugmentedLQR(AbstractForesighted):
     """The optimal regulator over the crossing that knows the loads, eq. (5.8) of the thesis.
 
     The weights of all loads are constant states of the model: the command answers those on the
     beam, and, as the times of entry are known, those still to come.
     """
 
-    terminal_weight: Float[Array, " state"] | None = number(
-        "s/unit of the state^2", "weight of each state at the end", NOT_NEGATIVE, default=None
-    )
-
     @property
     def feeds_loads_forward(self) -> bool:
         return True
 
-    def fault(self, case):
-        return super().fault(case) or too_coarse(self, case)
-
-    def gains(self, model):
-        return optimal(self, model)[0]
-
 
 def optimal(
-    regulator: FiniteLQR | AugmentedLQR, model: LoadedBeam
+    regulator: AbstractForesighted, model: LoadedBeam
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """Table of optimal gains for a model, and P at its edges, load states included."""
     Q, R = regulator.weights(model)
@@ -246,7 +260,7 @@ def optimal(
         return system.A, system.B[:, : len(model.case.actuators)]
 
     Q, F = (jnp.pad(weight, (0, loads)) for weight in (Q, F))
-    return finite_time(plant, edges_between(crossing(model), regulator.points), Q, R, F)
+    return finite_time(plant, edges_between(crossing(model), hastening(regulator.points)), Q, R, F)
 
 
 def too_coarse(regulator: AbstractScheduledRegulator, case: Any, slowest=None) -> str | None:
