@@ -120,7 +120,7 @@ def solve_contact(gains, inertia, drive):
     if size == 0:
         return drive
     matrix = inertia[:, None] * gains[:, :, None] + np.eye(size)[:, :, None]
-    return _solve(matrix, -drive[:, None])[:, 0]
+    return _solve(matrix, -drive[:, None])[0][:, 0]
 
 
 @solve_contact.defjvp
@@ -133,20 +133,23 @@ def _solve_contact_jvp(primals, tangents):
     return forces, solve_contact(gains, inertia, change)
 
 
-def _solve(matrix, right):
-    """Solve systems (row, row, lane) by halves: few operations, each on all lanes at once."""
+def _solve(matrix, *rights):
+    """Solve systems (row, row, lane) by halves: few operations, each on all lanes at once.
+
+    Linear in each of the right sides (row, column, lane), so that it can be transposed.
+    """
     size = matrix.shape[0]
     if size <= 3:
-        return _times(_inverse(matrix), right)
+        inverse = _inverse(matrix)
+        return tuple(_times(inverse, right) for right in rights)
     half = size // 2
-    upper = _solve(
-        matrix[:half, :half], jnp.concatenate([matrix[:half, half:], right[:half]], axis=1)
-    )
-    lower = jnp.concatenate([matrix[half:, half:], right[half:]], axis=1)
-    lower = lower - _times(matrix[half:, :half], upper)
-    rest = size - half
-    last = _solve(lower[:, :rest], lower[:, rest:])
-    return jnp.concatenate([upper[:, rest:] - _times(upper[:, :rest], last), last])
+    tops = [matrix[:half, half:], *(right[:half] for right in rights)]
+    across, *upper = _solve(matrix[:half, :half], *tops)
+    below = matrix[half:, :half]
+    rests = [right[half:] - _times(below, top) for right, top in zip(rights, upper, strict=True)]
+    lower = _solve(matrix[half:, half:] - _times(below, across), *rests)
+    pairs = zip(upper, lower, strict=True)
+    return tuple(jnp.concatenate([top - _times(across, end), end]) for top, end in pairs)
 
 
 def _times(a, b):
