@@ -111,7 +111,8 @@ def critical_gain(case: jb.Case, place: float) -> float:
     lower = -mobility @ np.hstack([np.diag(span.frequencies**2), damping])
     a = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
     b, c = np.append(np.zeros(n), mobility @ pull)[:, None], np.append(seen, np.zeros(n))[None]
-    drift, push, *_ = scipy.signal.cont2discrete((a, b, c, np.zeros((1, 1))), period)
+    system = scipy.signal.cont2discrete((a, b, c, np.zeros((1, 1))), period)
+    drift, push = np.asarray(system[0]), np.asarray(system[1])
 
     def beyond(gain):
         return np.abs(np.linalg.eigvals(drift - gain * push @ c)).max() - 1
