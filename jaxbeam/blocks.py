@@ -42,12 +42,11 @@ class Work:
 
     def __init__(self, case: Case, tasks: Tasks, histories: bool, tolerance: float):
         self.case, self.tasks, self.histories, self.tolerance = case, tasks, histories, tolerance
-        samples = sample_times(case)
-        self.schedule = (
-            sampled(samples, True)
-            if case.controller is None
-            else loop_schedule(case, np.asarray(samples))
-        )
+        self.schedule = None
+        if case.controller is not None:
+            self.schedule = loop_schedule(case, np.asarray(sample_times(case)))
+        elif histories:
+            self.schedule = sampled(sample_times(case), True)
         self._compiling, self._compiled = threading.Lock(), False
         count, lanes = tasks.index.shape
         self.each = min(count, max(1, RUNS // lanes))
@@ -214,17 +213,21 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
             driver = make_loop(varied, form.layout, loads, schedule)
             rigging = prepare(driver.rig, heavy, longest, driver)
         if substeps is None:
-            best = march(rigging, loads, slots=form.slots, driver=driver)
-            history = {}
+            best, memory = march(rigging, loads, slots=form.slots, driver=driver)
+            history = {} if driver is None else {"controller_failures": driver.failures(memory)}
         else:
             grid, assembled = rigging.grid, rigging.rig
             steps = grid.counts.shape[0] * substeps
-            best, states, *_ = trace(rigging, loads, slots=form.slots, steps=steps, driver=driver)
+            best, states, _, shown = trace(
+                rigging, loads, slots=form.slots, steps=steps, driver=driver
+            )
             edges = substeps * grid.place[schedule.samples]
             samples = states[edges][:, 0 : 2 * varied.beam.modes : 2]
             places = jnp.stack([sensor.position for sensor in varied.sensors])
             rows = assembled.shapes(places, (0,))[0]
             history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
+            if shown is not None:
+                history["controller_failures"] = shown[1][edges[-1]]
         peak, time = best.peak()
         return {
             "peak_deflection": peak.T,

@@ -156,8 +156,10 @@ def march(
     *,
     slots: int,
     driver: AbstractDriver | None = None,
-) -> Extremes:
+) -> tuple[Extremes, Any]:
     """Integrate from rest over a grid, keeping only extremes at the watched places.
+
+    They are returned with the memory of the driver at the end.
 
     The loop runs as long as it must: it ends early when all lanes are given up, and without a
     driver when the energy left after the last exit cannot raise any peak. `slots` is how many
@@ -198,4 +200,4 @@ def march(
         jnp.ones((), bool),
     )
     ended: Any = jax.lax.while_loop(more, go, start)
-    return ended[2]
+    return ended[2], ended[1]

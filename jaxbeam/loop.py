@@ -194,11 +194,13 @@ class Loop(AbstractDriver):
         controller = self.model.case.controller
         if controller.period is None:
             return None
+        return self._arrived(memory[3], moment.edge), self.failures(memory)
+
+    def failures(self, memory) -> Float[Array, " lane"]:
+        """How many steps of the controller found no solution until now, in every lane."""
         own, commands = memory[:2]
-        failures = jax.vmap(
-            controller.failures, in_axes=-1, out_axes=-1, axis_size=commands.shape[-1]
-        )(own)
-        return self._arrived(memory[3], moment.edge), failures
+        count = self.model.case.controller.failures
+        return jax.vmap(count, in_axes=-1, out_axes=-1, axis_size=commands.shape[-1])(own)
 
     def _arrived(self, shown, edge):
         """The newest readings (sensor, lane) that have arrived by an edge."""

@@ -81,7 +81,7 @@ def run_extremes(
     assembled = rig(case, form.layout, form.coupled)
     grid = even_grid(case, assembled, longest)
     loads = traffic(case) if lanes is None else lanes
-    return march(make_rigging(assembled, grid, watched), loads, slots=form.slots)
+    return march(make_rigging(assembled, grid, watched), loads, slots=form.slots)[0]
 
 
 class Plan(eqx.Module):
@@ -186,7 +186,7 @@ def _probe_driven(case, form, schedule, substeps):
     driver = make_loop(case, form.layout, loads, schedule)
     grid = scheduled_grid(case, driver.rig, schedule, substeps)
     rigging = make_rigging(driver.rig, grid, places, driver)
-    best = march(rigging, loads, slots=form.slots, driver=driver)
+    best, _ = march(rigging, loads, slots=form.slots, driver=driver)
     return best.peak()[0]
 
 

@@ -55,7 +55,8 @@ def sweep(
     each address, or with `paired` the first of each, the second of each, and so on along `run`.
     The dataset holds `peak_deflection` (..., sensor) in m with its time, the lowest contact force
     and the first time at which a load would have to pull (..., load), and `failed`: a run whose
-    result is not finite is marked there, holds NaN, and touches no other. With `histories`, also
+    result is not finite is marked there, holds NaN, and touches no other. With a controller,
+    `controller_failures` counts the steps at which it found no solution. With `histories`, also
     `deflection` (..., time, sensor) at the run's sample rate.
 
     Runs are computed in blocks on all cores, compiled once, each with the longest time step that
@@ -173,6 +174,7 @@ _UNITS = {
     "peak_time": ("s", "time of the largest absolute deflection", ("sensor",)),
     "lowest_contact_force": ("N", "smallest contact force", ("load",)),
     "contact_lost_time": ("s", "first time at which the load would have to pull", ("load",)),
+    "controller_failures": ("1", "steps at which the controller found no solution", ()),
     "deflection": ("m", "deflection", ("time", "sensor")),
 }
 

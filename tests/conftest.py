@@ -10,12 +10,8 @@ import sys
 os.environ["MPLBACKEND"] = "Agg"
 # On a machine with a GPU, several test processes share it: none may take most of the memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-# Most of the time of the tests is compiling: as `jaxbeam.compiling` does for the library itself,
-# and with hardly any optimisation of what is run only once or twice.
-os.environ["XLA_FLAGS"] = (
-    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 "
-    + os.environ.get("XLA_FLAGS", "")
-)
+# As `jaxbeam.compiling` does for the library itself: most of the time of the tests is compiling.
+os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false " + os.environ.get("XLA_FLAGS", "")
 
 import hypothesis
 import pytest

@@ -378,6 +378,16 @@ def test_records_count_steps_without_a_solution():
 
 
 @pytest.mark.slow
+def test_sweeps_count_steps_without_a_solution():
+    """At 1000 V/s the limits are reached in a period, at 10 V/s they never are."""
+    stuck = dataclasses.replace(PATCH, limits=jnp.array([1.0, 2.0]), rate_limit=jnp.array(10.0))
+    case = rig(mpc(), modes=1, patch=stuck, duration=0.05)
+    runs = jb.sweep(case, {"actuators.0.rate_limit": [10.0, 1000.0]}, progress=False)
+    assert_array_equal(runs.controller_failures, [6.0, 0.0])
+    assert not runs.failed.any()
+
+
+@pytest.mark.slow
 def test_derivatives_of_a_closed_loop(crossing):
     """By r_w and the weights of the horizon, forward and in reverse; limits are felt throughout."""
 
