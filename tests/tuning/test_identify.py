@@ -8,7 +8,6 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case import replace
-from jaxbeam.compiling import options
 from tests.oracles import modal_equations
 from tests.oracles.loads import Load
 from tuning import Fit, Log, identify
@@ -188,11 +187,7 @@ class Rehearsal:
 
 @pytest.fixture(scope="module")
 def rehearsal() -> Rehearsal:
-    """Optimised, as little else in the tests is: what is compiled here runs thousands of times."""
-    with pytest.MonkeyPatch.context() as patch:
-        optimised = options() | {"xla_backend_optimization_level": 2}
-        patch.setattr("tuning.search.options", lambda: optimised)
-        return Rehearsal()
+    return Rehearsal()
 
 
 def coloured(white, memory: float):

@@ -173,6 +173,7 @@ def test_the_start_is_kept_where_nothing_better_is_met():
 PLAIN = jb.Case(rig().beam, loads=rig().loads, sensors=rig().sensors)
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_to_stay_stable():
     # A light load: heavy ones have frozen poles to the right on the far half even without control.
     light = {"loads.0.mass": 0.05}
