@@ -214,11 +214,11 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
             rigging = prepare(driver.rig, heavy, longest, driver)
         if substeps is None:
             best, memory = march(rigging, loads, slots=form.slots, driver=driver)
-            history = {} if driver is None else {"controller_failures": driver.failures(memory)}
+            history = {}
         else:
             grid, assembled = rigging.grid, rigging.rig
             steps = grid.counts.shape[0] * substeps
-            best, states, _, shown = trace(
+            best, states, *_, memory = trace(
                 rigging, loads, slots=form.slots, steps=steps, driver=driver
             )
             edges = substeps * grid.place[schedule.samples]
@@ -226,8 +226,8 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
             places = jnp.stack([sensor.position for sensor in varied.sensors])
             rows = assembled.shapes(places, (0,))[0]
             history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
-            if shown is not None:
-                history["controller_failures"] = shown[1][edges[-1]]
+        if driver is not None:
+            history["controller_failures"] = driver.failures(memory)
         peak, time = best.peak()
         return {
             "peak_deflection": peak.T,

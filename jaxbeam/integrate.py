@@ -125,12 +125,13 @@ def trace(
     steps: int,
     driver: AbstractDriver | None = None,
 ):
-    """Integrate from rest over a grid; return extremes, states, commands, and what is shown.
+    """Integrate from rest over a grid: extremes, states, commands, what is shown, and memory.
 
     States (edge, state, lane) are those at the start of every step and at the end, commands
     (step, command, lane) those at the nodes of every step, None without a `driver`; what it shows
-    is kept for every step. Extremes are those at the watched places, None if there are none.
-    `slots` is how many loads may be on the beam at once. Reverse mode stores one state a chunk.
+    is kept for every step, its memory that at the end. Extremes are those at the watched places,
+    None if there are none. `slots` is how many loads may be on the beam at once. Reverse mode
+    stores one state a chunk.
     """
     chunk = _stepper(rigging, traffic, slots, driver)
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
@@ -144,10 +145,12 @@ def trace(
     memory = None if driver is None else driver.start(lanes)
     rest = jnp.zeros((rigging.rig.states, lanes))
     firsts = jnp.arange(0, steps, CHUNK)
-    (state, _, best), history = jax.lax.scan(jax.checkpoint(whole), (rest, memory, best), firsts)
+    (state, memory, best), history = jax.lax.scan(
+        jax.checkpoint(whole), (rest, memory, best), firsts
+    )
     history = jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2)[:steps], history)
     states, commands, shown = history
-    return best, jnp.concatenate([states, state[None]]), commands, shown
+    return best, jnp.concatenate([states, state[None]]), commands, shown, memory
 
 
 def march(

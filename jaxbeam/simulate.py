@@ -153,7 +153,9 @@ def _trace(case: Case, plan: Plan, times, watched):
     count = grid.counts.shape[0] * plan.substeps
     slots = plan.form.slots
     rigging = make_rigging(assembled, grid, watched, driver)
-    best, states, commands, shown = trace(rigging, loads, slots=slots, steps=count, driver=driver)
+    best, states, commands, shown, _ = trace(
+        rigging, loads, slots=slots, steps=count, driver=driver
+    )
     edges = plan.substeps * grid.place[schedule.samples]
     states = states[edges]
     shown, failures = (None, None) if shown is None else (part[edges, ..., 0] for part in shown)

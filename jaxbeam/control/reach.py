@@ -147,6 +147,6 @@ def _answers(case: Case, form: Form, schedule: Schedule, substeps: int, hold, wh
     grid = scheduled_grid(case, assembled, schedule, substeps)
     steps = grid.counts.shape[0] * substeps
     rigging = make_rigging(assembled, grid, None, driver)
-    _, states, _, _ = trace(rigging, loads, slots=form.slots, steps=steps, driver=driver)
+    _, states, *_ = trace(rigging, loads, slots=form.slots, steps=steps, driver=driver)
     edges = substeps * grid.place[schedule.samples]
     return states[edges][:, : 2 * case.beam.modes : 2]

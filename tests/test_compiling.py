@@ -1,0 +1,43 @@
+"""Compiled functions, alone and as parts of others; settings that XLA does not know."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from jaxbeam import compiling
+from jaxbeam.compiling import compiled
+
+POINTS = np.array([0.1, 0.7, 2.0])
+
+
+@compiled
+def wave(x, power: int = 1):
+    return jnp.sin(x) ** power
+
+
+@pytest.mark.parametrize(
+    ("transformed", "expected"),
+    [
+        (lambda x: wave(x, 3), lambda x: np.sin(x) ** 3),
+        (jax.vmap(wave), np.sin),
+        (jax.vmap(jax.grad(wave)), np.cos),
+        (jax.jacfwd(wave), lambda x: np.diag(np.cos(x))),
+        (jax.jit(lambda x: wave(x) + wave(0.5)), lambda x: np.sin(x) + np.sin(0.5)),
+        (jax.jit(lambda x: x * jax.grad(wave)(0.5)), lambda x: x * np.cos(0.5)),
+    ],
+)
+def test_it_is_the_function_wherever_it_is_called(transformed, expected):
+    """Settings are refused within another function: they must not be given there."""
+    assert_allclose(transformed(POINTS), expected(POINTS), rtol=1e-14)
+
+
+def test_settings_that_are_not_known_are_left_out(monkeypatch):
+    monkeypatch.setattr(compiling, "OPTIONS", {"xla_no_such_setting": True})
+    compiling._known.cache_clear()
+    try:
+        assert compiling.options() == {}
+        assert_allclose(compiled(jnp.cos)(0.5), np.cos(0.5), rtol=1e-14)
+    finally:
+        compiling._known.cache_clear()
