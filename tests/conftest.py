@@ -5,6 +5,7 @@ float64 is not set here: importing `jaxbeam` sets it, and the tests rely on that
 
 import os
 import sys
+import tempfile
 
 # No window, on a machine with or without a screen; also in processes a test starts.
 os.environ["MPLBACKEND"] = "Agg"
@@ -12,6 +13,13 @@ os.environ["MPLBACKEND"] = "Agg"
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 # As `jaxbeam.compiling` does for the library itself: most of the time of the tests is compiling.
 os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false " + os.environ.get("XLA_FLAGS", "")
+# What one process has compiled, the other test processes, later files, and commands that tests
+# start need not compile again. Set before these are started, they all use the same folder.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _programs = tempfile.TemporaryDirectory(prefix="compiled", ignore_cleanup_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs.name
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 import hypothesis
 import pytest
