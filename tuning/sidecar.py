@@ -10,9 +10,10 @@ from typing import Any
 from jaxbeam.casefile import read_part
 from jaxbeam.loads import KINDS, AbstractLoad
 
-_KEYS = ("loads", "columns", "time")
+_KEYS = ("loads", "columns", "time", "runs")
 _COLUMN_KEYS = {
     "unit": (str, "a word"),
+    "sensitivity": (str, 'like "100 mV/g"'),
     "sensor": (int, "a whole number from 0"),
     "position": ((int, float), "a number in m"),
     "actuator": (int, "a whole number from 0"),
@@ -26,6 +27,15 @@ class Sidecar:
     time: str | None = None
     columns: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     loads: tuple[AbstractLoad, ...] | None = None
+    runs: Mapping[str, tuple[AbstractLoad, ...]] = field(default_factory=dict)
+
+    def loads_of(self, run: str) -> tuple[AbstractLoad, ...] | None:
+        """The loads of a run of the file: its own, or else those of all."""
+        return self.runs.get(run, self.loads)
+
+    def sensitivity(self, name: str) -> str | None:
+        """What the transducer of a column gives for what it measures, such as `100 mV/g`."""
+        return self.columns.get(name, {}).get("sensitivity")
 
     def unit(self, name: str) -> str | None:
         """Unit declared for a column."""
@@ -69,10 +79,12 @@ def read_sidecar(log: Path) -> Sidecar:
         _check_keys(path, f"columns.{name}.", entry, _COLUMN_KEYS)
         _check_types(path, f"columns.{name}.", entry)
         columns[name] = entry
-    loads = None
-    if "loads" in data:
-        loads = tuple(_load(path, i, entry) for i, entry in enumerate(data["loads"]))
-    return Sidecar(data.get("time"), columns, loads)
+    loads = _loads(path, "", data) if "loads" in data else None
+    runs = {}
+    for name, entry in data.get("runs", {}).items():
+        _check_keys(path, f"runs.{name}.", entry, ("loads",))
+        runs[name] = _loads(path, f"runs.{name}.", entry)
+    return Sidecar(data.get("time"), columns, loads, runs)
 
 
 def _check_keys(path, prefix, data, known) -> None:
@@ -90,9 +102,12 @@ def _check_types(path, prefix, entry) -> None:
             raise ValueError(f"{path}, {prefix}{key}: must be {words}, not {value!r}")
 
 
-def _load(path, index, entry) -> AbstractLoad:
-    """Build one load from its table, as a case file has it."""
+def _loads(path, prefix, table) -> tuple[AbstractLoad, ...]:
+    """Build loads from their tables, as a case file has them."""
     try:
-        return read_part(f"loads.{index}", entry, KINDS)
+        return tuple(
+            read_part(f"{prefix}loads.{i}", entry, KINDS)
+            for i, entry in enumerate(table.get("loads", ()))
+        )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

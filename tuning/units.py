@@ -5,6 +5,7 @@ Units live at the edge: a log is converted once, on reading, and is SI from then
 
 import difflib
 import math
+import re
 from typing import NamedTuple
 
 
@@ -78,3 +79,27 @@ def unit(text: str) -> Unit:
         hint = f"did you mean {' or '.join(near)}" if near else f"known are {', '.join(UNITS)}"
         raise ValueError(f"unknown unit {text!r}; {hint}")
     return UNITS[name]
+
+
+_SENSITIVITY = re.compile(
+    r"\s*(?P<size>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<out>[^\s/]+)\s*/(?P<of>.+)"
+)
+
+
+def by_sensitivity(text: str, logged: Unit) -> Unit:
+    """The unit of what a transducer measures, given its sensitivity, such as `100 mV/g`.
+
+    `logged` is the unit of the column, that of the transducer's output (volts, say).
+
+    Raises ValueError if the text is no sensitivity, is zero, or is in another kind of unit.
+    """
+    found = _SENSITIVITY.fullmatch(text)
+    if found is None or float(found["size"]) == 0.0:
+        raise ValueError(f"the sensitivity {text!r} should be like '100 mV/g': number, unit/unit")
+    out, measured = unit(found["out"]), unit(found["of"].strip().strip("()"))
+    if out.quantity != logged.quantity:
+        raise ValueError(
+            f"the sensitivity {text!r} is for {out.quantity}, but the column is {logged.quantity}"
+        )
+    per_unit = float(found["size"]) * out.factor / measured.factor
+    return Unit(measured.si, logged.factor / per_unit, measured.quantity)

@@ -8,14 +8,11 @@ Lines at the top that start with `#` are comments.
 
 import csv
 import io
-import re
 from pathlib import Path
 
 import numpy as np
 
-from tuning.readers.table import Table, numbers, read_text
-
-_HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+from tuning.readers.table import Table, heading, numbers, read_text
 
 
 def read_csv(path: Path) -> Table:
@@ -51,11 +48,7 @@ def read_csv(path: Path) -> Table:
             trailing = len(row) == len(headings) + 1 and not row[-1].strip()
             rows.append(row[:-1] if trailing else row)
             lines.append(top + reader.line_num)
-    parts = [_HEADING.match(heading) for heading in headings]
-    names = tuple(
-        part["name"] if part else heading for part, heading in zip(parts, headings, strict=True)
-    )
-    units = tuple(part["unit"] if part else None for part in parts)
+    names, units = zip(*map(heading, headings), strict=True)
     decimal_comma = separator != "," and _has_decimal_comma(path, rows, lines)
     values = numbers(path, names, rows, lines, decimal_comma)
     return Table(names, units, values, np.array(lines))

@@ -1,0 +1,80 @@
+"""Faults put into a clean log are found where they are, and nothing else is."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tuning import Log, find_faults, mask
+
+TIMES = np.arange(600) / 500
+CLEAN = np.column_stack([np.sin(12 * TIMES) * np.exp(-TIMES), np.cos(20 * TIMES)])
+
+
+def log_of(values=None, times=TIMES, noise=1e-3):
+    values = CLEAN if values is None else values
+    values = values + noise * np.random.default_rng(0).normal(size=values.shape)
+    return Log(times, values, ("a", "b"), ("deflection",) * 2, ("m",) * 2, "run.csv")
+
+
+def changed(samples, to, log=None):
+    """The log with samples of its first channel set to something."""
+    log = log or log_of()
+    values = np.array(log.values)
+    values[samples, 0] = to
+    return dataclasses.replace(log, values=values)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 0.05])
+def test_a_clean_log_has_no_faults(noise):
+    assert find_faults(log_of(noise=noise)) == []
+    steps = np.where(TIMES > 0.5, CLEAN.T, 0.0).T  # a sudden onset is no fault
+    assert [f.kind for f in find_faults(log_of(steps, noise=1e-3))] == []
+    coarse = np.round(CLEAN / 0.05) * 0.05
+    assert find_faults(log_of(coarse, noise=0.0)) == []
+
+
+def test_spikes():
+    (fault,) = find_faults(changed([100, 300], [3.0, -2.0]))
+    assert (fault.kind, fault.channel) == ("spikes", "a")
+    assert np.flatnonzero(fault.samples).tolist() == [100, 300]
+    assert str(fault) == "run.csv: 2 samples of a stand far out of their neighbours, " + (
+        "first at t = 0.2 s"
+    )
+
+
+def test_clipped_readings():
+    log = log_of()
+    values = np.array(log.values)
+    values[:, 1] = np.clip(values[:, 1], -0.7, 0.9)
+    (fault,) = find_faults(dataclasses.replace(log, values=values))
+    assert (fault.kind, fault.channel) == ("saturation", "b")
+    truly = (log.values[:, 1] > 0.9) | (log.values[:, 1] < -0.7)
+    assert np.mean(fault.samples[truly]) > 0.7 and not np.any(fault.samples[~truly])
+
+
+def test_a_stuck_channel():
+    (fault,) = find_faults(changed(slice(400, 500), 0.123))
+    assert fault.kind == "stuck" and np.flatnonzero(fault.samples).tolist() == [*range(400, 500)]
+
+
+def test_gaps_and_a_drifting_clock():
+    kept = np.r_[:200, 230:600]
+    (gap,) = find_faults(log_of(CLEAN[kept], TIMES[kept]))
+    assert gap.words == "run.csv: about 30 samples are missing after t = 0.398 s"
+    bent = TIMES + 0.004 * (TIMES / 1.2) * (1 - TIMES / 1.2) * 4
+    (drift,) = find_faults(log_of(times=bent))
+    assert "the clock drifts: midway the times are 2 steps" in drift.words
+    assert find_faults(log_of(times=np.round(TIMES, 3))) == []
+
+
+def test_masking_is_asked_for_and_said():
+    log = changed(100, 3.0, changed(slice(400, 500), 0.123))
+    masked = mask(log, ["spikes"])
+    assert np.flatnonzero(~masked.valid[:, 0]).tolist() == [100] and masked.valid[:, 1].all()
+    assert masked.notes == ("1 samples of a are left out (spikes)",)
+    np.testing.assert_array_equal(masked.values, log.values)
+    assert [fault.kind for fault in find_faults(masked)] == ["stuck"]
+    assert np.sum(~mask(masked, ["stuck"]).valid) == 101
+    with pytest.raises(ValueError, match="'gaps' cannot be masked; spikes, saturation, stuck can"):
+        mask(log, ["gaps"])

@@ -1,0 +1,203 @@
+"""Binary logs, written by the libraries that own the formats: the same run comes back from each."""
+
+import numpy as np
+import pytest
+import scipy.io
+
+from tuning import read_log, read_logs
+
+TIMES = np.arange(40) / 500
+D1, D2 = np.sin(20 * TIMES), np.cos(30 * TIMES) - 1  # mm
+
+
+def tdms(path, runs=("",), step=0.002, extra=None):
+    nptdms = pytest.importorskip("nptdms")
+    channels = []
+    for i, run in enumerate(runs):
+        about = {"wf_increment": step, "wf_start_offset": 0.0, "unit_string": "mm"}
+        channels.append(nptdms.ChannelObject(run or "log", "d1", D1 + i, about))
+        channels.append(nptdms.ChannelObject(run or "log", "d2", D2 + i, about | (extra or {})))
+    with nptdms.TdmsWriter(path) as writer:
+        writer.write_segment(channels)
+
+
+def hdf5(path, runs=("",), units="mm"):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for i, run in enumerate(runs):
+            group = file.create_group(run) if run else file
+            group["time"], group["d1"], group["d2"] = TIMES, D1 + i, D2 + i
+            group["time"].attrs["units"] = "s"
+            group["calibration"] = np.arange(3.0)
+            for name in ("d1", "d2"):
+                group[name].attrs["units"] = units
+
+
+def hdf5_by_rate(path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        file.attrs["sample_rate"] = 500.0
+        file["d1 [mm]"], file["d2 [mm]"] = D1, D2
+
+
+def mat(path, runs=("",)):
+    def run(i):
+        names = {"time": "s", "d1": "mm", "d2": "mm"}
+        return {"time": TIMES, "d1": D1 + i, "d2": D2 + i, "gain": 3.0, "units": names}
+
+    scipy.io.savemat(path, run(0) if runs == ("",) else {r: run(i) for i, r in enumerate(runs)})
+
+
+def netcdf(path):
+    with scipy.io.netcdf_file(path, "w") as file:
+        file.createDimension("time", TIMES.size)
+        for name, values, unit in (("time", TIMES, "s"), ("d1", D1, "mm"), ("d2", D2, "mm")):
+            variable = file.createVariable(name, "d", ("time",))
+            variable[:], variable.units = values, unit
+
+
+def parquet(path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet as files
+
+    stamps = np.datetime64("2024-03-01T12:00:00") + (1e6 * TIMES).round().astype("timedelta64[us]")
+    fields = [
+        pyarrow.field("time", pyarrow.timestamp("us")),
+        pyarrow.field("d1 [mm]", pyarrow.float64()),
+        pyarrow.field("d2", pyarrow.float64(), metadata={"unit": "mm"}),
+    ]
+    columns = [pyarrow.array(values) for values in (stamps, D1, D2)]
+    files.write_table(pyarrow.table(columns, schema=pyarrow.schema(fields)), path)
+
+
+FORMATS = {
+    "run.tdms": tdms,
+    "run.h5": hdf5,
+    "rate.h5": hdf5_by_rate,
+    "run.mat": mat,
+    "run.nc": netcdf,
+    "run.parquet": parquet,
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_same_run_comes_back(tmp_path, name):
+    FORMATS[name](tmp_path / name)
+    log = read_log(tmp_path / name)
+    assert log.names == ("d1", "d2") and log.units == ("mm", "mm")
+    np.testing.assert_allclose(log.times, TIMES, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(log.values, 1e-3 * np.column_stack([D1, D2]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["run.tdms", "run.h5", "run.mat"])
+def test_several_runs_in_a_file(tmp_path, name):
+    path = tmp_path / name
+    FORMATS[name](path, ("slow", "fast"))
+    path.with_suffix(".toml").write_text(
+        "[[loads]]\nkind = 'mass'\nmass = 0.5\nspeed = 1.0\n"
+        "[[runs.fast.loads]]\nkind = 'mass'\nmass = 0.5\nspeed = 2.0\n"
+    )
+    logs = {log.source.rsplit(":", 1)[1]: log for log in read_logs(path)}
+    assert set(logs) == {"slow", "fast"}
+    assert {run: float(log.loads[0].speed) for run, log in logs.items()} == {"slow": 1, "fast": 2}
+    np.testing.assert_allclose(logs["fast"].values, logs["slow"].values + 1e-3, atol=1e-12)
+    assert read_log(path, run="fast").source == f"{path}:fast"
+    with pytest.raises(ValueError, match="it holds 2 runs, .*'fast'.*name one, or use read_logs"):
+        read_log(path)
+    with pytest.raises(ValueError, match="it has no run 'fats'; it has "):
+        read_log(path, run="fats")
+    path.with_suffix(".toml").write_text("[runs.quick]\n")
+    with pytest.raises(ValueError, match="run.toml: runs.quick is no run of run."):
+        read_logs(path)
+
+
+def test_rows_that_name_their_run(tmp_path):
+    path = tmp_path / "runs.csv"
+    path.write_text("run,t [s],d [mm]\n1,0,1\n1,1,2\n2,0,3\n2,1,4\n2,2,5\n")
+    first, second = read_logs(path)
+    assert first.source.endswith(":1") and first.names == ("d",)
+    np.testing.assert_allclose(second.values[:, 0], [3e-3, 4e-3, 5e-3])
+
+
+def test_what_is_left_out_is_said(tmp_path):
+    hdf5(tmp_path / "run.h5")
+    assert read_log(tmp_path / "run.h5").notes == (
+        "left out, not being 40 samples long: calibration",
+    )
+
+
+def test_missing_samples_are_masked_only_when_asked(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("t [s],a [mm],b [mm]\n0,1,5\n1,,6\n2,3,nan\n3,4,9\n")
+    with pytest.raises(ValueError, match="line 3, column 'a': nan is not a finite number"):
+        read_log(path)
+    log = read_log(path, missing="mask")
+    np.testing.assert_allclose(log.values[:, 0], [1e-3, 2e-3, 3e-3, 4e-3])  # a straight line
+    assert log.valid.T.tolist() == [[True, False, True, True], [True, True, False, True]]
+    assert log.notes[0] == "1 missing samples of a are left out"
+    with pytest.raises(ValueError, match='can be "refuse"d or "mask"ed'):
+        read_log(path, missing="fill")
+
+
+def test_transducers_with_a_sensitivity(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("t [s],a [V],d [mV]\n0,1,2\n1,2,4\n")
+    side = path.with_suffix(".toml")
+    side.write_text('[columns]\na = {sensitivity = "100 mV/g"}\nd = {sensitivity = "-0.5 V/mm"}\n')
+    log = read_log(path)
+    assert log.quantities == ("acceleration", "deflection")
+    np.testing.assert_allclose(log.values, [[98.0665, -4e-6], [196.133, -8e-6]])
+    side.write_text('[columns]\na = {sensitivity = "100 g"}\n')
+    with pytest.raises(ValueError, match="column 'a': the sensitivity '100 g' should be like"):
+        read_log(path)
+    side.write_text('[columns]\na = {sensitivity = "3 N/mm"}\n')
+    with pytest.raises(ValueError, match="is for force, but the column is voltage"):
+        read_log(path)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_file_cut_off_is_refused_in_one_sentence(tmp_path, name):
+    whole, cut = tmp_path / name, tmp_path / f"cut_{name}"
+    FORMATS[name](whole)
+    data = whole.read_bytes()
+    for share in (0.2, 0.6, 0.97):
+        cut.write_bytes(data[: int(share * len(data))])
+        try:
+            log = read_log(cut)
+        except ValueError as error:
+            assert str(error).startswith(str(cut)) and "\n" not in str(error)
+        else:  # what can still be read is the truth, and that something is missing is said
+            count = log.times.size
+            np.testing.assert_allclose(log.times, TIMES[:count], atol=1e-12)
+            assert count == TIMES.size or "breaks off" in log.notes[0]
+
+
+@pytest.mark.parametrize("suffix", [".tdms", ".mat", ".h5", ".nc", ".parquet"])
+def test_a_file_that_is_not_what_it_is_called(tmp_path, suffix):
+    path = tmp_path / f"run{suffix}"
+    path.write_text("t [s],d [mm]\n0,1\n1,2\n")
+    with pytest.raises(ValueError, match="whatever it is called: it starts with b't .s.,d"):
+        read_log(path)
+    path.write_bytes(b"")
+    with pytest.raises(ValueError, match="the log is empty"):
+        read_log(path)
+
+
+def test_content_wins_over_the_name(tmp_path):
+    mat(tmp_path / "run.csv")
+    assert read_log(tmp_path / "run.csv").names == ("d1", "d2")
+    (tmp_path / "noise.csv").write_bytes(bytes(range(256)))
+    with pytest.raises(ValueError, match="this is no text but a binary file"):
+        read_log(tmp_path / "noise.csv")
+
+
+def test_files_without_numbers(tmp_path):
+    scipy.io.savemat(tmp_path / "words.mat", {"about": "nothing"})
+    with pytest.raises(ValueError, match="no list of numbers in it; tables and timetables"):
+        read_log(tmp_path / "words.mat")
+
+
+def test_channels_of_a_group_with_different_clocks(tmp_path):
+    tdms(tmp_path / "run.tdms", extra={"wf_increment": 0.001})
+    with pytest.raises(ValueError, match="group 'log': the channels have different times"):
+        read_log(tmp_path / "run.tdms")

@@ -1,0 +1,15 @@
+"""Libraries that only some formats need."""
+
+import importlib
+from types import ModuleType
+
+
+def library(name: str, extra: str) -> ModuleType:
+    """Import a library of one of jaxbeam's extras. Raises ImportError, saying how to install it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ImportError(
+            f"{name} is not installed; install jaxbeam with the extra {extra!r}: "
+            f"pip install 'jaxbeam[{extra}]'"
+        ) from None

@@ -1,0 +1,67 @@
+"""LabVIEW's binary logs (.tdms), by npTDMS: each group of channels is a run."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from tuning.readers.optional import library
+from tuning.readers.table import Table, is_time, table_of
+
+MAGIC = b"TDSm"
+
+
+def read_tdms(path: Path) -> dict[str, Table]:
+    """Read a .tdms file: one run for each group that holds numbers, by the group's name.
+
+    Times are a channel called time, or follow from the waveform properties `wf_increment` and
+    `wf_start_offset` of the channels; units are the property `unit_string`.
+
+    Raises ValueError for a damaged file and for channels of a group that differ in their times,
+    ImportError without npTDMS.
+    """
+    nptdms = library("nptdms", "tdms")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of npTDMS about incomplete files: we say it
+            file = nptdms.TdmsFile.read(path)
+            groups = {group.name: _channels(group) for group in file.groups()}
+    except Exception as error:  # whatever npTDMS meets in a file that is not as it should be
+        raise ValueError(f"{path}: the file is damaged or cut off: {error}") from None
+    notes = ["the recording breaks off within a segment"] if _broken_off(file) else []
+    runs = {}
+    for name, channels in groups.items():
+        numeric = {label: channel[:] for label, channel in channels.items()}
+        numeric = {a: b for a, b in numeric.items() if np.issubdtype(b.dtype, np.number)}
+        if numeric:
+            place = f"{path}, group {name!r}"
+            units = {a: channels[a].properties.get("unit_string") for a in numeric}
+            clock = _clock(place, {a: channels[a] for a in numeric})
+            runs[name] = table_of(place, numeric, units, clock, notes)
+    return runs
+
+
+def _channels(group):
+    return {channel.name: channel for channel in group.channels()}
+
+
+def _broken_off(file) -> bool:
+    return bool(file.file_status.incomplete_final_segment)
+
+
+def _clock(place, channels):
+    """Times by number of samples, from the waveform properties; None if no channel has them."""
+    grids = {
+        (p["wf_increment"], p.get("wf_start_offset", 0.0))
+        for name, channel in channels.items()
+        if not is_time(name) and "wf_increment" in (p := channel.properties)
+    }
+    if len(grids) > 1:
+        raise ValueError(
+            f"{place}: the channels have different times; resample them to common times, or save "
+            "them to separate groups"
+        )
+    if not grids:
+        return None
+    ((step, start),) = grids
+    return lambda count: start + step * np.arange(count)
