@@ -195,8 +195,7 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
         else:
             finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int)
             grid = scheduled_grid(varied, assembled, schedule, substeps or finer)
-        watched = jnp.stack([sensor.position for sensor in varied.sensors])
-        return make_rigging(assembled, grid, watched, driver)
+        return make_rigging(assembled, grid, varied.sensor_places, driver)
 
     def task(values):
         rigging, assembled, heavy, light, longest = values
@@ -223,8 +222,7 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
             )
             edges = substeps * grid.place[schedule.samples]
             samples = states[edges][:, 0 : 2 * varied.beam.modes : 2]
-            places = jnp.stack([sensor.position for sensor in varied.sensors])
-            rows = assembled.shapes(places, (0,))[0]
+            rows = assembled.shapes(varied.sensor_places, (0,))[0]
             history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
         if driver is not None:
             history["controller_failures"] = driver.failures(memory)

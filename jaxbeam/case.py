@@ -66,6 +66,11 @@ class Case(eqx.Module):
         self.run = Run(duration=1.0) if run is None else run
         self.title = title
 
+    @property
+    def sensor_places(self) -> Float[Array, " sensor"]:
+        """Where the sensors are along the beam (m)."""
+        return jnp.array([sensor.position for sensor in self.sensors]).reshape(-1)
+
 
 def _name(key) -> str:
     """The word or number in one step of a tree path."""

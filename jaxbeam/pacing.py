@@ -61,8 +61,11 @@ def choose_steps(
     tasks, `guesses` start the search, `limits` (s) cap it. Raises RuntimeError if no step meets
     the tolerance.
     """
+    aim = tolerance / MARGIN
     chosen = spread(paces, count)
-    good, works = _search(measure, chosen, guesses[chosen], limits[chosen], tolerance)
+    good, works = _search(measure, chosen, guesses[chosen], limits[chosen], aim)
+    if not np.all(good > 0):
+        raise _hopeless(tolerance)
     if not works.any():
         return np.minimum(guesses, limits), 0.0
     chosen, good = chosen[works], good[works]
@@ -77,14 +80,14 @@ def choose_steps(
     for _ in range(ROUNDS):
         error = errors(measure, some, steps[some])
         worst = float(np.max(np.where(np.isnan(error), 0.0, error)))
-        if worst <= tolerance / MARGIN:
+        if worst <= aim:
             return steps, worst
         steps = steps * 0.7
     raise _hopeless(tolerance)
 
 
 def _search(measure: Measure, tasks, guesses, limits, tolerance: float):
-    """Longest good steps (s) of some tasks, and which of the tasks have any run that works."""
+    """Longest good steps (s) of some tasks, 0 if none was; which of these have a run that works."""
     steps = np.minimum(guesses, limits)
     good, bad = np.zeros(tasks.size), np.full(tasks.size, np.inf)
     for _ in range(ROUNDS):
@@ -100,8 +103,6 @@ def _search(measure: Measure, tasks, guesses, limits, tolerance: float):
         with np.errstate(divide="ignore"):
             change = np.clip((0.3 * tolerance / error) ** (1 / ORDER), 0.5, 1.5)
         steps = np.where(settled, good, np.minimum(steps * change, limits))
-    if not np.all(good > 0):
-        raise _hopeless(tolerance)
     return good, ~np.isnan(error)
 
 

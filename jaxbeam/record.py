@@ -63,8 +63,7 @@ class Record(eqx.Module):
         return _history(self.modes, motion, x, quantity, fibre_distance)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
-        positions = [sensor.position for sensor in self.case.sensors]
-        return self.at(jnp.array(positions).reshape(-1), quantity)
+        return self.at(self.case.sensor_places, quantity)
 
     @property
     def deflection(self) -> Float[Array, "time sensor"]:

@@ -66,8 +66,7 @@ def simulate_adaptive(
         older = histories or found
         histories = [jnp.where(after, new, old) for new, old in zip(found, older, strict=True)]
     coordinates, rates, accelerations, force = histories
-    places = jnp.array([sensor.position for sensor in case.sensors]).reshape(-1)
-    deflection = coordinates @ assembled.shapes(places, (0,))[0].T
+    deflection = coordinates @ assembled.shapes(case.sensor_places, (0,))[0].T
     if assembled.mixing is not None:
         coordinates, rates, accelerations = (
             part @ assembled.mixing.T for part in (coordinates, rates, accelerations)

@@ -73,8 +73,7 @@ def _check_times(times) -> None:
 
 @compiled
 def _record(case: Case, plan: Plan, times, error) -> Record:
-    watched = jnp.array([sensor.position for sensor in case.sensors]).reshape(-1)
-    best, outputs, found, count = _trace(case, plan, times, watched)
+    best, outputs, found, count = _trace(case, plan, times, case.sensor_places)
     coordinates, rates, accelerations, position, force, commands, shown, failures = outputs
     if commands is None:
         commands = jnp.zeros((times.shape[0], len(case.actuators)))

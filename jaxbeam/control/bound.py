@@ -144,7 +144,7 @@ def bound(
 
 def _places(case: Case, places) -> Float[np.ndarray, " place"]:
     if places is None:
-        places = [sensor.position for sensor in case.sensors]
+        places = case.sensor_places
     places = np.asarray(places, float).ravel()
     if places.size == 0:
         raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")

@@ -179,7 +179,7 @@ class MPC(AbstractStateLaw):
         """Rows that take the states to the deflections that are controlled."""
         places = self.places
         if places is None:
-            places = jnp.array([sensor.position for sensor in designed.case.sensors])
+            places = designed.case.sensor_places
         shape = designed.rig.shapes(places, (0,))[0] / designed.scale
         return jnp.zeros((shape.shape[0], states)).at[:, : shape.shape[1]].set(shape)
 
