@@ -185,7 +185,7 @@ class _Search:
         ]
         point = np.concatenate([self.own[None], np.array(spread).reshape(len(self.own), -1).T])
         moments = jax.vmap(self.adam.init)(jnp.asarray(point))
-        (_, true), _ = self._slope(jnp.asarray(point), SHARPNESS[0])
+        (_, true), _ = self._slope(jnp.asarray(point), jnp.asarray(SHARPNESS[0]))
         value = np.where(np.isfinite(true), true, np.inf)
         none = np.zeros(starts)
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(moments)]
@@ -195,7 +195,8 @@ class _Search:
         """One step of every start; those that came to a diverging loop go back, and go slower."""
         share = state.step / max(self.steps - 1, 1)
         sharpness = SHARPNESS[0] * (SHARPNESS[1] / SHARPNESS[0]) ** share
-        (_, true), gradient = self._slope(jnp.asarray(state.point), sharpness)
+        # An array: a plain number would be part of the program, compiled anew at every step.
+        (_, true), gradient = self._slope(jnp.asarray(state.point), jnp.asarray(sharpness))
         gradient, true = np.asarray(gradient), np.asarray(true)
         sound = np.isfinite(true) & np.isfinite(gradient).all(axis=1)
         better = sound & (true < state.best_value)
@@ -232,7 +233,8 @@ def _outcome(name, bench: Bench, objective, before, after, bounds) -> Outcome:
         pairs = [bench.records(values) for values in (before, after)]
     peaks = [_peaks(bench, records) for records in pairs]
     merits = compiled(bench.merits)
-    values = [np.asarray(objective.of_run(merits(v))) for v in (before, after)]
+    arrays = [jax.tree.map(jnp.asarray, values) for values in (before, after)]
+    values = [np.asarray(objective.of_run(merits(v))) for v in arrays]
     least = np.full(len(bench.runs), np.nan)
     if bounds:
         period = bench.cases[0].controller.period
