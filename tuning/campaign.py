@@ -215,7 +215,7 @@ def prepare(case: Case, logs: list[Log]) -> Campaign:
     measured, real = [], []
     for log, (values, has) in zip(logs, ordered, strict=True):
         measured.append(np.pad(values, ((0, count - log.times.size), (0, 0))))
-        real.append((np.arange(count) < log.times.size)[:, None] & has)
+        real.append(np.pad(has, ((0, count - log.times.size), (0, 0))))
     plans = [make_plan(own, jnp.asarray(t), TOLERANCE) for own, t in zip(cases, times, strict=True)]
     if len({plan.form.layout for plan in plans}) > 1:
         raise ValueError("the logs differ in the order of places along the beam; fit them apart")
@@ -246,7 +246,7 @@ def _filled(times: Float[np.ndarray, " time"], count: int) -> Float[np.ndarray, 
 
 
 def _at_sensors(case: Case, log: Log):
-    """The readings of a log in the order of the case's sensors (time, sensor), and which it has.
+    """The readings of a log in the order of the case's sensors (time, sensor), and which count.
 
     A log that does not name its sensors has them all, in their order.
     """
@@ -264,7 +264,8 @@ def _at_sensors(case: Case, log: Log):
             f"{log.source}: its channels {', '.join(log.names)} do not match the case's {ours}; "
             "say in the TOML file beside it which `sensor` each column is, counted from 0"
         )
-    values, has = np.zeros((log.times.size, len(sensors))), np.zeros(len(sensors), bool)
+    values = np.zeros((log.times.size, len(sensors)))
+    has = np.zeros(values.shape, bool)
     for number, channel in order.items():
         quantity = sensors[number].quantity
         if log.quantities[channel] != quantity:
@@ -272,7 +273,7 @@ def _at_sensors(case: Case, log: Log):
                 f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in "
                 f"{log.units[channel]}, but sensors.{number} measures {quantity}"
             )
-        values[:, number], has[number] = log.values[:, channel], True
+        values[:, number], has[:, number] = log.values[:, channel], log.valid[:, channel]
     return values, has
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import re
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float
 from jaxbeam.case import Case, replace, value_at
 from jaxbeam.fields import known
 from jaxbeam.sensors import QUANTITIES, Sensor
+from tuning.belief import Belief, as_belief
 
 OF_LOG = re.compile(r"logs\.(\d+)\.(.+)")
 INSIDE = 1e-3  # of the distance between bounds: a start on a bound is moved in by so much
@@ -22,6 +24,7 @@ class Free:
 
     With two bounds the number is low + (high - low) (1 + sin y) / 2 in the search variable y,
     which can reach both; with one it is the bound plus or minus an exponential; else y itself.
+    The scales "log" and "logit" of a `belief` change the first of these.
     """
 
     address: str
@@ -30,18 +33,33 @@ class Free:
     low: float
     high: float
     size: float
+    belief: Belief = Belief()
 
     def inward(self, value: float) -> float:
         """Search variable of a value; one on a bound is moved in a little."""
         least = INSIDE * self.size
         if np.isfinite(self.high - self.low):
+            if self.belief.scale == "log":
+                least = min(least, INSIDE * self.low)
             inner = np.clip(value, self.low + least, self.high - least)
-            return float(np.arcsin(2 * (inner - self.low) / (self.high - self.low) - 1))
+            return float(self.at_share(self._share(inner)))
         if np.isfinite(self.low):
             return float(np.log(max(value - self.low, least)))
         if np.isfinite(self.high):
             return float(-np.log(max(self.high - value, least)))
         return value
+
+    def at_share(self, share: float) -> float:
+        """Search variable at a share (0 to 1) of the way between two bounds, on the scale."""
+        if self.belief.scale == "logit":
+            return np.log(share / (1 - share))
+        return np.arcsin(2 * share - 1)
+
+    def _share(self, value: float) -> float:
+        """How far between its two bounds a value is; on the log scale, its logarithm."""
+        if self.belief.scale == "log":
+            return np.log(value / self.low) / np.log(self.high / self.low)
+        return (value - self.low) / (self.high - self.low)
 
     def at_bound(self, value: float) -> bool:
         """Whether a value lies on a bound, as good as."""
@@ -61,7 +79,12 @@ class Free:
     def outward(self, y: Float[Array, ""]) -> Float[Array, ""]:
         """Value of a search variable."""
         if np.isfinite(self.high - self.low):
-            return self.low + (self.high - self.low) * (1 + jnp.sin(y)) / 2
+            share = (1 + jnp.sin(y)) / 2
+            if self.belief.scale == "log":
+                return self.low * (self.high / self.low) ** share
+            if self.belief.scale == "logit":
+                share = jax.nn.sigmoid(y)
+            return self.low + (self.high - self.low) * share
         if np.isfinite(self.low):
             return self.low + jnp.exp(y)
         if np.isfinite(self.high):
@@ -70,12 +93,13 @@ class Free:
 
 
 def free_numbers(
-    cases: list[Case], bounds: dict[str, tuple[float, float] | None], reading: float
+    cases: list[Case], bounds: dict[str, tuple[float, float] | Belief | None], reading: float
 ) -> list[Free]:
     """Look up the free numbers in the cases of the logs.
 
     An address is that of the case, shared by all logs, or `logs.1.loads.0.speed` for a number of
-    one log. Without bounds a number stays on its side of zero, but for offsets and entry times.
+    one log, or `logs.*.loads.0.speed` for one of each log. Each has bounds, None or a `Belief`.
+    Without bounds a number stays on its side of zero, but for offsets and entry times.
     The typical size of a number is the distance of its bounds, or else itself; that of an offset
     is the largest `reading`, that of an entry time the duration.
 
@@ -84,8 +108,21 @@ def free_numbers(
     """
     if not bounds:
         raise ValueError("name at least one address as free")
+    bounds = _each_log(bounds, len(cases))
     _check_once(list(bounds))
     return [_free_number(cases, address, pair, reading) for address, pair in bounds.items()]
+
+
+def _each_log(bounds: dict[str, Any], logs: int) -> dict[str, Any]:
+    """Addresses with `logs.*` in front, written out for each log."""
+    spread = {}
+    for address, pair in bounds.items():
+        rest = address.removeprefix("logs.*.")
+        for own in [address] if rest == address else [f"logs.{i}.{rest}" for i in range(logs)]:
+            if own in spread:
+                raise ValueError(f"{own} is free twice; name it once")
+            spread[own] = pair
+    return spread
 
 
 def _check_once(addresses: list[str]) -> None:
@@ -105,7 +142,12 @@ def _free_number(cases: list[Case], address: str, pair, reading: float) -> Free:
     if value.ndim:
         raise ValueError(f"{address} is a list; free its entries, {address}.0 and so on")
     start = float(value)
-    low, high = (-np.inf, np.inf) if pair is None else (float(bound) for bound in pair)
+    try:
+        belief = as_belief(pair)
+    except ValueError as error:
+        raise ValueError(f"{address}: {error}") from None
+    pair = belief.bounds
+    low, high = (-np.inf, np.inf) if pair is None else pair
     signed = rest.endswith((".offset", ".entry_time"))
     if pair is None and not signed:
         low, high = (0.0, np.inf) if start > 0 else (-np.inf, 0.0)
@@ -129,7 +171,7 @@ def _free_number(cases: list[Case], address: str, pair, reading: float) -> Free:
             f"{address} starts at 0, which does not say how large it may be: give it bounds, such "
             f"as {address}=0:1, or another start"
         )
-    return Free(address, unit_at(case, rest), start, low, high, size)
+    return Free(address, unit_at(case, rest), start, low, high, size, belief)
 
 
 def _place(cases: list[Case], address: str) -> tuple[Case, str]:

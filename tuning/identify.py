@@ -1,18 +1,25 @@
 """Model identification: numbers of a case from logged runs, by least squares."""
 
 import dataclasses
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case import Case, replace
+from jaxbeam.fields import known
 from jaxbeam.sensors import QUANTITIES
+from tuning.belief import Belief
 from tuning.campaign import Campaign, prepare
+from tuning.checkpoint import fingerprint
 from tuning.free import OF_LOG, Free, free_numbers, insert
 from tuning.logs import Log
 from tuning.report import fit_table
-from tuning.search import MAX_STEPS, Search
+from tuning.search import MAX_STEPS, Estimate, Search
+from tuning.starts import Minimum, scout
 from tuning.uncertainty import INTERVAL
 
 
@@ -24,7 +31,9 @@ class Fit:
     each entry holds changes that, made together, leave the readings as good as they are. `noise`
     is the standard deviation of the residuals, NaN for a sensor that a log lacks. `case` has the
     fitted numbers; with several logs, those of one log (`logs.1.loads.0.speed`) have no place in
-    it, but in `cases`, one for each log.
+    it, but in `cases`, one for each log. `colour` is the factor by which the residuals'
+    autocorrelation raises variances, and has widened the intervals; `minima` are those found
+    where there were several starts, lowest first.
     """
 
     numbers: list[Free]
@@ -37,6 +46,15 @@ class Fit:
     case: Case
     campaign: Campaign
     fitted: Float[np.ndarray, "log time channel"]
+    colour: Float[np.ndarray, "log channel"]
+    search: Search
+    minima: tuple[Minimum, ...] = ()
+
+    @property
+    def residuals(self) -> Float[np.ndarray, "log time channel"]:
+        """Measured minus fitted, NaN where nothing was measured."""
+        campaign = self.campaign
+        return np.where(campaign.real > 0, campaign.measured - self.fitted, np.nan)
 
     @property
     def addresses(self) -> list[str]:
@@ -123,26 +141,59 @@ class Fit:
 def identify(
     case: Case,
     logs: Log | Sequence[Log],
-    free: Mapping[str, tuple[float, float] | None] | Sequence[str] | str,
+    free: Mapping[str, tuple[float, float] | Belief | None] | Sequence[str] | str,
+    *,
+    loss: str = "squares",
+    stages: Sequence[Sequence[str]] = (),
+    starts: int = 1,
+    seed: int = 0,
+    checkpoint: str | os.PathLike | None = None,
+    resume: bool = False,
 ) -> Fit:
     """Fit numbers of a case to logs of runs with known loads.
 
-    `free` names addresses, with bounds (low, high) or None; a number of one log, such as its
-    load's speed, is at `logs.0.loads.0.speed`. Loads are those of the logs, or else the case's.
-    The sum of squared residuals over their noise is minimised by bounded Levenberg-Marquardt
-    (optimistix) with exact forward derivatives; noise levels of the channels are estimated from
-    the residuals. Standard errors follow from the Jacobian, widened where residuals are
-    correlated in time; directions the data cannot see are reported by name.
+    `free` names addresses, each with bounds (low, high), a `Belief` (bounds, scale, prior) or
+    None; a number of one log, such as its load's speed, is at `logs.0.loads.0.speed`, one of every
+    log at `logs.*.loads.0.speed`. Loads are those of the logs, or else the case's.
+    The sum of squared residuals over their noise (and of the priors' pulls) is minimised by
+    bounded Levenberg-Marquardt (optimistix) with exact forward derivatives; noise levels of the
+    channels are estimated from the residuals. Standard errors follow from the Jacobian, widened
+    where residuals are correlated in time; directions the data cannot see are reported by name.
 
-    Raises ValueError for faulty input, and RuntimeError if the simulation cannot follow.
+    `loss` "soft-l1" or "huber" lets outliers count less. `stages` are lists of addresses that are
+    fitted first, one list after the other, the rest held. From more than one of the `starts`
+    (others are drawn by the `seed`) the lowest minimum is taken; with a `checkpoint` file that
+    search can be stopped at any time and taken up with `resume`: the result is the same.
+
+    Raises ValueError for faulty input or a checkpoint of another search, FileExistsError if the
+    checkpoint exists and `resume` is not set, and RuntimeError if the simulation cannot follow.
     """
     logs = [logs] if isinstance(logs, Log) else list(logs)
     addresses = [free] if isinstance(free, str) else free
     bounds = dict(addresses) if isinstance(addresses, Mapping) else dict.fromkeys(addresses)
+    if starts < 1:
+        raise ValueError(f"starts must be 1 or more, not {starts}")
+    file = None if checkpoint is None else Path(checkpoint)
+    if file is not None and file.exists() and not resume:
+        raise FileExistsError(f"{file} exists: resume that search, or delete it")
     campaign = prepare(case, logs)
     reading = float(np.max(np.abs(campaign.measured)))
     numbers = free_numbers(campaign.cases, bounds, reading)
-    found = Search(campaign, numbers).estimate(campaign.measured)
+    masks = [_stage(numbers, stage) for stage in stages]
+    search = Search(campaign, numbers, loss)
+    minima, start = (), None
+    if starts > 1:
+        mark = _mark(campaign, numbers, loss, starts, seed)
+        minima = tuple(scout(search, campaign.measured, starts, seed, file, mark))
+        start = minima[0].point
+    for mask in masks:
+        start = search.estimate(campaign.measured, start=start, free=mask).point
+    return fit_of(case, search, search.estimate(campaign.measured, start=start), minima)
+
+
+def fit_of(case: Case, search: Search, found: Estimate, minima: tuple[Minimum, ...] = ()) -> Fit:
+    """The result of a search: `case` is the one that was to be fitted."""
+    campaign, numbers = search.campaign, search.numbers
     pairs = zip(numbers, found.values, strict=True)
     values = {number.address: float(value) for number, value in pairs}
     verdict = (
@@ -159,6 +210,32 @@ def identify(
         case=_fitted_case(case, campaign, values),
         campaign=campaign,
         fitted=found.predicted,
+        colour=found.colour,
+        search=search,
+        minima=minima,
+    )
+
+
+def _stage(numbers: list[Free], stage: Sequence[str]):
+    """Which numbers move in a stage; `logs.*` in front means those of every log."""
+    names = [number.address for number in numbers]
+    inner = [OF_LOG.sub(r"logs.*.\2", name) for name in names]
+    for address in stage:
+        if address not in (*names, *inner):
+            raise ValueError(f"a stage fits {address}, which is not free; free are {names}")
+    return np.array([a in stage or b in stage for a, b in zip(names, inner, strict=True)])
+
+
+def _mark(campaign: Campaign, numbers: list[Free], loss: str, starts: int, seed: int) -> str:
+    """What tells one search from another."""
+    return fingerprint(
+        {
+            "cases": [jax.tree.map(lambda leaf: known(leaf).tolist(), c) for c in campaign.cases],
+            "measured": [campaign.measured.tobytes().hex(), campaign.real.tobytes().hex()],
+            "times": campaign.times.tobytes().hex(),
+            "numbers": [dataclasses.asdict(number) for number in numbers],
+            "settings": [loss, starts, seed],
+        }
     )
 
 

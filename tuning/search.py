@@ -1,17 +1,19 @@
 """Weighted least squares over the free numbers of a campaign; noise is found on the way."""
 
 import dataclasses
+import functools
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.compiling import compiled, options
 from tuning.campaign import Campaign
 from tuning.free import Free
+from tuning.loss import check_loss, shaped, widening
 from tuning.uncertainty import Uncertainty, colour, uncertainty
 
 ROUNDS = 2  # of fitting with the noise levels found in the round before
@@ -21,11 +23,19 @@ LEASH = 2.0  # width of the weak prior around the starts: a factor of e^2, or tw
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Estimate:
-    """What came out of a search; `noise` is the standard deviation of the residuals."""
+    """What came out of a search; `noise` is the standard deviation of the residuals.
+
+    `colour` is the factor by which their autocorrelation raises variances, 1 for white ones, and
+    `jacobian` the derivatives of the predicted samples with respect to the values; `point` holds
+    the search variables of the values.
+    """
 
     values: Float[np.ndarray, " free"]
+    point: Float[np.ndarray, " free"]
     predicted: Float[np.ndarray, "log time channel"]
     noise: Float[np.ndarray, "log channel"]
+    colour: Float[np.ndarray, "log channel"]
+    jacobian: Float[np.ndarray, "log time channel free"]
     uncertainty: Uncertainty
     converged: bool
 
@@ -33,19 +43,25 @@ class Estimate:
 class Search:
     """Least squares over the free numbers of a campaign, compiled once for any samples.
 
-    Raises ValueError if there are more numbers than samples.
+    Priors of the numbers count as further residuals. `loss` is one of `tuning.loss`.
+
+    Raises ValueError if there are more numbers than samples, or for an unknown loss.
     """
 
-    def __init__(self, campaign: Campaign, numbers: list[Free]):
+    def __init__(self, campaign: Campaign, numbers: list[Free], loss: str = "squares"):
+        check_loss(loss)
         if campaign.real.sum() < len(numbers):
             raise ValueError(f"{len(numbers)} free numbers need at least as many samples")
-        self.campaign, self.numbers = campaign, numbers
-        self._start = jnp.array([number.inward(number.start) for number in numbers])
-        start, width = self._start, LEASH * jnp.array([number.search_size for number in numbers])
+        self.campaign, self.numbers, self.loss = campaign, numbers, loss
+        self.start = np.array([number.inward(number.start) for number in numbers])
+        start, width = self.start, LEASH * np.array([number.search_size for number in numbers])
         predict = campaign.predictor([number.address for number in numbers])
 
         def values_at(y):
             return jnp.stack([number.outward(y[i]) for i, number in enumerate(numbers)])
+
+        def pulls(values):
+            return jnp.stack([n.belief.pull(values[i]) for i, n in enumerate(numbers)])
 
         def linearised(values):
             # One pass gives samples and derivatives (see `Campaign.predictor`).
@@ -53,105 +69,176 @@ class Search:
             return samples, jax.vmap(push, out_axes=-1)(jnp.eye(values.shape[0]))
 
         def misfit(z, args):
-            scale, weights, measured = args
-            y = z * scale
-            residuals = (measured - predict(values_at(y))) * weights
+            scale, weights, measured, free, held = args
+            y = jnp.where(free, z * scale, held)
+            values = values_at(y)
+            residuals = shaped(loss, (measured - predict(values)) * weights)
             # What the data cannot see would wander off, and spoil what they can: a prior too weak
             # to move anything they tell holds it near the start. It has no part in the errors.
-            return jnp.append(residuals.ravel(), (y - start) / width)
+            leash = (z * scale - start) / width
+            return jnp.concatenate([residuals.ravel(), pulls(values), leash])
 
         solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-6)
 
-        def minimise(y, scale, weights, measured):
+        def minimise(y, scale, weights, measured, free):
             found = optimistix.least_squares(
                 misfit,
                 solver,
                 y / scale,
-                (scale, weights, measured),
+                (scale, weights, measured, free, y),
                 max_steps=MAX_STEPS,
                 throw=False,
             )
-            return found.value * scale, found.result == optimistix.RESULTS.successful
+            ended = jnp.where(free, found.value * scale, y)
+            return ended, found.result == optimistix.RESULTS.successful
 
         self._values_at = compiled(values_at)
         self._slopes = compiled(lambda y: jnp.diag(jax.jacfwd(values_at)(y)))
-        # Compiling takes most of the time of a small fit: both at once, each on its own core.
-        point, samples = jnp.zeros(len(numbers)), jnp.zeros(campaign.measured.shape)
-        lowered = (
-            jax.jit(linearised).lower(point),
-            jax.jit(minimise).lower(point, point, samples, samples),
-        )
-        with ThreadPoolExecutor(2) as pool:
-            self._linearised, self._minimise = pool.map(
-                lambda program: program.compile(options()), lowered
-            )
+        self._pulls, self._push = compiled(pulls), compiled(jax.jacfwd(pulls))
+        self._linear, self.minimise = linearised, minimise
 
-    def estimate(self, measured: Float[np.ndarray, "log time channel"]) -> Estimate:
+    @functools.cached_property
+    def _programs(self):
+        """The two compiled programs: samples with derivatives, and the whole search."""
+        count, samples = len(self.numbers), jnp.zeros(self.campaign.measured.shape)
+        point = jnp.zeros(count)
+        lowered = (
+            jax.jit(self._linear).lower(point),
+            jax.jit(self.minimise).lower(point, point, samples, samples, jnp.zeros(count, bool)),
+        )
+        # Compiling takes most of the time of a small fit: both at once, each on its own core.
+        with ThreadPoolExecutor(2) as pool:
+            return tuple(pool.map(lambda program: program.compile(options()), lowered))
+
+    def estimate(
+        self,
+        measured: Float[np.ndarray, "log time channel"],
+        *,
+        start: Float[np.ndarray, " free"] | None = None,
+        use: Bool[np.ndarray, "log"] | None = None,
+        free: Bool[np.ndarray, " free"] | None = None,
+    ) -> Estimate:
         """Fit the numbers to samples like those of the campaign, from their starts on.
 
-        The noise of each channel is guessed first, then found from the residuals. Standard errors
-        are those of the linearised fit, widened where residuals are correlated in time. Raises
-        RuntimeError if the search leaves the range in which the case can be simulated.
+        `start` are other starts (search variables), `use` says which logs count, `free` which
+        numbers move. The noise of each channel is guessed first, then found from the residuals.
+        Standard errors are those of the linearised fit, widened where residuals are correlated in
+        time. Raises RuntimeError if the search leaves the range in which the case can be
+        simulated.
         """
-        y = self._start
-        noise = self._first_noise(measured)
+        y = self.start if start is None else start
+        free = np.ones(len(self.numbers), bool) if free is None else free
+        real = self.campaign.real
+        real = real if use is None else real * use[:, None, None]
+        noise = self.first_noise(measured)
         for _ in range(ROUNDS):
-            y, converged = self._search(y, noise, measured)
-            values = self._values_at(y)
-            predicted, jacobian = self._linearised(values)
-            residuals = measured - np.asarray(predicted)
+            y, converged = self._search(y, noise, measured, real, free)
+            values = self.values_at(y)
+            predicted, jacobian = self.linearised(values)
+            residuals = measured - predicted
             if not np.all(np.isfinite(residuals)):
                 raise RuntimeError(
                     "the fit left the range in which the case can be simulated; give its numbers "
                     "bounds"
                 )
-            noise = self._noise(residuals)
-        weights = self._weights(noise * np.sqrt(self._colours(residuals)))
-        found = uncertainty(
-            [number.address for number in self.numbers],
-            (np.asarray(jacobian) * weights[..., None]).reshape(-1, len(self.numbers)),
-            np.array([n.size_at(float(v)) for n, v in zip(self.numbers, values, strict=True)]),
-        )
-        return Estimate(np.asarray(values), np.asarray(predicted), noise, found, bool(converged))
+            noise = self._noise(residuals, real)
+        colours = self._colours(residuals)
+        found = self._uncertainty(values, jacobian, real, noise, colours, residuals)
+        return Estimate(values, y, predicted, noise, colours, jacobian, found, bool(converged))
 
-    def _search(self, y: Float[Array, " free"], noise, measured):
-        """Search point of the least squares for these noise levels, and whether it converged."""
-        weights = self._weights(noise)
-        # In units of a thousand of the standard errors that each would have alone, all numbers
-        # are of one size, and the solver's first damping, one, hardly shortens its first step.
-        _, jacobian = self._linearised(self._values_at(y))
-        rows = np.asarray(jacobian) * weights[..., None] * np.asarray(self._slopes(y))
+    def linearised(self, values):
+        """Predicted samples at some values, and their derivatives (log, time, channel, free)."""
+        return tuple(map(np.asarray, self._programs[0](jnp.asarray(values))))
+
+    def values_at(self, y) -> Float[np.ndarray, " free"]:
+        """Values of the numbers at a point of the search."""
+        return np.asarray(self._values_at(jnp.asarray(y)))
+
+    def scale(self, y: Float[np.ndarray, " free"], noise, real=None) -> Float[np.ndarray, " free"]:
+        """Size of steps of the search: a thousand of the standard errors each would have alone.
+
+        In these units all numbers are of one size, and the solver's first damping, one, hardly
+        shortens its first step.
+        """
+        weights = self.weights(noise, real)
+        _, jacobian = self.linearised(self.values_at(y))
+        rows = jacobian * weights[..., None] * np.asarray(self._slopes(y))
         strength = np.sqrt(np.sum(rows**2, axis=(0, 1, 2)))
-        scale = 1e3 / np.maximum(strength, max(1e-9 * strength.max(), 1e-300))
-        return self._minimise(y, jnp.asarray(scale), jnp.asarray(weights), jnp.asarray(measured))
+        return 1e3 / np.maximum(strength, max(1e-9 * strength.max(), 1e-300))
 
-    def _weights(self, noise) -> Float[np.ndarray, "log time channel"]:
+    def cost(self, values, noise, measured, real=None) -> float:
+        """Half the sum of squared residuals in standard deviations of the noise, or their loss.
+
+        Priors have their part. Infinite where the case cannot be simulated.
+        """
+        residuals = (measured - self.linearised(values)[0]) * self.weights(noise, real)
+        squares = jnp.sum(shaped(self.loss, residuals) ** 2) + jnp.sum(self._pulls(values) ** 2)
+        return float(squares / 2) if np.isfinite(squares) else np.inf
+
+    def weights(self, noise, real=None) -> Float[np.ndarray, "log time channel"]:
         """One over the noise for real samples, zero for those that only fill up."""
-        return self.campaign.real / noise[:, None, :]
+        return (self.campaign.real if real is None else real) / noise[:, None, :]
 
-    def _first_noise(self, measured) -> Float[np.ndarray, "log channel"]:
+    def first_noise(self, measured) -> Float[np.ndarray, "log channel"]:
         """Noise guessed from the second differences, which a smooth response hardly has."""
-        levels = []
-        for log, values in zip(self.campaign.logs, measured, strict=True):
-            bends = np.diff(values[: log.times.size], 2, axis=0)
-            levels.append(1.4826 * np.median(np.abs(bends), axis=0) / np.sqrt(6))
-        return np.maximum(np.array(levels), self._floor(1e-6))
+        bends = np.abs(np.diff(measured, 2, axis=1))
+        real = self.campaign.real
+        counts = (real[:, 2:] * real[:, 1:-1] * real[:, :-2]) > 0
+        levels = np.array(
+            [
+                [np.median(bends[i, :, c][counts[i, :, c]]) if counts[i, :, c].any() else 0.0
+                 for c in range(bends.shape[2])]
+                for i in range(len(bends))
+            ]
+        )  # fmt: skip
+        return np.maximum(1.4826 * levels / np.sqrt(6), self._floor(1e-6))
 
-    def _noise(self, residuals) -> Float[np.ndarray, "log channel"]:
-        """Standard deviation of the residuals, for the numbers fitted to them."""
-        counts = self.campaign.real.sum(axis=1)
+    def _search(self, y, noise, measured, real, free):
+        """Search point of the least squares for these noise levels, and whether it converged."""
+        given = y, self.scale(y, noise, real), self.weights(noise, real), measured
+        point, converged = self._programs[1](*map(jnp.asarray, given), jnp.asarray(free))
+        return np.asarray(point), converged
+
+    def _uncertainty(self, values, jacobian, real, noise, colours, residuals) -> Uncertainty:
+        """Standard errors and what is unseen, from samples and priors together."""
+        weights = self.weights(noise * np.sqrt(colours), real)
+        if self.loss != "squares":
+            sized = (residuals * self.weights(noise, real))[real > 0]
+            weights = weights / np.sqrt(widening(self.loss, sized))
+        rows = (jacobian * weights[..., None]).reshape(-1, len(self.numbers))
+        if any(number.belief.mean is not None for number in self.numbers):
+            rows = np.vstack([rows, self._push(values)])
+        sizes = [n.size_at(float(v)) for n, v in zip(self.numbers, values, strict=True)]
+        return uncertainty([number.address for number in self.numbers], rows, np.array(sizes))
+
+    def _noise(self, residuals, real) -> Float[np.ndarray, "log channel"]:
+        """Standard deviation of the residuals, for the numbers fitted to them.
+
+        Under a robust loss, the median of their sizes: outliers are not to raise it.
+        """
+        counts = real.sum(axis=1)
         left = max(1 - len(self.numbers) / counts.sum(), 1e-9)
-        squares = np.sum((residuals * self.campaign.real) ** 2, axis=1)
-        return np.maximum(np.sqrt(squares / np.maximum(counts, 1) / left), self._floor(1e-9))
+        squares = np.sum((residuals * real) ** 2, axis=1)
+        noise = np.sqrt(squares / np.maximum(counts, 1) / left)
+        if self.loss != "squares":
+            sizes = np.where(real > 0, np.abs(residuals), np.nan)
+            some = counts > 0
+            sizes = np.where(some[:, None, :], sizes, 0.0)
+            noise = 1.4826 * np.nanmedian(sizes, axis=1) / np.sqrt(left)
+        # A log without any weight tells its noise, too, though not to the fit.
+        unused = counts == 0
+        own = np.sqrt(np.mean(residuals**2, axis=1))
+        return np.maximum(np.where(unused, own, noise), self._floor(1e-9))
 
     def _floor(self, share: float) -> Float[np.ndarray, " channel"]:
         """Least noise of each channel: a share of its range, so that no weight is infinite."""
         return np.maximum(share * np.ptp(self.campaign.measured, axis=(0, 1)), 1e-300)
 
     def _colours(self, residuals) -> Float[np.ndarray, "log channel"]:
+        real = self.campaign.real > 0
         return np.array(
             [
-                [colour(part[: log.times.size, i]) for i in range(part.shape[1])]
-                for log, part in zip(self.campaign.logs, residuals, strict=True)
+                [colour(part[has[:, i], i]) for i in range(part.shape[1])]
+                for part, has in zip(residuals, real, strict=True)
             ]
         )

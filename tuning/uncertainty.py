@@ -32,6 +32,8 @@ def colour(residuals: Float[np.ndarray, " time"]) -> float:
     exact for slow changes of the reading and too much for fast ones (Box, Jenkins, Time Series
     Analysis, section 2.1.5).
     """
+    if residuals.size < 2:
+        return 1.0
     centred = residuals - residuals.mean()
     power = float(centred @ centred)
     if power == 0.0:
