@@ -32,8 +32,10 @@ class Campaign:
     Logs are padded to the longest with equally spaced times, `real` is 1 for samples
     that were measured and 0 for those that only fill up. Samples are (log, time, channel). Where
     a controller takes part, its commands from a log included, `schedule` holds its clock in each.
+    `given` is the case before any log changed it.
     """
 
+    given: Case
     cases: list[Case]
     logs: list[Log]
     plan: Plan
@@ -235,7 +237,14 @@ def prepare(case: Case, logs: list[Log]) -> Campaign:
     clocks = [own.schedule for own in plans]
     schedule = None if clocks[0] is None else stacked(clocks)
     return Campaign(
-        cases, logs, plan, np.array(times), np.array(measured), np.array(real, float), schedule
+        case,
+        cases,
+        logs,
+        plan,
+        np.array(times),
+        np.array(measured),
+        np.array(real, float),
+        schedule,
     )
 
 

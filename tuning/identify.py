@@ -20,7 +20,7 @@ from tuning.logs import Log
 from tuning.report import fit_table
 from tuning.search import MAX_STEPS, Estimate, Search
 from tuning.starts import Minimum, scout
-from tuning.uncertainty import INTERVAL
+from tuning.uncertainty import reach
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,7 +32,8 @@ class Fit:
     is the standard deviation of the residuals, NaN for a sensor that a log lacks. `case` has the
     fitted numbers; with several logs, those of one log (`logs.1.loads.0.speed`) have no place in
     it, but in `cases`, one for each log. `colour` is the factor by which the residuals'
-    autocorrelation raises variances, and has widened the intervals; `minima` are those found
+    autocorrelation raises variances, and has widened the intervals, and `freedom` the number
+    of independent samples left; `minima` are those found
     where there were several starts, lowest first.
     """
 
@@ -47,6 +48,7 @@ class Fit:
     campaign: Campaign
     fitted: Float[np.ndarray, "log time channel"]
     colour: Float[np.ndarray, "log channel"]
+    freedom: float
     search: Search
     minima: tuple[Minimum, ...] = ()
 
@@ -75,9 +77,9 @@ class Fit:
     @property
     def intervals(self) -> Float[np.ndarray, "free 2"]:
         """95 % intervals within the bounds; infinite where the data cannot tell."""
-        reach = INTERVAL * self.errors
-        low = np.maximum(self.values - reach, [number.low for number in self.numbers])
-        high = np.minimum(self.values + reach, [number.high for number in self.numbers])
+        half = reach(self.freedom) * self.errors
+        low = np.maximum(self.values - half, [number.low for number in self.numbers])
+        high = np.minimum(self.values + half, [number.high for number in self.numbers])
         told = np.isfinite(self.errors)
         return np.stack([np.where(told, low, -np.inf), np.where(told, high, np.inf)], axis=1)
 
@@ -211,6 +213,7 @@ def fit_of(case: Case, search: Search, found: Estimate, minima: tuple[Minimum, .
         campaign=campaign,
         fitted=found.predicted,
         colour=found.colour,
+        freedom=found.freedom,
         search=search,
         minima=minima,
     )

@@ -25,7 +25,8 @@ LEASH = 2.0  # width of the weak prior around the starts: a factor of e^2, or tw
 class Estimate:
     """What came out of a search; `noise` is the standard deviation of the residuals.
 
-    `colour` is the factor by which their autocorrelation raises variances, 1 for white ones, and
+    `colour` is the factor by which their autocorrelation raises variances, 1 for white ones;
+    `freedom` counts the independent samples that are left over, by which intervals widen;
     `jacobian` the derivatives of the predicted samples with respect to the values; `point` holds
     the search variables of the values.
     """
@@ -35,6 +36,7 @@ class Estimate:
     predicted: Float[np.ndarray, "log time channel"]
     noise: Float[np.ndarray, "log channel"]
     colour: Float[np.ndarray, "log channel"]
+    freedom: float
     jacobian: Float[np.ndarray, "log time channel free"]
     uncertainty: Uncertainty
     converged: bool
@@ -95,7 +97,8 @@ class Search:
         self._values_at = compiled(values_at)
         self._slopes = compiled(lambda y: jnp.diag(jax.jacfwd(values_at)(y)))
         self._pulls, self._push = compiled(pulls), compiled(jax.jacfwd(pulls))
-        self._linear, self.minimise = linearised, minimise
+        self._linear, self._minimise = linearised, minimise
+        self._side_by_side = compiled(jax.vmap(minimise, (0, 0, None, None, None)))
 
     @functools.cached_property
     def _programs(self):
@@ -104,7 +107,7 @@ class Search:
         point = jnp.zeros(count)
         lowered = (
             jax.jit(self._linear).lower(point),
-            jax.jit(self.minimise).lower(point, point, samples, samples, jnp.zeros(count, bool)),
+            jax.jit(self._minimise).lower(point, point, samples, samples, jnp.zeros(count, bool)),
         )
         # Compiling takes most of the time of a small fit: both at once, each on its own core.
         with ThreadPoolExecutor(2) as pool:
@@ -122,9 +125,10 @@ class Search:
 
         `start` are other starts (search variables), `use` says which logs count, `free` which
         numbers move. The noise of each channel is guessed first, then found from the residuals.
-        Standard errors are those of the linearised fit, widened where residuals are correlated in
-        time. Raises RuntimeError if the search leaves the range in which the case can be
-        simulated.
+        Standard errors are those of the linearised fit (0 for what does not move), widened where
+        residuals are correlated in time.
+
+        Raises RuntimeError if the search leaves the range in which the case can be simulated.
         """
         y = self.start if start is None else start
         free = np.ones(len(self.numbers), bool) if free is None else free
@@ -143,8 +147,16 @@ class Search:
                 )
             noise = self._noise(residuals, real)
         colours = self._colours(residuals)
-        found = self._uncertainty(values, jacobian, real, noise, colours, residuals)
-        return Estimate(values, y, predicted, noise, colours, jacobian, found, bool(converged))
+        counts = real.sum(axis=1)
+        independent = np.sum(counts / colours)
+        freedom = max(independent - free.sum(), 1.0)
+        # Coloured noise is fitted more closely than white noise: its level looks too low.
+        lost = (1 - free.sum() / counts.sum()) * independent / freedom
+        widened = noise * np.sqrt(colours * max(lost, 1.0))
+        found = self._uncertainty(values, jacobian, real, noise, widened, residuals, free)
+        return Estimate(
+            values, y, predicted, noise, colours, freedom, jacobian, found, bool(converged)
+        )
 
     def linearised(self, values):
         """Predicted samples at some values, and their derivatives (log, time, channel, free)."""
@@ -195,21 +207,56 @@ class Search:
 
     def _search(self, y, noise, measured, real, free):
         """Search point of the least squares for these noise levels, and whether it converged."""
-        given = y, self.scale(y, noise, real), self.weights(noise, real), measured
-        point, converged = self._programs[1](*map(jnp.asarray, given), jnp.asarray(free))
-        return np.asarray(point), converged
+        scale = self.scale(y, noise, real)
+        points, converged = self.minimise(
+            y[None], scale[None], self.weights(noise, real), measured, free
+        )
+        return points[0], converged[0]
 
-    def _uncertainty(self, values, jacobian, real, noise, colours, residuals) -> Uncertainty:
-        """Standard errors and what is unseen, from samples and priors together."""
-        weights = self.weights(noise * np.sqrt(colours), real)
+    def minimise(
+        self,
+        points: Float[np.ndarray, "start free"],
+        scales: Float[np.ndarray, "start free"],
+        weights: Float[np.ndarray, "log time channel"],
+        measured: Float[np.ndarray, "log time channel"],
+        free: Bool[np.ndarray, " free"],
+    ) -> tuple[Float[np.ndarray, "start free"], Bool[np.ndarray, " start"]]:
+        """Search points from several starts, and which searches converged.
+
+        On an accelerator all go side by side; on a CPU, one after the other takes no longer, and
+        needs no further program.
+        """
+        shared = [jnp.asarray(part) for part in (weights, measured, free)]
+        if len(points) > 1 and jax.default_backend() != "cpu":
+            found = self._side_by_side(jnp.asarray(points), jnp.asarray(scales), *shared)
+        else:
+            pairs = zip(points, scales, strict=True)
+            single = [
+                self._programs[1](jnp.asarray(point), jnp.asarray(scale), *shared)
+                for point, scale in pairs
+            ]
+            found = [np.stack(part) for part in zip(*single, strict=True)]
+        return np.asarray(found[0]), np.asarray(found[1])
+
+    def _uncertainty(self, values, jacobian, real, noise, widened, residuals, free) -> Uncertainty:
+        """Standard errors and what is unseen, from samples and priors; 0 for what was held."""
+        weights = self.weights(widened, real)
         if self.loss != "squares":
             sized = (residuals * self.weights(noise, real))[real > 0]
             weights = weights / np.sqrt(widening(self.loss, sized))
         rows = (jacobian * weights[..., None]).reshape(-1, len(self.numbers))
         if any(number.belief.mean is not None for number in self.numbers):
             rows = np.vstack([rows, self._push(values)])
-        sizes = [n.size_at(float(v)) for n, v in zip(self.numbers, values, strict=True)]
-        return uncertainty([number.address for number in self.numbers], rows, np.array(sizes))
+        moved = [(n, n.size_at(float(v))) for n, v in zip(self.numbers, values, strict=True)]
+        moved = [pair for pair, free_one in zip(moved, free, strict=True) if free_one]
+        found = uncertainty(
+            [n.address for n, _ in moved], rows[:, free], np.array([s for _, s in moved])
+        )
+        if free.all():
+            return found
+        errors, correlation = np.zeros(free.size), np.eye(free.size)
+        errors[free], correlation[np.ix_(free, free)] = found.errors, found.correlation
+        return Uncertainty(errors, correlation, found.unseen)
 
     def _noise(self, residuals, real) -> Float[np.ndarray, "log channel"]:
         """Standard deviation of the residuals, for the numbers fitted to them.

@@ -4,13 +4,10 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.stats import norm, qmc
 
-from jaxbeam.compiling import compiled
 from tuning.checkpoint import load, save
 from tuning.free import Free
 from tuning.search import LEASH, Search
@@ -72,26 +69,15 @@ def scout(
     found = {"points": np.empty((0, starts.shape[1])), "converged": np.empty(0, bool)}
     if checkpoint is not None and checkpoint.exists():
         found = load(checkpoint, mark)
-    weights, measured_ = jnp.asarray(search.weights(noise)), jnp.asarray(measured)
-    free = jnp.ones(len(search.numbers), bool)
-
-    @compiled
-    def minimise(points, scales):
-        return jax.vmap(search.minimise, (0, 0, None, None, None))(
-            points, scales, weights, measured_, free
-        )
-
+    weights, free = search.weights(noise), np.ones(len(search.numbers), bool)
     while len(found["points"]) < count:
         block = starts[len(found["points"]) :][:BLOCK]
-        used = len(block)
-        # A block is always full, so that one program serves them all.
-        block = np.concatenate([block, np.repeat(starts[:1], min(BLOCK, count) - used, axis=0)])
         scales = np.array([search.scale(point, noise) for point in block])
         scales = np.where(np.isfinite(scales), scales, 1.0)
-        points, converged = map(np.asarray, minimise(jnp.asarray(block), jnp.asarray(scales)))
+        points, converged = search.minimise(block, scales, weights, measured, free)
         found = {
-            "points": np.concatenate([found["points"], points[:used]]),
-            "converged": np.concatenate([found["converged"], converged[:used]]),
+            "points": np.concatenate([found["points"], points]),
+            "converged": np.concatenate([found["converged"], converged]),
         }
         if checkpoint is not None:
             save(checkpoint, mark, found)

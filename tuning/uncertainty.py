@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import t as student
 
 BLIND = 0.5  # standard error, in typical sizes, beyond which a direction counts as unseen
 SHARE = 0.1  # of an unseen direction: an address with more takes part in it
 FAR = 1e4  # typical sizes: the spread of a direction without any effect is taken for so much
 STEP = 0.1  # of a typical size: the largest change with which an unseen direction is reported
-INTERVAL = 1.959964  # standard errors to either side: 95 % of a normal distribution
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +46,14 @@ def colour(residuals: Float[np.ndarray, " time"]) -> float:
             break
         factor += 2 * correlation
     return factor
+
+
+def reach(freedom: float) -> float:
+    """Standard errors to either side of a 95 % interval: Student's quantile.
+
+    `freedom` is the number of independent samples beyond those that the values took; 1.96 for many.
+    """
+    return float(student.ppf(0.975, freedom))
 
 
 def uncertainty(
