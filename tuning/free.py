@@ -42,18 +42,18 @@ class Free:
             if self.belief.scale == "log":
                 least = min(least, INSIDE * self.low)
             inner = np.clip(value, self.low + least, self.high - least)
-            return float(self.at_share(self._share(inner)))
+            return float(self.at_share(np.asarray(self._share(inner))))
         if np.isfinite(self.low):
             return float(np.log(max(value - self.low, least)))
         if np.isfinite(self.high):
             return float(-np.log(max(self.high - value, least)))
         return value
 
-    def at_share(self, share: float) -> float:
+    def at_share(self, share: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
         """Search variable at a share (0 to 1) of the way between two bounds, on the scale."""
         if self.belief.scale == "logit":
-            return np.log(share / (1 - share))
-        return np.arcsin(2 * share - 1)
+            return np.asarray(np.log(share / (1 - share)))
+        return np.asarray(np.arcsin(2 * share - 1))
 
     def _share(self, value: float) -> float:
         """How far between its two bounds a value is; on the log scale, its logarithm."""

@@ -59,7 +59,7 @@ def load_fit(path: str | os.PathLike) -> Fit:
         raise ValueError(f"{path}: there is no such fit")
     arrays = load(path, FORMAT)
     about = json.loads(str(arrays["about"]))
-    logs = [_log(i, entry, arrays) for i, entry in enumerate(about["logs"])]
+    logs = [_log(i, entry, about["given"]["beam"], arrays) for i, entry in enumerate(about["logs"])]
     numbers = [Free(**{**n, "belief": Belief(**n["belief"])}) for n in about["numbers"]]
     campaign = prepare(case_from_dict(about["given"]), logs)
     minima = [
@@ -85,14 +85,13 @@ def _about(log: Log, case: Case) -> dict:
     if log.loads is not None:
         with_loads = dataclasses.replace(case, loads=tuple(log.loads), controller=None)
         about["loads"] = case_to_dict(with_loads).get("loads", [])
-        about["beam"] = case_to_dict(with_loads)["beam"]
     return about
 
 
-def _log(number: int, about: dict, arrays) -> Log:
+def _log(number: int, about: dict, beam: dict, arrays) -> Log:
     loads = about["loads"]
     if loads is not None:
-        loads = case_from_dict({"beam": about["beam"], "loads": loads}).loads
+        loads = case_from_dict({"beam": beam, "loads": loads}).loads
     words = {name: tuple(about[name]) for name in _WORDS}
     own = {name: arrays[f"log{number}.{name}"] for name in _LOG_ARRAYS}
     return Log(**own, **words, source=about["source"], loads=loads)

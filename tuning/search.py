@@ -56,7 +56,7 @@ class Search:
             raise ValueError(f"{len(numbers)} free numbers need at least as many samples")
         self.campaign, self.numbers, self.loss = campaign, numbers, loss
         self.start = np.array([number.inward(number.start) for number in numbers])
-        start, width = self.start, LEASH * np.array([number.search_size for number in numbers])
+        width = LEASH * np.array([number.search_size for number in numbers])
         predict = campaign.predictor([number.address for number in numbers])
 
         def values_at(y):
@@ -76,8 +76,9 @@ class Search:
             values = values_at(y)
             residuals = shaped(loss, (measured - predict(values)) * weights)
             # What the data cannot see would wander off, and spoil what they can: a prior too weak
-            # to move anything they tell holds it near the start. It has no part in the errors.
-            leash = (z * scale - start) / width
+            # to move anything they tell holds it near the start (in the next round, near what was
+            # found in the round before). It has no part in the errors.
+            leash = (z * scale - held) / width
             return jnp.concatenate([residuals.ravel(), pulls(values), leash])
 
         solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-6)
@@ -94,6 +95,7 @@ class Search:
             ended = jnp.where(free, found.value * scale, y)
             return ended, found.result == optimistix.RESULTS.successful
 
+        self.outward, self.pulls = values_at, pulls
         self._values_at = compiled(values_at)
         self._slopes = compiled(lambda y: jnp.diag(jax.jacfwd(values_at)(y)))
         self._pulls, self._push = compiled(pulls), compiled(jax.jacfwd(pulls))
@@ -184,7 +186,9 @@ class Search:
         Priors have their part. Infinite where the case cannot be simulated.
         """
         residuals = (measured - self.linearised(values)[0]) * self.weights(noise, real)
-        squares = jnp.sum(shaped(self.loss, residuals) ** 2) + jnp.sum(self._pulls(values) ** 2)
+        squares = jnp.sum(shaped(self.loss, jnp.asarray(residuals)) ** 2) + jnp.sum(
+            self._pulls(values) ** 2
+        )
         return float(squares / 2) if np.isfinite(squares) else np.inf
 
     def weights(self, noise, real=None) -> Float[np.ndarray, "log time channel"]:
