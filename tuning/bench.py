@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,15 +22,16 @@ from tuning.objective import Sharpness, run_merits
 TOLERANCE = 1e-4  # of the largest deflection: what tuning needs; verdicts are simulated finer
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Bench:
+class Bench(eqx.Module):
     """Runs of one case that differ in numbers only, and what they are without control.
 
-    `places` (m) are where deflections count: the sensors', or given ones.
+    `stacked` is the case with the numbers of all runs along a first axis. `places` (m) are where
+    deflections count: the sensors', or given ones. What is compiled should take the bench as an
+    argument: closed over, its arrays would be constants that XLA works on for seconds.
     """
 
     runs: Sequence[Values]
-    cases: list[Case]
+    stacked: Case
     plan: Plan
     times: Float[Array, " time"]
     places: Float[Array, " place"]
@@ -37,20 +39,25 @@ class Bench:
     after: Float[np.ndarray, "run time"]
     ranges: Float[np.ndarray, " actuator"]
 
+    @property
+    def cases(self) -> list[Case]:
+        """The cases of the runs, one by one."""
+        leaves, form = jax.tree.flatten(jax.tree.map(jnp.asarray, self.stacked))
+        return [jax.tree.unflatten(form, row) for row in zip(*leaves, strict=True)]
+
     def histories(self, values: Mapping[str, Any]) -> Histories:
         """Histories of all runs, along a first axis, with other numbers at some addresses."""
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self.cases)
 
         def single(case):
             return histories(replace(case, values), self.times, self.plan, self.places)
 
-        return jax.vmap(single)(stacked)
+        return jax.vmap(single)(self.stacked)
 
     def judge(
         self, found: Histories, sharpness: Sharpness = None
     ) -> dict[str, Float[Array, " run"]]:
         """Figures of merit of all runs; differentiable."""
-        weights = jnp.stack([traffic(case).weight[:, 0] for case in self.cases])
+        weights = jax.vmap(lambda case: traffic(case).weight[:, 0])(self.stacked)
         ranges = jnp.asarray(self.ranges)
 
         def single(found, free, after, weights):
@@ -87,14 +94,12 @@ def make_bench(case: Case, runs: Sequence[Values], places=None) -> Bench:
     plan = common_plan(cases)
     plain = [dataclasses.replace(own, controller=None) for own in cases]
     still = common_plan(plain)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *plain)
-    found = compiled(jax.vmap(lambda own: histories(own, times, still, places).deflection))
-    deflection = np.asarray(found(stacked))
+    deflection = np.asarray(_deflections(stacked_cases(plain), times, still, places))
     leaves = np.array([_last_exit(own) for own in cases])
     limits = [actuator.command_limits() for actuator in case.actuators]
     return Bench(
         runs=runs,
-        cases=cases,
+        stacked=stacked_cases(cases),
         plan=plan,
         times=times,
         places=places,
@@ -105,6 +110,16 @@ def make_bench(case: Case, runs: Sequence[Values], places=None) -> Bench:
         after=(np.asarray(times) > leaves[:, None]).astype(float),
         ranges=np.array([1.0 if pair is None else np.abs(pair).max() for pair in limits]),
     )
+
+
+def stacked_cases(cases: list[Case]) -> Case:
+    """One case with the numbers of several, alike in structure, along a first axis."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
+
+
+@compiled
+def _deflections(stacked: Case, times, plan: Plan, places) -> Float[Array, "run time place"]:
+    return jax.vmap(lambda own: histories(own, times, plan, places).deflection)(stacked)
 
 
 def common_plan(cases: list[Case]) -> Plan:

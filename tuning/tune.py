@@ -1,6 +1,7 @@
 """Controllers tuned by gradients through the closed loop, and proven on cases held out."""
 
 import dataclasses
+import functools
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -153,7 +154,7 @@ class _Search:
         self.own = np.array([number.inward(number.start) for number in numbers])
         self.adam = optax.adam(optax.cosine_decay_schedule(RATE, steps, alpha=0.05))
 
-        def smooth_and_true(point, sharpness):
+        def smooth_and_true(point, sharpness, bench):
             pairs = zip(numbers, point, strict=True)
             values = {n.address: n.outward(y) for n, y in pairs}
             found = bench.histories(values)
@@ -165,8 +166,12 @@ class _Search:
             )
             return smooth, true
 
-        slope = jax.value_and_grad(smooth_and_true, has_aux=True)
-        self._slope = compiled(jax.vmap(slope, in_axes=(0, None)))
+        @compiled
+        def slope(points, sharpness, bench):
+            single = jax.value_and_grad(smooth_and_true, has_aux=True)
+            return jax.vmap(lambda point: single(point, sharpness, bench))(points)
+
+        self._slope = functools.partial(slope, bench=bench)
 
         def onward(point, gradient, moments, scale):
             change, moments = self.adam.update(gradient, moments)
@@ -226,15 +231,19 @@ class _Search:
         return _State(step=step, moments=moments, **arrays)
 
 
+@compiled
+def _merits(bench: Bench, values):
+    return bench.merits(values)
+
+
 def _outcome(name, bench: Bench, objective, before, after, bounds) -> Outcome:
     """True peaks and merits of all runs, before and after, and the least peaks possible."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
         pairs = [bench.records(values) for values in (before, after)]
     peaks = [_peaks(bench, records) for records in pairs]
-    merits = compiled(bench.merits)
     arrays = [jax.tree.map(jnp.asarray, values) for values in (before, after)]
-    values = [np.asarray(objective.of_run(merits(v))) for v in arrays]
+    values = [np.asarray(objective.of_run(_merits(bench, v))) for v in arrays]
     least = np.full(len(bench.runs), np.nan)
     if bounds:
         period = bench.cases[0].controller.period

@@ -89,12 +89,13 @@ def test_smooth_maxima_come_to_the_true_ones(bench):
         assert np.all(smooth >= true) and np.all(smooth - true < np.log(200) / sharpness)
 
 
+CASES = tuning.LoadCases(RUNS, tuning.grid({"loads.0.mass": [0.4], "loads.0.speed": [1.2]}))
+FREE, OPTIONS = {GAIN: (500.0, 40000.0)}, {"steps": 25, "starts": 2, "progress": False}
+
+
 @pytest.fixture(scope="module")
 def tuned():
-    cases = tuning.LoadCases(RUNS, tuning.grid({"loads.0.mass": [0.4], "loads.0.speed": [1.2]}))
-    return tuning.tune(
-        rig(), {GAIN: (500.0, 40000.0)}, cases, steps=25, starts=2, progress=False
-    )  # fmt: skip
+    return tuning.tune(rig(), FREE, CASES, **OPTIONS)
 
 
 def test_finds_what_a_search_without_gradients_finds(bench, tuned):
@@ -130,43 +131,39 @@ def test_the_proof(tuned):
 
 def test_another_seed_comes_to_the_same(tuned):
     cases = tuning.LoadCases(RUNS)
-    free = {GAIN: (500.0, 40000.0)}
-    again = tuning.tune(
-        rig(9000.0), free, cases, steps=25, starts=2, seed=5, bounds=False, progress=False
-    )
+    again = tuning.tune(rig(9000.0), FREE, cases, seed=5, bounds=False, **OPTIONS)
     assert again.outcomes[0].objective[1] == pytest.approx(tuned.outcomes[0].objective[1], rel=2e-3)
     assert "nothing was held out" in again.verdict
 
 
-def test_a_search_that_was_stopped_goes_on_to_the_same_end(tmp_path, monkeypatch):
+def test_a_search_that_was_stopped_goes_on_to_the_same_end(tuned, tmp_path, monkeypatch):
     file = tmp_path / "search.npz"
-    cases, free = tuning.LoadCases(RUNS[:1]), {GAIN: (500.0, 40000.0)}
-    options = {"steps": 9, "bounds": False, "progress": False}
-    whole = tuning.tune(rig(), free, cases, **options)
 
     def killed(*arguments):
         save(*arguments)
         raise KeyboardInterrupt
 
+    options = OPTIONS | {"bounds": False}
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(importlib.import_module("tuning.tune"), "save", killed)
-        tuning.tune(rig(), free, cases, checkpoint=file, **options)
+        tuning.tune(rig(), FREE, CASES, checkpoint=file, **options)
     with pytest.raises(FileExistsError, match="resume the search"):
-        tuning.tune(rig(), free, cases, checkpoint=file, **options)
+        tuning.tune(rig(), FREE, CASES, checkpoint=file, **options)
     with pytest.raises(ValueError, match="belongs to another search"):
-        tuning.tune(rig(2500.0), free, cases, checkpoint=file, resume=True, **options)
-    resumed = tuning.tune(rig(), free, cases, checkpoint=file, resume=True, **options)
-    np.testing.assert_array_equal(resumed.history, whole.history)
-    np.testing.assert_array_equal(resumed.values, whole.values)
+        tuning.tune(rig(2500.0), FREE, CASES, checkpoint=file, resume=True, **options)
+    resumed = tuning.tune(rig(), FREE, CASES, checkpoint=file, resume=True, **options)
+    np.testing.assert_array_equal(resumed.history, tuned.history)
+    np.testing.assert_array_equal(resumed.values, tuned.values)
     file.write_bytes(file.read_bytes()[:200])
     with pytest.raises(ValueError, match="is damaged: delete it"):
         load(file, "")
 
 
 def test_the_start_is_kept_where_nothing_better_is_met():
-    cases, free = tuning.LoadCases(RUNS[:1]), {GAIN: (1999.0, 2001.0)}
+    cases, free = tuning.LoadCases(RUNS), {GAIN: (1999.0, 2001.0)}
     worse = tuning.Objective({"effort": 1.0})
-    found = tuning.tune(rig(1999.0), free, cases, worse, steps=2, bounds=False, progress=False)
+    options = OPTIONS | {"steps": 2, "bounds": False}
+    found = tuning.tune(rig(1999.0), free, cases, worse, **options)
     assert found.outcomes[0].objective[1] <= found.outcomes[0].objective[0] * (1 + 1e-6)
 
 
