@@ -12,6 +12,7 @@ from jaxbeam.compiling import compiled
 from tuning.campaign import prepare
 from tuning.identify import Fit
 from tuning.logs import Log
+from tuning.uncertainty import colour
 
 LAGS = 20  # of the autocorrelation that the whiteness test looks at
 DOUBTFUL = 0.01  # probability of residuals at least so coloured by chance, below which it is said
@@ -86,16 +87,17 @@ def channels(fit: Fit) -> list[Channel]:
                 continue
             residual, rate = residuals[has, j], rates[has, j]
             strength = max(float(rate @ rate), 1e-300)
-            noise, colour = float(fit.noise[i, j]), float(fit.colour[i, j])
+            shift = float(residual @ rate) / strength
+            left = residual - shift * rate
             found.append(
                 Channel(
                     log=i,
                     sensor=j,
-                    noise=noise,
+                    noise=float(fit.noise[i, j]),
                     probability=whiteness(residual),
-                    colour=colour,
-                    shift=float(residual @ rate) / strength,
-                    shift_error=noise * np.sqrt(colour / strength),
+                    colour=float(fit.colour[i, j]),
+                    shift=shift,
+                    shift_error=float(left.std() * np.sqrt(colour(left) / strength)),
                 )
             )
     return found

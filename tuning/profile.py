@@ -60,28 +60,33 @@ def profile(fit: Fit, address: str, points: int = 4) -> Profile:
     if address not in fit.addresses:
         raise ValueError(f"{address} is not free in this fit; free are {', '.join(fit.addresses)}")
     index = fit.addresses.index(address)
-    number, value = fit.numbers[index], float(fit.values[index])
     allowed = reach(fit.freedom) ** 2
     noise = np.where(np.isnan(fit.noise), 1.0, fit.noise * np.sqrt(fit.colour))
-    best = fit.search.cost(fit.values, noise, fit.campaign.measured)
+    # With weights widened channel by channel the least is not quite where the fit is.
+    centre = _refit(fit, _point(fit), noise)
+    least = fit.search.values_at(centre)
+    number, value = fit.numbers[index], float(least[index])
+    best = fit.search.cost(least, noise, fit.campaign.measured)
     error = fit.errors[index]
     size = number.size_at(value)
     step = min(error, size / 2) * np.sqrt(allowed) / points
     values, rises = [value], [0.0]
     for side in (-1.0, 1.0):
-        at, stride, rise, point = value, side * step, 0.0, _point(fit)
+        at, stride, rise, point = value, side * step, 0.0, centre
         for _ in range(MOST):
-            before, at = at, float(np.clip(at + stride, number.low, number.high))
-            if at == before:
+            if not number.low < at + stride < number.high:
                 break
-            point, rise_before = _refit(fit, point, index, at, noise), rise
-            rise = 2 * (fit.search.cost(fit.search.values_at(point), noise,
-                                        fit.campaign.measured) - best)  # fmt: skip
+            at += stride
+            point, before = np.array(point), rise
+            point[index] = number.inward(at)
+            point = _refit(fit, point, noise, index)
+            cost = fit.search.cost(fit.search.values_at(point), noise, fit.campaign.measured)
+            rise = 2 * (cost - best)
             values.append(at)
             rises.append(rise)
             if rise > 1.3 * allowed or not np.isfinite(rise):
                 break
-            if rise - rise_before < allowed / points**2:
+            if rise - before < allowed / points**2:
                 stride *= 2
     order = np.argsort(values)
     values, rises = np.array(values)[order], np.array(rises)[order]
@@ -96,11 +101,9 @@ def _point(fit: Fit) -> Float[np.ndarray, " free"]:
     return np.array([number.inward(float(value)) for number, value in pairs])
 
 
-def _refit(fit: Fit, point, index: int, value: float, noise) -> Float[np.ndarray, " free"]:
-    """The search point with one number held at a value, and the others fitted."""
-    point = np.array(point)
-    point[index] = fit.numbers[index].inward(value)
-    free = np.arange(point.size) != index
+def _refit(fit: Fit, point, noise, held: int | None = None) -> Float[np.ndarray, " free"]:
+    """The search point from some start on, with one number held and the others fitted."""
+    free = np.arange(point.size) != (-1 if held is None else held)
     if not free.any():
         return point
     search = fit.search

@@ -1,0 +1,209 @@
+"""Criticism, profiles and posterior of fits, on readings that are a formula."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tuning.stand_in import NOISE, PULLS, TIMES, TRUTH, campaign, clean, fit, formula, search
+from tuning.belief import Belief
+from tuning.criticism import channels, compare_fits, cross_validate, whiteness
+from tuning.identify import fit_of
+from tuning.posterior import nuts, sample, summary
+from tuning.profile import profile
+from tuning.uncertainty import reach
+
+VALUES = np.array(list(TRUTH.values()))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return fit()
+
+
+def refit(plain, measured, **about):
+    """Another log, fitted by the same program."""
+    found = plain.search.estimate(measured, **about)
+    made = dataclasses.replace(plain.campaign, measured=measured)
+    return dataclasses.replace(fit_of(plain.case, plain.search, found), campaign=made)
+
+
+# Criticism.
+
+
+def test_whiteness_of_known_noise():
+    rng = np.random.default_rng(0)
+    chances = [whiteness(rng.normal(size=400)) for _ in range(300)]
+    assert np.mean(np.array(chances) < 0.1) == pytest.approx(0.1, abs=0.05)
+    walk = np.convolve(rng.normal(size=400), np.ones(3) / 3, mode="valid")
+    assert whiteness(walk) < 1e-9 and whiteness(np.ones(50)) == 1.0
+
+
+def test_a_good_fit_has_nothing_said_against_it(plain):
+    found = channels(plain)
+    assert [(c.log, c.sensor) for c in found] == [(0, 0), (1, 0), (2, 0)]
+    assert [remark for channel in found for remark in channel.remarks] == []
+    np.testing.assert_allclose([c.noise for c in found], NOISE, rtol=0.2)
+
+
+def test_a_late_channel_and_coloured_residuals_are_told(plain):
+    measured = np.array(plain.campaign.measured)
+    late = np.interp(TIMES - 0.004, TIMES, clean()[1, :, 0])
+    measured[1, :, 0] = late + measured[1, :, 0] - clean()[1, :, 0]
+    # Fitted to the others only, so that nothing else makes up for it.
+    found = refit(plain, measured, use=np.array([True, False, True]))
+    _, channel, _ = channels(found)
+    assert channel.shift == pytest.approx(0.004, abs=4 * channel.shift_error)
+    assert channel.shift_error < 0.001
+    coloured, late_ = channel.remarks
+    assert "sensor 0 in log 1 is no white noise (probability" in coloured
+    assert "sensor 0 in log 1 seems " in late_ and " ms late (+- " in late_
+
+
+def test_rivals(plain):
+    """Without its damping free the model is wrong; with a number too many, it is no better."""
+    held = plain.search.estimate(plain.campaign.measured, free=np.array([True, False, True]))
+    undamped = dataclasses.replace(
+        fit_of(plain.case, plain.search, held), numbers=plain.numbers[:2]
+    )
+    best, worse = compare_fits({"damped": plain, "0.02": undamped})
+    assert (best.name, worse.name) == ("damped", "0.02")
+    assert worse.bic - best.bic > 10 and best.weight > 0.99
+    # White residuals, one channel a log: the textbook formulas, but for independent samples.
+    squares = np.nansum(plain.residuals**2, axis=(1, 2)) / TIMES.size
+    counts = TIMES.size / plain.colour[:, 0]
+    likely = -np.sum(counts * (np.log(2 * np.pi * squares) + 1)) / 2
+    assert best.log_likelihood == pytest.approx(likely)
+    assert best.aic == pytest.approx(6 - 2 * likely)
+    assert best.bic == pytest.approx(3 * np.log(counts.sum()) - 2 * likely)
+    with pytest.raises(ValueError, match="at least two"):
+        compare_fits({"one": plain})
+    with pytest.raises(ValueError, match="of other samples"):
+        compare_fits({"one": plain, "other": refit(plain, plain.campaign.measured + 1.0)})
+
+
+def test_cross_validation(plain):
+    left_out = cross_validate(plain)
+    assert [found.log for found in left_out] == ["run 0", "run 1", "run 2"]
+    ratios = np.array([found.ratio[0] for found in left_out])
+    np.testing.assert_allclose(ratios, 1.0, atol=0.3)
+    assert left_out[0].verdict.startswith("run 0: predicted; residuals are ")
+    measured = np.array(plain.campaign.measured)
+    measured[2] *= 1.3  # a run of which the model does not know something
+    told = [found.verdict for found in cross_validate(refit(plain, measured))]
+    assert "run 2: not predicted" in told[2]
+    with pytest.raises(ValueError, match="at least two"):
+        cross_validate(fit(search(logs=1)))
+
+
+# Profiles.
+
+
+def test_the_profile_of_a_number_that_acts_linearly_is_a_parabola(plain):
+    found = profile(plain, "sensors.0.offset")
+    error, centre = plain.errors[2], found.values[found.rises.argmin()]
+    assert abs(centre - plain.values[2]) < 0.1 * error
+    expected = ((found.values - centre) / error) ** 2
+    np.testing.assert_allclose(found.rises, expected, rtol=0.02, atol=1e-6)
+    np.testing.assert_allclose(found.interval, plain.intervals[2], atol=0.1 * error)
+    assert found.verdict.endswith("as the linearised fit says")
+    assert found.allowed == pytest.approx(reach(plain.freedom) ** 2)
+
+
+def test_a_number_at_its_bound_has_a_profile_of_one_side():
+    """Damping far below its error: the data only say that it is below something."""
+    undamped = np.array([formula(20.0, 1e-5, 0.2, pull) for pull in PULLS])[..., None]
+    noise = NOISE * np.random.default_rng(1).normal(size=undamped.shape)
+    found = fit(search(measured=undamped + noise))
+    told = profile(found, "beam.damping_ratio")
+    assert told.interval[0] == -np.inf and 0.0 < told.interval[1] < 1.0
+    assert told.verdict.startswith("the data only say that beam.damping_ratio is below ")
+
+
+def test_the_profile_of_a_number_that_is_not_free(plain):
+    with pytest.raises(ValueError, match="beam.length is not free in this fit; free are beam"):
+        profile(plain, "beam.length")
+
+
+# Posterior.
+
+
+def test_the_sampler_draws_from_a_known_density(tmp_path):
+    """Two correlated normal variables; stopped in between, it draws the same."""
+    pytest.importorskip("blackjax")
+    covariance = np.array([[1.0, 0.6], [0.6, 1.5]])
+    inverse = jnp.linalg.inv(covariance)
+
+    def density(z):
+        return -z @ inverse @ z / 2
+
+    given = (density, 2, 400, 2, 100, 0)
+    draws, divergences = nuts(*given)
+    found = summary(["a", "b"], draws, divergences)
+    np.testing.assert_allclose(np.cov(draws.reshape(-1, 2).T), covariance, atol=0.25)
+    np.testing.assert_allclose(found.means, 0.0, atol=0.2)
+    assert found.verdict.startswith("mixed: R-hat up to ") and divergences == 0
+    file = tmp_path / "draws.npz"
+    first, _ = nuts(density, 2, 100, 2, 100, 0, file, "this")
+    np.testing.assert_array_equal(first, draws[:, :100])
+    with pytest.raises(FileExistsError, match="resume that sampling, or delete it"):
+        nuts(*given, file, "this")
+    resumed, _ = nuts(*given, file, "this", resume=True)
+    np.testing.assert_array_equal(resumed, draws)
+    with pytest.raises(ValueError, match="belongs to another search"):
+        nuts(*given, file, "that", resume=True)
+
+
+def test_chains_that_do_not_mix_are_told():
+    pytest.importorskip("blackjax")
+    apart = np.random.default_rng(0).normal(size=(2, 300, 1)) + np.array([[[0.0]], [[5.0]]])
+    assert "the chains have not mixed" in summary(["a"], apart, 0).verdict
+    few = np.random.default_rng(0).normal(size=(2, 20, 1))
+    assert "effective draws: draw more" in summary(["a"], few, 0).verdict
+    astray = np.random.default_rng(0).normal(size=(2, 300, 1))
+    assert "100 divergent steps" in summary(["a"], astray, 100).verdict
+
+
+def test_the_posterior_of_a_fit_is_as_wide_as_its_intervals(plain):
+    """The model is nearly linear within its errors, so both ways must agree."""
+    pytest.importorskip("blackjax")
+    found = sample(plain, draws=300, chains=2, warmup=100)
+    np.testing.assert_allclose(found.deviations, plain.errors, rtol=0.2)
+    assert np.all(np.abs(found.means - plain.values) < 0.3 * plain.errors)
+    assert str(found).splitlines()[1].startswith("beam.flexural_rigidity ")
+
+
+def test_blind_directions_are_not_sampled(plain):
+    blind = dataclasses.replace(plain, unseen=[{"beam.damping_ratio": 0.1}])
+    with pytest.raises(ValueError, match="cannot see beam.damping_ratio: give a prior"):
+        sample(blind)
+
+
+# On disk.
+
+
+def test_a_fit_is_kept_to_the_last_bit(plain, tmp_path, monkeypatch):
+    from tuning import keeping
+
+    # The stand-in is made anew, as the campaign of real logs would be.
+    monkeypatch.setattr(keeping, "prepare", lambda case, logs: campaign())
+    keeping.save_fit(plain, tmp_path / "fit.npz")
+    again = keeping.load_fit(tmp_path / "fit.npz")
+    assert str(again) == str(plain)
+    for name in ("values", "errors", "correlation", "fitted", "noise", "intervals"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(plain, name))
+    np.testing.assert_allclose(
+        again.search.estimate(again.campaign.measured).values, plain.values, rtol=1e-12
+    )
+    with pytest.raises(FileExistsError, match="exists already"):
+        keeping.save_fit(plain, tmp_path / "fit.npz")
+    with pytest.raises(ValueError, match="there is no such fit"):
+        keeping.load_fit(tmp_path / "other.npz")
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "fit.npz").read_bytes()[:900])
+    with pytest.raises(ValueError, match="is damaged"):
+        keeping.load_fit(tmp_path / "cut.npz")
+
+
+def test_a_belief_is_kept_as_well(tmp_path):
+    assert dataclasses.asdict(Belief(0.1, 1.0, scale="log"))["scale"] == "log"
