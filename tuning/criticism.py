@@ -1,7 +1,10 @@
 """Whether a fitted model may be believed: its residuals, its rivals, and logs it has not seen."""
 
+from __future__ import annotations
+
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +13,11 @@ from scipy.stats import chi2
 
 from jaxbeam.compiling import compiled
 from tuning.campaign import prepare
-from tuning.identify import Fit
 from tuning.logs import Log
 from tuning.uncertainty import colour
+
+if TYPE_CHECKING:
+    from tuning.identify import Fit
 
 LAGS = 20  # of the autocorrelation that the whiteness test looks at
 DOUBTFUL = 0.01  # probability of residuals at least so coloured by chance, below which it is said

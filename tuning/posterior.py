@@ -63,6 +63,24 @@ class Posterior:
             f"mixed: R-hat up to {self.r_hat.max():.3f}, {self.effective.min():.0f} effective draws"
         )
 
+    def to_dict(self) -> dict:
+        """Means, deviations, intervals, R-hat and effective draws by address, and the verdict."""
+        rows = zip(
+            self.addresses, self.means, self.deviations, self.intervals, self.r_hat, self.effective,
+            strict=True,
+        )  # fmt: skip
+        numbers = {
+            address: {
+                "mean": float(mean),
+                "deviation": float(deviation),
+                "interval_95": interval.tolist(),
+                "r_hat": float(r_hat),
+                "effective_draws": float(effective),
+            }
+            for address, mean, deviation, interval, r_hat, effective in rows
+        }
+        return {"numbers": numbers, "verdict": self.verdict}
+
     def __str__(self) -> str:
         width = max(map(len, self.addresses))
         head = f"{'number':{width}}  {'mean':>11}  {'deviation':>10}  {'95 % interval':^25}"

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxbeam.sensors import QUANTITIES
+from tuning.criticism import channels
+from tuning.faults import find_faults
 
 if TYPE_CHECKING:
     from tuning.identify import Fit
+    from tuning.logs import Log
 
 CLOSE = 0.95  # correlation beyond which two numbers are said to be hard to tell apart
+PRIOR = 0.7  # of the prior's deviation: with a larger error the logs say less than the prior
 
 
 def fit_table(fit: Fit) -> str:
@@ -23,8 +28,41 @@ def fit_table(fit: Fit) -> str:
         f"{name:{a}}  {unit:{b}}  {start:>{c}}  {value:>{d}}  {told}"
         for name, unit, start, value, told in rows
     ]
-    remarks = [*_bounds(fit), *_unseen(fit), *_pairs(fit), *_residuals(fit)]
-    return "\n".join([*lines, "", *remarks, fit.verdict])
+    return "\n".join([*lines, *minima_table(fit), "", *remarks(fit), fit.verdict])
+
+
+def remarks(fit: Fit) -> list[str]:
+    """All that is to be said of a fit besides its numbers, in a sentence each."""
+    return [
+        *_bounds(fit),
+        *_unseen(fit),
+        *_pairs(fit),
+        *_priors(fit),
+        *_residuals(fit),
+        *(remark for channel in channels(fit) for remark in channel.remarks),
+        *log_remarks(fit.campaign.logs),
+    ]
+
+
+def log_remarks(logs: Sequence[Log]) -> list[str]:
+    """What was noted when logs were read, and faults that were found and not masked."""
+    said = []
+    for log in logs:
+        said += [f"{log.source}: {note}" for note in log.notes]
+        said += [f"{fault} (not masked)" for fault in find_faults(log)]
+    return said
+
+
+def minima_table(fit: Fit) -> list[str]:
+    """The minima that several starts led to, lowest first; nothing for a single start."""
+    if not fit.minima:
+        return []
+    lines = ["", f"{len(fit.minima)} minima from {sum(m.starts for m in fit.minima)} starts:"]
+    for found in fit.minima:
+        values = "  ".join(f"{value:.5g}" for value in found.values)
+        state = "" if found.converged else "  (not converged)"
+        lines.append(f"  misfit {found.cost:.6g} from {found.starts} starts: {values}{state}")
+    return lines
 
 
 def _rows(fit: Fit):
@@ -66,6 +104,13 @@ def _pairs(fit: Fit):
             f"{fit.addresses[i]} and {fit.addresses[j]} are hard to tell apart: "
             f"correlation {fit.correlation[i, j]:.3f}"
         )
+
+
+def _priors(fit: Fit):
+    for number, error in zip(fit.numbers, fit.errors, strict=True):
+        deviation = number.belief.deviation
+        if deviation is not None and error > PRIOR * deviation:
+            yield f"{number.address} is told by its prior more than by the logs"
 
 
 def _residuals(fit: Fit):

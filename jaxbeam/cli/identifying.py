@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from jaxbeam.arguments import (
+    assignment,
     bounds_of,
     check_outputs,
     picture_path,
@@ -36,8 +37,20 @@ def demo(
 def identify(
     *files: Path,
     free: tuple[str, ...] = (),
+    prior: tuple[str, ...] = (),
+    scale: tuple[str, ...] = (),
+    loss: str = "squares",
+    stage: tuple[str, ...] = (),
+    starts: int = 1,
+    seed: int = 0,
+    mask: tuple[str, ...] = (),
+    profile: tuple[str, ...] = (),
+    draws: int = 0,
+    validate: bool = False,
+    report: Path | None = None,
     output: Output = None,
     plot: bool = False,
+    resume: bool = False,
     set_: Settings = (),
     overwrite: Overwrite = False,
     json_: Json = False,
@@ -47,23 +60,58 @@ def identify(
     Parameters
     ----------
     files
-        [CASE.toml] LOG...: the case to fit, if any, and the logs.
+        [CASE.toml] LOG...: the case to fit, if any, and the logs; all runs that they hold.
     free
-        ADDRESS[=LOW:HIGH]: a number to identify, between bounds; repeat it for more.
+        ADDRESS[=LOW:HIGH]: a number to identify, between bounds; repeat it for more. A number of
+        every log is at logs.*.ADDRESS.
+    prior
+        ADDRESS=MEAN:DEVIATION: what is known of a free number beforehand.
+    scale
+        ADDRESS=log or ADDRESS=logit: the scale on which a number is searched between its bounds.
+    loss
+        squares, or soft-l1 or huber, for which outliers count less.
+    stage
+        ADDRESS,ADDRESS,...: free numbers to fit first, the others held; repeat it for more stages.
+    starts
+        How many points to search from; the first is the case as it is.
+    seed
+        Which random points the others are, and which random draws.
+    mask
+        missing, spikes, saturation or stuck: samples to leave out; repeat it for more.
+    profile
+        ADDRESS: a free number whose profile likelihood to compute; repeat it for more.
+    draws
+        How many draws of the posterior to make in each of four chains (extra bayes).
+    validate
+        Leave out one log after the other, and predict it.
+    report
+        Write an account with tables and pictures to this folder: report.md and report.html.
     output
-        Write the fitted case to this file, FIT.toml.
+        Write the fitted case to this file, FIT.toml, and all of the fit beside it, FIT.npz.
     plot
         Draw measured and fitted to a PNG beside the output, or named after the log.
+    resume
+        Go on with searches and draws that were stopped; they are kept beside the output.
     """
     case, logs = split_files(files, free)
     if case and free:
+        refuse(resume and not output, "--resume goes on with what is kept beside the output: -o")
         picture = picture_path(output, logs[0]) if plot else None
-        check_outputs(overwrite, output, picture)
-        _identify_case(read_case(case, set_), logs, free, output, picture, json_)
+        check_outputs(overwrite, output, _beside(output, ".npz"), picture)
+        _check_report(report, overwrite)
+        settings = {"loss": loss, "starts": starts, "seed": seed, "resume": resume}
+        settings["stages"] = [text.split(",") for text in stage]
+        fit = _fit(
+            read_case(case, set_), logs, mask, free, prior, scale, output, overwrite, settings
+        )
+        judged = _judge(fit, profile, draws, seed, validate, output, resume)
+        _tell(fit, judged, report, output, picture, json_)
         return
+    given = (prior, scale, stage, profile, draws, validate, report, resume, mask, starts > 1)
     refuse(
-        bool(output or set_),
-        "-o and --set are for fitting a case; name what is free with --free ADDRESS",
+        bool(output or set_ or any(given)),
+        "-o, --set and the options of fits are for fitting a case; name what is free with --free "
+        "ADDRESS",
     )
     if case:
         say(f"nothing is named with --free, so {case} is not used; modes of the free decay:")
@@ -72,21 +120,115 @@ def identify(
     _identify_modes(logs, pictures, json_)
 
 
-def _identify_case(case, logs, free, output, picture, json_) -> None:
-    import tuning
-    from jaxbeam.casefile import save_case
+def _beside(output: Path | None, suffix: str) -> Path | None:
+    return None if output is None else output.with_suffix(suffix)
 
+
+def _forget(output: Path | None) -> None:
+    """Remove what searches and draws kept beside the output on their way."""
+    for suffix in (".search.npz", ".draws.npz") if output else ():
+        output.with_suffix(suffix).unlink(missing_ok=True)
+
+
+def _check_report(folder: Path | None, overwrite: bool) -> None:
+    if folder and folder.exists() and any(folder.iterdir()) and not overwrite:
+        raise FileExistsError(
+            f"the folder {folder} is not empty; choose another or add --overwrite"
+        )
+
+
+def _fit(case, files, kinds, free, prior, scale, output, overwrite, settings):
+    """Read the logs and fit the case to them."""
+    import tuning
+
+    missing = "mask" if "missing" in kinds else "refuse"
+    logs = [log for path in files for log in tuning.read_logs(path, missing=missing)]
+    others = [kind for kind in kinds if kind != "missing"]
+    logs = [tuning.mask(log, others) for log in logs] if others else logs
+    if overwrite and not settings["resume"]:
+        _forget(output)
+    checkpoint = _beside(output, ".search.npz") if settings["starts"] > 1 else None
+    return tuning.identify(
+        case, logs, _beliefs(free, prior, scale), checkpoint=checkpoint, **settings
+    )
+
+
+def _beliefs(free, prior, scale) -> dict:
+    """Bounds, priors and scales by address, of the options that name them."""
+    from tuning.belief import Belief
+
+    scales = dict(assignment("--scale", text) for text in scale)
+    priors = {}
+    for text in prior:
+        address, value = assignment("--prior", text)
+        parts = value.split(":")
+        try:
+            mean, deviation = map(float, parts)
+        except ValueError:
+            raise ValueError(
+                f"--prior takes ADDRESS=MEAN:DEVIATION, such as beam.damping_ratio=0.02:0.005, not "
+                f"{text!r}"
+            ) from None
+        priors[address] = mean, deviation
     bounds = dict(bounds_of(text) for text in free)
-    fit = tuning.identify(case, [tuning.read_log(path) for path in logs], bounds)
+    for address in (*scales, *priors):
+        refuse(address not in bounds, f"{address} has a prior or a scale, but is not free: --free")
+    return {
+        address: Belief(
+            *(pair or (None, None)),
+            *priors.get(address, (None, None)),
+            scale=scales.get(address, "plain"),
+        )
+        for address, pair in bounds.items()
+    }
+
+
+def _judge(fit, profile, draws, seed, validate, output, resume) -> dict:
+    """Profiles, posterior and cross-validation, as far as they are asked for."""
+    from tuning.criticism import cross_validate
+    from tuning.posterior import sample
+    from tuning.profile import profile as profile_of
+
+    judged = {"profiles": [profile_of(fit, address) for address in profile]}
+    if validate:
+        judged["unseen"] = cross_validate(fit)
+    if draws:
+        checkpoint = _beside(output, ".draws.npz")
+        judged["posterior"] = sample(fit, draws, seed=seed, checkpoint=checkpoint, resume=resume)
+    return judged
+
+
+def _tell(fit, judged, report, output, picture, json_) -> None:
+    """Write and print what was found; then what was kept on the way is needed no longer."""
+    from jaxbeam.casefile import save_case
+    from tuning.account import write_report
+    from tuning.keeping import save_fit
+
     if output:
         save_case(fit.case, output, overwrite=True)  # checked before the work
+        save_fit(fit, output.with_suffix(".npz"), overwrite=True)
     if picture:
         fit.plot().savefig(picture)
+    if report:
+        write_report(report, fit, overwrite=True, **judged)
+    _forget(output)
+    posterior = judged.get("posterior")
     if json_:
-        print_json(fit.to_dict())
-    else:
-        print(fit)
-        print_written(output, picture)
+        told = fit.to_dict()
+        told["profiles"] = {p.address: {"interval": p.interval, "verdict": p.verdict}
+                            for p in judged["profiles"]}  # fmt: skip
+        if posterior:
+            told["posterior"] = posterior.to_dict()
+        told["left_out"] = {u.log: u.ratio for u in judged.get("unseen", ())}
+        print_json(told)
+        return
+    print(fit)
+    for found in (*judged["profiles"], *judged.get("unseen", ())):
+        print(found.verdict)
+    if posterior:
+        print(posterior)
+    print_written(output, _beside(output, ".npz"), picture)
+    print_written(report and report / "report.html")
 
 
 def _identify_modes(logs, pictures, json_) -> None:

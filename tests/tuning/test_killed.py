@@ -1,0 +1,54 @@
+"""Searches and samplings that are killed outright go on to the very same end."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tests.tuning.stand_in import fit, search
+from tuning.posterior import sample
+from tuning.starts import scout
+
+# What a process does until, having written its first state, it is killed.
+CHILD = """
+import os, signal, sys
+import tuning.posterior, tuning.starts
+from pathlib import Path
+from tests.tuning.stand_in import fit, search
+file = Path(sys.argv[1])
+def save_and_die(path, mark, arrays):
+    saved(path, mark, arrays)
+    os.kill(os.getpid(), signal.SIGKILL)
+saved = tuning.starts.save
+tuning.starts.save = tuning.posterior.save = save_and_die
+{task}
+"""
+SCOUT = "wide = search(); tuning.starts.scout(wide, wide.campaign.measured, 12, 1, file, 'it')"
+SAMPLE = "tuning.posterior.sample(fit(), 200, 2, 50, checkpoint=file)"
+
+
+def killed(task, file):
+    line = [sys.executable, "-c", CHILD.format(task=task), str(file)]
+    ended = subprocess.run(line, capture_output=True, env=os.environ)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    assert file.exists()
+
+
+def test_a_search_from_many_starts(tmp_path):
+    killed(SCOUT, tmp_path / "search.npz")
+    found = search()
+    given = found, found.campaign.measured, 12, 1
+    resumed = scout(*given, tmp_path / "search.npz", "it")
+    for one, other in zip(resumed, scout(*given), strict=True):
+        assert one.cost == other.cost and one.starts == other.starts
+        np.testing.assert_array_equal(one.values, other.values)
+
+
+def test_draws_of_a_posterior(tmp_path):
+    pytest.importorskip("blackjax")
+    killed(SAMPLE, tmp_path / "draws.npz")
+    resumed = sample(fit(), 200, 2, 50, checkpoint=tmp_path / "draws.npz", resume=True)
+    np.testing.assert_array_equal(resumed.draws, sample(fit(), 200, 2, 50).draws)
