@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case, replace
 from jaxbeam.compiling import compiled
+from jaxbeam.control.bound import HELD, bound
 from jaxbeam.dynamics import traffic
 from jaxbeam.plan import Plan, make_plan, sample_times
 from jaxbeam.record import Record
@@ -23,7 +24,7 @@ TOLERANCE = 1e-4  # of the largest deflection: what tuning needs; verdicts are s
 
 
 class Bench(eqx.Module):
-    """Runs of one case that differ in numbers only, and what they are without control.
+    """Runs of one case that differ in numbers only, and what they are without control (`free`).
 
     `stacked` is the case with the numbers of all runs along a first axis. `places` (m) are where
     deflections count: the sensors', or given ones. What is compiled should take the bench as an
@@ -76,8 +77,10 @@ class Bench(eqx.Module):
         return [simulate(replace(case, values), plan=self.plan) for case in self.cases]
 
 
-def make_bench(case: Case, runs: Sequence[Values], places=None) -> Bench:
+def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = False) -> Bench:
     """Prepare the runs of a case; peaks without control are simulated once.
+
+    With `bounds` the least peak that is possible is found for each, else it is NaN.
 
     Raises ValueError for an address that is not there, a run that is too short or faulty, and
     without a controller or anywhere to look at the deflection.
@@ -106,10 +109,17 @@ def make_bench(case: Case, runs: Sequence[Values], places=None) -> Bench:
         free={
             "peak": np.abs(deflection).max(axis=(1, 2)),
             "rms": np.sqrt((deflection**2).mean(axis=(1, 2))),
+            "least": _least_peaks(cases, places) if bounds else np.full(len(runs), np.nan),
         },
         after=(np.asarray(times) > leaves[:, None]).astype(float),
         ranges=np.array([1.0 if pair is None else np.abs(pair).max() for pair in limits]),
     )
+
+
+def _least_peaks(cases: list[Case], places) -> Float[np.ndarray, " run"]:
+    period = cases[0].controller.period
+    held = HELD if period is None else float(period)
+    return np.array([bound(own, places, held).peak for own in cases])
 
 
 def stacked_cases(cases: list[Case]) -> Case:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.simulate import Histories
 
-MERITS = ("peak", "rms", "after_exit", "effort", "contact")
+MERITS = ("peak", "shortfall", "rms", "after_exit", "effort", "contact")
 OVER = ("mean", "worst", "cvar")
 Sharpness = Float[Array, ""] | float | None  # of smooth maxima; None for true ones
 
@@ -17,11 +17,13 @@ Sharpness = Float[Array, ""] | float | None  # of smooth maxima; None for true o
 class Objective:
     """A weighted sum of figures of merit, and how runs are taken together.
 
-    Every figure is relative to the same run without control: the largest deflection (`peak`), its
-    root mean square (`rms`), the largest `after_exit` of the last load (relative to the peak);
-    the root mean square of the commands, relative to the largest within their limits (`effort`);
-    and the largest change of a contact force, relative to the weight (`contact`). Runs count by
-    their "mean", their "worst", or ("cvar") the mean of the worst `share` of them.
+    Every figure is relative to the same run without control: the largest deflection (`peak`), the
+    share of its attainable reduction that is missed (`shortfall`: 0 at the bound, 1 without
+    control, so that runs with little to gain count as much as others), its root mean square
+    (`rms`), the largest `after_exit` of the last load (relative to the peak); the root mean square
+    of the commands, relative to the largest within their limits (`effort`); and the largest change
+    of a contact force, relative to the weight (`contact`). Runs count by their "mean", their
+    "worst", or ("cvar") the mean of the worst `share` of them.
     """
 
     weights: dict[str, float] = dataclasses.field(default_factory=lambda: {"peak": 1.0})
@@ -72,7 +74,8 @@ def run_merits(
     weights: Float[Array, " load"],
     sharpness: Sharpness = None,
 ) -> dict[str, Float[Array, ""]]:
-    """Figures of merit of one run (see `Objective`); `free` holds those without control, in m.
+    """Figures of merit of one run (see `Objective`); `free` holds those without control, in m,
+    and the least peak possible (NaN where it is not known).
 
     `after` is 1 at samples after the last exit and 0 before; `ranges` are the largest commands
     within limits, `weights` those of the loads (N). With a `sharpness` maxima are smooth.
@@ -80,8 +83,10 @@ def run_merits(
     size = jnp.abs(found.deflection)
     change = jnp.abs(found.contact_force - weights) * (found.contact_force != 0)
     heavy = jnp.where(weights > 0, weights, 1.0)
+    peak, least = largest(size / free["peak"], sharpness), free["least"] / free["peak"]
     return {
-        "peak": largest(size / free["peak"], sharpness),
+        "peak": peak,
+        "shortfall": (peak - least) / (1 - least),
         "rms": jnp.sqrt(jnp.mean(found.deflection**2)) / free["rms"],
         "after_exit": largest(size * after[:, None] / free["peak"], sharpness),
         "effort": jnp.sqrt(jnp.mean((found.command / ranges) ** 2) + 1e-30),

@@ -17,7 +17,6 @@ from tqdm import tqdm
 from jaxbeam.case import Case, replace
 from jaxbeam.casefile import case_to_dict
 from jaxbeam.compiling import compiled
-from jaxbeam.control.bound import HELD, bound
 from jaxbeam.simulate import ContactLossWarning
 from tuning.bench import Bench, make_bench
 from tuning.checkpoint import fingerprint, load, save
@@ -70,6 +69,8 @@ def tune(
     objective = Objective() if objective is None else objective
     if steps < 1 or starts < 1:
         raise ValueError(f"steps and starts must be 1 or more; they are {steps} and {starts}")
+    if "shortfall" in objective.weights and not bounds:
+        raise ValueError("the shortfall is that behind the bounds: leave bounds on to tune for it")
     numbers = free_numbers([case], dict(free), 1.0)
     mark = fingerprint(
         {
@@ -84,7 +85,7 @@ def tune(
     file = None if checkpoint is None else Path(checkpoint)
     if file is not None and file.exists() and not resume:
         raise FileExistsError(f"{file} exists; resume the search, or name another file")
-    bench = make_bench(case, cases.training, places)
+    bench = make_bench(case, cases.training, places, bounds)
     violation = None if stable is None else stable.violation(bench.cases)
     search = _Search(bench, numbers, objective, violation, steps)
     state = search.first(starts, seed)
@@ -110,8 +111,8 @@ def tune(
     outcomes = []
     for name, runs in (("training", cases.training), ("held out", cases.held_out)):
         if runs:
-            own = bench if name == "training" else make_bench(case, runs, places)
-            outcomes.append(_outcome(name, own, objective, before, after, bounds))
+            own = bench if name == "training" else make_bench(case, runs, places, bounds)
+            outcomes.append(_outcome(name, own, objective, before, after))
     return Tuned(
         case=replace(case, after),
         numbers=numbers,
@@ -236,7 +237,7 @@ def _merits(bench: Bench, values):
     return bench.merits(values)
 
 
-def _outcome(name, bench: Bench, objective, before, after, bounds) -> Outcome:
+def _outcome(name, bench: Bench, objective, before, after) -> Outcome:
     """True peaks and merits of all runs, before and after, and the least peaks possible."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
@@ -244,18 +245,13 @@ def _outcome(name, bench: Bench, objective, before, after, bounds) -> Outcome:
     peaks = [_peaks(bench, records) for records in pairs]
     arrays = [jax.tree.map(jnp.asarray, values) for values in (before, after)]
     values = [np.asarray(objective.of_run(_merits(bench, v))) for v in arrays]
-    least = np.full(len(bench.runs), np.nan)
-    if bounds:
-        period = bench.cases[0].controller.period
-        held = HELD if period is None else float(period)
-        least = np.array([bound(own, bench.places, held).peak for own in bench.cases])
     return Outcome(
         name=name,
         runs=tuple(bench.runs),
         uncontrolled=bench.free["peak"],
         before=peaks[0],
         after=peaks[1],
-        least=least,
+        least=bench.free["least"],
         values=np.stack(values),
         saturated=np.array([float(np.asarray(r.saturated).mean()) for r in pairs[1]]),
         objective=[float(objective.of_runs(jnp.asarray(v))) for v in values],

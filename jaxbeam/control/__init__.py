@@ -5,6 +5,7 @@ from jaxbeam.control.discrete import DiscreteLQR
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.lqr import LQR, AugmentedLQR, FiniteLQR, StepLQR
 from jaxbeam.control.mpc import MPC
+from jaxbeam.control.passage import Passage
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.recognition import Recognised, Recognition, recognised
 from jaxbeam.control.sampling import SamplingWarning, sampling_limit
@@ -21,6 +22,7 @@ KINDS = {
     "lqr-scheduled": ScheduledLQR,
     "lqr-step": StepLQR,
     "mpc": MPC,
+    "passage": Passage,
     "pd": PD,
     "ppf": PositivePositionFeedback,
     "prescribed": Prescribed,
@@ -37,6 +39,7 @@ __all__ = [
     "Feedback",
     "FiniteLQR",
     "Lead",
+    "Passage",
     "PositivePositionFeedback",
     "Prescribed",
     "Recognised",

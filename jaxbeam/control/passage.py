@@ -1,0 +1,83 @@
+"""Commands that go with the load: a table over its way, clocked by two gates.
+
+Where voltage and not knowledge is the limit, a load need not be weighed: what a light one may be
+given at each place does for a heavy one too. It is enough to know where the load is.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.controller import AbstractController
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
+from jaxbeam.loads import motion
+from jaxbeam.motion import NEVER
+from jaxbeam.statespace import LoadedBeam
+
+
+class Passage(AbstractController):
+    """Commands tabulated over the share of the way of a load that two gates have announced.
+
+    The commands at the `shares` (0 at the end where the load enters, 1 at the other) are joined by
+    straight lines and zero outside; those of several loads are added. Gates may be before the beam
+    (a negative position if loads enter at the left). A load is taken to keep the speed that it
+    has between them, and commands begin when it has passed the second. The table is read `lead`
+    seconds ahead of the load, to make up for delay and hold. No sensor of the beam and no mass is
+    used: there is no loop that could become unstable.
+    """
+
+    gates: Float[Array, "2"] = number("m", "where the gates are, in the order they are passed")
+    shares: Float[Array, " knot"] = number("1", "shares of the way", INCREASING)
+    values: Float[Array, "actuator knot"] = number(
+        "unit of a command", "a list of commands for each actuator"
+    )
+    lead: Float[Array, ""] = number(
+        "s", "how far ahead of the load the table is read", NOT_NEGATIVE, default=0.0
+    )
+
+    @property
+    def blind(self) -> bool:
+        return True
+
+    @property
+    def memoryless(self) -> bool:
+        return True
+
+    def fault(self, case):
+        if self.period is None:
+            return "period must be given: kind 'passage' acts at its ticks"
+        if not case.loads:
+            return "kind needs loads that pass the gates; add one, or take kind 'prescribed'"
+        if self.values.shape != (len(case.actuators), self.shares.shape[0]):
+            return (
+                f"values must have for each of {len(case.actuators)} actuators as many entries as"
+                f" shares has, {self.shares.shape[0]}; they are of shape {self.values.shape}"
+            )
+        if not all(is_known(leaf) for leaf in jax.tree.leaves((self.gates, case))):
+            return None
+        if np.any(~(np.diff(_times(self.gates, case.loads, case.beam.length)) > 0)):
+            return "gates must be two places that every load passes, the first before the other"
+        return None
+
+    def init(self, model: LoadedBeam):
+        times = jnp.stack([path.arrivals(self.gates)[:2] for path in model.traffic.motions])
+        return times, model.case.beam.length
+
+    def step(self, memory, measurement, t):
+        times, length = memory
+        speeds = jnp.diff(self.gates) / jnp.diff(times, axis=1)[:, 0]
+        behind = jnp.where(speeds < 0, length - self.gates[1], self.gates[1])
+        way = behind + (t + self.lead - times[:, 1]) * jnp.abs(speeds)
+
+        def read(row):
+            return jnp.interp(way / length, self.shares, row, left=0.0, right=0.0)
+
+        commands = jnp.where(t >= times[:, 1], jax.vmap(read)(self.values), 0.0)
+        return jnp.sum(commands, axis=1), memory
+
+
+def _times(gates, loads, length) -> Float[np.ndarray, "load 2"]:
+    """When loads pass the gates (s), NaN where they do not."""
+    found = np.stack([known(motion(load, length).arrivals(gates))[:2] for load in loads])
+    return np.where(found < NEVER, found, np.nan)
