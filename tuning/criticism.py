@@ -57,24 +57,27 @@ class Channel:
     shift: float
     shift_error: float
 
-    @property
-    def remarks(self) -> list[str]:
-        """What is to be said of it, in a sentence each; nothing if all is well."""
-        place = f"sensor {self.sensor} in log {self.log}"
-        said = []
-        if self.probability < DOUBTFUL:
+
+def channel_remarks(found: Sequence[Channel], logs: Sequence[Log]) -> list[str]:
+    """What is to be said of residuals, in a sentence each; nothing if all is well."""
+    said = []
+    for i, log in enumerate(logs):
+        coloured = [c for c in found if c.log == i and c.probability < DOUBTFUL]
+        if coloured:
+            places = ", ".join(f"{c.colour:.2g} at sensor {c.sensor}" for c in coloured)
             said.append(
-                f"the residual of {place} is no white noise (probability {self.probability:.1g}): "
-                f"the model misses something there; intervals allow for {self.colour:.2g} times "
-                "the variance, but not for values that are off"
+                f"{log.source}: residuals are no white noise, so the model misses something; "
+                f"intervals are widened for it (variances times {places}), but cannot make up for "
+                "values that it puts off"
             )
-        if abs(self.shift) > LATE * self.shift_error:
-            what = "late" if self.shift > 0 else "early"
-            said.append(
-                f"{place} seems {1e3 * abs(self.shift):.3g} ms {what} "
-                f"(+- {2e3 * self.shift_error:.2g} ms): free its delay, or check its clock"
-            )
-        return said
+        for c in found:
+            if c.log == i and abs(c.shift) > LATE * c.shift_error:
+                what = "late" if c.shift > 0 else "early"
+                said.append(
+                    f"{log.source}: sensor {c.sensor} seems {1e3 * abs(c.shift):.3g} ms {what} "
+                    f"(+- {2e3 * c.shift_error:.2g} ms): free its delay, or check its clock"
+                )
+    return said
 
 
 def channels(fit: Fit) -> list[Channel]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxbeam.sensors import QUANTITIES
-from tuning.criticism import channels
+from tuning.criticism import channel_remarks, channels
 from tuning.faults import find_faults
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def remarks(fit: Fit) -> list[str]:
         *_pairs(fit),
         *_priors(fit),
         *_residuals(fit),
-        *(remark for channel in channels(fit) for remark in channel.remarks),
+        *channel_remarks(channels(fit), fit.campaign.logs),
         *log_remarks(fit.campaign.logs),
     ]
 

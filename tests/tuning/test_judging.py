@@ -8,7 +8,7 @@ import pytest
 
 from tests.tuning.stand_in import NOISE, PULLS, TIMES, TRUTH, campaign, clean, fit, formula, search
 from tuning.belief import Belief
-from tuning.criticism import channels, compare_fits, cross_validate, whiteness
+from tuning.criticism import channel_remarks, channels, compare_fits, cross_validate, whiteness
 from tuning.identify import fit_of
 from tuning.posterior import nuts, sample, summary
 from tuning.profile import profile
@@ -43,7 +43,7 @@ def test_whiteness_of_known_noise():
 def test_a_good_fit_has_nothing_said_against_it(plain):
     found = channels(plain)
     assert [(c.log, c.sensor) for c in found] == [(0, 0), (1, 0), (2, 0)]
-    assert [remark for channel in found for remark in channel.remarks] == []
+    assert channel_remarks(found, plain.campaign.logs) == []
     np.testing.assert_allclose([c.noise for c in found], NOISE, rtol=0.2)
 
 
@@ -56,9 +56,9 @@ def test_a_late_channel_and_coloured_residuals_are_told(plain):
     _, channel, _ = channels(found)
     assert channel.shift == pytest.approx(0.004, abs=4 * channel.shift_error)
     assert channel.shift_error < 0.001
-    coloured, late_ = channel.remarks
-    assert "sensor 0 in log 1 is no white noise (probability" in coloured
-    assert "sensor 0 in log 1 seems " in late_ and " ms late (+- " in late_
+    coloured, late_ = channel_remarks([channel], found.campaign.logs)
+    assert coloured.startswith("run 1: residuals are no white noise, so the model misses something")
+    assert late_.startswith("run 1: sensor 0 seems ") and " ms late (+- " in late_
 
 
 def test_rivals(plain):
