@@ -1,0 +1,83 @@
+"""Commands that go with the load: against the same history prescribed, and against themselves."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.controller import Measurement
+
+SHARES = [0.0, 0.2, 0.7, 1.0]
+VALUES = [[0.5, 6.0, 4.0, 1.0]]
+LAW = jb.Passage(gates=[-0.2, -0.1], shares=SHARES, values=VALUES, period=0.01, lead=0.02)
+
+
+ONE = (jb.MovingMass(mass=0.4, speed=1.0, entry_time=0.3),)
+
+
+def rig(controller=LAW, loads=ONE):
+    return jb.Case(
+        jb.Beam(0.6, 13.2, 0.81, 0.03, modes=1),
+        actuators=[jb.Patch(0.25, 0.35, 8.3e-4, correction=0.3, amplifier_gain=200.0)],
+        sensors=[jb.Sensor(0.3)],
+        loads=list(loads),
+        controller=controller,
+        run=jb.Run(duration=1.2, sample_rate=100.0),
+    )
+
+
+def commands(case, times):
+    model = jb.state_space(case)
+    memory = case.controller.init(model)
+    seen = Measurement(jnp.zeros(1), jnp.zeros(2), jnp.zeros(1))
+    return jax.vmap(lambda t: case.controller.step(memory, seen, t)[0])(times)[:, 0]
+
+
+def test_the_table_is_read_ahead_of_the_load_once_both_gates_are_passed():
+    times = np.linspace(0.0, 1.2, 301)
+    share = (times + 0.02 - 0.3) * 1.0 / 0.6
+    expected = np.interp(share, SHARES, VALUES[0], left=0.0, right=0.0)
+    assert_allclose(commands(rig(), times), expected, atol=1e-12)
+    late = dataclasses.replace(LAW, gates=np.array([0.1, 0.2]))
+    assert_allclose(commands(rig(late), times), np.where(times < 0.5, 0.0, expected), atol=1e-12)
+
+
+def test_in_a_run_it_does_what_the_same_commands_prescribed_do():
+    record = jb.simulate(rig())
+    table = np.asarray(commands(rig(), record.times))
+    same = jb.Prescribed(offsets=[0.0], times=record.times, values=table[None], period=0.01)
+    assert_allclose(record.command[:, 0], table, atol=1e-9)
+    assert_allclose(record.deflection, jb.simulate(rig(same)).deflection, atol=1e-12)
+
+
+def test_a_load_from_the_right_is_followed_as_well_and_loads_add_up():
+    times = np.linspace(0.003, 1.203, 61)  # not on the edge of the table
+    right = (jb.MovingMass(mass=0.4, speed=-1.0, entry_time=0.3),)
+    mirrored = dataclasses.replace(LAW, gates=np.array([0.8, 0.7]))
+    first = commands(rig(), times)
+    assert_allclose(commands(rig(mirrored, right), times), first, atol=1e-12)
+    both = (*ONE, jb.MovingMass(mass=0.2, speed=1.0, entry_time=0.5))
+    later = commands(rig(loads=both[1:]), times)
+    assert_allclose(commands(rig(loads=both), times), first + later, atol=1e-12)
+
+
+def test_round_trip_and_what_is_refused():
+    case = rig()
+    assert jax.tree.all(
+        jax.tree.map(np.array_equal, case_from_dict(case_to_dict(case)).controller, LAW)
+    )
+    slow = (jb.MovingMass(mass=0.4, speed=0.1, deceleration=0.1),)
+    for changes, loads, message in (
+        ({"period": None}, case.loads, "period must be given"),
+        ({"values": np.ones((1, 3))}, case.loads, "values must have for each of 1 actuators"),
+        ({"gates": np.array([0.2, 0.1])}, case.loads, "gates must be two places"),
+        ({"gates": np.array([0.1, 0.4])}, slow, "gates must be two places"),
+        ({}, (), "kind needs loads"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jb.simulate(rig(dataclasses.replace(LAW, **changes), loads))
