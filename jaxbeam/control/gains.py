@@ -15,7 +15,7 @@ from jaxbeam.stretches import NODES, Commands, Square, costs_to_go, riccati_rate
 
 # Backward in time P hastens, right before an event, to what the plant from then on demands: in the
 # last stretches, so many of them, edges come ever closer, each by a factor, so many times.
-LAST, CLOSER, LAYER = 8, 0.8, 50
+LAST, CLOSER, LAYER = 8, 0.9, 105
 INSIDE = 1e-9  # of a stretch: how far within it its ends are looked at
 
 # State matrix and command matrix at a time (s).
