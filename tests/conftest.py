@@ -11,8 +11,15 @@ import tempfile
 os.environ["MPLBACKEND"] = "Agg"
 # On a machine with a GPU, several test processes share it: none may take most of the memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-# As `jaxbeam.compiling` does for the library itself: most of the time of the tests is compiling.
-os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false " + os.environ.get("XLA_FLAGS", "")
+# Most of the time of the tests is compiling: as `jaxbeam.compiling` does for the library itself,
+# and without the optimisations that small cases do not repay.
+os.environ["XLA_FLAGS"] = " ".join(
+    [
+        "--xla_cpu_use_fusion_emitters=false",
+        "--xla_backend_optimization_level=0",
+        os.environ.get("XLA_FLAGS", ""),
+    ]
+)
 # What one process has compiled, the other test processes, later files, and commands that tests
 # start need not compile again. Set before these are started, they all use the same folder.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
