@@ -1,9 +1,20 @@
 """The beam and what it rests on: section, material, damping, ends and supports."""
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, number
+from jaxbeam.faults import described, suggestion
+from jaxbeam.fields import (
+    NOT_NEGATIVE,
+    ON_BEAM,
+    POSITIVE,
+    choice,
+    count,
+    is_known,
+    known,
+    number,
+)
 
 ENDS = ("pinned", "clamped", "free", "guided")
 
@@ -80,3 +91,42 @@ class Beam(eqx.Module):
     def right_end(self) -> str:
         """End condition at x = length."""
         return self.ends.split("-")[1]
+
+    def fault(self, address: str) -> str | None:
+        """What does not go together in it, as a sentence, or None."""
+        ends = self.ends.split("-")
+        if len(ends) != 2:
+            return (
+                f"{address}.ends must name the left and the right end, such as 'pinned-clamped';"
+                f" it is {self.ends!r}"
+            )
+        for end in ends:
+            if end not in ENDS:
+                return f"{address}.ends: no end is called {end!r}; {suggestion(end, ENDS)}"
+        section = ("width", "height")
+        unclear = described(
+            address, self, "flexural_rigidity", ("youngs_modulus",), section
+        ) or described(address, self, "mass_per_length", ("density",), section)
+        if unclear is not None:
+            return unclear
+        if self.youngs_modulus is None and self.density is None:
+            for name in section:
+                if getattr(self, name) is not None:
+                    return (
+                        f"{address}.{name} would have no effect: leave it out, or give"
+                        " youngs_modulus and density instead of flexural_rigidity and"
+                        " mass_per_length"
+                    )
+        return self._damping_fault(address)
+
+    def _damping_fault(self, address: str) -> str | None:
+        ratios = np.shape(self.damping_ratio)
+        if ratios and ratios != (self.modes,):
+            return (
+                f"{address}.damping_ratio lists {ratios[0]} values for {self.modes} modes;"
+                " give one for each mode, or a single number for all"
+            )
+        doubly = self.rayleigh_damping is not None and is_known(self.damping_ratio)
+        if doubly and known(self.damping_ratio).any():
+            return f"{address} has both damping_ratio and rayleigh_damping; leave one out"
+        return None

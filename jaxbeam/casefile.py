@@ -15,8 +15,9 @@ import tomli_w
 from jaxbeam import actuators, control, loads
 from jaxbeam.beam import Beam, Support
 from jaxbeam.case import Case, Run, unknown_address
-from jaxbeam.checks import check, check_field, missing, suggestion
+from jaxbeam.checks import check
 from jaxbeam.controller import AbstractController
+from jaxbeam.faults import check_field, missing, suggestion
 from jaxbeam.fields import fits, known, shape_in_words
 from jaxbeam.sensors import Sensor
 

@@ -20,8 +20,9 @@ from jaxtyping import Array, Complex, Float
 from scipy.linalg import eigvals
 
 from jaxbeam.case import Case
-from jaxbeam.checks import check, check_on_beam
+from jaxbeam.checks import check
 from jaxbeam.compiling import compiled
+from jaxbeam.faults import check_on_beam
 from jaxbeam.fields import is_known, known
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.ports import Pair, check_pairs, column, common_pairs, row

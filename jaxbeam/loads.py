@@ -11,7 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, number
+from jaxbeam.faults import either
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
 from jaxbeam.motion import AbstractMotion, Braking, Tabulated
 
 
@@ -31,6 +32,38 @@ class AbstractLoad(eqx.Module):
     @abc.abstractmethod
     def weight(self, gravity: Float[Array, ""]) -> Float[Array, ""]:
         """Force with which it presses on a beam at rest, in N, positive downwards."""
+
+    def fault(self, address: str) -> str | None:
+        """What does not go together in it, as a sentence, or None."""
+        if (self.times is None) != (self.positions is None):
+            lacking = "times" if self.times is None else "positions"
+            return f"{address}.{lacking} is missing; a table has both times and positions"
+        unclear = either(address, self, "speed", "times")
+        if unclear is not None:
+            return unclear
+        if self.times is None or self.positions is None:
+            if is_known(self.speed) and known(self.speed) == 0:
+                return (
+                    f"{address}.speed must not be 0: the load would never enter; a load that"
+                    " stands on the beam is a table of times and positions"
+                )
+            return None
+        points, places = self.times.shape[0], self.positions.shape[0]
+        if points != places:
+            return (
+                f"{address} has {points} times and {places} positions;"
+                " a table needs one position for each time"
+            )
+        if points < 2:
+            return f"{address}.times needs at least two points; it has {points}"
+        for name in ("entry_time", "deceleration"):
+            value = getattr(self, name)
+            if is_known(value) and known(value) != 0:
+                return (
+                    f"{address}.{name} would have no effect: the load follows its table; leave it"
+                    " out"
+                )
+        return None
 
 
 class MovingMass(AbstractLoad):
@@ -74,6 +107,9 @@ class MovingForce(AbstractLoad):
 
     def inertia(self):
         return jnp.zeros(())
+
+    def fault(self, address):
+        return either(address, self, "force", "mass") or super().fault(address)
 
     def weight(self, gravity):
         return self.force if self.force is not None else self.mass * gravity

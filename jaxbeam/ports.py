@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxbeam.actuators import AbstractActuator, Electrodynamic
 from jaxbeam.case import Case
-from jaxbeam.checks import check_on_beam, suggestion
+from jaxbeam.faults import check_on_beam, suggestion
 from jaxbeam.rig import Rig
 from jaxbeam.sensors import QUANTITIES
 

@@ -51,3 +51,17 @@ class Sensor(eqx.Module):
     def noise_covariance(self) -> Float[Array, ""]:
         """Variance of the noise of one reading, in the square of its unit; what filters call R."""
         return jnp.zeros(()) if self.noise is None else self.noise**2
+
+    def fault(self, address: str) -> str | None:
+        """What does not go together in it, as a sentence, or None."""
+        if self.quantity == "strain" and self.fibre_distance is None:
+            return (
+                f"{address}.fibre_distance is missing: strain needs the height of the gauge above"
+                " the neutral axis in m"
+            )
+        if self.quantity != "strain" and self.fibre_distance is not None:
+            return (
+                f"{address}.fibre_distance would have no effect on a sensor of {self.quantity};"
+                " leave it out, or set quantity to 'strain'"
+            )
+        return None

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case, known_case
-from jaxbeam.checks import check, check_on_beam
+from jaxbeam.checks import check
 from jaxbeam.compiling import compiled
 from jaxbeam.compliance import check_held, compliance
+from jaxbeam.faults import check_on_beam
 from jaxbeam.fields import is_known
 from jaxbeam.loads import motion
 from jaxbeam.modes import Layout, lay_out

@@ -11,7 +11,7 @@ from tests.modules import PACKAGES, module_files, parse
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
 jaxbeam.compiling  jaxbeam.driver  jaxbeam.fields  jaxbeam.holds
-jaxbeam.stretches
+jaxbeam.faults  jaxbeam.stretches
 jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
 jaxbeam.estimator  jaxbeam.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.sensors
 jaxbeam.case  jaxbeam.sensing

@@ -72,6 +72,10 @@ class AbstractActuator(eqx.Module):
         """Smallest and largest command it takes, in the unit of a command; None if any."""
         return self.limits
 
+    def fault(self, address: str) -> str | None:
+        """What does not go together in it, as a sentence naming its address, or None."""
+        return None
+
     def command_rate(self) -> Float[Array, ""] | None:
         """Fastest change of the command it can follow, per second; None if any."""
         return None

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.actuators.base import AbstractActuator, Attachment, Bonded
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
+from jaxbeam.faults import described
+from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, is_known, known, number
 
 # What the moment per volt follows from, where it is not given itself.
 MATERIAL = ("d33", "modulus", "electrode_spacing", "beam_height", "patch_height", "patch_width")
@@ -98,3 +99,20 @@ class Patch(AbstractActuator):
 
     def command_rate(self) -> Float[Array, ""] | None:
         return self.rate_limit
+
+    def fault(self, address: str) -> str | None:
+        if is_known(self.start) and is_known(self.end):
+            start, end = known(self.start), known(self.end)
+            if start >= end:
+                return (
+                    f"{address}.end must lie to the right of {address}.start;"
+                    f" {end:g} m is not beyond {start:g} m"
+                )
+        limits = self.command_limits()
+        if is_known(limits) and known(limits)[0] >= known(limits)[1]:
+            low, high = known(self.depolarisation / self.amplifier_gain)
+            return (
+                f"{address}.limits leave no command that the patch takes: its depolarisation limits"
+                f" over its amplifier_gain allow {low:g} to {high:g} V"
+            )
+        return described(address, self, "moment_per_volt", MATERIAL)
