@@ -1,4 +1,4 @@
-"""Predictive control: its matrices, reference runs, limits, what it knows, derivatives, faults.
+"""Predictive control: its law, reference runs, limits, what it knows, derivatives, faults.
 
 Most loops here run on a plant frozen anew in the middle of every millisecond, which compiles fast.
 """
@@ -12,13 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.checks import check
-from jaxbeam.control.prediction import Sampled, incremental, moves, predict, pulses, sample
+from jaxbeam.control.prediction import incremental
 from jaxbeam.controller import Measurement
 from jaxbeam.loop import loop_schedule
 from jaxbeam.modes import lay_out
@@ -57,58 +56,10 @@ def run(case: jb.Case, substeps: int) -> jb.Record:
     return jb.simulate(case, jnp.asarray(times), plan)
 
 
-# Prediction
+# What it computes
 
 
-def plant(states=4, inputs=2, outputs=2, seed=0):
-    rng = np.random.default_rng(seed)
-    A = 0.9 * scipy.linalg.orth(rng.normal(size=(states, states)))
-    B, C = rng.normal(size=(states, inputs)), rng.normal(size=(outputs, states))
-    return jnp.asarray(A), jnp.asarray(B), jnp.asarray(C)
-
-
-def test_prediction_is_that_of_the_incremental_model():
-    """F and Phi as eq. (7.5) spells them, from the matrices of eq. (7.1)."""
-    A, B, C = plant()
-    wide, push, seen = map(np.asarray, incremental(A, B, C))
-    steps = moves(pulses(5, 3), 2)
-    many = Sampled(*(jnp.stack([part] * 5) for part in (A, B, jnp.zeros((4, 0)))))
-    found = predict(many, C, steps, jnp.zeros(0))
-    power = [np.linalg.matrix_power(wide, n) for n in range(6)]
-    F = np.stack([seen @ power[n] for n in range(1, 6)])
-    Phi = np.zeros((5, 2, 6))
-    for i in range(5):
-        for j in range(min(i + 1, 3)):
-            Phi[i, :, 2 * j : 2 * j + 2] = seen @ power[i - j] @ push
-    assert_allclose(found.Phi, Phi, atol=1e-14)
-    before, now, command = np.random.default_rng(1).normal(size=(3, 4))
-    command = command[:2]
-    rest = now - A @ before - B @ command
-    free = found.F @ np.concatenate([now, rest, command, [1.0]])
-    assert_allclose(free, F @ np.concatenate([now - before, C @ now]), atol=1e-13)
-    assert_allclose(found.end[4:], found.F[-1], atol=1e-14)
-
-
-def test_sampling_with_a_delay():
-    rng = np.random.default_rng(2)
-    A, B, E = (jnp.asarray(rng.normal(size=s)) for s in ((3, 3), (3, 1), (3, 2)))
-    found = sample(A, B, E, jnp.array(0.3), jnp.array(0.1))
-    state, before, command, weights = rng.normal(size=3), *rng.normal(size=2), rng.normal(size=2)
-    for span, u in ((0.1, before), (0.2, command)):  # by the exponential of the forced system
-        rate = np.block([[A, (B[:, 0] * u + E @ weights)[:, None]], [np.zeros((1, 4))]])
-        if span == 0.1:
-            after = (scipy.linalg.expm(span * rate) @ np.append(state, 1.0))[:3]
-        else:
-            after = (scipy.linalg.expm(span * rate) @ np.append(after, 1.0))[:3]
-    wide = found.A @ np.append(state, before) + found.B @ np.array([command]) + found.E @ weights
-    assert_allclose(wide, np.append(after, command), rtol=1e-12)
-
-
-def test_laguerre_functions():
-    """Orthonormal; the first moves at pole 0; as many as there are periods span all moves."""
-    found = pulses(200, 5, jnp.array(0.7))
-    assert_allclose(found.T @ found, np.eye(5), atol=1e-12)
-    assert_array_equal(pulses(6, 4, jnp.array(0.0)), pulses(6, 4))
+def test_laguerre_moves_that_span_all_moves_change_nothing():
     states = jnp.asarray(np.random.default_rng(0).normal(size=(3, 6))) * 1e-3
     plain, spun = (
         commands(mpc(horizon=4, laguerre_pole=pole, solver="unconstrained"), states)

@@ -1,13 +1,10 @@
-"""Runs against closed forms, separate implementations, conservation laws and limits.
+"""Runs against closed forms, modal equations written separately, conservation laws and limits.
 
 Cases that share a structure share a plan here, made by hand, so that each is compiled once.
 """
 
 import dataclasses
-import json
-import tomllib
 import warnings
-from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,15 +13,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.casefile import case_from_dict
 from jaxbeam.dynamics import traffic
 from jaxbeam.grid import even_grid
 from jaxbeam.integrate import trace
-from jaxbeam.plan import Plan, form
+from jaxbeam.plan import form
 from jaxbeam.rig import rig
 from jaxbeam.simulate import ContactLossWarning
 from jaxbeam.tables import make_rigging
-from tests.oracles import crossing, finite_elements, modal_equations
+from tests.oracles import modal_equations
 from tests.oracles.closed_forms import (
     cancellation_speed,
     critical_speed,
@@ -33,12 +29,12 @@ from tests.oracles.closed_forms import (
 )
 from tests.oracles.loads import GRAVITY, Load
 from tests.oracles.modal_equations import Span
+from tests.runs import assert_close, load_of, plan_of
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::jaxbeam.simulate.ContactLossWarning"  # the model is bilateral, the oracles too
 )
 
-REFERENCE = json.loads((Path(__file__).parent / "data" / "reference_cases.json").read_text("utf-8"))
 SPAN = Span(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, modes=4, damping_ratio=0.02)
 SENSORS = [0.15, 0.4]
 TIMES = np.linspace(0.0, 1.0, 101)
@@ -62,30 +58,6 @@ def case_of(span: Span, loads: list[Load], **options) -> jb.Case:
     )
 
 
-def load_of(load: Load):
-    """The load of an oracle's load."""
-    kind = {"mass": jb.MovingMass, "force": jb.MovingForce}[load.kind]
-    return kind(
-        mass=load.mass,
-        speed=load.speed,
-        entry_time=load.entry_time,
-        deceleration=load.deceleration,
-    )
-
-
-def plan_of(case: jb.Case, substeps: int = 12, even: bool = True, slots: int | None = None) -> Plan:
-    """A plan with a given number of steps a sample, which spares the search for it."""
-    shape = form(case)
-    shape = dataclasses.replace(shape, slots=slots or shape.slots)
-    return Plan(shape, substeps, lead=0, even=even, error=0.0)
-
-
-def assert_close(found, expected, tolerance: float) -> None:
-    """Agreement relative to the largest expected value."""
-    expected = np.asarray(expected)
-    assert_allclose(found, expected, rtol=0, atol=tolerance * np.max(np.abs(expected)))
-
-
 def random_load(rng: np.random.Generator, kind: str = "mass") -> Load:
     """A load that may travel either way, brake, stop or speed up; enter early, late or never."""
     speed = rng.uniform(0.8, 4.0)
@@ -99,19 +71,7 @@ def random_load(rng: np.random.Generator, kind: str = "mass") -> Load:
     )
 
 
-# Independent implementations
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("reference", REFERENCE, ids=lambda reference: reference["title"])
-def test_reference_cases_are_matched(reference):
-    record = jb.simulate(case_from_dict(tomllib.loads(reference["case_toml"])))
-    assert_allclose(record.modes.frequencies, reference["natural_frequencies_hz"], rtol=1e-9)
-    deflection = record.deflection[np.array(reference["sample_index"])]
-    assert_close(deflection, reference["deflection_m"], 1e-7)
-    largest = reference["largest_sampled_abs_deflection_m"]
-    assert_allclose(np.max(np.abs(record.deflection), axis=0), largest, rtol=1e-6)
-    assert np.all(record.peak_deflection >= np.array(largest) * (1 - 1e-9))
+# The modal equations, written separately
 
 
 @pytest.fixture(scope="module")
@@ -186,120 +146,6 @@ def test_a_table_of_positions_gives_the_motion_it_samples(one_mass):
     record = jb.simulate(case, jnp.asarray(TIMES), plan_of(case))
     assert_close(record.deflection, one_mass(load).deflection, 1e-10)
     assert_close(record.contact_force, one_mass(load).contact_force, 1e-9)
-
-
-GENERAL = finite_elements.Beam(
-    length=1.3,
-    flexural_rigidity=12.0,
-    mass_per_length=0.7,
-    ends="guided-free",
-    supports=[
-        finite_elements.Support(0.3, 5000.0, 6.0, 3.0),
-        finite_elements.Support(0.78),
-        finite_elements.Support(1.1, 2000.0, 4.0),
-    ],
-    patches=[finite_elements.Patch(0.4, 0.6, 5.0, 0.4)],
-    suspensions=[finite_elements.Suspension(0.52, 3000.0, 25.0)],
-    damping_ratio=[0.01, 0.03, 0.02, 0.01],
-    elements=130,
-)
-
-
-def case_on(beam: finite_elements.Beam, loads: list[Load], modes: int, sensors) -> jb.Case:
-    """The case of a finite-element beam."""
-    return jb.Case(
-        jb.Beam(
-            beam.length,
-            beam.flexural_rigidity,
-            beam.mass_per_length,
-            beam.damping_ratio,
-            beam.ends,
-            modes,
-        ),
-        supports=[jb.Support(**vars(support)) for support in beam.supports],
-        actuators=[
-            *(
-                jb.Patch(
-                    p.start,
-                    p.end,
-                    1e-3,
-                    added_mass=p.mass_per_length,
-                    added_rigidity=p.flexural_rigidity,
-                )
-                for p in beam.patches
-            ),
-            *(jb.Shaker(s.position, s.stiffness, s.damping) for s in beam.suspensions),
-        ],
-        sensors=[jb.Sensor(x) for x in sensors],
-        loads=[load_of(load) for load in loads],
-        run=jb.Run(1.0, gravity=GRAVITY),
-    )
-
-
-def mirrored(beam: finite_elements.Beam) -> finite_elements.Beam:
-    """The beam seen from behind."""
-
-    def flip(parts, *names):
-        places = [{n: beam.length - getattr(part, n) for n in names} for part in parts]
-        return [dataclasses.replace(p, **x) for p, x in zip(parts, places, strict=True)]
-
-    return dataclasses.replace(
-        beam,
-        ends="-".join(reversed(beam.ends.split("-"))),
-        supports=flip(beam.supports, "position"),
-        patches=[
-            dataclasses.replace(p, start=beam.length - p.end, end=beam.length - p.start)
-            for p in beam.patches
-        ],
-        suspensions=flip(beam.suspensions, "position"),
-    )
-
-
-@pytest.mark.slow
-def test_a_general_rig_agrees_with_finite_elements_and_with_its_mirror_image():
-    """Unequal spans, elastic and damped supports, a patch, a suspension; masses both ways."""
-    loads = [Load(0.3, 2.5, 0.02, deceleration=4.0), Load(0.2, -3.0, 0.1, deceleration=-1.0)]
-    times, sensors = np.linspace(0.0, 0.8, 81), np.array([0.2, 0.6, 1.3])
-    case = case_on(GENERAL, loads, 4, sensors)
-    record = jb.simulate(case, jnp.asarray(times), plan_of(case))
-    expected = crossing.respond(GENERAL, loads, sensors, times, modes=4, rtol=1e-9)
-    assert_close(record.deflection, expected.deflection, 2e-6)
-    assert_close(record.velocity, expected.velocity, 1e-4)
-    assert_close(record.contact_force, expected.contact_force, 1e-4)
-
-    turned = [dataclasses.replace(load, speed=-load.speed) for load in loads]
-    other = case_on(mirrored(GENERAL), turned, 4, GENERAL.length - sensors)
-    image = jb.simulate(other, jnp.asarray(times), plan_of(other))
-    assert_close(image.deflection, record.deflection, 1e-9)
-    assert_close(image.contact_force, record.contact_force, 1e-8)
-    assert_allclose(image.load_position, GENERAL.length - record.load_position, rtol=1e-12)
-
-
-SPRINGS = [finite_elements.Support(x, 3000.0, 5.0) for x in (0.2, 0.9)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("ends", "supports", "speed"),
-    [
-        ("clamped-free", [], 4.0),  # leaves over the tip
-        ("clamped-free", [], -4.0),  # enters over the tip
-        ("free-free", SPRINGS, 3.0),
-        ("clamped-guided", [], 5.0),
-        ("free-pinned", [SPRINGS[0]], -3.0),
-    ],
-)
-def test_all_kinds_of_ends_agree_with_finite_elements(ends, supports, speed):
-    """Also that the peak is that of the finely sampled deflection, wherever it is."""
-    beam = finite_elements.Beam(
-        1.2, 12.0, 0.7, ends, supports=supports, damping_ratio=0.02, elements=100
-    )
-    loads, times, sensors = [Load(0.3, speed, 0.02)], np.linspace(0.0, 0.8, 81), [0.5, 1.2]
-    case = case_on(beam, loads, 3, sensors)
-    record = jb.simulate(case, jnp.asarray(times), plan_of(case))
-    expected = crossing.respond(beam, loads, sensors, times, modes=3, rtol=1e-9)
-    assert_close(record.deflection, expected.deflection, 2e-6)
-    assert_close(record.contact_force, expected.contact_force, 1e-4)
 
 
 # Closed forms and limits
