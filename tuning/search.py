@@ -2,7 +2,9 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,6 @@ import optimistix
 from jaxtyping import Bool, Float
 
 from jaxbeam.compiling import compiled, options
-from tuning.campaign import Campaign
 from tuning.free import Free
 from tuning.loss import check_loss, shaped, widening
 from tuning.uncertainty import Uncertainty, colour, uncertainty
@@ -19,6 +20,22 @@ from tuning.uncertainty import Uncertainty, colour, uncertainty
 ROUNDS = 2  # of fitting with the noise levels found in the round before
 MAX_STEPS = 60
 LEASH = 2.0  # width of the weak prior around the starts: a factor of e^2, or two typical sizes
+
+
+@runtime_checkable
+class Samples(Protocol):
+    """What a search needs of a campaign: samples, which of them count, and how to predict them.
+
+    `measured` and `real` (1 or 0) are (log, time, channel); `predictor` makes of addresses a
+    function from values at them to such samples, differentiable forward.
+    """
+
+    measured: np.ndarray
+    real: np.ndarray
+
+    def predictor(self, addresses: list[str]) -> Callable:
+        """Function from the values at the addresses to all samples."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -50,7 +67,7 @@ class Search:
     Raises ValueError if there are more numbers than samples, or for an unknown loss.
     """
 
-    def __init__(self, campaign: Campaign, numbers: list[Free], loss: str = "squares"):
+    def __init__(self, campaign: Samples, numbers: list[Free], loss: str = "squares"):
         check_loss(loss)
         if campaign.real.sum() < len(numbers):
             raise ValueError(f"{len(numbers)} free numbers need at least as many samples")
