@@ -20,6 +20,7 @@ MODULES = (
     "optimal_control",
     "feedback",
     "predictive_control",
+    "tuned",
 )
 FOLDER = "out/reproduce"
 

@@ -44,6 +44,7 @@ def text(run: "Run") -> str:
         lines += [f"    {sentence}" for sentence in _comments(one, judged.words)]
     lines += [f"  {remark}" for remark in run.outcome.remarks]
     tally = ", ".join(f"{number} {word}" for word, number in _tally([run]) if number)
+    tally = tally or "nothing printed to compare with"
     return "\n".join([*lines, "", f"  {tally}; {run.seconds:.0f} s", ""])
 
 
