@@ -1,31 +1,54 @@
 """tuning: what measured logs say about a rig, and controllers tuned for it."""
 
+from tuning.account import write_report
+from tuning.belief import Belief
+from tuning.criticism import compare_fits, cross_validate, hold_out
+from tuning.design import sharpen
 from tuning.faults import find_faults, mask
 from tuning.identify import Fit, identify
+from tuning.keeping import load_fit, save_fit
 from tuning.load_cases import LoadCases, grid, read_load_cases
 from tuning.logs import Log
 from tuning.modal import ModalFit, identify_modes
 from tuning.objective import Objective
+from tuning.posterior import sample
+from tuning.profile import profile
 from tuning.proof import Tuned
 from tuning.reading import read_log, read_logs
+from tuning.responses import Responses, identify_responses, responses_of
 from tuning.stable import Stable
 from tuning.tune import tune
+from tuning.weigh import weigh
 
 __all__ = [
+    "Belief",
     "Fit",
     "LoadCases",
     "Log",
     "ModalFit",
     "Objective",
+    "Responses",
     "Stable",
     "Tuned",
+    "compare_fits",
+    "cross_validate",
     "find_faults",
     "grid",
+    "hold_out",
     "identify",
     "identify_modes",
+    "identify_responses",
+    "load_fit",
     "mask",
+    "profile",
     "read_load_cases",
     "read_log",
     "read_logs",
+    "responses_of",
+    "sample",
+    "save_fit",
+    "sharpen",
     "tune",
+    "weigh",
+    "write_report",
 ]

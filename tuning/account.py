@@ -4,13 +4,11 @@ import html as escaping
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from tuning.criticism import Rival, Unseen, channels
-from tuning.fit_plot import plot_posterior, plot_profiles
 from tuning.identify import Fit
 from tuning.posterior import Posterior
 from tuning.profile import Profile
@@ -37,7 +35,7 @@ class Picture(NamedTuple):
     """A figure of an account, and the name of its file without the suffix."""
 
     name: str
-    figure: Figure
+    figure: Any  # of matplotlib, which is imported only where something is drawn
 
 
 class Section(NamedTuple):
@@ -83,6 +81,8 @@ def account(
     rivals: Sequence[Rival] = (),
 ) -> list[Section]:
     """What is to be told of a fit, section by section."""
+    from tuning.fit_plot import plot_posterior, plot_profiles
+
     sections = [
         Section("Numbers", [fit.verdict + ".", _numbers(fit), *_minima(fit)]),
         Section("Remarks", remarks(fit)),

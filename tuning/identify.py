@@ -17,6 +17,7 @@ from tuning.campaign import Campaign, prepare
 from tuning.checkpoint import fingerprint
 from tuning.free import OF_LOG, Free, free_numbers, insert
 from tuning.logs import Log
+from tuning.loss import check_loss
 from tuning.report import fit_table
 from tuning.search import MAX_STEPS, Estimate, Search
 from tuning.starts import Minimum, scout
@@ -173,6 +174,7 @@ def identify(
     logs = [logs] if isinstance(logs, Log) else list(logs)
     addresses = [free] if isinstance(free, str) else free
     bounds = dict(addresses) if isinstance(addresses, Mapping) else dict.fromkeys(addresses)
+    check_loss(loss)
     if starts < 1:
         raise ValueError(f"starts must be 1 or more, not {starts}")
     file = None if checkpoint is None else Path(checkpoint)
