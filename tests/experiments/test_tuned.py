@@ -32,8 +32,8 @@ def test_it_is_proven_on_other_loads_than_it_was_tuned_on():
 def test_a_load_that_was_held_out_comes_near_what_is_possible():
     """On the bench, with the rig's own beam, against the linear program."""
     law = tuned.on_bench(jb.load_case(tuned_search.FOLDER / "B.toml").controller)
-    case = dataclasses.replace(rigs.load("B"), controller=law, run=jb.Run(0.8, 200.0))
+    case = dataclasses.replace(rigs.load("B"), controller=law, run=jb.Run(0.85, 200.0))
     case = jb.replace(
-        case, {"loads.0.mass": 0.42, "loads.0.speed": 0.95, "loads.0.entry_time": 0.004}
+        case, {"loads.0.mass": 0.42, "loads.0.speed": 0.95, "loads.0.entry_time": 0.054}
     )
-    assert 0.9 < jb.bound(case).share(jb.simulate(case, tolerance=1e-4)) < 1.0
+    assert 0.93 < jb.bound(case).share(jb.simulate(case, tolerance=1e-4)) < 1.0
