@@ -22,6 +22,7 @@ PERIOD, LEAD = 0.01, 0.005  # s: of sampling, and half of it to make up for the 
 GATES = (-0.2, -0.1)  # m: on the ramp before the beam, as the induction sensors of the thesis
 LIMITS, STEP = (-2.5, 7.5), 0.01  # V
 MASSES = (0.261, 0.509)  # kg
+ENTRY = 0.05  # s
 SPEEDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m/s
 STARTS = {  # V at shares of the way
     "B": [([0.0, 0.2, 0.9, 1.0], [0.5, 6.8, 6.8, 0.0])],
@@ -30,7 +31,7 @@ STARTS = {  # V at shares of the way
         ([0.0, 0.1, 0.38, 0.55, 0.9, 1.0], [0.0, -1.8, -1.8, 6.8, 6.8, 0.0]),
     ],
 }
-KNOTS, STEPS = {"B": 31, "C": 41}, {"B": 200, "C": 140}
+KNOTS, STEPS = {"B": 31, "C": 41}, {"B": 250, "C": 140}
 SAMPLE_RATE = {"B": 200.0, "C": 100.0}  # Hz: enough for a peak that is smooth
 MODES = 3  # tuned on three modes, to be proven on those of the rig
 
@@ -45,12 +46,12 @@ def start(name: str) -> jb.Passage:
 
 
 def training() -> tuple[dict[str, float], ...]:
-    """The lightest and the heaviest load at all speeds, one at a tick and one between two."""
+    """The lightest and the heaviest load at all speeds, entering at ticks and between them."""
     return tuple(
         {
             "loads.0.mass": mass,
             "loads.0.speed": speed,
-            "loads.0.entry_time": PERIOD / 2 * ((i + j) % 2),
+            "loads.0.entry_time": ENTRY + PERIOD * ((2 * i + j) % 4) / 4,
         }
         for i, speed in enumerate(SPEEDS)
         for j, mass in enumerate(MASSES)
@@ -65,7 +66,7 @@ def search(name: str, progress: bool = True) -> tuning.Tuned:
         case,
         beam=dataclasses.replace(case.beam, modes=MODES),
         controller=start(name),
-        run=jb.Run(duration=slowest + 0.1, sample_rate=SAMPLE_RATE[name]),
+        run=jb.Run(duration=slowest + 0.15, sample_rate=SAMPLE_RATE[name]),
     )
     actuators, knots = case.controller.values.shape
     free = {f"controller.values.{a}.{k}": LIMITS for a in range(actuators) for k in range(knots)}

@@ -26,7 +26,7 @@ def test_it_is_proven_on_other_loads_than_it_was_tuned_on():
     trained = tuned_search.training()
     assert {run["loads.0.mass"] for run in trained}.isdisjoint(tuned.MASSES)
     assert {run["loads.0.speed"] for run in trained}.isdisjoint(tuned.SPEEDS)
-    assert {run["loads.0.entry_time"] for run in trained} == {0.0, tuned_search.PERIOD / 2}
+    assert tuned.ENTRY not in {run["loads.0.entry_time"] for run in trained}
 
 
 def test_a_load_that_was_held_out_comes_near_what_is_possible():
