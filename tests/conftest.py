@@ -11,6 +11,8 @@ import tempfile
 os.environ["MPLBACKEND"] = "Agg"
 # On a machine with a GPU, several test processes share it: none may take most of the memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+# Test processes share the cores: threads for small matrices would wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Most of the time of the tests is compiling: as `jaxbeam.compiling` does for the library itself,
 # and without the optimisations that small cases do not repay.
 os.environ["XLA_FLAGS"] = " ".join(
