@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from tuning.checkpoint import fingerprint, load, save
 from tuning.identify import Fit
+from tuning.optional import library
 
 BLOCK = 100  # draws between two states on disk
 WORST = 1.05  # R-hat beyond which chains have not mixed
@@ -139,15 +140,17 @@ def sample(
 def summary(
     addresses: list[str], draws: Float[np.ndarray, "chain draw free"], divergences: int
 ) -> Posterior:
-    """Draws with R-hat and effective number (Gelman and others, Bayesian Data Analysis, 11.4)."""
-    from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
+    """Draws with R-hat and effective number (Gelman and others, Bayesian Data Analysis, 11.4).
 
+    Raises ImportError without blackjax.
+    """
+    diagnostics = library("blackjax.diagnostics", "bayes")
     columns = jnp.asarray(draws)
     return Posterior(
         addresses,
         draws,
-        np.atleast_1d(np.asarray(potential_scale_reduction(columns))),
-        np.atleast_1d(np.asarray(effective_sample_size(columns))),
+        np.atleast_1d(np.asarray(diagnostics.potential_scale_reduction(columns))),
+        np.atleast_1d(np.asarray(diagnostics.effective_sample_size(columns))),
         divergences,
     )
 
@@ -197,13 +200,7 @@ def nuts(
     own, and kept in the file. Raises ValueError for a damaged or foreign file, FileExistsError if
     it exists and `resume` is not set, ImportError without blackjax.
     """
-    try:
-        import blackjax
-    except ImportError:
-        raise ImportError(
-            "blackjax is not installed; install jaxbeam with the extra 'bayes': "
-            "pip install 'jaxbeam[bayes]'"
-        ) from None
+    blackjax = library("blackjax", "bayes")
     if file is not None and file.exists() and not resume:
         raise FileExistsError(f"{file} exists: resume that sampling, or delete it")
     keys = jax.random.split(jax.random.key(seed), chains)

@@ -9,7 +9,7 @@ import dataclasses
 
 from jaxbeam.case import Case
 from jaxbeam.fields import known
-from jaxbeam.loads import MovingMass
+from jaxbeam.loads import AbstractLoad, MovingMass
 from tuning.criticism import DOUBTFUL, Rival, channels, compare_fits
 from tuning.identify import Fit, identify
 from tuning.logs import Log
@@ -31,7 +31,7 @@ class Weighing:
     counts: list[Rival]
 
     @property
-    def loads(self) -> tuple[MovingMass, ...]:
+    def loads(self) -> tuple[AbstractLoad, ...]:
         """The loads, in the order in which they were found."""
         return self.fit.cases[0].loads
 

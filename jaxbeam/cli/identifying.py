@@ -154,13 +154,9 @@ def weigh(
     import tuning
     from jaxbeam.casefile import save_case
 
-    try:
-        low, high = map(float, speeds.split(":"))
-    except ValueError:
-        raise ValueError(f"--speeds takes LOW:HIGH in m/s, such as 0.5:3, not {speeds!r}") from None
     check_outputs(overwrite, output)
     found = tuning.weigh(
-        read_case(case, set_), tuning.read_log(log), (low, high), most, both_ways=not one_way
+        read_case(case, set_), tuning.read_log(log), _range(speeds), most, both_ways=not one_way
     )
     if output:
         save_case(found.fit.case, output, overwrite=True)  # checked before the work
@@ -169,6 +165,14 @@ def weigh(
     else:
         print(found)
         print_written(output)
+
+
+def _range(speeds: str) -> tuple[float, float]:
+    try:
+        low, high = map(float, speeds.split(":"))
+    except ValueError:
+        raise ValueError(f"--speeds takes LOW:HIGH in m/s, such as 0.5:3, not {speeds!r}") from None
+    return low, high
 
 
 def _beside(output: Path | None, suffix: str) -> Path | None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.readers.optional import library
+from tuning.optional import library
 from tuning.readers.table import Table, table_of
 
 MAGIC = b"PAR1"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.readers.optional import library
+from tuning.optional import library
 from tuning.readers.table import Table, is_time, table_of
 
 MAGIC = b"TDSm"

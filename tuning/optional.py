@@ -1,4 +1,4 @@
-"""Libraries that only some formats need."""
+"""Libraries that come with extras only, and are imported where they are used."""
 
 import importlib
 from types import ModuleType
