@@ -70,7 +70,8 @@ def margins(loop: LinearLoop, actuator: int = 0) -> Margins:
             )
 
     gains = [1 / response(w)[0].real for w in crossings(np.imag)]
-    gains += [1 / value.real for value in (curve[0], curve[-1]) if abs(value.imag) < 1e-9]
+    ends = (value for value in (curve[0], curve[-1]) if abs(value.imag) < 1e-9)
+    gains += [1 / value.real for value in ends if value.real != 0]
     phases, delays = [np.inf], [np.inf]
     for w in crossings(lambda z: np.abs(z) - 1):
         # What lags by its own angle meets the critical point at angle zero.

@@ -1,5 +1,6 @@
 """Poles, growth and Floquet multipliers against matrices written out and integrated by scipy."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -230,6 +231,9 @@ def test_margins_against_python_control():
     assert found.phase == pytest.approx(np.radians(phase), rel=1e-6)
     assert found.delay == pytest.approx(np.radians(phase) / crossover, rel=1e-6)
     assert found.distance == pytest.approx(distance, rel=1e-6)
+    # Nothing that is fed back comes round: no gain and no delay of it matters.
+    silent = dataclasses.replace(loop, K=0.0 * loop.K)
+    assert margins(silent) == (np.inf, 0.0, np.inf, np.inf, 1.0)
 
 
 def test_at_the_gain_margin_a_pole_is_on_the_limit():
