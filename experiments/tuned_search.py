@@ -23,7 +23,7 @@ GATES = (-0.2, -0.1)  # m: on the ramp before the beam, as the induction sensors
 LIMITS, STEP = (-2.5, 7.5), 0.01  # V
 MASSES = (0.261, 0.509)  # kg
 ENTRY = 0.05  # s
-SPEEDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m/s
+SPEEDS = {"B": np.linspace(0.3, 1.0, 12), "C": np.linspace(0.3, 1.0, 8)}  # m/s
 STARTS = {  # V at shares of the way
     "B": [([0.0, 0.2, 0.9, 1.0], [0.5, 6.8, 6.8, 0.0])],
     "C": [
@@ -45,15 +45,15 @@ def start(name: str) -> jb.Passage:
     )
 
 
-def training() -> tuple[dict[str, float], ...]:
+def training(name: str) -> tuple[dict[str, float], ...]:
     """The lightest and the heaviest load at all speeds, entering at ticks and between them."""
     return tuple(
         {
             "loads.0.mass": mass,
-            "loads.0.speed": speed,
+            "loads.0.speed": float(speed),
             "loads.0.entry_time": ENTRY + PERIOD * ((2 * i + j) % 4) / 4,
         }
-        for i, speed in enumerate(SPEEDS)
+        for i, speed in enumerate(SPEEDS[name])
         for j, mass in enumerate(MASSES)
     )
 
@@ -61,7 +61,7 @@ def training() -> tuple[dict[str, float], ...]:
 def search(name: str, progress: bool = True) -> tuning.Tuned:
     """Tune the table and its lead for the worst of all loads on rig B or C."""
     case = rigs.load(name)
-    slowest = float(case.beam.length) / min(SPEEDS)
+    slowest = float(case.beam.length) / min(SPEEDS[name])
     case = dataclasses.replace(
         case,
         beam=dataclasses.replace(case.beam, modes=MODES),
@@ -73,7 +73,7 @@ def search(name: str, progress: bool = True) -> tuning.Tuned:
     return tuning.tune(
         case,
         free | {"controller.lead": (0.0, 0.1)},
-        tuning.LoadCases(training()),
+        tuning.LoadCases(training(name)),
         tuning.Objective({"shortfall": 1.0}),
         steps=STEPS[name],
         progress=progress,
