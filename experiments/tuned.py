@@ -35,6 +35,7 @@ DELAY, MORE_DELAY, STEP = 0.02, 0.01, 0.01  # s, s, V
 STIFFER = {"10 % stiffer": 1.1, "10 % softer": 0.9}
 RIGIDITY = "beam.flexural_rigidity"
 CUBIC, IDEAL, BENCH, LATE = "hand-set, cubic", "tuned, ideal", "tuned, bench", "10 ms later"
+DRAWN = (CUBIC, BENCH, LATE)
 CUTOFFS = {"B": ONE_CUTOFF, "C": TWO_CUTOFF}
 
 
@@ -149,7 +150,7 @@ def draw(studies: list[Study]) -> Figure:
 
 def _shares(axes, one: Study):
     rows = np.arange(len(one.loads))
-    for i, law in enumerate((CUBIC, IDEAL, BENCH)):
+    for i, law in enumerate(DRAWN):
         axes.plot(100 * one.shares(law), rows, "o", color=colour(i), label=law)
     axes.axvline(100, color=INK, linewidth=1.0)
     words = [f"{x['loads.0.mass']:g} kg, {x['loads.0.speed']:g} m/s" for x in one.loads]
@@ -163,7 +164,7 @@ def _run(upper, lower, one: Study):
     free = dataclasses.replace(one.records[IDEAL].case, controller=None)
     plain = jb.simulate(free, tolerance=1e-4)
     upper.plot(plain.times, 1e3 * plain.deflection[:, 0], color=GREY, label="no control")
-    for i, law in enumerate((CUBIC, IDEAL, BENCH)):
+    for i, law in enumerate(DRAWN):
         record = one.records[law]
         upper.plot(record.times, 1e3 * record.deflection[:, 0], color=colour(i))
         for j, sent in enumerate(np.asarray(record.command).T):
