@@ -107,11 +107,14 @@ def identify(
         judged = _judge(fit, profile, draws, seed, validate, output, resume)
         _tell(fit, judged, report, output, picture, json_)
         return
+    refuse(
+        bool(output or set_),
+        "-o and --set are for fitting a case; name what is free with --free ADDRESS",
+    )
     given = (prior, scale, stage, profile, draws, validate, report, resume, mask, starts > 1)
     refuse(
-        bool(output or set_ or any(given)),
-        "-o, --set and the options of fits are for fitting a case; name what is free with --free "
-        "ADDRESS",
+        any(given),
+        "the options of fits are for fitting a case; name what is free with --free ADDRESS",
     )
     if case:
         say(f"nothing is named with --free, so {case} is not used; modes of the free decay:")
