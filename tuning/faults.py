@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import median_filter
 
 if TYPE_CHECKING:
     from tuning.logs import Log
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 MASKABLE = ("spikes", "saturation", "stuck")
 GAP = 1.5  # steps between two samples, beyond which some are missing
 SPIKE = 12.0  # robust standard deviations off the smooth course of the neighbours
+AROUND = 31  # samples within which what is usual is told
 LEAST_SPIKE = 0.02  # of a channel's range
 FLAT = 4  # samples at an extreme value, and no fewer, that look clipped
 STUCK = 12  # samples of one value in a channel that otherwise never repeats itself
@@ -118,11 +120,13 @@ def _spikes(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
         return spikes
     left2, left, here, right, right2 = (values[i : values.size - 4 + i] for i in range(5))
     stray = np.abs(here - (4 * (left + right) - left2 - right2) / 6)
-    usual = 1.4826 * np.median(stray)
+    # As much as is usual around: an impact rings too fast for cubics, but not for one sample.
+    around = median_filter(stray, AROUND, mode="nearest")
+    usual = 1.4826 * np.maximum(around, np.median(stray))
     # A spike stands out to both sides; a jump, or a neighbour of a spike, does not.
     rise, fall = here - left, here - right
     outstanding = np.minimum(np.abs(rise), np.abs(fall)) * (rise * fall > 0)
-    least = max(SPIKE * usual, LEAST_SPIKE * np.ptp(np.sort(values)[1:-1]))
+    least = np.maximum(SPIKE * usual, LEAST_SPIKE * np.ptp(np.sort(values)[1:-1]))
     spikes[2:-2] = (outstanding > stray / 2) & (stray > least)
     return spikes
 
@@ -160,10 +164,10 @@ def _stuck(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
 
 def _words(log: Log, kind: str, name: str, samples) -> str:
     first, count = log.times[np.argmax(samples)], int(samples.sum())
-    number = f"{count} samples" if count > 1 else "a sample"
+    number = f"{count} samples" if count > 1 else "one sample"
     what = {
-        "spikes": f"{number} of {name} stand far out of their neighbours",
-        "saturation": f"{number} of {name} look clipped at the end of its range",
-        "stuck": f"{name} stays at one value for {count} samples",
+        "spikes": f"{name} has spikes ({number})",
+        "saturation": f"{name} looks clipped at the end of its range ({number})",
+        "stuck": f"{name} stays at one value for {number}",
     }[kind]
     return f"{log.source}: {what}, first at t = {first:.6g} s"

@@ -38,9 +38,14 @@ def test_spikes():
     (fault,) = find_faults(changed([100, 300], [3.0, -2.0]))
     assert (fault.kind, fault.channel) == ("spikes", "a")
     assert np.flatnonzero(fault.samples).tolist() == [100, 300]
-    assert str(fault) == "run.csv: 2 samples of a stand far out of their neighbours, " + (
-        "first at t = 0.2 s"
-    )
+    assert str(fault) == "run.csv: a has spikes (2 samples), first at t = 0.2 s"
+
+
+def test_an_impact_that_rings_has_no_spikes():
+    """Faster than cubics follow, as of a roller on a footbridge, but not for one sample only."""
+    after = np.maximum(TIMES - 0.4, 0.0)
+    ringing = np.exp(-5 * after) * np.sin(2 * np.pi * 90 * after)
+    assert find_faults(log_of(np.column_stack([ringing, ringing]))) == []
 
 
 def test_clipped_readings():
