@@ -43,7 +43,7 @@ def rig(gain=2000.0, **options):
 
 @pytest.fixture(scope="module")
 def bench():
-    return make_bench(rig(), RUNS)
+    return make_bench(rig(), RUNS, bounds=True)
 
 
 def test_merits_are_those_of_the_simulated_runs(bench):
@@ -57,6 +57,9 @@ def test_merits_are_those_of_the_simulated_runs(bench):
         assert merits["rms"][i] == pytest.approx(
             np.sqrt(np.mean(bent**2) / np.mean(free**2)), rel=1e-4
         )
+        limit = jb.bound(apply(rig(), run)).peak
+        missed = (bent.max() - limit) / (free.max() - limit)
+        assert merits["shortfall"][i] == pytest.approx(missed, rel=1e-3)
         late = np.asarray(record.times) > 0.4
         assert merits["after_exit"][i] == pytest.approx(bent[late].max() / free.max(), rel=1e-3)
         effort = np.sqrt(np.mean(np.asarray(record.command) ** 2)) / 7.5
@@ -200,6 +203,10 @@ BAD = [
     ({"free": {}}, "name at least one address as free"),
     ({"free": {"controller.gain": None}}, "did you mean 'controller.gains"),
     ({"free": {GAIN: (5000.0, 9000.0)}}, f"{GAIN} starts at 2000, outside its bounds"),
+    (
+        {"objective": tuning.Objective({"shortfall": 1.0}), "bounds": False},
+        "leave bounds on to tune for it",
+    ),
     ({"steps": 0}, "steps and starts must be 1 or more"),
     ({"cases": tuning.LoadCases(({"loads.0.speed": 0.5},))}, "run.duration is 0.6 s, but with"),
     ({"cases": tuning.LoadCases(({"loads.0.weight": 0.5},))}, "no number at address"),
