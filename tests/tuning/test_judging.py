@@ -1,13 +1,28 @@
 """Criticism, profiles and posterior of fits, on readings that are a formula."""
 
 import dataclasses
+import json
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tuning.stand_in import NOISE, PULLS, TIMES, TRUTH, campaign, clean, fit, formula, search
-from tuning.belief import Belief
+import jaxbeam as jb
+from jaxbeam.casefile import case_to_dict
+from tests.tuning.stand_in import (
+    CASE,
+    NOISE,
+    PULLS,
+    TIMES,
+    TRUTH,
+    campaign,
+    clean,
+    fit,
+    formula,
+    search,
+)
+from tuning import keeping
 from tuning.criticism import channel_remarks, channels, compare_fits, cross_validate, whiteness
 from tuning.identify import fit_of
 from tuning.posterior import nuts, sample, summary
@@ -184,8 +199,6 @@ def test_blind_directions_are_not_sampled(plain):
 
 
 def test_a_fit_is_kept_to_the_last_bit(plain, tmp_path, monkeypatch):
-    from tuning import keeping
-
     # The stand-in is made anew, as the campaign of real logs would be.
     monkeypatch.setattr(keeping, "prepare", lambda case, logs: campaign())
     keeping.save_fit(plain, tmp_path / "fit.npz")
@@ -205,5 +218,12 @@ def test_a_fit_is_kept_to_the_last_bit(plain, tmp_path, monkeypatch):
         keeping.load_fit(tmp_path / "cut.npz")
 
 
-def test_a_belief_is_kept_as_well(tmp_path):
-    assert dataclasses.asdict(Belief(0.1, 1.0, scale="log"))["scale"] == "log"
+def test_logs_are_kept_with_their_loads():
+    loads = (jb.MovingMass(mass=0.5, speed=-1.0, entry_time=0.1), jb.MovingForce(force=3, speed=2))
+    log = dataclasses.replace(campaign().logs[0], loads=loads, notes=("half of it",), sensors=(0,))
+    about = json.loads(json.dumps(keeping._about(log, CASE)))
+    arrays = {f"log0.{name}": getattr(log, name) for name in ("times", "values", "valid")}
+    again = keeping._log(0, about, case_to_dict(CASE)["beam"], arrays)
+    assert eqx.tree_equal(again.loads, loads)
+    for name in ("names", "units", "sensors", "notes", "source"):
+        assert getattr(again, name) == getattr(log, name)

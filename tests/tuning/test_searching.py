@@ -1,5 +1,7 @@
 """Priors, scales, robust losses, many starts, stages: on readings that are a formula."""
 
+import sys
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import scipy.optimize
 from tests.tuning.stand_in import CASE, NOISE, PULLS, TRUTH, campaign, clean, fit, formula, search
 from tuning.belief import Belief
 from tuning.free import Free, free_numbers
-from tuning.identify import _stage
+from tuning.identify import _stage, identify
 from tuning.loss import EDGE, check_loss, shaped, widening
 from tuning.starts import draw_starts, scout
 
@@ -201,3 +203,25 @@ def test_a_search_that_was_killed_goes_on_to_the_same_end(wide, tmp_path, monkey
     np.testing.assert_array_equal(resumed[0].values, whole[0].values)
     with pytest.raises(ValueError, match="belongs to another search"):
         scout(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, mark="that")
+
+
+def test_identify_takes_the_lowest_minimum_and_goes_on(tmp_path, monkeypatch):
+    """The whole way, but for the campaign, which is a formula; a wrong start alone fails."""
+    made = campaign()
+    monkeypatch.setattr(sys.modules["tuning.identify"], "prepare", lambda case, logs: made)
+    far = {address: BOUNDS[address] for address in ADDRESSES}
+    file = tmp_path / "search.npz"
+    found = identify(CASE, made.logs, far, starts=12, seed=1, checkpoint=file)
+    assert np.all(np.abs(found.values - VALUES) < 4 * found.errors)
+    assert sum(minimum.starts for minimum in found.minima) == 12 and file.exists()
+    assert "minima from 12 starts:" in str(found)
+    with pytest.raises(FileExistsError, match="exists: resume that search, or delete it"):
+        identify(CASE, made.logs, far, starts=12, seed=1, checkpoint=file)
+    again = identify(CASE, made.logs, far, starts=12, seed=1, checkpoint=file, resume=True)
+    np.testing.assert_array_equal(again.values, found.values)
+    with pytest.raises(ValueError, match="belongs to another search"):
+        identify(CASE, made.logs, far, starts=12, seed=2, checkpoint=file, resume=True)
+    staged = identify(CASE, made.logs, list(TRUTH), stages=[["sensors.0.offset"]])
+    np.testing.assert_allclose(staged.values, found.values, rtol=1e-5)
+    with pytest.raises(ValueError, match="starts must be 1 or more, not 0"):
+        identify(CASE, made.logs, far, starts=0)
