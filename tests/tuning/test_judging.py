@@ -22,7 +22,7 @@ from tests.tuning.stand_in import (
     formula,
     search,
 )
-from tuning import keeping
+from tuning import criticism, keeping
 from tuning.criticism import channel_remarks, channels, compare_fits, cross_validate, whiteness
 from tuning.identify import fit_of
 from tuning.posterior import nuts, sample, summary
@@ -110,6 +110,16 @@ def test_cross_validation(plain):
     assert "run 2: not predicted" in told[2]
     with pytest.raises(ValueError, match="at least two"):
         cross_validate(fit(search(logs=1)))
+
+
+def test_logs_that_were_held_out(plain, monkeypatch):
+    measured = clean() + NOISE * np.random.default_rng(9).normal(size=(3, 120, 1))
+    measured[1] += 0.1
+    monkeypatch.setattr(criticism, "prepare", lambda case, logs: campaign(measured=measured))
+    good, bad, _ = criticism.hold_out(plain, campaign(measured=measured).logs)
+    assert good.ratio[0] == pytest.approx(1.0, abs=0.25) and ": predicted; " in good.verdict
+    assert bad.ratio[0] == pytest.approx(np.hypot(1, 0.1 / NOISE), rel=0.1)
+    assert ": not predicted; " in bad.verdict
 
 
 # Profiles.
