@@ -3,10 +3,10 @@
     python -m experiments.benchmarks.tuners
 
 A table of commands (11 knots and the lead) on rig B is tuned for the worst peak of four loads. A
-gradient in reverse mode is counted as four evaluations; differential evolution (scipy's) is given as
-many evaluations as the gradient took, and then ten times as many. Both start from the same trapezium
-and search within the same limits. Worst peaks, relative to no control: 0.825 at the start, 0.792 by
-80 gradients; 0.815 by 320 evaluations without, and 0.792 by 3200.
+gradient in reverse mode is counted as four evaluations; differential evolution (scipy's) is given
+as many evaluations as the gradient took, and then ten times as many. Both start from the same
+trapezium and search within the same limits. Worst peaks, relative to no control: 0.825 at the
+start, 0.792 by 80 gradients; 0.815 by 320 evaluations without, and 0.792 by 3200.
 """
 
 import dataclasses

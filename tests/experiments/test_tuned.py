@@ -30,6 +30,7 @@ def test_it_is_proven_on_other_loads_than_it_was_tuned_on(rig):
     assert tuned.ENTRY not in {run["loads.0.entry_time"] for run in trained}
 
 
+@pytest.mark.slow
 def test_a_load_that_was_held_out_comes_near_what_is_possible():
     """On the bench, with the rig's own beam, against the linear program."""
     law = tuned.on_bench(jb.load_case(tuned_search.FOLDER / "B.toml").controller)

@@ -54,6 +54,7 @@ def rig(controller):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LOOPS)
 def test_slopes_through_the_loop_are_those_of_differences(kind):
     controller, start = LOOPS[kind]

@@ -46,6 +46,7 @@ def bench():
     return make_bench(rig(), RUNS, bounds=True)
 
 
+@pytest.mark.slow
 def test_merits_are_those_of_the_simulated_runs(bench):
     merits = bench.merits({GAIN: 5000.0})
     for i, run in enumerate(RUNS):
@@ -70,6 +71,7 @@ def test_merits_are_those_of_the_simulated_runs(bench):
         assert merits["contact"][i] == pytest.approx(change, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_objectives(bench):
     """Of a mix of all, which share the runs, and so what is compiled for them."""
     weights = {"peak": 1.0, "rms": 0.3, "effort": 0.1, "contact": 0.2}
@@ -139,6 +141,7 @@ def test_another_seed_comes_to_the_same(tuned):
     assert "nothing was held out" in again.verdict
 
 
+@pytest.mark.slow
 def test_a_search_that_was_stopped_goes_on_to_the_same_end(tuned, tmp_path, monkeypatch):
     file = tmp_path / "search.npz"
 
