@@ -142,6 +142,11 @@ def test_case_files_hold_regulators():
     assert eqx.tree_equal(case, again)
 
 
+def test_stretches_are_counted_for_the_modes_that_are_designed_for():
+    few = Beliefs(modes=1)
+    check(rig(FiniteLQR([1.0] * 3, [1.0], points=100, design=few)))
+
+
 @pytest.mark.parametrize(
     ("controller", "message"),
     [

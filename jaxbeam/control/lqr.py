@@ -274,12 +274,13 @@ def too_coarse(regulator: AbstractScheduledRegulator, case: Any, slowest=None) -
     if not all(value is not None and is_known(value) for value in numbers):
         return None
     length, rigidity, density, *speeds = (float(known(value)) for value in numbers)
-    fastest = (beam.modes * math.pi / length) ** 2 * (rigidity / density) ** 0.5
+    modes = regulator.modes(case)
+    fastest = (modes * math.pi / length) ** 2 * (rigidity / density) ** 0.5
     span = length / max(min(abs(speed) for speed in speeds), 1e-300)
     needed = math.ceil(fastest * span / TURN)
     if regulator.points >= needed:
         return None
     return (
-        f"points must be at least {needed} for {beam.modes} modes and a crossing of {span:.3g} s:"
+        f"points must be at least {needed} for {modes} modes and a crossing of {span:.3g} s:"
         " in each stretch the fastest mode may turn by some radians only"
     )
