@@ -146,6 +146,19 @@ def time_call(function, *args, repeat=5):
     return Timing(run, max(cold - run, 0.0))
 
 
+def best_in_turn(functions, *args, rounds=40):
+    """Shortest times of several functions, called in turn: disturbances meet them all alike."""
+    times = []
+    for function in functions:
+        jax.block_until_ready(function(*args))
+    for _ in range(rounds):
+        for function in functions:
+            start = time.perf_counter()
+            jax.block_until_ready(function(*args))
+            times.append(time.perf_counter() - start)
+    return np.min(np.reshape(times, (rounds, -1)), axis=0)
+
+
 def scipy_time(masses, speeds, modes, runs=12):
     """Seconds `scipy_peaks` would take for all masses and speeds, from a sample of `runs`.
 
