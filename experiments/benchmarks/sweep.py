@@ -4,7 +4,8 @@
 
 4096 crossings of the one-span rig, 64 masses by 64 speeds, peaks at three sensors with free
 vibration, to one part in a million; everything timed in one run, compiling apart. Runs are medians,
-derivatives the best of calls in turn, as they take milliseconds. scipy is timed on twelve runs and scaled; the accuracy of all is checked against a reference.
+derivatives the best of calls in turn, as they take milliseconds. scipy is timed on twelve runs and
+scaled; the accuracy of all is checked against a reference.
 """
 
 import argparse
