@@ -229,12 +229,13 @@ def gradients() -> Iterator[Check]:
 
     one = jnp.ones(len(free))
     expected = central(peaks, one)
-    yield Check(
-        "derivatives of 3 peaks by 5 numbers",
-        "central differences of order 6",
-        off(jax.jit(jax.jacfwd(peaks))(one), expected),
-        1e-6,
-    )
+    for mode, jacobian in (("forward", jax.jacfwd), ("reverse", jax.jacrev)):
+        yield Check(
+            f"derivatives of 3 peaks by 5 numbers, {mode} mode",
+            "central differences of order 6",
+            off(jax.jit(jacobian(peaks))(one), expected),
+            1e-6,
+        )
 
 
 def loops() -> Iterator[Check]:
