@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from experiments.verdicts import IMPOSSIBLE, VERDICTS, Finding, Judged
+from jaxbeam.document import html_table, markdown_table, page
 
 if TYPE_CHECKING:
     from experiments.reproduction import Run
@@ -17,15 +18,9 @@ MEASURED = (
     " numbers, and figures have the thesis's axes. Tolerances were chosen by the kind of number"
     " before the experiments were run; verdicts are computed from them."
 )
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
-       color: #22282e }
-table { border-collapse: collapse; font-size: 0.85rem; margin: 1rem 0 }
-th, td { text-align: left; padding: 0.2rem 0.8rem 0.2rem 0; border-bottom: 1px solid #dfe3e6 }
-td { font-variant-numeric: tabular-nums }
-img { max-width: 100% }
-.reproduced { color: #00694c } .explained { color: #0072b2 } .not, .cannot { color: #b34700 }
-"""
+STYLE = (
+    ".reproduced { color: #00694c } .explained { color: #0072b2 } .not, .cannot { color: #b34700 }"
+)
 
 
 def count(runs: Sequence["Run"], word: str) -> int:
@@ -51,11 +46,11 @@ def text(run: "Run") -> str:
 def markdown(runs: Sequence["Run"]) -> str:
     """The report in Markdown, figures beside it."""
     lines = ["# The thesis, reproduced", "", MEASURED, ""]
-    lines += _markdown_table(*_summary(runs))
+    lines += markdown_table(*_summary(runs))
     for run in runs:
         lines += [f"## {run.experiment.name}: {run.experiment.covers}", "", run.experiment.claim]
         for one, judged in zip(run.outcome.findings, run.judged, strict=True):
-            lines += ["", f"**{_title(one)}**", "", *_markdown_table(HEADER, _rows(one, judged))]
+            lines += ["", f"**{_title(one)}**", "", *markdown_table(HEADER, _rows(one, judged))]
             lines += [f"{sentence}\n" for sentence in _comments(one, judged.words)]
         lines += ["", *(f"{remark}\n" for remark in run.outcome.remarks)]
         lines += [f"![{name}]({_picture(run, name)})\n" for name in run.outcome.figures]
@@ -65,18 +60,20 @@ def markdown(runs: Sequence["Run"]) -> str:
 def html(runs: Sequence["Run"]) -> str:
     """The report as a page, figures beside it."""
     safe = escaping.escape
-    parts = [f"<h1>The thesis, reproduced</h1><p>{MEASURED}</p>", _html_table(*_summary(runs))]
+    parts = [
+        f"<h1>The thesis, reproduced</h1><p>{MEASURED}</p>",
+        html_table(*_summary(runs), _marked),
+    ]
     for run in runs:
         title = safe(f"{run.experiment.name}: {run.experiment.covers}")
         parts.append(f"<h2>{title}</h2><p>{safe(run.experiment.claim)}</p>")
         for one, judged in zip(run.outcome.findings, run.judged, strict=True):
             parts.append(f"<h4>{safe(_title(one))}</h4>")
-            parts.append(_html_table(HEADER, _rows(one, judged)))
+            parts.append(html_table(HEADER, _rows(one, judged), _marked))
             parts += [f"<p>{safe(sentence)}</p>" for sentence in _comments(one, judged.words)]
         parts += [f"<p>{safe(remark)}</p>" for remark in run.outcome.remarks]
         parts += [f'<img src="{_picture(run, n)}" alt="{safe(n)}">' for n in run.outcome.figures]
-    head = f'<meta charset="utf-8"><title>The thesis, reproduced</title><style>{STYLE}</style>'
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(parts)}</body></html>'
+    return page("The thesis, reproduced", parts, STYLE)
 
 
 def _title(one: Finding) -> str:
@@ -132,21 +129,6 @@ def _picture(run: "Run", name: str) -> str:
     return f"{run.experiment.name}-{name}.png"
 
 
-def _markdown_table(header, rows) -> list[str]:
-    lines = [header, ["---"] * len(header), *rows]
-    return [f"| {' | '.join(line)} |" for line in lines] + [""]
-
-
-def _html_table(header, rows) -> str:
-    def line(tag, cells):
-        marked = (
-            f'<{tag} class="{cell.split()[0]}">' if cell in VERDICTS and tag == "td" else f"<{tag}>"
-            for cell in cells
-        )
-        inner = (
-            f"{start}{escaping.escape(cell)}</{tag}>"
-            for start, cell in zip(marked, cells, strict=True)
-        )
-        return f"<tr>{''.join(inner)}</tr>"
-
-    return f"<table>{line('th', header)}{''.join(line('td', row) for row in rows)}</table>"
+def _marked(cell: str) -> str | None:
+    """The style of a verdict."""
+    return cell.split()[0] if cell in VERDICTS else None

@@ -10,7 +10,7 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.compiling  jaxbeam.driver  jaxbeam.fields  jaxbeam.holds
+jaxbeam.compiling  jaxbeam.document  jaxbeam.driver  jaxbeam.fields  jaxbeam.holds
 jaxbeam.faults  jaxbeam.stretches
 jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
 jaxbeam.estimator  jaxbeam.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.sensors

@@ -8,20 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxbeam.document import html_table, markdown_table, page
 from tuning.criticism import Rival, Unseen, channels
 from tuning.identify import Fit
 from tuning.posterior import Posterior
 from tuning.profile import Profile
 from tuning.report import remarks
-
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
-       color: #22282e }
-table { border-collapse: collapse; font-size: 0.85rem; margin: 1rem 0 }
-th, td { text-align: left; padding: 0.2rem 0.8rem 0.2rem 0; border-bottom: 1px solid #dfe3e6 }
-td { font-variant-numeric: tabular-nums }
-img { max-width: 100% }
-"""
 
 
 class Table(NamedTuple):
@@ -112,13 +104,11 @@ def markdown(title: str, sections: Sequence[Section]) -> str:
         lines += [f"## {section.title}", ""]
         for part in section.parts:
             if isinstance(part, Table):
-                rows = [part.header, ("---",) * len(part.header), *part.rows]
-                lines += [f"| {' | '.join(row)} |" for row in rows]
+                lines += markdown_table(*part)
             elif isinstance(part, Picture):
-                lines.append(f"![{part.name}]({part.name}.png)")
+                lines += [f"![{part.name}]({part.name}.png)", ""]
             else:
-                lines.append(part)
-            lines.append("")
+                lines += [part, ""]
     return "\n".join(lines)
 
 
@@ -130,18 +120,12 @@ def html(title: str, sections: Sequence[Section]) -> str:
         body.append(f"<h2>{safe(section.title)}</h2>")
         for part in section.parts:
             if isinstance(part, Table):
-                rows = [_row("th", part.header), *(_row("td", row) for row in part.rows)]
-                body.append(f"<table>{''.join(rows)}</table>")
+                body.append(html_table(*part))
             elif isinstance(part, Picture):
                 body.append(f'<img src="{part.name}.png" alt="{part.name}">')
             else:
                 body.append(f"<p>{safe(part)}</p>")
-    head = f'<meta charset="utf-8"><title>{safe(title)}</title><style>{STYLE}</style>'
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>'
-
-
-def _row(tag: str, cells: Sequence[str]) -> str:
-    return f"<tr>{''.join(f'<{tag}>{escaping.escape(cell)}</{tag}>' for cell in cells)}</tr>"
+    return page(title, body)
 
 
 def _numbers(fit: Fit) -> Table:

@@ -230,14 +230,16 @@ def _beliefs(free, prior, scale) -> dict:
     bounds = dict(bounds_of(text) for text in free)
     for address in (*scales, *priors):
         refuse(address not in bounds, f"{address} has a prior or a scale, but is not free: --free")
-    return {
-        address: Belief(
-            *(pair or (None, None)),
-            *priors.get(address, (None, None)),
-            scale=scales.get(address, "plain"),
-        )
-        for address, pair in bounds.items()
-    }
+    found = {}
+    for address, pair in bounds.items():
+        prior = priors.get(address, (None, None))
+        try:
+            found[address] = Belief(
+                *(pair or (None, None)), *prior, scale=scales.get(address, "plain")
+            )
+        except ValueError as error:
+            raise ValueError(f"{address}: {error}") from None
+    return found
 
 
 def _judge(fit, profile, draws, seed, validate, output, resume) -> dict:
