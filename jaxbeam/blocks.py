@@ -4,8 +4,9 @@ import dataclasses
 import math
 import re
 import threading
-from contextlib import nullcontext
+from concurrent.futures import ThreadPoolExecutor
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,8 +48,8 @@ class Work:
             self.schedule = loop_schedule(case, np.asarray(sample_times(case)))
         elif histories:
             self.schedule = sampled(sample_times(case), True)
-        self._compiling, self._compiled = threading.Lock(), False
         count, lanes = tasks.index.shape
+        self._compiling = threading.Lock()
         self.each = min(count, max(1, RUNS // lanes))
         self.blocks = -(-count // self.each)
         self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
@@ -62,7 +63,13 @@ class Work:
         slots = max(most_at_once(window) for window in windows)
         self.form = Form(layout, couples(case), slots)
 
-        found = [_rigs(case, self.form, self.addresses[0], tasks.heavy[part]) for part in parts]
+        design = case, self.form, self.addresses[0]
+        # Blocks are compiled while the rigs are: it is known before what a rig looks like.
+        with ThreadPoolExecutor(1) as pool:
+            alike = eqx.filter_eval_shape(_rigs, *design, tasks.heavy[:1])[0]
+            compiling = pool.submit(self._compile, alike)
+            found = [_rigs(*design, tasks.heavy[part]) for part in parts]
+        compiling.result()
         self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
         limits = limits[self.rig_of]
         limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
@@ -106,24 +113,33 @@ class Work:
             substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
         return self._run(chosen, steps[chosen], substeps)
 
+    def _compile(self, alike):
+        """Compile what finds the steps, from what rigs look like."""
+        first = np.zeros(self.each, int)
+        rigs = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape[1:]), leaf.dtype), alike)
+        _block.ahead(*self._arguments(first, np.ones(self.each), None, rigs, first))
+
     def _run(self, chosen, steps, substeps):
-        tasks = self.tasks
-        scheduled = substeps is not None or self.case.controller is not None
-        # The first call compiles: others wait for it instead of compiling the same again.
-        with nullcontext() if self._compiled else self._compiling:
-            results = _block(
-                self.case,
-                self.form,
-                self.addresses,
-                self.schedule if scheduled else None,
-                substeps,
-                jax.tree.map(lambda leaf: leaf[self.rig_of[chosen]], self.rigs),
-                tasks.heavy[chosen],
-                tasks.light[chosen],
-                np.asarray(steps),
-            )
-            self._compiled = True
+        arguments = self._arguments(chosen, steps, substeps, self.rigs, self.rig_of[chosen])
+        with self._compiling:  # others wait for the first, instead of compiling the same again
+            if substeps is not None:
+                _block.ahead(*arguments)
+        results = _block(*arguments)
         return {name: np.asarray(values) for name, values in results.items()}
+
+    def _arguments(self, chosen, steps, substeps, rigs, rig_of):
+        scheduled = substeps is not None or self.case.controller is not None
+        return (
+            self.case,
+            self.form,
+            self.addresses,
+            self.schedule if scheduled else None,
+            substeps,
+            jax.tree.map(lambda leaf: leaf[rig_of], rigs),
+            self.tasks.heavy[chosen],
+            self.tasks.light[chosen],
+            np.asarray(steps),
+        )
 
 
 def _values(case: Case, tasks: Tasks, address: str) -> np.ndarray:

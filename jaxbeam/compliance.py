@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
-from jaxbeam.modes import Layout, assemble, piecewise, section, supported
+from jaxbeam.modes import Layout, assemble, section, supported
+from jaxbeam.piecewise import piecewise
 
 SOFTEST = 1e-10  # stiffness against rigid-body motion in E I / L^3: less is an unstable beam
 

@@ -86,6 +86,7 @@ def _balance(rig: Rig):
     return jax.lax.stop_gradient(scale)
 
 
+@jax.named_scope("propagators")
 def propagators(
     rig: Rig, lengths: Float[Array, " *length"], points: int = 0, driven: bool = False
 ) -> Step:

@@ -37,6 +37,7 @@ class Extremes(eqx.Module):
         return jnp.where(self.sound, value, jnp.nan), jnp.where(self.sound, time, jnp.nan)
 
 
+@jax.named_scope("extremes")
 def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) -> Extremes:
     """Extremes of the run so far, from those up to a chunk of steps and the chunk itself."""
     steps, lanes = states.shape[0], states.shape[-1]

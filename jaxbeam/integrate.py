@@ -39,6 +39,7 @@ def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
     return jax.lax.stop_gradient(limit)
 
 
+@jax.named_scope("collocation")
 def _contact(tables: Tables, inertia, weight, state, commands):
     """Contact forces (row, lane) of a step from this state under these commands, if any."""
     felt = tables.respond @ state
@@ -47,6 +48,7 @@ def _contact(tables: Tables, inertia, weight, state, commands):
     return solve_contact(tables.gains, inertia, weight + inertia * felt)
 
 
+@jax.named_scope("propagation")
 def _advance(state, step):
     """One step of all lanes: the contact forces at the nodes, and the state at the end."""
     tables, inertia, weight, commands = step

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 LIGHT = re.compile(r"loads\.\d+\.(mass|force)|run\.gravity")
+MOST_RUNS = 10**9  # of a sweep: more would not fit into any memory
 LANES = 256  # more lanes in one task fall out of the cache
 
 

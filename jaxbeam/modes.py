@@ -16,16 +16,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
-from numpy.polynomial import chebyshev, legendre
+from numpy.polynomial import legendre
 
 from jaxbeam.case import Case
+from jaxbeam.eigen import SAME_EIGENVALUE, eigen
 from jaxbeam.fields import known
+from jaxbeam.piecewise import piecewise, to_chebyshev
 
 SAME_PLACE = 1e-9  # of the length: closer nodes are one node
-SAME_EIGENVALUE = 1e-6  # relative: closer modes are treated as a repeated one
-RIGID_BODY = 1e-10  # in beam units: lower eigenvalues are those of rigid-body modes, zero
 HELD = {  # deflection, rotation
     "pinned": (True, False),
     "clamped": (True, True),
@@ -116,46 +115,7 @@ def _element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     mass = basis.T @ (weights[:, None] * basis)
     curvature = legendre.legder(basis, 2)
     bending = curvature.T @ (weights[: degree - 1, None] * curvature)
-    return _to_chebyshev(degree + 1) @ basis, mass, bending
-
-
-@jax.custom_jvp
-def eigen(stiffness, mass):
-    """Solve K x = lambda M x: ascending values, mass-normalised vectors, zero coupling.
-
-    Vectors of (nearly) repeated values have no derivative of their own. Their tangents leave the
-    vectors unrotated and appear in the third result instead, the off-diagonal part of X' K X,
-    which is zero but has a derivative; whoever uses it gets exact derivatives of the response.
-    """
-    factor = jnp.linalg.cholesky(stiffness + mass)  # the shift lifts rigid-body modes off zero
-    half = solve_triangular(factor, mass, lower=True)
-    flexibility = solve_triangular(factor, half.T, lower=True)
-    inverse, vectors = jnp.linalg.eigh((flexibility + flexibility.T) / 2)
-    vectors = solve_triangular(factor.T, vectors[:, ::-1], lower=False)
-    inverse = jnp.maximum(inverse[::-1], jnp.finfo(inverse.dtype).tiny)
-    vectors = vectors / jnp.sqrt(jnp.sum(vectors * (mass @ vectors), axis=0))
-    # The quotient is right to the square of the error of the vector.
-    values = jnp.sum(vectors * (stiffness @ vectors), axis=0)
-    values = jnp.where(values > RIGID_BODY, values, 0.0)
-    return values, vectors, jnp.zeros_like(mass)
-
-
-@eigen.defjvp
-def _eigen_jvp(primals, tangents):
-    values, vectors, none = eigen(*primals)
-    stiffness, mass = (vectors.T @ tangent @ vectors for tangent in tangents)
-    gap = values[None, :] - values[:, None]
-    near = jnp.abs(gap) <= SAME_EIGENVALUE * (1 + values[None, :] + values[:, None])
-    turn = (stiffness - values[None, :] * mass) / jnp.where(near, 1.0, gap)
-    turn = jnp.where(near, -mass / 2, turn)
-    couple = stiffness - (values[None, :] + values[:, None]) / 2 * mass
-    # Zero, but a second derivative sees how the coupling changes.
-    twist = turn.T @ none + none @ turn
-    turn = turn + jnp.where(near, 0.0, twist / jnp.where(near, 1.0, gap))
-    couple = couple + twist
-    diagonal = jnp.diag(couple)
-    couple = jnp.where(near, couple, 0.0) - jnp.diag(diagonal)
-    return (values, vectors, none), (diagonal, vectors @ turn, couple)
+    return to_chebyshev(degree + 1) @ basis, mass, bending
 
 
 class Modes(eqx.Module):
@@ -228,59 +188,7 @@ def _root(square):
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-def piecewise(nodes, series, x, derivatives) -> Float[Array, "order *place column"]:
-    """Functions given by one Legendre series for each segment between nodes, at positions x.
-
-    `series` is (segment, degree, column); the derivatives are by x, in the unit of the nodes.
-    """
-    x = jnp.asarray(x, float)
-    size = jnp.diff(nodes) / 2
-    segments, terms, modes = series.shape
-    stretched = [_differentiate(terms, d) @ series / size[:, None, None] ** d for d in derivatives]
-    series = jnp.stack(stretched, axis=2).reshape(segments, terms, len(derivatives) * modes)
-    segment = jnp.sum(x[..., None] >= nodes[1:-1], axis=-1)
-    local = (x - nodes[segment]) / size[segment] - 1
-    table = _chebyshev_table(local, terms)
-    masks = (segment[..., None] == s for s in range(segments))
-    parts = [jnp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
-    values = jnp.concatenate(parts, axis=-1) @ series.reshape(segments * terms, -1)
-    return jnp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
-
-
-@functools.cache
-def _differentiate(terms: int, times: int) -> np.ndarray:
-    """Matrix that differentiates a Chebyshev series `times` times, keeping its length."""
-    matrix = np.zeros((terms, terms))
-    matrix[: terms - times] = chebyshev.chebder(np.eye(terms), times)[: terms - times]
-    return matrix
-
-
-@functools.cache
-def _to_chebyshev(terms: int) -> np.ndarray:
-    """Matrix from Legendre to Chebyshev coefficients, by the values at Chebyshev points."""
-    points = chebyshev.chebpts1(terms)
-    values = legendre.legvander(points, terms - 1)
-    scale = np.where(np.arange(terms) == 0, 1.0, 2.0)[:, None] / terms
-    return scale * (chebyshev.chebvander(points, terms - 1).T @ values)
-
-
-def _chebyshev_table(t, terms: int):
-    """Chebyshev polynomials of degree 0 to terms - 1 at t, along a new last axis.
-
-    Built by doubling, T_(k+j) = 2 T_k T_j - T_(k-j), which takes few steps and does not lose
-    accuracy.
-    """
-    axis = t.ndim
-    table = jnp.stack([jnp.ones_like(t), t], axis=axis)
-    while table.shape[axis] < terms:
-        # Plain slices: indexing would give the compiler several times as much to read.
-        last = 2 * jax.lax.slice_in_dim(table, -1, None, axis=axis)
-        lower = jax.lax.rev(jax.lax.slice_in_dim(table, 0, -1, axis=axis), (axis,))
-        higher = last * jax.lax.slice_in_dim(table, 1, None, axis=axis) - lower
-        table = jnp.concatenate([table, higher], axis=axis)
-    return jax.lax.slice_in_dim(table, 0, terms, axis=axis)
-
-
+@jax.named_scope("modes")
 def modes(case: Case, layout: Layout | None = None) -> Modes:
     """Find the lowest `case.beam.modes` natural modes of the beam on its supports.
 

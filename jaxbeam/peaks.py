@@ -53,6 +53,7 @@ def vertex(samples: Float[Array, "point *rest"]) -> Float[Array, " *rest"]:
     return jnp.maximum(jnp.abs(_value(curve, place)), highest)
 
 
+@jax.named_scope("peaks")
 def refine(samples: Float[Array, "point *rest"]) -> tuple[Float[Array, " *rest"], ...]:
     """Largest absolute value of the polynomial through the samples, and where in [0, 1] it is.
 

@@ -1,55 +1,29 @@
-"""Modes against characteristic equations, the Wittrick-Williams count, finite elements, and laws.
+"""Natural frequencies by characteristic equations, the Wittrick-Williams count, finite elements.
 
-Accuracy reached (relative frequencies): 1e-14 for the first dozen modes, 1e-13 for 50.
+Accuracy reached (relative): 1e-14 for the first dozen modes, 1e-13 for 50.
 """
 
-import equinox as eqx
 import hypothesis
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.polynomial import legendre
 from numpy.testing import assert_allclose
 
 from jaxbeam.actuators import Patch
-from jaxbeam.beam import ENDS, Beam, Support
-from jaxbeam.case import Case, replace, value_at
-from jaxbeam.modes import Modes, lay_out, modes
+from jaxbeam.beam import Beam, Support
+from jaxbeam.case import Case
 from tests.as_oracle import as_oracle
-from tests.differences import central
 from tests.oracles.closed_forms import single_span_parameters, two_span_parameters
 from tests.oracles.exact_frequencies import exact_frequencies
 from tests.oracles.finite_elements import assemble
-
-STUFF = {"flexural_rigidity": 11.68, "mass_per_length": 0.535}
-PAIRS = [f"{left}-{right}" for left in ENDS for right in ENDS]
-
-
-@eqx.filter_jit
-def _modes(case, layout):
-    return modes(case, layout)
-
-
-def solve(case: Case) -> Modes:
-    """Compiled as a whole, which is faster than step by step."""
-    return _modes(case, lay_out(case))
-
-
-def parameters(case: Case, span: float) -> np.ndarray:
-    """k times a length, of each mode of a beam of 11.68 N m^2 and 0.535 kg/m."""
-    return (0.535 / 11.68 * np.asarray(solve(case).stiffness)) ** 0.25 * span
+from tests.solved_modes import PAIRS, PATCHED, STUFF, held, parameters, solve
 
 
 def assert_frequencies(case: Case, rtol: float = 1e-12) -> None:
     """The same as the Wittrick-Williams count, rigid-body modes included."""
     expected = exact_frequencies(as_oracle(case), case.beam.modes)
     assert_allclose(solve(case).angular_frequencies, expected, rtol=rtol)
-
-
-# Frequencies
 
 
 @pytest.mark.parametrize("ends", PAIRS)
@@ -84,11 +58,6 @@ def test_equal_spans_have_the_printed_parameters(spans, ends, expected):
     assert_allclose(parameters(case, 0.6), expected, rtol=0, atol=6e-7)
 
 
-def held(stiffness, turn=0.0) -> Case:
-    """A pinned beam with one support of given springs."""
-    return Case(Beam(1.2, **STUFF, modes=12), [Support(0.5, stiffness, 0.0, turn)])
-
-
 def test_an_elastic_support_ranges_from_none_to_a_rigid_one():
     for stiffness in (0.0, 1.0, 1e3, 1e5, 1e8, 1e12, 1e16):
         assert_frequencies(held(stiffness))
@@ -111,16 +80,6 @@ def test_rotational_springs_range_from_none_to_a_clamp():
     apart = [Case(Beam(x, **STUFF, ends="clamped-pinned", modes=12)) for x in (0.5, 0.7)]
     expected = np.sort(np.concatenate([solve(case).frequencies for case in apart]))[:12]
     assert_allclose(solve(held(None, 1e14)).frequencies, expected, rtol=1e-10)
-
-
-PATCHED = Case(
-    Beam(1.3, 2.0, 0.7, ends="guided-free", modes=8),
-    [Support(0.3, 500.0, 0.4, 3.0), Support(0.91), Support(1.25, 20.0)],
-    [
-        Patch(0.2, 0.45, 1e-3, added_mass=0.4, added_rigidity=1.0),
-        Patch(0.4, 0.7, 1e-3, added_mass=0.1, added_rigidity=0.5),
-    ],
-)
 
 
 def test_bonded_patches_have_the_frequencies_and_shapes_of_finite_elements():
@@ -170,255 +129,3 @@ def test_random_beams_have_exact_frequencies(case):
     expected = exact_frequencies(as_oracle(case), 5)
     unit = np.sqrt(float(solve(case).unit))
     assert_allclose(solve(case).angular_frequencies, expected, rtol=1e-9, atol=1e-3 * unit)
-
-
-# Shapes
-
-
-@pytest.mark.parametrize("derivative", [0, 1, 2, 3])
-def test_shapes_of_pinned_beams_are_sines(derivative):
-    x, n = np.linspace(0.0, 0.6, 41), np.arange(1, 7)
-    wave = n * np.pi / 0.6
-    found = solve(Case(Beam(0.6, **STUFF, modes=6))).shapes(x, derivative)
-    expected = np.sqrt(2 / (0.535 * 0.6)) * np.imag(
-        np.exp(1j * np.outer(x, wave)) * (1j * wave) ** derivative
-    )
-    assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-
-
-def products(case: Case) -> np.ndarray:
-    """Mass matrix of the modes, by Gauss quadrature over each segment."""
-    found, beam = solve(case), as_oracle(case)
-    t, weights = legendre.leggauss(40)
-    total = 0.0
-    for left, right in zip(found.nodes[:-1], found.nodes[1:], strict=True):
-        x = (left + right) / 2 + (right - left) / 2 * t
-        over = [p.mass_per_length for p in beam.patches if p.start < float(x[20]) < p.end]
-        density = beam.mass_per_length + sum(over)
-        shape = np.asarray(found.shapes(x))
-        total = total + density * (right - left) / 2 * shape.T @ (weights[:, None] * shape)
-    return np.asarray(total)
-
-
-@pytest.mark.parametrize(
-    "case",
-    [PATCHED, held(1e4), held(None), Case(Beam(0.6, **STUFF, ends="free-free", modes=6))],
-    ids=["patched", "spring", "two spans", "free"],
-)
-def test_shapes_are_orthonormal_and_join(case):
-    found = solve(case)
-    assert_allclose(products(case), np.eye(case.beam.modes), atol=1e-11)
-    for node in found.nodes[1:-1]:
-        before, after = (found.shapes_together(node + d, (0, 1)) for d in (-1e-9, 1e-9))
-        # A shape changes by its slope times 2e-9 m, far below the tolerance.
-        assert_allclose(before, after, rtol=0, atol=1e-6 * np.abs(after).max())
-    for support in case.supports:
-        if support.stiffness is None:
-            assert np.abs(found.shapes(support.position)).max() < 1e-10
-
-
-def test_derivatives_of_shapes_are_their_slopes():
-    found = solve(PATCHED)
-    for x in (0.1, 0.33, 0.8, 1.28):
-        for order in (1, 2, 3):
-            slope = central(lambda y, n=order - 1: found.shapes(y[0], n), [x], 1e-3)[:, 0]
-            exact = found.shapes(x, order)
-            assert_allclose(exact, slope, rtol=0, atol=1e-8 * np.abs(exact).max())
-
-
-@pytest.mark.parametrize("ends", PAIRS)
-def test_shapes_are_positive_near_the_left_end(ends):
-    found = solve(Case(Beam(0.6, **STUFF, ends=ends, modes=12)))
-    assert np.all(found.shapes(0.01) > 0)
-
-
-def test_fifty_modes_stay_exact_and_bounded():
-    """The shapes of a cantilever reach 2 at its tip, where hyperbolic functions would overflow."""
-    case = Case(Beam(1.2, **STUFF, ends="clamped-free", modes=50))
-    assert_allclose(parameters(case, 1.2), single_span_parameters("clamped-free", 50), rtol=1e-12)
-    shapes = np.asarray(solve(case).shapes(np.linspace(0.0, 1.2, 2001))) * np.sqrt(0.535 * 1.2)
-    assert_allclose(np.abs(shapes).max(axis=0), 2.0, rtol=1e-6)
-    assert_allclose(np.abs(shapes[-1]), 2.0, rtol=1e-8)
-
-
-def test_a_mirrored_beam_has_mirrored_shapes():
-    mirrored = Case(
-        Beam(1.3, 2.0, 0.7, ends="free-guided", modes=8),
-        [Support(1.0, 500.0, 0.0, 3.0), Support(0.39), Support(0.05, 20.0)],
-        [
-            Patch(0.85, 1.1, 1.0, added_mass=0.4, added_rigidity=1.0),
-            Patch(0.6, 0.9, 1.0, added_mass=0.1, added_rigidity=0.5),
-        ],
-    )
-    first, second = solve(PATCHED), solve(mirrored)
-    assert_allclose(first.frequencies, second.frequencies, rtol=1e-12)
-    x = np.linspace(0.0, 1.3, 14)
-    assert_allclose(np.abs(first.shapes(x)), np.abs(second.shapes(1.3 - x)), atol=1e-9)
-
-
-# Derivatives
-
-BY_SECTION = Case(
-    Beam(
-        1.3,
-        width=0.1,
-        height=0.003,
-        youngs_modulus=7e10,
-        density=2700.0,
-        ends="pinned-clamped",
-        modes=4,
-        damping_ratio=0.02,
-    ),
-    [Support(0.5, 3e3, 0.0, 2.0), Support(0.9)],
-    [Patch(0.2, 0.35, 1.0, added_mass=0.4, added_rigidity=9.0)],
-)
-NUMBERS = [
-    "beam.length", "beam.width", "beam.height", "beam.youngs_modulus", "beam.density",
-    "beam.damping_ratio", "supports.0.position", "supports.0.stiffness",
-    "supports.0.rotational_stiffness", "supports.1.position", "actuators.0.start",
-    "actuators.0.end", "actuators.0.added_mass", "actuators.0.added_rigidity",
-]  # fmt: skip
-
-
-BOTH, REVERSE = (jax.jacfwd, jax.jacrev), (jax.jacrev,)
-
-
-def assert_derivatives(function, size: int, ways=REVERSE, floor: float = 0.0) -> None:
-    """Automatic derivatives against central differences, at zero, each result on its scale.
-
-    Reverse mode transposes what forward mode does, so where it is right, both are. What is smaller
-    than `floor` times the largest, and so only rounding, is on that scale.
-    """
-    expected = central(function, np.zeros(size), 1e-3)
-    scale = np.abs(expected).max(axis=1, keepdims=True)
-    scale = np.maximum(scale, floor * scale.max())
-    scale = np.where(scale > 0, scale, 1.0)
-    for jacobian in ways:
-        found = jax.jit(jacobian(function))(jnp.zeros(size))
-        assert_allclose(found / scale, expected / scale, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "numbers", "ways"),
-    [
-        (BY_SECTION, NUMBERS, BOTH),
-        (
-            Case(Beam(1.2, **STUFF, ends="clamped-free", modes=5), [Support(0.7)]),
-            ["beam.length", "beam.flexural_rigidity", "beam.mass_per_length"],
-            REVERSE,
-        ),
-    ],
-    ids=["section", "rigidity"],
-)
-def test_derivatives_of_frequencies_and_shapes_in_every_number(case, numbers, ways):
-    layout, x = lay_out(case), jnp.array([0.1, 0.62, 1.0])
-    start = np.array([float(value_at(case, address)) for address in numbers])
-
-    @jax.jit
-    def quantities(change):
-        changed = replace(case, dict(zip(numbers, start * (1 + change), strict=True)))
-        found = modes(changed, layout)
-        shapes = found.shapes_together(x, (0, 1, 2))
-        return jnp.concatenate([found.stiffness, found.damping, shapes.ravel()])
-
-    assert_derivatives(quantities, len(numbers), ways)
-
-
-def flexibility(found: Modes, x) -> jax.Array:
-    """psi(x)' (s^2 + s D + K)^-1 psi(x), what the response is made of, free of how modes mix."""
-    s = jnp.sqrt(found.unit)
-    stiffness = jnp.diag(found.stiffness) + found.coupling
-    damping = jnp.diag(found.damping) + found.damping_coupling
-    dynamic = s**2 * jnp.eye(stiffness.shape[0]) + s * damping + stiffness
-    shapes = found.shapes(x)
-    return (shapes @ jnp.linalg.solve(dynamic, shapes.T))[jnp.triu_indices(x.shape[0])]
-
-
-def crossing(**damping) -> Case:
-    """A pinned beam whose midspan spring lifts the first mode into the second.
-
-    The second has its node there. At its wavenumber b = 2 pi / L the deflection at midspan under
-    a unit force is (tan(b L / 2) - tanh(b L / 2)) / (4 E I b^3), and the spring cancels it.
-    """
-    wave = 2 * np.pi / 1.2
-    spring = 4 * 11.68 * wave**3 / np.tanh(np.pi)
-    return Case(Beam(1.2, **STUFF, modes=6, **damping), [Support(0.6, spring)])
-
-
-def decoupled(**damping) -> Case:
-    """Two equal spans, each clamped at the common support by a very stiff spring."""
-    return Case(Beam(1.2, **STUFF, modes=6, **damping), [Support(0.6, rotational_stiffness=1e12)])
-
-
-FREE = Case(
-    Beam(1.2, **STUFF, ends="free-free", modes=6, damping_ratio=0.05),
-    actuators=[Patch(0.2, 0.5, 1.0, added_mass=0.2, added_rigidity=3.0)],
-)
-REPEATED = {
-    "crossing": (
-        crossing(damping_ratio=0.1),
-        ["supports.0.position", "supports.0.stiffness", "beam.length"],
-    ),
-    "decoupled": (decoupled(damping_ratio=0.1), ["supports.0.position", "beam.length"]),
-    "rayleigh": (
-        decoupled(rayleigh_damping=[0.3, 1e-4]),
-        ["supports.0.position", "beam.mass_per_length"],
-    ),
-    "free": (FREE, ["beam.length", "actuators.0.start", "actuators.0.added_mass"]),
-}
-
-
-def response(case: Case, numbers: list[str]):
-    """The flexibility as a function of relative changes of some numbers."""
-    layout, x = lay_out(case), jnp.array([0.13, 0.45, 0.8])
-    start = np.array([float(value_at(case, address)) for address in numbers])
-
-    @jax.jit
-    def function(change):
-        changed = replace(case, dict(zip(numbers, start * (1 + change), strict=True)))
-        return flexibility(modes(changed, layout), x)
-
-    return function
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", REPEATED)
-def test_responses_have_derivatives_where_frequencies_are_repeated(name):
-    case, numbers = REPEATED[name]
-    assert bool(solve(case).repeated)
-    # Spans that a stiff spring keeps apart answer each other with 1e-11 of their own response.
-    assert_derivatives(response(case, numbers), len(numbers), floor=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", [crossing(), decoupled()], ids=["crossing", "decoupled"])
-def test_second_derivatives_where_frequencies_are_repeated(case):
-    """Undamped: a damping ratio goes with the root of the stiffness, right to first order only."""
-    numbers = ["supports.0.position", "beam.length"]
-    function = response(case, numbers)
-    slope = jax.jit(jax.jacfwd(function))
-    found = jax.jit(jax.jacfwd(jax.jacfwd(function)))(jnp.zeros(len(numbers)))
-    expected = central(lambda p: slope(p).reshape(-1), np.zeros(len(numbers)), 1e-3)
-    scale = np.abs(expected).max()
-    assert_allclose(found.reshape(expected.shape), expected, rtol=0, atol=1e-6 * scale)
-
-
-def test_a_free_beam_feels_the_first_newton_per_metre_that_holds_it():
-    """Rigid-body modes at zero: one-sided differences, for a stiffness cannot be negative."""
-    case = Case(Beam(1.2, **STUFF, ends="free-free", modes=5), [Support(0.3, 0.0, 0.0, 0.0)])
-    layout, x = lay_out(case), jnp.array([0.13, 0.8])
-
-    @jax.jit
-    def function(stiffness):
-        springs = {
-            "supports.0.stiffness": stiffness[0],
-            "supports.0.rotational_stiffness": stiffness[1],
-        }
-        return flexibility(modes(replace(case, springs), layout), x)
-
-    found = jax.jit(jax.jacfwd(function))(jnp.zeros(2))
-    for i, h in enumerate((1e-3, 1e-3)):
-        values = [np.asarray(function(n * h * jnp.eye(2)[i])) for n in range(4)]
-        expected = (-11 * values[0] + 18 * values[1] - 9 * values[2] + 2 * values[3]) / (6 * h)
-        assert_allclose(found[:, i], expected, rtol=1e-6)

@@ -1,0 +1,65 @@
+"""Functions made of one Chebyshev series for each segment between nodes, and their derivatives."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.polynomial import chebyshev, legendre
+
+from jaxbeam.compiling import compiled
+
+
+@compiled  # many small operations, which one by one would take seconds to compile
+def piecewise(nodes, series, x, derivatives) -> Float[Array, "order *place column"]:
+    """Functions given by one Chebyshev series for each segment between nodes, at positions x.
+
+    `series` is (segment, degree, column); the derivatives are by x, in the unit of the nodes.
+    """
+    x = jnp.asarray(x, float)
+    size = jnp.diff(nodes) / 2
+    segments, terms, modes = series.shape
+    stretched = [_differentiate(terms, d) @ series / size[:, None, None] ** d for d in derivatives]
+    series = jnp.stack(stretched, axis=2).reshape(segments, terms, len(derivatives) * modes)
+    segment = jnp.sum(x[..., None] >= nodes[1:-1], axis=-1)
+    local = (x - nodes[segment]) / size[segment] - 1
+    table = _chebyshev_table(local, terms)
+    masks = (segment[..., None] == s for s in range(segments))
+    parts = [jnp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
+    values = jnp.concatenate(parts, axis=-1) @ series.reshape(segments * terms, -1)
+    return jnp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
+
+
+@functools.cache
+def _differentiate(terms: int, times: int) -> np.ndarray:
+    """Matrix that differentiates a Chebyshev series `times` times, keeping its length."""
+    matrix = np.zeros((terms, terms))
+    matrix[: terms - times] = chebyshev.chebder(np.eye(terms), times)[: terms - times]
+    return matrix
+
+
+@functools.cache
+def to_chebyshev(terms: int) -> np.ndarray:
+    """Matrix from Legendre to Chebyshev coefficients, by the values at Chebyshev points."""
+    points = chebyshev.chebpts1(terms)
+    values = legendre.legvander(points, terms - 1)
+    scale = np.where(np.arange(terms) == 0, 1.0, 2.0)[:, None] / terms
+    return scale * (chebyshev.chebvander(points, terms - 1).T @ values)
+
+
+def _chebyshev_table(t, terms: int):
+    """Chebyshev polynomials of degree 0 to terms - 1 at t, along a new last axis.
+
+    Built by doubling, T_(k+j) = 2 T_k T_j - T_(k-j), which takes few steps and does not lose
+    accuracy.
+    """
+    axis = t.ndim
+    table = jnp.stack([jnp.ones_like(t), t], axis=axis)
+    while table.shape[axis] < terms:
+        # Plain slices: indexing would give the compiler several times as much to read.
+        last = 2 * jax.lax.slice_in_dim(table, -1, None, axis=axis)
+        lower = jax.lax.rev(jax.lax.slice_in_dim(table, 0, -1, axis=axis), (axis,))
+        higher = last * jax.lax.slice_in_dim(table, 1, None, axis=axis) - lower
+        table = jnp.concatenate([table, higher], axis=axis)
+    return jax.lax.slice_in_dim(table, 0, terms, axis=axis)

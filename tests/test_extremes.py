@@ -1,0 +1,47 @@
+"""Runs at the edge of sense: very heavy, very fast, very many modes. Finite, right, or told."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from experiments.benchmarks.baselines import reference_peaks
+from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.static import static_peak
+
+MASS = 0.535 * 0.6  # of the beam, kg
+CRITICAL = np.pi / 0.6 * np.sqrt(11.68 / 0.535)  # speed at which the first mode is in step, m/s
+
+
+def rig(modes: int, mass: float, speed: float, **run) -> jb.Case:
+    """The rig of the reference solutions, long enough for the vibration after the exit."""
+    return jb.Case(
+        jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=modes),
+        sensors=[jb.Sensor(x) for x in (0.15, 0.3, 0.45)],
+        loads=[jb.MovingMass(mass=mass, speed=speed)],
+        run=jb.Run(0.6 / speed + 0.5, **run),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mass", "speed"), [(100 * MASS, 0.5), (0.05, 5 * CRITICAL)])
+def test_heavy_and_fast_masses_agree_with_scipy(mass, speed):
+    with pytest.warns(ContactLossWarning):
+        record = jb.simulate(rig(3, mass, speed, sample_rate=200.0))
+    expected = reference_peaks([mass], [speed], modes=3)[0, 0]
+    assert_allclose(record.peak_deflection, expected, rtol=1e-6)
+    assert "would have to pull" in record.verdict
+
+
+@pytest.mark.slow
+def test_two_hundred_modes_of_a_slow_beam_hold_the_load_as_statics_say():
+    """Crossed slowly, the beam sags as it would under the load at rest, in the limit of modes."""
+    case = jb.Case(
+        jb.Beam(6.0, 1168.0, 5.35, damping_ratio=0.05, modes=200),
+        sensors=[jb.Sensor(3.0)],
+        loads=[jb.MovingMass(mass=0.5, times=[0.0, 0.2], positions=[2.99, 3.01])],
+        run=jb.Run(0.2, sample_rate=100.0),
+    )
+    record = jb.simulate(case)
+    assert np.isfinite(np.asarray(record.deflection)).all()
+    assert record.peak_deflection[0] < 2.001 * static_peak(case, np.array([3.0]))[0]
