@@ -4,7 +4,7 @@ The controllers themselves are in `control`.
 """
 
 import abc
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,15 +26,25 @@ class Measurement(eqx.Module):
     command: Float[Array, " actuator"]
 
 
+class OwnFilter(NamedTuple):
+    """A filter of the readings y of one sensor: x' = A x + B y, output C x + D y."""
+
+    sensor: int
+    A: Float[Array, "state state"]
+    B: Float[Array, " state"]
+    C: Float[Array, " state"]
+    D: Float[Array, ""]
+
+
 class AbstractController(eqx.Module):
     """Interface of all controllers.
 
     With a sampling `period` (s) a controller acts at 0, period, 2 period, ...; its command begins
     `delay` (s) later and is held until the next one. Without a period it acts at every instant,
     the limit of ever faster sampling; its memory then stays as it was at the start, so it must be
-    `memoryless`. Commands are rounded to `resolution` and kept within the actuators' limits by
-    the loop. To add a controller, write a file with a subclass and name it in
-    `jaxbeam.control.KINDS`.
+    `memoryless`, but for filters of its own, whose states join the plant. Commands are rounded to
+    `resolution` and kept within the actuators' limits by the loop. To add a controller, write a
+    file with a subclass and name it in `jaxbeam.control.KINDS`.
     """
 
     period: Float[Array, ""] | None = number(
@@ -74,6 +84,10 @@ class AbstractController(eqx.Module):
         self, memory: Any, measurement: Measurement, t: Float[Array, ""]
     ) -> tuple[Float[Array, " actuator"], Any]:
         """Commands, in the units of the actuators, at time t (s), and the memory after it."""
+
+    def own_filters(self) -> tuple[OwnFilter, ...]:
+        """Its filters where it acts at every instant; their outputs follow the readings."""
+        return ()
 
     def fault(self, case: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", before anything compiles; or None."""

@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
@@ -21,10 +20,10 @@ from jaxbeam.driver import AbstractDriver, Moment
 from jaxbeam.dynamics import Traffic, at_instant
 from jaxbeam.exponentials import GAUSS, NODES
 from jaxbeam.fields import known
-from jaxbeam.filters import analogue
 from jaxbeam.modes import Layout
 from jaxbeam.rig import Rig
 from jaxbeam.schedule import Schedule, merged
+from jaxbeam.sensed import sensed
 from jaxbeam.sensing import design, init, noise_samples, read
 from jaxbeam.statespace import LoadedBeam, state_space
 
@@ -49,48 +48,14 @@ def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> Schedule:
     return merged(samples, clock(period), delay, [clock(float(p)) for p in own], late, knots)
 
 
-def plant(model: LoadedBeam) -> tuple[Rig, Float[Array, "sensor state"]]:
-    """The rig with the states of its sensors' analogue filters, and what the sensors see of it.
-
-    Rows of acceleration sensors are zero: they see forces too.
-    """
-    case, rig = model.case, model.rig
-    states, modal = rig.states, 2 * model.scale.shape[0]
-    parts, feeds, rows = [rig.state_matrix[0]], [], []
-    for sensor in case.sensors:
-        derivative = {"slope": 1, "strain": 2}.get(sensor.quantity, 0)
-        shape = rig.shapes(sensor.position, (derivative,))[0]
-        if sensor.quantity == "strain":
-            shape = -sensor.fibre_distance * shape
-        if sensor.quantity == "acceleration":
-            shape = jnp.zeros_like(shape)
-        first = 1 if sensor.quantity == "velocity" else 0
-        row = jnp.zeros(states).at[first:modal:2].set(shape)
-        if sensor.filter is None or sensor.filter.realisation != "analogue":
-            rows.append((row, None))
-            continue
-        matrix, column, output, _ = analogue(sensor.filter)
-        rows.append((output, len(parts)))
-        parts.append(matrix)
-        feeds.append((len(parts) - 1, jnp.outer(column, row)))
-    starts = np.cumsum([0, *(part.shape[0] for part in parts)])
-    total = int(starts[-1])
-    whole = block_diag(*parts)
-    for i, feed in feeds:
-        whole = whole.at[starts[i] : starts[i + 1], :states].set(feed)
-    seen = jnp.zeros((len(rows), total))
-    for i, (row, place) in enumerate(rows):
-        start = 0 if place is None else starts[place]
-        seen = seen.at[i, start : start + row.shape[0]].set(row)
-    command = jnp.zeros((total, rig.command_matrix.shape[1])).at[:states].set(rig.command_matrix)
-    wide = eqx.tree_at(lambda r: (r.state_matrix, r.command_matrix), rig, (whole[None], command))
-    return wide, seen
-
-
 class Loop(AbstractDriver):
-    """The driver made of the controller of a case. Lanes share the controller, not its memory."""
+    """The driver made of the controller of a case. Lanes share the controller, not its memory.
+
+    `designed` is that memory at the start, which holds what the controller works out beforehand.
+    """
 
     model: LoadedBeam
+    designed: Any
     rig: Rig
     seen: Float[Array, "sensor state"]
     traffic: Traffic
@@ -102,7 +67,7 @@ class Loop(AbstractDriver):
 
     def start(self, lanes: int) -> Any:
         controller, case = self.model.case.controller, self.model.case
-        memory = _every_lane(controller.init(self.model), lanes)
+        memory = _every_lane(self.designed, lanes)
         commands = jnp.zeros((len(case.actuators), lanes))
         if controller.period is None:
             return memory, commands
@@ -145,7 +110,7 @@ class Loop(AbstractDriver):
 
     def at_instants(self, states: Float[Array, "time state"], times: Float[Array, " time"]):
         """Commands (time, actuator) of a law at every instant, for a single lane."""
-        own = _every_lane(self.model.case.controller.init(self.model), 1)
+        own = _every_lane(self.designed, 1)
         return jax.vmap(lambda state, time: self._answer(own, state[:, None], time)[:, 0])(
             states, times
         )
@@ -153,8 +118,10 @@ class Loop(AbstractDriver):
     def _answer(self, own, state, time):
         """Commands (actuator, lane) of a law at every instant, to a state."""
         sensors, seen = self.model.case.sensors, self.seen @ state
-        readings = [read(s, None, None, value)[0] for s, value in zip(sensors, seen, strict=True)]
-        shown = jnp.stack(readings) if readings else seen
+        pairs = zip(sensors, seen[: len(sensors)], strict=True)
+        readings = [read(sensor, None, None, value)[0] for sensor, value in pairs]
+        # What filters of the law's own give follows.
+        shown = jnp.stack([*readings, *seen[len(sensors) :]]) if seen.shape[0] else seen
         none = jnp.zeros((len(self.model.case.actuators), state.shape[-1]))
         wanted, _ = self._step(own, shown, state, none, time)
         return self._limited(wanted)
@@ -278,7 +245,7 @@ def _choose(condition, new, old):
 def make_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) -> Loop:
     """The driver for a case that has a controller; its `rig` is the plant to integrate."""
     model = state_space(case, layout=layout)
-    wide, seen = plant(model)
+    wide, seen = sensed(model)
     controller = case.controller
     if controller.period is None:
         sections, noise = (None,) * len(case.sensors), None
@@ -292,4 +259,5 @@ def make_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) ->
     beam = case.beam
     most = beam.length * jnp.sqrt(beam.linear_density * beam.length / 2)
     bound = jnp.full(wide.states, jnp.inf).at[0 : 2 * beam.modes : 2].set(most)
-    return Loop(model, wide, seen, loads, schedule, sections, noise, bound, inner)
+    designed = controller.init(model)  # once: it may solve Riccati equations
+    return Loop(model, designed, wide, seen, loads, schedule, sections, noise, bound, inner)

@@ -22,10 +22,11 @@ from jaxtyping import Complex, Float
 from jaxbeam.case import Case, known_case, replace
 from jaxbeam.compiling import compiled
 from jaxbeam.fields import known
-from jaxbeam.linear_loop import Clock, OpenLoop, linear, open_loop, prepared, through
+from jaxbeam.linear_loop import linear, prepared
 from jaxbeam.loads import motion
 from jaxbeam.modes import lay_out
 from jaxbeam.motion import NEVER
+from jaxbeam.open_loop import Clock, OpenLoop, open_loop, through
 
 TURN = 0.15  # rad by which the fastest mode may turn in a step along a transition
 

@@ -19,6 +19,7 @@ import jaxbeam as jb
 from jaxbeam.loop import loop_schedule
 from jaxbeam.plan import Plan, form
 from jaxbeam.sensing import noise_samples
+from jaxbeam.simulate import readings
 from tests.loop_as_oracle import expected, span_of
 
 TIMES = np.linspace(0.0, 0.4, 81)
@@ -149,6 +150,17 @@ def test_noise_is_what_the_controller_hears_and_the_record_keeps():
     assert_allclose(record.measured, np.repeat(read, 2, axis=0)[:101], rtol=1e-12)
     # The last command too is that just after the controller acted.
     assert_allclose(record.command, -1000.0 * record.measured, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_fits_see_the_readings_of_a_loop_without_noise():
+    """Filtered at the loop's ticks, where samples lie between: not as of an uncontrolled log."""
+    silent = LOOPS["delay beyond two periods, filter at the sensor's own clock"]
+    noisy = dataclasses.replace(silent.sensors[0], noise=jnp.array(1e-3))
+    case = dataclasses.replace(silent, sensors=(noisy,))
+    found = readings(case, jnp.asarray(TIMES), planned(case, TIMES, 2))
+    truth = expected(silent, TIMES).shown
+    assert_allclose(found, truth, rtol=0, atol=1e-9 * np.max(np.abs(truth)))
 
 
 @pytest.mark.slow

@@ -8,13 +8,14 @@ from jaxtyping import Array, Float
 
 from jaxbeam.controller import Measurement
 from jaxbeam.estimation.sampled import Transition
-from jaxbeam.statespace import LoadedBeam, StateSpace
+from jaxbeam.statespace import LoadedBeam
 
 
 class FixedGain(eqx.Module):
     """Memory of such an estimator: its design, the state it believes in, the command before.
 
-    The reading expected of a state is C x + D u + offset.
+    The reading expected of a state is C x + D u + offset. The first `own` states are those of the
+    plant, which others may follow that the sensors add.
     """
 
     transition: Transition
@@ -24,6 +25,12 @@ class FixedGain(eqx.Module):
     gain: Float[Array, "state sensor"]
     state: Float[Array, " state"]
     command: Float[Array, " actuator"]
+    own: int = eqx.field(static=True)
+
+    @property
+    def plant_state(self) -> Float[Array, " own"]:
+        """The states of the plant."""
+        return self.state[: self.own]
 
     def corrected(self, measurement: Measurement) -> "FixedGain":
         """The memory after the next tick."""
@@ -34,11 +41,15 @@ class FixedGain(eqx.Module):
 
 
 def at_rest(
-    model: LoadedBeam, plant: StateSpace, transition: Transition, gain: Float[Array, "..."]
+    model: LoadedBeam,
+    transition: Transition,
+    C: Float[Array, "sensor state"],
+    D: Float[Array, "sensor actuator"],
+    gain: Float[Array, "state sensor"],
 ) -> FixedGain:
     """The memory at the start of a run, from rest."""
-    state, command = jnp.zeros(plant.A.shape[0]), jnp.zeros(plant.B.shape[1])
-    return FixedGain(transition, plant.C, plant.D, offsets(model), gain, state, command)
+    state, command = jnp.zeros(C.shape[1]), jnp.zeros(D.shape[1])
+    return FixedGain(transition, C, D, offsets(model), gain, state, command, model.rig.states)
 
 
 def offsets(model: LoadedBeam) -> Float[Array, " sensor"]:

@@ -1,6 +1,7 @@
 """Kalman filters at the ticks of a controller: time-invariant, or along a crossing."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,12 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.controller import Measurement
+from jaxbeam.estimation.chain import Chain, Sight, chain, sight
 from jaxbeam.estimation.fixed import at_rest, offsets
 from jaxbeam.estimation.gains import filter_gain, sampled_kalman_gain
 from jaxbeam.estimation.observability import modes_of, unseen_fault
-from jaxbeam.estimation.sampled import Ticks, ticks
+from jaxbeam.estimation.sampled import ROUNDING, ticks
 from jaxbeam.estimator import AbstractEstimator, Estimate
-from jaxbeam.fields import POSITIVE, choice, is_known, known, number
+from jaxbeam.fields import POSITIVE, choice, count, is_known, known, number
 from jaxbeam.holds import balance
 from jaxbeam.statespace import LoadedBeam
 from jaxbeam.stretches import symmetric
@@ -30,8 +32,10 @@ class Kalman(AbstractEstimator):
     weights are "estimated" too, starting from what the design believes of them with standard
     deviation `weight_deviation`. When and how fast they cross, and their inertia, are known.
 
-    The beam is at rest one period before the first tick. Filters, delays and clocks of sensors are
-    not modelled, nor is what the white forces do to an accelerometer at once.
+    Filters of the sensors and their delays are part of the model, so that its surprises are white;
+    delays may `reach` over so many periods. Noise is that of the samples: behind a digital filter
+    it is coloured. The beam is at rest one period before the first tick. Not modelled are clocks
+    of the sensors' own, nor what the white forces do to an accelerometer at once.
     """
 
     process_noise: Float[Array, " *mode"] = number(
@@ -47,39 +51,45 @@ class Kalman(AbstractEstimator):
     weight_deviation: Float[Array, " *load"] | None = number(
         "N", "standard deviation of the weights as believed", POSITIVE, default=None
     )
+    reach: int = count("periods that delays of sensors reach back", default=1)
 
     def init(self, model):
-        intensity, covariance = self.intensity(model), self.reading_covariance(model)
-        clock = ticks(model.case.controller)
-        if self.loads == "ignored":
-            plant = model.unloaded
-            transition = clock.transition(lambda t: (plant.A, plant.B), intensity, balance(plant.A))
-            gain, _ = sampled_kalman_gain(transition.drift, plant.C, transition.noise, covariance)
-            return at_rest(model, plant, transition, gain)
+        view, clock = sight(model), ticks(model.case.controller)
+        wide, intensity = view.model, self.intensity(view.model)
         states, loads = intensity.shape[0], len(model.case.loads)
+        variance, scale = self.reading_variance(model), balance(wide.unloaded.A)
+        if self.loads == "ignored":
+            plant = view.behind(wide.unloaded)
+            behind = chain(model, variance, clock, states, self.reach)
+            transition = behind.onward(lambda t: plant, intensity, scale)
+            C, D = behind.rows(plant.C, plant.D)
+            gain, _ = sampled_kalman_gain(transition.drift, C, transition.noise, behind.noise)
+            return at_rest(model, transition, C, D, gain)
+        behind = chain(model, variance, clock, states + loads, self.reach)
         spread = jnp.zeros(loads)
         if self.weight_deviation is not None:
             spread = jnp.broadcast_to(self.weight_deviation**2, (loads,))
+        weights = jnp.zeros(behind.size).at[states : states + loads]
         return Crossing(
-            model,
-            clock,
-            jnp.append(balance(model.unloaded.A), jnp.ones(loads)),
+            view,
+            behind,
+            model.rig.states,
+            jnp.append(scale, jnp.ones(loads)),
             jnp.pad(intensity, (0, loads)),
-            covariance,
-            jnp.concatenate([jnp.zeros(states), model.weights]),
-            jnp.diag(jnp.concatenate([jnp.zeros(states), spread])),
+            weights.set(model.weights),
+            jnp.diag(weights.set(spread)),
             jnp.zeros(len(model.case.actuators)),
         )
 
     def step(self, memory, measurement, t):
         if self.loads == "ignored":
             memory = memory.corrected(measurement)
-            return Estimate(memory.state), memory
+            return Estimate(memory.plant_state), memory
         memory = memory.corrected(measurement, t)
-        state, weights = jnp.split(memory.state, [memory.model.rig.states])
         if self.loads == "known":
-            return Estimate(state), memory
-        return Estimate(state, jnp.where(memory.model.traffic.on_beam(t), weights, 0.0)), memory
+            return Estimate(memory.plant_state), memory
+        on_beam = memory.view.model.traffic.on_beam(t)
+        return Estimate(memory.plant_state, jnp.where(on_beam, memory.weights, 0.0)), memory
 
     def intensity(self, model: LoadedBeam) -> Square:
         """Intensity of the white noise in the rates of the states."""
@@ -88,12 +98,12 @@ class Kalman(AbstractEstimator):
         own = jnp.zeros(model.rig.states - 2 * modes)
         return jnp.diag(jnp.concatenate([jnp.zeros(modes), force, own]))
 
-    def reading_covariance(self, model: LoadedBeam) -> Float[Array, "sensor sensor"]:
-        """Covariance of the noise of the readings."""
+    def reading_variance(self, model: LoadedBeam) -> Float[Array, " sensor"]:
+        """Variance of the noise of each reading."""
         sensors = model.case.sensors
         if self.measurement_noise is None:
-            return jnp.diag(jnp.stack([sensor.noise_covariance for sensor in sensors]))
-        return jnp.diag(jnp.broadcast_to(self.measurement_noise**2, (len(sensors),)))
+            return jnp.stack([sensor.noise_covariance for sensor in sensors])
+        return jnp.broadcast_to(self.measurement_noise**2, (len(sensors),))
 
     def fault(self, case, plant):
         if not case.sensors:
@@ -102,6 +112,12 @@ class Kalman(AbstractEstimator):
             for i, sensor in enumerate(case.sensors):
                 if sensor.noise is None or (is_known(sensor.noise) and known(sensor.noise) == 0):
                     return f"measurement_noise must be given, as sensors.{i} has no noise"
+        period = case.controller.period
+        for i, sensor in enumerate(case.sensors):
+            if sensor.delay is not None and is_known(sensor.delay) and is_known(period):
+                back = math.ceil(known(sensor.delay) / known(period) - ROUNDING)
+                if back > self.reach:
+                    return f"reach must be at least {back}, the periods of sensors.{i}.delay"
         if self.loads != "ignored" and not case.loads:
             return "loads must be 'ignored': there are none"
         if (self.loads == "estimated") != (self.weight_deviation is not None):
@@ -127,44 +143,54 @@ class Prediction(NamedTuple):
 
 
 class Crossing(eqx.Module):
-    """Memory of a filter along a crossing; the weights of the loads are its last states.
+    """Memory of a filter along a crossing.
 
-    `scale` is the size of the states, `intensity` that of the white noise in their rates, `noise`
-    the covariance of that in the readings.
+    The first `own` states are those of the plant; those of analogue filters follow, the weights of
+    the loads, and what else the sensors add (see `chain`). `scale` is the size of the states of the
+    plant with filters and weights, `intensity` that of the white noise in their rates.
     """
 
-    model: LoadedBeam
-    clock: Ticks
-    scale: Float[Array, " state"]
-    intensity: Square
-    noise: Float[Array, "sensor sensor"]
+    view: Sight
+    behind: Chain
+    own: int = eqx.field(static=True)
+    scale: Float[Array, " loaded"]
+    intensity: Float[Array, "loaded loaded"]
     state: Float[Array, " state"]
     covariance: Square
     command: Float[Array, " actuator"]
+
+    @property
+    def plant_state(self) -> Float[Array, " own"]:
+        """The states of the plant."""
+        return self.state[: self.own]
+
+    @property
+    def weights(self) -> Float[Array, " load"]:
+        """The weights of the loads (N)."""
+        return self.state[self.view.model.rig.states : self.behind.plant]
 
     def predicted(self, command: Float[Array, " actuator"], t: Float[Array, ""]) -> Prediction:
         """What is expected at the tick at t (s), the given command having acted until then."""
 
         def plant(time):
-            system = self.model.augmented(time)
-            return system.A, system.B
+            return self.view.behind(self.view.model.augmented(time))
 
-        transition = self.clock.transition(plant, self.intensity, self.scale, t)
+        transition = self.behind.onward(plant, self.intensity, self.scale, t)
         state = transition.mean(self.state, self.command, command)
         covariance = transition.covariance(self.covariance)
-        now = self.model.augmented(t)
-        readings = now.C @ state + now.D @ command + offsets(self.model)
-        spread = now.C @ covariance @ now.C.T + self.noise
-        return Prediction(state, covariance, readings, spread, now.C)
+        now = plant(t)
+        C, D = self.behind.rows(now.C, now.D)
+        readings = C @ state + D @ command + offsets(self.view.model)
+        return Prediction(state, covariance, readings, C @ covariance @ C.T + self.behind.noise, C)
 
     def corrected(self, measurement: Measurement, t: Float[Array, ""]) -> "Crossing":
         """The memory after the tick at t (s)."""
-        expected = self.predicted(measurement.command, t)
-        gain = filter_gain(expected.covariance, expected.C, self.noise)
+        expected, noise = self.predicted(measurement.command, t), self.behind.noise
+        gain = filter_gain(expected.covariance, expected.C, noise)
         state = expected.state + gain @ (measurement.readings - expected.readings)
         # Joseph's form: symmetric and not negative, whatever the rounding.
         left = jnp.eye(state.shape[0]) - gain @ expected.C
-        covariance = left @ expected.covariance @ left.T + gain @ self.noise @ gain.T
+        covariance = left @ expected.covariance @ left.T + gain @ noise @ gain.T
         return dataclasses.replace(
             self, state=state, covariance=symmetric(covariance), command=measurement.command
         )

@@ -34,11 +34,12 @@ class Observer(AbstractEstimator):
         plant, clock = model.unloaded, ticks(model.case.controller)
         still = jnp.zeros_like(plant.A)
         transition = clock.transition(lambda t: (plant.A, plant.B), still, balance(plant.A))
-        return at_rest(model, plant, transition, self.gain(plant, transition.drift, clock))
+        gain = self.gain(plant, transition.drift, clock)
+        return at_rest(model, transition, plant.C, plant.D, gain)
 
     def step(self, memory: FixedGain, measurement, t):
         memory = memory.corrected(measurement)
-        return Estimate(memory.state), memory
+        return Estimate(memory.plant_state), memory
 
     def gain(
         self, plant: StateSpace, drift: Float[Array, "state state"], clock: Ticks

@@ -4,14 +4,15 @@ The command of a tick begins a delay later: within each period, first the comman
 then the one that acts at its end.
 """
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbeam.controller import AbstractController
 
@@ -41,6 +42,15 @@ class Transition(eqx.Module):
         """The covariance at the end of the period, for that at its start."""
         return self.drift @ covariance @ self.drift.T + self.noise
 
+    def then(self, after: "Transition") -> "Transition":
+        """This one and, of the same period, what comes after it."""
+        return Transition(
+            after.drift @ self.drift,
+            after.drift @ self.before + after.before,
+            after.drift @ self.after + after.after,
+            after.covariance(self.noise),
+        )
+
 
 class Ticks(eqx.Module):
     """The period of a controller (s), and how far into it new commands begin; None: at once."""
@@ -61,17 +71,32 @@ class Ticks(eqx.Module):
         one exponential between any two changes of the command. In states over their `scale`, from
         `holds.balance`, numbers should be of like size.
         """
-        start = jnp.asarray(t - self.period)
-        starts, spans = start[None], self.period[None]
-        if self.late is not None:
-            starts = jnp.stack([start, start + self.late])
-            spans = jnp.stack([self.late, self.period - self.late])
-        parts = jax.vmap(lambda *at: _stretch(plant, intensity, scale, *at))(starts, spans)
-        drift, push, noise = (part[-1] for part in parts)
-        if self.late is None:
-            return Transition(drift, jnp.zeros_like(push), push, noise)
-        first, before, early = (part[0] for part in parts)
-        return Transition(drift @ first, drift @ before, push, noise + drift @ early @ drift.T)
+        parts, _, _ = self.parts(plant, intensity, scale, t)
+        return functools.reduce(Transition.then, parts)
+
+    def parts(
+        self,
+        plant: Plant,
+        intensity: Square,
+        scale: Float[Array, " state"],
+        t: Number | float = 0.0,
+        stops: Sequence[Number] = (),
+    ) -> tuple[list[Transition], Float[Array, " part"], Bool[Array, " part"]]:
+        """The same in parts, cut where the command changes and at some `stops` (s into the period).
+
+        And where in the period each part ends (s), and whether the command before acts in it.
+        """
+        late = jnp.zeros(()) if self.late is None else self.late
+        cuts = [*stops, *([] if self.late is None else [late])]
+        ends = jnp.sort(jnp.stack([*cuts, self.period]))
+        starts = jnp.concatenate([jnp.zeros(1), ends[:-1]])
+        early = (ends <= late)[:, None, None]
+        drifts, pushes, noises = jax.vmap(lambda *at: _stretch(plant, intensity, scale, *at))(
+            t - self.period + starts, ends - starts
+        )
+        before, after = jnp.where(early, pushes, 0.0), jnp.where(early, 0.0, pushes)
+        columns = zip(drifts, before, after, noises, strict=True)
+        return [Transition(*column) for column in columns], ends, early[:, 0, 0]
 
 
 def ticks(controller: AbstractController) -> Ticks:
