@@ -8,38 +8,55 @@ import subprocess
 import zlib
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.interpolate
 import scipy.io
 import scipy.signal
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.cli import main
-from jaxbeam.control import DiscreteLQR, Feedback, FiniteLQR
+from jaxbeam.control import DiscreteLQR, Feedback, FiniteLQR, ScheduledLQR
+from jaxbeam.controller import Measurement
 from jaxbeam.export import Gains, export_gains, read_gains, write_gains
 from jaxbeam.modes import lay_out
 
 RANDOM = np.random.default_rng(0)
 SIGNALS = (tuple((f"q_{i}", "m kg^0.5") for i in range(4)), (("u_0", "V"), ("u_1", "N")))
-TABLE = Gains(
-    np.sort(np.append(RANDOM.uniform(0, 1, 9), [0.0, 1.0])),
-    1e3 * RANDOM.normal(size=(11, 2, 4)),
-    RANDOM.normal(size=(2, 4)),
-    np.insert(scipy.signal.butter(3, 0.1, output="sos"), 0, 1.0, axis=1),
-    2e-3,
-    0.6,
-    *SIGNALS,
-)
+FILTER = np.insert(scipy.signal.butter(3, 0.1, output="sos"), 0, 1.0, axis=1)
+POINTS = np.sort(np.append(RANDOM.uniform(0, 1, 9), [0.0, 1.0]))
+
+
+def made(masses, speeds, fade=np.inf, between="interpolated") -> Gains:
+    """Some gains."""
+    masses, speeds = np.array(masses), np.array(speeds)
+    grid = masses.size, speeds.size
+    table = 1e3 * RANDOM.normal(size=(*grid, POINTS.size, 2, 4))
+    rest = RANDOM.normal(size=(*grid, 2, 4))
+    numbers = 2e-3, 0.6, fade, between
+    return Gains(masses, speeds, POINTS, table, rest, FILTER, *numbers, *SIGNALS)
+
+
+TABLE = made([0.0], [0.0])
+FAMILY = made([0.2, 0.3, 0.5], [1.0, 2.5], fade=0.07)
+NEAREST = dataclasses.replace(FAMILY, between="nearest")
 CONSTANT = dataclasses.replace(
     TABLE,
     shares=np.zeros(1),
-    table=TABLE.rest[None],
+    table=TABLE.rest[:, :, None],
     filters=np.zeros((0, 7)),
     crossing=0.0,
 )
-SHARES = [-0.1, 0.0, 0.37, 0.5, float(TABLE.shares[4]), 0.999, 1.0, 1.7]
+EVERY = {"table": TABLE, "constant": CONSTANT, "family": FAMILY, "nearest": NEAREST}
+every = pytest.mark.parametrize("gains", EVERY.values(), ids=EVERY)
+SHARES = [-0.1, 0.0, 0.37, 0.5, float(POINTS[4]), 0.999, 1.0, 1.7]
+SINCE = [0.0] * 7 + [0.11]
+MASSES = [0.3, 0.1, 0.2, 0.24, 0.3, 0.44, 0.5, 0.8]
+SPEEDS = [1.0, 2.0, 1.7, 0.5, 3.0, 2.5, 2.4, 1.1]
+INPUTS = list(zip(SHARES, SINCE, MASSES, SPEEDS, strict=True))
 STATES = RANDOM.normal(size=(len(SHARES), 4))
 WEIGHTS = {"state_weight": [1e3, 1e2, 0.1, 0.01, 0.0], "command_weight": [9e-5], "period": 2e-3}
 TDMS = pytest.mark.skipif(importlib.util.find_spec("nptdms") is None, reason="needs npTDMS")
@@ -51,41 +68,54 @@ def same(found, expected):
         assert_array_equal(getattr(found, field.name), getattr(expected, field.name))
 
 
-@pytest.mark.parametrize("gains", [TABLE, CONSTANT])
+@every
 @pytest.mark.parametrize("ending", [".csv", ".mat", pytest.param(".tdms", marks=TDMS)])
 def test_what_is_read_back_runs_identically(gains, ending, tmp_path):
     path = tmp_path / f"gains{ending}"
     write_gains(gains, path)
     back = read_gains(path)
     same(back, gains)
-    for share, state in zip(SHARES, STATES, strict=True):
-        assert_array_equal(back.command(state, share), gains.command(state, share))
+    for given, state in zip(INPUTS, STATES, strict=True):
+        assert_array_equal(back.command(state, *given), gains.command(state, *given))
     with pytest.raises(FileExistsError, match="exists already"):
         write_gains(gains, path)
 
 
-def test_commands_are_interpolated():
-    """As numpy interpolates; nothing before the entry, the last gain after the exit."""
-    for share, state in zip(SHARES, STATES, strict=True):
-        every = TABLE.table.reshape(11, -1).T
-        gain = np.array([np.interp(share, TABLE.shares, one) for one in every]).reshape(2, 4)
-        gain = np.zeros((2, 4)) if share < 0 else TABLE.rest if share >= 1 else gain
-        assert_allclose(TABLE.command(state, share), -gain @ state, rtol=1e-11, atol=1e-12)
+@every
+def test_commands_are_interpolated(gains):
+    """As numpy and scipy interpolate; nothing before the entry, the last gain after the exit."""
+    method = "nearest" if gains.between == "nearest" else "linear"
+    grid, points = gains.rest.shape[:2], gains.shares.size
+    along = np.moveaxis(gains.table, 2, -1).reshape(-1, points)
+    for (share, since, mass, speed), state in zip(INPUTS, STATES, strict=True):
+        members = np.array([np.interp(share, gains.shares, one) for one in along])
+        if share >= 1 and points > 1:
+            members = gains.rest.ravel() * np.exp(-since / gains.fade)
+        members = members.reshape(gains.rest.shape)
+        gain = members[0, 0]
+        if grid != (1, 1):
+            axes = gains.masses, gains.speeds
+            held = np.clip([mass, speed], [g[0] for g in axes], [g[-1] for g in axes])
+            (gain,) = scipy.interpolate.interpn(axes, members, held, method)
+        expected = -gain @ state if share >= 0 else np.zeros(2)
+        found = gains.command(state, share, since, mass, speed)
+        assert_allclose(found, expected, rtol=1e-11, atol=1e-10)
 
 
 def test_other_programs_can_read_them(tmp_path):
     write_gains(TABLE, tmp_path / "gains.mat")
     content = scipy.io.loadmat(tmp_path / "gains.mat")
     assert_array_equal(content["table"], TABLE.table)
+    assert content["rest"].shape == (1, 1, 2, 4)
     assert content["period"].item() == 2e-3
     write_gains(TABLE, tmp_path / "gains.csv")
     first, heading, *rows = (tmp_path / "gains.csv").read_text().splitlines()
     about = json.loads(first[2:])
     assert about["period_s"] == 2e-3 and about["columns"][0] == ["q_0", "m kg^0.5"]
-    assert heading.split(",")[2] == "K u_0/q_0 [V/(m kg^0.5)]"
-    numbers = [float(x) for row in rows if row.startswith("gain") for x in row.split(",")[1:]]
+    assert heading.split(",")[4] == "K u_0/q_0 [V/(m kg^0.5)]"
+    numbers = [float(x) for row in rows if row.startswith("gain") for x in row.split(",")[3:]]
     shares, table = np.array(numbers).reshape(11, 9)[:, 0], np.array(numbers).reshape(11, 9)[:, 1:]
-    parts = [[2e-3, 0.6], shares, table, TABLE.rest, TABLE.filters]
+    parts = [[2e-3, 0.6, np.inf, 0.0, 0.0], shares, table, TABLE.rest, TABLE.filters]
     whole = np.concatenate([np.ravel(part) for part in parts]).astype("<f8").tobytes()
     assert about["crc32"] == zlib.crc32(whole)
 
@@ -94,38 +124,39 @@ def test_other_programs_can_read_them(tmp_path):
 def test_damage_is_noticed(ending, tmp_path):
     path = tmp_path / f"gains{ending}"
     write_gains(TABLE, path)
-    number = TABLE.table[3, 1, 2]
+    number = TABLE.table[0, 0, 3, 1, 2]
     if ending == ".csv":
         path.write_text(path.read_text().replace(repr(float(number)), repr(float(number) + 1e-9)))
     else:
         content = scipy.io.loadmat(path)
-        content["table"][3, 1, 2] += 1e-9
+        content["table"][0, 0, 3, 1, 2] += 1e-9
         scipy.io.savemat(path, {k: v for k, v in content.items() if not k.startswith("__")})
     with pytest.raises(ValueError, match="do not give the check values"):
         read_gains(path)
 
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
-@pytest.mark.parametrize("gains", [TABLE, CONSTANT])
+@every
 def test_a_c_program_gives_the_same_commands(gains, tmp_path):
     write_gains(gains, tmp_path / "gains.h")
     calls = "".join(
         f"{{ double z[] = {{{', '.join(map(repr, state.tolist()))}}};\n"
-        f'jaxbeam_command({share!r}, z, u); printf("%a %a\\n", u[0], u[1]); }}\n'
-        for share, state in zip(SHARES, STATES, strict=True)
+        f"jaxbeam_command({mass!r}, {speed!r}, {share!r}, {since!r}, z, u);\n"
+        'printf("%a %a\\n", u[0], u[1]); }\n'
+        for (share, since, mass, speed), state in zip(INPUTS, STATES, strict=True)
     )
     (tmp_path / "run.c").write_text(
         '#include <stdio.h>\n#include "gains.h"\n'
         f"int main(void) {{ double u[JAXBEAM_ACTUATORS];\n{calls}"
         'printf("%a %a\\n", jaxbeam_test_command[0], jaxbeam_test_command[1]); return 0; }\n'
     )
-    build = [COMPILER, "-std=c99", "-O2", "-ffp-contract=off", "-o", "run", "run.c"]
+    build = [COMPILER, "-std=c99", "-O2", "-ffp-contract=off", "-o", "run", "run.c", "-lm"]
     subprocess.run(build, cwd=tmp_path, check=True)
     printed = subprocess.run(
         [tmp_path / "run"], capture_output=True, text=True, check=True
     ).stdout.splitlines()
     found = [[float.fromhex(word) for word in line.split()] for line in printed]
-    expected = [gains.command(z, share) for share, z in zip(SHARES, STATES, strict=True)]
+    expected = [gains.command(z, *given) for given, z in zip(INPUTS, STATES, strict=True)]
     assert_array_equal(found, [*expected, gains.test_command])
 
 
@@ -172,9 +203,41 @@ def test_tables_are_those_of_the_design():
         table = case.controller.gains(jb.state_space(case, layout=layout))
         return jnp.stack([table(jnp.asarray(share)) for share in (0.0, 0.5, 0.98, 1.0)])
 
-    found = gains.table[[0, 25, 49, 50]]
+    found = gains.table[0, 0, [0, 25, 49, 50]]
     assert_allclose(found, designed(case), rtol=1e-9, atol=1e-9 * np.max(np.abs(found)))
     assert gains.crossing == pytest.approx(0.6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("between", ["interpolated", "nearest"])
+def test_families_run_as_in_a_simulation(between, tmp_path):
+    """Between masses, along the crossing, and while the gain fades."""
+    end = {"terminal_weight": [1e3, 1e2, 0.1, 0.01, 1e-3], "after": "fade", "fade_time": 0.05}
+    family = {"masses": [0.2, 0.4], "between": between, "loads": "known"}
+    law = ScheduledLQR(**WEIGHTS, **end, **family, points=210)
+    case = jb.replace(rig(law), {"loads.0.mass": 0.25})
+    write_gains(export_gains(case, 11), tmp_path / "gains.csv")
+    gains, layout = read_gains(tmp_path / "gains.csv"), lay_out(case)
+    shares = np.array([-0.1, 0.2, 0.5, 1.0 + 1e-9, 1.5])
+    states = RANDOM.normal(size=(shares.size, 5)) * [1e-3, 1e-4, 0.03, 0.01, 0.2]
+
+    @eqx.filter_jit
+    def asked(case, states, times):
+        memory = law.init(jb.state_space(case, layout=layout))
+
+        def one(state, t):
+            return law.step(memory, Measurement(jnp.zeros(2), state, jnp.zeros(1)), t)[0]
+
+        return jax.vmap(one)(states, times)
+
+    expected = asked(case, jnp.asarray(states), jnp.asarray(0.6 * shares))
+    weight = 0.25 * 9.81
+    for state, share, command in zip(states, shares, expected, strict=True):
+        since = max(0.0, 0.6 * (share - 1))
+        found = gains.command(np.append(state, weight), share, since, 0.25, 1.0)
+        assert_allclose(found, command, rtol=1e-9)
+    assert gains.columns[-1] == ("load_0", "N")
+    assert gains.crossing == pytest.approx(0.6) and gains.fade == 0.05
 
 
 @pytest.mark.parametrize(
@@ -182,7 +245,6 @@ def test_tables_are_those_of_the_design():
     [
         (Feedback([1.0], period=1e-3), "controller.kind cannot be exported"),
         (jb.StateFeedback([[0.0] * 5]), "controller.period is missing"),
-        (FiniteLQR(**WEIGHTS, after="fade", fade_time=0.1), "controller.after cannot be 'fade'"),
     ],
 )
 def test_what_cannot_be_exported(controller, message):

@@ -1,0 +1,93 @@
+"""The gains of the controller of a case, designed and tabulated."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbeam.case import Case
+from jaxbeam.checks import check
+from jaxbeam.compiling import compiled
+from jaxbeam.control import DiscreteLQR, StateFeedback
+from jaxbeam.control.lqr import LQR, AbstractScheduledRegulator, Schedule
+from jaxbeam.control.scheduled import Family, ScheduledLQR
+from jaxbeam.export.gains import Gains
+from jaxbeam.fields import known
+from jaxbeam.modes import lay_out
+from jaxbeam.sensing import design
+from jaxbeam.statespace import state_space
+
+
+def export_gains(case: Case, points: int = 1001) -> Gains:
+    """The gains of a case's controller, designed, and the digital filters of its sensors.
+
+    Gains that change over the crossing are tabulated at so many `points`. Where the controller
+    recognises its loads, that is left to the one who runs the table: there is no command before
+    the second gate, and the lightest mass is taken until the mass is told. Raises ValueError for a
+    faulty case, a controller without a period, and one that is no table of gains.
+    """
+    check(case)
+    law = case.controller
+    tabled = isinstance(law, AbstractScheduledRegulator)
+    if not (tabled or isinstance(law, LQR | DiscreteLQR | StateFeedback)):
+        raise ValueError(
+            "controller.kind cannot be exported: tables are made of 'state', 'lqr', 'dlqr',"
+            " 'lqr-finite', 'lqr-step', 'lqr-augmented' and 'lqr-scheduled'"
+        )
+    if law.period is None:
+        raise ValueError("controller.period is missing: a real controller samples; give its period")
+    if points < 2:
+        raise ValueError(f"a table needs at least two points, not {points}")
+    shares = np.linspace(0, 1, points) if tabled else np.zeros(1)
+    plant, grid, table, rest, crossing = _designed(case, lay_out(case), shares)
+    columns, commands = plant.states, plant.inputs
+    more = table.shape[-1] - len(columns)
+    if more and tabled:
+        columns += tuple((f"load_{i}", "N") for i in range(more))
+    elif more:
+        columns += tuple((f"last_{name}", unit) for name, unit in commands)
+    fade, (masses, speeds) = getattr(law, "fade_time", None), grid
+    return Gains(
+        np.asarray(masses),
+        np.asarray(speeds),
+        shares,
+        np.asarray(table),
+        np.asarray(rest),
+        _filters(case),
+        float(known(law.period)),
+        float(crossing),
+        np.inf if fade is None else float(known(fade)),
+        law.between if isinstance(law, ScheduledLQR) else "interpolated",
+        tuple(tuple(column) for column in columns),
+        tuple(tuple(command) for command in commands),
+    )
+
+
+def _filters(case: Case) -> np.ndarray:
+    """The digital filters of the sensors: rows of a sensor's index and one of its sections."""
+    rows = np.zeros((0, 7))
+    for i, sensor in enumerate(case.sensors):
+        sections = design(sensor, case.controller.period)
+        if sections is not None:
+            rows = np.concatenate([rows, np.insert(np.asarray(sections), 0, i, axis=1)])
+    return rows
+
+
+@compiled
+def _designed(case: Case, layout, shares):
+    """The plant designed for; masses and speeds; gains over a crossing and after it; its time (s).
+
+    Tables and gains have a mass and a speed as their first axes.
+    """
+    model, law = state_space(case, layout=layout), case.controller
+    designed = law.believed(model)
+    memory = law.gain if isinstance(law, StateFeedback) else law.prepare(model, designed)
+    one = jnp.zeros(1), jnp.zeros(1)
+    if isinstance(memory, Family):
+        tables = jax.vmap(jax.vmap(lambda each: jax.vmap(each.table)(shares)))(memory.schedules)
+        crossing = memory.length / memory.told[1]
+        grid = memory.masses, memory.speeds
+        return designed.unloaded, grid, tables, memory.schedules.rest, crossing
+    if isinstance(memory, Schedule):
+        table, crossing = jax.vmap(memory.table)(shares), memory.end - memory.start
+        return designed.unloaded, one, table[None, None], memory.rest[None, None], crossing
+    return designed.unloaded, one, memory[None, None, None], memory[None, None], 0.0
