@@ -156,6 +156,57 @@ def test_what_is_recognised_is_followed():
     assert_allclose(answers[4:], other[:, 0], rtol=1e-7)
 
 
+def test_a_way_is_found_from_deflections_alone():
+    """Static readings, with an offset, of a mass that travels to the left at a steady speed."""
+    settings = jb.Recognition(threshold=1e-6, until=0.4)
+    case = rig(mass=0.3)
+    offset = dataclasses.replace(case.sensors[2], offset=jnp.asarray(1e-4))
+    case = dataclasses.replace(case, sensors=(*case.sensors[:2], offset))
+    layout = lay_out(case)
+    times = 0.004 * jnp.arange(200)
+
+    @eqx.filter_jit
+    def run(case):
+        model = jb.state_space(case, layout=layout)
+        start = settings.init(model, model)
+        places = jnp.linspace(0, 0.6, start.line.shape[1])
+        sent = jnp.full(1, 0.7)
+
+        def tick(fit, t):
+            way = 0.6 - 0.8 * (t - 0.2)
+            on = (way > 0) & (way < 0.6)
+            line = jax.vmap(lambda each: jnp.interp(way, places, each))(start.line)
+            static = jnp.where(on, 0.3 * 9.81 * line, 0.0) + start.lift @ sent
+            readings = jnp.stack([static[0], jnp.asarray(7.0), static[1] + 1e-4])
+            before = eqx.tree_at(lambda m: m.fit, start, fit)
+            after = before.hear(Measurement(readings, jnp.zeros(5), sent), t)
+            return after.fit, (after.told(t)[0], after.speed, after.entry, after.mass)
+
+        return jax.lax.scan(tick, start.fit, times)[1]
+
+    told, speed, entry, mass = map(np.asarray, run(case))
+    at = np.argmax(told)
+    assert times[at] == pytest.approx(0.2 + 0.4 * 0.75, abs=0.01)
+    assert not told[:at].any() and told[at:].all()
+    assert_allclose(speed[at:], -0.8, rtol=0.01)
+    assert_allclose(entry[at:], 0.2, atol=0.005)
+    assert_allclose(mass[at:], 0.3, rtol=0.01)
+
+
+@pytest.mark.slow
+def test_a_load_is_recognised_without_gates():
+    recognition = jb.Recognition(threshold=2e-5, until=0.4)
+    gentle = WEIGHTS | {"command_weight": [1e-2], "period": 2e-3}
+    law = ScheduledLQR(**gentle, masses=[0.2, 0.6], speeds=[0.5, 1.0], recognition=recognition)
+    record = jb.simulate(rig(law, 0.5, 0.8, duration=1.1, sample_rate=500.0))
+    quiet = np.asarray(record.times) < 0.2 + 0.3 * 0.75
+    assert np.all(record.command[quiet] == 0)
+    assert np.max(np.abs(record.command)) > 0.01
+    found = jb.recognised(record, recognition)
+    assert abs(found.speed_error) < 0.1
+    assert abs(found.mass_error) < 0.1
+
+
 def test_influence_and_lift_are_the_static_ones():
     """But for the modes left out: of a beam on pins they are 2 L^3 / (EI pi^4) sum of n^-4."""
     case = rig()
@@ -196,6 +247,10 @@ def test_case_files_hold_schedules():
         (
             {"period": 0.004, "recognition": jb.Recognition([-0.05, 0.3], until=0.4)},
             "recognition.until must be beyond the second gate, at 0.5 of the way",
+        ),
+        (
+            {"period": 0.004, "recognition": jb.Recognition()},
+            "recognition.gates or threshold must be given, and not both",
         ),
         ({"after": "fade"}, "fade_time belongs to after = 'fade'"),
     ],

@@ -1,4 +1,4 @@
-"""Tables of gains over a crossing: cubics between the edges of short stretches of time."""
+"""Tables of gains over a crossing: polynomials between the edges of short stretches of time."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ from jaxbeam.stretches import NODES, Commands, Square, costs_to_go, riccati_rate
 # Backward in time P hastens, right before an event, to what the plant from then on demands: in the
 # last stretches, so many of them, edges come ever closer, each by a factor, so many times.
 LAST, CLOSER, LAYER = 8, 0.9, 105
-INSIDE = 1e-9  # of a stretch: how far within it its ends are looked at
+INSIDE = 1e-9  # of a stretch: how far within it its ends are looked at, step by step
 
 # State matrix and command matrix at a time (s).
 Plant = Callable[[Float[Array, ""]], tuple[Float[Array, "..."], Float[Array, "..."]]]
@@ -34,7 +34,7 @@ class GainTable(eqx.Module):
         i = jnp.clip(i, 0, self.pieces.shape[0] - 1)
         length = self.edges[i + 1] - self.edges[i]
         part = (share - self.edges[i]) / jnp.where(length > 0, length, 1.0)
-        powers = jnp.clip(part, 0.0, 1.0) ** np.arange(4)
+        powers = jnp.clip(part, 0.0, 1.0) ** np.arange(self.pieces.shape[1])
         return jnp.tensordot(powers, self.pieces[i], axes=1)
 
 
@@ -80,35 +80,67 @@ def finite_time(
     times = edges[:-1, None] + lengths[:, None] * NODES
     A, B = jax.vmap(jax.vmap(plant))(times)
     costs = costs_to_go(stretches(A, B, Q, R, lengths), terminal)
+    # The plant at the ends of a stretch, and its rates, from what it is at the nodes within.
+    A, B = (jnp.einsum("erj,sj...->esr...", AT_ENDS, part) for part in (A, B))
 
-    def gain(time, cost):
-        return jnp.linalg.solve(R, plant(time)[1].T @ cost)
+    def gains(A, B, cost, length):
+        """The gain, its rate and the rate of that, as the plant is given, by share of a stretch."""
 
-    def with_rate(time, cost):
-        rate = riccati_rate(cost, *plant(time), Q, R)
-        return jax.jvp(gain, (time, cost), (jnp.ones(()), rate))
+        def rate(cost, A, B):
+            return length * riccati_rate(cost, A, B, Q, R)
 
-    return _table(edges, with_rate, costs), costs
+        first = rate(cost, A[0], B[0])
+        second = jax.jvp(rate, (cost, A[0], B[0]), (first, A[1], B[1]))[1]
+        rows = [
+            B[0].T @ cost,
+            B[1].T @ cost + B[0].T @ first,
+            B[2].T @ cost + 2 * B[1].T @ first + B[0].T @ second,
+        ]
+        return jax.vmap(lambda row: jnp.linalg.solve(R, row))(jnp.stack(rows))
+
+    every = jax.vmap(gains)
+    starts = every(A[0], B[0], costs[:-1], lengths)
+    ends = every(A[1], B[1], costs[1:], lengths)
+    return _table(edges, starts, ends), costs
 
 
 def step_by_step(plant: Plant, edges: Float[Array, " edge"], Q: Square, R: Commands) -> GainTable:
     """Gains for the plant frozen at each time, eqs (3.10) and (3.11) of the thesis."""
 
-    def with_rate(time, _):
-        return jax.jvp(lambda t: lqr(*plant(t), Q, R)[0], (time,), (jnp.ones(()),))
-
-    return _table(edges, with_rate, edges)
-
-
-def _table(edges, with_rate, at_edges) -> GainTable:
-    """Cubics through gains and their rates just within both ends of every stretch."""
     lengths = jnp.diff(edges)
     nudge = INSIDE * lengths
-    every = jax.vmap(with_rate)
-    start, leaving = every(edges[:-1] + nudge, at_edges[:-1])
-    end, arriving = every(edges[1:] - nudge, at_edges[1:])
-    span = lengths[:, None, None]
-    leaving, arriving, rise = leaving * span, arriving * span, end - start
-    bend = 3 * rise - 2 * leaving - arriving, leaving + arriving - 2 * rise
-    shares = (edges - edges[0]) / (edges[-1] - edges[0])
-    return GainTable(shares, jnp.stack([start, leaving, *bend], axis=1))
+
+    def gains(time, length):
+        gain, rate = jax.jvp(lambda t: lqr(*plant(t), Q, R)[0], (time,), (length,))
+        return jnp.stack([gain, rate])
+
+    every = jax.vmap(gains)
+    return _table(edges, every(edges[:-1] + nudge, lengths), every(edges[1:] - nudge, lengths))
+
+
+def _table(edges, starts, ends) -> GainTable:
+    """Polynomials through gains and their rates (stretch, rate, ...) at both ends of stretches."""
+    low, high = _hermite(starts.shape[1])
+    pieces = jnp.einsum("pr,sriz->spiz", low, starts) + jnp.einsum("pr,sriz->spiz", high, ends)
+    return GainTable((edges - edges[0]) / (edges[-1] - edges[0]), pieces)
+
+
+def _rates(at: float, orders: int, powers: int) -> Float[np.ndarray, "order power"]:
+    """The powers of a number, and their rates up to an order."""
+    exponents = np.arange(powers)
+    factors = [np.prod([exponents - k for k in range(r)], axis=0) for r in range(orders)]
+    left = [np.maximum(exponents - r, 0) for r in range(orders)]
+    return np.stack([factor * at**rest for factor, rest in zip(factors, left, strict=True)])
+
+
+def _hermite(orders: int) -> tuple[Float[np.ndarray, "power order"], ...]:
+    """What takes a value and its rates at 0, and those at 1, to the polynomial through them."""
+    rows = [_rates(at, orders, 2 * orders) for at in (0.0, 1.0)]
+    inverse = np.linalg.inv(np.concatenate(rows))
+    return inverse[:, :orders], inverse[:, orders:]
+
+
+# What takes values at the nodes to that at each end, and to its first two rates there.
+AT_ENDS = np.stack([_rates(at, 3, NODES.size) for at in (0.0, 1.0)]) @ np.linalg.inv(
+    NODES[:, None] ** np.arange(NODES.size)
+)

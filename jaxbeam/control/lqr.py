@@ -157,7 +157,7 @@ class AbstractScheduledRegulator(AbstractRegulator):
     fade_time: Float[Array, ""] | None = number(
         "s", "time constant with which the last gain fades", POSITIVE, default=None
     )
-    points: int = count("stretches of the table from event to event", default=1200)
+    points: int = count("stretches of the table from event to event", default=1600)
 
     def fault(self, case):
         if not case.loads:
@@ -196,7 +196,9 @@ class AbstractScheduledRegulator(AbstractRegulator):
 class AbstractForesighted(AbstractScheduledRegulator):
     """What those regulators share that are found backward in time.
 
-    `terminal_weight` is the diagonal of F, eq. (3.3) of the thesis; Q if left out.
+    `terminal_weight` is the diagonal of F, eq. (3.3) of the thesis; Q if left out. The gains are
+    right to 1e-8 of their largest, if a stretch of the table lasts no longer than seven time
+    constants of the fastest lag.
     """
 
     terminal_weight: Float[Array, " state"] | None = number(

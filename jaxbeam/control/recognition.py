@@ -1,4 +1,4 @@
-"""Which load is coming: its speed from two gates, its mass from how the beam sinks at first.
+"""Which load is coming: its speed from two gates or from how the beam sinks at first, as its mass.
 
 In a simulation the gates are passed when the load's path says so; the law is told those two times.
 """
@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
 from jaxbeam.compiling import compiled
+from jaxbeam.control.following import Follower
+from jaxbeam.control.listening import Listener
 from jaxbeam.controller import Measurement
 from jaxbeam.estimation.fixed import offsets
 from jaxbeam.estimation.observability import deflections
@@ -24,23 +26,37 @@ PLACES = 201  # at which influence lines are kept
 
 
 class Recognition(eqx.Module):
-    """How a load is recognised: places of two gates, and how much of the crossing is listened to.
+    """How a load is recognised: how much of the crossing is listened to, and what tells the speed.
 
-    Gates may be before the beam (a negative position if the load enters at the left). Their times
-    give the speed, which is taken to be constant from there on. While the load is on the first
-    part of the beam, `until`, its weight is the one whose static deflections fit the readings of
-    the sensors of deflection best, those that the commands cause subtracted. The beam must be held.
+    That are two `gates`, which may be before the beam (a negative position if the load enters at
+    the left); the speed is taken to be constant from there on. Without gates it is the deflections
+    (see `following`), of two sensors or more, where they exceed a `threshold`. While the load is on
+    the first part of the beam, `until`, its weight is the one whose static deflections fit the
+    readings of the sensors of deflection best, those that the commands cause subtracted. The beam
+    must be held.
     """
 
-    gates: Float[Array, "2"] = number("m", "where the gates are, in the order they are passed")
+    gates: Float[Array, "2"] | None = number(
+        "m", "where the gates are, in the order they are passed", default=None
+    )
     until: Float[Array, ""] = number(
         "1", "share of the way after which the mass is told", POSITIVE, default=0.3
+    )
+    threshold: Float[Array, ""] | None = number(
+        "m", "deflection that tells of a load, without gates", POSITIVE, default=None
     )
 
     def fault(self, case: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", or None."""
         if not any(sensor.quantity == "deflection" for sensor in case.sensors):
             return "until has no use without a sensor of deflection; add one"
+        if (self.gates is None) == (self.threshold is None):
+            return "gates or threshold must be given, and not both"
+        if self.gates is None:
+            seeing = sum(sensor.quantity == "deflection" for sensor in case.sensors)
+            if seeing < 2:
+                return "threshold needs two sensors of deflection or more; add one, or give gates"
+            return None
         numbers = (self.gates, self.until, case.beam.length, case.loads[0].speed)
         if not all(is_known(value) for value in numbers):
             return None
@@ -54,42 +70,33 @@ class Recognition(eqx.Module):
             )
         return None
 
-    def init(self, model: LoadedBeam, designed: LoadedBeam) -> "Recogniser":
+    def init(self, model: LoadedBeam, designed: LoadedBeam) -> Listener:
         """The recogniser of the first load of a model; deflections are those of the design."""
         plant, modes = designed.unloaded, designed.scale.shape[0]
         length = model.case.beam.length
         answer = jnp.linalg.solve(plant.A.T, plant.C[deflections(plant)].T).T
         shapes = designed.rig.shapes(length * np.linspace(0, 1, PLACES), (0,))[0]
-        return Recogniser(
-            self,
-            times=model.traffic.motions[0].arrivals(self.gates)[:2],
-            length=length,
-            gravity=designed.case.run.gravity,
-            line=answer[:, modes : 2 * modes] @ (designed.scale[:, None] * shapes.T),
-            lift=-answer @ plant.B,
-            offset=offsets(designed)[deflections(plant)],
-            fit=jnp.zeros(2),
-            seen=tuple(int(i) for i in deflections(plant)),
-        )
+        seen = deflections(plant)
+        common = {
+            "length": length,
+            "gravity": designed.case.run.gravity,
+            "line": answer[:, modes : 2 * modes] @ (designed.scale[:, None] * shapes.T),
+            "lift": -answer @ plant.B,
+            "offset": offsets(designed)[seen],
+            "seen": tuple(int(i) for i in seen),
+        }
+        if self.gates is None:
+            settings = {"until": self.until, "threshold": self.threshold}
+            return Follower(fit=jnp.zeros(8), **settings, **common)
+        times = model.traffic.motions[0].arrivals(self.gates)[:2]
+        return Recogniser(settings=self, times=times, fit=jnp.zeros(2), **common)
 
 
-class Recogniser(eqx.Module):
-    """What is known of a load by now.
-
-    `times` (s) are when it passes the gates. `line` are the influence lines (m/N) of the sensors
-    `seen`, by the modes of the design (`static.influence_line` is exact), and `lift` the static
-    deflections there per unit of the commands. `fit` gathers the sums of the least squares.
-    """
+class Recogniser(Listener):
+    """What is known of a load by now; `times` (s) are when it passes the gates."""
 
     settings: Recognition
     times: Float[Array, "2"]
-    length: Float[Array, ""]
-    gravity: Float[Array, ""]
-    line: Float[Array, "sensor place"]
-    lift: Float[Array, "sensor actuator"]
-    offset: Float[Array, " sensor"]
-    fit: Float[Array, "2"]
-    seen: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def speed(self) -> Float[Array, ""]:
@@ -105,9 +112,7 @@ class Recogniser(eqx.Module):
     @property
     def mass(self) -> Float[Array, ""]:
         """The mass (kg) that fits what was heard; zero where nothing was."""
-        across, along = self.fit
-        weight = jnp.where(along > 0, across / jnp.where(along > 0, along, 1.0), 0.0)
-        return weight / self.gravity
+        return self.mass_of(*self.fit)
 
     def share(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """The share of the way that is behind the load at a time (s)."""
@@ -118,18 +123,14 @@ class Recogniser(eqx.Module):
         passed = t >= self.times[1]
         return passed, passed & (self.share(t) >= self.settings.until)
 
-    def hear(self, measurement: Measurement, t: Float[Array, ""]) -> "Recogniser":
-        """The same after the readings of a tick at t (s)."""
+    def news(self, deflections, t):
         share = self.share(t)
         passed, done = self.told(t)
         way = jnp.where(self.speed < 0, 1 - share, share)
         places = np.linspace(0, 1, PLACES)
         line = jax.vmap(lambda each: jnp.interp(way, places, each))(self.line)
-        readings = measurement.readings[np.array(self.seen)] - self.offset
-        readings = readings - self.lift @ measurement.command
         listening = passed & ~done & (share > 0)
-        news = jnp.where(listening, jnp.stack([line @ readings, line @ line]), 0.0)
-        return eqx.tree_at(lambda r: r.fit, self, self.fit + news)
+        return jnp.where(listening, jnp.stack([line @ deflections, line @ line]), 0.0)
 
 
 class Recognised(NamedTuple):
@@ -170,4 +171,5 @@ def _replayed(settings: Recognition, case: Case, layout, record):
         return heard.hear(Measurement(readings, still, command), t).fit, None
 
     fit, _ = jax.lax.scan(tick, start.fit, (record.measured, record.command, record.times))
-    return eqx.tree_at(lambda r: r.fit, start, fit).mass, start.speed
+    last = eqx.tree_at(lambda r: r.fit, start, fit)
+    return last.mass, last.speed

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.control.listening import Listener
 from jaxbeam.control.lqr import FiniteLQR, Schedule, too_coarse
-from jaxbeam.control.recognition import Recogniser, Recognition
+from jaxbeam.control.recognition import Recognition
 from jaxbeam.dynamics import traffic
 from jaxbeam.fields import INCREASING, choice, is_known, known, number, part
 from jaxbeam.statespace import LoadedBeam
@@ -18,7 +19,8 @@ from jaxbeam.statespace import LoadedBeam
 class Family(eqx.Module):
     """Schedules for each mass and speed, and what is known of the load.
 
-    `told` are its mass (kg), speed (m/s) and time of entry (s) if they are given beforehand.
+    `told` are its mass (kg), speed (m/s) and time of entry (s) if they are given beforehand;
+    `gravity` (m/s^2) makes a weight of the mass.
     """
 
     schedules: Schedule
@@ -26,7 +28,8 @@ class Family(eqx.Module):
     speeds: Float[Array, " speed"]
     length: Float[Array, ""]
     told: Float[Array, "3"]
-    recogniser: Recogniser | None
+    gravity: Float[Array, ""]
+    recogniser: Listener | None
 
 
 class ScheduledLQR(FiniteLQR):
@@ -35,11 +38,11 @@ class ScheduledLQR(FiniteLQR):
     `FiniteLQR` is designed for each of the `masses` and `speeds` (magnitudes; that of the load, as
     believed, if left out), at constant speed. Between them commands are "interpolated" linearly, or
     those of the "nearest" design are given; outside, the mass or speed is clamped to the grid. The
-    tables are stretched to the speed of the load, also outside the grid. With loads "known" their
-    weights are fed forward, as in `AugmentedLQR`.
+    tables are stretched to the speed of the load, also outside the grid. With loads "known" the
+    weight of that mass is fed forward, as in `AugmentedLQR`.
 
     Mass, speed and time of entry are those of the load as believed, or found by the `recognition`:
-    then there is no command before the second gate, and the lightest mass is assumed until the
+    then there is no command before the speed is told, and the lightest mass is assumed until the
     mass is told.
     """
 
@@ -72,7 +75,8 @@ class ScheduledLQR(FiniteLQR):
         members = jax.vmap(jax.vmap(member, (None, 0)), (0, None))(self.masses, speeds)
         heard = None if self.recognition is None else self.recognition.init(model, designed)
         told = jnp.stack([load.mass, jnp.abs(load.speed), load.entry_time])
-        return Family(members, self.masses, speeds, model.case.beam.length, told, heard)
+        length, gravity = model.case.beam.length, designed.case.run.gravity
+        return Family(members, self.masses, speeds, length, told, gravity, heard)
 
     def command(self, memory, estimate, measurement, t):
         mass, speed, entry = memory.told
@@ -84,9 +88,13 @@ class ScheduledLQR(FiniteLQR):
             mass = jnp.where(weighed, heard.mass, memory.masses[0])
             speed, entry = jnp.abs(heard.speed), heard.entry
         end = entry + memory.length / speed
+        weights = jnp.zeros(0)
+        if self.feeds_loads_forward:
+            held = jnp.clip(mass, memory.masses[0], memory.masses[-1])
+            weights = (held * memory.gravity)[None]
 
         def answer(schedule):
-            stretched = dataclasses.replace(schedule, start=entry, end=end)
+            stretched = dataclasses.replace(schedule, known=weights, start=entry, end=end)
             return super(ScheduledLQR, self).command(stretched, estimate, measurement, t)[0]
 
         answers = jax.vmap(jax.vmap(answer))(memory.schedules)
