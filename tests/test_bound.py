@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from scipy.optimize import OptimizeResult, linprog
 
 import jaxbeam as jb
 from jaxbeam.control.bound import bound
@@ -194,6 +195,19 @@ def test_slower_actuators_raise_it(best, found):
         least_peak(found, low + 3.0, high, change)
 
 
+def test_a_solver_that_loses_its_way_is_replaced(best, found, monkeypatch):
+    """As the simplex method does now and then, at one program in some hundred."""
+
+    def stray(*program, method, **options):
+        if method == "highs":
+            return OptimizeResult(status=4, message="(HiGHS Status 0: Not Set)")
+        return linprog(*program, method=method, **options)
+
+    monkeypatch.setattr("jaxbeam.control.least_peak.linprog", stray)
+    peak, *_ = least_peak(found, *np.array([[-2.5], [7.5], [np.inf]]))
+    assert_allclose(peak, best.peak, rtol=1e-6)
+
+
 def test_without_limits_one_place_can_be_held_still_once_a_hold(found):
     parts = {name: getattr(found, name)[::10] for name in ("instants", "free", "response")}
     endless = np.array([np.inf])
@@ -227,6 +241,9 @@ def test_two_actuators_and_a_hold_cut_short():
 
 FAULTS = {
     "without actuators": lambda: bound(dataclasses.replace(patched(), actuators=())),
+    "none of the 1 takes commands": lambda: bound(
+        dataclasses.replace(patched(), actuators=(jb.SpringDamper(0.2, 100.0),))
+    ),
     "without loads": lambda: bound(dataclasses.replace(patched(), loads=())),
     "add a sensor, or give places": lambda: bound(dataclasses.replace(patched(), sensors=())),
     "places.1 must lie on the beam": lambda: bound(patched(), places=[0.1, 0.7]),
@@ -243,10 +260,3 @@ FAULTS = {
 def test_faults_are_named(words):
     with pytest.raises(ValueError, match=words):
         FAULTS[words]()
-
-
-@pytest.mark.slow
-def test_actuators_that_take_no_commands_are_refused():
-    idle = dataclasses.replace(patched(), actuators=(jb.SpringDamper(0.2, 100.0),))
-    with pytest.raises(ValueError, match="no actuator of the case takes commands"):
-        bound(idle)

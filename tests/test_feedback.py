@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.signal
 from numpy.testing import assert_allclose
 
@@ -173,11 +174,80 @@ def test_positive_position_feedback_damps_the_mode_it_is_tuned_to():
     assert truth.real.max() < -2 * 0.01 * first  # twice the damping of the beam's own
 
 
+def at_every_instant(name, **changes) -> jb.Case:
+    law = dataclasses.replace(COMPENSATORS[name][0], period=None)
+    return dataclasses.replace(CASE, controller=law, **changes)
+
+
+@pytest.mark.parametrize("name", COMPENSATORS)
+def test_poles_without_sampling_are_those_of_python_control(name):
+    """Point forces where the sensors are; states of the filters are among those of the loop."""
+    forces, places = [jb.PointForce(0.19), jb.PointForce(0.4)], (0.19, 0.4)
+    case = at_every_instant(name, actuators=forces, loads=[])
+    span = span_of(case)
+    n, rows = span.modes, np.array([span.shapes(x) for x in places])
+    stiffness, damping = np.diag(span.frequencies**2), 0.02 * np.diag(span.frequencies)
+    none = np.zeros((n, n))
+    a = np.block([[none, np.eye(n)], [-stiffness, -damping]])
+    plant = control.ss(
+        a, np.vstack([0 * rows.T, rows.T]), np.hstack([rows, 0 * rows]), np.zeros((2, 2))
+    )
+    filters = control.append(*(control.ss(control.tf(*loop)) for loop in COMPENSATORS[name][1]))
+    truth = control.feedback(plant, filters, sign=1).poles()
+    found = linear_loop(case, 0.0).poles()
+    assert found.size == truth.size
+    order = np.lexsort((found.imag, found.real.round(3)))
+    expected_order = np.lexsort((truth.imag, truth.real.round(3)))
+    assert_allclose(found[order], truth[expected_order], rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_run_without_sampling_is_that_of_scipy():
+    """A crossing force, point forces, an analogue filter before the second compensator."""
+    times, cutoff = np.linspace(0.0, 0.2, 21), 2 * np.pi * 40.0
+    smooth = jb.Filter(40.0, 1, realisation="analogue")
+    case = at_every_instant(
+        "ppf",
+        actuators=[jb.PointForce(0.19), jb.PointForce(0.4)],
+        sensors=[jb.Sensor(0.19), jb.Sensor(0.4, filter=smooth)],
+        loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    )
+    record = jb.simulate(case, times=jnp.asarray(times), tolerance=1e-8)
+    span, n = span_of(case), 2
+    rows = np.array([span.shapes(x) for x in (0.19, 0.4)])
+    filters = [scipy.signal.tf2ss(*loop) for loop in COMPENSATORS["ppf"][1]]
+    orders = [part[0].shape[0] for part in filters]
+
+    def commands(y):
+        seen, found, place = [rows[0] @ y[:n], y[2 * n]], [], 2 * n + 1
+        for (_, _, c, d), order, reading in zip(filters, orders, seen, strict=True):
+            found.append((c @ y[place : place + order] + d[0] * reading).item())
+            place += order
+        return seen, np.array(found)
+
+    def rate(t, y):
+        seen, given = commands(y)
+        push = given @ rows - (4.0 * span.shapes(2.0 * t) if t < 0.3 else 0.0)
+        moved = push - span.frequencies**2 * y[:n] - 0.02 * span.frequencies * y[n : 2 * n]
+        parts, place = [y[n : 2 * n], moved, [cutoff * (rows[1] @ y[:n] - y[2 * n])]], 2 * n + 1
+        for (a, b, _, _), order, reading in zip(filters, orders, seen, strict=True):
+            parts.append(a @ y[place : place + order] + b[:, 0] * reading)
+            place += order
+        return np.concatenate(parts)
+
+    start = np.zeros(2 * n + 1 + sum(orders))
+    truth = scipy.integrate.solve_ivp(
+        rate, (0.0, 0.2), start, "DOP853", times, rtol=1e-11, atol=1e-14
+    ).y.T
+    given = np.array([commands(y)[1] for y in truth])
+    for found, true in ((record.deflection, truth[:, :n] @ rows.T), (record.command, given)):
+        assert_allclose(found, true, rtol=0, atol=1e-6 * np.max(np.abs(true)))
+
+
 FAULTS = [
     ({"gains": jnp.ones(1)}, "controller.gains must list one gain for each of 2 actuators, not 1"),
     ({"lag": jnp.ones(3)}, "controller.lag must be one number for all 2 loops or one for each"),
     ({"lag": jnp.asarray(0.0)}, "controller.lag must be positive"),
-    ({"period": None}, "the controller's memory needs a controller that samples: give controller."),
 ]
 
 
@@ -186,6 +256,12 @@ def test_faulty_compensators_are_refused(change, message):
     law = dataclasses.replace(COMPENSATORS["pd"][0], **change)
     with pytest.raises(ValueError, match=re.escape(message)):
         check(dataclasses.replace(CASE, controller=law))
+
+
+def test_an_offset_needs_samples():
+    sensors = [jb.Sensor(0.19, offset=1e-3), jb.Sensor(0.4)]
+    with pytest.raises(ValueError, match=r"controller.period must be given, as sensors.0 has"):
+        check(at_every_instant("pd", sensors=sensors))
 
 
 def test_an_oscillator_too_quick_for_the_sampling_is_refused():

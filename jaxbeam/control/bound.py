@@ -27,6 +27,7 @@ from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.reach import TOLERANCE, reach
 from jaxbeam.faults import check_on_beam
 from jaxbeam.plan import form, run_extremes, suitable_step
+from jaxbeam.ports import takes_commands
 from jaxbeam.record import Record
 
 HELD = 0.01  # s: over which commands are held, where no controller says
@@ -118,6 +119,10 @@ def bound(
     places = _places(case, places)
     if not case.actuators:
         raise ValueError("without actuators there is nothing to command; add one for a bound")
+    if not any(map(takes_commands, case.actuators)):
+        raise ValueError(
+            f"actuators: none of the {len(case.actuators)} takes commands; add one that does"
+        )
     if not (np.isfinite([period, spacing]).all() and min(period, spacing) > 0):
         raise ValueError(f"period and spacing must be positive; they are {period:g}, {spacing:g} s")
     if period > float(case.run.duration):
@@ -128,7 +133,7 @@ def bound(
     if not np.any(found.free @ found.rows.T):
         raise ValueError("no load deflects the beam at these places during the run")
     if not np.any(found.response):
-        raise ValueError("no actuator of the case takes commands that move the beam; add one")
+        raise ValueError("no command moves the beam; move an actuator off the supports and nodes")
     peak, commands, weights = least_peak(found, *_ranges(case, period))
     when, where = np.nonzero(weights)
     return Bound(

@@ -1,7 +1,8 @@
 """Feedback of readings through a filter of each loop's own: PD, lead, positive position feedback.
 
-Each is given by its continuous transfer function and made sampled by the bilinear transform, so a
-stable filter stays stable at every period. To add one, write a subclass with its `transfer`.
+Each is given by its continuous transfer function. With a period it is made sampled by the bilinear
+transform, so a stable filter stays stable at every period; without one it acts at every instant,
+and its states join those of the plant. To add one, write a subclass with its `transfer`.
 """
 
 import abc
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 from numpy.polynomial import polynomial
 
 from jaxbeam.control.feedback import pairing_fault
-from jaxbeam.controller import AbstractController
+from jaxbeam.controller import AbstractController, OwnFilter
 from jaxbeam.fields import POSITIVE, dimensions, is_known, known, number
 from jaxbeam.filters import filter_step
 
@@ -23,8 +24,8 @@ Polynomials = Float[Array, "power actuator"]  # in s (rad/s), the coefficients a
 class AbstractCompensator(AbstractController):
     """Each actuator answers the readings y of its own sensor through a filter: u(s) = H(s) y(s).
 
-    The first actuator listens to the first sensor, the second to the second, and so on. It needs
-    a period; before its first tick the filters have seen nothing but zero.
+    The first actuator listens to the first sensor, the second to the second, and so on. Before its
+    first tick the filters have seen nothing but zero.
     """
 
     gains: Float[Array, " actuator"] = number("command per reading", "one gain for each actuator")
@@ -32,6 +33,10 @@ class AbstractCompensator(AbstractController):
     @property
     def knows_loads(self) -> bool:
         return False
+
+    @property
+    def memoryless(self) -> bool:
+        return self.period is None
 
     @abc.abstractmethod
     def transfer(self) -> tuple[Polynomials, Polynomials]:
@@ -54,14 +59,31 @@ class AbstractCompensator(AbstractController):
                         f"{field.name} must be one number for all {loops} loops or one for each,"
                         f" not {shape[0]}"
                     )
+        if self.period is not None:
+            return None
+        for i, sensor in enumerate(case.sensors[:loops]):
+            if sensor.range is not None or (is_known(sensor.offset) and known(sensor.offset) != 0):
+                return f"period must be given, as sensors.{i} has an offset or a range"
         return None
 
+    def own_filters(self):
+        if self.period is not None:
+            return ()
+        numerator, denominator = self.transfer()
+        return tuple(
+            _realised(i, numerator[:, i], denominator[:, i]) for i in range(self.gains.shape[0])
+        )
+
     def init(self, model):
+        if self.period is None:
+            return None
         numerator, denominator = (_bilinear(part, self.stretch()) for part in self.transfer())
         section = jnp.concatenate([numerator, denominator]) / denominator[0]
         return section[None], jnp.zeros((1, 2, self.gains.shape[0]))
 
     def step(self, memory, measurement, t):
+        if self.period is None:
+            return measurement.readings[-self.gains.shape[0] :], memory
         sections, passed = memory
         readings = measurement.readings[: self.gains.shape[0]]
         command, passed = filter_step(sections, passed, readings)
@@ -133,6 +155,26 @@ class PositivePositionFeedback(AbstractCompensator):
                     f" it is {highest:g} Hz: lower it, or sample faster"
                 )
         return super().fault(case)
+
+
+def _realised(
+    sensor: int, numerator: Float[Array, " power"], denominator: Float[Array, " power"]
+) -> OwnFilter:
+    """States of a transfer function: x1 follows the reading, x2 is its rate over a frequency.
+
+    At rest x1 is the reading; denominators are of degree 1 or 2.
+    """
+    direct = numerator[-1] / denominator[-1]
+    rest = (numerator - direct * denominator)[:-1] / denominator[0]
+    if denominator.shape[0] == 2:
+        rate = (denominator[0] / denominator[1])[None]
+        return OwnFilter(sensor, -rate[None], rate, rest, direct)
+    turn, drag = jnp.sqrt(denominator[0] / denominator[2]), denominator[1] / denominator[2]
+    zero = jnp.zeros(())
+    matrix = jnp.stack([jnp.stack([zero, turn]), jnp.stack([-turn, -drag])])
+    return OwnFilter(
+        sensor, matrix, jnp.stack([zero, turn]), jnp.stack([rest[0], rest[1] * turn]), direct
+    )
 
 
 def _bilinear(coefficients: Polynomials, stretch) -> Float[Array, "3 actuator"]:

@@ -17,7 +17,9 @@ from jaxbeam.control.reach import Reach
 EXACT = 1e-9  # of the largest deflection without commands: how exactly a program is solved
 VIOLATED = 1e-7  # of the same: rows that are violated by less are left out
 CALM = 1e-6  # of the same: price of a change of command by its largest value, or of its average
-ROUNDS = 100  # of adding rows; about ten are usual
+ROUNDS = 100  # of adding rows; about five are usual
+METHODS = ("highs", "highs-ipm")  # the simplex method now and then loses its way
+SOLVED, INFEASIBLE = 0, 2  # by linprog
 
 
 def least_peak(
@@ -44,7 +46,9 @@ def least_peak(
         raise RuntimeError(f"the linear program for the bound did not settle in {ROUNDS} rounds")
     # With fewer rows than there are the peak is no larger than the least one: a bound in any case.
     peak, _, weights = program.solve(0.0)
-    return peak * program.size, commands, weights
+    # Programs are solved to rounding; the commands keep to their limits nevertheless.
+    changes = np.clip(np.diff(commands, axis=0, prepend=0.0), -change, change)
+    return peak * program.size, np.clip(np.cumsum(changes, axis=0), low, high), weights
 
 
 class _Program:
@@ -59,16 +63,11 @@ class _Program:
         self.taken = np.zeros((3, 0), int)  # instant, place, sign of the deflection
 
     def take(self, commands, peak) -> bool:
-        """Take in where the deflection under some commands most exceeds a peak, if it does."""
+        """Take in where along the beam some commands exceed a peak most, whenever they do."""
         deflection = self.found.deflection(commands) / self.size
         size = np.abs(deflection)
-        around = np.pad(size, 1, constant_values=-1.0)
-        highest = (
-            (size >= around[:-2, 1:-1])
-            & (size > around[2:, 1:-1])
-            & (size >= around[1:-1, :-2])
-            & (size > around[1:-1, 2:])
-        )
+        around = np.pad(size, ((0, 0), (1, 1)), constant_values=-1.0)
+        highest = (size >= around[:, :-2]) & (size > around[:, 2:])
         when, where = np.nonzero(highest & (size > peak + VIOLATED))
         new = np.stack([when, where, np.sign(deflection[when, where]).astype(int)])
         self.taken = np.concatenate([self.taken, new], axis=1)
@@ -85,12 +84,16 @@ class _Program:
         cost = np.repeat(prices, [count, count + actuators, count, 1])
         matrix, right = self._matrix()
         exact = {"primal_feasibility_tolerance": EXACT, "dual_feasibility_tolerance": EXACT}
-        best = linprog(cost, matrix, right, bounds=self._bounds(), method="highs", options=exact)
-        if best.status == 2:
+        bounds = self._bounds()
+        for method in METHODS:
+            best = linprog(cost, matrix, right, bounds=bounds, method=method, options=exact)
+            if best.status in (SOLVED, INFEASIBLE):
+                break
+        if best.status == INFEASIBLE:
             raise ValueError(
                 "no commands, starting from zero, stay within limits and rates of the actuators"
             )
-        if best.status != 0:
+        if best.status != SOLVED:
             raise RuntimeError(f"the linear program for the bound failed: {best.message}")
         weights = np.zeros((self.found.instants.size, self.found.rows.shape[0]))
         when, where, sign = self.taken
