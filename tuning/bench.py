@@ -26,14 +26,16 @@ TOLERANCE = 1e-4  # of the largest deflection: what tuning needs; verdicts are s
 class Bench(eqx.Module):
     """Runs of one case that differ in numbers only, and what they are without control (`free`).
 
-    `stacked` is the case with the numbers of all runs along a first axis. `places` (m) are where
-    deflections count: the sensors', or given ones. What is compiled should take the bench as an
-    argument: closed over, its arrays would be constants that XLA works on for seconds.
+    `stacked` is the case with the numbers of all runs along a first axis, `error` the relative
+    error of their peaks with the `plan`. `places` (m) are where deflections count: the sensors', or
+    given ones. What is compiled should take the bench as an argument: closed over, its arrays would
+    be constants that XLA works on for seconds.
     """
 
     runs: Sequence[Values]
     stacked: Case
     plan: Plan
+    error: Float[np.ndarray, ""]
     times: Float[Array, " time"]
     places: Float[Array, " place"]
     free: dict[str, Float[np.ndarray, " run"]]
@@ -74,7 +76,8 @@ class Bench(eqx.Module):
 
     def records(self, values: Mapping[str, Any]) -> list[Record]:
         """Records of all runs, with true peaks between and at samples."""
-        return [simulate(replace(case, values), plan=self.plan) for case in self.cases]
+        plan = dataclasses.replace(self.plan, error=float(self.error))
+        return [simulate(replace(case, values), plan=plan) for case in self.cases]
 
 
 def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = False) -> Bench:
@@ -94,9 +97,9 @@ def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = F
         raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")
     cases = [apply(case, run) for run in runs]
     times = sample_times(case)
-    plan = common_plan(cases)
+    plan, error = _common_plan(cases)
     plain = [dataclasses.replace(own, controller=None) for own in cases]
-    still = common_plan(plain)
+    still, _ = _common_plan(plain)
     deflection = np.asarray(_deflections(stacked_cases(plain), times, still, places))
     leaves = np.array([_last_exit(own) for own in cases])
     limits = [actuator.command_limits() for actuator in case.actuators]
@@ -104,6 +107,7 @@ def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = F
         runs=runs,
         stacked=stacked_cases(cases),
         plan=plan,
+        error=np.asarray(error),
         times=times,
         places=places,
         free={
@@ -132,8 +136,10 @@ def _deflections(stacked: Case, times, plan: Plan, places) -> Float[Array, "run 
     return jax.vmap(lambda own: histories(own, times, plan, places).deflection)(stacked)
 
 
-def common_plan(cases: list[Case]) -> Plan:
-    """One plan for cases alike in structure, fine enough for each.
+def _common_plan(cases: list[Case]) -> tuple[Plan, float]:
+    """One plan for cases alike in structure, fine enough for each, and its error apart from it.
+
+    Runs whose plans differ in nothing but the error share what is compiled.
 
     Raises ValueError if they differ in more than numbers.
     """
@@ -141,12 +147,13 @@ def common_plan(cases: list[Case]) -> Plan:
     if len({plan.form.layout for plan in plans}) > 1:
         raise ValueError("the runs differ in the order of places along the beam; tune them apart")
     slots = max(plan.form.slots for plan in plans)
-    return dataclasses.replace(
+    common = dataclasses.replace(
         plans[0],
         form=dataclasses.replace(plans[0].form, slots=slots),
         substeps=max(plan.substeps for plan in plans),
-        error=max(plan.error for plan in plans),
+        error=0.0,
     )
+    return common, max(plan.error for plan in plans)
 
 
 def _last_exit(case: Case) -> float:
