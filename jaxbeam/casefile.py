@@ -17,7 +17,7 @@ from jaxbeam.beam import Beam, Support
 from jaxbeam.case import Case, Run, unknown_address
 from jaxbeam.checks import check
 from jaxbeam.controller import AbstractController
-from jaxbeam.faults import check_field, missing, suggestion
+from jaxbeam.faults import check_field, in_words, missing, suggestion
 from jaxbeam.fields import fits, known, shape_in_words
 from jaxbeam.sensors import Sensor
 
@@ -77,7 +77,7 @@ def _read_toml(path: str | os.PathLike) -> dict[str, Any]:
         raise type(error)(f"cannot read the case file {path}: {reason}") from None
     except UnicodeDecodeError:
         raise ValueError(f"{path}: a case file is text in UTF-8, which this is not") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # also of numbers and lists without end
         raise ValueError(f"{path}: not valid TOML: {error}") from None
 
 
@@ -118,10 +118,10 @@ def case_from_dict(content: dict[str, Any]) -> Case:
             )
         elif key == "title":
             if not isinstance(value, str):
-                raise ValueError(f"title must be text in quotes, not {value!r}")
+                raise ValueError(f"title must be text in quotes, not {in_words(value)}")
             parts[key] = value
         else:
-            raise ValueError(f"a case has no {key!r}; {suggestion(key, known_keys)}")
+            raise ValueError(f"a case has no {in_words(key)}; {suggestion(key, known_keys)}")
     if "beam" not in parts:
         raise ValueError("a case needs a beam; write a table [beam]")
     return Case(**parts)
@@ -188,7 +188,7 @@ def read_part(address: str, table: dict[str, Any], kind: Kind) -> Any:
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for key, value in values.items():
         if key not in fields:
-            raise ValueError(f"{address} has no key {key!r}; {suggestion(key, fields)}")
+            raise ValueError(f"{address} has no key {in_words(key)}; {suggestion(key, fields)}")
         inner = fields[key].metadata.get("part")
         if inner is not None and isinstance(value, dict):
             values[key] = read_part(f"{address}.{key}", value, inner)
@@ -205,7 +205,7 @@ def _look_up(address: str, word: Any, registry: dict[str, type]) -> type:
         raise ValueError(f"{address}.kind is missing; it may be {', '.join(registry)}")
     if not isinstance(word, str) or word not in registry:
         hint = suggestion(str(word), registry)
-        raise ValueError(f"{address}.kind cannot be {word!r}; {hint}")
+        raise ValueError(f"{address}.kind cannot be {in_words(word)}; {hint}")
     return registry[word]
 
 
@@ -216,13 +216,17 @@ def _check_type(address: str, value: Any, field: dataclasses.Field) -> None:
         return
     shape = _shape(value)
     if shape is None or not fits(field, shape):
-        raise ValueError(f"{address} must be {shape_in_words(field)}, not {value!r}")
+        raise ValueError(f"{address} must be {shape_in_words(field)}, not {in_words(value)}")
 
 
 def _shape(value: Any) -> tuple[int, ...] | None:
-    """Shape of a number or of nested lists of numbers; None for anything else."""
+    """Shape of a number or of nested lists of numbers; None for anything else.
+
+    No number is a whole one that is too large for a float.
+    """
     if not isinstance(value, list):
-        return () if isinstance(value, int | float) and not isinstance(value, bool) else None
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        return () if is_number and (isinstance(value, float) or abs(value) < 2**1023) else None
     shapes = {_shape(entry) for entry in value} or {()}
     inner = shapes.pop()
     return None if shapes or inner is None else (len(value), *inner)

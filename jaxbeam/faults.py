@@ -6,6 +6,7 @@ together within one part, that part says itself: its method `fault(address)` giv
 
 import dataclasses
 import difflib
+import reprlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -23,6 +24,9 @@ from jaxbeam.fields import (
     known,
     shape_in_words,
 )
+
+SHORT = reprlib.Repr()  # what is wrong is quoted, but not without end
+SHORT.maxstring, SHORT.maxlist, SHORT.maxdict = 80, 10, 10
 
 ROUNDING = 1e-9  # of the length: 3 * 0.2 is still on a beam of 0.6 m
 
@@ -75,7 +79,9 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
         if value is None and field.default is None:
             return
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise ValueError(f"{address} must be a whole number, {least} or more; it is {value!r}")
+            raise ValueError(
+                f"{address} must be a whole number, {least} or more; it is {in_words(value)}"
+            )
     elif "part" in field.metadata:
         kind = field.metadata["part"]
         kinds = tuple(kind.values()) if isinstance(kind, dict) else (kind,)
@@ -92,7 +98,7 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
             raise ValueError(f"{address} must be a word in quotes, not {in_words(value)}")
         allowed = field.metadata["allowed"]
         if allowed and value not in allowed:
-            raise ValueError(f"{address} cannot be {value!r}; {suggestion(value, allowed)}")
+            raise ValueError(f"{address} cannot be {in_words(value)}; {suggestion(value, allowed)}")
 
 
 def described(
@@ -176,6 +182,6 @@ def _in(field: dataclasses.Field) -> str:
 
 def in_words(value: Any) -> str:
     """A wrong value in the words of an error message."""
-    if isinstance(value, str | bool | int | float | list):
-        return repr(value)
+    if isinstance(value, str | bool | int | float | list | dict):
+        return SHORT.repr(value)
     return f"a {type(value).__name__}"

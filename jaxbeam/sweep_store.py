@@ -8,9 +8,13 @@ everything that shapes the numbers guards against mixing sweeps.
 
 from __future__ import annotations
 
+import contextlib
+import json
 import shutil
+import tempfile
+import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import xarray
@@ -20,8 +24,10 @@ if TYPE_CHECKING:
 
 FINGERPRINT = "jaxbeam_sweep"
 BLOCKS = "blocks"
+DAMAGE = (OSError, ValueError, KeyError, TypeError, RuntimeError)  # what zarr raises for it
 
 
+@runtime_checkable
 class Keeper(Protocol):
     """Keeps finished blocks: in memory or on disk."""
 
@@ -63,51 +69,173 @@ class Memory(Keeper):
 
 
 class Disk(Keeper):
-    """Keeps blocks in a zarr store; `steps` is what `create` was given with them."""
+    """Keeps blocks in a zarr store; `steps` is what `create` was given with them.
 
-    def __init__(self, path: Path, group: zarr.Group):
+    Raises ValueError if it cannot be read.
+    """
+
+    def __init__(self, path: Path):
+        import zarr
+
         self._path = path
-        self._blocks: Any = group[BLOCKS]
-        self.steps = np.asarray(self._blocks["steps"][:])
+        with _reading(path):
+            self._blocks: Any = zarr.open_group(path, mode="r+")[BLOCKS]
+            self.steps = np.asarray(self._blocks["steps"][:])
+            self._flags = self._blocks["done"]
+            self._count = self._flags.shape[0]
+        self._arrays: dict[str, Any] = {}  # opened once: to open one takes as long as to write
+
+    def order(self) -> dict[str, Any]:
+        """What was ordered, as it was given to `create`."""
+        with _reading(self._path):
+            return json.loads(np.asarray(self._blocks["order"][:]).tobytes())
 
     def missing(self) -> list[int]:
-        return np.flatnonzero(~np.asarray(self._blocks["done"][:])).tolist()
+        marked = [block for block in range(self._count) if self._flagged(block)]
+        damaged = [] if self._readable() else [b for b in marked if not self._sound(b)]
+        if damaged:
+            warnings.warn(
+                f"{self._path}: {len(damaged)} finished blocks are damaged and are computed again",
+                stacklevel=3,
+            )
+        return sorted(set(range(self._count)) - set(marked) | set(damaged))
+
+    def done(self, block: int) -> bool:
+        """Whether a block has been written."""
+        return self._flagged(block) and self._sound(block)
 
     def write(self, block: int, results: dict[str, np.ndarray]) -> None:
-        count = self._blocks["done"].shape[0]
-        for name, values in results.items():
-            size = values.shape[0]
+        with _writing(self._path):
+            for name, values in results.items():
+                size = values.shape[0]
+                self._array(name, values)[block * size : (block + 1) * size] = values
+            self._flags[block] = True
+
+    def collect(self) -> dict[str, np.ndarray]:
+        with _reading(self._path):
+            return {name: np.asarray(self._blocks[name][:]) for name in self._names()}
+
+    def finish(self, dataset: xarray.Dataset) -> None:
+        with _writing(self._path):
+            # What an interrupted attempt has left may be incomplete.
+            for part in self._path.iterdir():
+                if part.is_dir() and part.name != BLOCKS:
+                    shutil.rmtree(part)
+            # Words of fixed length have no settled place in the format, words of any length do.
+            words = dataset["sensor"].values.astype(object)
+            dataset.assign_coords(sensor=words).to_zarr(
+                self._path,
+                mode="a",
+                consolidated=False,
+                write_empty_chunks=True,
+                encoding={name: {"compressors": _checked()} for name in dataset.variables},
+            )
+            # From here on the store is complete: a group is one by its description.
+            (self._path / BLOCKS / "zarr.json").unlink()
+            shutil.rmtree(self._path / BLOCKS)
+
+    def _names(self) -> list[str]:
+        return sorted(set(self._blocks.array_keys()) - {"done", "steps", "order"})
+
+    def _array(self, name: str, values: np.ndarray) -> Any:
+        """The array for all results of a name, created from those of the first block."""
+        if name not in self._arrays:
             if name not in self._blocks:
                 self._blocks.create_array(
                     name,
-                    shape=(count * size, *values.shape[1:]),
+                    shape=(self._count * values.shape[0], *values.shape[1:]),
                     chunks=values.shape,
                     dtype=values.dtype,
+                    **_careful(),
                 )
-            self._blocks[name][block * size : (block + 1) * size] = values
-        self._blocks["done"][block] = True
+            self._arrays[name] = self._blocks[name]
+        return self._arrays[name]
 
-    def collect(self) -> dict[str, np.ndarray]:
-        names = set(self._blocks.array_keys()) - {"done", "steps"}
-        return {name: np.asarray(self._blocks[name][:]) for name in sorted(names)}
+    def _flagged(self, block: int) -> bool:
+        if not (self._path / BLOCKS / "done" / "c" / str(block)).is_file():
+            return False
+        try:
+            return bool(self._flags[block])
+        except DAMAGE:
+            return False
 
-    def finish(self, dataset: xarray.Dataset) -> None:
-        # What an interrupted attempt has left may be incomplete.
-        for part in self._path.iterdir():
-            if part.is_dir() and part.name != BLOCKS:
-                shutil.rmtree(part)
-        # Words of fixed length have no settled place in the format, words of any length do.
-        words = dataset["sensor"].values.astype(object)
-        dataset.assign_coords(sensor=words).to_zarr(self._path, mode="a", consolidated=False)
-        # From here on the store is complete: a group is one by its description.
-        (self._path / BLOCKS / "zarr.json").unlink()
-        shutil.rmtree(self._path / BLOCKS)
+    def _readable(self) -> bool:
+        """Whether all that is there can be read, found out quickly."""
+        try:
+            whole = all(_is_whole(self._blocks[name]) for name in self._names())
+            return whole and bool(self.collect())
+        except ValueError:
+            return False
+
+    def _sound(self, block: int) -> bool:
+        """Whether all results of a block are there and can be read."""
+        try:
+            for name in self._names():
+                array = self._blocks[name]
+                size = array.chunks[0]
+                chunk = Path("c", str(block), *["0"] * (array.ndim - 1))
+                if not (self._path / BLOCKS / name / chunk).is_file():
+                    return False
+                array[block * size : (block + 1) * size]
+        except DAMAGE:
+            return False
+        return True
 
 
 def read(path: Path) -> xarray.Dataset:
-    """The dataset of a complete store."""
+    """The dataset of a complete store. Raises ValueError if part of it is missing or damaged."""
+    import zarr
+
     shutil.rmtree(path / BLOCKS, ignore_errors=True)  # a kill may have left its chunks behind
-    return xarray.open_zarr(path, consolidated=False).load()
+    with _reading(path):
+        group = zarr.open_group(path, mode="r")
+        parts: dict[str, Any] = {
+            part.name: group[part.name] for part in path.iterdir() if part.is_dir()
+        }
+        broken = [name for name, array in parts.items() if not _is_whole(array)]
+        if broken:
+            raise ValueError(f"parts of {', '.join(sorted(broken))} are missing")
+        return xarray.open_zarr(path, consolidated=False).load()
+
+
+def _checked():
+    from zarr.codecs import ZstdCodec
+
+    return [ZstdCodec(checksum=True)]
+
+
+def _careful() -> dict[str, Any]:
+    """How arrays are written so that what is damaged or missing can be told."""
+    return {"compressors": _checked(), "config": {"write_empty_chunks": True}}
+
+
+def _is_whole(array: zarr.Array) -> bool:
+    """Whether every chunk of an array is there: zarr reads those that are not as zeros."""
+    return array.nchunks_initialized == array.nchunks
+
+
+@contextlib.contextmanager
+def _reading(path: Path):
+    """Turn what damaged files make zarr raise into one sentence."""
+    try:
+        yield
+    except DAMAGE as error:
+        raise ValueError(
+            f"{path} is damaged ({' '.join(str(error).split())}): make the sweep anew, under"
+            " another name or with overwrite"
+        ) from None
+
+
+@contextlib.contextmanager
+def _writing(path: Path):
+    """Say in one sentence what kept a sweep from being written, and that nothing is lost."""
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise type(error)(
+            f"cannot write to {path}: {reason}; what is done is kept: mend this, then resume"
+        ) from None
 
 
 def status(path: Path) -> tuple[str, str] | None:
@@ -139,6 +267,7 @@ def prepare(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> str:
         raise ValueError("resume continues a sweep, overwrite discards it; choose one of them")
     found = status(path)
     if found is None or overwrite:
+        check_folder(path)
         return "new"
     if not resume:
         raise FileExistsError(
@@ -153,31 +282,44 @@ def prepare(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> str:
     return "complete" if found[0] == "complete" else "resume"
 
 
+def check_folder(path: Path) -> None:
+    """Raises OSError, before any work, if nothing can be written beside a path."""
+    try:
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise type(error)(
+            f"cannot write {path.name} to the folder {path.parent}: {reason}"
+        ) from None
+
+
 def create(
-    path: Path, fingerprint: str, blocks: int, steps: np.ndarray, overwrite: bool = False
+    path: Path,
+    fingerprint: str,
+    order: dict[str, Any],
+    blocks: int,
+    steps: np.ndarray,
+    overwrite: bool = False,
 ) -> Disk:
     """Start a store for a number of blocks; `steps` (s) are the time steps of the tasks.
 
-    With `overwrite` what is at the path gives way.
+    What was ordered, in plain words and numbers, is kept with them. With `overwrite` what is at
+    the path gives way.
     """
     import zarr
 
     # Built aside and moved into place: a store either exists whole or not at all.
     fresh = path.with_name(f".{path.name}.new")
     shutil.rmtree(fresh, ignore_errors=True)
-    group = zarr.create_group(fresh)
-    inner = group.create_group(BLOCKS)
-    inner.create_array("done", shape=(blocks,), chunks=(1,), dtype=bool, fill_value=False)
-    inner.create_array("steps", data=np.asarray(steps, float))
-    group.attrs[FINGERPRINT] = fingerprint
-    if overwrite:
-        shutil.rmtree(path, ignore_errors=True)
-    fresh.rename(path)
-    return reopen(path)
-
-
-def reopen(path: Path) -> Disk:
-    """Open an unfinished store."""
-    import zarr
-
-    return Disk(path, zarr.open_group(path, mode="r+"))
+    with _writing(path):
+        group = zarr.create_group(fresh)
+        inner = group.create_group(BLOCKS)
+        inner.create_array("done", shape=(blocks,), chunks=(1,), dtype=bool, fill_value=False)
+        inner.create_array("steps", data=np.asarray(steps, float), compressors=_checked())
+        words = np.frombuffer(json.dumps(order).encode(), np.uint8)
+        inner.create_array("order", data=words, compressors=_checked())
+        group.attrs[FINGERPRINT] = fingerprint
+        if overwrite:
+            shutil.rmtree(path, ignore_errors=True)
+        fresh.rename(path)
+    return Disk(path)

@@ -32,8 +32,10 @@ def read_csv(path: Path) -> Table:
     if top == len(kept):
         raise ValueError(f"{path}: the log is empty: it has comments only")
     separator = next((mark for mark in "\t;" if mark in kept[top]), ",")
-    reader = csv.reader(io.StringIO("".join(kept[top:])), delimiter=separator)
-    headings = [cell.strip() for cell in next(reader)]
+    rows, lines = _cells(path, kept, top, separator)
+    if not rows:
+        raise ValueError(f"{path}: the log is empty: no cell has anything in it")
+    headings = [cell.strip() for cell in rows[0]]
     if _all_numbers(headings):
         raise ValueError(
             f"{path}, line {top + 1}: the first line must name the columns, "
@@ -41,17 +43,28 @@ def read_csv(path: Path) -> Table:
         )
     if not headings[-1]:
         headings.pop()
-    rows, lines = [], []
-    for row in reader:
-        if any(cell.strip() for cell in row):
-            # A separator that ends every line closes the last column; it opens no new one.
-            trailing = len(row) == len(headings) + 1 and not row[-1].strip()
-            rows.append(row[:-1] if trailing else row)
-            lines.append(top + reader.line_num)
+    # A separator that ends every line closes the last column; it opens no new one.
+    trailing = len(headings) + 1
+    rows = [row[:-1] if len(row) == trailing and not row[-1].strip() else row for row in rows[1:]]
+    lines = lines[1:]
     names, units = zip(*map(heading, headings), strict=True)
     decimal_comma = separator != "," and _has_decimal_comma(path, rows, lines)
     values = numbers(path, names, rows, lines, decimal_comma)
     return Table(names, units, values, np.array(lines))
+
+
+def _cells(path, kept, top, separator):
+    """The cells of the rows that have any, from the line of names on, and their line numbers."""
+    reader = csv.reader(io.StringIO("".join(kept[top:])), delimiter=separator)
+    rows, lines = [], []
+    try:
+        for row in reader:
+            if any(cell.strip() for cell in row):
+                rows.append(row)
+                lines.append(top + reader.line_num)
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {top + reader.line_num}: {error}") from None
+    return rows, lines
 
 
 def _all_numbers(cells) -> bool:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from tuning.optional import library
-from tuning.readers.table import Table, table_of
+from tuning.readers.table import Table, damaged, table_of, word
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 MATLAB = b"MATLAB 7.3 MAT-file"
@@ -37,8 +37,8 @@ def read_hdf5(path: Path) -> dict[str, Table]:
                 rates[group] = _rate(item.parent) or _rate(file)
 
             file.visititems(visit)
-    except (OSError, RuntimeError, KeyError) as error:
-        raise ValueError(f"{path}: the file is damaged or cut off: {error}") from None
+    except Exception as error:  # whatever h5py meets in a file that is not as it should be
+        raise damaged(path, error) from None
     return {
         group: table_of(f"{path}, group {group or '/'}", arrays, units[group], _clock(rates[group]))
         for group, arrays in groups.items()
@@ -56,8 +56,7 @@ def _numbers(dataset) -> np.ndarray:
 
 
 def _unit(dataset) -> str | None:
-    unit = dataset.attrs.get("units", dataset.attrs.get("unit"))
-    return unit.decode() if isinstance(unit, bytes) else unit
+    return word(dataset.attrs.get("units", dataset.attrs.get("unit")))
 
 
 def _rate(group) -> float | None:

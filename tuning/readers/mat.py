@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat, matlab
 
-from tuning.readers.table import Table, table_of
+from tuning.readers.mat_elements import check_elements
+from tuning.readers.table import Table, damaged, table_of
 
 MAGIC = b"MATLAB 5.0 MAT-file"
 
@@ -19,9 +20,10 @@ def read_mat(path: Path) -> dict[str, Table]:
     Raises ValueError for a damaged file, or one that holds objects only (such as a timetable).
     """
     try:
+        check_elements(path.read_bytes())
         content = loadmat(path, squeeze_me=True, struct_as_record=False)
     except Exception as error:  # scipy raises whatever its parser stumbles over
-        raise ValueError(f"{path}: the file is damaged or cut off: {error}") from None
+        raise damaged(path, error) from None
     content = {name: value for name, value in content.items() if not name.startswith("__")}
     runs = {"": content}
     for name, value in content.items():

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.io import netcdf_file
 
-from tuning.readers.table import Table, table_of
+from tuning.readers.table import Table, damaged, table_of, word
 
 MAGIC = b"CDF"
 
@@ -22,7 +22,7 @@ def read_netcdf(path: Path) -> dict[str, Table]:
                 # Text is an array of characters.
                 if variable.typecode() != "c" and np.size(variable.data) > 1:
                     arrays[name] = np.array(variable.data, float)
-                    units[name] = getattr(variable, "units", b"").decode() or None
-    except (OSError, TypeError, ValueError, KeyError, AssertionError, IndexError) as error:
-        raise ValueError(f"{path}: the file is damaged or cut off: {error}") from None
+                    units[name] = word(getattr(variable, "units", None))
+    except Exception as error:  # scipy raises whatever its parser stumbles over
+        raise damaged(path, error) from None
     return {"": table_of(str(path), arrays, units)}

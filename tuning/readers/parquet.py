@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from tuning.optional import library
-from tuning.readers.table import Table, table_of
+from tuning.readers.table import Table, damaged, table_of, word
 
 MAGIC = b"PAR1"
 
@@ -22,7 +22,7 @@ def read_parquet(path: Path) -> dict[str, Table]:
     try:
         table = parquet.read_table(path)
     except (OSError, pyarrow.ArrowException) as error:
-        raise ValueError(f"{path}: the file is damaged or cut off: {error}") from None
+        raise damaged(path, error) from None
     arrays, units = {}, {}
     for field in table.schema:
         values = table[field.name].to_numpy()
@@ -31,6 +31,5 @@ def read_parquet(path: Path) -> dict[str, Table]:
             units[field.name] = "s"
         if values.dtype.kind in "fiu":
             arrays[field.name] = values
-            named = (field.metadata or {}).get(b"unit", b"").decode()
-            units.setdefault(field.name, named or None)
+            units.setdefault(field.name, word((field.metadata or {}).get(b"unit")))
     return {"": table_of(str(path), arrays, units)}

@@ -1,6 +1,7 @@
 """What every reader returns: named columns of numbers as read, and the lines they came from."""
 
 import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,6 +120,20 @@ def read_text(path: Path) -> str:
     if not text.strip():
         raise ValueError(f"{path}: the log is empty")
     return text
+
+
+def word(attribute: Any) -> str | None:
+    """The text of an attribute of a file, None if it holds none."""
+    if isinstance(attribute, bytes):
+        attribute = attribute.decode(errors="replace")
+    return attribute if isinstance(attribute, str) and attribute else None
+
+
+def damaged(path: Path, error: Exception) -> ValueError:
+    """The error for a file that the library which reads it stumbles over, in one line."""
+    words = "".join(letter if letter.isprintable() else " " for letter in str(error))
+    why = textwrap.shorten(words, 150, placeholder=" ...") or type(error).__name__
+    return ValueError(f"{path}: the file is damaged or cut off: {why}")
 
 
 def numbers(

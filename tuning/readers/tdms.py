@@ -1,12 +1,14 @@
 """LabVIEW's binary logs (.tdms), by npTDMS: each group of channels is a run."""
 
+import contextlib
+import logging
 import warnings
 from pathlib import Path
 
 import numpy as np
 
 from tuning.optional import library
-from tuning.readers.table import Table, is_time, table_of
+from tuning.readers.table import Table, damaged, is_time, table_of, word
 
 MAGIC = b"TDSm"
 
@@ -22,12 +24,11 @@ def read_tdms(path: Path) -> dict[str, Table]:
     """
     nptdms = library("nptdms", "tdms")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of npTDMS about incomplete files: we say it
+        with _silent(nptdms):
             file = nptdms.TdmsFile.read(path)
             groups = {group.name: _channels(group) for group in file.groups()}
     except Exception as error:  # whatever npTDMS meets in a file that is not as it should be
-        raise ValueError(f"{path}: the file is damaged or cut off: {error}") from None
+        raise damaged(path, error) from None
     notes = ["the recording breaks off within a segment"] if _broken_off(file) else []
     runs = {}
     for name, channels in groups.items():
@@ -35,10 +36,24 @@ def read_tdms(path: Path) -> dict[str, Table]:
         numeric = {a: b for a, b in numeric.items() if np.issubdtype(b.dtype, np.number)}
         if numeric:
             place = f"{path}, group {name!r}"
-            units = {a: channels[a].properties.get("unit_string") for a in numeric}
+            units = {a: word(channels[a].properties.get("unit_string")) for a in numeric}
             clock = _clock(place, {a: channels[a] for a in numeric})
             runs[name] = table_of(place, numeric, units, clock, notes)
     return runs
+
+
+@contextlib.contextmanager
+def _silent(nptdms):
+    """Keep npTDMS from printing what it thinks of a file: it is said here."""
+    manager = nptdms.log.log_manager
+    level = manager.log_level
+    manager.set_level(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        manager.set_level(level)
 
 
 def _channels(group):

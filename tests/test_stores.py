@@ -1,0 +1,197 @@
+"""Stores that are damaged, full or forbidden: found, told in one sentence, and nothing is lost."""
+
+import ast
+import resource
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+
+import jaxbeam as jb
+from jaxbeam.record import read_record
+from jaxbeam.sweep_store import Disk
+from tests.modules import module_files, parse
+from tests.test_sweep import CASE
+from tuning import read_logs
+
+OVER = {"loads.0.mass": np.linspace(0.1, 0.9, 200), "loads.0.speed": [1.5, 2.0, 4.0]}
+
+
+def sweep(store: Path, **options) -> xarray.Dataset:
+    return jb.sweep(CASE, OVER, store=store, progress=False, **options)
+
+
+def stop_after(blocks: int, store: Path) -> None:
+    """Begin a sweep and interrupt it after some blocks."""
+    write = Disk.write
+
+    def stop(self, block, results):
+        if block == blocks:
+            raise KeyboardInterrupt
+        write(self, block, results)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Disk, "write", stop)
+        with pytest.raises(KeyboardInterrupt):
+            sweep(store)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A complete store and its dataset."""
+    path = tmp_path_factory.mktemp("whole") / "runs.zarr"
+    return path, sweep(path)
+
+
+@pytest.fixture
+def copy(whole, tmp_path):
+    path = tmp_path / "runs.zarr"
+    shutil.copytree(whole[0], path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """A store in which two blocks of three are done."""
+    path = tmp_path_factory.mktemp("begun") / "runs.zarr"
+    stop_after(2, path)
+    return path
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+def garble(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x55
+    path.write_bytes(content)
+
+
+DAMAGES = {
+    "cut off": cut,
+    "garbled": garble,
+    "empty": lambda p: p.write_bytes(b""),
+    "gone": Path.unlink,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("part", ["peak_deflection/c/0/0/0", "failed/c/0/0", "peak_time/zarr.json"])
+def test_a_damaged_result_is_refused(copy, part, damage):
+    DAMAGES[damage](copy / part)
+    if (part, damage) == ("peak_time/zarr.json", "garbled"):
+        (copy / part).write_text("{" + (copy / part).read_text())
+    with pytest.raises(ValueError, match=r"runs\.zarr is damaged \(.*\): make the sweep anew"):
+        sweep(copy, resume=True)
+    assert (copy / "peak_deflection").is_dir()
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("part", ["peak_deflection/c/1/0/0", "done/c/1"])
+def test_damaged_blocks_are_computed_again(begun, whole, tmp_path, part, damage):
+    path = tmp_path / "runs.zarr"
+    shutil.copytree(begun, path)
+    DAMAGES[damage](path / "blocks" / part)
+    if part == "done/c/1":
+        found = sweep(path, resume=True)
+    else:
+        with pytest.warns(
+            UserWarning, match="1 finished blocks are damaged and are computed again"
+        ):
+            found = sweep(path, resume=True)
+    xarray.testing.assert_identical(found, whole[1])
+
+
+def test_damaged_beginnings_are_refused(begun, tmp_path):
+    path = tmp_path / "runs.zarr"
+    shutil.copytree(begun, path)
+    garble(path / "blocks" / "steps" / "c" / "0")
+    with pytest.raises(ValueError, match=r"is damaged"):
+        sweep(path, resume=True)
+    shutil.copytree(begun, path, dirs_exist_ok=True)
+    text = (path / "zarr.json").read_text()
+    (path / "zarr.json").write_text(text.replace('"jaxbeam_sweep": "', '"jaxbeam_sweep": "0'))
+    with pytest.raises(ValueError, match="another case, other values or settings"):
+        sweep(path, resume=True)
+    cut(path / "zarr.json")
+    with pytest.raises(FileExistsError, match="is not a sweep of jaxbeam"):
+        sweep(path, overwrite=True)
+    assert (path / "blocks" / "done").is_dir()
+
+
+def test_a_full_disk_costs_no_finished_block(begun, whole, tmp_path):
+    path = tmp_path / "runs.zarr"
+    shutil.copytree(begun, path)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # bytes in a file
+    try:
+        with pytest.raises(OSError, match=r"cannot write to .*: file too large; what is done is"):
+            sweep(path, resume=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert Disk(path).missing() == [2]
+    xarray.testing.assert_identical(sweep(path, resume=True), whole[1])
+    assert not list(path.rglob("*.partial"))
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(jb.order.Order, "work", lambda self: pytest.fail("began to work"))
+    with pytest.raises(OSError, match=r"cannot write runs\.zarr to the folder .*none: no such"):
+        sweep(tmp_path / "none" / "runs.zarr")
+    monkeypatch.setattr("tempfile.TemporaryFile", forbidden)
+    with pytest.raises(PermissionError, match=r"cannot write runs\.zarr .*: permission denied"):
+        sweep(tmp_path / "runs.zarr")
+    assert not list(tmp_path.iterdir())
+
+
+def forbidden(**_):
+    raise PermissionError(13, "Permission denied")
+
+
+# No code from files
+
+
+class Bomb:
+    """Something that, unpickled, leaves a trace."""
+
+    def __init__(self, trace: Path):
+        self.trace = trace
+
+    def __reduce__(self):
+        return Path.touch, (self.trace,)
+
+
+def test_nothing_is_unpickled(copy, tmp_path):
+    trace = tmp_path / "trace"
+    objects = np.array([Bomb(trace)] * 3, dtype=object)
+    for name in ("run.csv", "run.mat", "run.npz", "run.nc", "run.h5", "run.tdms", "run.parquet"):
+        with open(tmp_path / name, "wb") as file:
+            np.savez(file, time=objects)
+        with pytest.raises(ValueError):
+            read_logs(tmp_path / name)
+        with pytest.raises((ValueError, TypeError)):
+            read_record(tmp_path / name)
+    text = (copy / "peak_time" / "zarr.json").read_text()
+    (copy / "peak_time" / "zarr.json").write_text(text.replace('"zstd"', '"numcodecs.pickle"'))
+    with pytest.raises(ValueError, match="is damaged"):
+        sweep(copy, resume=True)
+    assert not trace.exists()
+
+
+RUN = {"eval", "exec", "compile", "__import__"}
+UNPICKLE = {"pickle", "cloudpickle", "marshal", "shelve", "dill", "joblib"}
+
+
+def test_no_module_runs_what_it_reads():
+    for name, path in module_files().items():
+        for node in ast.walk(parse(path)):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id not in RUN, f"{name} calls {node.func.id}"
+            if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
+                assert getattr(node.value, "value", True) is False, f"{name} allows pickles"
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                named = {alias.name for alias in node.names} | {getattr(node, "module", None)}
+                assert not named & UNPICKLE, f"{name} imports {named & UNPICKLE}"

@@ -1,0 +1,97 @@
+"""Whether a MATLAB file holds together, found out before scipy reads it.
+
+scipy trusts the types, sizes and counts in a file; a wrong one ends the whole process or keeps it
+busy for minutes. The format is that of "MAT-File Format" (MathWorks), section 1: a tree of data
+elements, each a tag (type and size) and its data.
+"""
+
+import math
+import struct
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+
+HEADER = 128  # bytes
+MATRIX, COMPRESSED = 14, 15  # types of elements
+# Bytes of one number, by the type of the element.
+NUMBERS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
+CELL, STRUCT, OBJECT, TEXT, SPARSE = 1, 2, 3, 4, 5  # classes of arrays, others are numeric
+NUMERIC = range(6, 16)
+FUNCTION, OPAQUE = 16, 17
+COMPLEX = 1 << 11
+
+
+class Element(NamedTuple):
+    """A data element: the type in its tag, and its data."""
+
+    kind: int
+    data: bytes
+
+
+def check_elements(content: bytes) -> None:
+    """Walk through the elements of a MATLAB file (version 5 to 7).
+
+    Raises ValueError where types, sizes or counts contradict each other, zlib.error where what is
+    compressed is damaged.
+    """
+    order = "<" if content[126:128] == b"IM" else ">"
+    for element in _elements(content[HEADER:], order):
+        if element.kind == COMPRESSED:
+            (element,) = _elements(zlib.decompress(element.data), order)
+        if element.kind == MATRIX:
+            _check_array(element.data, order)
+
+
+def _elements(data: bytes, order: str) -> list[Element]:
+    found, place = [], 0
+    while place + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, place)
+        start = place + 8
+        if kind >> 16:  # up to four bytes of data, within the tag
+            kind, size, start = kind & 0xFFFF, kind >> 16, place + 4
+        if start + size > len(data) or kind not in (MATRIX, COMPRESSED, *NUMBERS):
+            raise ValueError(f"no element can be of type {kind} and {size} bytes long")
+        found.append(Element(kind, data[start : start + size]))
+        # Elements begin at multiples of eight bytes, except after those that are compressed.
+        place = start + size + (0 if kind == COMPRESSED else -(start + size) % 8)
+    return found
+
+
+def _check_array(data: bytes, order: str) -> None:
+    if not data:
+        return  # an empty array may be written so
+    flags, *rest = _elements(data, order)
+    word = struct.unpack_from(f"{order}I", flags.data)[0]
+    kind = word & 0xFF
+    if kind in (FUNCTION, OPAQUE):
+        return
+    shape, name, *rest = rest
+    if shape.kind not in (5, 6) or name.kind not in (1, 16):
+        raise ValueError("an array has neither a shape nor a name")
+    sizes = [int(size) for size in np.frombuffer(shape.data, f"{order}i4")]
+    count = math.prod(sizes)
+    if len(sizes) < 2 or min(sizes) < 0:
+        raise ValueError(f"no array can have the shape {sizes}")
+    if kind in (STRUCT, OBJECT):
+        if kind == OBJECT:
+            rest = rest[1:]
+        length, names, *rest = rest
+        width = struct.unpack_from(f"{order}i", length.data)[0]
+        count *= len(names.data) // width
+    if kind in (CELL, STRUCT, OBJECT):
+        if len(rest) != count or any(element.kind != MATRIX for element in rest):
+            raise ValueError(f"{len(rest)} arrays are where {count} should be")
+        for element in rest:
+            _check_array(element.data, order)
+        return
+    parts = 2 if word & COMPLEX else 1
+    parts += 2 if kind == SPARSE else 0
+    if kind not in (TEXT, SPARSE, *NUMERIC) or len(rest) != parts:
+        raise ValueError(f"no array of class {kind} has {len(rest)} parts")
+    for element in rest:
+        if element.kind not in NUMBERS:
+            raise ValueError(f"there are no numbers in an element of type {element.kind}")
+        fits = len(element.data) == count * NUMBERS[element.kind]
+        if kind in NUMERIC and not fits:
+            raise ValueError(f"{len(element.data)} bytes are no array of shape {sizes}")
