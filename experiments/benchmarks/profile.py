@@ -1,0 +1,80 @@
+"""Where the time of a sweep goes, by stages of the physics.
+
+    python -m experiments.benchmarks.profile [--modes 3] [--keep FOLDER]
+
+The sweep of the speed benchmark is run once under JAX's profiler. Each kernel that XLA has made is
+put down to the innermost `jax.named_scope` of jaxbeam in which it was written; loops and branches
+are left out, as they only contain others. The trace may be kept, for https://ui.perfetto.dev.
+"""
+
+import argparse
+import collections
+import gzip
+import json
+import os
+import re
+import tempfile
+from pathlib import Path
+
+STAGES = ("modes", "rig", "propagators", "path", "collocation", "propagation", "extremes", "peaks")
+CONTAINERS = re.compile(r"(while|cond|call|conditional)[.\d]*$")
+
+
+def stage_of(op_name: str) -> str:
+    """The innermost stage that the name of an operation mentions, such as jit(f)/path/while/dot."""
+    named = [part for part in op_name.split("/") if part in STAGES]
+    return named[-1] if named else "the rest"
+
+
+def stages(dump: Path, module: str) -> dict[str, str]:
+    """The stage of every operation of a compiled module, from what XLA has dumped."""
+    found = {}
+    for path in dump.glob(f"*{module}*after_optimizations.txt"):
+        for line in path.read_text().splitlines():
+            named = re.match(r'\s+(?:ROOT )?%(\S+) = .*op_name="([^"]*)"', line)
+            if named:
+                found[named[1]] = stage_of(named[2])
+    return found
+
+
+def shares(trace: Path, found: dict[str, str], module: str) -> dict[str, float]:
+    """The share of each stage in the time of all kernels of a module."""
+    (path,) = trace.rglob("*.trace.json.gz")
+    with gzip.open(path) as file:
+        events = json.load(file)["traceEvents"]
+    times: collections.Counter[str] = collections.Counter()
+    for event in events:
+        about = event.get("args", {})
+        name = about.get("hlo_op", "")
+        if about.get("hlo_module") == module and not CONTAINERS.match(name):
+            times[found.get(name, "the rest")] += event.get("dur", 0.0)
+    return {stage: time / times.total() for stage, time in times.most_common()}
+
+
+def main() -> None:
+    """Profile the sweep and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--modes", type=int, default=3)
+    parser.add_argument("--keep", type=Path, help="folder for the trace")
+    given = parser.parse_args()
+    folder = given.keep or Path(tempfile.mkdtemp())
+    flags = f"--xla_dump_to={folder / 'hlo'} --xla_dump_hlo_as_text"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
+    import jax
+
+    from experiments.benchmarks.sweep import sweep_peaks
+
+    jax.config.update("jax_enable_compilation_cache", False)  # what is not compiled is not dumped
+    sweep_peaks(given.modes)
+    options = jax.profiler.ProfileOptions()
+    options.python_tracer_level = 0
+    with jax.profiler.trace(str(folder / "trace"), profiler_options=options):
+        sweep_peaks(given.modes)
+    found = shares(folder / "trace", stages(folder / "hlo", "jit__block"), "jit__block")
+    print(f"| {given.modes} modes, 4096 crossings | share of the time |\n| --- | ---: |")
+    for stage, share in found.items():
+        print(f"| {stage} | {share:.0%} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""Sweeps beyond one machine: a Dask cluster computes blocks, each worker writes its own.
+
+What travels is small: the path of the store and numbers of blocks, there and back. A worker builds
+the sweep from the order that it finds in the store, with the time steps, and writes each block as
+its own chunk, so that no two write one. When workers die, Dask gives what they had not finished to
+others, who leave out what was written.
+"""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jaxbeam import sweep_store
+from jaxbeam.blocks import Work
+from jaxbeam.order import order_from_dict
+
+if TYPE_CHECKING:
+    import distributed  # comes with the extra `cluster` only
+
+BUNDLE = 16  # blocks handed out at once, at most: some tenths of a second
+SHARES = 4  # bundles for each thread, at least, so that all finish at one time
+
+
+def connect(address: str) -> "distributed.Client":
+    """A client of the Dask scheduler at an address, such as tcp://10.0.0.1:8786.
+
+    Raises ImportError without Dask, ConnectionError if no scheduler answers there.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ImportError(
+            "sweeps on a cluster need Dask; install jaxbeam with the extra 'cluster': "
+            "pip install 'jaxbeam[cluster]'"
+        ) from None
+    try:
+        return Client(address, timeout="10s", set_as_default=False)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ConnectionError(f"no Dask scheduler answers at {address}: {reason}") from None
+
+
+def compute(
+    client: "distributed.Client", mark: str, path: Path, blocks: list[int]
+) -> Iterator[int]:
+    """Have the workers of a cluster compute blocks of a sweep and write them to its store.
+
+    `mark` is the fingerprint of the sweep. Gives the number of each block that is done. Raises
+    RuntimeError if there are no workers or they keep dying, and whatever a worker raises.
+    """
+    from distributed import KilledWorker, as_completed
+
+    threads = sum(client.nthreads().values())
+    if not threads:
+        raise RuntimeError("the cluster has no workers; start some, then resume")
+    size = max(1, min(BUNDLE, len(blocks) // (SHARES * threads)))
+    bundles = [blocks[i : i + size] for i in range(0, len(blocks), size)]
+    futures = client.map(work_off, bundles, mark=mark, path=path, pure=False)
+    try:
+        for future in as_completed(futures, loop=client.loop):
+            yield from future.result()
+    except KilledWorker:
+        raise RuntimeError(
+            "workers keep dying (too little memory for each?); what they finished is kept:"
+            " mend this, then resume"
+        ) from None
+    finally:
+        client.cancel(futures)
+
+
+def work_off(blocks: list[int], mark: str, path: Path) -> list[int]:
+    """Compute blocks and write them to the store at a path; what a worker does.
+
+    Raises ValueError if the worker's versions differ from those that began the sweep, or if it
+    does not see the store.
+    """
+    if sweep_store.status(path) != ("unfinished", mark):
+        raise ValueError(
+            f"a worker does not find the sweep at {path}; put the store where all machines see it"
+        )
+    keeper = sweep_store.Disk(path)
+    work, made = _work(mark, keeper)
+    if made != mark:
+        raise ValueError(
+            "a worker has another version of jaxbeam or JAX than that which began the sweep;"
+            " install the same everywhere"
+        )
+    for block in blocks:
+        if not keeper.done(block):
+            keeper.write(block, work.block(block, keeper.steps[:-1]))
+    return blocks
+
+
+_preparing = threading.Lock()
+_known: dict[str, tuple[Work, str]] = {}
+
+
+def _work(mark: str, keeper: sweep_store.Disk) -> tuple[Work, str]:
+    """The blocks of a sweep, prepared once in each process, and the fingerprint made there."""
+    with _preparing:
+        if mark not in _known:
+            order = order_from_dict(keeper.order())
+            _known.clear()
+            _known[mark] = order.work(), order.fingerprint()
+        return _known[mark]

@@ -1,0 +1,155 @@
+"""What is to be swept, checked before anything compiles, and known again by its fingerprint."""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import math
+import re
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.blocks import RUNS, Work
+from jaxbeam.case import Case, replace, value_at
+from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.checks import check
+from jaxbeam.faults import in_words
+from jaxbeam.lanes import LANES, MOST_RUNS, Tasks, arrange
+
+# Whether these are right depends on each other: places, and entries of a list.
+TOGETHER = re.compile(
+    r"beam\.length|(supports|actuators|sensors)\.\d+\.(position|start|end)|.*\.\d+"
+)
+
+# What decides when a controller acts and its sensors are read.
+CLOCK = re.compile(
+    r"run\.(duration|sample_rate)|controller\.(period|delay|times\.\d+)"
+    r"|sensors\.\d+\.(sampling_period|delay)"
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Order:
+    """A case, the values at some of its addresses, and how they are to be run.
+
+    Either all combinations of the values, or with `paired` the first of each, the second of each,
+    and so on; `tolerance` is the relative error allowed of peaks.
+    """
+
+    case: Case
+    axes: dict[str, Float[np.ndarray, " value"]]
+    paired: bool
+    histories: bool
+    tolerance: float
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """How many values there are along each dimension of the results."""
+        sizes = tuple(values.size for values in self.axes.values())
+        return sizes[:1] if self.paired else sizes
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Names of the dimensions of the results."""
+        return ("run",) if self.paired else tuple(self.axes)
+
+    def runs(self) -> Float[np.ndarray, "run address"]:
+        """The values of every run."""
+        values = self.axes.values()
+        columns = values if self.paired else np.meshgrid(*values, indexing="ij")
+        return np.stack([column.ravel() for column in columns], axis=-1)
+
+    def tasks(self) -> Tasks:
+        """The runs, arranged into tasks."""
+        alone = self.case.controller is not None and self.case.controller.knows_loads
+        return arrange(list(self.axes), self.runs(), alone)
+
+    def work(self) -> Work:
+        """The runs, cut into blocks.
+
+        Raises ValueError if places along the beam change their order within the sweep.
+        """
+        return Work(self.case, self.tasks(), self.histories, self.tolerance)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The order in plain words and numbers, which `order_from_dict` makes an order again."""
+        return {
+            "case": case_to_dict(self.case),
+            "axes": {address: values.tolist() for address, values in self.axes.items()},
+            "settings": [self.paired, self.histories, self.tolerance],
+        }
+
+    def fingerprint(self) -> str:
+        """A number for all that shapes the results: case, values, settings and versions."""
+        content = self.to_dict() | {
+            "blocks": [RUNS, LANES],
+            "versions": [importlib.metadata.version("jaxbeam"), jax.__version__],
+        }
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
+def order_from_dict(content: dict[str, Any]) -> Order:
+    """An order from its plain words and numbers, taken to be right."""
+    axes = {address: np.asarray(values, float) for address, values in content["axes"].items()}
+    return Order(case_from_dict(content["case"]), axes, *content["settings"])
+
+
+def make_order(
+    case: Case, over: dict[str, Any], paired: bool, histories: bool, tolerance: float
+) -> Order:
+    """Check a case and the values it is to be swept over, and put them together.
+
+    Raises ValueError for an unknown address, faulty or too many values, and a case without sensors.
+    """
+    check(case)
+    if not over:
+        raise ValueError("give at least one address to sweep over, with a list of values")
+    if not case.sensors:
+        raise ValueError("the case has no sensors, and peaks are taken there; add one to `sensors`")
+    axes = {address: _values(case, address, given) for address, given in over.items()}
+    for address in axes:
+        if histories and address in ("run.duration", "run.sample_rate"):
+            raise ValueError(
+                f"histories of different length do not fit together: leave out {address}"
+            )
+    sizes = {address: values.size for address, values in axes.items()}
+    if paired and len(set(sizes.values())) > 1:
+        raise ValueError(f"paired values must be equally many, not {sizes}")
+    order = Order(case, axes, paired, histories, tolerance)
+    if math.prod(order.shape) > MOST_RUNS:
+        raise ValueError(
+            f"{math.prod(order.shape):.1e} combinations of values are too many; a sweep may have"
+            f" {MOST_RUNS:.0e} runs: split it"
+        )
+    names = list(axes)
+    joint = [i for i, name in enumerate(names) if TOGETHER.fullmatch(name)]
+    if joint:
+        for row in np.unique(order.runs()[:, joint], axis=0):
+            check(replace(case, dict(zip([names[i] for i in joint], row, strict=True))))
+    return order
+
+
+def _values(case: Case, address: str, given: Any) -> Float[np.ndarray, " value"]:
+    """The values of an address, as far as they can be checked without those of others."""
+    if np.ndim(value_at(case, address)):
+        raise ValueError(f"{address} is a list; sweep over one of its entries, {address}.0")
+    try:
+        values = np.atleast_1d(np.asarray(given, float))
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{address} takes a list of numbers, not {in_words(given)}") from None
+    if values.ndim != 1 or values.size == 0:
+        raise ValueError(f"{address} takes a list of values, not one of shape {values.shape}")
+    if case.controller is not None and CLOCK.fullmatch(address):
+        raise ValueError(
+            f"{address} sets the clock of the run, which all runs with a controller share:"
+            " make a sweep for each of its values"
+        )
+    if not TOGETHER.fullmatch(address):
+        # What is allowed is a range, from which zero may be left out.
+        odd = values[~np.isfinite(values) | (values == 0)]
+        for value in {values.min(), values.max(), *odd[:1]}:
+            check(replace(case, {address: value}))
+    return values

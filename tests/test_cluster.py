@@ -1,0 +1,122 @@
+"""Sweeps on a cluster: as on one machine, whoever dies on the way."""
+
+import os
+import signal
+import threading
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+import jaxbeam as jb
+from jaxbeam import cluster
+from jaxbeam.casefile import case_to_dict
+from jaxbeam.cli import main
+from jaxbeam.order import make_order, order_from_dict
+from jaxbeam.sweep_store import Disk, create
+from tests.test_sweep import CASE
+
+distributed = pytest.importorskip("distributed")
+
+OVER = {"loads.0.mass": np.linspace(0.1, 0.9, 64), "loads.0.speed": np.linspace(1, 4, 48)}
+
+
+def files(store: Path) -> dict[str, bytes]:
+    """Every file of a store."""
+    return {
+        str(path.relative_to(store)): path.read_bytes()
+        for path in sorted(store.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def workers():
+    """Two workers in processes of their own, and a client of theirs."""
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=":0"
+        ) as machines,
+        distributed.Client(machines, set_as_default=False) as client,
+    ):
+        yield client
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The store of the sweep as one machine makes it."""
+    path = tmp_path_factory.mktemp("alone") / "runs.zarr"
+    jb.sweep(CASE, OVER, store=path, progress=False)
+    return path
+
+
+def kill_one(client, store: Path) -> None:
+    """Kill a worker as soon as three blocks are done."""
+    flags = store / "blocks" / "done" / "c"
+    while not flags.exists() or len(list(flags.iterdir())) < 3:
+        time.sleep(0.001)
+    os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # of Dask, about the worker that is killed
+def test_two_workers_one_of_them_killed_make_the_same_store(workers, alone, tmp_path):
+    store = tmp_path / "runs.zarr"
+    killer = threading.Thread(target=kill_one, args=(workers, store))
+    killer.start()
+    found = jb.sweep(CASE, OVER, store=store, progress=False, client=workers)
+    killer.join()
+    assert not found.failed.any()
+    assert files(store) == files(alone)
+
+    # Begun on one machine, killed, and ended by the workers, it is the same once more.
+    second = tmp_path / "second.zarr"
+
+    def stop(self, block, results):
+        if block == 2:
+            raise KeyboardInterrupt
+        write(self, block, results)
+
+    write = Disk.write
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Disk, "write", stop)
+        with pytest.raises(KeyboardInterrupt):
+            jb.sweep(CASE, OVER, store=second, progress=False)
+    case = tmp_path / "case.toml"
+    case.write_text(tomli_w.dumps(case_to_dict(CASE)))
+    lists = [f"{name}={','.join(map(repr, values.tolist()))}" for name, values in OVER.items()]
+    address = workers.scheduler.address
+    line = ["sweep", str(case), "--scheduler", address, "-o", str(second), "--resume", "--json"]
+    with pytest.raises(SystemExit) as ended:
+        main([*line, "--over", lists[0], "--over", lists[1]])
+    assert ended.value.code == 0
+    assert files(second) == files(alone)
+    assert case.read_text() == tomli_w.dumps(tomllib.loads(case.read_text()))
+
+
+def test_an_order_travels_in_plain_words_and_numbers():
+    order = make_order(CASE, OVER, False, False, 1e-7)
+    again = order_from_dict(order.to_dict())
+    assert again.fingerprint() == order.fingerprint()
+    np.testing.assert_array_equal(again.runs(), order.runs())
+
+
+def test_workers_refuse_what_they_would_spoil(tmp_path, monkeypatch):
+    path = tmp_path / "runs.zarr"
+    with pytest.raises(ValueError, match="where all machines see it"):
+        cluster.work_off([0], "mark", path)
+    order = make_order(CASE, {"loads.0.mass": [0.1]}, False, False, 1e-7)
+    create(path, "mark", order.to_dict(), 1, np.ones(2))
+    monkeypatch.setattr(cluster, "_work", lambda mark, keeper: (None, "other"))
+    with pytest.raises(ValueError, match="another version of jaxbeam"):
+        cluster.work_off([0], "mark", path)
+    with pytest.raises(ValueError, match="write their blocks to a store; name one"):
+        jb.sweep(CASE, {"loads.0.mass": [0.1]}, client=object())
+
+
+def test_a_scheduler_that_does_not_answer_is_named():
+    with pytest.raises(ConnectionError, match="no Dask scheduler answers at nowhere"):
+        cluster.connect("nowhere://1")
