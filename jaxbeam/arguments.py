@@ -10,6 +10,7 @@ import numpy as np
 from jaxbeam.case import Case
 from jaxbeam.casefile import load_case, load_controller, with_settings
 from jaxbeam.controller import AbstractController
+from jaxbeam.lanes import MOST_RUNS
 
 
 def read_case(path: Path, settings: Iterable[str]) -> Case:
@@ -70,6 +71,8 @@ def sweep_values(over: Iterable[str]) -> dict[str, list[float]]:
             values[address] = _numbers("--over", text, value.split(","))
             continue
         limits = _numbers("--over", text, value.split(":"))
+        if len(limits) == 3 and limits[2] > MOST_RUNS:
+            raise ValueError(f"--over {text}: a range may have {MOST_RUNS:.0e} values, no more")
         if len(limits) != 3 or limits[2] < 1 or limits[2] % 1:
             raise ValueError(
                 f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"

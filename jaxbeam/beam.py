@@ -16,6 +16,8 @@ from jaxbeam.fields import (
     number,
 )
 
+MOST_MODES = 1000  # of a beam; finding more would take minutes
+
 ENDS = ("pinned", "clamped", "free", "guided")
 
 
@@ -117,6 +119,8 @@ class Beam(eqx.Module):
                         " youngs_modulus and density instead of flexural_rigidity and"
                         " mass_per_length"
                     )
+        if self.modes > MOST_MODES:
+            return f"{address}.modes must not exceed {MOST_MODES}; it is {self.modes}"
         return self._damping_fault(address)
 
     def _damping_fault(self, address: str) -> str | None:

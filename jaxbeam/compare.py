@@ -21,10 +21,11 @@ from jaxbeam.control import MPC
 from jaxbeam.control.bound import HELD, Bound, bound
 from jaxbeam.controller import AbstractController, Measurement
 from jaxbeam.fields import known
-from jaxbeam.linear_loop import LinearLoop, OpenLoop, linear, open_loop, prepared
+from jaxbeam.linear_loop import LinearLoop, linear, prepared
 from jaxbeam.loads import motion
 from jaxbeam.margins import margins
 from jaxbeam.modes import lay_out
+from jaxbeam.open_loop import OpenLoop, open_loop
 from jaxbeam.record import Record
 from jaxbeam.simulate import ContactLossWarning, simulate
 from jaxbeam.statespace import state_space

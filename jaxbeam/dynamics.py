@@ -19,6 +19,7 @@ from jaxbeam.case import Case
 from jaxbeam.loads import motion
 from jaxbeam.motion import AbstractMotion
 from jaxbeam.rig import Rig
+from jaxbeam.small import solve_small
 
 
 class Traffic(eqx.Module):
@@ -104,8 +105,8 @@ def at_instant(
     mass = jnp.where(active[:, None], traffic.inertia, 0.0)
     weight = jnp.where(active[:, None], traffic.weight, 0.0)
     # The contact law: (1 + m S S') r = -W - m (contact row) . z.
-    matrix = jnp.eye(loads) + mass.T[:, :, None] * (shape @ shape.T)
-    force = -jnp.linalg.solve(matrix, (weight + mass * felt).T[..., None])[..., 0].T
+    matrix = jnp.eye(loads)[:, :, None] + mass[:, None] * (shape @ shape.T)[:, :, None]
+    force = -solve_small(matrix, (weight + mass * felt)[:, None])[:, 0]
     return force, free + shape.T @ force
 
 
@@ -114,13 +115,10 @@ def solve_contact(gains, inertia, drive):
     """Solve (1 + m_i G_ij) r_j = -d_i for every lane.
 
     `gains` (row, row) are shared, `inertia` and `drive` are (row, lane). The matrix is close to
-    the identity plus a positive matrix for the step lengths in use: no pivots are sought.
+    the identity plus a positive matrix for the step lengths in use.
     """
-    size = gains.shape[0]
-    if size == 0:
-        return drive
-    matrix = inertia[:, None] * gains[:, :, None] + np.eye(size)[:, :, None]
-    return _solve(matrix, -drive[:, None])[0][:, 0]
+    matrix = inertia[:, None] * gains[:, :, None] + np.eye(gains.shape[0])[:, :, None]
+    return solve_small(matrix, -drive[:, None])[:, 0]
 
 
 @solve_contact.defjvp
@@ -131,47 +129,3 @@ def _solve_contact_jvp(primals, tangents):
     forces = solve_contact(*primals)
     change = inertia_change * (gains @ forces) + inertia * (gains_change @ forces) + drive_change
     return forces, solve_contact(gains, inertia, change)
-
-
-def _solve(matrix, *rights):
-    """Solve systems (row, row, lane) by halves: few operations, each on all lanes at once.
-
-    Linear in each of the right sides (row, column, lane), so that it can be transposed.
-    """
-    size = matrix.shape[0]
-    if size <= 3:
-        inverse = _inverse(matrix)
-        return tuple(_times(inverse, right) for right in rights)
-    half = size // 2
-    tops = [matrix[:half, half:], *(right[:half] for right in rights)]
-    across, *upper = _solve(matrix[:half, :half], *tops)
-    below = matrix[half:, :half]
-    rests = [right[half:] - _times(below, top) for right, top in zip(rights, upper, strict=True)]
-    lower = _solve(matrix[half:, half:] - _times(below, across), *rests)
-    pairs = zip(upper, lower, strict=True)
-    return tuple(jnp.concatenate([top - _times(across, end), end]) for top, end in pairs)
-
-
-def _times(a, b):
-    """Product of small matrices (row, row, lane), spelt out."""
-    return sum(a[:, k, None] * b[k] for k in range(1, b.shape[0])) + a[:, 0, None] * b[0]
-
-
-def _inverse(matrix):
-    """Inverse of up to three rows, by cofactors."""
-    size = matrix.shape[0]
-    if size == 1:
-        return 1 / matrix
-    if size == 2:
-        (a, b), (c, d) = matrix
-        return jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)
-    minors = [
-        [
-            matrix[i - 2, j - 2] * matrix[i - 1, j - 1]
-            - matrix[i - 2, j - 1] * matrix[i - 1, j - 2]
-            for i in range(3)
-        ]
-        for j in range(3)
-    ]
-    adjugate = jnp.stack([jnp.stack(row) for row in minors])
-    return adjugate / jnp.sum(matrix[0] * adjugate[:, 0], axis=0)

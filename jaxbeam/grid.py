@@ -20,13 +20,16 @@ from jaxbeam.schedule import Schedule
 class Grid(eqx.Module):
     """Panels, each with a number of equal steps; step lengths are shared among panels.
 
-    `kind` says which of `lengths` (s) the steps of a panel have. The last of the lengths is zero:
-    it belongs to the steps after the end, which fill up a chunk. `opens` is the edge of the
-    schedule at which a panel starts, -1 for an event; `place` is where edges of the schedule are.
+    `counts` are the numbers of steps in the panels, `ends` those up to the end of each: added up
+    once, because a loop over many panels must not add them up in every turn. `kind` says which of
+    `lengths` (s) the steps of a panel have. The last of the lengths is zero: it belongs to the
+    steps after the end, which fill up a chunk. `opens` is the edge of the schedule at which a panel
+    starts, -1 for an event; `place` is where edges of the schedule are.
     """
 
     edges: Float[Array, " edge"]
     counts: Int[Array, " panel"]
+    ends: Int[Array, " panel"]
     kind: Int[Array, " panel"]
     lengths: Float[Array, " length"]
     active: Bool[Array, "panel load"]
@@ -42,24 +45,26 @@ class Grid(eqx.Module):
     @property
     def total(self) -> Int[Array, ""]:
         """Number of steps."""
-        return jnp.sum(self.counts)
+        return self.ends[-1]
 
     def steps(self, index: Int[Array, " step"]):
         """Panel, start time (s) and kind of length of the steps with these indices."""
-        first = jnp.cumsum(self.counts) - self.counts
         beyond = index >= self.total
-        panel = jnp.searchsorted(jnp.cumsum(self.counts), index, side="right")
+        panel = jnp.searchsorted(self.ends, index, side="right")
         panel = jnp.minimum(panel, self.counts.shape[0] - 1)
         kind = jnp.where(beyond, self.lengths.shape[0] - 1, self.kind[panel])
-        start = self.edges[panel] + (index - first[panel]) * self.lengths[self.kind[panel]]
+        start = self.edges[panel] + (index - self._first(panel)) * self.lengths[self.kind[panel]]
         return panel, jnp.where(beyond, self.edges[-1], start), kind
 
     def edge(self, index: Int[Array, " step"]) -> Int[Array, " step"]:
         """Edge of the schedule at which each of some steps starts, -1 for none."""
-        first = jnp.cumsum(self.counts) - self.counts
         panel, _, _ = self.steps(index)
-        starts = (index == first[panel]) & (index < self.total)
+        starts = (index == self._first(panel)) & (index < self.total)
         return jnp.where(starts, self.opens[panel], -1)
+
+    def _first(self, panel):
+        """The first step of a panel."""
+        return self.ends[panel] - self.counts[panel]
 
 
 def _events(case: Case, rig: Rig):
@@ -90,7 +95,7 @@ def even_grid(case: Case, rig: Rig, longest: Float[Array, ""]) -> Grid:
     kind = jnp.arange(spans.shape[0])
     lengths = jnp.append(lengths, 0.0)
     active = _activity(windows, edges)
-    return Grid(edges, counts, kind, lengths, active, windows)
+    return Grid(edges, counts, jnp.cumsum(counts), kind, lengths, active, windows)
 
 
 def scheduled_grid(
@@ -123,4 +128,6 @@ def scheduled_grid(
     counts = jnp.full(spans.shape, substeps)
     active = _activity(windows, edges)
     opens = jnp.where(planned[:-1], order[:-1], -1)
-    return Grid(edges, counts, kind, lengths / substeps, active, windows, opens, jnp.argsort(order))
+    ends, lengths = jnp.cumsum(counts), lengths / substeps
+    place = jnp.argsort(order)
+    return Grid(edges, counts, ends, kind, lengths, active, windows, opens, place)

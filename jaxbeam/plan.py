@@ -29,6 +29,8 @@ from jaxbeam.schedule import Schedule
 from jaxbeam.tables import make_rigging
 
 TOLERANCE = 1e-7  # relative to the largest deflection
+MOST = 10**8  # samples or time steps of a run: more would fill any memory, or take days
+HOPELESS = 6  # halvings of a step after which a run that still overflows is given up
 EVEN = 1e-6  # of the spacing: more even samples are taken for equally spaced
 PROBES = (0.13, 0.29, 0.47, 0.62, 0.88)  # of the length: where errors are looked for
 
@@ -122,13 +124,22 @@ def make_plan(
     gaps = np.diff(samples)
     even = bool(np.all(np.abs(gaps - gaps.mean()) < EVEN * gaps.mean()))
     lead = max(0, int(np.ceil(samples[0] / gaps.mean() - EVEN)))
+    _check_steps(samples.size * (gaps.max() / step), step)
     substeps = max(1, int(np.ceil(gaps.max() / step)))
     return Plan(shape, substeps, lead, even, error)
 
 
 def sample_times(case: Case) -> Float[Array, " time"]:
-    """Times (s) at which a run saves samples: from 0 to its duration at its sample rate."""
+    """Times (s) at which a run saves samples: from 0 to its duration at its sample rate.
+
+    Raises ValueError if these are more than can be kept.
+    """
     duration, rate = float(known(case.run.duration)), float(known(case.run.sample_rate))
+    if duration * rate > MOST:
+        raise ValueError(
+            f"run.duration ({duration:g} s) and run.sample_rate ({rate:g} Hz) make"
+            f" {duration * rate:.3g} samples, and a run may have {MOST:.0e}: lower one of them"
+        )
     return jnp.arange(max(2, int(np.floor(duration * rate * (1 + 1e-12))) + 1)) / rate
 
 
@@ -136,6 +147,16 @@ def sample_times(case: Case) -> Float[Array, " time"]:
 def _probe(case, form, longest, lanes):
     places = case.beam.length * jnp.array(PROBES)
     return run_extremes(case, form, longest, places, lanes).peak()[0]
+
+
+def _check_steps(count: float, step: float) -> None:
+    """Raises RuntimeError if a run needs too many time steps, such as these (s)."""
+    if not count <= MOST:
+        raise RuntimeError(
+            f"the run takes {count:.1e} time steps of {step:.1e} s, and {MOST:.0e} are the most:"
+            " check stiffnesses, masses and damping, shorten the run, or keep fewer modes"
+            " (beam.modes)"
+        )
 
 
 def _longest_step(case: Case, form: Form) -> float:
@@ -154,6 +175,7 @@ def suitable_step(
     """
     case = known_case(case)
     step = _longest_step(case, form)
+    _check_steps(float(known(case.run.duration)) / step, step)
 
     def peaks(halvings):
         return np.asarray(_probe(case, form, jnp.asarray(step / 2**halvings), lanes))
@@ -164,7 +186,9 @@ def suitable_step(
 
 def _suitable_substeps(case: Case, form: Form, schedule: Schedule, tolerance: float):
     """How many steps to take from edge to edge of a schedule, and the error of the peaks."""
-    fewest = max(1, int(np.ceil(float(schedule.lengths.max()) / _longest_step(case, form))))
+    step = _longest_step(case, form)
+    _check_steps(schedule.times.size * float(schedule.lengths.max()) / step, step)
+    fewest = max(1, int(np.ceil(float(schedule.lengths.max()) / step)))
 
     @functools.cache
     def peaks(halvings):
@@ -201,6 +225,8 @@ def _halve(peaks: Callable[[int], np.ndarray], tolerance: float, most: int) -> t
             error = 0.0
         if error <= tolerance:
             return halvings, float(error)
+        if halvings >= HOPELESS and not np.isfinite(fine).all():
+            break
         coarse = fine
     raise RuntimeError(
         f"no time step makes the peaks agree to {tolerance:g}; the response grows without bound, "

@@ -65,7 +65,7 @@ def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
     """
     pairs = []
     for i, actuator in enumerate(case.actuators):
-        if _command_unit(actuator) != "1":
+        if takes_commands(actuator):
             pairs += [(f"actuators.{i}", f"sensors.{j}") for j in range(len(case.sensors))]
         if isinstance(actuator, Electrodynamic):
             pairs += shaker_chain(i)
@@ -152,7 +152,7 @@ def _input_unit(case: Case, word: str) -> str:
         _check_place(case, word, place)
         return "N"
     actuator, what = _actuator(case, word, "input")
-    if _command_unit(actuator) == "1":
+    if not takes_commands(actuator):
         raise ValueError(f"the input {word!r} takes no command")
     if what not in ("", "active_force"):
         raise ValueError(
@@ -203,6 +203,11 @@ def _check_place(case: Case, word: str, place: str) -> None:
     except ValueError:
         raise ValueError(f"{word!r}: {place!r} is not a number in m") from None
     check_on_beam(repr(word), x, case.beam.length)
+
+
+def takes_commands(actuator: AbstractActuator) -> bool:
+    """Whether an actuator does something with a command, as a passive one does not."""
+    return _command_unit(actuator) != "1"
 
 
 def _command_unit(actuator: AbstractActuator) -> str:

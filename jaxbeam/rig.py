@@ -8,6 +8,7 @@ that follows works on blocks and does not ask which of the two it has.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag, solve_triangular
@@ -73,6 +74,7 @@ def rig(case: Case, layout: Layout | None = None, coupled: bool = True) -> Rig:
     return assemble(case, modes(case, layout), coupled)
 
 
+@jax.named_scope("rig")
 def assemble(case: Case, found: Modes, coupled: bool = True) -> Rig:
     """The rig of a case whose modes are known already; see `rig`."""
     count = case.beam.modes

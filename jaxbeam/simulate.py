@@ -110,9 +110,14 @@ def _record(case: Case, plan: Plan, times, error) -> Record:
 def readings(case: Case, times: Float[Array, " time"], plan: Plan) -> Float[Array, "time sensor"]:
     """What the sensors read at ascending times (s), and nothing else: `Record.measured`.
 
-    Lean in compiling and differentiating, for fits; see `simulate`, which checks and warns.
+    Without noise, which is not known of a log, neither in the readings nor in what a controller
+    sees of them. Lean in compiling and differentiating, for fits; see `simulate`, which checks and
+    warns.
     """
-    _, (coordinates, rates, accelerations, *_), found, _ = _trace(case, plan, times, None)
+    _, outputs, found, _ = _trace(case, plan, times, None, noisy=False)
+    coordinates, rates, accelerations, *_, shown, _ = outputs
+    if shown is not None:
+        return shown
     return measure(case, found, coordinates, rates, accelerations, times)
 
 
@@ -135,7 +140,7 @@ def histories(
     return Histories(coordinates @ found.shapes(places).T, commands, force)
 
 
-def _trace(case: Case, plan: Plan, times, watched):
+def _trace(case: Case, plan: Plan, times, watched, noisy=True):
     """Extremes, outputs at the sample times, modes, and the number of steps."""
     loads, layout = traffic(case), plan.form.layout
     if case.controller is None:
@@ -147,6 +152,8 @@ def _trace(case: Case, plan: Plan, times, watched):
     else:
         schedule = plan.schedule
         driver = make_loop(case, layout, loads, schedule)
+        if not noisy:
+            driver = dataclasses.replace(driver, noise=None)
         assembled = driver.rig
     grid = scheduled_grid(case, assembled, schedule, plan.substeps)
     count = grid.counts.shape[0] * plan.substeps

@@ -24,6 +24,7 @@ from jaxbeam.holds import hold
 from jaxbeam.modes import Layout
 from jaxbeam.rig import Rig, rig
 from jaxbeam.sensors import QUANTITIES
+from jaxbeam.small import solve_small
 
 
 class Signal(NamedTuple):
@@ -214,7 +215,8 @@ class LoadedBeam(eqx.Module):
         matrix, command = block_diag(*model.state_matrix), model.command_matrix
         # The contact forces: (1 + m S S') r = -W - m (rows z + S forces of the commands).
         push = jnp.zeros((model.states, shape.shape[0])).at[rates].set(shape.T)
-        push = push @ jnp.linalg.inv(jnp.eye(len(mass)) + mass[:, None] * (shape @ shape.T))
+        held = jnp.eye(len(mass)) + mass * (shape @ shape.T)
+        push = solve_small(held[:, :, None], push.T[:, :, None])[:, :, 0].T
         matrix = matrix - push @ (mass[:, None] * rows)
         command = command - push @ (mass[:, None] * (shape @ command[rates]))
         inputs = jnp.concatenate([command, -push], axis=1)

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.driver import AbstractDriver
@@ -96,18 +97,21 @@ def make_rigging(
     watch = jnp.einsum("wbm,lpbmj->lpwbj", rows, step.drift_points[..., places, :])
     push = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, step.push_points[..., places, :])
     flat = (grid.lengths.shape[0], -1)
+    # Not a number for rigid-body modes, which no energy bounds.
+    bent = solve_triangular(jnp.linalg.cholesky(rig.stiffness()), shapes.T, lower=True)
     return Rigging(
         rig,
         grid,
         step,
         watch.reshape(*flat, *watch.shape[3:]),
         push.reshape(*flat, *push.shape[3:]),
-        jnp.sum(shapes * jnp.linalg.solve(rig.stiffness(), shapes.T).T, axis=-1),
+        jnp.sum(bent**2, axis=0),
         commands,
         inner,
     )
 
 
+@jax.named_scope("path")
 def tabulate(rigging: Rigging, traffic: Traffic, slots: int, index: Int[Array, " step"]):
     """Tables of the steps with the given indices, and their start times and lengths (s)."""
     rig, grid = rigging.rig, rigging.grid

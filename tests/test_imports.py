@@ -10,8 +10,9 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.compiling  jaxbeam.document  jaxbeam.driver  jaxbeam.fields  jaxbeam.holds
-jaxbeam.faults  jaxbeam.stretches
+jaxbeam.compiling  jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.fields  jaxbeam.holds
+jaxbeam.small
+jaxbeam.faults  jaxbeam.piecewise  jaxbeam.stretches
 jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
 jaxbeam.estimator  jaxbeam.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.sensors
 jaxbeam.case  jaxbeam.sensing
@@ -22,10 +23,11 @@ jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.ports  jaxbeam.
 jaxbeam.frequency  jaxbeam.grid
 jaxbeam.dynamics
 jaxbeam.reference  jaxbeam.statespace  jaxbeam.static  jaxbeam.tables
+jaxbeam.sensed
 jaxbeam.estimation
 jaxbeam.control  jaxbeam.extremes
 jaxbeam.casefile  jaxbeam.integrate
-jaxbeam.export  jaxbeam.loop  jaxbeam.record  jaxbeam.rigs
+jaxbeam.export  jaxbeam.loop  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
 jaxbeam.linear_loop  jaxbeam.plan
 jaxbeam.margins  jaxbeam.stability
 jaxbeam.control.reach
@@ -34,6 +36,8 @@ jaxbeam.control.bound
 jaxbeam.lanes  jaxbeam.pacing  jaxbeam.sweep_store
 jaxbeam.simulate  jaxbeam.amplification  jaxbeam.correction
 jaxbeam.blocks
+jaxbeam.order
+jaxbeam.cluster
 jaxbeam.sweep  jaxbeam.compare
 jaxbeam.plot
 jaxbeam.__init__

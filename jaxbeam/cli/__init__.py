@@ -45,6 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         _keep_compiled()
     try:
         app(arguments, exit_on_error=False, print_error=False)
+    except MemoryError as error:
+        say(f"not enough memory: {error}")
+        sys.exit(1)
     except (ValueError, OSError, RuntimeError, ImportError, CycloptsError) as error:
         say(" ".join(str(error).split()))
         sys.exit(1)

@@ -21,12 +21,12 @@ def demo(
     output: Output = None,
     json_: Json = False,
 ) -> None:
-    """Identify a rig from logged data, end to end, in under a minute.
+    """Identify a rig from logs, sweep it, and tune a controller for it, in a minute or two.
 
     Parameters
     ----------
     output
-        Folder for the figure and the record; a fresh one below `out` if left out.
+        Folder for figures, cases and results; a fresh one below `out` if left out.
     """
     from experiments import demo as demonstration
 

@@ -1,6 +1,7 @@
 """Commands that simulate a case: modes, one run, many runs, frequency responses."""
 
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -151,6 +152,7 @@ def sweep(
     output: Output = None,
     paired: bool = False,
     resume: bool = False,
+    scheduler: str | None = None,
     set_: Settings = (),
     overwrite: Overwrite = False,
     json_: Json = False,
@@ -170,22 +172,30 @@ def sweep(
         Take the values of all numbers together, one by one, not in every combination.
     resume
         Continue an interrupted sweep in the same store.
+    scheduler
+        Have the workers of a Dask cluster do it: the address of its scheduler, tcp://HOST:PORT.
+        The store must be where all of them see it.
     """
     import jaxbeam as jb
+    from jaxbeam.cluster import connect
 
     values = sweep_values(over)
     refuse(resume and not output, "--resume needs the store to continue; name it with -o OUT.zarr")
+    refuse(bool(scheduler) and not output, "--scheduler needs a store for the results: -o OUT.zarr")
     check_suffix(output, ".zarr", "a sweep")
     check_outputs(overwrite or resume, output)
-    results = jb.sweep(
-        read_case(case, set_),
-        values,
-        store=output,
-        resume=resume,
-        overwrite=overwrite,
-        paired=paired,
-        progress=not json_,
-    )
+    described = read_case(case, set_)
+    with connect(scheduler) if scheduler else nullcontext() as client:
+        results = jb.sweep(
+            described,
+            values,
+            store=output,
+            resume=resume,
+            overwrite=overwrite,
+            paired=paired,
+            progress=not json_,
+            client=client,
+        )
     peaks = results["peak_deflection"]
     if json_:
         print_json(
