@@ -1,30 +1,48 @@
 """Envelopes of the deflection along the beam, and how far they exceed static loading."""
 
+import dataclasses
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
-from jaxbeam.checks import check
 from jaxbeam.compiling import compiled
-from jaxbeam.plan import TOLERANCE, form, run_extremes, suitable_step
+from jaxbeam.faults import check_on_beam
+from jaxbeam.integrate import march
+from jaxbeam.plan import TOLERANCE, make_plan, sample_times
+from jaxbeam.simulate import prepare
 from jaxbeam.static import static_peak
+from jaxbeam.tables import both_sides
 
 
-def envelope(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, " place"]:
-    """Largest absolute deflection (m) at positions x (m) during a run, free vibration included.
+class Envelope(NamedTuple):
+    """How far a beam goes down and up (m) at some places: nowhere above zero, nowhere below."""
 
-    Found while integrating, without storing histories. `tolerance` is relative. Raises ValueError
-    for a faulty case, RuntimeError if no time step meets the tolerance.
+    lowest: Float[Array, " place"]
+    highest: Float[Array, " place"]
+
+
+def envelope(case: Case, x, tolerance: float = TOLERANCE) -> Envelope:
+    """Lowest and highest deflection (m) at positions x (m) during a run, between samples too.
+
+    Found while integrating, without storing histories; free vibration and control are included.
+    The beam begins at rest, so zero is always reached. `tolerance` is relative to the largest
+    deflection. Raises ValueError for a faulty case or positions off the beam, RuntimeError if no
+    time step meets the tolerance.
     """
-    check(case)
-    shape = form(case)
-    step, _ = suitable_step(case, shape, tolerance)
-    return _peaks(case, shape, jnp.asarray(step), jnp.asarray(x, float))
+    x = jnp.asarray(x, float)
+    plan = make_plan(case, tolerance=tolerance)
+    check_on_beam("x", x, case.beam.length)
+    return _envelope(case, dataclasses.replace(plan, error=0.0), sample_times(case), x)
 
 
 @compiled
-def _peaks(case, shape, step, x):
-    return run_extremes(case, shape, step, x).peak()[0][:, 0]
+def _envelope(case, plan, times, x):
+    rigging, loads, driver, *_ = prepare(case, plan, times, x)
+    best, _ = march(both_sides(rigging), loads, slots=plan.form.slots, driver=driver)
+    highest, lowest = jnp.split(best.peak()[0][:, 0], 2)
+    return Envelope(-lowest, highest)
 
 
 def amplification(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, " place"]:
@@ -35,4 +53,5 @@ def amplification(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, "
     slow crossing fall a little short of one. Raises as `envelope`, and ValueError for a beam that
     can move as a rigid body.
     """
-    return envelope(case, x, tolerance) / static_peak(case, jnp.asarray(x, float))
+    lowest, highest = envelope(case, x, tolerance)
+    return jnp.maximum(-lowest, highest) / static_peak(case, jnp.asarray(x, float))

@@ -1,5 +1,7 @@
 """The largest deflections and smallest contact forces of a run, kept without storing it."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ NEAR = 1.1  # a peak between samples is less than this above the highest of them
 class Extremes(eqx.Module):
     """What is kept of a run.
 
-    `samples` are the deflections at equal points of the step with the largest absolute deflection
+    `samples` are the deflections at equal points of the step with the largest `size` of deflection
     of each watched place, `start` (s) and `span` (s) that step. Contact forces are those with
     which a load presses on the beam; `lost` (s) is the first time it would have to pull.
     """
@@ -29,10 +31,11 @@ class Extremes(eqx.Module):
     lowest: Float[Array, "load lane"]
     lost: Float[Array, "load lane"]
     sound: Bool[Array, " lane"]
+    size: Callable = eqx.field(static=True)
 
     def peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
-        """Largest absolute deflection (m) of each watched place, and when (s); NaN if not sound."""
-        value, place = refine(self.samples)
+        """Largest size of deflection (m) of each watched place, and when (s); NaN if not sound."""
+        value, place = refine(self.samples, self.size)
         time = self.start + place * self.span
         return jnp.where(self.sound, value, jnp.nan), jnp.where(self.sound, time, jnp.nan)
 
@@ -46,7 +49,9 @@ def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) 
     samples = jax.lax.optimization_barrier(seen.reshape(steps, POINTS + 1, -1, lanes))
 
     def raised(best):
-        score = jax.lax.optimization_barrier(jax.vmap(vertex)(samples))
+        score = jax.lax.optimization_barrier(
+            jax.vmap(lambda step: vertex(step, best.size))(samples)
+        )
         highest = jnp.max(score, axis=0)
         # Found so, and not by argmax, which looks at one number after the other.
         top = jnp.max(jnp.where(score == highest, np.arange(steps)[:, None, None], 0), axis=0)
@@ -60,6 +65,7 @@ def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) 
             best.lowest,
             best.lost,
             best.sound,
+            best.size,
         )
 
     # Most chunks come nowhere near the peak so far, or press all along: they end here.
@@ -82,8 +88,8 @@ def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) 
     return eqx.tree_at(lambda b: (b.lowest, b.lost, b.sound), best, (lowest, first, sound))
 
 
-def nothing_seen(places: int, loads: int, lanes: int) -> Extremes:
-    """Extremes of a run that has not begun."""
+def nothing_seen(places: int, loads: int, lanes: int, size: Callable) -> Extremes:
+    """Extremes of a run that has not begun, by some size of deflection that is zero at rest."""
     nothing = jnp.zeros((places, lanes))
     return Extremes(
         nothing,
@@ -93,4 +99,5 @@ def nothing_seen(places: int, loads: int, lanes: int) -> Extremes:
         jnp.full((loads, lanes), jnp.inf),
         jnp.full((loads, lanes), NEVER),
         jnp.ones(lanes, bool),
+        size,
     )

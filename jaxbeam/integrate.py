@@ -143,7 +143,9 @@ def trace(
         state, memory, best, _, history = chunk(state, memory, best, first)
         return (state, memory, best), history
 
-    best = None if rigging.watch is None else nothing_seen(rigging.places, loads, lanes)
+    best = (
+        None if rigging.watch is None else nothing_seen(rigging.places, loads, lanes, rigging.size)
+    )
     memory = None if driver is None else driver.start(lanes)
     rest = jnp.zeros((rigging.rig.states, lanes))
     firsts = jnp.arange(0, steps, CHUNK)
@@ -195,7 +197,7 @@ def march(
         return state, memory, best, first, going
 
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
-    best = nothing_seen(rigging.places, loads, lanes)
+    best = nothing_seen(rigging.places, loads, lanes, rigging.size)
     memory = None if driver is None else driver.start(lanes)
     start = (
         jnp.zeros((rigging.rig.states, lanes)),

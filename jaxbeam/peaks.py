@@ -1,4 +1,6 @@
-"""Largest absolute value of a smooth curve known at a few equal points."""
+"""Largest value of a smooth curve known at a few equal points, absolute unless asked otherwise."""
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -40,22 +42,26 @@ def _climb(curve: list, start, reach: float, rounds: int):
     return place
 
 
-def vertex(samples: Float[Array, "point *rest"]) -> Float[Array, " *rest"]:
-    """Largest absolute value, closely estimated: sought from the largest sample alone.
+def vertex(
+    samples: Float[Array, "point *rest"], size: Callable = jnp.abs
+) -> Float[Array, " *rest"]:
+    """Largest size of a value, closely estimated: sought from the largest sample alone.
 
     Cheap, to tell which of many steps holds the peak; `refine` then finds it.
     """
-    size = jnp.abs(samples)
-    highest = jnp.max(size, axis=0)
-    start = jnp.linspace(-1.0, 1.0, size.shape[0])[jnp.argmax(size, axis=0)]
+    sizes = size(samples)
+    highest = jnp.max(sizes, axis=0)
+    start = jnp.linspace(-1.0, 1.0, sizes.shape[0])[jnp.argmax(sizes, axis=0)]
     curve = _polynomial(samples)
-    place = _climb(curve, start, 1 / size.shape[0], rounds=2)
-    return jnp.maximum(jnp.abs(_value(curve, place)), highest)
+    place = _climb(curve, start, 1 / sizes.shape[0], rounds=2)
+    return jnp.maximum(size(_value(curve, place)), highest)
 
 
 @jax.named_scope("peaks")
-def refine(samples: Float[Array, "point *rest"]) -> tuple[Float[Array, " *rest"], ...]:
-    """Largest absolute value of the polynomial through the samples, and where in [0, 1] it is.
+def refine(
+    samples: Float[Array, "point *rest"], size: Callable = jnp.abs
+) -> tuple[Float[Array, " *rest"], ...]:
+    """Largest size of a value of the polynomial through the samples, and where in [0, 1] it is.
 
     The derivative is that at the fixed place of the peak, which is exact where the peak is a
     maximum inside the curve and where it is at an end that stays.
@@ -64,9 +70,9 @@ def refine(samples: Float[Array, "point *rest"]) -> tuple[Float[Array, " *rest"]
     frozen = [jax.lax.stop_gradient(coefficient) for coefficient in curve]
     fine = np.linspace(-1.0, 1.0, FINE + 1)
     looked = jnp.tensordot(fine[:, None] ** np.arange(len(curve)), jnp.stack(frozen), axes=1)
-    start = jnp.asarray(fine)[jnp.argmax(jnp.abs(looked), axis=0)]
+    start = jnp.asarray(fine)[jnp.argmax(size(looked), axis=0)]
     place = _climb(frozen, start, 2 / FINE, rounds=4)
     # Where the curve is highest at an end, Newton's method may run away to a lower place.
-    better = jnp.abs(_value(frozen, place)) > jnp.abs(_value(frozen, start))
+    better = size(_value(frozen, place)) > size(_value(frozen, start))
     place = jax.lax.stop_gradient(jnp.where(better, place, start))
-    return jnp.abs(_value(curve, place)), (place + 1) / 2
+    return size(_value(curve, place)), (place + 1) / 2

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbeam.case import Case
 from jaxbeam.compiling import compiled
+from jaxbeam.driver import AbstractDriver
 from jaxbeam.dynamics import Traffic, at_instant, traffic
 from jaxbeam.exponentials import NODES, at_ends
 from jaxbeam.fields import is_known, known
@@ -21,7 +22,7 @@ from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
 from jaxbeam.record import Record, measure, never_as_nan
 from jaxbeam.rig import Rig, rig
 from jaxbeam.schedule import sampled
-from jaxbeam.tables import make_rigging
+from jaxbeam.tables import Rigging, make_rigging
 
 
 class ContactLossWarning(UserWarning):
@@ -140,8 +141,21 @@ def histories(
     return Histories(coordinates @ found.shapes(places).T, commands, force)
 
 
-def _trace(case: Case, plan: Plan, times, watched, noisy=True):
-    """Extremes, outputs at the sample times, modes, and the number of steps."""
+class Prepared(NamedTuple):
+    """All that an integration needs: a rig on its grid, its loads, and what drives it, if any.
+
+    `edges` are the steps with which the samples begin, `count` is how many steps there are.
+    """
+
+    rigging: Rigging
+    loads: Traffic
+    driver: AbstractDriver | None
+    edges: Int[Array, " time"]
+    count: int
+
+
+def prepare(case: Case, plan: Plan, times, watched, noisy: bool = True) -> Prepared:
+    """A case made ready to be integrated as planned, watching deflections at some places (m)."""
     loads, layout = traffic(case), plan.form.layout
     if case.controller is None:
         assembled, driver = rig(case, layout, plan.form.coupled), None
@@ -156,13 +170,18 @@ def _trace(case: Case, plan: Plan, times, watched, noisy=True):
             driver = dataclasses.replace(driver, noise=None)
         assembled = driver.rig
     grid = scheduled_grid(case, assembled, schedule, plan.substeps)
-    count = grid.counts.shape[0] * plan.substeps
-    slots = plan.form.slots
     rigging = make_rigging(assembled, grid, watched, driver)
-    best, states, commands, shown, _ = trace(
-        rigging, loads, slots=slots, steps=count, driver=driver
-    )
     edges = plan.substeps * grid.place[schedule.samples]
+    return Prepared(rigging, loads, driver, edges, grid.counts.shape[0] * plan.substeps)
+
+
+def _trace(case: Case, plan: Plan, times, watched, noisy=True):
+    """Extremes, outputs at the sample times, modes, and the number of steps."""
+    rigging, loads, driver, edges, count = prepare(case, plan, times, watched, noisy)
+    assembled = rigging.rig
+    best, states, commands, shown, _ = trace(
+        rigging, loads, slots=plan.form.slots, steps=count, driver=driver
+    )
     states = states[edges]
     shown, failures = (None, None) if shown is None else (part[edges, ..., 0] for part in shown)
     if driver is not None:

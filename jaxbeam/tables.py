@@ -5,6 +5,8 @@ is every command; the rig answers both exactly (`exponentials`). Here the answer
 what the contact law feels at the nodes, the state at the end, the watched deflections.
 """
 
+import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -58,7 +60,8 @@ class Rigging(eqx.Module):
     """A rig on a grid: its propagators, and the rows that give the watched deflections.
 
     `flexibility` is the static deflection at each watched place under a unit force there, which
-    bounds the deflection by the energy. `inner` asks for the states at the nodes too.
+    bounds the deflection by the energy. `inner` asks for the states at the nodes too. `size` is
+    what makes a watched deflection large; see `both_sides`.
     """
 
     rig: Rig
@@ -69,6 +72,7 @@ class Rigging(eqx.Module):
     flexibility: Float[Array, " place"] | None
     commands: Float[Array, "mode actuator"] | None
     inner: bool = eqx.field(static=True)
+    size: Callable = eqx.field(static=True, default=jnp.abs)
 
     @property
     def places(self) -> int:
@@ -108,6 +112,23 @@ def make_rigging(
         jnp.sum(bent**2, axis=0),
         commands,
         inner,
+    )
+
+
+def both_sides(rigging: Rigging) -> Rigging:
+    """A rigging that watches every place twice: how far up the beam goes, then how far down."""
+
+    def twice(rows):
+        split = rows.reshape(rows.shape[0], POINTS + 1, rigging.places, *rows.shape[2:])
+        both = jnp.concatenate([split, -split], axis=2)
+        return both.reshape(rows.shape[0], -1, *rows.shape[2:])
+
+    return dataclasses.replace(
+        rigging,
+        watch=twice(rigging.watch),
+        watch_push=twice(rigging.watch_push),
+        flexibility=jnp.tile(rigging.flexibility, 2),
+        size=jnp.positive,
     )
 
 

@@ -34,7 +34,8 @@ jaxbeam.control.reach
 jaxbeam.control.least_peak
 jaxbeam.control.bound
 jaxbeam.lanes  jaxbeam.pacing  jaxbeam.sweep_store
-jaxbeam.simulate  jaxbeam.amplification  jaxbeam.correction
+jaxbeam.simulate  jaxbeam.correction
+jaxbeam.amplification
 jaxbeam.blocks
 jaxbeam.order
 jaxbeam.cluster
