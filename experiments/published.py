@@ -72,6 +72,16 @@ CRITICAL = Printed(
     "24.03 48.95 38.24",
     "one-span two-spans,1st two-spans,2nd",
 )
+SPEED_RATIOS = Printed(
+    "2.3",
+    "speed over critical speed",
+    "1",
+    "computed",
+    EXACT,
+    "0.04 0.04 0.08",
+    "0.9m/s,one-span 1.5m/s,two-spans 3m/s,two-spans",
+    "v_cr2 for two spans",
+)
 ANGULAR = Printed(
     "2.3",
     "angular frequencies of two spans",
@@ -189,6 +199,9 @@ SHAKER_GAIN = Printed(
     "low peak",
 )
 SHAKER_PEAK = Printed("Fig. 2.15", "the peak is at", HZ, "computed", CURVE, "27")
+TRANSMITTED_PEAK = Printed(
+    "Fig. 2.18", "peak of the force on the beam per coil force", HZ, "computed", CURVE, "27"
+)
 PARKED_DROP = Printed(
     "Fig. 2.16", "further force drop with 0.5 kg at 0.3 m", HZ, "computed", CURVE, "13"
 )
