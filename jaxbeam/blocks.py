@@ -6,7 +6,6 @@ import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,12 +63,12 @@ class Work:
         self.form = Form(layout, couples(case), slots)
 
         design = case, self.form, self.addresses[0]
-        # Blocks are compiled while the rigs are: it is known before what a rig looks like.
-        with ThreadPoolExecutor(1) as pool:
-            alike = eqx.filter_eval_shape(_rigs, *design, tasks.heavy[:1])[0]
-            compiling = pool.submit(self._compile, alike)
+        # All is compiled side by side: it is known before what a rig looks like.
+        with ThreadPoolExecutor(2) as pool:
+            alike = _rigs.blank(*design, tasks.heavy[:1])[0]
+            compiling = pool.map(lambda work: work[0].ahead(*work[1]), self._programs(alike))
             found = [_rigs(*design, tasks.heavy[part]) for part in parts]
-        compiling.result()
+        list(compiling)  # raises what went wrong
         self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
         limits = limits[self.rig_of]
         limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
@@ -113,33 +112,40 @@ class Work:
             substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
         return self._run(chosen, steps[chosen], substeps)
 
-    def _compile(self, alike):
-        """Compile what finds the steps, from what rigs look like."""
-        first = np.zeros(self.each, int)
-        rigs = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape[1:]), leaf.dtype), alike)
-        _block.ahead(*self._arguments(first, np.ones(self.each), None, rigs, first))
+    def _programs(self, alike):
+        """What finds the steps, with arguments made from what rigs look like."""
+        first, steps = np.zeros(self.each, int), np.ones(self.each)
+        given = self._rigging(first, steps, None, alike, first)
+        riggings = None if given is None else _riggings.blank(*given)
+        programs = [(_block, self._block(first, steps, None, riggings))]
+        return programs if given is None else [*programs, (_riggings, given)]
 
     def _run(self, chosen, steps, substeps):
-        arguments = self._arguments(chosen, steps, substeps, self.rigs, self.rig_of[chosen])
+        given = self._rigging(chosen, steps, substeps, self.rigs, self.rig_of[chosen])
+        riggings = None if given is None else _riggings(*given)
+        arguments = self._block(chosen, steps, substeps, riggings)
         with self._compiling:  # others wait for the first, instead of compiling the same again
             if substeps is not None:
                 _block.ahead(*arguments)
         results = _block(*arguments)
         return {name: np.asarray(values) for name, values in results.items()}
 
-    def _arguments(self, chosen, steps, substeps, rigs, rig_of):
+    def _rigging(self, chosen, steps, substeps, rigs, rig_of):
+        """Arguments of `_riggings`; None with a controller, which has a rig of its own."""
+        if self.case.controller is not None:
+            return None
+        rigs = jax.tree.map(lambda leaf: leaf[rig_of], rigs)
+        heavy, names = self.tasks.heavy[chosen], self.addresses[0]
+        return self.case, names, *self._clock(substeps), rigs, heavy, np.asarray(steps)
+
+    def _block(self, chosen, steps, substeps, riggings):
+        """Arguments of `_block`."""
+        tasks = self.tasks.heavy[chosen], self.tasks.light[chosen], np.asarray(steps)
+        return self.case, self.form, self.addresses, *self._clock(substeps), riggings, *tasks
+
+    def _clock(self, substeps):
         scheduled = substeps is not None or self.case.controller is not None
-        return (
-            self.case,
-            self.form,
-            self.addresses,
-            self.schedule if scheduled else None,
-            substeps,
-            jax.tree.map(lambda leaf: leaf[rig_of], rigs),
-            self.tasks.heavy[chosen],
-            self.tasks.light[chosen],
-            np.asarray(steps),
-        )
+        return (self.schedule if scheduled else None), substeps
 
 
 def _values(case: Case, tasks: Tasks, address: str) -> np.ndarray:
@@ -199,22 +205,39 @@ def _windows(case, addresses, heavy):
     return jax.vmap(task)(heavy)
 
 
+def _prepare(case, addresses, schedule, substeps, assembled, heavy, longest, driver=None):
+    """A rig on the grid of one task."""
+    varied = _varied(case, addresses, heavy)
+    if schedule is None:
+        grid = even_grid(varied, assembled, longest)
+    else:
+        finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int)
+        grid = scheduled_grid(varied, assembled, schedule, substeps or finer)
+    return make_rigging(assembled, grid, varied.sensor_places, driver)
+
+
 @compiled
-def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longest):
+def _riggings(case, addresses, schedule, substeps, rigs, heavy, longest):
+    """Rigs on the grids of some tasks, several at once because each is little work."""
+
+    def group(values):
+        return jax.vmap(lambda task: _prepare(case, addresses, schedule, substeps, *task))(values)
+
+    count, size = longest.shape[0], math.gcd(TOGETHER, longest.shape[0])
+    parts = jax.tree.map(
+        lambda part: part.reshape(count // size, size, *part.shape[1:]), (rigs, heavy, longest)
+    )
+    made = jax.lax.map(group, parts)
+    return jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2), made)
+
+
+@compiled
+def _block(case, form, addresses, schedule, substeps, riggings, heavy, light, longest):
     """Results of some tasks, one after the other, their lanes side by side."""
     heavy_addresses, light_addresses = addresses
 
-    def prepare(assembled, heavy, longest, driver=None):
-        varied = _varied(case, heavy_addresses, heavy)
-        if schedule is None:
-            grid = even_grid(varied, assembled, longest)
-        else:
-            finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int)
-            grid = scheduled_grid(varied, assembled, schedule, substeps or finer)
-        return make_rigging(assembled, grid, varied.sensor_places, driver)
-
     def task(values):
-        rigging, assembled, heavy, light, longest = values
+        rigging, heavy, light, longest = values
         varied = _varied(case, heavy_addresses, heavy)
 
         def press(values):
@@ -226,19 +249,20 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
         driver = None
         if rigging is None:
             driver = make_loop(varied, form.layout, loads, schedule)
-            rigging = prepare(driver.rig, heavy, longest, driver)
+            given = driver.rig, heavy, longest, driver
+            rigging = _prepare(case, heavy_addresses, schedule, substeps, *given)
         if substeps is None:
             best, memory = march(rigging, loads, slots=form.slots, driver=driver)
             history = {}
         else:
-            grid, assembled = rigging.grid, rigging.rig
+            grid = rigging.grid
             steps = grid.counts.shape[0] * substeps
             best, states, *_, memory = trace(
                 rigging, loads, slots=form.slots, steps=steps, driver=driver
             )
             edges = substeps * grid.place[schedule.samples]
             samples = states[edges][:, 0 : 2 * varied.beam.modes : 2]
-            rows = assembled.shapes(varied.sensor_places, (0,))[0]
+            rows = rigging.rig.shapes(varied.sensor_places, (0,))[0]
             history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
         if driver is not None:
             history["controller_failures"] = driver.failures(memory)
@@ -251,17 +275,4 @@ def _block(case, form, addresses, schedule, substeps, rigs, heavy, light, longes
             **history,
         }
 
-    def group(values):
-        assembled, heavy, light, longest = values
-        # Propagators are little work, done for several tasks at once; a loop has its own.
-        alike = case.controller is None
-        rigging = jax.vmap(prepare)(assembled, heavy, longest) if alike else None
-        return jax.lax.map(task, (rigging, assembled, heavy, light, longest))
-
-    count = longest.shape[0]
-    split = count // math.gcd(TOGETHER, count), math.gcd(TOGETHER, count)
-    parts = jax.tree.map(
-        lambda part: part.reshape(*split, *part.shape[1:]), (rigs, heavy, light, longest)
-    )
-    results = jax.lax.map(group, parts)
-    return jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2), results)
+    return jax.lax.map(task, (riggings, heavy, light, longest))

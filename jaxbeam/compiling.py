@@ -3,11 +3,12 @@
 import functools
 import os
 from collections.abc import Callable
-from typing import Generic, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 # XLA's newer code generator for CPUs takes twice as long to compile the programs here, and its
 # last level of optimisation a third longer; they run no faster for the one, 3 % for the other.
@@ -23,38 +24,77 @@ def options() -> dict[str, bool | int]:
     return {name: value for name, value in _known().items() if name not in given}
 
 
+class _Kept(eqx.Module):
+    """What a function returns beside arrays."""
+
+    rest: Any = eqx.field(static=True)
+
+
 class Compiled(Generic[P, R]):
     """A function compiled anew for every structure of its arguments; see `compiled`."""
 
     def __init__(self, function: Callable[P, R]):
         functools.update_wrapper(self, function)
-        self._plain = eqx.filter_jit(function)
+
+        def program(arrays, given):
+            args, kwargs = _together(arrays, *given)
+            arrays, *rest = _apart(function(*args, **kwargs))  # type: ignore[call-arg]
+            return arrays, _Kept(tuple(rest))
+
+        # Its name is the function's in what JAX tells of it.
+        program.__name__ = program.__qualname__ = function.__name__
+        self._program = program
+        self._plain = jax.jit(program, static_argnums=1)
 
     @functools.cached_property
     def _quick(self):  # at the first call, because to ask for the options starts JAX's machinery
-        return eqx.filter_jit(self.__wrapped__, compiler_options=options())  # type: ignore[call-overload]
+        return jax.jit(self._program, static_argnums=1, compiler_options=options())
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        chosen = self._plain if _tracing((args, kwargs)) else self._quick
-        return chosen(*args, **kwargs)
+        arrays, *rest = _apart((args, kwargs))
+        arrays, kept = (self._plain if _tracing(arrays) else self._quick)(arrays, tuple(rest))
+        return _together(arrays, *kept.rest)
 
     def ahead(self, *args: P.args, **kwargs: P.kwargs) -> None:
         """Compile for arguments of the structure and shapes of these: calls then need not."""
-        self._quick.lower(*args, **kwargs).compile()
+        arrays, *rest = _apart((args, kwargs))
+        self._quick.lower(arrays, tuple(rest)).compile()
+
+    def blank(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """What a call would return, with zeros for its numbers: known without compiling."""
+        arrays, *rest = _apart((args, kwargs))
+        shapes, kept = self._quick.eval_shape(arrays, tuple(rest))
+        zeros = [None if leaf is None else np.zeros(leaf.shape, leaf.dtype) for leaf in shapes]
+        return _together(zeros, *kept.rest)
 
 
 def compiled(function: Callable[P, R]) -> Compiled[P, R]:
-    """`equinox.filter_jit` with settings under which XLA compiles faster, where it knows them.
+    """Compile a function for the arrays among its arguments, with settings that make that quick.
 
-    Called within another function that is being traced, it becomes part of that one.
+    As with `equinox.filter_jit`, what is no array is constant. Called within another function that
+    is being traced, it becomes part of that one.
     """
     return Compiled(function)
 
 
-def _tracing(given) -> bool:
-    """Whether a call with these arguments is part of a function being traced."""
-    leaves = [*jax.tree.leaves(given), jnp.zeros(())]  # zeros, too, where all that is done is
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+def _apart(tree) -> tuple[list, tuple, Any]:
+    """Leaves that are arrays, those that are not, each None where it is the other, and the tree."""
+    leaves, structure = jax.tree.flatten(tree)
+    are = [eqx.is_array(leaf) for leaf in leaves]
+    arrays = [leaf if is_array else None for leaf, is_array in zip(leaves, are, strict=True)]
+    rest = tuple(None if is_array else leaf for leaf, is_array in zip(leaves, are, strict=True))
+    return arrays, rest, structure
+
+
+def _together(arrays, rest, structure):
+    pairs = zip(arrays, rest, strict=True)
+    return jax.tree.unflatten(structure, [b if a is None else a for a, b in pairs])
+
+
+def _tracing(arrays) -> bool:
+    """Whether a call with these arrays is part of a function being traced."""
+    given = [*arrays, jnp.zeros(())]  # zeros, too, where all that is done is
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in given)
 
 
 @functools.cache

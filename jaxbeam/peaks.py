@@ -33,13 +33,14 @@ def _climb(curve: list, start, reach: float, rounds: int):
     """Where the curve is flat near the start, by rounds of Newton's method within reach."""
     slope = _differentiate(curve)
     bend = _differentiate(slope)
-    place = start
-    for _ in range(rounds):
+
+    def closer(_, place):
         steep = _value(bend, place)
         flat = steep == 0
         step = jnp.where(flat, 0.0, _value(slope, place) / jnp.where(flat, 1.0, steep))
-        place = jnp.clip(place - jnp.clip(step, -reach, reach), -1.0, 1.0)
-    return place
+        return jnp.clip(place - jnp.clip(step, -reach, reach), -1.0, 1.0)
+
+    return jax.lax.fori_loop(0, rounds, closer, start)
 
 
 def vertex(
@@ -74,5 +75,5 @@ def refine(
     place = _climb(frozen, start, 2 / FINE, rounds=4)
     # Where the curve is highest at an end, Newton's method may run away to a lower place.
     better = size(_value(frozen, place)) > size(_value(frozen, start))
-    place = jax.lax.stop_gradient(jnp.where(better, place, start))
+    place = jax.lax.optimization_barrier(jax.lax.stop_gradient(jnp.where(better, place, start)))
     return size(_value(curve, place)), (place + 1) / 2

@@ -57,6 +57,7 @@ def _chebyshev_table(t, terms: int):
     axis = t.ndim
     table = jnp.stack([jnp.ones_like(t), t], axis=axis)
     while table.shape[axis] < terms:
+        table = jax.lax.optimization_barrier(table)
         # Plain slices: indexing would give the compiler several times as much to read.
         last = 2 * jax.lax.slice_in_dim(table, -1, None, axis=axis)
         lower = jax.lax.rev(jax.lax.slice_in_dim(table, 0, -1, axis=axis), (axis,))

@@ -76,7 +76,7 @@ def test_the_envelope_of_a_controlled_beam_is_that_of_its_record():
 
 
 def test_an_envelope_off_the_beam_is_refused():
-    with pytest.raises(ValueError, match="x must lie on the beam, between 0 and 0.6 m; it is 0.7 m"):
+    with pytest.raises(ValueError, match="x must lie on the beam.* it is 0.7 m"):
         envelope(crossing(1.0), np.array([0.7]))
 
 

@@ -33,6 +33,19 @@ def test_it_is_the_function_wherever_it_is_called(transformed, expected):
     assert_allclose(transformed(POINTS), expected(POINTS), rtol=1e-14)
 
 
+@compiled
+def halves(x, words: str):
+    return {"half": x[: x.shape[0] // 2], "words": words, "count": x.shape[0], "none": None}
+
+
+def test_what_it_will_return_is_known_before_it_is_compiled():
+    blank, real = halves.blank(POINTS[:2], "as given"), halves(POINTS[:2], "as given")
+    assert jax.tree.structure(blank) == jax.tree.structure(real)
+    assert_allclose(real["half"], POINTS[:1])
+    assert (blank["words"], blank["count"]) == (real["words"], real["count"]) == ("as given", 2)
+    assert blank["half"].shape == (1,) and blank["half"].dtype == real["half"].dtype
+
+
 def test_settings_that_are_not_known_are_left_out(monkeypatch):
     monkeypatch.setattr(compiling, "OPTIONS", {"xla_no_such_setting": True})
     compiling._known.cache_clear()
