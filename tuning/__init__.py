@@ -2,15 +2,18 @@
 
 from tuning.account import write_report
 from tuning.belief import Belief
+from tuning.choices import tune_choices
 from tuning.criticism import compare_fits, cross_validate, hold_out
 from tuning.design import sharpen
 from tuning.faults import find_faults, mask
 from tuning.identify import Fit, identify
 from tuning.keeping import load_fit, save_fit
-from tuning.load_cases import LoadCases, grid, read_load_cases
+from tuning.load_cases import LoadCases, draws, grid, read_load_cases
 from tuning.logs import Log
 from tuning.modal import ModalFit, identify_modes
 from tuning.objective import Objective
+from tuning.pareto import lexicographic, pareto
+from tuning.plants import adopt, draw_plants
 from tuning.posterior import sample
 from tuning.profile import profile
 from tuning.proof import Tuned
@@ -30,16 +33,21 @@ __all__ = [
     "Responses",
     "Stable",
     "Tuned",
+    "adopt",
     "compare_fits",
     "cross_validate",
+    "draw_plants",
+    "draws",
     "find_faults",
     "grid",
     "hold_out",
     "identify",
     "identify_modes",
     "identify_responses",
+    "lexicographic",
     "load_fit",
     "mask",
+    "pareto",
     "profile",
     "read_load_cases",
     "read_log",
@@ -49,6 +57,7 @@ __all__ = [
     "save_fit",
     "sharpen",
     "tune",
+    "tune_choices",
     "weigh",
     "write_report",
 ]

@@ -8,16 +8,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from jaxbeam.case import Case, replace
+from jaxbeam.case import Case, replace, value_at
 from jaxbeam.compiling import compiled
 from jaxbeam.control.bound import HELD, bound
 from jaxbeam.dynamics import traffic
 from jaxbeam.plan import Plan, make_plan, sample_times
 from jaxbeam.record import Record
 from jaxbeam.simulate import Histories, histories, simulate
-from tuning.load_cases import Values, apply
+from tuning.believing import believing
+from tuning.load_cases import PLANT, Values, apply
 from tuning.objective import Sharpness, run_merits
 
 TOLERANCE = 1e-4  # of the largest deflection: what tuning needs; verdicts are simulated finer
@@ -28,8 +29,9 @@ class Bench(eqx.Module):
 
     `stacked` is the case with the numbers of all runs along a first axis, `error` the relative
     error of their peaks with the `plan`. `places` (m) are where deflections count: the sensors', or
-    given ones. What is compiled should take the bench as an argument: closed over, its arrays would
-    be constants that XLA works on for seconds.
+    given ones. Laws are designed for the plant of the case: where runs have other plants, `nominal`
+    holds its numbers. What is compiled should take the bench as an argument: closed over, its
+    arrays would be constants that XLA works on for seconds.
     """
 
     runs: Sequence[Values]
@@ -41,6 +43,7 @@ class Bench(eqx.Module):
     free: dict[str, Float[np.ndarray, " run"]]
     after: Float[np.ndarray, "run time"]
     ranges: Float[np.ndarray, " actuator"]
+    nominal: dict[str, Float[np.ndarray, ""]]
 
     @property
     def cases(self) -> list[Case]:
@@ -52,7 +55,7 @@ class Bench(eqx.Module):
         """Histories of all runs, along a first axis, with other numbers at some addresses."""
 
         def single(case):
-            return histories(replace(case, values), self.times, self.plan, self.places)
+            return histories(self._used(case, values), self.times, self.plan, self.places)
 
         return jax.vmap(single)(self.stacked)
 
@@ -77,7 +80,16 @@ class Bench(eqx.Module):
     def records(self, values: Mapping[str, Any]) -> list[Record]:
         """Records of all runs, with true peaks between and at samples."""
         plan = dataclasses.replace(self.plan, error=float(self.error))
-        return [simulate(replace(case, values), plan=plan) for case in self.cases]
+        return [simulate(self._used(case, values), plan=plan) for case in self.cases]
+
+    def at(self, rows: Int[Array, " some"]) -> "Bench":
+        """The bench with some of its runs only."""
+        parts = self.stacked, self.free, self.after
+        some = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rows], parts)
+        return eqx.tree_at(lambda b: (b.stacked, b.free, b.after), self, some)
+
+    def _used(self, case: Case, values: Mapping[str, Any]) -> Case:
+        return believing(replace(case, values), self.nominal, self.plan.form.layout)
 
 
 def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = False) -> Bench:
@@ -101,6 +113,7 @@ def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = F
     plain = [dataclasses.replace(own, controller=None) for own in cases]
     still, _ = _common_plan(plain)
     deflection = np.asarray(_deflections(stacked_cases(plain), times, still, places))
+    varied = dict.fromkeys(a for run in runs for a in run if a.startswith(PLANT))
     leaves = np.array([_last_exit(own) for own in cases])
     limits = [actuator.command_limits() for actuator in case.actuators]
     return Bench(
@@ -117,6 +130,7 @@ def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = F
         },
         after=(np.asarray(times) > leaves[:, None]).astype(float),
         ranges=np.array([1.0 if pair is None else np.abs(pair).max() for pair in limits]),
+        nominal={address: np.asarray(value_at(case, address)) for address in varied},
     )
 
 

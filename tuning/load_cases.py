@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.stats.qmc import LatinHypercube
 
 from jaxbeam.case import Case, replace
 from jaxbeam.fields import known
@@ -16,6 +17,7 @@ from jaxbeam.motion import NEVER
 
 Values = dict[str, float]  # numbers of the case by address
 TABLES = ("training", "held_out")
+PLANT = ("beam.", "supports.", "actuators.", "sensors.")  # what addresses of the plant begin with
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +37,19 @@ class LoadCases:
         if both:
             raise ValueError(f"held-out cases must not be trained on, but {_words(both[0])} is")
 
+    def across(self, plants: Sequence[Values], others: Sequence[Values] = ()) -> "LoadCases":
+        """Every training run on each of the plants, and every held-out run on each of the others.
+
+        Plants are numbers by address, as `tuning.draw_plants` gives them; without others the
+        held-out runs stay on the case's own.
+        """
+        held_out = _on(self.held_out, others) if others else self.held_out
+        return LoadCases(_on(self.training, plants), held_out)
+
+
+def _on(runs: Sequence[Values], plants: Sequence[Values]) -> tuple[Values, ...]:
+    return tuple({**run, **plant} for run in runs for plant in plants)
+
 
 def grid(values: Mapping[str, Sequence[float]]) -> tuple[Values, ...]:
     """Every combination of the values given by address."""
@@ -42,12 +57,31 @@ def grid(values: Mapping[str, Sequence[float]]) -> tuple[Values, ...]:
     return tuple(dict(zip(values, map(float, row), strict=True)) for row in rows)
 
 
+def draws(
+    ranges: Mapping[str, Sequence[float]], count: int, seed: int = 0
+) -> tuple[Values, ...]:
+    """Values drawn evenly from a range for each address, spread as a Latin hypercube.
+
+    Raises ValueError for a count below 1 or a range that does not ascend.
+    """
+    if count < 1:
+        raise ValueError(f"the number of draws must be 1 or more, not {count}")
+    for address, (low, high) in ranges.items():
+        if not low < high:
+            raise ValueError(f"{address}: a range must ascend, but it is {low:g} to {high:g}")
+    shares = LatinHypercube(len(ranges), rng=np.random.default_rng(seed)).random(count)
+    low, high = np.array(list(ranges.values()), float).T
+    rows = low + (high - low) * shares
+    return tuple(dict(zip(ranges, map(float, row), strict=True)) for row in rows)
+
+
 def read_load_cases(path: str | os.PathLike) -> LoadCases:
     """Read load cases from a TOML file with tables [training] and [held_out].
 
     Each holds lists of values by address in quotes, such as "loads.0.mass" = [0.2, 0.5], all
-    combinations of which are run. Raises ValueError, naming the file and the key, for what it does
-    not understand; OSError if it cannot be read.
+    combinations of which are run. With `draws = 12` (and `seed = 1`, 0 if left out) the lists are
+    ranges, low and high, from which so many runs are drawn. Raises ValueError, naming the file and
+    the key, for what it does not understand; OSError if it cannot be read.
     """
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
@@ -63,7 +97,8 @@ def read_load_cases(path: str | os.PathLike) -> LoadCases:
         )
     runs = {}
     for name in TABLES:
-        table = content.get(name, {})
+        table = dict(content.get(name, {}))
+        drawn = {key: table.pop(key) for key in ("draws", "seed") if key in table}
         for address, entries in table.items():
             numbers = isinstance(entries, list) and entries
             if not numbers or not all(type(x) in (int, float) for x in entries):
@@ -71,11 +106,31 @@ def read_load_cases(path: str | os.PathLike) -> LoadCases:
                     f"{path}: {name}.{address} must be a list of numbers, such as"
                     f' "loads.0.mass" = [0.2, 0.5]'
                 )
-        runs[name] = grid(table) if table else ()
+        runs[name] = _runs(table, drawn, f"{path}: {name}")
     try:
         return LoadCases(**runs)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _runs(table, drawn, where: str) -> tuple[Values, ...]:
+    """Runs of a table: the grid of its lists, or draws from them."""
+    if any(type(number) is not int or number < 0 for number in drawn.values()):
+        raise ValueError(f"{where}: draws and seed are whole numbers, such as draws = 12")
+    if "draws" not in drawn:
+        if drawn:
+            raise ValueError(f"{where}.seed is for drawing: say how many with draws = 12")
+        return grid(table) if table else ()
+    for address, entries in table.items():
+        if len(entries) != 2:
+            raise ValueError(
+                f"{where}.{address} must be a range, low and high, to draw from; it has"
+                f" {len(entries)} entries"
+            )
+    try:
+        return draws(table, drawn["draws"], drawn.get("seed", 0))
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def apply(case: Case, run: Values) -> Case:

@@ -1,6 +1,7 @@
 """What a controller is tuned for: figures of merit of runs, each smooth, and true."""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,15 @@ from jaxbeam.simulate import Histories
 
 MERITS = ("peak", "shortfall", "rms", "after_exit", "effort", "contact")
 OVER = ("mean", "worst", "cvar")
+STEEP = 10.0  # of the objective, for each unit by which a limited figure exceeds its limit
 Sharpness = Float[Array, ""] | float | None  # of smooth maxima; None for true ones
+
+
+class Target(NamedTuple):
+    """Weights and limits of all figures of merit, as arrays in the order of `MERITS`."""
+
+    weights: Float[Array, " merit"]
+    limits: Float[Array, " merit"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,26 +31,50 @@ class Objective:
     control, so that runs with little to gain count as much as others), its root mean square
     (`rms`), the largest `after_exit` of the last load (relative to the peak); the root mean square
     of the commands, relative to the largest within their limits (`effort`); and the largest change
-    of a contact force, relative to the weight (`contact`). Runs count by their "mean", their
-    "worst", or ("cvar") the mean of the worst `share` of them.
+    of a contact force, relative to the weight (`contact`: how rough the ride is). Runs count by
+    their "mean", their "worst", or ("cvar") the mean of the worst `share` of them. Figures with
+    `limits` must not exceed those, runs taken together likewise.
     """
 
     weights: dict[str, float] = dataclasses.field(default_factory=lambda: {"peak": 1.0})
     over: str = "worst"
     share: float = 0.25
+    limits: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        unknown = set(self.weights) - set(MERITS)
+        unknown = (set(self.weights) | set(self.limits)) - set(MERITS)
         if unknown:
             raise ValueError(
                 f"there is no merit {min(unknown)!r} to tune for; it may be {', '.join(MERITS)}"
             )
         if not self.weights or any(not 0 < value < float("inf") for value in self.weights.values()):
             raise ValueError("an objective needs merits with positive, finite weights")
+        if any(not 0 < value < float("inf") for value in self.limits.values()):
+            raise ValueError("limits of merits must be positive and finite")
         if self.over not in OVER:
             raise ValueError(f"over may be {', '.join(OVER)}, not {self.over!r}")
         if not 0 < self.share <= 1:
             raise ValueError(f"share must be above 0 and at most 1; it is {self.share:g}")
+
+    @property
+    def target(self) -> Target:
+        """Weights, zero for what does not count, and limits, infinite for what has none."""
+        weights = [self.weights.get(name, 0.0) for name in MERITS]
+        return Target(
+            jnp.array(weights), jnp.array([self.limits.get(name, jnp.inf) for name in MERITS])
+        )
+
+    def with_price(
+        self, merits: dict[str, Float[Array, " run"]], target: Target, sharpness: Sharpness = None
+    ) -> Float[Array, ""]:
+        """One number for all runs by the weights of a target, with a price on excess of limits.
+
+        The price is so steep that the least lies at a limit, not beyond it.
+        """
+        rows = jnp.stack([merits[name] for name in MERITS])
+        excess = jnp.stack([self.of_runs(row, sharpness) for row in rows]) - target.limits
+        price = STEEP * jnp.sum(jnp.maximum(excess, 0.0))
+        return self.of_runs(target.weights @ rows, sharpness) + price
 
     def of_run(self, merits: dict[str, Float[Array, "..."]]) -> Float[Array, "..."]:
         """The weighted sum for runs whose merits are known."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -11,13 +12,16 @@ from tuning.free import Free
 from tuning.load_cases import Values, columns
 from tuning.objective import Objective
 
+SLIGHT = 0.01  # of a limit: excess that is not spoken of
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Outcome:
     """Runs before and after tuning. Peaks in m; `least` is the bound, NaN where not asked for.
 
     `values` are those of the objective (before and after, by run), `objective` the one number for
-    all runs; `saturated` is the share of the run that commands spend at a limit, after tuning.
+    all runs; `saturated` is the share of the run that commands spend at a limit, and `merits` all
+    figures of merit of the runs together, both after tuning.
     """
 
     name: str
@@ -29,10 +33,18 @@ class Outcome:
     values: Float[np.ndarray, "2 run"]
     saturated: Float[np.ndarray, " run"]
     objective: list[float]
+    merits: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def shares(self, peaks: Float[np.ndarray, " run"]) -> Float[np.ndarray, " run"]:
         """Shares of the attainable reduction that peaks stand for, run by run."""
         return (self.uncontrolled - peaks) / (self.uncontrolled - self.least)
+
+
+class Minimum(NamedTuple):
+    """Where one of several starts came to: the objective (with its price), and the values."""
+
+    value: float
+    values: Float[np.ndarray, " free"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,7 +53,8 @@ class Tuned:
 
     `history` holds the true objective by step and start, NaN where the loop diverged, which
     happened `rejected` times. `violation` (1/s) is by how much a pole lies too far right for the
-    constraint on stability, zero if it is met or was not asked for.
+    constraint on stability, zero if it is met or was not asked for. `minima` are the best that
+    each start has met, lowest first.
     """
 
     case: Case
@@ -52,6 +65,19 @@ class Tuned:
     rejected: int
     outcomes: list[Outcome]
     violation: float = 0.0
+    minima: tuple[Minimum, ...] = ()
+
+    @property
+    def excess(self) -> dict[str, float]:
+        """The limits that training or held-out runs exceed, and by how much at most."""
+        found = {
+            name: max(outcome.merits[name] for outcome in self.outcomes) - limit
+            for name, limit in self.objective.limits.items()
+        }
+        return {name: much for name, much in found.items() if much > SLIGHT * self._limit(name)}
+
+    def _limit(self, name: str) -> float:
+        return self.objective.limits[name]
 
     @property
     def verdict(self) -> str:
@@ -77,6 +103,8 @@ class Tuned:
             words += (
                 f"; not as stable as asked for: a pole lies {self.violation:.3g} 1/s too far right"
             )
+        for name, much in self.excess.items():
+            words += f"; {name} exceeds its limit of {self._limit(name):.4g} by {much:.3g}"
         if judged.name == "training":
             words += "; nothing was held out, so this proves nothing for other loads"
         return words
@@ -90,6 +118,8 @@ class Tuned:
             )
         for outcome in self.outcomes:
             lines += ["", *_rows(outcome)]
+        if len(self.minima) > 1:
+            lines += ["", "minima by start:", *_minima(self.minima)]
         if self.rejected:
             lines += ["", f"{self.rejected} steps came to a loop that diverges and were taken back"]
         return "\n".join([*lines, "", self.verdict])
@@ -120,6 +150,12 @@ class Tuned:
                 }
                 for outcome in self.outcomes
             },
+            "minima": [
+                {"objective": m.value, "values": m.values.tolist()}
+                for m in self.minima
+                if math.isfinite(m.value)
+            ],
+            "excess_of_limits": self.excess,
             "rejected_steps": self.rejected,
             "stability_violation": self.violation,
             "verdict": self.verdict,
@@ -149,6 +185,16 @@ def _labels(outcome: Outcome) -> list[str]:
         ", ".join(f"{address.rsplit('.', 1)[-1]} {value:g}" for address, value in run.items())
         for run in outcome.runs
     ]
+
+
+def _minima(minima: tuple[Minimum, ...]) -> list[str]:
+    """A line for each start: the objective, and the values it belongs to."""
+    lines = []
+    for found in minima:
+        values = "  ".join(f"{value:.5g}" for value in found.values)
+        told = f"{found.value:.6g}: {values}" if math.isfinite(found.value) else "diverges"
+        lines.append(f"  objective {told}")
+    return lines
 
 
 def _rows(outcome: Outcome) -> list[str]:

@@ -13,6 +13,7 @@ from jaxbeam.case import Case, known_case, replace, value_at
 from jaxbeam.linear_loop import linear, open_loop, prepared
 from jaxbeam.loads import motion
 from jaxbeam.modes import lay_out
+from tuning.believing import believing
 
 STEEP = 1.0  # of the objective, for each 1/s of too large a real part
 
@@ -38,10 +39,12 @@ class Stable:
                 " between 0 and 1"
             )
 
-    def violation(self, cases: list[Case]):
+    def violation(self, cases: list[Case], nominal: Mapping[str, Any] | None = None):
         """Function of values by address: by how much (1/s) the worst pole is too far right.
 
-        Raises ValueError as `linear_loop` does, and for a delay without a sampling period.
+        Laws are designed for the cases, not for what the spread makes of them, and for the
+        `nominal` numbers, by address, where the cases differ from these. Raises ValueError as
+        `linear_loop` does, and for a delay without a sampling period.
         """
         clock = prepared(cases[0])
         if clock is None and self.delay:
@@ -58,10 +61,10 @@ class Stable:
 
         def violation(values: Mapping[str, Any]) -> Float[Array, ""]:
             def varied(case, times, factor):
+                believed = {a: value_at(case, a) for a in self.spread} | dict(nominal or {})
                 pairs = zip(self.spread, factor, strict=True)
-                loop = open_loop(
-                    replace(case, {a: f * value_at(case, a) for a, f in pairs}), layout
-                )
+                changed = replace(case, {a: f * value_at(case, a) for a, f in pairs})
+                loop = open_loop(believing(changed, believed, layout), layout)
                 return jnp.stack(
                     [
                         jax.vmap(lambda t, own=own: linear(loop, own, t).rate())(times)

@@ -1,46 +1,54 @@
 """Controllers tuned by gradients through the closed loop, and proven on cases held out."""
 
+from __future__ import annotations
+
 import dataclasses
-import functools
 import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Float
-from tqdm import tqdm
 
 from jaxbeam.case import Case, replace
 from jaxbeam.casefile import case_to_dict
 from jaxbeam.compiling import compiled
 from jaxbeam.simulate import ContactLossWarning
 from tuning.bench import Bench, make_bench
-from tuning.checkpoint import fingerprint, load, save
-from tuning.free import Free, free_numbers
+from tuning.checkpoint import fingerprint
+from tuning.descent import Descent, State
+from tuning.free import free_numbers
 from tuning.load_cases import LoadCases
+from tuning.methods import method_of
 from tuning.objective import Objective
-from tuning.proof import Outcome, Tuned
-from tuning.stable import STEEP, Stable
+from tuning.plants import adopt, draw_plants
+from tuning.proof import Minimum, Outcome, Tuned
+from tuning.stable import Stable
 
-RATE = 0.1  # first step of the search variables, each of which is of order one
-SHARPNESS = (30.0, 1000.0)  # of smooth maxima, at the first step and the last
-EVERY = 5  # steps between checkpoints
-SHRINK = 0.5  # of the steps of a start that has come to a loop which diverges
+if TYPE_CHECKING:
+    from tuning.identify import Fit
+    from tuning.posterior import Posterior
+
+Bounds = Mapping[str, tuple[float, float] | None]
 
 
 def tune(
     case: Case,
-    free: Mapping[str, tuple[float, float] | None],
+    free: Bounds,
     cases: LoadCases,
     objective: Objective | None = None,
     *,
+    plant: Fit | Posterior | None = None,
+    plants: int = 4,
     stable: Stable | None = None,
     places: Sequence[float] | None = None,
+    method: str = "adam",
     steps: int = 80,
+    batch: int | None = None,
     starts: int = 1,
     seed: int = 0,
     bounds: bool = True,
@@ -52,13 +60,20 @@ def tune(
 
     `free` gives addresses, each with its bounds or None: gains and weights of the controller, but
     also filters' cutoffs or places of actuators and sensors. The runs of `cases` are simulated
-    closed loop, limits included, side by side; Adam follows the gradient of the `objective`, whose
-    maxima are smooth at first and ever sharper, for a number of `steps`, from the case's own
+    closed loop, limits included, side by side; a `method` follows the gradient of the `objective`,
+    whose maxima are smooth at first and ever sharper, for a number of `steps`, from the case's own
     numbers and from `starts` - 1 random ones at once. What is kept is the best that was met by the
     true objective, the start included. `places` (m) are where deflections count, the sensors' if
     left out. `stable` asks for a loop that stays stable along the crossings, with room to spare
     (what violates it is kept only where nothing met satisfies it, and the result says so). With
     `bounds` every run is also held against the least peak that is possible.
+
+    The method is "adam" or "lbfgs" (optax) or "bfgs" (optimistix); each step simulates all runs
+    once. With a `batch`, for Adam only, a step simulates so many of them, drawn by the `seed`.
+
+    A `plant` that was identified takes the place of the case's own: its beam, supports, actuators
+    and sensors. Training runs are simulated on a number of `plants` drawn from what the fit leaves
+    uncertain, held-out ones on as many others; laws are designed for the fitted one.
 
     With a `checkpoint` file the search can be stopped at any time, and taken up with `resume`: the
     result is the same. A step to where a loop diverges is taken back, and later ones are shorter.
@@ -67,169 +82,117 @@ def tune(
     diverges; FileExistsError if the checkpoint exists and `resume` is not set.
     """
     objective = Objective() if objective is None else objective
-    if steps < 1 or starts < 1:
-        raise ValueError(f"steps and starts must be 1 or more; they are {steps} and {starts}")
-    if "shortfall" in objective.weights and not bounds:
-        raise ValueError("the shortfall is that behind the bounds: leave bounds on to tune for it")
-    numbers = free_numbers([case], dict(free), 1.0)
-    mark = fingerprint(
-        {
-            "case": case_to_dict(case),
-            "free": {n.address: [n.low, n.high] for n in numbers},
-            "cases": dataclasses.asdict(cases),
-            "objective": dataclasses.asdict(objective),
-            "stable": None if stable is None else dataclasses.asdict(stable),
-            "settings": [places, steps, starts, seed],
-        }
-    )
+    if plant is not None:
+        case = adopt(case, plant)
+        drawn = draw_plants(plant, 2 * plants, seed)
+        cases = cases.across(drawn[:plants], drawn[plants:])
+    check(free, cases, objective, method, steps, starts=starts, batch=batch, bounds=bounds)
     file = None if checkpoint is None else Path(checkpoint)
     if file is not None and file.exists() and not resume:
         raise FileExistsError(f"{file} exists; resume the search, or name another file")
-    bench = make_bench(case, cases.training, places, bounds)
-    violation = None if stable is None else stable.violation(bench.cases)
-    search = _Search(bench, numbers, objective, violation, steps)
-    state = search.first(starts, seed)
-    if not np.isfinite(state.best_value[0]):
-        raise ValueError("the loop diverges as it is: start from a controller that does not")
-    if file is not None and file.exists():
-        state = search.rebuilt(state, load(file, mark))
-    with tqdm(total=steps, initial=state.step, desc="tuning", disable=not progress) as bar:
-        while state.step < steps:
-            state = search.next(state)
-            bar.update()
-            bar.set_postfix_str(f"objective {state.best_value.min():.4g}")
-            if file is not None and (state.step % EVERY == 0 or state.step == steps):
-                save(file, mark, state.arrays())
-    best = state.best[np.argmin(state.best_value)]
-    values = np.array(
-        [float(n.outward(jnp.asarray(y))) for n, y in zip(numbers, best, strict=True)]
-    )
-    if np.array_equal(best, search.own):
-        values = np.array([number.start for number in numbers])
-    before = {number.address: number.start for number in numbers}
-    after = dict(zip(before, map(float, values), strict=True))
-    outcomes = []
-    for name, runs in (("training", cases.training), ("held out", cases.held_out)):
-        if runs:
-            own = bench if name == "training" else make_bench(case, runs, places, bounds)
-            outcomes.append(_outcome(name, own, objective, before, after))
-    return Tuned(
-        case=replace(case, after),
-        numbers=numbers,
-        values=values,
-        objective=objective,
-        history=state.history,
-        rejected=int(state.rejected.sum()),
-        outcomes=outcomes,
-        violation=0.0 if violation is None else float(compiled(violation)(after)),
-    )
+    problem = Problem(case, free, cases, objective, stable, places, bounds)
+    descent = problem.descent(method, steps, batch)
+    mark = fingerprint(problem.about | {"settings": [method, steps, batch, starts, seed]})
+    points = descent.points(starts, seed)
+    state = descent.run(objective.target, points, seed, file=file, mark=mark, progress=progress)
+    return problem.proven(descent, state, objective)
 
 
-@dataclasses.dataclass(frozen=True)
-class _State:
-    """Where a search has come to: each start at its search point, with the best it has met."""
+def check(
+    free: Bounds,
+    cases: LoadCases,
+    objective: Objective,
+    method: str,
+    steps: int,
+    *,
+    starts: int = 1,
+    batch: int | None = None,
+    bounds: bool = True,
+) -> None:
+    """Refuse what could only fail later. Raises ValueError, saying what and why."""
+    if steps < 1 or starts < 1:
+        raise ValueError(f"steps and starts must be 1 or more; they are {steps} and {starts}")
+    if "shortfall" in objective.weights | objective.limits and not bounds:
+        raise ValueError("the shortfall is that behind the bounds: leave bounds on to tune for it")
+    method_of(method, steps)
+    runs = len(cases.training)
+    if batch is not None and method != "adam":
+        raise ValueError(f"a batch is for adam: the slopes of {method} must be those of one sum")
+    if batch is not None and not 1 <= batch <= runs:
+        raise ValueError(f"batch must be between 1 and the {runs} training runs; it is {batch}")
+    varied = {address for run in (*cases.training, *cases.held_out) for address in run}
+    both = sorted(varied & set(free))
+    if both:
+        raise ValueError(f"{both[0]} is free, but differs from run to run: leave out one of these")
+    for address in free:
+        if address.endswith(("period", "delay")):
+            raise ValueError(
+                f"{address} cannot be free: it decides when the loop acts, and so how the run is"
+                " cut into steps; tune for several of its values and compare"
+            )
 
-    step: int
-    point: Float[np.ndarray, "start free"]
-    moments: list[np.ndarray]
-    scale: Float[np.ndarray, " start"]
-    best: Float[np.ndarray, "start free"]
-    best_value: Float[np.ndarray, " start"]
-    history: Float[np.ndarray, "step start"]
-    rejected: Float[np.ndarray, " start"]
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """All of it as named arrays."""
-        named = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        moments = {f"moment_{i}": part for i, part in enumerate(named.pop("moments"))}
-        return {name: np.asarray(value) for name, value in named.items()} | moments
-
-
-class _Search:
-    """Steps of a search, compiled once for all starts."""
+class Problem:
+    """What is tuned, on what runs: prepared once for any number of searches."""
 
     def __init__(
-        self, bench: Bench, numbers: list[Free], objective: Objective, violation, steps: int
+        self,
+        case: Case,
+        free: Bounds,
+        cases: LoadCases,
+        objective: Objective,
+        stable: Stable | None = None,
+        places: Sequence[float] | None = None,
+        bounds: bool = True,
     ):
-        self.numbers, self.steps = numbers, steps
-        self.own = np.array([number.inward(number.start) for number in numbers])
-        self.adam = optax.adam(optax.cosine_decay_schedule(RATE, steps, alpha=0.05))
+        self.case, self.cases, self.objective = case, cases, objective
+        self.places, self.bounds = places, bounds
+        self.numbers = free_numbers([case], dict(free), 1.0)
+        self.bench = make_bench(case, cases.training, places, bounds)
+        self.violation = None
+        if stable is not None:
+            self.violation = stable.violation(self.bench.cases, self.bench.nominal)
+        self.about = {
+            "case": case_to_dict(case),
+            "free": {n.address: [n.low, n.high] for n in self.numbers},
+            "cases": dataclasses.asdict(cases),
+            "objective": dataclasses.asdict(objective),
+            "stable": None if stable is None else dataclasses.asdict(stable),
+            "places": places,
+        }
+        self._held_out = None
 
-        def smooth_and_true(point, sharpness, bench):
-            pairs = zip(numbers, point, strict=True)
-            values = {n.address: n.outward(y) for n, y in pairs}
-            found = bench.histories(values)
-            # So steep that what violates it is never the best, unless everything does.
-            price = 0.0 if violation is None else STEEP * violation(values)
-            smooth, true = (
-                objective.of_runs(objective.of_run(bench.judge(found, sharp)), sharp) + price
-                for sharp in (sharpness, None)
-            )
-            return smooth, true
-
-        @compiled
-        def slope(points, sharpness, bench):
-            single = jax.value_and_grad(smooth_and_true, has_aux=True)
-            return jax.vmap(lambda point: single(point, sharpness, bench))(points)
-
-        self._slope = functools.partial(slope, bench=bench)
-
-        def onward(point, gradient, moments, scale):
-            change, moments = self.adam.update(gradient, moments)
-            return point + scale * change, moments
-
-        self._onward = compiled(jax.vmap(onward))
-
-    def first(self, starts: int, seed: int) -> _State:
-        """The case's own numbers, and random ones within bounds or a factor of three."""
-        rng = np.random.default_rng(seed)
-        spread = [
-            rng.uniform(-np.pi / 2, np.pi / 2, starts - 1)
-            if np.isfinite(n.high - n.low)
-            else n.inward(n.start) + np.log(3) * n.search_size * rng.uniform(-1, 1, starts - 1)
-            for n in self.numbers
-        ]
-        point = np.concatenate([self.own[None], np.array(spread).reshape(len(self.own), -1).T])
-        moments = jax.vmap(self.adam.init)(jnp.asarray(point))
-        (_, true), _ = self._slope(jnp.asarray(point), jnp.asarray(SHARPNESS[0]))
-        value = np.where(np.isfinite(true), true, np.inf)
-        none = np.zeros(starts)
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(moments)]
-        return _State(0, point, leaves, none + 1, point, value, np.zeros((0, starts)), none)
-
-    def next(self, state: _State) -> _State:
-        """One step of every start; those that came to a diverging loop go back, and go slower."""
-        share = state.step / max(self.steps - 1, 1)
-        sharpness = SHARPNESS[0] * (SHARPNESS[1] / SHARPNESS[0]) ** share
-        # An array: a plain number would be part of the program, compiled anew at every step.
-        (_, true), gradient = self._slope(jnp.asarray(state.point), jnp.asarray(sharpness))
-        gradient, true = np.asarray(gradient), np.asarray(true)
-        sound = np.isfinite(true) & np.isfinite(gradient).all(axis=1)
-        better = sound & (true < state.best_value)
-        best = np.where(better[:, None], state.point, state.best)
-        best_value = np.where(better, true, state.best_value)
-        scale = np.where(sound, state.scale, SHRINK * state.scale)
-        structure = jax.tree.structure(self.adam.init(jnp.asarray(state.point[0])))
-        moments = jax.tree.unflatten(structure, list(state.moments))
-        point, moments = self._onward(
-            state.point, np.where(sound[:, None], gradient, 0.0), moments, scale
-        )
-        return _State(
-            step=state.step + 1,
-            point=np.where(sound[:, None], np.asarray(point), best),
-            moments=[np.asarray(leaf) for leaf in jax.tree.leaves(moments)],
-            scale=scale,
-            best=best,
-            best_value=best_value,
-            history=np.concatenate([state.history, np.where(sound, true, np.nan)[None]]),
-            rejected=state.rejected + ~sound,
+    def descent(self, method: str, steps: int, batch: int | None = None) -> Descent:
+        """A search of this problem."""
+        return Descent(
+            self.bench, self.numbers, self.objective, self.violation, method, steps, batch
         )
 
-    def rebuilt(self, like: _State, arrays: dict[str, np.ndarray]) -> _State:
-        """The state whose arrays were saved."""
-        moments = [arrays.pop(f"moment_{i}") for i in range(len(like.moments))]
-        step = int(arrays.pop("step"))
-        return _State(step=step, moments=moments, **arrays)
+    def proven(self, descent: Descent, state: State, objective: Objective) -> Tuned:
+        """What a search came to, on training and held-out runs."""
+        values = descent.values(state)
+        before = {number.address: number.start for number in self.numbers}
+        after = dict(zip(before, map(float, values), strict=True))
+        outcomes = [_outcome("training", self.bench, objective, before, after)]
+        if self.cases.held_out:
+            if self._held_out is None:
+                runs = self.cases.held_out
+                self._held_out = make_bench(self.case, runs, self.places, self.bounds)
+            outcomes.append(_outcome("held out", self._held_out, objective, before, after))
+        order = np.argsort(state.best_value).tolist()
+        return Tuned(
+            case=replace(self.case, after),
+            numbers=self.numbers,
+            values=values,
+            objective=objective,
+            history=state.history,
+            rejected=int(state.rejected.sum()),
+            outcomes=outcomes,
+            violation=0.0 if self.violation is None else float(compiled(self.violation)(after)),
+            minima=tuple(
+                Minimum(float(state.best_value[i]), descent.values(state, i)) for i in order
+            ),
+        )
 
 
 @compiled
@@ -246,7 +209,8 @@ def _outcome(name, bench: Bench, objective, before, after) -> Outcome:
     arrays = [jax.tree.map(jnp.asarray, values) for values in (before, after)]
     # What is compiled must not depend on what the runs are called.
     nameless = dataclasses.replace(bench, runs=())
-    values = [np.asarray(objective.of_run(_merits(nameless, v))) for v in arrays]
+    merits = [_merits(nameless, v) for v in arrays]
+    values = [np.asarray(objective.of_run(found)) for found in merits]
     return Outcome(
         name=name,
         runs=tuple(bench.runs),
@@ -257,6 +221,7 @@ def _outcome(name, bench: Bench, objective, before, after) -> Outcome:
         values=np.stack(values),
         saturated=np.array([float(np.asarray(r.saturated).mean()) for r in pairs[1]]),
         objective=[float(objective.of_runs(jnp.asarray(v))) for v in values],
+        merits={name: float(objective.of_runs(part)) for name, part in merits[1].items()},
     )
 
 

@@ -26,10 +26,19 @@ def tune(
     cases: Path,
     objective: tuple[str, ...] = (),
     over: str = "worst",
+    limit: tuple[str, ...] = (),
+    rank: str = "",
+    front: str = "",
+    choose: tuple[str, ...] = (),
+    plant: Path | None = None,
+    plants: int = 4,
+    sampled: bool = False,
     stable: float | None = None,
     reserve: float = 0.0,
     spread: tuple[str, ...] = (),
+    method: str | None = None,
     steps: int = 80,
+    batch: int | None = None,
     starts: int = 1,
     seed: int = 0,
     bounds: Annotated[bool, Parameter(negative="--no-bounds")] = True,
@@ -51,9 +60,27 @@ def tune(
     cases
         Load cases, TOML: tables [training] and [held_out] with lists of values by address.
     objective
-        MERIT=WEIGHT: peak, rms, after_exit, effort or contact; the peak alone if left out.
+        MERIT=WEIGHT: peak, shortfall, rms, after_exit, effort or contact; the peak alone if left
+        out.
     over
         How runs are taken together: worst, mean, or cvar (the mean of the worst quarter).
+    limit
+        MERIT=NUMBER: a figure of merit that must not exceed a number; repeat it for more.
+    rank
+        MERIT,MERIT,...: in place of an objective, merits in order of rank; each is lowered as far
+        as those before it allow.
+    front
+        MERIT=NUMBER,NUMBER,...: tune under each of these limits, and print what they cost.
+    choose
+        ADDRESS=NUMBER,NUMBER,...: whole numbers to try, such as controller.horizon=4,6,8; repeat it
+        for all combinations.
+    plant
+        FIT.npz, or the FIT.toml beside it, of jaxbeam identify: the plant that was identified.
+    plants
+        With --plant: so many plants that the fit leaves possible, to train on, and as many others
+        for the runs held out.
+    sampled
+        With --plant: draw them from the posterior (extra bayes), not from the covariance.
     stable
         Largest real part (1/s) that a pole may have with loads frozen along the crossings.
     reserve
@@ -61,8 +88,12 @@ def tune(
     spread
         With --stable: ADDRESS=SHARE by which a number may be off, such as
         beam.flexural_rigidity=0.1; repeat it for more.
+    method
+        adam or lbfgs (optax), or bfgs (optimistix); if left out adam, for fronts and ranks lbfgs.
     steps
         Steps of the search.
+    batch
+        How many training runs, drawn anew, each step of adam looks at; all if left out.
     starts
         How many points to search from at once; the first is the case as it is.
     seed
@@ -70,50 +101,125 @@ def tune(
     bounds
         Whether to compute the least peak possible for every run.
     output
-        Write the tuned case to this file, TUNED.toml; the search is kept beside it on the way.
+        Write the tuned case to this file, TUNED.toml (those of a front to TUNED-1.toml and so on);
+        the search is kept beside it on the way.
     plot
         Draw peaks before and after to a PNG beside the output.
     resume
         Go on with a search that was stopped.
     """
     import tuning
-    from jaxbeam.casefile import save_case
 
     weights = dict(_weight(text) for text in objective)
+    limits = dict(_weight(text) for text in limit)
     shares = dict(_weight(text) for text in spread)
     refuse(stable is None and bool(reserve or shares), "--reserve and --spread need --stable")
-    limits = None if stable is None else tuning.Stable(stable, reserve, shares)
+    refuse(plant is None and sampled, "--sampled draws from a posterior: it needs --plant")
+    many = [name for name, given in (("--rank", rank), ("--front", front), ("--choose", choose))
+            if given]  # fmt: skip
+    refuse(len(many) > 1, f"{' and '.join(many)} do not go together; give one of them")
+    refuse(bool(rank and (weights or limits)), "--rank takes the place of --objective and --limit")
+    alone = batch is not None or starts > 1 or resume
+    refuse(
+        bool(many and many != ["--choose"] and alone),
+        f"--batch, --starts and --resume are for a single search, not for {''.join(many)}",
+    )
     picture = picture_path(output, case.with_suffix(".tuned")) if plot else None
     check_suffix(output, ".toml", "a tuned case")
-    check_outputs(overwrite, output, picture)
-    checkpoint = None if output is None else output.with_suffix(".search.npz")
-    if checkpoint and checkpoint.exists() and overwrite and not resume:
-        checkpoint.unlink()
-    found = tuning.tune(
-        read_case(case, set_),
-        dict(bounds_of(text) for text in free),
-        tuning.read_load_cases(cases),
-        tuning.Objective(weights or {"peak": 1.0}, over),
-        stable=limits,
-        steps=steps,
-        starts=starts,
-        seed=seed,
-        bounds=bounds,
-        checkpoint=checkpoint,
-        resume=resume,
-        progress=not json_,
-    )
+    sweep = _front(front) if front else None
+    files = _outputs(output, len(sweep[1]) if sweep else 0)
+    check_outputs(overwrite, *files, picture)
+    rig = read_case(case, set_)
+    loads = tuning.read_load_cases(cases)
+    if plant is not None:
+        rig, loads = _on_plant(rig, loads, plant, plants, sampled, seed)
+    goal = tuning.Objective(weights or {"peak": 1.0}, over, limits=limits)
+    given = rig, dict(bounds_of(text) for text in free), loads
+    common = {
+        "stable": None if stable is None else tuning.Stable(stable, reserve, shares),
+        "method": method or ("lbfgs" if sweep or rank else "adam"),
+        "steps": steps, "seed": seed, "bounds": bounds, "progress": not json_,
+    }  # fmt: skip
+    if sweep:
+        found = tuning.pareto(*given, goal, *sweep, **common)
+        results = found.tuned
+    elif rank:
+        results = tuning.lexicographic(*given, rank.split(","), over=over, **common)[-1:]
+        found = results[0]
+    elif choose:
+        chosen = dict(_wholes(text) for text in choose)
+        more = {"batch": batch, "starts": starts}
+        found = tuning.tune_choices(rig, chosen, *given[1:], goal, **more, **common)
+        results = (found.best,)
+    else:
+        checkpoint = None if output is None else output.with_suffix(".search.npz")
+        if checkpoint and checkpoint.exists() and overwrite and not resume:
+            checkpoint.unlink()
+        more = {"batch": batch, "starts": starts, "checkpoint": checkpoint, "resume": resume}
+        found = tuning.tune(*given, goal, **more, **common)
+        results = (found,)
+    _tell(found, results, files, picture, json_)
     if output:
-        save_case(found.case, output, overwrite=True)  # checked before the work
-    if checkpoint:
-        checkpoint.unlink()
+        output.with_suffix(".search.npz").unlink(missing_ok=True)
+
+
+def _tell(found, results, files, picture, json_) -> None:
+    """Write the tuned cases and the picture, and print what was found."""
+    from jaxbeam.casefile import save_case
+
+    for one, file in zip(results, files, strict=False):
+        save_case(one.case, file, overwrite=True)  # checked before the work
     if picture:
-        found.plot().savefig(picture)
+        drawn = found if hasattr(found, "plot") else results[0]
+        drawn.plot().savefig(picture)
     if json_:
-        print_json(found.to_dict())
+        told = [one.to_dict() for one in results]
+        print_json(told[0] if len(told) == 1 else {"front": told})
     else:
         print(found)
-        print_written(output, picture)
+        print_written(*files, picture)
+
+
+def _on_plant(case, loads, file: Path, count: int, sampled: bool, seed: int):
+    """The case on the plant of a fit, and its load cases on plants that the fit leaves possible."""
+    import tuning
+
+    fit = tuning.load_fit(file.with_suffix(".npz"))
+    source = tuning.sample(fit, seed=seed) if sampled else fit
+    drawn = tuning.draw_plants(source, 2 * count, seed)
+    return tuning.adopt(case, fit), loads.across(drawn[:count], drawn[count:])
+
+
+def _outputs(output: Path | None, count: int) -> list[Path]:
+    """The files to write tuned cases to: one, or one for each limit of a front."""
+    if output is None:
+        return []
+    if not count:
+        return [output]
+    return [output.with_stem(f"{output.stem}-{i + 1}") for i in range(count)]
+
+
+def _front(text: str) -> tuple[str, list[float]]:
+    """The merit and the limits of MERIT=NUMBER,NUMBER,...; raises ValueError otherwise."""
+    merit, _, numbers = text.partition("=")
+    try:
+        return merit, [float(number) for number in numbers.split(",")]
+    except ValueError:
+        raise ValueError(
+            f"--front takes MERIT=NUMBER,NUMBER,..., such as effort=0.1,0.2,0.4, not {text!r}"
+        ) from None
+
+
+def _wholes(text: str) -> tuple[str, list[int]]:
+    """The address and the numbers of ADDRESS=NUMBER,...; raises ValueError otherwise."""
+    address, _, numbers = text.partition("=")
+    try:
+        return address, [int(number) for number in numbers.split(",")]
+    except ValueError:
+        raise ValueError(
+            f"--choose takes ADDRESS=NUMBER,NUMBER,..., such as controller.horizon=4,6,8, not"
+            f" {text!r}"
+        ) from None
 
 
 def _weight(text: str) -> tuple[str, float]:

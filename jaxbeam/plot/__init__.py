@@ -8,6 +8,7 @@ from jaxbeam.plot.animation import animate
 from jaxbeam.plot.compare import plot_comparison
 from jaxbeam.plot.fit import FitPanel, plot_fit
 from jaxbeam.plot.frequency import plot_frequency
+from jaxbeam.plot.front import plot_front
 from jaxbeam.plot.modes import plot_modes
 from jaxbeam.plot.poles import plot_poles
 from jaxbeam.plot.record import plot_record
@@ -21,6 +22,7 @@ __all__ = [
     "plot_comparison",
     "plot_fit",
     "plot_frequency",
+    "plot_front",
     "plot_modes",
     "plot_poles",
     "plot_record",

@@ -151,7 +151,7 @@ def test_a_search_that_was_stopped_goes_on_to_the_same_end(tuned, tmp_path, monk
 
     options = OPTIONS | {"bounds": False}
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(importlib.import_module("tuning.tune"), "save", killed)
+        patch.setattr(importlib.import_module("tuning.descent"), "save", killed)
         tuning.tune(rig(), FREE, CASES, checkpoint=file, **options)
     with pytest.raises(FileExistsError, match="resume the search"):
         tuning.tune(rig(), FREE, CASES, checkpoint=file, **options)

@@ -1,0 +1,66 @@
+"""A law designed for one plant and used on another: what an uncertain plant demands of it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+
+from jaxbeam.case import Case, replace
+from jaxbeam.controller import AbstractController
+from jaxbeam.modes import Layout
+from jaxbeam.statespace import state_space
+
+
+class Believing(AbstractController):
+    """A `law` whose gains and estimators are designed for the `believed` case; else it is as it is.
+
+    Laws design themselves for the rig of their case (`AbstractController.init`). Where that rig is
+    uncertain, they would otherwise know each plant that is tried.
+    """
+
+    law: AbstractController = eqx.field(kw_only=True)
+    believed: Case = eqx.field(kw_only=True)
+    layout: Layout = eqx.field(static=True, kw_only=True)
+
+    @property
+    def memoryless(self) -> bool:
+        return self.law.memoryless
+
+    @property
+    def blind(self) -> bool:
+        return self.law.blind
+
+    @property
+    def knows_loads(self) -> bool:
+        return self.law.knows_loads
+
+    def init(self, model):
+        return self.law.init(state_space(self.believed, layout=self.layout))
+
+    def step(self, memory, measurement, t):
+        return self.law.step(memory, measurement, t)
+
+    def own_filters(self):
+        return self.law.own_filters()
+
+    def fault(self, case):
+        return self.law.fault(case)
+
+    def failures(self, memory):
+        return self.law.failures(memory)
+
+    def knots(self, case):
+        return self.law.knots(case)
+
+
+def believing(case: Case, nominal: Mapping[str, Any], layout: Layout) -> Case:
+    """The case with a controller that takes the numbers at some addresses for the `nominal` ones.
+
+    `layout` is the order of places along the beam, the same for both.
+    """
+    law = case.controller
+    if not nominal or law is None:
+        return case
+    clock = {name: getattr(law, name) for name in ("period", "delay", "resolution")}
+    wrapped = Believing(law=law, believed=replace(case, dict(nominal)), layout=layout, **clock)
+    return eqx.tree_at(lambda c: c.controller, case, wrapped)
