@@ -208,3 +208,30 @@ def march(
     )
     ended: Any = jax.lax.while_loop(more, go, start)
     return ended[2], ended[1]
+
+
+def at_edges(
+    rigging: Rigging, traffic: Traffic, *, slots: int, driver: AbstractDriver | None = None
+) -> Float[Array, "edge state lane"]:
+    """Integrate from rest over a grid, keeping only the states at the edges of its schedule.
+
+    The number of steps between these need not be known when this is compiled. The state at the
+    last edge is left out, zero, unless a driver acts there. Forward mode only.
+    """
+    chunk = _stepper(rigging, traffic, slots, driver)
+    grid = rigging.grid
+
+    def go(carry):
+        state, memory, kept, first = carry
+        edge = grid.edge(first + jnp.arange(CHUNK))
+        state, memory, _, _, (states, *_) = chunk(state, memory, None, first)
+        kept = kept.at[jnp.where(edge < 0, kept.shape[0], edge)].set(states, mode="drop")
+        return state, memory, kept, first + CHUNK
+
+    lanes = traffic.inertia.shape[1]
+    rest = jnp.zeros((rigging.rig.states, lanes))
+    memory = None if driver is None else driver.start(lanes)
+    kept = jnp.zeros((grid.place.shape[0], *rest.shape))
+    start = rest, memory, kept, jnp.zeros((), int)
+    ended: Any = jax.lax.while_loop(lambda carry: carry[3] < grid.total, go, start)
+    return ended[2]

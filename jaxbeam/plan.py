@@ -20,7 +20,7 @@ from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.extremes import Extremes
 from jaxbeam.fields import known
 from jaxbeam.grid import even_grid, scheduled_grid
-from jaxbeam.integrate import longest_step, march
+from jaxbeam.integrate import at_edges, longest_step, march
 from jaxbeam.loads import motion
 from jaxbeam.loop import loop_schedule, make_loop
 from jaxbeam.modes import Layout, lay_out
@@ -185,40 +185,47 @@ def suitable_step(
 
 
 def _suitable_substeps(case: Case, form: Form, schedule: Schedule, tolerance: float):
-    """How many steps to take from edge to edge of a schedule, and the error of the peaks."""
+    """How many steps to take from edge to edge of a schedule, and the error of the deflection."""
     step = _longest_step(case, form)
     _check_steps(schedule.times.size * float(schedule.lengths.max()) / step, step)
     fewest = max(1, int(np.ceil(float(schedule.lengths.max()) / step)))
 
     @functools.cache
-    def peaks(halvings):
+    def seen(halvings):
         return np.asarray(_probe_driven(case, form, schedule, jnp.asarray(fewest * 2**halvings)))
 
     # A loop that diverges does so with any step; how far it has come by then is not the question.
     # A stiff law at every instant may only seem to, with steps that are too long for it.
     sure = 6 if case.controller.period is None else 1
-    if np.isnan(peaks(1)).any() and np.isnan(peaks(sure)).any():
+    if np.isnan(seen(1)).any() and np.isnan(seen(sure)).any():
         return 2 * fewest, np.nan
-    halvings, error = _halve(peaks, tolerance, 8)
+    halvings, error = _halve(seen, tolerance, 8)
     return fewest * 2**halvings, error
 
 
 @compiled
 def _probe_driven(case, form, schedule, substeps):
+    """Deflections at some places and all edges of the schedule (edge and place, lane).
+
+    Not peaks, as without a controller: where a law saturates its command has a kink, whose error
+    shows everywhere but at a peak, which is flat.
+    """
     places = case.beam.length * jnp.array(PROBES)
     loads = traffic(case)
     driver = make_loop(case, form.layout, loads, schedule)
     grid = scheduled_grid(case, driver.rig, schedule, substeps)
-    rigging = make_rigging(driver.rig, grid, places, driver)
-    best, _ = march(rigging, loads, slots=form.slots, driver=driver)
-    return best.peak()[0]
+    rigging = make_rigging(driver.rig, grid, None, driver)
+    states = at_edges(rigging, loads, slots=form.slots, driver=driver)
+    rows = driver.rig.shapes(places, (0,))[0]
+    seen = rows @ states[:, 0 : 2 * case.beam.modes : 2]
+    return seen.reshape(-1, seen.shape[-1])
 
 
-def _halve(peaks: Callable[[int], np.ndarray], tolerance: float, most: int) -> tuple[int, float]:
-    """How often to halve a step until halving it again changes no peak much, and that change."""
-    coarse = peaks(0)
+def _halve(seen: Callable[[int], np.ndarray], tolerance: float, most: int) -> tuple[int, float]:
+    """How often to halve a step until halving it again changes little seen, and that change."""
+    coarse = seen(0)
     for halvings in range(most):
-        fine = peaks(halvings + 1)
+        fine = seen(halvings + 1)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             error = np.max(np.abs(coarse - fine) / np.max(np.abs(fine), axis=0), initial=0.0)
         if not np.any(fine):
@@ -229,7 +236,8 @@ def _halve(peaks: Callable[[int], np.ndarray], tolerance: float, most: int) -> t
             break
         coarse = fine
     raise RuntimeError(
-        f"no time step makes the peaks agree to {tolerance:g}; the response grows without bound, "
-        "or its frequencies are too far apart: check stiffnesses, masses and damping, "
-        "or keep fewer modes (beam.modes)"
+        f"no time step makes the response agree to {tolerance:g}; it grows without bound, or its "
+        "frequencies are too far apart: check stiffnesses, masses and damping, or keep fewer modes "
+        "(beam.modes); or a law at every instant switches too often: give it a period, or ask for "
+        "a larger tolerance"
     )

@@ -164,14 +164,23 @@ def test_fits_see_the_readings_of_a_loop_without_noise():
 
 
 @pytest.mark.slow
-def test_a_law_that_saturates_within_a_step():
-    """Where the command bends the order is lost, to about two: fine steps are needed."""
-    limited = dataclasses.replace(SHAKER, limits=jnp.array([-0.3, 0.4]))
-    case = loop([limited], [PLACE], jb.Feedback([500.0]))
-    record = run(case, substeps=32)
+@pytest.mark.parametrize(
+    ("actuator", "gain"),
+    [
+        (dataclasses.replace(SHAKER, limits=jnp.array([-0.3, 0.4])), 500.0),
+        (jb.PointForce(0.25, limits=[-1.0, 1.0]), 20000.0),
+    ],
+)
+def test_a_law_that_saturates_within_a_step_keeps_to_the_tolerance(actuator, gain):
+    """Where the command bends the order is lost, to about two; peaks alone would not show it."""
+    case = loop([actuator], [PLACE], jb.Feedback([gain]))
+    record = jb.simulate(case, jnp.asarray(TIMES), tolerance=1e-7)
     truth = expected(case, TIMES)
-    assert_allclose(record.deflection, truth.deflection, rtol=0, atol=5e-8 * 1e-3)
-    assert np.max(record.command) == 0.4 and 0 < np.sum(record.saturated) < TIMES.size
+    error = np.max(np.abs(record.deflection - truth.deflection)) / np.max(np.abs(truth.deflection))
+    assert error <= 1e-7 and record.error_estimate <= 1e-7
+    assert record.steps > 8 * TIMES.size
+    assert np.max(record.command) == actuator.limits[1]
+    assert 0 < np.sum(record.saturated) < TIMES.size
 
 
 @pytest.mark.slow
