@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments import published
+from experiments.ripple import gain_margin, rippled
 from experiments.verdicts import Experiment, Outcome, finding
 from jaxbeam.plan import make_plan
 from jaxbeam.plot.style import colour, name, styled
@@ -184,11 +185,18 @@ def _one_span(case: jb.Case):
         ),
         by_correction(published.SWITCHED_MASSES, switches),
         by_correction(published.LAST_GAIN, last),
+        by_correction(
+            published.LIGHTEST_ONE, [[a[0], b[0]] for a, b in zip(linear, cubic, strict=True)]
+        ),
         finding(published.AFTER_EXIT, jb.modes(case).frequencies[0]),
+        gain_margin(case, CORRECTIONS),
     ]
+    oscillating, oscillation = rippled(controlled(case, 3, ONE_CUTOFF), runs)
+    findings += oscillating
     heaviest = {word: row[len(MASSES) - 1] for word, row in zip(LAWS, found, strict=True)}
     return findings, {
         "one-span": _draw(heaviest, "One span, 0.509 kg (Figs 6.3, 6.5)"),
+        "filters": oscillation,
         "reductions": _draw_reductions(linear[0], cubic[0]),
         "schedule": _draw_schedule(peaks[0][: len(MASSES)], *_by_gain(case)),
     }

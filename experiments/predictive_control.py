@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments import published
-from experiments.verdicts import Experiment, Outcome, finding
+from experiments.verdicts import Experiment, Finding, Outcome, finding
+from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.reach import reach
 from jaxbeam.loop import loop_schedule
@@ -36,9 +37,15 @@ def crossing(case: jb.Case) -> jb.Case:
     return jb.replace(case, {"loads.0.speed": SPEED})
 
 
-def controlled(case: jb.Case, horizon: int, moves: int, weight: float = STRONG) -> jb.Record:
-    """A run under predictive control of the deflections at the sensors, sampled at its ticks."""
-    law = jb.MPC(horizon=horizon, moves=moves, move_weight=weight, period=PERIOD)
+def controlled(
+    case: jb.Case, horizon: int, moves: int, weight: float = STRONG, modes: int | None = None
+) -> jb.Record:
+    """A run under predictive control of the deflections at the sensors, sampled at its ticks.
+
+    The controller's model has fewer `modes` than the case, if that is given.
+    """
+    design = None if modes is None else Beliefs(modes=modes)
+    law = jb.MPC(horizon=horizon, moves=moves, move_weight=weight, period=PERIOD, design=design)
     case = dataclasses.replace(case, controller=law)
     times = np.arange(round(float(case.run.duration) / PERIOD) + 1) * PERIOD
     # Enough steps for the fastest mode to turn by a radian or two in each.
@@ -68,7 +75,9 @@ def _one_span(case):
             records = {"no control": free, "r_w 1e-11": strong, "r_w 1e-6": weak}
     both = [records[f"r_w {weight}"] for weight in ("1e-11", "1e-6")]
     exact, seen = ([_first_at(one, 0, 7.5, near) for one in both] for near in (1e-6, LINE))
+    hasty = controlled(case, 6, 1)
     findings = (
+        finding(published.ONE_MOVE_PEAKS, _peak_times(hasty)),
         finding(published.PREDICTIVE_ONE, less[0], {"8 modes": less[1]}),
         finding(published.SATURATED_ONE, exact, {f"as a curve shows it, to {LINE:.0%}": seen}),
     )
@@ -95,9 +104,31 @@ def _two_spans(case):
             if possible < far
             else "",
         ),
+        _few_modes(case),
         finding(published.SATURATED_TWO, [_first_at(short, 0, 7.5), _first_at(short, 1, -2.5)]),
     )
     return findings, {"no control": free, "Np 4, Nc 3": short, "Np 6, Nc 4": long}
+
+
+def _few_modes(case: jb.Case) -> Finding:
+    """A controller that knows 3 modes, on a beam that has 12."""
+    twelve = dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=12))
+    free, few = jb.simulate(twelve, tolerance=TOLERANCE), controlled(twelve, 2, 1, modes=3)
+    less = [
+        100 * (1 - b / a) for a, b in zip(free.peak_deflection, few.peak_deflection, strict=True)
+    ]
+    told = f"less by {less[0]:.1f} and {less[1]:.1f} %"
+    works = np.array([float(value > 0) for value in less])
+    return finding(published.FEW_MODES, works, {told: works})
+
+
+def _peak_times(record: jb.Record) -> np.ndarray:
+    """When (s) the first and the last upward peak of the deflection are, the load on the beam."""
+    history = np.asarray(record.deflection)[:, 0]
+    middle = history[1:-1]
+    peaks = 1 + np.flatnonzero((middle > history[:-2]) & (middle > history[2:]))
+    times = np.asarray(record.times)[peaks]
+    return times[times < float(record.case.beam.length) / SPEED][[0, -1]]
 
 
 def _out_of_range(case: jb.Case) -> str:

@@ -28,9 +28,10 @@ class Tolerance:
     digits: float = 0.0
 
     def __str__(self) -> str:
-        if self.digits:
-            return f"{self.digits:g} in the last digit"
-        return f"{self.absolute:g}" if self.absolute else f"{100 * self.relative:g} %"
+        parts = [f"{self.absolute:g}"] if self.absolute else []
+        parts += [f"{100 * self.relative:g} %"] if self.relative else []
+        parts += [f"{self.digits:g} in the last digit"] if self.digits else []
+        return " or ".join(parts)
 
 
 @dataclasses.dataclass(frozen=True)

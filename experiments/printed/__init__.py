@@ -1,0 +1,1 @@
+"""Numbers that the thesis prints, a file for each chapter."""
