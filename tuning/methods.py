@@ -38,7 +38,9 @@ class AbstractMethod(eqx.Module):
         """Memory before the first step."""
 
     @abc.abstractmethod
-    def next(self, memory, point: Point, value: Value, slope: Point, fresh: Yes):
+    def next(
+        self, memory, point: Point, value: Value, slope: Point, fresh: Yes
+    ) -> tuple[Point, Any]:
         """The next point to ask for, and the memory.
 
         `value` is infinite where the loop diverges (the slope is zero then). `fresh` says that

@@ -8,6 +8,7 @@ from jaxbeam.control.mpc import MPC
 from jaxbeam.control.passage import Passage
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.recognition import Recognised, Recognition, recognised
+from jaxbeam.control.relief import Relief
 from jaxbeam.control.sampling import SamplingWarning, sampling_limit
 from jaxbeam.control.scheduled import ScheduledLQR
 from jaxbeam.control.state_feedback import StateFeedback
@@ -26,6 +27,7 @@ KINDS = {
     "pd": PD,
     "ppf": PositivePositionFeedback,
     "prescribed": Prescribed,
+    "relief": Relief,
     "state": StateFeedback,
 }
 
@@ -44,6 +46,7 @@ __all__ = [
     "Prescribed",
     "Recognised",
     "Recognition",
+    "Relief",
     "SamplingWarning",
     "ScheduledLQR",
     "StateFeedback",

@@ -1,0 +1,93 @@
+"""How the laws of `experiments.sensed` are found, which know nothing but what their sensors read.
+
+    python -m experiments.sensed_search B      # or C; writes experiments/controllers/sensed/B.toml
+
+On each patch rig one table of commands over the deflection under the load (kind "relief") serves
+all masses and speeds. All of the bench is in the loop that is differentiated: noise, a filter of
+tenth order, sampling, delay, rounding and limits. The knots follow the gradient of the worst
+shortfall behind the bound.
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import jaxbeam as jb
+import tuning
+from experiments.tuned_search import LIMITS, MASSES, MODES, PERIOD, STEP
+from jaxbeam import rigs
+
+FOLDER = Path(__file__).parent / "controllers" / "sensed"
+DELAY = 0.02  # s
+NOISE = 4e-6  # m: about the largest of section 5.1 of the thesis, (0.135e-10 m^2)^0.5
+CUTOFF, ORDER = 10.0, 10  # Hz: the filter of section 6.1; that of 6.2, 20 Hz, passes too much
+READINGS = 1e-3 * np.array([-1.2, -0.8, -0.55, -0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4])  # m
+SPEEDS = np.linspace(0.3, 1.0, 8)  # m/s
+ENTRY = 0.05  # s
+START = {"B": (0.45e-3, 7.2, 0.0), "C": (0.45e-3, 7.2, -1.8)}  # m, V below, V above
+STEPS, SAMPLE_RATE = 120, {"B": 200.0, "C": 100.0}  # Hz
+
+
+def on_bench(case: jb.Case, seed: int = 0) -> jb.Case:
+    """The rig as on the bench: noise and filters at all sensors."""
+    smooth = jb.Filter(CUTOFF, order=ORDER)
+    seen = [dataclasses.replace(s, filter=smooth, noise=np.asarray(NOISE)) for s in case.sensors]
+    run = dataclasses.replace(case.run, seed=seed)
+    return dataclasses.replace(case, sensors=tuple(seen), run=run)
+
+
+def start(name: str) -> jb.Relief:
+    """The law that the search starts from on rig B or C: steep, then flat."""
+    full, below, above = START[name]
+    row = np.interp(READINGS, [-full, 0.0, full], [below, 0.0, above])
+    actuators = len(rigs.load(name).actuators)
+    return jb.Relief(
+        readings=READINGS, values=[row] * actuators, period=PERIOD, delay=DELAY, resolution=STEP
+    )
+
+
+def training() -> tuple[dict[str, float], ...]:
+    """The lightest and the heaviest load at all speeds, entering at ticks and between them."""
+    return tuple(
+        {
+            "loads.0.mass": mass,
+            "loads.0.speed": float(speed),
+            "loads.0.entry_time": ENTRY + PERIOD * ((2 * i + j) % 4) / 4,
+        }
+        for i, speed in enumerate(SPEEDS)
+        for j, mass in enumerate(MASSES)
+    )
+
+
+def search(name: str, steps: int = STEPS, progress: bool = True) -> tuning.Tuned:
+    """Tune the table for the worst of all loads on rig B or C."""
+    case = on_bench(rigs.load(name))
+    slowest = float(case.beam.length) / min(SPEEDS)
+    case = dataclasses.replace(
+        case,
+        beam=dataclasses.replace(case.beam, modes=MODES),
+        controller=start(name),
+        run=jb.Run(duration=slowest + 0.15, sample_rate=SAMPLE_RATE[name]),
+    )
+    actuators, knots = case.controller.values.shape
+    # Without a load there is no command; upwards the beam of one span goes only when it rings.
+    used = [k for k in range(knots) if READINGS[k] < 0 or (READINGS[k] > 0 and actuators > 1)]
+    free = {f"controller.values.{a}.{k}": LIMITS for a in range(actuators) for k in used}
+    return tuning.tune(
+        case,
+        free,
+        tuning.LoadCases(training()),
+        tuning.Objective({"shortfall": 1.0}),
+        steps=steps,
+        progress=progress,
+    )
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    for rig in sys.argv[1:]:
+        found = search(rig)
+        print(found)
+        jb.save_case(found.case, FOLDER / f"{rig}.toml", overwrite=True)
