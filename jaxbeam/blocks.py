@@ -1,14 +1,17 @@
 """The runs of a sweep, cut into blocks of equal shape that are compiled once."""
 
+import contextlib
 import dataclasses
 import math
 import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Float
 
 from jaxbeam.case import Case, replace, value_at
@@ -21,7 +24,7 @@ from jaxbeam.lanes import Tasks
 from jaxbeam.loads import motion
 from jaxbeam.loop import loop_schedule, make_loop
 from jaxbeam.modes import Layout, lay_out
-from jaxbeam.pacing import choose_steps
+from jaxbeam.pacing import choose_steps, drawn, rounding
 from jaxbeam.plan import Form, most_at_once, sample_times
 from jaxbeam.record import never_as_nan
 from jaxbeam.rig import couples, rig
@@ -37,19 +40,28 @@ PLACE = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end
 class Work:
     """All tasks of a sweep, cut into blocks of equal shape.
 
-    Raises ValueError if places along the beam change their order within the sweep.
+    `single` says that runs are integrated in single precision; rigs and propagators are made in
+    double all the same. Raises ValueError if places along the beam change their order within the
+    sweep.
     """
 
-    def __init__(self, case: Case, tasks: Tasks, histories: bool, tolerance: float):
+    def __init__(
+        self, case: Case, tasks: Tasks, histories: bool, tolerance: float, single: bool = False
+    ):
         self.case, self.tasks, self.histories, self.tolerance = case, tasks, histories, tolerance
+        self.single = single
         self.schedule = None
         if case.controller is not None:
             self.schedule = loop_schedule(case, np.asarray(sample_times(case)))
         elif histories:
             self.schedule = sampled(sample_times(case), True)
         count, lanes = tasks.index.shape
-        self._compiling = threading.Lock()
-        self.each = min(count, max(1, RUNS // lanes))
+        self._compiling, self._ready = threading.Lock(), set()
+        # Each device takes an equal part of a block.
+        self.devices = len(jax.local_devices())
+        self.each = self.devices * -(
+            -min(count, max(1, RUNS * self.devices // lanes)) // self.devices
+        )
         self.blocks = -(-count // self.each)
         self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
         layout = _common_layout(case, tasks)
@@ -91,12 +103,18 @@ class Work:
         """
         batches = -(-PACES // self.each)
 
-        def measure(chosen, steps):
+        def measure(chosen, steps, single=False):
             parts = zip(np.split(chosen, batches), np.split(steps, batches), strict=True)
-            return np.concatenate([self._run(*part, None)["peak_deflection"] for part in parts])
+            found = [self._run(*part, None, single)["peak_deflection"] for part in parts]
+            return np.concatenate(found)
 
         count = batches * self.each
-        return choose_steps(measure, self.paces, self.guesses, self.limits, count, self.tolerance)
+        given = self.paces, self.guesses, self.limits, count, self.tolerance
+        steps, error = choose_steps(measure, *given)
+        if self.single:
+            some = drawn(self.paces.size, count)
+            error += rounding(*(measure(some, steps[some], single) for single in (False, True)))
+        return steps, error
 
     def runs(self, number: int) -> int:
         """How many runs are in a block, apart from those that only fill it up."""
@@ -110,7 +128,7 @@ class Work:
         substeps = None
         if self.histories:
             substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
-        return self._run(chosen, steps[chosen], substeps)
+        return self._run(chosen, steps[chosen], substeps, self.single)
 
     def _programs(self, alike):
         """What finds the steps, with arguments made from what rigs look like."""
@@ -120,14 +138,17 @@ class Work:
         programs = [(_block, self._block(first, steps, None, riggings))]
         return programs if given is None else [*programs, (_riggings, given)]
 
-    def _run(self, chosen, steps, substeps):
+    def _run(self, chosen, steps, substeps, single):
         given = self._rigging(chosen, steps, substeps, self.rigs, self.rig_of[chosen])
         riggings = None if given is None else _riggings(*given)
         arguments = self._block(chosen, steps, substeps, riggings)
-        with self._compiling:  # others wait for the first, instead of compiling the same again
-            if substeps is not None:
-                _block.ahead(*arguments)
-        results = _block(*arguments)
+        arguments = jax.tree.map(_shortened, arguments) if single else arguments
+        with jax.enable_x64(False) if single else contextlib.nullcontext():
+            with self._compiling:  # others wait for the first, instead of compiling the same again
+                if (substeps, single) not in self._ready:
+                    _block.ahead(*arguments)
+                    self._ready.add((substeps, single))
+            results = _block(*arguments)
         return {name: np.asarray(values) for name, values in results.items()}
 
     def _rigging(self, chosen, steps, substeps, rigs, rig_of):
@@ -141,7 +162,8 @@ class Work:
     def _block(self, chosen, steps, substeps, riggings):
         """Arguments of `_block`."""
         tasks = self.tasks.heavy[chosen], self.tasks.light[chosen], np.asarray(steps)
-        return self.case, self.form, self.addresses, *self._clock(substeps), riggings, *tasks
+        settings = self.case, self.form, self.addresses, self.devices, *self._clock(substeps)
+        return *settings, riggings, *tasks
 
     def _clock(self, substeps):
         scheduled = substeps is not None or self.case.controller is not None
@@ -176,6 +198,13 @@ def _common_layout(case: Case, tasks: Tasks) -> Layout:
             "where supports or patch edges meet"
         )
     return common.pop()
+
+
+def _shortened(leaf):
+    """Numbers in half the length."""
+    if not eqx.is_array(leaf) or leaf.dtype == bool:
+        return leaf
+    return np.asarray(leaf, np.float32 if np.issubdtype(leaf.dtype, np.floating) else np.int32)
 
 
 def _varied(case, addresses, values):
@@ -232,8 +261,8 @@ def _riggings(case, addresses, schedule, substeps, rigs, heavy, longest):
 
 
 @compiled
-def _block(case, form, addresses, schedule, substeps, riggings, heavy, light, longest):
-    """Results of some tasks, one after the other, their lanes side by side."""
+def _block(case, form, addresses, devices, schedule, substeps, riggings, heavy, light, longest):
+    """Results of some tasks: lanes side by side, tasks one after the other, shared by devices."""
     heavy_addresses, light_addresses = addresses
 
     def task(values):
@@ -275,4 +304,10 @@ def _block(case, form, addresses, schedule, substeps, riggings, heavy, light, lo
             **history,
         }
 
-    return jax.lax.map(task, (riggings, heavy, light, longest))
+    def part(values):
+        return jax.lax.map(task, values)
+
+    if devices > 1:
+        mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
+        part = jax.shard_map(part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    return part((riggings, heavy, light, longest))

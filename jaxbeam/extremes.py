@@ -79,7 +79,9 @@ def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) 
 
     def lost(first):
         pulls = -forces.reshape(steps, -1, 1, len(GAUSS), lanes) < 0
-        times = (start[:, None] + span[:, None] * GAUSS)[:, None, None, :, None]
+        times = (start[:, None] + span[:, None] * jnp.asarray(GAUSS, span.dtype))[
+            :, None, None, :, None
+        ]
         when = jnp.where(pulls & here[..., None, None], times, NEVER)
         return jnp.minimum(first, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
 

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-import scipy.signal
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.fields import POSITIVE, choice, count, is_known, known, number
@@ -34,7 +33,9 @@ class Filter(eqx.Module):
 @functools.cache
 def _prototype(order: int) -> tuple[np.ndarray, bool]:
     """Damping ratios of the second-order sections at 1 rad/s, and whether one of first order."""
-    _, poles, _ = scipy.signal.buttap(order)
+    from scipy.signal import buttap  # here, as it takes half a second and most cases have no filter
+
+    _, poles, _ = buttap(order)
     # Well-damped sections first: the resonant ones then see what is already filtered.
     return np.sort(-poles[poles.imag > 1e-9].real)[::-1], order % 2 == 1
 

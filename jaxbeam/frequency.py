@@ -9,12 +9,11 @@ E is the identity but for the parked masses, eq. (2.30) of the thesis. C' takes 
 
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import xarray
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Complex, Float
 from scipy.linalg import eigvals
@@ -27,6 +26,9 @@ from jaxbeam.fields import is_known, known
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.ports import Pair, check_pairs, column, common_pairs, row
 from jaxbeam.rig import Rig, rig
+
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
 
 Parked = Sequence[tuple[Any, Any]]  # position (m) and mass (kg) of each
 
@@ -61,8 +63,10 @@ class FrequencyResponse(eqx.Module):
         have = ", ".join(map(str, self.pairs))
         raise ValueError(f"there is no response of {output} to {input}; there are {have}")
 
-    def to_xarray(self) -> xarray.Dataset:
+    def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units, all of it real so that every file format takes it."""
+        import xarray
+
         dims = ("frequency", "pair")
         values = np.asarray(self.values)
         return xarray.Dataset(

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-NEVER = 1e300  # a time that is never reached, finite so that its arithmetic has derivatives
+NEVER = 1e30  # s, never reached; finite, in single precision too: its arithmetic has derivatives
 
 
 class AbstractMotion(eqx.Module):

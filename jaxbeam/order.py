@@ -24,6 +24,8 @@ TOGETHER = re.compile(
     r"beam\.length|(supports|actuators|sensors)\.\d+\.(position|start|end)|.*\.\d+"
 )
 
+PRECISIONS = ("double", "single")
+
 # What decides when a controller acts and its sensors are read.
 CLOCK = re.compile(
     r"run\.(duration|sample_rate)|controller\.(period|delay|times\.\d+)"
@@ -36,7 +38,8 @@ class Order:
     """A case, the values at some of its addresses, and how they are to be run.
 
     Either all combinations of the values, or with `paired` the first of each, the second of each,
-    and so on; `tolerance` is the relative error allowed of peaks.
+    and so on; `tolerance` is the relative error allowed of peaks, apart from that of rounding in
+    `single` precision.
     """
 
     case: Case
@@ -44,6 +47,7 @@ class Order:
     paired: bool
     histories: bool
     tolerance: float
+    single: bool
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -72,20 +76,20 @@ class Order:
 
         Raises ValueError if places along the beam change their order within the sweep.
         """
-        return Work(self.case, self.tasks(), self.histories, self.tolerance)
+        return Work(self.case, self.tasks(), self.histories, self.tolerance, self.single)
 
     def to_dict(self) -> dict[str, Any]:
         """The order in plain words and numbers, which `order_from_dict` makes an order again."""
         return {
             "case": case_to_dict(self.case),
             "axes": {address: values.tolist() for address, values in self.axes.items()},
-            "settings": [self.paired, self.histories, self.tolerance],
+            "settings": [self.paired, self.histories, self.tolerance, self.single],
         }
 
     def fingerprint(self) -> str:
         """A number for all that shapes the results: case, values, settings and versions."""
         content = self.to_dict() | {
-            "blocks": [RUNS, LANES],
+            "blocks": [RUNS, LANES, len(jax.local_devices())],
             "versions": [importlib.metadata.version("jaxbeam"), jax.__version__],
         }
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
@@ -98,13 +102,27 @@ def order_from_dict(content: dict[str, Any]) -> Order:
 
 
 def make_order(
-    case: Case, over: dict[str, Any], paired: bool, histories: bool, tolerance: float
+    case: Case,
+    over: dict[str, Any],
+    paired: bool,
+    histories: bool,
+    tolerance: float,
+    precision: str,
 ) -> Order:
     """Check a case and the values it is to be swept over, and put them together.
 
-    Raises ValueError for an unknown address, faulty or too many values, and a case without sensors.
+    Raises ValueError for an unknown address, faulty or too many values, a case without sensors, or
+    a precision that there is not.
     """
     check(case)
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision must be {' or '.join(PRECISIONS)}, not {in_words(precision)}")
+    single = precision == "single"
+    if single and case.controller is not None:
+        raise ValueError(
+            "controllers need double precision: they are designed anew for every run; leave out"
+            " precision, or the controller"
+        )
     if not over:
         raise ValueError("give at least one address to sweep over, with a list of values")
     if not case.sensors:
@@ -118,7 +136,7 @@ def make_order(
     sizes = {address: values.size for address, values in axes.items()}
     if paired and len(set(sizes.values())) > 1:
         raise ValueError(f"paired values must be equally many, not {sizes}")
-    order = Order(case, axes, paired, histories, tolerance)
+    order = Order(case, axes, paired, histories, tolerance, single)
     if math.prod(order.shape) > MOST_RUNS:
         raise ValueError(
             f"{math.prod(order.shape):.1e} combinations of values are too many; a sweep may have"

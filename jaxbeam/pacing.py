@@ -37,6 +37,21 @@ def errors(measure: Measure, tasks, steps) -> Float[np.ndarray, " task"]:
     """
     with ThreadPoolExecutor(2) as pool:
         coarse, fine = pool.map(measure, (tasks, tasks), (steps, steps / FINER))
+    return _changes(coarse, fine)
+
+
+def rounding(exact: Float[np.ndarray, "task lane sensor"], rounded: np.ndarray) -> float:
+    """The largest relative error of peaks computed with rounded numbers, where any run works."""
+    return float(np.nanmax(_changes(rounded, exact), initial=0.0))
+
+
+def drawn(tasks: int, count: int) -> Int[np.ndarray, " chosen"]:
+    """`count` of so many tasks (some maybe twice), at random and the same each time."""
+    return np.resize(np.random.default_rng(0).permutation(tasks), count)
+
+
+def _changes(coarse, fine):
+    """The largest relative change of peaks in each task; NaN where no run works."""
     works = np.isfinite(fine)
     size = np.abs(np.where(works, fine, 0.0))
     size = np.maximum(size, SMALL * size.max(axis=-1, keepdims=True))
@@ -76,7 +91,7 @@ def choose_steps(
     np.minimum.at(lowest, which, np.log(good / start[chosen]))
     longer = np.exp(np.interp(np.log(paces), unique, lowest))
     steps = np.minimum(start * longer, limits)
-    some = np.resize(np.random.default_rng(0).permutation(paces.size), count)
+    some = drawn(paces.size, count)
     for _ in range(ROUNDS):
         error = errors(measure, some, steps[some])
         worst = float(np.max(np.where(np.isnan(error), 0.0, error)))

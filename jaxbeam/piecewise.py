@@ -20,7 +20,10 @@ def piecewise(nodes, series, x, derivatives) -> Float[Array, "order *place colum
     x = jnp.asarray(x, float)
     size = jnp.diff(nodes) / 2
     segments, terms, modes = series.shape
-    stretched = [_differentiate(terms, d) @ series / size[:, None, None] ** d for d in derivatives]
+    stretched = [
+        jnp.asarray(_differentiate(terms, d), series.dtype) @ series / size[:, None, None] ** d
+        for d in derivatives
+    ]
     series = jnp.stack(stretched, axis=2).reshape(segments, terms, len(derivatives) * modes)
     segment = jnp.sum(x[..., None] >= nodes[1:-1], axis=-1)
     local = (x - nodes[segment]) / size[segment] - 1

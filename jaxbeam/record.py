@@ -2,11 +2,11 @@
 
 import json
 import os
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import xarray
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case import Case
@@ -16,6 +16,9 @@ from jaxbeam.modes import Modes
 from jaxbeam.motion import NEVER
 from jaxbeam.sensing import convert, needs_times, noise_samples, sense
 from jaxbeam.sensors import QUANTITIES
+
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
 
 
 class Record(eqx.Module):
@@ -159,8 +162,10 @@ class Record(eqx.Module):
         parts.append(f"estimated error {float(known(self.error_estimate)):.1e} of the peak")
         return "; ".join(parts)
 
-    def to_xarray(self) -> xarray.Dataset:
+    def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units; `from_xarray` restores the record exactly."""
+        import xarray
+
         variables = {
             name: (dims, np.asarray(getattr(self, name)), {"units": unit, "long_name": words})
             for name, (dims, unit, words) in _VARIABLES.items()
@@ -231,7 +236,7 @@ _OF_MODES = {
 _STORED = [name for name in _VARIABLES if name in Record.__annotations__]
 
 
-def record_from_xarray(dataset: xarray.Dataset) -> Record:
+def record_from_xarray(dataset: "xarray.Dataset") -> Record:
     """Restore a record from the dataset made by `Record.to_xarray` (or read from its file).
 
     Raises ValueError if the dataset was not made by a record.
@@ -282,6 +287,8 @@ def read_record(path: str | os.PathLike) -> Record:
 
     Raises OSError if it cannot be read, ValueError if it holds something else.
     """
+    import xarray
+
     with xarray.open_dataset(path, engine="scipy") as dataset:
         return record_from_xarray(dataset.load())
 

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
-import xarray
 
 if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
     import zarr  # takes long to import; only sweeps that are kept need it
 
 FINGERPRINT = "jaxbeam_sweep"
@@ -184,6 +184,7 @@ class Disk(Keeper):
 
 def read(path: Path) -> xarray.Dataset:
     """The dataset of a complete store. Raises ValueError if part of it is missing or damaged."""
+    import xarray
     import zarr
 
     shutil.rmtree(path / BLOCKS, ignore_errors=True)  # a kill may have left its chunks behind

@@ -138,7 +138,8 @@ def tabulate(rigging: Rigging, traffic: Traffic, slots: int, index: Int[Array, "
     rig, grid = rigging.rig, rigging.grid
     panel, start, kind = grid.steps(index)
     span = grid.lengths[kind]
-    times = start[:, None] + span[:, None] * GAUSS
+    # As an array: JAX remembers a NumPy constant in the precision in which it met it first.
+    times = start[:, None] + span[:, None] * jnp.asarray(GAUSS, span.dtype)
     position, speed, acceleration = (jnp.moveaxis(p, 0, 1) for p in traffic.travel(times))
     active = grid.active[panel]  # step, load
     if slots < len(traffic.motions):

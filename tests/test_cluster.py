@@ -98,7 +98,7 @@ def test_two_workers_one_of_them_killed_make_the_same_store(workers, alone, tmp_
 
 
 def test_an_order_travels_in_plain_words_and_numbers():
-    order = make_order(CASE, OVER, False, False, 1e-7)
+    order = make_order(CASE, OVER, False, False, 1e-7, "double")
     again = order_from_dict(order.to_dict())
     assert again.fingerprint() == order.fingerprint()
     np.testing.assert_array_equal(again.runs(), order.runs())
@@ -108,7 +108,7 @@ def test_workers_refuse_what_they_would_spoil(tmp_path, monkeypatch):
     path = tmp_path / "runs.zarr"
     with pytest.raises(ValueError, match="where all machines see it"):
         cluster.work_off([0], "mark", path)
-    order = make_order(CASE, {"loads.0.mass": [0.1]}, False, False, 1e-7)
+    order = make_order(CASE, {"loads.0.mass": [0.1]}, False, False, 1e-7, "double")
     create(path, "mark", order.to_dict(), 1, np.ones(2))
     monkeypatch.setattr(cluster, "_work", lambda mark, keeper: (None, "other"))
     with pytest.raises(ValueError, match="another version of jaxbeam"):

@@ -153,6 +153,7 @@ def sweep(
     paired: bool = False,
     resume: bool = False,
     scheduler: str | None = None,
+    precision: str = "double",
     set_: Settings = (),
     overwrite: Overwrite = False,
     json_: Json = False,
@@ -175,6 +176,8 @@ def sweep(
     scheduler
         Have the workers of a Dask cluster do it: the address of its scheduler, tcp://HOST:PORT.
         The store must be where all of them see it.
+    precision
+        double, or single: runs in half the bits, to a few parts in a million.
     """
     import jaxbeam as jb
     from jaxbeam.cluster import connect
@@ -194,6 +197,7 @@ def sweep(
             overwrite=overwrite,
             paired=paired,
             progress=not json_,
+            precision=precision,
             client=client,
         )
     peaks = results["peak_deflection"]

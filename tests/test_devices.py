@@ -1,0 +1,78 @@
+"""Sweeps in single precision, and shared by several devices: the same results, to rounding."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+
+CASE = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3),
+    supports=[jb.Support(0.25, stiffness=2e4, damping=3.0)],  # modes coupled by a damper
+    actuators=[jb.PointForce(0.3)],
+    sensors=[jb.Sensor(0.15), jb.Sensor(0.4)],
+    loads=[jb.MovingMass(mass=0.3, speed=1.0), jb.MovingForce(force=2.0, speed=2.0)],
+    run=jb.Run(0.5, sample_rate=200.0),
+)
+OVER = {
+    "loads.0.mass": np.linspace(0.1, 1.0, 5),
+    "loads.0.speed": np.geomspace(1.0, 10.0, 4),
+    "beam.flexural_rigidity": [10.0, 12.0],
+}
+
+
+def test_single_precision_is_right_to_what_is_stated():
+    double, single = (
+        jb.sweep(CASE, OVER, progress=False, precision=word) for word in ("double", "single")
+    )
+    assert single.peak_deflection.dtype == np.float32
+    assert double.peak_deflection.dtype == np.float64
+    error = np.max(np.abs(single.peak_deflection / double.peak_deflection - 1))
+    assert 1e-8 < error < 2e-5  # some tens of roundings, 6e-8 each
+    assert float(error) < 5 * single.error_estimate  # which was seen on some of the runs only
+    assert not single.failed.any()
+    whole = jb.sweep(CASE, OVER, progress=False, precision="single", histories=True)
+    assert whole.deflection.dtype == np.float32
+    assert_allclose(np.abs(whole.deflection).max("time") <= double.peak_deflection * 1.00002, True)
+
+
+def test_precisions_that_there_are_not_are_refused():
+    with pytest.raises(ValueError, match="precision must be double or single, not 'half'"):
+        jb.sweep(CASE, OVER, precision="half")
+    looped = dataclasses.replace(CASE, controller=jb.Feedback(gains=[100.0], period=0.01))
+    with pytest.raises(ValueError, match="controllers need double precision"):
+        jb.sweep(looped, OVER, precision="single")
+
+
+SHARED = """
+import sys
+import jax
+import numpy as np
+import jaxbeam as jb
+from tests.test_devices import CASE, OVER
+assert len(jax.local_devices()) == 3
+peaks = jb.sweep(CASE, OVER, progress=False).peak_deflection.values
+lines = jb.sweep(CASE, OVER, progress=False, histories=True).deflection.values
+np.savez(sys.argv[1], peaks=peaks, lines=lines)
+"""
+
+
+@pytest.mark.slow
+def test_several_devices_share_a_block(tmp_path):
+    """Three, among which eight tasks do not divide evenly."""
+    flags = os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=3"
+    command = [sys.executable, "-c", SHARED, str(tmp_path / "shared.npz")]
+    subprocess.run(
+        command, env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}, check=True
+    )
+    alone = jb.sweep(CASE, OVER, progress=False, histories=True)
+    with np.load(tmp_path / "shared.npz") as shared:
+        assert_allclose(shared["lines"], alone.deflection, rtol=1e-9, atol=1e-16)
+        assert_allclose(
+            shared["peaks"], jb.sweep(CASE, OVER, progress=False).peak_deflection, rtol=1e-12
+        )
