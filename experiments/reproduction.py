@@ -21,6 +21,7 @@ MODULES = (
     "feedback",
     "predictive_control",
     "tuned",
+    "sensed",
 )
 FOLDER = "out/reproduce"
 

@@ -51,6 +51,23 @@ def test_commands_are_those_of_the_table_for_readings_without_the_own_lift():
     assert_allclose(sent[2:], wanted[:-2], atol=1e-6)
 
 
+def test_notches_are_the_analogue_ones_warped_to_their_frequencies():
+    law = dataclasses.replace(LAW, notches=[16.0, 27.0], notch_damping=0.4)
+    made = law.init(jb.state_space(rig(law))).notches
+    # At rest 1, at its frequency 0, and in between what the analogue one gives a warped frequency.
+    for hertz, section in zip([16.0, 27.0], np.asarray(made), strict=True):
+        turn, at = 2 * 100.0 * np.tan(np.pi * hertz / 100.0), np.array([0.0, 9.0, hertz])
+        analogue = [1.0, 0.0, turn**2], [1.0, 0.8 * turn, turn**2]
+        warped = 2 * 100.0 * np.tan(np.pi * at / 100.0)
+        _, expected = scipy.signal.freqs(*analogue, worN=warped)
+        _, found = scipy.signal.freqz(section[:3], section[3:], worN=at, fs=100.0)
+        assert_allclose(found, expected, atol=1e-12)
+    with pytest.raises(
+        ValueError, match="notches must be below half the sampling frequency, 50 Hz"
+    ):
+        jb.simulate(rig(dataclasses.replace(LAW, notches=[16.0, 60.0])))
+
+
 def test_it_may_be_steep_where_plain_feedback_of_the_same_slope_is_not_stable():
     steep, times = 3e4, np.zeros(1)  # V/m; the load is not on the beam yet
     readings, values = [-2e-4, 2e-4], [[6.0, -6.0]]

@@ -13,17 +13,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.controller import AbstractController
-from jaxbeam.fields import INCREASING, number
+from jaxbeam.fields import INCREASING, POSITIVE, is_known, known, number
 from jaxbeam.filters import filter_step, initial, sections
 from jaxbeam.statespace import LoadedBeam
 
 
 class Watch(eqx.Module):
-    """Memory of `Relief`: lift (m per unit of a command), and the sensors' filters on it."""
+    """Memory of `Relief`: lift (m per unit of a command), filters, and what has passed them.
+
+    The filters of each sensor are those of its own, for the lift, and the notches.
+    """
 
     lift: Float[Array, "actuator actuator"]
     filters: tuple[Float[Array, "section 6"] | None, ...]
+    notches: Float[Array, "section 6"] | None
     passed: tuple[Float[Array, "section 2"] | None, ...]
+    notched: Float[Array, "section 2 actuator"] | None
 
 
 class Relief(AbstractController):
@@ -35,6 +40,10 @@ class Relief(AbstractController):
     straight lines, and those at its ends hold beyond. Where a table is flat no deviation is
     answered, so a load that sinks the beam beyond its last reading leaves the loop open there.
     Neither mass nor speed nor place of the load is used.
+
+    What the static lift does not know is how the beam rings. Where the sensors' filters let that
+    through, `notches` take it out of y - c H u: (s^2 + w^2) / (s^2 + 2 zeta w s + w^2) each, which
+    delays slow changes by 2 zeta / w only.
     """
 
     readings: Float[Array, " knot"] = number("m", "deflections under the load", INCREASING)
@@ -43,6 +52,13 @@ class Relief(AbstractController):
     )
     compensation: Float[Array, ""] = number(
         "1", "share of the commands' own lift that is taken off the readings", default=1.0
+    )
+
+    notches: Float[Array, " notch"] | None = number(
+        "Hz", "frequencies that are taken out", POSITIVE, default=None
+    )
+    notch_damping: Float[Array, ""] = number(
+        "1", "damping ratio of the notches: half their relative width", POSITIVE, default=0.5
     )
 
     @property
@@ -58,6 +74,13 @@ class Relief(AbstractController):
                 f"values must have for each of {actuators} actuators as many entries as readings"
                 f" has, {self.readings.shape[0]}; they are of shape {self.values.shape}"
             )
+        if self.notches is not None and is_known(self.notches) and is_known(self.period):
+            nyquist = 0.5 / float(known(self.period))
+            if known(self.notches).max(initial=0.0) >= nyquist:
+                return (
+                    f"notches must be below half the sampling frequency, {nyquist:g} Hz: lower"
+                    " them, or sample faster"
+                )
         own = case.sensors[:actuators]
         if len(own) < actuators or any(sensor.quantity != "deflection" for sensor in own):
             return (
@@ -74,7 +97,18 @@ class Relief(AbstractController):
             for sensor in sensors
         )
         passed = tuple(None if part is None else initial(part, 0.0) for part in filters)
-        return Watch(-rows @ plant.B, filters, passed)
+        notches = None if self.notches is None else self._sections()
+        still = None if notches is None else initial(notches, jnp.zeros(len(sensors)))
+        return Watch(-rows @ plant.B, filters, notches, passed, still)
+
+    def _sections(self) -> Float[Array, "notch 6"]:
+        """The notches, sampled: bilinear transforms that are warped to meet their frequencies."""
+        warped = jnp.tan(jnp.pi * self.notches * self.period)
+        wide, one = 2 * self.notch_damping * warped, jnp.ones_like(warped)
+        whole = 1 + wide + warped**2
+        middle, side = 2 * (warped**2 - 1) / whole, (1 + warped**2) / whole
+        last = (1 - wide + warped**2) / whole
+        return jnp.stack([side, middle, side, one, middle, last], axis=1)
 
     def step(self, memory, measurement, t):
         caused = memory.lift @ measurement.command
@@ -84,8 +118,13 @@ class Relief(AbstractController):
             seen.append(value)
             passed.append(after)
         own = measurement.readings[: caused.shape[0]]
-        offsets = own - self.compensation * jnp.stack(seen)
+        offsets, notched = own - self.compensation * jnp.stack(seen), memory.notched
+        if memory.notches is not None:
+            offsets, notched = filter_step(memory.notches, notched, offsets)
         command = jax.vmap(lambda x, row: jnp.interp(x, self.readings, row))(offsets, self.values)
         return command, eqx.tree_at(
-            lambda m: m.passed, memory, tuple(passed), is_leaf=lambda x: x is None
+            lambda m: (m.passed, m.notched),
+            memory,
+            (tuple(passed), notched),
+            is_leaf=lambda x: x is None,
         )
