@@ -21,7 +21,7 @@ import numpy as np
 
 from experiments.benchmarks import baselines
 from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, rig, sweep_peaks
-from jaxbeam import blocks
+from jaxbeam import programs
 from jaxbeam.exponentials import GAUSS, POINTS
 from jaxbeam.order import make_order
 
@@ -50,7 +50,7 @@ def prepare(modes: int) -> tuple[np.ndarray, list]:
     steps, _ = work.steps()
     everything = np.arange(SPEEDS.size)
     given = work._rigging(everything, steps, None, work.rigs, work.rig_of[everything])
-    riggings = jax.tree.map(np.asarray, blocks._riggings(*given))
+    riggings = jax.tree.map(np.asarray, programs.riggings(*given))
     plain = baselines.Rig(modes)
     rates = riggings.rig.state_matrix[0, :, 1, :]
     powers = np.linalg.inv(np.linspace(-1, 1, POINTS + 1)[:, None] ** np.arange(POINTS + 1))

@@ -70,7 +70,7 @@ def main() -> None:
     options.python_tracer_level = 0
     with jax.profiler.trace(str(folder / "trace"), profiler_options=options):
         sweep_peaks(given.modes)
-    found = shares(folder / "trace", stages(folder / "hlo", "jit__block"), "jit__block")
+    found = shares(folder / "trace", stages(folder / "hlo", "jit_block"), "jit_block")
     print(f"| {given.modes} modes, 4096 crossings | share of the time |\n| --- | ---: |")
     for stage, share in found.items():
         print(f"| {stage} | {share:.0%} |")

@@ -5,7 +5,9 @@
 A table of commands (11 knots and the lead) on rig B is tuned for the worst peak of four loads. All
 start from the same trapezium and search within the same limits. Differential evolution (scipy's) is
 given as much time as Adam took (compiling apart on both sides), as many evaluations as the
-gradients took (one in reverse mode counted as four), and ten times as many.
+gradients took (one in reverse mode counted as four), and ten times as many. Worst peaks, relative
+to no control: 0.825 at the start, 0.7923 by 80 gradients of each method (2 s); 0.807 by evolution
+in the same 2 s, 0.815 by as many evaluations, 0.7924 by ten times as many (10 s).
 """
 
 import dataclasses

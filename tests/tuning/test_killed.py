@@ -8,6 +8,8 @@ import sys
 import numpy as np
 import pytest
 
+import tuning
+from tests.tuning.small_rig import GAIN, rig
 from tests.tuning.stand_in import fit, search
 from tuning.posterior import sample
 from tuning.starts import scout
@@ -15,18 +17,20 @@ from tuning.starts import scout
 # What a process does until, having written its first state, it is killed.
 CHILD = """
 import os, signal, sys
-import tuning.posterior, tuning.starts
+import tuning.descent, tuning.posterior, tuning.starts
 from pathlib import Path
+from tests.tuning import test_killed
 from tests.tuning.stand_in import fit, search
 file = Path(sys.argv[1])
 def save_and_die(path, mark, arrays):
     saved(path, mark, arrays)
     os.kill(os.getpid(), signal.SIGKILL)
 saved = tuning.starts.save
-tuning.starts.save = tuning.posterior.save = save_and_die
+tuning.starts.save = tuning.posterior.save = tuning.descent.save = save_and_die
 {task}
 """
 SCOUT = "wide = search(); tuning.starts.scout(wide, wide.campaign.measured, 12, 1, file, 'it')"
+TUNE = "test_killed.tuned(file)"
 SAMPLE = "tuning.posterior.sample(fit(), 200, 2, 50, checkpoint=file)"
 
 
@@ -35,6 +39,23 @@ def killed(task, file):
     ended = subprocess.run(line, capture_output=True, env=os.environ)
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     assert file.exists()
+
+
+def tuned(file, **options):
+    """A tuning in mini-batches, from two starts, that keeps its state in a file, or not."""
+    cases = tuning.LoadCases(tuning.grid({"loads.0.mass": [0.2, 0.3, 0.4]}))
+    return tuning.tune(
+        rig(), {GAIN: (500.0, 7500.0)}, cases, steps=12, starts=2, batch=2, bounds=False,
+        progress=False, checkpoint=file, **options,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_tuning(tmp_path):
+    killed(TUNE, tmp_path / "search.npz")
+    resumed, whole = tuned(tmp_path / "search.npz", resume=True), tuned(None)
+    np.testing.assert_array_equal(resumed.history, whole.history)
+    np.testing.assert_array_equal(resumed.values, whole.values)
 
 
 def test_a_search_from_many_starts(tmp_path):
