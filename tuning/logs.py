@@ -99,10 +99,11 @@ def check_samples(
     bad = np.argwhere(~np.isfinite(values))
     if bad.size:
         row, column = bad[0]
+        value = values[row, column]
+        what = "the cell is empty, or says nan" if np.isnan(value) else f"{value} is not finite"
         raise ValueError(
-            f"{place(row)}, column {names[column]!r}: {values[row, column]} is not a finite "
-            "number (an empty cell counts as nan); cut the log there, or read it with "
-            'missing="mask"'
+            f"{place(row)}, column {names[column]!r}: {what}; fill in what was measured, cut the "
+            'log there, or read it with missing="mask", which leaves such samples out'
         )
     if len(values) < 2:
         raise ValueError(f"{source}: a log needs at least two samples, this one has {len(values)}")

@@ -90,7 +90,7 @@ REFUSED = [
     ),
     ("--free beam.length --resume", "--resume goes on with what is kept beside the output: -o"),
     ("--validate", "the options of fits are for fitting a case; name what is free with --free"),
-    ("--free beam.length", "runs.csv:1, line 4, column 'b': nan is not a finite number"),
+    ("--free beam.length", "runs.csv:1, line 4, column 'b': the cell is empty"),
     ("--free beam.length --mask missing --loss l1", "a loss is one of squares, soft-l1, huber"),
 ]
 

@@ -117,10 +117,10 @@ def test_mistakes_beside_the_log(tmp_path, text, message):
         ("t [s],d [mm]\n0,1\n1,x\n", "line 3, column 'd': 'x' is no number"),
         (
             "t [s],d [mm]\n0,1\n1,\n",
-            "line 3, column 'd': nan is not a finite number .an empty cell",
+            "line 3, column 'd': the cell is empty",
         ),
-        ("t [s],d [mm]\n0,1\n\n1,nan\n", "line 4, column 'd': nan is not a finite number"),
-        ("t [s],d [mm]\n0,1\n1,inf\n", "line 3, column 'd': inf is not a finite"),
+        ("t [s],d [mm]\n0,1\n\n1,nan\n", "line 4, column 'd': the cell is empty"),
+        ("t [s],d [mm]\n0,1\n1,inf\n", "line 3, column 'd': inf is not finite"),
         ("t [s],d [mm]\n0,1\n1,2,3\n", "line 3: 3 cells for 2 columns"),
         ("t [s],d [mm]\n0,1\n1,2\n1,3\n", "line 4: time 1 s is repeated"),
         ("t [s],d [mm]\n0,1\n2,2\n1,3\n", "line 4: time 1 s comes after 2 s"),

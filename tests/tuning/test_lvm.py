@@ -104,7 +104,7 @@ def test_special_blocks_are_passed_over(tmp_path):
     [
         ("***End_of_Header***", "", "the header has no end"),
         ("2.5", "2.5x", "line 24, column 'a': '2.5x' is no number"),
-        ("2.5", "", "line 24, column 'a': nan is not a finite number"),
+        ("2.5", "", "line 24, column 'a': the cell is empty"),
         ("0.0012", "0.0000", "line 24: time 0 s is repeated"),
         ("0.0012", "-1", "line 24: time -1 s comes after 0 s"),
         ("Y_Unit_Label,g,", "Y_Unit_Label,,", "column 'a': no unit found"),
