@@ -2,37 +2,27 @@
 
 import contextlib
 import dataclasses
-import math
 import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Float
 
+from jaxbeam import programs
 from jaxbeam.case import Case, replace, value_at
-from jaxbeam.compiling import compiled
-from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.exponentials import NODES
-from jaxbeam.grid import even_grid, scheduled_grid
-from jaxbeam.integrate import longest_step, march, trace
 from jaxbeam.lanes import Tasks
-from jaxbeam.loads import motion
-from jaxbeam.loop import loop_schedule, make_loop
+from jaxbeam.loop import loop_schedule
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.pacing import choose_steps, drawn, rounding
 from jaxbeam.plan import Form, most_at_once, sample_times
-from jaxbeam.record import never_as_nan
-from jaxbeam.rig import couples, rig
+from jaxbeam.rig import couples
 from jaxbeam.schedule import sampled
-from jaxbeam.tables import make_rigging
 
 RUNS = 256  # in a block, about: its states stay in the cache, its results are one write
-TOGETHER = 4  # tasks prepared at once, or fewer
 PACES = 4  # at which time steps are measured, at least
 PLACE = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
 
@@ -56,12 +46,12 @@ class Work:
         elif histories:
             self.schedule = sampled(sample_times(case), True)
         count, lanes = tasks.index.shape
-        self._compiling, self._ready = threading.Lock(), set()
+        # What finds the steps is compiled below, all else when it is first wanted.
+        self._compiling, self._ready = threading.Lock(), {(None, False)}
         # Each device takes an equal part of a block.
         self.devices = len(jax.local_devices())
-        self.each = self.devices * -(
-            -min(count, max(1, RUNS * self.devices // lanes)) // self.devices
-        )
+        self.each = min(count, max(1, RUNS * self.devices // lanes))
+        self.each += -self.each % self.devices
         self.blocks = -(-count // self.each)
         self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
         layout = _common_layout(case, tasks)
@@ -70,16 +60,16 @@ class Work:
         moving = all(name.startswith(outside) for name in self.addresses[0])
         self.rig_of = np.zeros(count, int) if moving else np.arange(count)
         parts = [[0]] if moving else np.resize(np.arange(count), (self.blocks, self.each))
-        windows = np.asarray(_windows(case, self.addresses[0], tasks.heavy))
+        windows = np.asarray(programs.windows(case, self.addresses[0], tasks.heavy))
         slots = max(most_at_once(window) for window in windows)
         self.form = Form(layout, couples(case), slots)
 
         design = case, self.form, self.addresses[0]
         # All is compiled side by side: it is known before what a rig looks like.
         with ThreadPoolExecutor(2) as pool:
-            alike = _rigs.blank(*design, tasks.heavy[:1])[0]
+            alike = programs.rigs.blank(*design, tasks.heavy[:1])[0]
             compiling = pool.map(lambda work: work[0].ahead(*work[1]), self._programs(alike))
-            found = [_rigs(*design, tasks.heavy[part]) for part in parts]
+            found = [programs.rigs(*design, tasks.heavy[part]) for part in parts]
         list(compiling)  # raises what went wrong
         self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
         limits = limits[self.rig_of]
@@ -134,25 +124,25 @@ class Work:
         """What finds the steps, with arguments made from what rigs look like."""
         first, steps = np.zeros(self.each, int), np.ones(self.each)
         given = self._rigging(first, steps, None, alike, first)
-        riggings = None if given is None else _riggings.blank(*given)
-        programs = [(_block, self._block(first, steps, None, riggings))]
-        return programs if given is None else [*programs, (_riggings, given)]
+        riggings = None if given is None else programs.riggings.blank(*given)
+        block = programs.block, self._block(first, steps, None, riggings)
+        return [block] if given is None else [block, (programs.riggings, given)]
 
     def _run(self, chosen, steps, substeps, single):
         given = self._rigging(chosen, steps, substeps, self.rigs, self.rig_of[chosen])
-        riggings = None if given is None else _riggings(*given)
+        riggings = None if given is None else programs.riggings(*given)
         arguments = self._block(chosen, steps, substeps, riggings)
         arguments = jax.tree.map(_shortened, arguments) if single else arguments
         with jax.enable_x64(False) if single else contextlib.nullcontext():
             with self._compiling:  # others wait for the first, instead of compiling the same again
                 if (substeps, single) not in self._ready:
-                    _block.ahead(*arguments)
+                    programs.block.ahead(*arguments)
                     self._ready.add((substeps, single))
-            results = _block(*arguments)
+            results = programs.block(*arguments)
         return {name: np.asarray(values) for name, values in results.items()}
 
     def _rigging(self, chosen, steps, substeps, rigs, rig_of):
-        """Arguments of `_riggings`; None with a controller, which has a rig of its own."""
+        """Arguments of `programs.riggings`; None with a controller, which has a rig of its own."""
         if self.case.controller is not None:
             return None
         rigs = jax.tree.map(lambda leaf: leaf[rig_of], rigs)
@@ -160,7 +150,7 @@ class Work:
         return self.case, names, *self._clock(substeps), rigs, heavy, np.asarray(steps)
 
     def _block(self, chosen, steps, substeps, riggings):
-        """Arguments of `_block`."""
+        """Arguments of `programs.block`."""
         tasks = self.tasks.heavy[chosen], self.tasks.light[chosen], np.asarray(steps)
         settings = self.case, self.form, self.addresses, self.devices, *self._clock(substeps)
         return *settings, riggings, *tasks
@@ -205,109 +195,3 @@ def _shortened(leaf):
     if not eqx.is_array(leaf) or leaf.dtype == bool:
         return leaf
     return np.asarray(leaf, np.float32 if np.issubdtype(leaf.dtype, np.floating) else np.int32)
-
-
-def _varied(case, addresses, values):
-    return replace(case, dict(zip(addresses, values, strict=True)))
-
-
-@compiled
-def _rigs(case, form, addresses, heavy):
-    """Rigs of some tasks, and the longest step (s) each allows."""
-
-    def task(values):
-        assembled = rig(_varied(case, addresses, values), form.layout, form.coupled)
-        return assembled, longest_step(assembled, case.loads)
-
-    return jax.vmap(task)(heavy)
-
-
-@compiled
-def _windows(case, addresses, heavy):
-    """Times of entry and exit (task, load, 2) of the loads."""
-
-    def task(values):
-        varied = _varied(case, addresses, values)
-        paths = [motion(load, varied.beam.length) for load in varied.loads]
-        return jnp.array([path.window() for path in paths]).reshape(-1, 2)
-
-    return jax.vmap(task)(heavy)
-
-
-def _prepare(case, addresses, schedule, substeps, assembled, heavy, longest, driver=None):
-    """A rig on the grid of one task."""
-    varied = _varied(case, addresses, heavy)
-    if schedule is None:
-        grid = even_grid(varied, assembled, longest)
-    else:
-        finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int)
-        grid = scheduled_grid(varied, assembled, schedule, substeps or finer)
-    return make_rigging(assembled, grid, varied.sensor_places, driver)
-
-
-@compiled
-def _riggings(case, addresses, schedule, substeps, rigs, heavy, longest):
-    """Rigs on the grids of some tasks, several at once because each is little work."""
-
-    def group(values):
-        return jax.vmap(lambda task: _prepare(case, addresses, schedule, substeps, *task))(values)
-
-    count, size = longest.shape[0], math.gcd(TOGETHER, longest.shape[0])
-    parts = jax.tree.map(
-        lambda part: part.reshape(count // size, size, *part.shape[1:]), (rigs, heavy, longest)
-    )
-    made = jax.lax.map(group, parts)
-    return jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2), made)
-
-
-@compiled
-def _block(case, form, addresses, devices, schedule, substeps, riggings, heavy, light, longest):
-    """Results of some tasks: lanes side by side, tasks one after the other, shared by devices."""
-    heavy_addresses, light_addresses = addresses
-
-    def task(values):
-        rigging, heavy, light, longest = values
-        varied = _varied(case, heavy_addresses, heavy)
-
-        def press(values):
-            loads = traffic(_varied(varied, light_addresses, values))
-            return loads.inertia[:, 0], loads.weight[:, 0]
-
-        inertia, weight = jax.vmap(press, out_axes=1)(light)
-        loads = Traffic(traffic(varied).motions, inertia, weight)
-        driver = None
-        if rigging is None:
-            driver = make_loop(varied, form.layout, loads, schedule)
-            given = driver.rig, heavy, longest, driver
-            rigging = _prepare(case, heavy_addresses, schedule, substeps, *given)
-        if substeps is None:
-            best, memory = march(rigging, loads, slots=form.slots, driver=driver)
-            history = {}
-        else:
-            grid = rigging.grid
-            steps = grid.counts.shape[0] * substeps
-            best, states, *_, memory = trace(
-                rigging, loads, slots=form.slots, steps=steps, driver=driver
-            )
-            edges = substeps * grid.place[schedule.samples]
-            samples = states[edges][:, 0 : 2 * varied.beam.modes : 2]
-            rows = rigging.rig.shapes(varied.sensor_places, (0,))[0]
-            history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
-        if driver is not None:
-            history["controller_failures"] = driver.failures(memory)
-        peak, time = best.peak()
-        return {
-            "peak_deflection": peak.T,
-            "peak_time": time.T,
-            "lowest_contact_force": best.lowest.T,
-            "contact_lost_time": never_as_nan(best.lost).T,
-            **history,
-        }
-
-    def part(values):
-        return jax.lax.map(task, values)
-
-    if devices > 1:
-        mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
-        part = jax.shard_map(part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    return part((riggings, heavy, light, longest))

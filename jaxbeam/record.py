@@ -12,10 +12,9 @@ from jaxtyping import Array, Bool, Float
 from jaxbeam.case import Case
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.fields import known
+from jaxbeam.measuring import history, measure
 from jaxbeam.modes import Modes
 from jaxbeam.motion import NEVER
-from jaxbeam.sensing import convert, needs_times, noise_samples, sense
-from jaxbeam.sensors import QUANTITIES
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -63,7 +62,7 @@ class Record(eqx.Module):
         ValueError for an unknown quantity, or strain without a fibre.
         """
         motion = self.coordinates, self.rates, self.accelerations
-        return _history(self.modes, motion, x, quantity, fibre_distance)
+        return history(self.modes, motion, x, quantity, fibre_distance)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
         return self.at(self.case.sensor_places, quantity)
@@ -291,57 +290,6 @@ def read_record(path: str | os.PathLike) -> Record:
 
     with xarray.open_dataset(path, engine="scipy") as dataset:
         return record_from_xarray(dataset.load())
-
-
-def _history(modes: Modes, motion, x, quantity: str, fibre_distance) -> Float[Array, "time ..."]:
-    if quantity not in QUANTITIES:
-        raise ValueError(f"no quantity {quantity!r}; there are {', '.join(QUANTITIES)}")
-    if quantity == "strain" and fibre_distance is None:
-        raise ValueError("strain needs fibre_distance, the height above the neutral axis in m")
-    order = {"slope": 1, "strain": 2}.get(quantity, 0)
-    amplitudes = motion[{"velocity": 1, "acceleration": 2}.get(quantity, 0)]
-    history = jnp.tensordot(amplitudes, modes.shapes(x, order), axes=[1, -1])
-    return -fibre_distance * history if quantity == "strain" else history
-
-
-def measure(
-    case: Case,
-    modes: Modes,
-    coordinates: Float[Array, "time mode"],
-    rates: Float[Array, "time mode"],
-    accelerations: Float[Array, "time mode"],
-    times: Float[Array, " time"] | None = None,
-    noisy: bool = False,
-) -> Float[Array, "time sensor"]:
-    """What the sensors of a case read when its modes move so (SI units; see `sensing`).
-
-    Only sensors with a filter, a delay or a sampling period ask for the times (s). Noise is drawn
-    by the run's seed if `noisy`; predictions to be held against logs leave it out.
-
-    Raises ValueError, naming the sensor, for what `sensing.sense` refuses and for missing times.
-    """
-    motion = coordinates, rates, accelerations
-    samples = coordinates.shape[0]
-    noisy = noisy and any(sensor.noise is not None for sensor in case.sensors)
-    noise = noise_samples(case.run.seed, len(case.sensors), samples) if noisy else None
-    columns = []
-    for i, sensor in enumerate(case.sensors):
-        what = sensor.position, sensor.quantity, sensor.fibre_distance
-        values = _history(modes, motion, *what)
-        drawn = None if noise is None else noise[:, i]
-        if not needs_times(sensor):
-            columns.append(convert(sensor, values, drawn))
-            continue
-        if times is None:
-            raise ValueError(f"sensors.{i} has a filter, delay or clock: its readings need times")
-        change = None
-        if sensor.quantity != "acceleration":
-            change = _history(modes, motion[1:], *what)
-        try:
-            columns.append(sense(sensor, times, values, change, drawn))
-        except ValueError as error:
-            raise ValueError(f"sensors.{i}: {error}") from None
-    return jnp.array(columns).reshape(-1, samples).T
 
 
 def sensor_labels(case: Case) -> np.ndarray:

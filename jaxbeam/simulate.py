@@ -18,8 +18,9 @@ from jaxbeam.fields import is_known, known
 from jaxbeam.grid import scheduled_grid
 from jaxbeam.integrate import trace
 from jaxbeam.loop import make_loop
+from jaxbeam.measuring import measure
 from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
-from jaxbeam.record import Record, measure, never_as_nan
+from jaxbeam.record import Record, never_as_nan
 from jaxbeam.rig import Rig, rig
 from jaxbeam.schedule import sampled
 from jaxbeam.tables import Rigging, make_rigging

@@ -12,70 +12,36 @@ from hypothesis import strategies as st
 from jaxbeam.casefile import case_from_dict, case_to_dict, load_case
 from jaxbeam.cli import main
 from tests import mutations
+from tests.test_casefile import FULL
 from tests.test_cli import CASE as SMALL
 from tests.tuning import test_readers as readers
 from tuning import read_logs
 
-CASE = tomllib.loads(
-    """
-title = "something of everything"
-[beam]
-length = 0.6
-width = 0.1
-height = 0.003
-youngs_modulus = 6.5e10
-density = 2800.0
-damping_ratio = [0.03, 0.02]
-ends = "pinned-clamped"
-modes = 2
-[[supports]]
-position = 0.25
-[[supports]]
-position = 0.4
-stiffness = 2e6
-damping = 1.0
-[[actuators]]
-kind = "shaker"
-position = 0.5
-stiffness = 3500.0
-damping = 80.0
-force_per_volt = 4.6
-bandwidth = 10000.0
-limits = [-10.0, 10.0]
-[[actuators]]
-kind = "patch"
-start = 0.2575
-end = 0.3425
-moment_per_volt = 8.292e-4
-[[sensors]]
-position = 0.15
-noise = 1e-5
-filter = { cutoff = 10.0, order = 4 }
-sampling_period = 0.01
-delay = 0.01
-[[sensors]]
-position = 0.3
-quantity = "strain"
-fibre_distance = 0.001
-[[loads]]
-kind = "mass"
-mass = 0.5
-speed = 1.2
-deceleration = 0.1
-[[loads]]
-kind = "force"
-force = 0.5
-times = [0.0, 0.1, 0.2]
-positions = [0.1, 0.2, 0.4]
-[controller]
-kind = "feedback"
-gains = [1.0, 1.0]
-period = 0.01
-delay = 0.001
-[run]
-duration = 1.0
-"""
-)
+# Something of everything.
+CASE = tomllib.loads(FULL) | {
+    "beam": {
+        "length": 0.6,
+        "width": 0.1,
+        "height": 0.003,
+        "youngs_modulus": 6.5e10,
+        "density": 2800.0,
+        "damping_ratio": [0.03, 0.02],
+        "ends": "pinned-clamped",
+        "modes": 2,
+    },
+    "supports": [{"position": 0.25}, {"position": 0.4, "stiffness": 2e6, "damping": 1.0}],
+    "sensors": [
+        {
+            "position": 0.15,
+            "noise": 1e-5,
+            "filter": {"cutoff": 10.0, "order": 4},
+            "sampling_period": 0.01,
+            "delay": 0.01,
+        },
+        {"position": 0.3, "quantity": "strain", "fibre_distance": 0.001},
+    ],
+    "controller": {"kind": "feedback", "gains": [1.0, 1.0], "period": 0.01, "delay": 0.001},
+}
 
 
 def assert_one_sentence(error: Exception, start: str) -> None:

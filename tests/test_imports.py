@@ -18,7 +18,7 @@ jaxbeam.estimator  jaxbeam.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.sen
 jaxbeam.case  jaxbeam.sensing
 jaxbeam.checks
 jaxbeam.modes
-jaxbeam.rig
+jaxbeam.measuring  jaxbeam.rig
 jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.ports  jaxbeam.sine_basis
 jaxbeam.frequency  jaxbeam.grid
 jaxbeam.dynamics
@@ -28,7 +28,7 @@ jaxbeam.estimation
 jaxbeam.control  jaxbeam.extremes
 jaxbeam.casefile  jaxbeam.integrate
 jaxbeam.export  jaxbeam.loop  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
-jaxbeam.linear_loop  jaxbeam.plan
+jaxbeam.linear_loop  jaxbeam.plan  jaxbeam.programs
 jaxbeam.margins  jaxbeam.stability
 jaxbeam.control.reach
 jaxbeam.control.least_peak

@@ -14,7 +14,7 @@ import jaxbeam as jb
 from jaxbeam.casefile import case_from_dict
 from jaxbeam.checks import check
 from jaxbeam.filters import Filter
-from jaxbeam.record import measure
+from jaxbeam.measuring import measure
 from jaxbeam.sensing import convert, design, init, noise_samples, read, sense
 from jaxbeam.sensors import Sensor
 from tests.differences import central

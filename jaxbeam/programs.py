@@ -1,0 +1,131 @@
+"""The programs of a sweep, each compiled once for all its blocks.
+
+A case comes with the addresses of what varies and, task by task, its values there. Tasks differ in
+`heavy` values, which decide the path and the rig, and the lanes of a task in `light` ones.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from jaxbeam.case import replace
+from jaxbeam.compiling import compiled
+from jaxbeam.dynamics import Traffic, traffic
+from jaxbeam.grid import even_grid, scheduled_grid
+from jaxbeam.integrate import longest_step, march, trace
+from jaxbeam.loads import motion
+from jaxbeam.loop import make_loop
+from jaxbeam.record import never_as_nan
+from jaxbeam.rig import rig
+from jaxbeam.tables import make_rigging
+
+TOGETHER = 4  # tasks prepared at once, or fewer
+
+
+def _varied(case, addresses, values):
+    return replace(case, dict(zip(addresses, values, strict=True)))
+
+
+@compiled
+def rigs(case, form, addresses, heavy):
+    """Rigs of some tasks, and the longest step (s) each allows."""
+
+    def task(values):
+        assembled = rig(_varied(case, addresses, values), form.layout, form.coupled)
+        return assembled, longest_step(assembled, case.loads)
+
+    return jax.vmap(task)(heavy)
+
+
+@compiled
+def windows(case, addresses, heavy):
+    """Times of entry and exit (task, load, 2) of the loads."""
+
+    def task(values):
+        varied = _varied(case, addresses, values)
+        paths = [motion(load, varied.beam.length) for load in varied.loads]
+        return jnp.array([path.window() for path in paths]).reshape(-1, 2)
+
+    return jax.vmap(task)(heavy)
+
+
+def _prepare(case, addresses, schedule, substeps, assembled, heavy, longest, driver=None):
+    """A rig on the grid of one task."""
+    varied = _varied(case, addresses, heavy)
+    if schedule is None:
+        grid = even_grid(varied, assembled, longest)
+    else:
+        finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int)
+        grid = scheduled_grid(varied, assembled, schedule, substeps or finer)
+    return make_rigging(assembled, grid, varied.sensor_places, driver)
+
+
+@compiled
+def riggings(case, addresses, schedule, substeps, rigs, heavy, longest):
+    """Rigs on the grids of some tasks, several at once because each is little work."""
+
+    def group(values):
+        return jax.vmap(lambda task: _prepare(case, addresses, schedule, substeps, *task))(values)
+
+    count, size = longest.shape[0], math.gcd(TOGETHER, longest.shape[0])
+    parts = jax.tree.map(
+        lambda part: part.reshape(count // size, size, *part.shape[1:]), (rigs, heavy, longest)
+    )
+    made = jax.lax.map(group, parts)
+    return jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2), made)
+
+
+@compiled
+def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, light, longest):
+    """Results of some tasks: lanes side by side, tasks one after the other, shared by devices."""
+    heavy_addresses, light_addresses = addresses
+
+    def task(values):
+        rigging, heavy, light, longest = values
+        varied = _varied(case, heavy_addresses, heavy)
+
+        def press(values):
+            loads = traffic(_varied(varied, light_addresses, values))
+            return loads.inertia[:, 0], loads.weight[:, 0]
+
+        inertia, weight = jax.vmap(press, out_axes=1)(light)
+        loads = Traffic(traffic(varied).motions, inertia, weight)
+        driver = None
+        if rigging is None:
+            driver = make_loop(varied, form.layout, loads, schedule)
+            given = driver.rig, heavy, longest, driver
+            rigging = _prepare(case, heavy_addresses, schedule, substeps, *given)
+        if substeps is None:
+            best, memory = march(rigging, loads, slots=form.slots, driver=driver)
+            history = {}
+        else:
+            grid = rigging.grid
+            steps = grid.counts.shape[0] * substeps
+            best, states, *_, memory = trace(
+                rigging, loads, slots=form.slots, steps=steps, driver=driver
+            )
+            edges = substeps * grid.place[schedule.samples]
+            samples = states[edges][:, 0 : 2 * varied.beam.modes : 2]
+            rows = rigging.rig.shapes(varied.sensor_places, (0,))[0]
+            history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
+        if driver is not None:
+            history["controller_failures"] = driver.failures(memory)
+        peak, time = best.peak()
+        return {
+            "peak_deflection": peak.T,
+            "peak_time": time.T,
+            "lowest_contact_force": best.lowest.T,
+            "contact_lost_time": never_as_nan(best.lost).T,
+            **history,
+        }
+
+    def part(values):
+        return jax.lax.map(task, values)
+
+    if devices > 1:
+        mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
+        part = jax.shard_map(part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    return part((riggings, heavy, light, longest))
