@@ -14,6 +14,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray  # noqa: F401 - imported with the first sweep otherwise, and timed as compiling
 
 import jaxbeam as jb
 from experiments.benchmarks import baselines
