@@ -17,6 +17,7 @@ from tuning.checkpoint import fingerprint, load, save
 from tuning.identify import Fit
 from tuning.optional import library
 
+NOISES = ("held", "estimated")
 BLOCK = 100  # draws between two states on disk
 WORST = 1.05  # R-hat beyond which chains have not mixed
 FEWEST = 100  # effective draws below which intervals are not to be trusted
@@ -103,32 +104,37 @@ def sample(
     seed: int = 0,
     checkpoint: str | os.PathLike | None = None,
     resume: bool = False,
+    noise: str = "held",
 ) -> Posterior:
     """Sample the posterior of a fit's numbers: its likelihood, priors, and bounds.
 
-    The noise is that of the fit, widened where residuals are coloured; a number without a prior is
-    believed to be anywhere within its bounds. Chains start around the fit, scattered as widely as
-    its standard errors; for speed the sampler moves in the directions and sizes of these.
+    The noise is that of the fit, widened where residuals are coloured; if it is "estimated", the
+    level of each channel is unknown with the prior 1 / level, and integrated out (Gelman and
+    others, section 3.2). A number without a prior is believed to be anywhere within its bounds.
+    Chains start around the fit, scattered as widely as its standard errors; for speed the sampler
+    moves in the directions and sizes of these.
 
     With a `checkpoint` file sampling can be stopped at any time and taken up with `resume`: the
     draws are the same.
 
-    Raises ValueError if the data cannot see some direction without a prior, and for a damaged or
-    foreign checkpoint, FileExistsError if it exists and `resume` is not set, ImportError without
-    blackjax.
+    Raises ValueError if the data cannot see some direction without a prior, for another word on
+    the noise, and for a damaged or foreign checkpoint, FileExistsError if it exists and `resume`
+    is not set, ImportError without blackjax.
     """
     if fit.unseen:
         raise ValueError(
             f"the data cannot see {', '.join(fit.unseen[0])}: give a prior, or a value known "
             "otherwise, before sampling"
         )
-    density, outward, start, spread = _density(fit)
+    if noise not in NOISES:
+        raise ValueError(f"noise can be {' or '.join(map(repr, NOISES))}, not {noise!r}")
+    density, outward, start, spread = _density(fit, noise)
     mark = fingerprint(
         {
             "values": fit.values.tobytes().hex(),
             "measured": fit.campaign.measured.tobytes().hex(),
             "addresses": fit.addresses,
-            "settings": [chains, warmup, seed],
+            "settings": [chains, warmup, seed, noise],
         }
     )
     file = None if checkpoint is None else Path(checkpoint)
@@ -155,7 +161,7 @@ def summary(
     )
 
 
-def _density(fit: Fit):
+def _density(fit: Fit, levels: str = "held"):
     """Log density over whitened search variables, their map to values, centre and directions."""
     search, campaign = fit.search, fit.campaign
     noise = np.where(np.isnan(fit.noise), 1.0, fit.noise * np.sqrt(fit.colour))
@@ -173,12 +179,21 @@ def _density(fit: Fit):
     floor = 1 / np.array([number.search_size for number in numbers]) ** 2
     spread = np.linalg.cholesky(np.linalg.inv(information + np.diag(floor)))
 
+    independent = campaign.real.sum(axis=1) / fit.colour
+
+    def misfit(residuals):
+        squares = jnp.sum(residuals**2, axis=1)
+        if levels == "held":
+            return jnp.sum(squares)
+        # The integral of level^-(n + 1) exp(-squares / (2 level^2)) is squares^(-n / 2).
+        return jnp.sum(independent * jnp.log(jnp.where(independent > 0, squares, 1.0)))
+
     def density(z):
         y = start + spread @ z
         values, stretch = jax.jvp(search.outward, (y,), (jnp.ones_like(y),))
         residuals = (measured - predict(values)) * weights
-        misfit = jnp.sum(residuals**2) + jnp.sum(search.pulls(values) ** 2)
-        return -misfit / 2 + jnp.sum(jnp.log(jnp.abs(stretch) + 1e-300))
+        total = misfit(residuals) + jnp.sum(search.pulls(values) ** 2)
+        return -total / 2 + jnp.sum(jnp.log(jnp.abs(stretch) + 1e-300))
 
     return density, search.outward, start, spread
 

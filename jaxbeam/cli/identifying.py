@@ -46,6 +46,7 @@ def identify(
     mask: tuple[str, ...] = (),
     profile: tuple[str, ...] = (),
     draws: int = 0,
+    noise: str = "held",
     validate: bool = False,
     report: Path | None = None,
     output: Output = None,
@@ -82,6 +83,8 @@ def identify(
         ADDRESS: a free number whose profile likelihood to compute; repeat it for more.
     draws
         How many draws of the posterior to make in each of four chains (extra bayes).
+    noise
+        held at the levels found by the fit, or estimated with each draw.
     validate
         Leave out one log after the other, and predict it.
     report
@@ -104,7 +107,9 @@ def identify(
         fit = _fit(
             read_case(case, set_), logs, mask, free, prior, scale, output, overwrite, settings
         )
-        judged = _judge(fit, profile, draws, seed, validate, output, resume)
+        judged = _judge(
+            fit, profile, draws, {"seed": seed, "noise": noise}, validate, output, resume
+        )
         _tell(fit, judged, report, output, picture, json_)
         return
     refuse(
@@ -242,7 +247,7 @@ def _beliefs(free, prior, scale) -> dict:
     return found
 
 
-def _judge(fit, profile, draws, seed, validate, output, resume) -> dict:
+def _judge(fit, profile, draws, sampling, validate, output, resume) -> dict:
     """Profiles, posterior and cross-validation, as far as they are asked for."""
     from tuning.criticism import cross_validate
     from tuning.posterior import sample
@@ -253,7 +258,7 @@ def _judge(fit, profile, draws, seed, validate, output, resume) -> dict:
         judged["unseen"] = cross_validate(fit)
     if draws:
         checkpoint = _beside(output, ".draws.npz")
-        judged["posterior"] = sample(fit, draws, seed=seed, checkpoint=checkpoint, resume=resume)
+        judged["posterior"] = sample(fit, draws, checkpoint=checkpoint, resume=resume, **sampling)
     return judged
 
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 import jaxbeam as jb
 from jaxbeam.casefile import case_to_dict
@@ -25,7 +26,7 @@ from tests.tuning.stand_in import (
 from tuning import criticism, keeping
 from tuning.criticism import channel_remarks, channels, compare_fits, cross_validate, whiteness
 from tuning.identify import fit_of
-from tuning.posterior import nuts, sample, summary
+from tuning.posterior import _density, nuts, sample, summary
 from tuning.profile import profile
 from tuning.uncertainty import reach
 
@@ -197,6 +198,40 @@ def test_the_posterior_of_a_fit_is_as_wide_as_its_intervals(plain):
     np.testing.assert_allclose(found.deviations, plain.errors, rtol=0.2)
     assert np.all(np.abs(found.means - plain.values) < 0.3 * plain.errors)
     assert str(found).splitlines()[1].startswith("beam.flexural_rigidity ")
+
+
+def test_unknown_noise_levels_are_integrated_out():
+    """Twelve samples: against the integral over the level, by quadrature."""
+    real = np.zeros((1, TIMES.size, 1))
+    real[0, :12] = 1.0
+    found = fit(search({"sensors.0.offset": None}, logs=1, real=real))
+    density, _, start, spread = _density(found, "estimated")
+    places = np.linspace(-4.0, 4.0, 9)
+    ours = np.array([density(jnp.array([place])) for place in places])
+    offsets = start[0] + spread[0, 0] * places
+    rest = (campaign(logs=1).measured - clean(1))[0, :12, 0] + TRUTH["sensors.0.offset"]
+    count = 12 / found.colour[0, 0]
+
+    def evidence(offset):
+        squares = np.sum((rest - offset) ** 2) / found.colour[0, 0]
+        return quad(
+            lambda s: np.exp(-(count + 1) * np.log(s / NOISE) - squares / (2 * s**2)),
+            NOISE / 10,
+            50 * NOISE,
+            limit=200,
+            points=[NOISE],
+        )[0]
+
+    theirs = np.log([evidence(offset) for offset in offsets])
+    np.testing.assert_allclose(ours - ours[4], theirs - theirs[4], atol=1e-3)
+    # Less sure than with the noise held: the tails of Student's distribution.
+    held = _density(found)[0]
+    assert ours[-1] - ours[4] > float(held(jnp.array([4.0])) - held(jnp.array([0.0])))
+
+
+def test_another_word_on_the_noise_is_refused(plain):
+    with pytest.raises(ValueError, match="noise can be 'held' or 'estimated', not 'free'"):
+        sample(plain, noise="free")
 
 
 def test_blind_directions_are_not_sampled(plain):
