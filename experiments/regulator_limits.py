@@ -5,6 +5,7 @@ Frozen poles are no criterion for a loop that changes with time, but they are wh
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
@@ -53,15 +54,15 @@ def sampled(rig: jb.Case, weights) -> list[Finding]:
 def optimal_gain(case, period: float, weights, effort: float = EFFORT):
     """The gain that costs least in discrete time, and that cost; states as in the thesis."""
     plant = jb.state_space(case, "sine").unloaded.discretize(period)
-    return dlqr(plant.A, plant.B, np.diag(weights), effort * np.eye(1))
+    return dlqr(plant.A, plant.B, jnp.diag(jnp.array(weights)), effort * jnp.eye(1))
 
 
 def _gain(printed, case, period, weights) -> Finding:
     """A printed gain beside the optimal one; what is wrong with it, if it costs much more."""
     plant = jb.state_space(case, "sine").unloaded.discretize(period)
-    Q, R = np.diag(weights), EFFORT * np.eye(1)
+    Q, R = jnp.diag(jnp.array(weights)), EFFORT * jnp.eye(1)
     best, least = optimal_gain(case, period, weights)
-    theirs = printed.numbers[None]
+    theirs = jnp.array(printed.numbers)[None]
     closed = plant.A - plant.B @ theirs
     radius = np.abs(np.linalg.eigvals(np.asarray(closed))).max()
     obstacle = ""

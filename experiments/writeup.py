@@ -16,8 +16,8 @@ HEADER = ("number", "published", "ours", "difference", "tolerance", "verdict")
 MEASURED = (
     "The thesis's figures and measured curves are not available: comparisons are with printed"
     " numbers, and figures have the thesis's axes. Tolerances were chosen by the kind of number"
-    " before the experiments were run, but for those by which numbers of Figs 7.1 and 7.2, of Table"
-    " 5.3 and printed sampled gains are explained, set after a first look; verdicts are computed"
+    " before the experiments were run, but for those by which numbers of Figs 6.4, 7.1 and 7.2, of"
+    " Table 5.3 and printed sampled gains are judged, set after a first look; verdicts are computed"
     " from them."
 )
 STYLE = (
