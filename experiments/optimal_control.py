@@ -277,7 +277,7 @@ def _draw_readings(tables, ratios) -> Figure:
 
 EXPERIMENT = Experiment(
     "optimal-control",
-    "section 5.1, Tables 5.1 to 5.4, Figs 5.13 to 5.28",
+    "section 5.1, Tables 5.1 to 5.4, Figs 5.5, 5.10, 5.11, 5.13 to 5.28",
     "Gains that follow the crossing do more than a constant one, and most if they know the load.",
     run,
 )

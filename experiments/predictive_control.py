@@ -1,4 +1,4 @@
-"""Model predictive control of one and two spans with patches: section 7.3, Figs 7.1 to 7.7.
+"""Model predictive control of one and two spans with patches: section 7.3, Figs 7.1 to 7.9.
 
 What no controller whatever can do within the limits of the patches is a linear program (see
 `jaxbeam.control.bound`); it is asked for each half of a crossing.
@@ -211,7 +211,7 @@ def _draw(records: dict[str, jb.Record], title: str) -> Figure:
 
 EXPERIMENT = Experiment(
     "predictive-control",
-    "section 7.3, Figs 7.1 to 7.7, Table 8.1",
+    "section 7.3, Figs 7.1 to 7.9, Table 8.1",
     "Predictive control uses the whole voltage of the patches: more than a fifth off the peak of"
     " one span, more than a quarter off that of two.",
     run,
