@@ -250,3 +250,14 @@ def test_derivatives_by_mass_speed_and_rigidity():
     for derivative in (jax.jacfwd, jax.jacrev):
         found = derivative(discrete)(at)
         assert_allclose(found, expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+
+
+def test_rayleigh_damping_is_proportional_to_mass_and_stiffness():
+    """Free decays of a pinned beam: s^2 + (a + b w^2) s + w^2 = 0 for each mode."""
+    a, b = 3.0, 2e-4
+    beam = jb.Beam(0.6, 11.68, 0.535, rayleigh_damping=[a, b], modes=3)
+    w = (np.arange(1, 4) * np.pi / 0.6) ** 2 * np.sqrt(11.68 / 0.535)
+    expected = np.concatenate([np.roots([1.0, a + b * each**2, each**2]) for each in w])
+    plant = jb.state_space(jb.Case(beam, loads=[jb.MovingMass(mass=0.1, speed=1.0)])).unloaded
+    found = np.linalg.eigvals(np.asarray(plant.A))
+    assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-9)

@@ -1,6 +1,8 @@
 """The thesis reproduced: how verdicts come about, what reports hold, and the cheap experiments."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -63,6 +65,13 @@ def test_published_numbers_are_complete():
     for one in found:
         assert one.kind in ("measured", "computed"), one
         assert len(one.names) == one.numbers.size and np.all(one.allowed > 0), one
+
+
+def test_every_published_number_is_judged_in_an_experiment():
+    sources = Path(published.__file__).parent.glob("*.py")
+    used = set(re.findall(r"published\.([A-Z]\w+)", "".join(map(Path.read_text, sources))))
+    listed = {name for name, one in vars(published).items() if isinstance(one, Printed)}
+    assert listed == used & listed
 
 
 @pytest.mark.parametrize("name", rigs.NAMES)
