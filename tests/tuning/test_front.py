@@ -68,9 +68,7 @@ def test_ranks(swept):
     assert allowed == pytest.approx(1.03 * best)
     assert second.outcomes[0].merits["peak"] <= allowed * 1.01
     assert second.outcomes[0].merits["effort"] < first.outcomes[0].merits["effort"]
-    most, least = (
-        swept["effort"][swept["peak"] <= share * allowed].min() for share in (1.0, 1.01)
-    )
+    most, least = (swept["effort"][swept["peak"] <= share * allowed].min() for share in (1.0, 1.01))
     assert 0.99 * least <= second.outcomes[0].merits["effort"] <= 1.02 * most
 
 
