@@ -57,9 +57,7 @@ def grid(values: Mapping[str, Sequence[float]]) -> tuple[Values, ...]:
     return tuple(dict(zip(values, map(float, row), strict=True)) for row in rows)
 
 
-def draws(
-    ranges: Mapping[str, Sequence[float]], count: int, seed: int = 0
-) -> tuple[Values, ...]:
+def draws(ranges: Mapping[str, Sequence[float]], count: int, seed: int = 0) -> tuple[Values, ...]:
     """Values drawn evenly from a range for each address, spread as a Latin hypercube.
 
     Raises ValueError for a count below 1 or a range that does not ascend.
