@@ -7,6 +7,7 @@ To add a figure of merit, give `Merits` a field, `merits_of` its value and the t
 import dataclasses
 import time
 import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -107,6 +108,37 @@ def compare(
         best = _run(case, "the bound", limit.controller())
     merits = {name: merits_of(record, limit) for name, record in records.items()}
     return Comparison(free_case, free, best, records, merits, limit)
+
+
+class Standing(NamedTuple):
+    """How a controller does over several load cases.
+
+    Its largest peak (m); the least and the mean share of the attainable reduction; the largest
+    deflection (m) after the last exit, NaN if a run ends before; the largest share of a run that an
+    actuator spends at a limit.
+    """
+
+    peak: float
+    worst_share: float
+    mean_share: float
+    after_exit: float
+    saturated: float
+
+
+def standings(found: Sequence[Comparison]) -> dict[str, Standing]:
+    """By controller, how it does over comparisons of the same controllers on several load cases."""
+    table = {}
+    for name in found[0].merits:
+        each = [one.merits[name] for one in found]
+        shares = [merits.share for merits in each]
+        table[name] = Standing(
+            peak=float(np.max([merits.peak for merits in each])),
+            worst_share=float(np.min(shares)),
+            mean_share=float(np.mean(shares)),
+            after_exit=float(np.max([merits.after_exit for merits in each])),
+            saturated=float(np.max([merits.saturated for merits in each])),
+        )
+    return table
 
 
 def _run(case: Case, name: str, controller: AbstractController) -> Record:

@@ -64,8 +64,9 @@ def refine(
 ) -> tuple[Float[Array, " *rest"], ...]:
     """Largest size of a value of the polynomial through the samples, and where in [0, 1] it is.
 
-    The derivative is that at the fixed place of the peak, which is exact where the peak is a
-    maximum inside the curve and where it is at an end that stays.
+    Of several peaks that differ by less than the curve bends between `FINE` places, the one that is
+    taken need not be the highest. The derivative is that at the fixed place of the peak, which is
+    exact where the peak is a maximum inside the curve and where it is at an end that stays.
     """
     curve = _polynomial(samples)
     frozen = [jax.lax.stop_gradient(coefficient) for coefficient in curve]

@@ -30,6 +30,7 @@ from jaxbeam.tables import make_rigging
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 MOST = 10**8  # samples or time steps of a run: more would fill any memory, or take days
+MOST_BETWEEN = 10**5  # time steps from one sample of a controlled run to the next
 HOPELESS = 6  # halvings of a step after which a run that still overflows is given up
 EVEN = 1e-6  # of the spacing: more even samples are taken for equally spaced
 PROBES = (0.13, 0.29, 0.47, 0.62, 0.88)  # of the length: where errors are looked for
@@ -186,9 +187,15 @@ def suitable_step(
 
 def _suitable_substeps(case: Case, form: Form, schedule: Schedule, tolerance: float):
     """How many steps to take from edge to edge of a schedule, and the error of the deflection."""
-    step = _longest_step(case, form)
-    _check_steps(schedule.times.size * float(schedule.lengths.max()) / step, step)
-    fewest = max(1, int(np.ceil(float(schedule.lengths.max()) / step)))
+    step, gap = _longest_step(case, form), float(schedule.lengths.max())
+    if gap / step > MOST_BETWEEN:
+        raise RuntimeError(
+            f"the {gap:g} s from one sample to the next are too long to bridge: they take"
+            f" {gap / step:.1e} time steps of {step:.1e} s, and {MOST_BETWEEN:.0e} are the most;"
+            " give a shorter controller.period or a higher run.sample_rate"
+        )
+    _check_steps(schedule.times.size * gap / step, step)
+    fewest = max(1, int(np.ceil(gap / step)))
 
     @functools.cache
     def seen(halvings):

@@ -202,9 +202,32 @@ def test_the_command_prints_and_draws(found, folder, monkeypatch, capsys):
     assert answer["controllers"]["wild"]["reserve"]["gain"] is None  # any: it is infinite
 
 
+@pytest.mark.slow
+def test_several_load_cases_are_compared_and_summed_up(found, folder, monkeypatch, capsys):
+    line = "compare weak.toml --over loads.0.mass=0.3,0.509"
+    code, printed, wrong = run(f"{line} --json", folder, monkeypatch, capsys)
+    assert code == 0, wrong
+    answer = json.loads(printed)
+    light, heavy = (case["controllers"]["weak"] for case in answer["cases"])
+    assert [case["values"] for case in answer["cases"]] == [
+        {"loads.0.mass": 0.3},
+        {"loads.0.mass": 0.509},
+    ]
+    assert heavy["peak"] == pytest.approx(found.merits["weak"].peak, rel=1e-6)
+    summary = answer["over_all"]["weak"]
+    assert summary["peak"] == max(light["peak"], heavy["peak"])
+    assert summary["worst_share"] == min(light["share"], heavy["share"])
+    assert summary["mean_share"] == pytest.approx((light["share"] + heavy["share"]) / 2)
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
+        (
+            "compare weak.toml --over loads.0.mass=0.1,0.2 -o out.png",
+            "a picture shows one load case: leave out -o or --over",
+        ),
+        ("compare weak.toml --over loads.0.mass=-0.1", "loads.0.mass must not be negative"),
         ("compare bare.toml", "bare.toml has no controller; name some with --controllers FILE"),
         (
             "compare weak.toml --controllers bare.toml",

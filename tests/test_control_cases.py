@@ -141,6 +141,14 @@ TABLES = [
 ]
 
 
+def test_sampling_too_slow_to_bridge_is_refused():
+    law = jb.Feedback([1.0], period=1e4)
+    run = jb.Run(2e4, sample_rate=1e-4)
+    case = dataclasses.replace(HELD, sensors=(jb.Sensor(0.3),), controller=law, run=run)
+    with pytest.raises(RuntimeError, match="the 10000 s from one sample to the next are too long"):
+        jb.simulate(case)
+
+
 @pytest.mark.parametrize(("table", "message"), TABLES)
 def test_faulty_tables_are_refused(table, message):
     content = case_to_dict(HELD) | {"controller": table}

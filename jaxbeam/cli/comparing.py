@@ -1,11 +1,20 @@
 """The command that compares controllers."""
 
+import itertools
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.arguments import check_outputs, check_suffix, read_case, read_controllers
+from jaxbeam.arguments import (
+    check_outputs,
+    check_suffix,
+    read_case,
+    read_controllers,
+    refuse,
+    sweep_values,
+)
+from jaxbeam.checks import check
 from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
 from jaxbeam.printing import print_json, print_table, print_written
 
@@ -16,6 +25,7 @@ def compare(
     /,
     *,
     controllers: Annotated[tuple[Path, ...], Parameter(consume_multiple=True)] = (),
+    over: tuple[str, ...] = (),
     period: float | None = None,
     output: Output = None,
     set_: Settings = (),
@@ -31,37 +41,87 @@ def compare(
     controllers
         More controllers: files with a table [controller], or case files of which only that is
         used. They are called after their files.
+    over
+        ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: compare on every combination of these values,
+        and over all of them; repeat it for more numbers.
     period
         The least peak is for commands held this long (s); the shortest period of the
         controllers, or 0.01, if left out.
     output
         Draw deflections and commands to this file, OUT.png.
     """
-    from jaxbeam.compare import compare
+    import jaxbeam as jb
+    from jaxbeam.compare import compare, standings
 
+    values = sweep_values(over)
     check_suffix(output, ".png", "a comparison")
+    refuse(bool(output and over), "a picture shows one load case: leave out -o or --over")
     check_outputs(overwrite, output)
     described = read_case(case, set_)
-    found = compare(described, read_controllers(case, described, controllers), period)
+    laws = read_controllers(case, described, controllers)
+    runs = [dict(zip(values, row, strict=True)) for row in itertools.product(*values.values())]
+    varied = [jb.replace(described, run) for run in runs]
+    for one in varied:
+        check(one)
+    found = [compare(one, laws, period) for one in varied]
+    table = standings(found)
     if output:
         from jaxbeam.plot import plot_comparison
 
-        plot_comparison(found).savefig(output)
-    limit = found.bound
+        plot_comparison(found[0]).savefig(output)
     if json_:
-        print_json(
-            {
-                "uncontrolled_peak": limit.uncontrolled,
-                "least_peak": limit.peak,
-                "held_for": limit.period,
-                "controllers": {
-                    name: merits._asdict()
-                    | {"reserve": merits.reserve._asdict(), "verdict": found.records[name].verdict}
-                    for name, merits in found.merits.items()
-                },
-            }
-        )
+        cases = [{"values": run} | _content(one) for run, one in zip(runs, found, strict=True)]
+        summary = {name: standing._asdict() for name, standing in table.items()}
+        print_json({"cases": cases, "over_all": summary} if over else _content(found[0]))
         return
+    for run, one in zip(runs, found, strict=True):
+        if over:
+            print("; ".join(f"{address} = {value:g}" for address, value in run.items()))
+        _print(one)
+    if over:
+        print(f"over all {len(found)} load cases:")
+        print_table(
+            (
+                "controller",
+                "largest peak (m)",
+                "worst share of the bound",
+                "mean share",
+                "largest after exit (m)",
+                "most saturated",
+            ),
+            [
+                (
+                    name,
+                    f"{one.peak:.6g}",
+                    f"{one.worst_share:.1%}",
+                    f"{one.mean_share:.1%}",
+                    f"{one.after_exit:.4g}",
+                    f"{one.saturated:.1%}",
+                )
+                for name, one in table.items()
+            ],
+        )
+    print_written(output)
+
+
+def _content(found) -> dict:
+    """A comparison in words and numbers."""
+    limit = found.bound
+    return {
+        "uncontrolled_peak": limit.uncontrolled,
+        "least_peak": limit.peak,
+        "held_for": limit.period,
+        "controllers": {
+            name: merits._asdict()
+            | {"reserve": merits.reserve._asdict(), "verdict": found.records[name].verdict}
+            for name, merits in found.merits.items()
+        },
+    }
+
+
+def _print(found) -> None:
+    """Print a comparison for people."""
+    limit = found.bound
     print(
         f"no control: peak {limit.uncontrolled:.6g} m; no controller that holds its commands for "
         f"{limit.period:g} s gets below {limit.peak:.6g} m, {limit.reduction:.1%} less"
@@ -100,7 +160,6 @@ def compare(
         print(f"no margin of {', '.join(names)}: {obstacle}")
     for name, record in found.records.items():
         print(f"{name}: {record.verdict}")
-    print_written(output)
 
 
 def _margin(reserve, number: float) -> str:
