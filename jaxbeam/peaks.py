@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-FINE = 64  # places at which the interpolant is looked at before Newton's method takes over
+STARTS = 17  # places from which a peak is sought: closer than the extrema of the curve can be
 
 
 def _polynomial(samples: Float[Array, "point *rest"]) -> list:
@@ -64,17 +64,16 @@ def refine(
 ) -> tuple[Float[Array, " *rest"], ...]:
     """Largest size of a value of the polynomial through the samples, and where in [0, 1] it is.
 
-    Of several peaks that differ by less than the curve bends between `FINE` places, the one that is
-    taken need not be the highest. The derivative is that at the fixed place of the peak, which is
-    exact where the peak is a maximum inside the curve and where it is at an end that stays.
+    The derivative is that at the fixed place of the peak, which is exact where the peak is a
+    maximum inside the curve and where it is at an end that stays.
     """
     curve = _polynomial(samples)
     frozen = [jax.lax.stop_gradient(coefficient) for coefficient in curve]
-    fine = np.linspace(-1.0, 1.0, FINE + 1)
-    looked = jnp.tensordot(fine[:, None] ** np.arange(len(curve)), jnp.stack(frozen), axes=1)
-    start = jnp.asarray(fine)[jnp.argmax(size(looked), axis=0)]
-    place = _climb(frozen, start, 2 / FINE, rounds=4)
-    # Where the curve is highest at an end, Newton's method may run away to a lower place.
-    better = size(_value(frozen, place)) > size(_value(frozen, start))
-    place = jax.lax.optimization_barrier(jax.lax.stop_gradient(jnp.where(better, place, start)))
+    # From everywhere, as peaks may tie; at an end Newton's method may run away to a lower place.
+    starts = np.linspace(-1.0, 1.0, STARTS).reshape(-1, *(1,) * (samples.ndim - 1))
+    starts = jnp.broadcast_to(starts.astype(samples.dtype), (STARTS, *samples.shape[1:]))
+    places = jnp.concatenate([starts, _climb(frozen, starts, 2 / STARTS, rounds=5)])
+    best = jnp.argmax(size(_value(frozen, places)), axis=0)
+    place = jnp.take_along_axis(places, best[None], axis=0)[0]
+    place = jax.lax.optimization_barrier(jax.lax.stop_gradient(place))
     return size(_value(curve, place)), (place + 1) / 2
