@@ -48,15 +48,15 @@ def rig(controller=None):
     )
 
 
-def plant(time):
+def plant(time, masses=MASSES, speeds=SPEEDS, entries=ENTRIES):
     """A, B and B_f at a time, which is not one of the events."""
     n = np.arange(1, MODES + 1) * np.pi / LENGTH
     rate = n**2 * np.sqrt(RIGIDITY / DENSITY)
     half = DENSITY * LENGTH / 2
     M, C, K = half * np.eye(MODES), 2 * DAMPING * half * np.diag(rate), half * np.diag(rate**2)
     pressed = []
-    for mass, speed, entry, leave in zip(MASSES, SPEEDS, ENTRIES, EXITS, strict=True):
-        on = float(entry < time < leave)
+    for mass, speed, entry in zip(masses, speeds, entries, strict=True):
+        on = float(entry < time < entry + LENGTH / speed)
         S, slope = np.sin(n * speed * (time - entry)), n * np.cos(n * speed * (time - entry))
         M = M + on * mass * np.outer(S, S)
         C = C + on * mass * 2 * speed * np.outer(S, slope)
@@ -69,10 +69,10 @@ def plant(time):
     return A, inputs[:, :1], inputs[:, 1:]
 
 
-def by_pieces(rate, start, tolerance, backward=False):
+def by_pieces(rate, start, tolerance, backward=False, events=EVENTS):
     """States at `TIMES` from an ODE that changes at the events, forward or backward."""
     found, state = {}, start
-    stops = np.sort([*TIMES, *EVENTS])
+    stops = np.unique([*TIMES, *events])
     legs = list(zip(stops[:-1], stops[1:], strict=True))
     for early, late in reversed(legs) if backward else legs:
         inside = early + 1e-12, late - 1e-12

@@ -12,7 +12,7 @@ from jaxbeam.rig import assemble
 from jaxbeam.statespace import LoadedBeam, loaded_beam
 
 OF_ACTUATORS = ("force_per_volt", "stiffness", "damping", "correction")
-OF_LOADS = ("mass", "speed")
+OF_LOADS = ("mass", "speed", "entry_time")
 
 
 class Beliefs(eqx.Module):
@@ -39,6 +39,9 @@ class Beliefs(eqx.Module):
         "kg", "masses of loads", NOT_NEGATIVE, default=None
     )
     speed: Float[Array, " *load"] | None = number("m/s", "speeds of loads", default=None)
+    entry_time: Float[Array, " *load"] | None = number(
+        "s", "when loads are predicted to enter", default=None
+    )
     modes: int | None = count("modes of the beam that are modelled", default=None)
 
     def fault(self, case: Any) -> str | None:
@@ -52,7 +55,7 @@ class Beliefs(eqx.Module):
                     continue
                 if value.shape not in ((), (len(parts),)):
                     return f"{name} must be one number or {len(parts)}, not {value.shape[0]}"
-                if not any(getattr(part, name, None) is not None for part in parts):
+                if not any(_has(part, name) for part in parts):
                     return f"{name} has no effect: no part of the case has a {name}"
         return None
 
@@ -62,16 +65,23 @@ class Beliefs(eqx.Module):
         if self.modes is not None:
             case = eqx.tree_at(lambda c: c.beam, case, _with_modes(case.beam, self.modes))
             modes = modes.first(self.modes)
-        for key, names in (("actuators", OF_ACTUATORS), ("loads", OF_LOADS)):
-            parts = getattr(case, key)
-            for name in names:
-                value = getattr(self, name)
-                if value is None:
-                    continue
-                values = jnp.broadcast_to(value, (len(parts),))
-                parts = tuple(_changed(part, name, values[i]) for i, part in enumerate(parts))
-            case = eqx.tree_at(lambda c, key=key: getattr(c, key), case, parts)
+        parts = self._changed(case.actuators, OF_ACTUATORS), self.loads(case)
+        case = eqx.tree_at(lambda c: (c.actuators, c.loads), case, parts)
         return loaded_beam(case, assemble(case, modes), coordinates)
+
+    def loads(self, case: Any) -> tuple:
+        """The loads of a case as believed."""
+        return self._changed(case.loads, OF_LOADS)
+
+    def _changed(self, parts, names) -> tuple:
+        """Parts of a case with those of these numbers that are believed to be others."""
+        for name in names:
+            value = getattr(self, name)
+            if value is None:
+                continue
+            values = jnp.broadcast_to(value, (len(parts),))
+            parts = tuple(_changed(part, name, values[i]) for i, part in enumerate(parts))
+        return parts
 
 
 def _with_modes(beam, count):
@@ -83,6 +93,12 @@ def _with_modes(beam, count):
 
 
 def _changed(part, name, value):
-    if getattr(part, name, None) is None:
+    if not _has(part, name):
         return part
     return eqx.tree_at(lambda p: getattr(p, name), part, value)
+
+
+def _has(part, name) -> bool:
+    """Whether a number has a say in a part: a load that follows a table enters when that says."""
+    tabulated = name == "entry_time" and part.times is not None
+    return getattr(part, name, None) is not None and not tabulated

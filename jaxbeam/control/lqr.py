@@ -9,13 +9,13 @@ import abc
 import math
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.control.gains import (
     GainTable,
+    Schedule,
     crossing,
     edges_between,
     even,
@@ -116,30 +116,6 @@ class LQR(AbstractRegulator):
         return -memory @ estimate.state, memory
 
 
-class Schedule(eqx.Module):
-    """Gains over a crossing from `start` to `end` (s), and the gain from then on.
-
-    That dies away with a time constant `fade` (s), or does not if that is None. `known` are the
-    weights of the loads (N), which have columns of their own behind the states.
-    """
-
-    table: GainTable
-    rest: Float[Array, "actuator column"]
-    known: Float[Array, " load"]
-    start: Float[Array, ""]
-    end: Float[Array, ""]
-    fade: Float[Array, ""] | None = None
-
-    def gain(self, t: Float[Array, ""]) -> Float[Array, "actuator column"]:
-        """The gain at a time (s); zero before the first load enters."""
-        share = (t - self.start) / (self.end - self.start)
-        rest = self.rest
-        if self.fade is not None:
-            rest = rest * jnp.exp(-jnp.maximum(t - self.end, 0.0) / self.fade)
-        gain = jnp.where(t < self.end, self.table(share), rest)
-        return jnp.where(t < self.start, 0.0, gain)
-
-
 class AbstractScheduledRegulator(AbstractRegulator):
     """A regulator whose gain changes while loads cross, tabulated over the share of the crossing.
 
@@ -147,10 +123,14 @@ class AbstractScheduledRegulator(AbstractRegulator):
     share of the way only while a single load keeps its speed. Where the design believes in another
     speed, its table is stretched. From then on the command is "none", or the last gain is on
     "hold", or it fades ("fade", with the time constant `fade_time`), or the "time-invariant"
-    regulator takes over. A table has `points` stretches from each
-    entry or exit to the next.
+    regulator takes over. A table has `points` stretches from each entry or exit to the next.
+
+    The `entries` are "measured": the table starts with the first entry and ends with the last exit
+    as they are. Or they are "predicted": it runs by the clock, from the first entry to the last
+    exit as the `design` believes them to be, whatever comes.
     """
 
+    entries: str = choice("times of entry and exit", "measured", "predicted", default="measured")
     after: str = choice(
         "gain after the last exit", "none", "hold", "fade", "time-invariant", default="none"
     )
@@ -183,8 +163,21 @@ class AbstractScheduledRegulator(AbstractRegulator):
             rest = rest.at[:, : self.shares.shape[0]].set(last[:, : self.shares.shape[0]])
         shares = jnp.concatenate([self.shares, jnp.ones_like(loads)])
         table = GainTable(table.edges, table.pieces * shares)
-        events = crossing(model)
+        events = crossing(designed if self.entries == "predicted" else model)
         return Schedule(table, rest * shares, loads, events[0], events[-1], self.fade_time)
+
+    def events(self, case: Any) -> Float[np.ndarray, " event"]:
+        """Times (s) of entry and exit by which the table runs, ascending."""
+        loads = believed_loads(self, case) if self.entries == "predicted" else case.loads
+        windows = [known(motion(load, case.beam.length).window()) for load in loads]
+        return np.sort(np.ravel(windows))
+
+    def knots(self, case):
+        """At every instant, the gain jumps at predicted entries and exits, where no load does."""
+        others = super().knots(case)
+        if self.period is not None or self.entries == "measured":
+            return others
+        return np.append([] if others is None else others, self.events(case))
 
     def command(self, memory, estimate, measurement, t):
         loads = memory.known
@@ -212,13 +205,13 @@ class AbstractForesighted(AbstractScheduledRegulator):
         return optimal(self, model)[0]
 
     def knots(self, case):
-        """At every instant, the fast layer of the gains before each event must be resolved."""
+        """At every instant, the fast layer of the gains before each event must be resolved, too."""
         if self.period is not None:
             return None
-        windows = [known(motion(load, case.beam.length).window()) for load in case.loads]
-        events = np.sort(np.ravel(windows))
+        events, others = self.events(case), super().knots(case)
         spans = np.diff(events[events < known(case.run.duration)])
-        return (events[1 : spans.size + 1, None] - spans[:, None] * layer(self.points)).ravel()
+        layers = events[1 : spans.size + 1, None] - spans[:, None] * layer(self.points)
+        return np.append([] if others is None else others, layers)
 
 
 class StepLQR(AbstractScheduledRegulator):
@@ -241,7 +234,7 @@ class AugmentedLQR(AbstractForesighted):
     """The optimal regulator over the crossing that knows the loads, eq. (5.8) of the thesis.
 
     The weights of all loads are constant states of the model: the command answers those on the
-    beam, and, as the times of entry are known, those still to come.
+    beam, and, as the times of entry are known or predicted, those still to come.
     """
 
     @property
@@ -265,13 +258,19 @@ def optimal(
     return finite_time(plant, edges_between(crossing(model), hastening(regulator.points)), Q, R, F)
 
 
+def believed_loads(regulator: AbstractScheduledRegulator, case: Any) -> tuple:
+    """The loads of a case as the design believes them to be."""
+    return case.loads if regulator.design is None else regulator.design.loads(case)
+
+
 def too_coarse(regulator: AbstractScheduledRegulator, case: Any, slowest=None) -> str | None:
     """Whether the fastest mode turns too far within a stretch, by the formula for pinned ends.
 
-    A sentence, or None. Loads are as fast as in the case, or have the `slowest` speed (m/s).
+    A sentence, or None. Loads are as fast as believed, or have the `slowest` speed (m/s).
     """
     beam = case.beam
-    speeds = [load.speed for load in case.loads] if slowest is None else [slowest]
+    loads = believed_loads(regulator, case)
+    speeds = [load.speed for load in loads] if slowest is None else [slowest]
     numbers = (beam.length, beam.rigidity, beam.linear_density, *speeds)
     if not all(value is not None and is_known(value) for value in numbers):
         return None

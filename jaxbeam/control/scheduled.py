@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.control.gains import Schedule
 from jaxbeam.control.listening import Listener
-from jaxbeam.control.lqr import FiniteLQR, Schedule, too_coarse
+from jaxbeam.control.lqr import FiniteLQR, too_coarse
 from jaxbeam.control.recognition import Recognition
 from jaxbeam.dynamics import traffic
 from jaxbeam.fields import INCREASING, choice, is_known, known, number, part
@@ -114,6 +115,8 @@ class ScheduledLQR(FiniteLQR):
             getattr(load, name) is None for load in case.loads for name in ("mass", "speed")
         ):
             return "kind needs a single load, with a mass and a speed; or take another kind"
+        if self.entries == "predicted":
+            return "entries must be 'measured': the load is followed as told, or as recognised"
         for name in ("masses", "speeds"):
             values = getattr(self, name)
             if values is not None and (values.size == 0 or _not_positive(values)):

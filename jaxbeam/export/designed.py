@@ -8,7 +8,8 @@ from jaxbeam.case import Case
 from jaxbeam.checks import check
 from jaxbeam.compiling import compiled
 from jaxbeam.control import DiscreteLQR, StateFeedback
-from jaxbeam.control.lqr import LQR, AbstractScheduledRegulator, Schedule
+from jaxbeam.control.gains import Schedule
+from jaxbeam.control.lqr import LQR, AbstractScheduledRegulator
 from jaxbeam.control.scheduled import Family, ScheduledLQR
 from jaxbeam.export.gains import Gains
 from jaxbeam.fields import known
