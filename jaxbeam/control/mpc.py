@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbeam.control.by_qpax import installed
 from jaxbeam.control.prediction import (
     Prediction,
     Sampled,
@@ -133,6 +134,8 @@ class MPC(AbstractStateLaw):
         pole = self.laguerre_pole
         if pole is not None and is_known(pole) and known(pole) >= 1:
             return f"laguerre_pole must be below 1, not {known(pole):g}"
+        if self.solver == "qpax" and not installed():
+            return "solver must be another: qpax is not installed (pip install 'qpax>=0.1.4')"
         if self.loads == "known" and not case.loads:
             return "loads must be 'ignored' where there are none"
         if self.terminal == "riccati" and outputs > len(case.actuators):

@@ -20,7 +20,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-METHODS = ("interior", "hildreth")
+from jaxbeam.control.by_qpax import nearest
+
+METHODS = ("interior", "hildreth", "qpax")
 SOLVED, INFEASIBLE, UNFINISHED = range(3)
 WORDS = {
     SOLVED: "solved",
@@ -69,11 +71,12 @@ def solve_qp(
     """The x that minimises 1/2 x'H x + f'x subject to M x <= gamma, for a positive definite H.
 
     By an interior-point method, or by Hildreth's dual procedure, eqs (7.22) and (7.23) of the
-    thesis, swept until it has converged. Differentiable (see the module), and to be batched by
-    `vmap`; never raises for what the numbers do: look at the verdict. An H that is not positive
-    definite and numbers that are not finite leave it `UNFINISHED`.
+    thesis, swept until it has converged, or by the package qpax (see `by_qpax`), which takes what
+    is infeasible for `UNFINISHED`. Differentiable (see the module), and to be batched by `vmap`;
+    never raises for what the numbers do: look at the verdict. An H that is not positive definite
+    and numbers that are not finite leave it `UNFINISHED`.
 
-    Raises ValueError for an unknown method.
+    Raises ValueError for an unknown method, ImportError for qpax where it is not installed.
     """
     if method not in METHODS:
         raise ValueError(f"no method {method!r}; there are {', '.join(METHODS)}")
@@ -112,7 +115,7 @@ def _nearest(H, f, M, gamma) -> _Nearest:
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(method, H, f, M, gamma):
     problem = _nearest(H, f, M, gamma)
-    search = _interior if method == "interior" else _hildreth
+    search = {"interior": _interior, "hildreth": _hildreth, "qpax": _by_qpax}[method]
     z, multipliers, verdict, steps = search(problem.G, problem.h, problem.felt)
     x = problem.inverse.T @ (problem.unit * z + problem.centre)
     return x, problem.unit * multipliers / problem.length, verdict, steps
@@ -159,7 +162,9 @@ def _verdict(tolerance, error, z, before, after, h, G):
     A ray r >= 0 with G'r = 0 and h'r < 0 proves it (Farkas); any other shows that whatever is
     within the limits is at least -h'r / |G'r| away from the origin.
     """
-    solved = error <= tolerance * (1 + jnp.max(jnp.abs(z)))
+    # XLA's maxima may pass over NaN, so that the error alone does not tell.
+    finite = jnp.all(jnp.isfinite(z)) & jnp.all(jnp.isfinite(after))
+    solved = finite & (error <= tolerance * (1 + jnp.max(jnp.abs(z))))
     ray = jnp.maximum(after - before, 0.0)
     least = FARTHEST * jnp.max(jnp.abs(G.T @ ray)) + TOLERANCE * jnp.sum(ray)
     nothing = -(h @ ray) > least
@@ -248,3 +253,10 @@ def _hildreth(G, h, felt):
     begin = jnp.where(felt, UNFINISHED, SOLVED), jnp.zeros((), int)
     start = jnp.zeros(variables), jnp.zeros(rows)
     return jax.lax.while_loop(goes_on, sweep, (*start, *begin))
+
+
+def _by_qpax(G, h, felt):
+    z, weight, believed, steps = nearest(G, h)
+    verdict = jnp.where(~felt | believed, SOLVED, UNFINISHED)
+    z, weight = jnp.where(felt, z, 0.0), jnp.where(felt, weight, 0.0)
+    return z, weight, verdict, jnp.where(felt, steps, 0)
