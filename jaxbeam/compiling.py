@@ -11,17 +11,30 @@ import jax.numpy as jnp
 import numpy as np
 
 # XLA's newer code generator for CPUs takes twice as long to compile the programs here, and its
-# last level of optimisation a third longer; they run no faster for the one, 3 % for the other.
-OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
+# last level of optimisation a third longer; they run no faster for the one, 3 % for the other. In
+# the 32 parts into which it would cut a program, a quarter more work is done than in two.
+OPTIONS = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 2,
+    "xla_cpu_parallel_codegen_split_count": 2,
+}
+# For programs that are compiled side by side and leave no core to spare.
+SIDE_BY_SIDE = {"xla_cpu_parallel_codegen_split_count": 1}
+# For a program that takes longer to compile well than it will ever run.
+ROUGHLY = {"xla_backend_optimization_level": 0}
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def options() -> dict[str, bool | int]:
-    """Settings for `jax.jit` and `Lowered.compile` on this machine; those of XLA_FLAGS prevail."""
-    given = os.environ.get("XLA_FLAGS", "")
-    return {name: value for name, value in _known().items() if name not in given}
+def options(**settings: bool | int) -> dict[str, bool | int]:
+    """Settings for `jax.jit` and `Lowered.compile` on this machine, some of them set otherwise.
+
+    Those of XLA_FLAGS prevail.
+    """
+    given, known = os.environ.get("XLA_FLAGS", ""), _known()
+    chosen = known | {name: value for name, value in settings.items() if name in known}
+    return {name: value for name, value in chosen.items() if name not in given}
 
 
 class _Kept(eqx.Module):
@@ -33,8 +46,9 @@ class _Kept(eqx.Module):
 class Compiled(Generic[P, R]):
     """A function compiled anew for every structure of its arguments; see `compiled`."""
 
-    def __init__(self, function: Callable[P, R]):
+    def __init__(self, function: Callable[P, R], settings: dict[str, bool | int]):
         functools.update_wrapper(self, function)
+        self._settings = settings
 
         def program(arrays, given):
             args, kwargs = _together(arrays, *given)
@@ -48,7 +62,7 @@ class Compiled(Generic[P, R]):
 
     @functools.cached_property
     def _quick(self):  # at the first call, because to ask for the options starts JAX's machinery
-        return jax.jit(self._program, static_argnums=1, compiler_options=options())
+        return jax.jit(self._program, static_argnums=1, compiler_options=options(**self._settings))
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         arrays, *rest = _apart((args, kwargs))
@@ -74,7 +88,12 @@ def compiled(function: Callable[P, R]) -> Compiled[P, R]:
     As with `equinox.filter_jit`, what is no array is constant. Called within another function that
     is being traced, it becomes part of that one.
     """
-    return Compiled(function)
+    return Compiled(function, {})
+
+
+def compiled_with(**settings: bool | int) -> Callable[[Callable[P, R]], Compiled[P, R]]:
+    """`compiled`, with some settings of XLA of its own."""
+    return lambda function: Compiled(function, settings)
 
 
 def _apart(tree) -> tuple[list, tuple, Any]:

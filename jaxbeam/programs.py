@@ -12,7 +12,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxbeam.case import replace
-from jaxbeam.compiling import compiled
+from jaxbeam.compiling import ROUGHLY, SIDE_BY_SIDE, compiled, compiled_with
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.grid import even_grid, scheduled_grid
 from jaxbeam.integrate import longest_step, march, trace
@@ -29,7 +29,7 @@ def _varied(case, addresses, values):
     return replace(case, dict(zip(addresses, values, strict=True)))
 
 
-@compiled
+@compiled_with(**SIDE_BY_SIDE, **ROUGHLY)
 def rigs(case, form, addresses, heavy):
     """Rigs of some tasks, and the longest step (s) each allows."""
 
@@ -63,7 +63,7 @@ def _prepare(case, addresses, schedule, substeps, assembled, heavy, longest, dri
     return make_rigging(assembled, grid, varied.sensor_places, driver)
 
 
-@compiled
+@compiled_with(**SIDE_BY_SIDE)
 def riggings(case, addresses, schedule, substeps, rigs, heavy, longest):
     """Rigs on the grids of some tasks, several at once because each is little work."""
 
@@ -78,7 +78,7 @@ def riggings(case, addresses, schedule, substeps, rigs, heavy, longest):
     return jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2), made)
 
 
-@compiled
+@compiled_with(**SIDE_BY_SIDE)
 def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, light, longest):
     """Results of some tasks: lanes side by side, tasks one after the other, shared by devices."""
     heavy_addresses, light_addresses = addresses
