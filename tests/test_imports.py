@@ -15,7 +15,7 @@ jaxbeam.small
 jaxbeam.faults  jaxbeam.piecewise  jaxbeam.stretches
 jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
 jaxbeam.estimator  jaxbeam.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.sensors
-jaxbeam.case  jaxbeam.sensing
+jaxbeam.case  jaxbeam.gain_table  jaxbeam.sensing
 jaxbeam.checks
 jaxbeam.modes
 jaxbeam.measuring  jaxbeam.rig
@@ -40,7 +40,7 @@ jaxbeam.blocks
 jaxbeam.order
 jaxbeam.cluster
 jaxbeam.sweep  jaxbeam.compare
-jaxbeam.plot
+jaxbeam.derived_gains  jaxbeam.plot
 jaxbeam.__init__
 tuning
 experiments

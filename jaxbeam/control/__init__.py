@@ -11,11 +11,13 @@ from jaxbeam.control.recognition import Recognised, Recognition, recognised
 from jaxbeam.control.relief import Relief
 from jaxbeam.control.sampling import SamplingWarning, sampling_limit
 from jaxbeam.control.scheduled import ScheduledLQR
+from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from jaxbeam.control.state_feedback import StateFeedback
 
 KINDS = {
     "dlqr": DiscreteLQR,
     "feedback": Feedback,
+    "feedback-scheduled": ScheduledFeedback,
     "lead": Lead,
     "lqr": LQR,
     "lqr-augmented": AugmentedLQR,
@@ -48,6 +50,7 @@ __all__ = [
     "Recognition",
     "Relief",
     "SamplingWarning",
+    "ScheduledFeedback",
     "ScheduledLQR",
     "StateFeedback",
     "StepLQR",

@@ -1,0 +1,174 @@
+"""Gains of displacement feedback over the mass of the load, derived: Fig. 6.7 of the thesis.
+
+By statics, a linear gain that answers a mass as a power law does; by optimisation, the gain that
+leaves the lowest peak of a whole crossing, filters, delays and limits included.
+"""
+
+import dataclasses
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from jaxbeam.case import Case, replace
+from jaxbeam.compare import reserve
+from jaxbeam.control import Feedback, Recognition, ScheduledFeedback
+from jaxbeam.fields import known
+from jaxbeam.plan import make_plan
+from jaxbeam.simulate import ContactLossWarning, simulate
+from jaxbeam.static import influence_line, static_lift
+
+POSITIONS = 201  # of the load, at which the static deflection is looked for
+TRIED = 8  # gains from the largest one down, by equal factors
+LEAST = 1 / 64  # the smallest of them, of the largest
+EXACT = 1e-3  # how exactly the best gain is found, relative
+TOLERANCE = 1e-5  # of the runs
+
+
+class BestGain(NamedTuple):
+    """What `best_gains` finds for a mass (kg): gain, peak (m), and the peak without control."""
+
+    mass: float
+    gain: float
+    peak: float
+    uncontrolled: float
+
+
+def equivalent_gains(
+    case: Case, masses: ArrayLike, gain: float, power: int = 3
+) -> Float[np.ndarray, "actuator mass"]:
+    """Linear gains with which each mass sinks each sensor as far as under a power law.
+
+    Statically, with the load where it sinks the sensor most, each loop alone: the deflection w that
+    a mass m leaves under u = -gain w |w|^(power - 1) obeys s m = w + h gain w^power, with s the
+    deflection per kilogram and h the lift per unit of command, and k = gain w^(power - 1). Speed,
+    filters, limits and the other loops play no part. Masses are in kg, gains in a command per m.
+
+    Raises ValueError for a faulty case and one with fewer sensors than actuators.
+    """
+    actuators, masses = len(case.actuators), np.asarray(masses, float)
+    if len(case.sensors) < actuators:
+        raise ValueError(
+            f"there are only {len(case.sensors)} sensors for {actuators} actuators; add some"
+        )
+    places = np.asarray(case.sensor_places)[:actuators]
+    ways = np.linspace(0, float(case.beam.length), POSITIONS)
+    sunk = float(case.run.gravity) * -np.asarray(influence_line(case, places, ways)).min(axis=0)
+    lifts = np.diagonal(np.asarray(static_lift(case, places)))
+
+    def found(free, lift):
+        def rest(w):
+            return w + lift * gain * w**power - free
+
+        return gain * scipy.optimize.brentq(rest, 0.0, free, xtol=1e-15) ** (power - 1)
+
+    rows = zip(sunk, lifts, strict=True)
+    return np.array([[found(each * mass, lift) for mass in masses] for each, lift in rows])
+
+
+def best_gains(
+    case: Case, masses: ArrayLike, most: float, margin: float | None = None
+) -> list[BestGain]:
+    """For each mass (kg) the gain, up to `most`, that leaves the lowest peak of the run.
+
+    The case has a controller of kind "feedback"; all its loops are given the same gain, in its own
+    units, and its power. Gains from `most` down to a 64th are tried, then the best is sought
+    between its neighbours. With a `margin` only gains count with which the loop bears that much
+    more with the loads parked anywhere on the way (see `compare.reserve`); without, also those of
+    loops that would be unstable if the load stayed, but not within the crossing.
+
+    Raises ValueError for another controller, a faulty case, and if no gain that is tried has the
+    margin.
+    """
+    law = case.controller
+    if type(law) is not Feedback or law.higher_gains is not None:
+        raise ValueError("gains are derived for a controller of kind 'feedback' with one power")
+    masses = [float(mass) for mass in np.atleast_1d(np.asarray(masses, float))]
+    free = dataclasses.replace(case, controller=None)
+    plan = make_plan(_with(case, most, max(masses)), None, TOLERANCE)
+    plain = make_plan(_with(free, None, max(masses)), None, TOLERANCE)
+    found = []
+    for mass in masses:
+        top = most if margin is None else _steady(case, mass, most, margin)
+        gain, peak = _lowest(lambda g, m=mass: _peak(_with(case, g, m), plan), top)
+        found.append(BestGain(mass, gain, peak, _peak(_with(free, None, mass), plain)))
+    return found
+
+
+def scheduled(
+    case: Case,
+    found: list[BestGain],
+    between: str = "interpolated",
+    recognition: Recognition | None = None,
+) -> ScheduledFeedback:
+    """The controller with the gains that `best_gains` found for a case, all else as in its own.
+
+    Raises ValueError if masses do not increase.
+    """
+    masses = [each.mass for each in found]
+    if np.any(np.diff(masses) <= 0):
+        raise ValueError("masses must increase")
+    law = case.controller
+    return ScheduledFeedback(
+        masses=masses,
+        gains=[[each.gain for each in found]] * len(case.actuators),
+        power=law.power,
+        between=between,
+        recognition=recognition,
+        period=law.period,
+        delay=law.delay,
+        resolution=law.resolution,
+    )
+
+
+def _with(case: Case, gain: float | None, mass: float) -> Case:
+    """The case with this gain in every loop, if there are loops, and this mass."""
+    change = {"loads.0.mass": mass}
+    if gain is not None:
+        change["controller.gains"] = np.full(len(case.actuators), gain)
+    return replace(case, change)
+
+
+def _peak(case: Case, plan) -> float:
+    """The largest deflection (m) at the sensors; infinite where the loop diverges."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ContactLossWarning)  # a gain to be left aside may cause it
+        peak = float(np.max(known(simulate(case, plan=plan).peak_deflection)))
+    return peak if np.isfinite(peak) else np.inf
+
+
+def _lowest(peak, top: float) -> tuple[float, float]:
+    """Where a function of the gain is lowest up to a top, and its value there."""
+    gains = top * np.geomspace(LEAST, 1, TRIED)
+    tried = [peak(gain) for gain in gains]
+    best = int(np.argmin(tried))
+    ends = np.log(gains[[max(best - 1, 0), min(best + 1, TRIED - 1)]])
+    refined = scipy.optimize.minimize_scalar(
+        lambda x: peak(np.exp(x)), bounds=tuple(ends), method="bounded", options={"xatol": EXACT}
+    )
+    if refined.fun < tried[best]:
+        return float(np.exp(refined.x)), float(refined.fun)
+    return float(gains[best]), tried[best]
+
+
+def _steady(case: Case, mass: float, most: float, margin: float) -> float:
+    """The largest gain up to `most` with a margin, to EXACT."""
+
+    def lacks(gain):
+        return not reserve(_with(case, gain, mass)).gain >= margin
+
+    if not lacks(most):
+        return most
+    low, high = LEAST * most, most
+    if lacks(low):
+        raise ValueError(
+            f"a mass of {mass:g} kg leaves a gain margin below {margin:g} even with a gain of"
+            f" {low:g}; ask for less, or lower the largest gain"
+        )
+    while high / low > 1 + EXACT:
+        middle = np.sqrt(low * high)
+        low, high = (low, middle) if lacks(middle) else (middle, high)
+    return float(low)

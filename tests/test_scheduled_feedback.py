@@ -1,0 +1,176 @@
+"""Gains of feedback over the mass of the load: the law, and where its gains come from."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.checks import check
+from jaxbeam.control import ScheduledFeedback
+from jaxbeam.controller import Measurement
+from jaxbeam.derived_gains import BestGain, best_gains, equivalent_gains, scheduled
+from tests.loop_as_oracle import expected, span_of
+from tests.test_compare import critical_gain
+
+PATCH = jb.Patch(
+    0.2575, 0.3425, 8.292e-4, correction=0.32, amplifier_gain=200.0, limits=[-2.5, 7.5]
+)
+MASSES, GAINS = [0.2, 0.3, 0.6], [[1000.0, 4000.0, 2000.0]]
+
+
+def rig(controller=None, mass=0.45, **run) -> jb.Case:
+    return jb.Case(
+        jb.Beam(0.6, 13.211, 0.812, 0.03, modes=2),
+        actuators=[PATCH],
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.MovingMass(mass=mass, speed=2.0, entry_time=0.05)],
+        controller=controller,
+        run=jb.Run(**({"duration": 0.4, "sample_rate": 100.0} | run)),
+    )
+
+
+def law(**settings) -> ScheduledFeedback:
+    return ScheduledFeedback(MASSES, GAINS, **({"period": 0.01} | settings))
+
+
+# The law
+
+
+def test_gains_are_those_for_the_mass():
+    two = ScheduledFeedback([0.2, 0.4], [[1.0, 3.0], [8.0, 4.0]], power=3)
+    stepped = dataclasses.replace(two, between="stepped")
+    for mass, line, steps in (
+        (0.1, [1.0, 8.0], [1.0, 8.0]),
+        (0.25, [1.5, 7.0], [1.0, 8.0]),
+        (0.4, [3.0, 4.0], [3.0, 4.0]),
+        (0.9, [3.0, 4.0], [3.0, 4.0]),
+    ):
+        assert_allclose(two.gains_for(jnp.asarray(mass)), line, rtol=1e-14)
+        assert_allclose(stepped.gains_for(jnp.asarray(mass)), steps, rtol=1e-14)
+    readings = jnp.array([-2.0, 0.5])
+    memory = eqx.tree_at(lambda m: m.mass, two.init(jb.state_space(rig())), jnp.asarray(0.25))
+    command, _ = two.step(memory, Measurement(readings, jnp.zeros(0), jnp.zeros(2)), 0.0)
+    assert_allclose(command, [1.5 * 8.0, -7.0 * 0.125], rtol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def heard():
+    """A run in which the mass is recognised, its sensors and gates without error."""
+    recognition = jb.Recognition(gates=[-0.1, -0.05], until=0.3)
+    return jb.simulate(rig(law(recognition=recognition), mass=0.4))
+
+
+def test_the_lightest_is_assumed_until_the_mass_is_recognised(heard):
+    """Then it is that whose static deflections fit the readings best, by two modes, in numpy."""
+    times, readings = np.asarray(heard.times), np.asarray(heard.measured)[:, 0]
+    given = np.append(0.0, np.asarray(heard.command)[:-1, 0])  # until each tick
+    span, share = span_of(heard.case), (times - 0.05) * 2.0 / 0.6
+    seen = span.shapes(0.3) / span.frequencies**2
+    pull = 8.292e-4 * 0.32 * 200.0 * (span.shapes(0.2575, 1) - span.shapes(0.3425, 1))
+    heeded = (share > 0) & (share < 0.3 - 1e-9)
+    line = np.array([-seen @ span.shapes(0.6 * x) for x in share[heeded]])
+    rest = readings[heeded] - (seen @ pull) * given[heeded]
+    mass = line @ rest / (line @ line) / 9.81
+    assert_allclose(mass, 0.4, rtol=0.15)
+    gains = np.where(share < 0.3 - 1e-9, 1000.0, np.interp(mass, MASSES, GAINS[0]))
+    wanted = np.clip(-gains * readings, -2.5, 7.5)
+    assert np.ptp(wanted) > 0.5
+    # Influence lines are read from 201 places: to (pi / 200)^2 / 8 of their size.
+    assert_allclose(heard.command[:, 0], wanted, rtol=4e-5, atol=1e-12)
+
+
+def test_a_case_file_keeps_it():
+    case = rig(law(between="stepped", recognition=jb.Recognition(gates=[-0.1, -0.05])))
+    check(case)
+    assert case_to_dict(case)["controller"]["kind"] == "feedback-scheduled"
+    assert eqx.tree_equal(case, case_from_dict(case_to_dict(case)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"loads": ()}, "kind needs a single load, with a mass"),
+        ({"controller": law(period=None, recognition=jb.Recognition(threshold=1e-4))}, "period"),
+        ({"controller": ScheduledFeedback([0.2], GAINS)}, "a gain for each of 1 masses, not 3"),
+        ({"controller": ScheduledFeedback(MASSES, GAINS * 2)}, "for each of 1 actuators, not 2"),
+        ({"controller": ScheduledFeedback([], [[]])}, "masses must list at least one"),
+        (
+            {"controller": law(recognition=jb.Recognition(threshold=1e-4))},
+            "recognition.threshold needs two sensors",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        check(dataclasses.replace(rig(law()), **change))
+
+
+# Where its gains come from
+
+
+def test_printed_gains_follow_from_statics():
+    """Fig. 6.7: 2 V/mm up to 0.345 kg, 3 up to 0.45, then 3.6, in place of 2 V/mm^3.
+
+    A pinned beam sinks by g L^3 / (48 E I) per kilogram; w = 1 mm, where k w = 2 w^3 at k = 2, and
+    w = 1.2247 mm at k = 3 tell the masses, with the lift of a patch at midspan.
+    """
+    case = jb.replace(rig(), {"actuators.0.correction": 0.502})
+    sunk = 9.81 * 0.6**3 / (48 * 13.211)
+    # A moment between 0.2575 m and its mirror image: w(L/2) is the integral of x M / (E I) from
+    # the support to the middle.
+    lift = 200.0 * 0.502 * 8.292e-4 * (0.3**2 - 0.2575**2) / 2 / 13.211
+    masses = [(w + lift * 2e9 * w**3) / sunk for w in (1e-3, np.sqrt(1.5) * 1e-3)]
+    assert_allclose(masses, [0.344, 0.4486], atol=1e-3)
+    assert_allclose(equivalent_gains(case, masses, 2e9), [[2000.0, 3000.0]], rtol=1e-6)
+    assert_allclose(equivalent_gains(case, [0.509], 2e9), [[3596.0]], rtol=2e-3)
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return rig(jb.Feedback([1000.0], period=0.01))
+
+
+@pytest.mark.slow
+def test_the_best_gain_is_lowest_by_the_oracle(loop):
+    """The peak at the samples, by scipy, is higher with a seventh less gain and with more."""
+    light, heavy = best_gains(loop, [0.05, 0.2], 1e5)
+    times = np.asarray(jb.simulate(loop).times)
+
+    def peak(gain, mass):
+        changed = jb.replace(loop, {"loads.0.mass": mass, "controller.gains.0": gain})
+        return np.max(np.abs(expected(changed, times).deflection))
+
+    for found in (light, heavy):
+        lowest = peak(found.gain, found.mass)
+        assert_allclose(found.peak, lowest, rtol=0.02)  # between samples it is a little higher
+        assert found.peak < 0.95 * found.uncontrolled
+        for other in (0.85, 1.18):
+            assert peak(other * found.gain, found.mass) > lowest
+    made = scheduled(loop, [light, heavy], "stepped")
+    assert_allclose(made.gains_for(jnp.asarray(0.1)), [light.gain], rtol=1e-12)
+    check(dataclasses.replace(loop, controller=made))
+
+
+@pytest.mark.slow
+def test_gains_keep_a_margin_where_one_is_asked_for(loop):
+    """Against the critical gain with the mass parked, by scipy."""
+    case = jb.replace(loop, {"loads.0.mass": 0.509})
+    (found,) = best_gains(case, [0.509], 1e4, margin=2.0)
+    critical = min(critical_gain(case, x) for x in np.linspace(0, 0.6, 13))
+    assert found.gain <= critical / 2 * (1 + 1e-6)
+    with pytest.raises(ValueError, match="leaves a gain margin below 1e"):
+        best_gains(case, [0.509], 1e4, margin=1e6)
+
+
+def test_other_laws_are_refused():
+    with pytest.raises(ValueError, match="kind 'feedback' with one power"):
+        best_gains(rig(law()), [0.2], 1.0)
+    with pytest.raises(ValueError, match="only 0 sensors for 1 actuators"):
+        equivalent_gains(dataclasses.replace(rig(), sensors=()), [0.2], 1.0)
+    with pytest.raises(ValueError, match="masses must increase"):
+        scheduled(rig(law()), [BestGain(mass, 1.0, 1.0, 1.0) for mass in (0.2, 0.1)])
