@@ -66,9 +66,9 @@ def channel_remarks(found: Sequence[Channel], logs: Sequence[Log]) -> list[str]:
         if coloured:
             places = ", ".join(f"{c.colour:.2g} at sensor {c.sensor}" for c in coloured)
             said.append(
-                f"{log.source}: residuals are no white noise, so the model misses something; "
-                f"intervals are widened for it (variances times {places}), but cannot make up for "
-                "values that it puts off"
+                f"{log.source}: residuals are no white noise, so the model misses something and "
+                f"its intervals are unreliable: widened for it (variances times {places}), they "
+                "cannot make up for values that are put off"
             )
         for c in found:
             if c.log == i and abs(c.shift) > LATE * c.shift_error:
