@@ -4,6 +4,7 @@ The controllers themselves are in `control`.
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -42,9 +43,9 @@ class AbstractController(eqx.Module):
     With a sampling `period` (s) a controller acts at 0, period, 2 period, ...; its command begins
     `delay` (s) later and is held until the next one. Without a period it acts at every instant,
     the limit of ever faster sampling; its memory then stays as it was at the start, so it must be
-    `memoryless`, but for filters of its own, whose states join the plant. Commands are rounded to
-    `resolution` and kept within the actuators' limits by the loop. To add a controller, write a
-    file with a subclass and name it in `jaxbeam.control.KINDS`.
+    `memoryless`, but for filters and states of its own, which join those of the plant. Commands are
+    rounded to `resolution` and kept within the actuators' limits by the loop. To add a controller,
+    write a file with a subclass and name it in `jaxbeam.control.KINDS`.
     """
 
     period: Float[Array, ""] | None = number(
@@ -88,6 +89,24 @@ class AbstractController(eqx.Module):
     def own_filters(self) -> tuple[OwnFilter, ...]:
         """Its filters where it acts at every instant; their outputs follow the readings."""
         return ()
+
+    def own_states(self, memory: Any) -> int:
+        """How many states of its own it has where it acts at every instant; they start at zero."""
+        return 0
+
+    def flow(
+        self,
+        memory: Any,
+        own: Float[Array, " own"],
+        measurement: Measurement,
+        t: Float[Array, ""],
+        limited: Callable[[Array], Array],
+    ) -> tuple[Float[Array, " actuator"], Float[Array, " own"]]:
+        """Commands at every instant, and the rates of the states of its own.
+
+        `limited` takes the commands that are wanted to those that the actuators are given.
+        """
+        return limited(self.step(memory, measurement, t)[0]), own
 
     def fault(self, case: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", before anything compiles; or None."""

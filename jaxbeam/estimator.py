@@ -27,9 +27,15 @@ class AbstractEstimator(eqx.Module):
     """Interface of all estimators.
 
     They run at the sampling period of the controller that they serve, which is that of
-    `model.case.controller`. To add one, write a file with a subclass and name it in
+    `model.case.controller`. Without a period those that `flow` have a memory that is a
+    `estimation.flowing.Flowing`. To add one, write a file with a subclass and name it in
     `jaxbeam.estimation.KINDS`.
     """
+
+    @property
+    def flows(self) -> bool:
+        """Whether it may act at every instant."""
+        return False
 
     @abc.abstractmethod
     def init(self, model: Any) -> Any:

@@ -52,6 +52,8 @@ class Loop(AbstractDriver):
     """The driver made of the controller of a case. Lanes share the controller, not its memory.
 
     `designed` is that memory at the start, which holds what the controller works out beforehand.
+    So many states of a law that acts at every instant are `flowing`: they are the last of the
+    rig's, and their rates the last of the commands.
     """
 
     model: LoadedBeam
@@ -64,13 +66,14 @@ class Loop(AbstractDriver):
     noise: Float[Array, "read sensor"] | None
     bound: Float[Array, " state"]
     inner: bool = eqx.field(static=True)
+    flowing: int = eqx.field(static=True)
 
     def start(self, lanes: int) -> Any:
         controller, case = self.model.case.controller, self.model.case
         memory = _every_lane(self.designed, lanes)
-        commands = jnp.zeros((len(case.actuators), lanes))
         if controller.period is None:
-            return memory, commands
+            return memory, jnp.zeros((self.rig.command_matrix.shape[1], lanes))
+        commands = jnp.zeros((len(case.actuators), lanes))
         pairs = zip(case.sensors, self.sections, strict=True)
         sensing = [init(sensor, sections, jnp.zeros(lanes)) for sensor, sections in pairs]
         rest = [
@@ -109,22 +112,33 @@ class Loop(AbstractDriver):
         return commands, (own, commands[-1])
 
     def at_instants(self, states: Float[Array, "time state"], times: Float[Array, " time"]):
-        """Commands (time, actuator) of a law at every instant, for a single lane."""
+        """Commands (time, command) of a law at every instant, for a single lane.
+
+        Behind those to the actuators are the rates of the law's own states.
+        """
         own = _every_lane(self.designed, 1)
         return jax.vmap(lambda state, time: self._answer(own, state[:, None], time)[:, 0])(
             states, times
         )
 
     def _answer(self, own, state, time):
-        """Commands (actuator, lane) of a law at every instant, to a state."""
-        sensors, seen = self.model.case.sensors, self.seen @ state
-        pairs = zip(sensors, seen[: len(sensors)], strict=True)
+        """Commands (actuator, lane) of a law at every instant to a state; rates of own states."""
+        case, seen = self.model.case, self.seen @ state
+        pairs = zip(case.sensors, seen[: len(case.sensors)], strict=True)
         readings = [read(sensor, None, None, value)[0] for sensor, value in pairs]
         # What filters of the law's own give follows.
-        shown = jnp.stack([*readings, *seen[len(sensors) :]]) if seen.shape[0] else seen
-        none = jnp.zeros((len(self.model.case.actuators), state.shape[-1]))
-        wanted, _ = self._step(own, shown, state, none, time)
-        return self._limited(wanted)
+        shown = jnp.stack([*readings, *seen[len(case.sensors) :]]) if seen.shape[0] else seen
+        none = jnp.zeros((len(case.actuators), state.shape[-1]))
+        moving = state[state.shape[0] - self.flowing :]
+
+        def single(own, moving, *seen):
+            return jnp.concatenate(
+                case.controller.flow(own, moving, Measurement(*seen), time, self._limited)
+            )
+
+        ordered = self.model.from_rig(state[: self.model.rig.states])
+        every = jax.vmap(single, in_axes=-1, out_axes=-1)
+        return every(own, moving, shown, ordered, none)
 
     def _act(self, memory, state, moment: Moment):
         """All that is due at an edge: readings, a new command, and commands that begin."""
@@ -255,9 +269,26 @@ def make_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) ->
         if any(sensor.noise is not None for sensor in case.sensors):
             noise = noise_samples(case.run.seed, len(case.sensors), schedule.most_reads)
     inner = controller.period is None and not controller.blind
+    designed = controller.init(model)  # once: it may solve Riccati equations
+    flowing = controller.own_states(designed) if inner else 0
+    wide, seen = with_flowing(wide, seen, flowing)
     # A deflection about as large as the beam is long: modes are of the order sqrt(2 / mass).
     beam = case.beam
     most = beam.length * jnp.sqrt(beam.linear_density * beam.length / 2)
     bound = jnp.full(wide.states, jnp.inf).at[0 : 2 * beam.modes : 2].set(most)
-    designed = controller.init(model)  # once: it may solve Riccati equations
-    return Loop(model, designed, wide, seen, loads, schedule, sections, noise, bound, inner)
+    return Loop(
+        model, designed, wide, seen, loads, schedule, sections, noise, bound, inner, flowing
+    )
+
+
+def with_flowing(
+    rig: Rig, seen: Float[Array, "sensor state"], count: int
+) -> tuple[Rig, Float[Array, "sensor all"]]:
+    """A rig with so many more states, whose rates are its last commands; no sensor sees them."""
+    if count == 0:
+        return rig, seen
+    matrix = jnp.pad(rig.state_matrix, ((0, 0), (0, count), (0, count)))
+    command = jax.scipy.linalg.block_diag(rig.command_matrix, jnp.eye(count))
+    parts = matrix, command
+    wide = eqx.tree_at(lambda r: (r.state_matrix, r.command_matrix), rig, parts)
+    return wide, jnp.pad(seen, ((0, 0), (0, count)))

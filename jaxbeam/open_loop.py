@@ -78,17 +78,33 @@ class OpenLoop(eqx.Module):
         return eqx.tree_at(lambda loop: loop.wide.traffic.motions, self, motions)
 
     def parts(self, t):
-        """A, B, the rates that the weights cause, and commands as a function of the state."""
+        """A, B, the rates that the weights cause, and commands as a function of the state.
+
+        States of its own that a law has are the last, about those at the start of a run.
+        """
         system, held = self.wide.at(t), len(self.model.case.actuators)
+        controller, size = self.model.case.controller, system.A.shape[0]
         none = jnp.zeros(held)
 
-        def command(state):
+        def answer(state, limited):
             # The sensors are ideal here; what filters of the law's own give follows.
-            readings = self._signals(state, none, t)
-            return self._law(self.memory, readings, state, none, t)[0]
+            inner, own = state[:size], state[size:]
+            measurement = self._measured(self._signals(inner, none, t), inner, none)
+            return controller.flow(self.memory, own, measurement, t, limited)
 
-        push, load = system.B[:, :held], system.B[:, held:] @ self.wide.weights
-        return system.A, push, load, command
+        def command(state):
+            return answer(state, lambda wanted: wanted)[0]
+
+        def rates(state, given):
+            return answer(state, lambda wanted: given)[1]
+
+        own = controller.own_states(self.memory)
+        still = jnp.zeros(size + own)
+        slopes, pushes = jax.jacfwd(rates, argnums=(0, 1))(still, none)
+        A = jnp.concatenate([jnp.pad(system.A, ((0, 0), (0, own))), slopes])
+        push = jnp.concatenate([system.B[:, :held], pushes])
+        load = jnp.append(system.B[:, held:] @ self.wide.weights, rates(still, none))
+        return A, push, load, command
 
     def at_rest(self, clock: Clock):
         """State of the sampled loop at rest as one vector, and the function that unpacks it."""
@@ -165,9 +181,12 @@ class OpenLoop(eqx.Module):
         return jnp.where(quick, felt, signals)
 
     def _law(self, memory, readings, state, command, t):
-        inner = self.wide.to_rig(state)[: self.model.rig.states]
-        seen = Measurement(readings, self.model.from_rig(inner), command)
+        seen = self._measured(readings, state, command)
         return self.model.case.controller.step(memory, seen, t)
+
+    def _measured(self, readings, state, command):
+        inner = self.wide.to_rig(state)[: self.model.rig.states]
+        return Measurement(readings, self.model.from_rig(inner), command)
 
     def _changes(self) -> list[bool]:
         """Which leaves of the law's memory its steps change; the others are its design."""

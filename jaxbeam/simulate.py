@@ -192,8 +192,10 @@ def _trace(case: Case, plan: Plan, times, watched, noisy=True):
             if driver.inner
             else _begin(case, commands, edges)
         )
-    outputs = *_outputs(assembled, loads, times, states, commands), shown, failures
-    return best, outputs, assembled.modes, count
+    *motion, commands = _outputs(assembled, loads, times, states, commands)
+    if commands is not None:
+        commands = commands[:, : len(case.actuators)]
+    return best, (*motion, commands, shown, failures), assembled.modes, count
 
 
 def _begin(case: Case, commands, edges):

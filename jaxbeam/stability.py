@@ -238,7 +238,7 @@ def _transitions(loop: OpenLoop, clock: Clock | None, times, substeps: int):
             whole = through(matrix, t[0], t[1] - t[0], substeps, whole)
             return whole, whole
 
-        start = jnp.eye(loop.wide.rig.states)
+        start = jnp.eye(matrix(times[0]).shape[0])
         spans = jnp.stack([times[:-1], times[1:]], axis=1)
         whole = jax.lax.scan(onward, start, spans)[1]
     else:

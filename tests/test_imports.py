@@ -29,7 +29,8 @@ jaxbeam.control  jaxbeam.extremes
 jaxbeam.casefile  jaxbeam.integrate
 jaxbeam.export  jaxbeam.loop  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
 jaxbeam.linear_loop  jaxbeam.plan  jaxbeam.programs
-jaxbeam.margins  jaxbeam.stability
+jaxbeam.margins  jaxbeam.stability  jaxbeam.step_times  jaxbeam.swings
+jaxbeam.reserve
 jaxbeam.control.reach
 jaxbeam.control.least_peak
 jaxbeam.control.bound

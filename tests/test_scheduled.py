@@ -13,8 +13,9 @@ import jaxbeam as jb
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.checks import check
 from jaxbeam.control import FiniteLQR, ScheduledLQR
-from jaxbeam.control.gains import GainTable, Schedule
+from jaxbeam.control.gains import Schedule
 from jaxbeam.controller import Measurement
+from jaxbeam.gain_table import GainTable
 from jaxbeam.modes import lay_out
 from jaxbeam.static import influence_line, static_lift
 

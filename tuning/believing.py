@@ -43,6 +43,12 @@ class Believing(AbstractController):
     def own_filters(self):
         return self.law.own_filters()
 
+    def own_states(self, memory):
+        return self.law.own_states(memory)
+
+    def flow(self, memory, own, measurement, t, limited):
+        return self.law.flow(memory, own, measurement, t, limited)
+
     def fault(self, case):
         return self.law.fault(case)
 

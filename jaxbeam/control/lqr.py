@@ -13,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.control.gains import (
+from jaxbeam.control.gains import Schedule, crossing
+from jaxbeam.control.sampling import warn_if_slow
+from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, is_known, known, number
+from jaxbeam.gain_table import (
     GainTable,
-    Schedule,
-    crossing,
     edges_between,
     even,
     finite_time,
@@ -24,9 +26,6 @@ from jaxbeam.control.gains import (
     layer,
     step_by_step,
 )
-from jaxbeam.control.sampling import warn_if_slow
-from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, is_known, known, number
 from jaxbeam.loads import motion
 from jaxbeam.riccati import lqr
 from jaxbeam.statespace import LoadedBeam
@@ -197,6 +196,9 @@ class AbstractForesighted(AbstractScheduledRegulator):
     terminal_weight: Float[Array, " state"] | None = number(
         "s/unit of the state^2", "weight of each state at the end", NOT_NEGATIVE, default=None
     )
+    in_time: str = choice(
+        "how P is carried backward", "sequential", "parallel", default="sequential"
+    )
 
     def fault(self, case):
         return super().fault(case) or too_coarse(self, case)
@@ -255,7 +257,8 @@ def optimal(
         return system.A, system.B[:, : len(model.case.actuators)]
 
     Q, F = (jnp.pad(weight, (0, loads)) for weight in (Q, F))
-    return finite_time(plant, edges_between(crossing(model), hastening(regulator.points)), Q, R, F)
+    edges = edges_between(crossing(model), hastening(regulator.points))
+    return finite_time(plant, edges, Q, R, F, regulator.in_time == "parallel")
 
 
 def believed_loads(regulator: AbstractScheduledRegulator, case: Any) -> tuple:

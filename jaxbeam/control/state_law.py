@@ -5,13 +5,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbeam.compiling import compiled
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.controller import AbstractController
 from jaxbeam.estimation import KINDS
+from jaxbeam.estimation.flowing import Flowing
 from jaxbeam.estimator import AbstractEstimator, Estimate
 from jaxbeam.fields import choice, is_known, known, part
+from jaxbeam.loads import motion
 from jaxbeam.modes import lay_out
 from jaxbeam.statespace import LoadedBeam, StateSpace, loaded_beam, state_space
 
@@ -32,7 +35,7 @@ class AbstractStateLaw(AbstractController):
 
     @property
     def memoryless(self) -> bool:
-        return self.estimator is None
+        return self.estimator is None or self.estimator.flows
 
     @abc.abstractmethod
     def prepare(self, model: LoadedBeam, designed: LoadedBeam) -> Any:
@@ -64,6 +67,24 @@ class AbstractStateLaw(AbstractController):
         wanted, law = self.command(law, estimate, measurement, t)
         return wanted, (law, own)
 
+    def own_states(self, memory):
+        own = memory[1]
+        return own.start.shape[0] if isinstance(own, Flowing) else 0
+
+    def flow(self, memory, own, measurement, t, limited):
+        law, flowing = memory
+        if not isinstance(flowing, Flowing):
+            return super().flow(memory, own, measurement, t, limited)
+        command = limited(self.command(law, flowing.estimate(own, t), measurement, t)[0])
+        return command, flowing.rates(own, measurement.readings, command, t)
+
+    def knots(self, case):
+        """At every instant, an estimator's gain bends where loads are believed to come and go."""
+        if self.period is not None or self.estimator is None:
+            return None
+        loads = case.loads if self.design is None else self.design.loads(case)
+        return np.ravel([known(motion(load, case.beam.length).window()) for load in loads])
+
     def fault(self, case):
         bonded = any(actuator.bonded() is not None for actuator in case.actuators)
         if self.coordinates == "sine" and (
@@ -76,13 +97,16 @@ class AbstractStateLaw(AbstractController):
         fault = None if self.design is None else self.design.fault(case)
         if fault is not None:
             return f"design.{fault}"
-        if self.period is None:
+        if self.period is None and not self.memoryless:
+            return "period must be given: this estimator steps from sample to sample"
+        if self.period is None and self.estimator is None:
             return None
         fault = None if self.estimator is None else self.estimator.fault(case, None)
         if fault is None and all(is_known(leaf) for leaf in jax.tree.leaves((self, case))):
             law, plain = jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), (self, case))
             plant = _plant(law, plain, lay_out(plain))
-            self.look_at(plant, case)
+            if self.period is not None:
+                self.look_at(plant, case)
             fault = None if self.estimator is None else self.estimator.fault(case, plant)
         return None if fault is None else f"estimator.{fault}"
 

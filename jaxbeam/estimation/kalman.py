@@ -6,19 +6,24 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.controller import Measurement
 from jaxbeam.estimation.chain import Chain, Sight, chain, sight
 from jaxbeam.estimation.fixed import at_rest, offsets
-from jaxbeam.estimation.gains import filter_gain, sampled_kalman_gain
+from jaxbeam.estimation.flowing import Flowing
+from jaxbeam.estimation.gains import filter_gain, kalman_gain, sampled_kalman_gain
 from jaxbeam.estimation.observability import modes_of, unseen_fault
 from jaxbeam.estimation.sampled import ROUNDING, ticks
 from jaxbeam.estimator import AbstractEstimator, Estimate
 from jaxbeam.fields import POSITIVE, choice, count, is_known, known, number
+from jaxbeam.gain_table import edges_between, finite_time, hastening
 from jaxbeam.holds import balance
 from jaxbeam.statespace import LoadedBeam
 from jaxbeam.stretches import symmetric
+
+TURN = 3.0  # rad by which the fastest mode may turn within a stretch of a table
 
 Square = Float[Array, "state state"]
 
@@ -36,6 +41,11 @@ class Kalman(AbstractEstimator):
     delays may `reach` over so many periods. Noise is that of the samples: behind a digital filter
     it is coloured. The beam is at rest one period before the first tick. Not modelled are clocks
     of the sensors' own, nor what the white forces do to an accelerometer at once.
+
+    Without a period it acts at every instant (Kalman and Bucy): the noise of readings then has the
+    `measurement_intensity`, which samples a period apart have with variance intensity / period; the
+    beam is at rest at first. Along the crossing its gain is tabulated, with so many `points` from
+    each entry or exit to the next, to 1e-8.
     """
 
     process_noise: Float[Array, " *mode"] = number(
@@ -52,8 +62,18 @@ class Kalman(AbstractEstimator):
         "N", "standard deviation of the weights as believed", POSITIVE, default=None
     )
     reach: int = count("periods that delays of sensors reach back", default=1)
+    measurement_intensity: Float[Array, " *sensor"] | None = number(
+        "unit of quantity^2 s", "intensity of the noise of readings", POSITIVE, default=None
+    )
+    points: int = count("stretches of the gain from event to event", default=400)
+
+    @property
+    def flows(self) -> bool:
+        return True
 
     def init(self, model):
+        if model.case.controller.period is None:
+            return self._flowing(model)
         view, clock = sight(model), ticks(model.case.controller)
         wide, intensity = view.model, self.intensity(view.model)
         states, loads = intensity.shape[0], len(model.case.loads)
@@ -79,6 +99,42 @@ class Kalman(AbstractEstimator):
             weights.set(model.weights),
             jnp.diag(weights.set(spread)),
             jnp.zeros(len(model.case.actuators)),
+        )
+
+    def _flowing(self, model: LoadedBeam) -> Flowing:
+        """The filter at every instant."""
+        view, count = sight(model), len(model.case.sensors)
+        wide, intensity = view.model, self.intensity(view.model)
+        noise = jnp.diag(jnp.broadcast_to(self.measurement_intensity, (count,)))
+        states, loads = intensity.shape[0], len(model.case.loads)
+        offset, own = offsets(model), model.rig.states
+        if self.loads == "ignored":
+            plant = view.behind(wide.unloaded)
+            gain, _ = kalman_gain(plant.A, plant.C, intensity, noise)
+            return Flowing(offset, jnp.zeros(states), own, still=plant, gain=gain)
+        spread, none = jnp.zeros(loads), jnp.zeros(states)
+        if self.weight_deviation is not None:
+            spread = jnp.broadcast_to(self.weight_deviation**2, (loads,))
+        end = model.case.run.duration
+
+        def dual(back):
+            """The plant a time (s) before the end, as that of a regulator with the same gain."""
+            plant = view.behind(wide.augmented(end - back))
+            return plant.A.T, plant.C.T
+
+        windows = jnp.array([path.window() for path in wide.traffic.motions]).reshape(-1)
+        events = jnp.concatenate([jnp.zeros(1), jnp.clip(windows, 0.0, end), end[None]])
+        edges = edges_between(jnp.sort(end - events), hastening(self.points))
+        first, Q = jnp.diag(jnp.append(none, spread)), jnp.pad(intensity, (0, loads))
+        table = finite_time(dual, edges, Q, noise, first)[0]
+        return Flowing(
+            offset,
+            jnp.append(none, model.weights),
+            own,
+            view=view,
+            table=table,
+            duration=end,
+            sought=self.loads == "estimated",
         )
 
     def step(self, memory, measurement, t):
@@ -108,13 +164,18 @@ class Kalman(AbstractEstimator):
     def fault(self, case, plant):
         if not case.sensors:
             return "kind needs sensors; add one"
-        if self.measurement_noise is None:
+        period = case.controller.period
+        if (period is None) != (self.measurement_intensity is not None):
+            return "measurement_intensity must be given without a controller.period, and only then"
+        if period is None and self.measurement_noise is not None:
+            return "measurement_noise is that of samples; without a period leave it out"
+        if period is not None and self.measurement_noise is None:
             for i, sensor in enumerate(case.sensors):
                 if sensor.noise is None or (is_known(sensor.noise) and known(sensor.noise) == 0):
                     return f"measurement_noise must be given, as sensors.{i} has no noise"
-        period = case.controller.period
         for i, sensor in enumerate(case.sensors):
-            if sensor.delay is not None and is_known(sensor.delay) and is_known(period):
+            sampled = period is not None and sensor.delay is not None
+            if sampled and is_known(sensor.delay) and is_known(period):
                 back = math.ceil(known(sensor.delay) / known(period) - ROUNDING)
                 if back > self.reach:
                     return f"reach must be at least {back}, the periods of sensors.{i}.delay"
@@ -123,13 +184,27 @@ class Kalman(AbstractEstimator):
         if (self.loads == "estimated") != (self.weight_deviation is not None):
             return "weight_deviation and loads = 'estimated' belong together; give both or neither"
         sizes = {"measurement_noise": len(case.sensors), "weight_deviation": len(case.loads)}
+        sizes["measurement_intensity"] = len(case.sensors)
         if plant is not None:
             sizes["process_noise"] = modes_of(plant)
         for name, size in sizes.items():
             value = getattr(self, name)
             if value is not None and value.shape not in ((), (size,)):
                 return f"{name} must be one number or {size}, not {value.shape[0]}"
-        return None if plant is None else unseen_fault(plant)
+        if plant is None:
+            return None
+        return unseen_fault(plant) or self._too_coarse(case, plant)
+
+    def _too_coarse(self, case, plant) -> str | None:
+        """Whether the fastest mode turns too far within a stretch of the gain's table."""
+        if case.controller.period is not None or self.loads == "ignored":
+            return None
+        modes = modes_of(plant)
+        fastest = np.max(np.abs(np.linalg.eigvals(known(plant.A)[: 2 * modes, : 2 * modes])))
+        needed = math.ceil(fastest * known(case.run.duration) / TURN)
+        if self.points >= needed:
+            return None
+        return f"points must be at least {needed} for {modes} modes and a run so long"
 
 
 class Prediction(NamedTuple):

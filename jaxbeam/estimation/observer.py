@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.estimation.fixed import FixedGain, at_rest
+from jaxbeam.estimation.fixed import FixedGain, at_rest, offsets
+from jaxbeam.estimation.flowing import Flowing
 from jaxbeam.estimation.gains import placed_gain
 from jaxbeam.estimation.observability import modes_of, unseen_fault
 from jaxbeam.estimation.sampled import Ticks, ticks
@@ -19,7 +20,8 @@ class Observer(AbstractEstimator):
 
     The error in the states of the beam dies away with the `poles` given, or with those of the
     beam `speed` times as fast (eq. 4.4 of the thesis, sampled: a pole p becomes exp(p period)).
-    States of actuators follow from the commands, uncorrected. Loads are not modelled: they
+    Without a period it acts at every instant, and the poles are those themselves. States of
+    actuators follow from the commands, uncorrected. Loads are not modelled: they
     pull the estimate off. Nor are filters and delays of the sensors.
     """
 
@@ -30,7 +32,15 @@ class Observer(AbstractEstimator):
         "1", "how many times as fast as those of the beam its poles are", POSITIVE, default=None
     )
 
+    @property
+    def flows(self) -> bool:
+        return True
+
     def init(self, model):
+        if model.case.controller.period is None:
+            plant, start = model.unloaded, jnp.zeros(model.rig.states)
+            gain = _placed(plant.A, plant.C, self.wanted(plant))
+            return Flowing(offsets(model), start, start.size, still=plant, gain=gain)
         plant, clock = model.unloaded, ticks(model.case.controller)
         still = jnp.zeros_like(plant.A)
         transition = clock.transition(lambda t: (plant.A, plant.B), still, balance(plant.A))
@@ -45,12 +55,8 @@ class Observer(AbstractEstimator):
         self, plant: StateSpace, drift: Float[Array, "state state"], clock: Ticks
     ) -> Float[Array, "state sensor"]:
         """The gain for a plant whose state `drift` takes from tick to tick."""
-        modal = 2 * modes_of(plant)
-        C = plant.C[:, :modal]
-        wanted, _ = hold(self.wanted(plant), jnp.zeros((modal, 1)), clock.period)
-        drift = drift[:modal, :modal]
-        gain = placed_gain(drift, C @ drift, wanted)
-        return jnp.zeros((plant.A.shape[0], C.shape[0])).at[:modal].set(gain)
+        wanted, _ = hold(self.wanted(plant), jnp.zeros((2 * modes_of(plant), 1)), clock.period)
+        return _placed(drift, plant.C @ drift, wanted)
 
     def wanted(self, plant: StateSpace) -> Float[Array, "modal modal"]:
         """A state matrix (1/s) with the poles that are wanted for the error."""
@@ -77,3 +83,10 @@ class Observer(AbstractEstimator):
             if np.max(poles.real) > -1e-9 * np.max(np.abs(poles)):
                 return "speed must not be used on a beam without damping; give poles instead"
         return unseen_fault(plant)
+
+
+def _placed(A, C, wanted) -> Float[Array, "state sensor"]:
+    """The gain with which the states of the beam, the first ones, have a wanted state matrix."""
+    modal = wanted.shape[0]
+    gain = placed_gain(A[:modal, :modal], C[:, :modal], wanted)
+    return jnp.zeros((A.shape[0], C.shape[0])).at[:modal].set(gain)
