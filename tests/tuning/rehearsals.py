@@ -1,0 +1,172 @@
+"""Rigs of finite elements, what is measured on them, and searches for what they are made of.
+
+The plant is the finite-element beam with twelve modes, integrated by scipy; the model that is
+fitted to its readings keeps fewer.
+"""
+
+import dataclasses
+
+import numpy as np
+import scipy.signal
+
+import jaxbeam as jb
+from jaxbeam.case import replace
+from tests.oracles import crossing, finite_elements
+from tests.oracles.loads import Load
+from tuning import Fit, Log
+from tuning.campaign import prepare
+from tuning.free import free_numbers
+from tuning.identify import fit_of
+from tuning.search import Search
+from tuning.uncertainty import reach
+
+RATE, NOISE, MEMORY = 100.0, 1e-5, 0.5  # Hz, m, correlation from sample to sample
+YIELDING, SAGGING = 1e6, 4e4  # N/m: under 0.5 kg by half the noise, and by twelve times the noise
+MOMENT, AMPLIFIER = 8.292e-4, 200.0  # N m/V
+SHAKER = {"position": 0.5, "stiffness": 3500.0, "damping": 80.0, "force_per_volt": 4.6}
+
+
+@dataclasses.dataclass(frozen=True)
+class Plant:
+    """A rig as finite elements, its load and commands, and the case with the true numbers."""
+
+    beam: finite_elements.Beam
+    case: jb.Case
+    truth: dict[str, float]
+
+    def readings(self, times, commands):
+        """Deflections (time, sensor) in m; commands (time, actuator) are joined by lines."""
+        model = finite_elements.assemble(self.beam)
+        rows = [self._row(model, actuator) for actuator in self.case.actuators]
+
+        def force(t):
+            columns = zip(rows, commands.T, strict=True)
+            return sum(row * np.interp(t - late, times, column) for (row, late), column in columns)
+
+        (load,) = self.case.loads
+        run = crossing.respond(
+            self.beam,
+            [Load(float(load.mass), float(load.speed), float(load.entry_time))],
+            [float(sensor.position) for sensor in self.case.sensors],
+            times,
+            modes=12,
+            force=force,
+            rtol=1e-7,
+            atol=1e-10,
+        )
+        return run.deflection
+
+    def _row(self, model, actuator):
+        """Nodal forces per volt, and how late (s) they are: a pure delay in place of a lag."""
+        if isinstance(actuator, jb.Shaker):
+            return float(actuator.force_per_volt) * model.shape(
+                float(actuator.position)
+            ), 1 / float(actuator.bandwidth)
+        moment = MOMENT * float(actuator.correction) * AMPLIFIER
+        return moment * model.patch_row(float(actuator.start), float(actuator.end)), 0.0
+
+
+def patch(start: float, correction: float) -> jb.Patch:
+    return jb.Patch(
+        start,
+        start + 0.085,
+        moment_per_volt=MOMENT,
+        correction=correction,
+        amplifier_gain=AMPLIFIER,
+    )
+
+
+def plant(
+    spans, rigidity, density, actuators, suspensions, supports, places, modes, ends=None
+) -> Plant:
+    """A beam over spans of 0.6 m, crossed by 0.5 kg at 2 m/s."""
+    length, damping = 0.6 * spans, 0.03
+    ends = ends or ("free-free" if spans == 1 else "pinned-pinned")
+    beam = finite_elements.Beam(
+        length,
+        rigidity,
+        density,
+        ends=ends,
+        supports=[finite_elements.Support(*support) for support in supports.items()],
+        suspensions=suspensions,
+        damping_ratio=damping,
+        elements=24 * spans,
+    )
+    case = jb.Case(
+        jb.Beam(
+            length=length,
+            flexural_rigidity=rigidity,
+            mass_per_length=density,
+            damping_ratio=damping,
+            ends=ends,
+            modes=modes,
+        ),
+        supports=[jb.Support(x, stiffness=stiffness) for x, stiffness in supports.items()],
+        actuators=actuators,
+        sensors=[jb.Sensor(x) for x in places],
+        loads=[jb.MovingMass(mass=0.5, speed=2.0, entry_time=0.02)],
+    )
+    truth = {
+        "beam.flexural_rigidity": rigidity,
+        "beam.mass_per_length": density,
+        "beam.damping_ratio": damping,
+    }
+    for i, stiffness in enumerate(supports.values()):
+        truth |= {f"supports.{i}.stiffness": stiffness} if stiffness == SAGGING else {}
+    for i, actuator in enumerate(actuators):
+        names = ("correction",) if isinstance(actuator, jb.Patch) else tuple(SHAKER)[1:]
+        truth |= {f"actuators.{i}.{name}": float(getattr(actuator, name)) for name in names}
+    return Plant(beam, case, truth)
+
+
+def coloured(shape, seed):
+    """First-order noise (time, sensor) of standard deviation `NOISE`."""
+    white = np.random.default_rng(seed).normal(size=shape)
+    filtered = scipy.signal.lfilter([np.sqrt(1 - MEMORY**2)], [1, -MEMORY], white, axis=0)
+    return NOISE * np.asarray(filtered)
+
+
+class Rehearsal:
+    """Readings of a plant, and one compiled search for all its numbers."""
+
+    def __init__(self, made: Plant):
+        self.truth, count = made.truth, len(made.case.actuators)
+        times = np.arange(round(0.8 * RATE)) / RATE
+        phases = 90.0 * np.arange(count)
+        commands = np.stack(
+            [2.0 * scipy.signal.chirp(times, 2.0, times[-1], 30.0, phi=phi) for phi in phases], 1
+        )
+        self.clean = made.readings(times, commands)
+        sensors = self.clean.shape[1]
+        log = Log(
+            times,
+            np.column_stack([self.clean, commands]),
+            tuple(f"c{i}" for i in range(sensors + count)),
+            ("deflection",) * sensors + ("voltage",) * count,
+            ("m",) * sensors + ("V",) * count,
+            actuators=(None,) * sensors + tuple(range(count)),
+        )
+        start = {address: 1.06 * value for address, value in made.truth.items()}
+        campaign = prepare(replace(made.case, start), [log])
+        scale = np.ptp(self.clean)
+        self.numbers = free_numbers(campaign.cases, dict.fromkeys(made.truth), scale)
+        self.search = Search(campaign, self.numbers)
+        self.known = np.array([n.inward(made.truth[n.address]) for n in self.numbers])
+
+    def fit(self, noise, free, held=None):
+        """A fit of what is free, the other numbers `held`, or known."""
+        measured = (self.clean + noise)[None]
+        start = np.where(free, self.search.start, self.known if held is None else held)
+        return self.search.estimate(measured, start=start, free=free)
+
+    def errors(self, found, free):
+        """Errors of what was free, in half widths of the stated intervals."""
+        halves = reach(found.freedom) * found.uncertainty.errors[free]
+        return (found.values[free] - np.array(list(self.truth.values()))[free]) / halves
+
+    def told(self, noise, found) -> Fit:
+        """All of a fit."""
+        campaign = self.search.campaign
+        fit = fit_of(campaign.cases[0], self.search, found)
+        noisy = dataclasses.replace(campaign, measured=(self.clean + noise)[None])
+        return dataclasses.replace(fit, campaign=noisy)
