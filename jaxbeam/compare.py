@@ -5,35 +5,23 @@ To add a figure of merit, give `Merits` a field, `merits_of` its value and the t
 """
 
 import dataclasses
-import time
 import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxbeam.case import Case, known_case
-from jaxbeam.compiling import compiled
-from jaxbeam.control import MPC
+from jaxbeam.case import Case
 from jaxbeam.control.bound import HELD, Bound, bound
-from jaxbeam.controller import AbstractController, Measurement
-from jaxbeam.fields import known
-from jaxbeam.linear_loop import LinearLoop, linear, prepared
+from jaxbeam.controller import AbstractController
 from jaxbeam.loads import motion
-from jaxbeam.margins import margins
-from jaxbeam.modes import lay_out
-from jaxbeam.open_loop import OpenLoop, open_loop
 from jaxbeam.record import Record
+from jaxbeam.reserve import Reserve, reserve
 from jaxbeam.simulate import ContactLossWarning, simulate
-from jaxbeam.statespace import state_space
-
-REPEATS = 5  # of timing a controller
-PLACES = 13  # of the loads along a crossing, at which margins are looked for
-STILL = 1e-6  # 1/s: what moves at a smaller rate neither grows nor dies out
+from jaxbeam.step_times import StepTimes, step_times
+from jaxbeam.swings import Swings, swings
 
 
 class Merits(NamedTuple):
@@ -41,9 +29,9 @@ class Merits(NamedTuple):
 
     Peak (m), at samples and in between; root mean square (m) over the run; largest deflection (m)
     after the last load has left, NaN if the run ends before; effort of each actuator (the integral
-    of its squared command); share of the run that each spends at a limit; median time (s) a step
-    takes to compute, NaN without steps; share of the attainable reduction of the peak; stability
-    margins as `Reserve` has them.
+    of its squared command); share of the run that each spends at a limit; times (s) that steps take
+    to compute; share of the attainable reduction of the peak; stability margins; and how each
+    command swings more often than the beam does without control.
     """
 
     peak: float
@@ -51,22 +39,10 @@ class Merits(NamedTuple):
     after_exit: float
     effort: Float[np.ndarray, " actuator"]
     saturated: Float[np.ndarray, " actuator"]
-    step_time: float
+    step_times: StepTimes
     share: float
-    reserve: "Reserve"
-
-
-class Reserve(NamedTuple):
-    """How much more gain (a factor) and delay (s) a loop bears at any one of its commands.
-
-    The loads are parked, in several places along the crossing, of which the worst counts; limits
-    of the actuators are left out. Both are zero where the loop is unstable as it is, and NaN
-    where `obstacle` says why there are none.
-    """
-
-    gain: float
-    delay: float
-    obstacle: str = ""
+    reserve: Reserve
+    swings: tuple[Swings, ...]
 
 
 class Comparison(eqx.Module):
@@ -81,6 +57,29 @@ class Comparison(eqx.Module):
     records: dict[str, Record]
     merits: dict[str, Merits]
     bound: Bound
+
+    def loop(self, name: str) -> str:
+        """In words: how much a controller is at its limits, and whether its loop holds still."""
+        merits = self.merits[name]
+        parts = []
+        if merits.saturated.any():
+            shares = ", ".join(f"{share:.1%}" for share in merits.saturated)
+            parts.append(f"at its limits {shares} of the run")
+        lost = merits.reserve.unstable
+        if lost is not None:
+            parts.append(
+                f"unstable with the loads parked where they are from t = {lost.start:.3g} to"
+                f" {lost.end:.3g} s: deviations grow by {lost.rate:.3g} 1/s at {lost.frequency:.3g}"
+                " Hz, so lower the gains, or shorten filters and delays"
+            )
+        for i, one in enumerate(merits.swings):
+            if one.oscillates:
+                how = "in a limit cycle" if one.limit_cycle else "to and fro"
+                parts.append(
+                    f"command {i} swings {how}, {one.extra} times more than the beam without"
+                    f" control, at {one.frequency:.3g} Hz"
+                )
+        return "; ".join(parts)
 
 
 def compare(
@@ -106,7 +105,7 @@ def compare(
         free = simulate(free_case)
         records = {name: _run(case, name, one) for name, one in controllers.items()}
         best = _run(case, "the bound", limit.controller())
-    merits = {name: merits_of(record, limit) for name, record in records.items()}
+    merits = {name: merits_of(record, free, limit) for name, record in records.items()}
     return Comparison(free_case, free, best, records, merits, limit)
 
 
@@ -148,8 +147,8 @@ def _run(case: Case, name: str, controller: AbstractController) -> Record:
         raise ValueError(f"{name}: {error}") from None
 
 
-def merits_of(record: Record, limit: Bound) -> Merits:
-    """The merits of a run, held against the bound of its case."""
+def merits_of(record: Record, free: Record, limit: Bound) -> Merits:
+    """The merits of a run, held against the run without control and the bound of its case."""
     deflection, times = np.asarray(record.deflection), np.asarray(record.times)
     leaves = [motion(load, record.case.beam.length).window()[1] for load in record.case.loads]
     after = np.abs(deflection[times > max(float(end) for end in leaves)])
@@ -159,110 +158,8 @@ def merits_of(record: Record, limit: Bound) -> Merits:
         after_exit=float(after.max()) if after.size else np.nan,
         effort=np.asarray(record.effort),
         saturated=np.asarray(record.saturated).mean(axis=0),
-        step_time=step_time(record),
+        step_times=step_times(record),
         share=limit.share(record),
         reserve=reserve(record.case),
+        swings=swings(record, free),
     )
-
-
-def reserve(case: Case) -> Reserve:
-    """The stability margins of the loop of a case, the worst along the crossing.
-
-    Parked loads lack the terms of their motion, which act as damping of either sign: what those do
-    within a crossing is for `stability.growth` to tell, a margin belongs to a loop that stays.
-    """
-    controller = case.controller
-    if controller is None or controller.blind:
-        return _without("commands that do not depend on readings close no loop")
-    if isinstance(controller, MPC) and controller.solver != "unconstrained":
-        return _without("a law that heeds limits bends at them: no linear loop stands for it")
-    try:
-        clock = prepared(case)
-    except ValueError as error:
-        return _without(str(error))
-    loop = open_loop(case, lay_out(known_case(case)))
-    least = Reserve(np.inf, np.inf)
-    for t in _along(case):
-        parked = _changing(linear(_parked(loop, t), clock, jnp.asarray(t)))
-        if not np.all(np.isfinite(parked.closed)):
-            return _without("the law finds no rest under loads that are parked")
-        rightmost = float(parked.poles().real[0])
-        if abs(rightmost) < STILL:
-            return _without("a part of the loop, as a mode without damping, never comes to rest")
-        if rightmost > 0:
-            return Reserve(0.0, 0.0)
-        with np.errstate(divide="ignore"):  # a loop without gain bears any
-            each = [margins(parked, i) for i in range(len(case.actuators))]
-        gain, delay = min(one.gain for one in each), min(one.delay for one in each)
-        least = Reserve(min(least.gain, gain), min(least.delay, delay))
-    return least
-
-
-def _without(obstacle: str) -> Reserve:
-    return Reserve(np.nan, np.nan, obstacle)
-
-
-def _parked(loop: OpenLoop, t: float) -> OpenLoop:
-    """The loop with its loads at rest where they are at t (s)."""
-    loop, none = loop.frozen(jnp.asarray(t)), jnp.zeros(())
-    still = tuple(
-        dataclasses.replace(load, speed=none, acceleration=none)
-        for load in loop.wide.traffic.motions
-    )
-    return eqx.tree_at(lambda loop: loop.wide.traffic.motions, loop, still)
-
-
-def _changing(loop: LinearLoop) -> LinearLoop:
-    """A sampled loop without what stays as it is from tick to tick, such as a law's counters."""
-    if loop.period is None:
-        return loop
-    size = loop.A.shape[0]
-    stays = np.all(np.asarray(loop.A) == np.eye(size), axis=1) & ~np.any(loop.B, axis=1)
-    kept = ~stays
-    return LinearLoop(loop.A[kept][:, kept], loop.B[kept], loop.K[:, kept], loop.period, loop.modal)
-
-
-def _along(case: Case) -> np.ndarray:
-    """Instants (s) from the first entry to the last exit, or the end of the run."""
-    if not case.loads:
-        return np.zeros(1)
-    windows = [motion(load, case.beam.length).window() for load in case.loads]
-    entries, exits = known(jnp.array(windows)).T
-    return np.linspace(entries.min(), min(exits.max(), known(case.run.duration)), PLACES)
-
-
-def step_time(record: Record) -> float:
-    """Median time (s) in which the controller of a run computes one command, compiled; or NaN.
-
-    It is given what it saw in the run, at most a thousand samples one after another in one compiled
-    loop; the time of the whole loop is divided by their number. NaN without a controller.
-    """
-    if record.case.controller is None:
-        return np.nan
-    shown = record.deflection if record.shown is None else record.shown
-    moving = jnp.concatenate([record.coordinates, record.rates], axis=1)
-    model = state_space(record.case)
-    states = jnp.zeros((moving.shape[0], model.rig.states)).at[:, : moving.shape[1]].set(moving)
-    seen = jnp.nan_to_num(shown), jnp.nan_to_num(states), jnp.nan_to_num(record.command)
-    few = [part[:1000] for part in (*seen, record.times)]
-    memory = record.case.controller.init(model)
-    durations = []
-    for _ in range(REPEATS + 1):
-        start = time.perf_counter()
-        jax.block_until_ready(_steps(record.case.controller, memory, *few))
-        durations.append(time.perf_counter() - start)
-    return float(np.median(durations[1:])) / few[0].shape[0]
-
-
-@compiled
-def _steps(
-    controller: AbstractController, memory, readings, states, commands, times
-) -> Float[Array, "time actuator"]:
-    """Commands of a controller that sees these readings, states and commands one by one."""
-
-    def step(memory, now):
-        *seen, instant = now
-        command, memory = controller.step(memory, Measurement(*seen), instant)
-        return memory, command
-
-    return jax.lax.scan(step, memory, (readings, states, commands, times))[1]

@@ -14,10 +14,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxbeam.case import Case, replace
-from jaxbeam.compare import reserve
 from jaxbeam.control import Feedback, Recognition, ScheduledFeedback
 from jaxbeam.fields import known
 from jaxbeam.plan import make_plan
+from jaxbeam.reserve import reserve
 from jaxbeam.simulate import ContactLossWarning, simulate
 from jaxbeam.static import influence_line, static_lift
 
@@ -77,7 +77,7 @@ def best_gains(
     The case has a controller of kind "feedback"; all its loops are given the same gain, in its own
     units, and its power. Gains from `most` down to a 64th are tried, then the best is sought
     between its neighbours. With a `margin` only gains count with which the loop bears that much
-    more with the loads parked anywhere on the way (see `compare.reserve`); without, also those of
+    more with the loads parked anywhere on the way (see `reserve`); without, also those of
     loops that would be unstable if the load stayed, but not within the crossing.
 
     Raises ValueError for another controller, a faulty case, and if no gain that is tried has the

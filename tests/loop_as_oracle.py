@@ -9,15 +9,18 @@ from jaxbeam.loads import MovingMass
 from tests.oracles import closed_loop
 from tests.oracles.loads import Load
 from tests.oracles.modal_equations import Span
+from tests.oracles.two_spans import TwoSpans
 
 
-def span_of(case: Case) -> Span:
+def span_of(case: Case) -> Span | TwoSpans:
+    """One span on two pins, or two equal ones on three."""
     beam = case.beam
     numbers = beam.length, beam.rigidity, beam.linear_density
-    return Span(*map(float, numbers), beam.modes, float(beam.damping_ratio))
+    kind = TwoSpans if case.supports else Span
+    return kind(*map(float, numbers), beam.modes, float(beam.damping_ratio))
 
 
-def parts_of(case: Case) -> tuple[Span, list, list, list]:
+def parts_of(case: Case) -> tuple[Span | TwoSpans, list, list, list]:
     """Span, loads, actuators and sensors; loads must travel at given speeds."""
     loads = [
         Load(

@@ -30,7 +30,7 @@ jaxbeam.casefile  jaxbeam.integrate
 jaxbeam.export  jaxbeam.loop  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
 jaxbeam.linear_loop  jaxbeam.plan  jaxbeam.programs
 jaxbeam.margins  jaxbeam.stability  jaxbeam.step_times  jaxbeam.swings
-jaxbeam.reserve
+jaxbeam.limits  jaxbeam.reserve
 jaxbeam.control.reach
 jaxbeam.control.least_peak
 jaxbeam.control.bound

@@ -113,7 +113,14 @@ def _content(found) -> dict:
         "held_for": limit.period,
         "controllers": {
             name: merits._asdict()
-            | {"reserve": merits.reserve._asdict(), "verdict": found.records[name].verdict}
+            | {
+                "step_times": merits.step_times._asdict(),
+                "reserve": merits.reserve._asdict()
+                | {"unstable": merits.reserve.unstable and merits.reserve.unstable._asdict()},
+                "swings": [one._asdict() for one in merits.swings],
+                "loop": found.loop(name),
+                "verdict": found.records[name].verdict,
+            }
             for name, merits in found.merits.items()
         },
     }
@@ -138,6 +145,8 @@ def _print(found) -> None:
             "gain margin",
             "delay margin (s)",
             "time per step (s)",
+            "worst",
+            "batched",
         ),
         [
             (
@@ -149,7 +158,7 @@ def _print(found) -> None:
                 " ".join(f"{effort:.4g}" for effort in merits.effort),
                 " ".join(f"{share:.1%}" for share in merits.saturated),
                 *(_margin(merits.reserve, number) for number in merits.reserve[:2]),
-                f"{merits.step_time:.2g}",
+                *(f"{seconds:.2g}" for seconds in merits.step_times[:3]),
             )
             for name, merits in found.merits.items()
         ],
@@ -159,7 +168,7 @@ def _print(found) -> None:
         names = [name for name, met in obstacles.items() if met == obstacle]
         print(f"no margin of {', '.join(names)}: {obstacle}")
     for name, record in found.records.items():
-        print(f"{name}: {record.verdict}")
+        print(f"{name}: {'; '.join(filter(None, (found.loop(name), record.verdict)))}")
 
 
 def _margin(reserve, number: float) -> str:

@@ -151,7 +151,7 @@ class _Plant:
         self.strokes = np.array([a.row(span) for a in actuators]).reshape(-1, n)
         self.rows = np.array([s.row(span) for s in sensors]).reshape(-1, n)
         self.stiffness = np.diag(span.frequencies**2)
-        self.damping = np.diag(2 * span.damping_ratio * span.frequencies)
+        self.damping = span.damping
         for actuator, row in zip(actuators, self.strokes, strict=True):
             self.stiffness = self.stiffness + actuator.stiffness * np.outer(row, row)
             self.damping = self.damping + actuator.damping * np.outer(row, row)

@@ -38,6 +38,11 @@ class Span:
         """Angular, rad/s."""
         return self.wavenumbers**2 * np.sqrt(self.flexural_rigidity / self.mass_per_length)
 
+    @property
+    def damping(self) -> np.ndarray:
+        """Damping matrix in 1/s."""
+        return np.diag(2 * self.damping_ratio * self.frequencies)
+
     def shapes(self, x: float | np.ndarray, derivative: int = 0) -> np.ndarray:
         """Modes or their x-derivatives: (..., mode), in 1 / (sqrt(kg) m^derivative)."""
         k = self.wavenumbers
