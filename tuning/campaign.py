@@ -15,7 +15,7 @@ from jaxbeam.schedule import Schedule, stacked
 from jaxbeam.simulate import readings
 from tuning.free import OF_LOG, insert
 from tuning.logs import Log
-from tuning.pairing import at_sensors, case_of_log, check_loads, check_times
+from tuning.pairing import at_sensors, case_of_log, check_loads, check_times, made_alike
 
 TOLERANCE = 1e-5  # of the largest deflection: what logs can resolve, with room to spare
 OFFSET = re.compile(r"sensors\.(\d+)\.offset")
@@ -154,11 +154,12 @@ def prepare(case: Case, logs: list[Log]) -> Campaign:
     ordered = [at_sensors(case, log) for log in logs]
     for log, own in zip(logs, cases, strict=True):
         check_loads(log, own)
+    cases = made_alike(cases, times)
     shapes = {jax.tree.structure(own) for own in cases}
     if len(shapes) > 1:
         raise ValueError(
-            "the logs differ in the kind or number of their loads, or in what is commanded; fit "
-            "them apart, or give all the same (a mass of 1e-9 kg does no harm)"
+            "the logs differ in the kinds of their loads, one after the other, or in how these "
+            "move (by a speed, or by a table); give all the same kinds, or fit the logs apart"
         )
     measured, real = [], []
     for log, (values, has) in zip(logs, ordered, strict=True):

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from jaxbeam.case import Case, replace
 from jaxbeam.control import Prescribed
 from jaxbeam.fields import known
-from jaxbeam.loads import motion
+from jaxbeam.loads import AbstractLoad, motion
 from tuning.logs import Log
 
 LATEST = 10.0  # start of a log, in its own durations, that is still simulated from 0 on
@@ -34,6 +34,31 @@ def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case
         controller = Prescribed(offsets=np.zeros(len(commands)), times=times, values=commands)
         case = dataclasses.replace(case, controller=controller)
     return replace(case, {"run.duration": float(log.times[-1])})
+
+
+def made_alike(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> list[Case]:
+    """The cases, each with what others have besides: commands of zero, loads that come too late.
+
+    So a crossing without commands and a beam at rest that is shaken are runs of one structure.
+    """
+    commanded = any(isinstance(case.controller, Prescribed) for case in cases)
+    longest = max((case.loads for case in cases), key=len)
+    made = []
+    for case, own in zip(cases, times, strict=True):
+        if commanded and case.controller is None:
+            count = len(case.actuators)
+            still = Prescribed(np.zeros(count), times=own, values=np.zeros((count, own.size)))
+            case = dataclasses.replace(case, controller=still)
+        late = tuple(_late(load, 2 * own[-1]) for load in longest[len(case.loads) :])
+        made.append(dataclasses.replace(case, loads=(*case.loads, *late)))
+    return made
+
+
+def _late(load: AbstractLoad, time: float) -> AbstractLoad:
+    """The load, entering at a time (s)."""
+    if load.times is None:
+        return dataclasses.replace(load, entry_time=time)
+    return dataclasses.replace(load, times=load.times - load.times[0] + time)
 
 
 def _check_command(case: Case, log: Log, channel: int, actuator: int) -> None:

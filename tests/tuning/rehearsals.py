@@ -1,7 +1,7 @@
 """Rigs of finite elements, what is measured on them, and searches for what they are made of.
 
-The plant is the finite-element beam with twelve modes, integrated by scipy; the model that is
-fitted to its readings keeps fewer.
+The plant is the finite-element beam with its first modes, integrated by scipy; the model that is
+fitted to its readings keeps fewer, or as many.
 """
 
 import dataclasses
@@ -20,7 +20,9 @@ from tuning.identify import fit_of
 from tuning.search import Search
 from tuning.uncertainty import reach
 
-RATE, NOISE, MEMORY = 100.0, 1e-5, 0.5  # Hz, m, correlation from sample to sample
+RATE, MEMORY = 100.0, 0.5  # Hz, correlation from sample to sample
+NOISE = {"deflection": 1e-5, "acceleration": 2e-3}  # m, m/s^2
+UNITS = {"deflection": "m", "acceleration": "m/s^2"}
 YIELDING, SAGGING = 1e6, 4e4  # N/m: under 0.5 kg by half the noise, and by twelve times the noise
 MOMENT, AMPLIFIER = 8.292e-4, 200.0  # N m/V
 SHAKER = {"position": 0.5, "stiffness": 3500.0, "damping": 80.0, "force_per_volt": 4.6}
@@ -33,9 +35,10 @@ class Plant:
     beam: finite_elements.Beam
     case: jb.Case
     truth: dict[str, float]
+    modes: int = 12
 
-    def readings(self, times, commands):
-        """Deflections (time, sensor) in m; commands (time, actuator) are joined by lines."""
+    def readings(self, times, commands, loaded=True):
+        """What the sensors read (time, sensor); commands (time, actuator) are joined by lines."""
         model = finite_elements.assemble(self.beam)
         rows = [self._row(model, actuator) for actuator in self.case.actuators]
 
@@ -43,18 +46,19 @@ class Plant:
             columns = zip(rows, commands.T, strict=True)
             return sum(row * np.interp(t - late, times, column) for (row, late), column in columns)
 
-        (load,) = self.case.loads
+        loads = self.case.loads if loaded else ()
         run = crossing.respond(
             self.beam,
-            [Load(float(load.mass), float(load.speed), float(load.entry_time))],
+            [Load(float(a.mass), float(a.speed), float(a.entry_time)) for a in loads],
             [float(sensor.position) for sensor in self.case.sensors],
             times,
-            modes=12,
+            modes=self.modes,
             force=force,
             rtol=1e-7,
             atol=1e-10,
         )
-        return run.deflection
+        columns = [getattr(run, s.quantity)[:, i] for i, s in enumerate(self.case.sensors)]
+        return np.stack(columns, axis=1)
 
     def _row(self, model, actuator):
         """Nodal forces per volt, and how late (s) they are: a pure delay in place of a lag."""
@@ -77,7 +81,7 @@ def patch(start: float, correction: float) -> jb.Patch:
 
 
 def plant(
-    spans, rigidity, density, actuators, suspensions, supports, places, modes, ends=None
+    spans, rigidity, density, actuators, suspensions, supports, sensors, modes, ends=None
 ) -> Plant:
     """A beam over spans of 0.6 m, crossed by 0.5 kg at 2 m/s."""
     length, damping = 0.6 * spans, 0.03
@@ -103,7 +107,7 @@ def plant(
         ),
         supports=[jb.Support(x, stiffness=stiffness) for x, stiffness in supports.items()],
         actuators=actuators,
-        sensors=[jb.Sensor(x) for x in places],
+        sensors=[jb.Sensor(*sensor) for sensor in sensors],
         loads=[jb.MovingMass(mass=0.5, speed=2.0, entry_time=0.02)],
     )
     truth = {
@@ -120,10 +124,10 @@ def plant(
 
 
 def coloured(shape, seed):
-    """First-order noise (time, sensor) of standard deviation `NOISE`."""
+    """First-order noise (time, sensor) of standard deviation one."""
     white = np.random.default_rng(seed).normal(size=shape)
     filtered = scipy.signal.lfilter([np.sqrt(1 - MEMORY**2)], [1, -MEMORY], white, axis=0)
-    return NOISE * np.asarray(filtered)
+    return np.asarray(filtered)
 
 
 class Rehearsal:
@@ -137,13 +141,15 @@ class Rehearsal:
             [2.0 * scipy.signal.chirp(times, 2.0, times[-1], 30.0, phi=phi) for phi in phases], 1
         )
         self.clean = made.readings(times, commands)
-        sensors = self.clean.shape[1]
+        quantities = tuple(sensor.quantity for sensor in made.case.sensors)
+        self.noise = np.array([NOISE[quantity] for quantity in quantities])
+        sensors = len(quantities)
         log = Log(
             times,
             np.column_stack([self.clean, commands]),
             tuple(f"c{i}" for i in range(sensors + count)),
-            ("deflection",) * sensors + ("voltage",) * count,
-            ("m",) * sensors + ("V",) * count,
+            quantities + ("voltage",) * count,
+            tuple(UNITS[quantity] for quantity in quantities) + ("V",) * count,
             actuators=(None,) * sensors + tuple(range(count)),
         )
         start = {address: 1.06 * value for address, value in made.truth.items()}
@@ -154,8 +160,8 @@ class Rehearsal:
         self.known = np.array([n.inward(made.truth[n.address]) for n in self.numbers])
 
     def fit(self, noise, free, held=None):
-        """A fit of what is free, the other numbers `held`, or known."""
-        measured = (self.clean + noise)[None]
+        """A fit of what is free, the other numbers `held`, or known; noise of unit size."""
+        measured = (self.clean + self.noise * noise)[None]
         start = np.where(free, self.search.start, self.known if held is None else held)
         return self.search.estimate(measured, start=start, free=free)
 
@@ -168,5 +174,5 @@ class Rehearsal:
         """All of a fit."""
         campaign = self.search.campaign
         fit = fit_of(campaign.cases[0], self.search, found)
-        noisy = dataclasses.replace(campaign, measured=(self.clean + noise)[None])
+        noisy = dataclasses.replace(campaign, measured=(self.clean + self.noise * noise)[None])
         return dataclasses.replace(fit, campaign=noisy)

@@ -208,6 +208,7 @@ def faulty(quantities=("deflection", "deflection"), **about) -> Log:
 
 LATE = (jb.MovingMass(mass=0.5, speed=1.0, entry_time=0.9),)
 SOON = (jb.MovingMass(mass=0.5, speed=2.0),)
+FORCE = (jb.MovingForce(force=5.0, speed=2.0),)
 SLOW = (jb.MovingMass(mass=0.5, speed=0.5),)
 FAULTS = {
     "no logs": ([], "give at least one log"),
@@ -236,7 +237,7 @@ FAULTS = {
         "speed and entry time",
     ),
     "no loads": (faulty(loads=()), "run.csv: no load is known, neither in the case nor in"),
-    "unlike loads": ([faulty(), faulty(loads=SOON + SOON)], "the logs differ in the kind"),
+    "unlike loads": ([faulty(), faulty(loads=FORCE)], "the logs differ in the kinds of their"),
 }  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.case import replace
 from tests.oracles import finite_elements
-from tests.tuning.rehearsals import NOISE, SAGGING, SHAKER, Rehearsal, plant
+from tests.tuning.rehearsals import SAGGING, SHAKER, Rehearsal, plant
 from tuning.criticism import compare_fits
 
 LATE = 4e-3  # s
@@ -29,7 +29,7 @@ def rehearsal() -> Rehearsal:
         [jb.Shaker(**(SHAKER | {"position": 0.9}))],
         [finite_elements.Suspension(0.9, *list(SHAKER.values())[1:3])],
         {0.6: 1e7, 1.2: SAGGING},
-        (0.3, 0.9),
+        [(0.3,), (0.9,)],
         modes=5,
         ends="pinned-free",
     )
@@ -40,7 +40,7 @@ def rehearsal() -> Rehearsal:
 
 @pytest.mark.slow
 def test_the_log_tells_sagging_supports_and_late_actuators(rehearsal):
-    noise = NOISE * np.random.default_rng(0).normal(size=rehearsal.clean.shape)
+    noise = np.random.default_rng(0).normal(size=rehearsal.clean.shape)
     names = list(rehearsal.truth)
     held = rehearsal.truth | {SUPPORT: STIFF, BANDWIDTH: PROMPT}
     point = [n.inward(held[n.address]) for n in rehearsal.numbers]
