@@ -1,0 +1,77 @@
+"""No controller of ours beats the bound: feedback, predictive control, passage and relief."""
+
+import dataclasses
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+import jaxbeam as jb
+from jaxbeam.control.bound import bound
+from jaxbeam.plan import make_plan
+
+PERIOD = 0.02
+CASE = jb.Case(
+    jb.Beam(0.6, 13.211, 0.812, 0.03, modes=2),
+    actuators=[
+        jb.Patch(0.2575, 0.3425, 8.292e-4, correction=0.4, amplifier_gain=200.0, limits=[-2.5, 7.5])
+    ],
+    sensors=[jb.Sensor(0.3)],
+    loads=[jb.MovingMass(mass=0.4, speed=2.0)],
+    run=jb.Run(0.4, sample_rate=250.0),
+)
+SHARES, DEPTHS = np.linspace(0, 1, 5), np.linspace(-2e-3, 0, 4)
+LAWS = {
+    "feedback": jb.Feedback([1.0], 1, [[1.0]], period=PERIOD),
+    "mpc": jb.MPC(4, 2, 1e-10, period=PERIOD, loads="known"),
+    "passage": jb.Passage([-0.2, -0.1], SHARES, np.ones((1, 5)), period=PERIOD),
+    "relief": jb.Relief(DEPTHS, np.ones((1, 4)), period=PERIOD),
+}
+CASES = {name: dataclasses.replace(CASE, controller=law) for name, law in LAWS.items()}
+
+
+@pytest.fixture(scope="module")
+def plans():
+    return {name: make_plan(case, None, 1e-6) for name, case in CASES.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+@settings(max_examples=12)
+@given(
+    mass=st.floats(0.05, 0.8),
+    speed=st.floats(1.6, 4.0),
+    strength=st.floats(2.0, 5.0),
+    weight=st.floats(-12.0, -7.0),
+    commands=st.lists(st.floats(-2.5, 7.5), min_size=5, max_size=5),
+)
+def test_no_controller_of_ours_beats_it(plans, mass, speed, strength, weight, commands):
+    """Each with numbers drawn at random, on a load drawn at random, at the same ticks."""
+    load = {"loads.0.mass": mass, "loads.0.speed": speed}
+    least = bound(jb.replace(CASE, load), period=PERIOD)
+    numbers = {
+        "feedback": {
+            "controller.gains.0": 10**strength,
+            "controller.higher_gains.0.0": 10 ** (strength + 6),
+        },
+        "mpc": {"controller.move_weight": 10**weight},
+        "passage": {"controller.values": np.array([commands])},
+        "relief": {"controller.values": np.array([commands[:4]])},
+    }
+    reached = []
+    for name, case in CASES.items():
+        record = jb.simulate(jb.replace(case, load | numbers[name]), plan=plans[name])
+        if not np.all(np.isfinite(record.deflection)):
+            continue  # a loop that diverges has beaten nothing
+        assert np.max(np.abs(record.deflection)) >= least.peak * (1 - 1e-6), name
+        reached.append(least.share(record))
+    assert reached and max(reached) <= 1 + 1e-6
+
+
+@pytest.mark.slow
+def test_predictive_control_comes_near_it(plans):
+    """So the inequality above is not held by laws that are all poor."""
+    case = jb.replace(CASES["mpc"], {"controller.move_weight": 1e-12})
+    record = jb.simulate(case, plan=plans["mpc"])
+    assert 2 / 3 < bound(CASE, period=PERIOD).share(record) <= 1 + 1e-6
