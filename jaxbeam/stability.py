@@ -8,7 +8,6 @@ equal loads that follow each other for ever, by the multipliers of one period (F
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,7 +18,7 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 
-from jaxbeam.case import Case, known_case, replace
+from jaxbeam.case import Case, known_case
 from jaxbeam.compiling import compiled
 from jaxbeam.fields import known
 from jaxbeam.linear_loop import linear, prepared
@@ -161,44 +160,6 @@ def stream(case: Case, spacing: float) -> Stream:
     steps = _substeps(loop, clock, times)
     whole, _ = _transitions(loop, clock, jnp.asarray(times), steps)
     return Stream(np.linalg.eigvals(np.asarray(whole[-1])), float(spacing))
-
-
-def limit(
-    case: Case,
-    address: str,
-    low: float,
-    high: float,
-    measure: Callable[[Case], float] | None = None,
-    points: int = 25,
-) -> float | None:
-    """The least value of a number of the case between two at which the loop turns unstable.
-
-    For the margin in mass or speed give `loads.0.mass` or `loads.0.speed`. `measure` is above
-    zero for an unstable case: the largest real part of the frozen poles over the crossing if left
-    out; for the other criteria `lambda case: growth(case).factor.max() - 10` (by choice), or
-    `lambda case: stream(case, spacing).largest - 1`. Values at `points` steps are tried, then the
-    first change is bracketed to 1e-6. None if there is none. Raises ValueError for an address
-    that is not there, and if the case is unstable already at `low`.
-    """
-    if not 0 < low < high:
-        raise ValueError(f"low and high must be positive and ascend; they are {low:g}, {high:g}")
-
-    def at(value):
-        changed = replace(case, {address: float(value)})
-        if measure is None:
-            return float(frozen_poles(changed).largest.max())
-        return measure(changed)
-
-    values = np.geomspace(low, high, points)
-    before = at(values[0])
-    if before > 0:
-        raise ValueError(f"the loop is unstable already at {address} = {low:g}; start lower")
-    for below, above in zip(values[:-1], values[1:], strict=True):
-        after = at(above)
-        if after > 0:
-            return float(scipy.optimize.brentq(at, below, above, rtol=1e-6))
-        before = after
-    return None
 
 
 def _crossing(case: Case) -> tuple[float, float]:

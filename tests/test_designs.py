@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.control.beliefs import Beliefs
-from jaxbeam.stability import frozen_poles, limit
+from jaxbeam.limits import limit
+from jaxbeam.stability import frozen_poles
 from tests import test_stability as oracle
 from tests.test_stability import LENGTH, MASS, SPEED, rig, written_out
 

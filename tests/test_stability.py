@@ -11,9 +11,10 @@ import scipy.linalg
 
 import jaxbeam as jb
 from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.limits import limit
 from jaxbeam.linear_loop import linear_loop
 from jaxbeam.margins import gramians, margins
-from jaxbeam.stability import _followed, frozen_poles, growth, limit, stream
+from jaxbeam.stability import _followed, frozen_poles, growth, stream
 from jaxbeam.statespace import state_space
 
 REFERENCE = json.loads((Path(__file__).parent / "data/optimal_control.json").read_text())

@@ -15,6 +15,8 @@ def stability(
     /,
     *,
     set_: Settings = (),
+    limits: bool = False,
+    spacing: float | None = None,
     plot: bool = False,
     overwrite: Overwrite = False,
     json_: Json = False,
@@ -25,12 +27,19 @@ def stability(
     ----------
     case
         Case file with a controller, TOML.
+    limits
+        Search the mass and the speed of the first load from which the loop is unstable, from those
+        of the case up to ten times as much, or down to a tenth where it is unstable as it is.
+    spacing
+        Also of an endless stream of the load, one every so many seconds: what a period multiplies
+        deviations by (Floquet); with --limits, where that exceeds one.
     plot
         Draw the poles along the crossing to CASE_poles.png in this folder.
     """
+    from jaxbeam.limits import frozen, load_limits, streaming
     from jaxbeam.linear_loop import linear_loop
     from jaxbeam.margins import margins
-    from jaxbeam.stability import frozen_poles, growth
+    from jaxbeam.stability import frozen_poles, growth, stream
 
     picture = picture_path(None, case.with_stem(f"{case.stem}_poles")) if plot else None
     check_outputs(overwrite, picture)
@@ -41,6 +50,10 @@ def stability(
     each = [margins(alone, i) for i in range(len(described.actuators))] if settled else []
     poles = frozen_poles(described)
     grown = growth(described) if described.loads else None
+    passing = None if spacing is None else stream(described, spacing)
+    by = {"loads frozen": frozen} if limits else {}
+    by |= {"a stream": streaming(spacing)} if limits and spacing is not None else {}
+    found = {word: load_limits(described, measure) for word, measure in by.items()}
     if picture:
         from jaxbeam.plot import plot_poles
 
@@ -54,6 +67,8 @@ def stability(
                 "largest_real_part": poles.largest[worst],
                 "at_time": poles.times[worst],
                 "largest_growth": None if grown is None else grown.factor.max(),
+                "largest_multiplier": None if passing is None else passing.largest,
+                "unstable_from": {word: each._asdict() for word, each in found.items()},
             }
         )
         return
@@ -80,4 +95,21 @@ def stability(
             "over the crossing a deviation grows at most by a factor of"
             f" {grown.factor.max():.4g}, to {grown.factor[-1]:.3g} at its end"
         )
+    if passing is not None:
+        print(
+            f"in an endless stream, a load every {passing.period:g} s, a deviation is multiplied by"
+            f" at most {passing.largest:.4g} each time: {'' if passing.stable else 'un'}stable"
+        )
+    for word, each in found.items():
+        pairs = (("mass", each.mass, "kg"), ("speed", each.speed, "m/s"))
+        for name, value, unit in pairs:
+            if value is not None:
+                print(f"with {word} the loop is unstable {_from(name, value, unit)}")
     print_written(picture)
+
+
+def _from(name: str, value: float, unit: str) -> str:
+    """From where on a loop is unstable, in words."""
+    if value == 0:
+        return f"at every {name} that was tried"
+    return f"at no {name} that was tried" if value == np.inf else f"from {value:.4g} {unit} on"

@@ -1,0 +1,94 @@
+"""At which value of a number a loop turns unstable: margins in mass and in speed, by search."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+
+from jaxbeam.case import Case, replace
+from jaxbeam.fields import known
+from jaxbeam.stability import frozen_poles, stream
+
+# What is above zero for an unstable case.
+Measure = Callable[[Case], float]
+
+
+class LoadLimits(NamedTuple):
+    """From which mass (kg) and which speed (m/s, its size) of its load a loop is unstable.
+
+    Infinite where no limit was found, zero where all that was tried is unstable; None where the
+    load has no such number.
+    """
+
+    mass: float | None
+    speed: float | None
+
+
+def frozen(case: Case) -> float:
+    """The largest real part (1/s) of the frozen poles over the crossing."""
+    return float(frozen_poles(case).largest.max())
+
+
+def streaming(spacing: float) -> Measure:
+    """By how much the largest multiplier of a stream, loads a `spacing` (s) apart, exceeds one."""
+    return lambda case: stream(case, spacing).largest - 1
+
+
+def limit(
+    case: Case,
+    address: str,
+    low: float,
+    high: float,
+    measure: Measure = frozen,
+    points: int = 25,
+) -> float | None:
+    """The least value of a number of the case between two at which the loop turns unstable.
+
+    For the margin in mass or speed give `loads.0.mass` or `loads.0.speed`. `measure` is above
+    zero for an unstable case: `frozen`, `streaming(spacing)`, or any other, such as
+    `lambda case: growth(case).factor.max() - 10` (by choice). Values at `points` steps are tried,
+    then the first change is bracketed to 1e-6. The bounds have the sign of the number, the larger
+    size last. None if there is no such value. Raises ValueError for an address that is not there,
+    and if the case is unstable already at `low`.
+    """
+    if not 0 < low < high and not high < low < 0:
+        raise ValueError(f"low and high must be positive and ascend; they are {low:g}, {high:g}")
+
+    def at(value):
+        return measure(replace(case, {address: float(value)}))
+
+    values = np.geomspace(low, high, points)
+    if at(values[0]) > 0:
+        raise ValueError(f"the loop is unstable already at {address} = {low:g}; start lower")
+    for below, above in zip(values[:-1], values[1:], strict=True):
+        if at(above) > 0:
+            return float(scipy.optimize.brentq(at, below, above, rtol=1e-6))
+    return None
+
+
+def load_limits(
+    case: Case, measure: Measure = frozen, most: float = 10.0, points: int = 12
+) -> LoadLimits:
+    """From which mass and which speed of its first load a loop is unstable, all else kept.
+
+    Tried are values up to `most` times as large as that of the case, or, where the case is unstable
+    as it is, down to as many times smaller ones. Laws are designed anew for each. Raises ValueError
+    for a case without loads, and as `measure`.
+    """
+    if not case.loads:
+        raise ValueError("there is no load whose mass or speed could have a limit; add one")
+    unstable = measure(case) > 0
+
+    def of(name):
+        value = getattr(case.loads[0], name)
+        if value is None or known(value) == 0:
+            return None
+        value, address = float(known(value)), f"loads.0.{name}"
+        low, high = (value / most, value) if unstable else (value, value * most)
+        if unstable and measure(replace(case, {address: low})) > 0:
+            return 0.0
+        found = limit(case, address, low, high, measure, points)
+        return np.inf if found is None else abs(found)
+
+    return LoadLimits(of("mass"), of("speed"))

@@ -1,0 +1,147 @@
+"""Margins in mass and speed; branches that cross; what frozen poles say of loops that change."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+
+import jaxbeam as jb
+from jaxbeam.cli import main
+from jaxbeam.limits import LoadLimits, load_limits, streaming
+from jaxbeam.stability import frozen_poles, stream
+from tests.test_stability import LENGTH, MASS, SPEED, regulator, rig, written_out
+
+STATES = np.diag([1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0])
+
+
+def regulated(x, speed=SPEED, mass=MASS):
+    """The loop of the published regulator, all states fed back, its load frozen at a place."""
+    A, B = written_out(0.0, 0.0, 0.0, 4.6)
+    P = scipy.linalg.solve_continuous_are(A, B, STATES, [[9e-5]])
+    return written_out(x, speed, mass, 4.6)[0] - B @ B.T @ P / 9e-5
+
+
+def fastest_growth(speed, mass):
+    places = LENGTH * np.linspace(0.0, 1.0, 101)[:-1]
+    return max(np.linalg.eigvals(regulated(x, speed, mass)).real.max() for x in places)
+
+
+def test_margins_of_the_published_regulator():
+    """Where the largest real part of written-out poles over the crossing turns positive."""
+    case = jb.replace(rig(regulator()), {"loads.0.mass": 0.15})
+    found = load_limits(case, most=2.0, points=3)
+    mass = scipy.optimize.brentq(lambda m: fastest_growth(SPEED, m), 0.15, 0.3, rtol=1e-7)
+    assert found.mass == pytest.approx(mass, rel=1e-5)
+    assert found.speed == np.inf and fastest_growth(2 * SPEED, 0.15) < 0
+
+
+@pytest.mark.parametrize(
+    ("limit", "expected"),
+    [(0.7, 0.7), (0.2, 0.2), (0.01, 0.0), (1e3, np.inf)],  # beyond, before, below, nowhere
+)
+def test_limits_are_sought_upward_or_downward(limit, expected):
+    case = rig(jb.Feedback([1.0]))
+    found = load_limits(case, lambda case: float(case.loads[0].mass) - limit, points=4)
+    assert found.mass == pytest.approx(expected, rel=1e-5)
+    assert found.speed == (np.inf if limit > MASS else 0.0)
+
+
+def test_what_a_load_lacks_has_no_limit():
+    parked = [jb.MovingMass(mass=0.1, times=[0.0, 1.0], positions=[0.2, 0.2])]
+    case = rig(jb.Feedback([1.0]), loads=parked)
+    assert load_limits(case, lambda case: -1.0, points=2) == LoadLimits(np.inf, None)
+    left = rig(jb.Feedback([1.0]), loads=[jb.MovingMass(mass=0.1, speed=-1.0)])
+    found = load_limits(left, lambda case: -2.0 - float(case.loads[0].speed), points=4)
+    assert found == LoadLimits(np.inf, pytest.approx(2.0, rel=1e-5))
+    with pytest.raises(ValueError, match="there is no load whose mass or speed"):
+        load_limits(rig(jb.Feedback([1.0]), loads=[]))
+
+
+def test_branches_are_followed_where_modes_cross():
+    """Two pairs of the published loop swap their frequencies near the middle of the beam.
+
+    Independently they are followed by the likeness of their eigenvectors, in far shorter steps.
+    """
+    places = np.linspace(0.2, 0.42, 45)
+    found = frozen_poles(rig(regulator()), places / SPEED)
+    fine, vectors = [], None
+    for x in np.linspace(0.2, 0.42, 44 * 50 + 1):
+        values, columns = np.linalg.eig(regulated(x))
+        if vectors is None:
+            order = np.argsort(values.imag)
+        else:
+            alike = np.abs(vectors.conj().T @ columns)
+            order = scipy.optimize.linear_sum_assignment(-alike)[1]
+        vectors = columns[:, order]
+        fine.append(values[order])
+    fine = np.array(fine)[::50]
+    start = np.argsort(found.poles[0].imag)
+    np.testing.assert_allclose(found.poles[:, start], fine, rtol=1e-6)
+    # One overtakes the other: sorted by frequency at each place they would be mixed up.
+    upper = fine[:, -2:].imag
+    assert np.all(np.diff(upper[0]) > 0) != np.all(np.diff(upper[-1]) > 0)
+
+
+def period(row, speed, mass, spacing, steps=400):
+    """What a stream multiplies deviations by: a product of exponentials, by Magnus (order 4)."""
+    end, size = LENGTH / speed, row.shape[1]
+    step, whole, reach = end / steps, np.eye(size), np.sqrt(3) / 6
+
+    def closed(t):
+        A, B = written_out(speed * t, speed, mass, 4.6, modes=2)
+        return A - B @ row
+
+    for k in range(steps):
+        early, late = (closed(step * (k + 0.5 + side * reach)) for side in (-1, 1))
+        turn = np.sqrt(3) / 12 * step**2 * (late @ early - early @ late)
+        whole = scipy.linalg.expm(step / 2 * (early + late) + turn) @ whole
+    A, B = written_out(0.0, 0.0, 0.0, 4.6, modes=2)
+    return scipy.linalg.expm((spacing - end) * (A - B @ row)) @ whole
+
+
+def largest_frozen(row, speed, mass):
+    places = LENGTH * np.linspace(0.0, 1.0, 101)[:-1]
+    frozen = [written_out(x, speed, mass, 4.6, modes=2) for x in places]
+    return max(np.linalg.eigvals(A - B @ row).real.max() for A, B in frozen)
+
+
+def streamed(row, speed, mass):
+    """A case with two modes under a feedback of states."""
+    case = rig(jb.StateFeedback(gain=row, coordinates="sine"), modes=2)
+    return jb.replace(case, {"loads.0.speed": speed, "loads.0.mass": mass})
+
+
+def test_a_stream_may_be_stable_where_frozen_poles_are_not():
+    """A beam without control dissipates, whatever crosses it; its frozen poles at 12 m/s grow."""
+    row, speed, spacing = np.zeros((1, 5)), 12.0, 1.5 * LENGTH / 12.0
+    case = streamed(row, speed, MASS)
+    worst, found = frozen_poles(case).largest.max(), stream(case, spacing)
+    assert worst == pytest.approx(largest_frozen(row, speed, MASS), rel=1e-6) and worst > 10
+    expected = np.abs(np.linalg.eigvals(period(row, speed, MASS, spacing))).max()
+    assert found.largest == pytest.approx(expected, rel=1e-4) and found.stable
+    slow = dataclasses.replace(case.loads[0], speed=np.asarray(6.0))
+    limits = load_limits(dataclasses.replace(case, loads=(slow,)), streaming(0.15), 3.0, 3)
+    assert limits == LoadLimits(np.inf, np.inf)
+    # By its frozen poles it would have a limit.
+    limit = scipy.optimize.brentq(lambda v: largest_frozen(row, v, MASS), 6.0, 12.0, rtol=1e-7)
+    found = load_limits(dataclasses.replace(case, loads=(slow,)), most=3.0, points=3)
+    assert found.speed == pytest.approx(limit, rel=1e-5)
+
+
+def test_the_command_tells_limits_and_multipliers(tmp_path, capsys):
+    case = jb.replace(rig(jb.Feedback([3000.0]), modes=2), {"loads.0.speed": 6.0})
+    jb.save_case(case, tmp_path / "case.toml")
+
+    with pytest.raises(SystemExit) as ended:
+        main(["stability", str(tmp_path / "case.toml"), "--limits", "--spacing", "0.15"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert f"multiplied by at most {stream(case, 0.15).largest:.4g} each time: stable" in text
+    mass = float(re.search(r"loads frozen the loop is unstable from (\S+) kg on", text)[1])
+    for share, unstable in ((0.999, False), (1.001, True)):
+        poles = frozen_poles(jb.replace(case, {"loads.0.mass": share * mass}))
+        assert (poles.largest.max() > 0) == unstable
+    assert "with a stream the loop is unstable at no" in text
