@@ -78,6 +78,14 @@ LOOPS = {
         jb.ScheduledLQR(**REGULATOR, points=24, masses=[0.2, 0.4], speeds=[1.0, 2.0]),
         {"controller.state_weight.0": 1e4, "controller.masses.0": 0.2},
     ),
+    "scheduled feedback": (
+        jb.ScheduledFeedback([0.2, 0.6], [[2000.0, 4000.0]], power=1, period=0.01),
+        {
+            "controller.gains.0.0": 2000.0,
+            "controller.gains.0.1": 4000.0,
+            "controller.masses.1": 0.6,
+        },
+    ),
     "prescribed": (
         jb.Prescribed(offsets=[1.0], times=[0.0, 0.2, 0.5], values=[[0.0, 6.0, 0.0]], period=0.01),
         {"controller.values.0.1": 6.0, "controller.offsets.0": 1.0},
