@@ -138,7 +138,7 @@ def _numbers(option: str, text: str, entries: Sequence[str]) -> list[float]:
         raise ValueError(f"{option} {text}: {word} is not a number") from None
 
 
-def bounds_of(text: str) -> tuple[str, tuple[float, float] | None]:
+def bounds_of(text: str, option: str = "--free") -> tuple[str, tuple[float, float] | None]:
     """The address and the bounds of ADDRESS or ADDRESS=LOW:HIGH.
 
     Raises ValueError if the bounds are no two increasing numbers.
@@ -146,10 +146,19 @@ def bounds_of(text: str) -> tuple[str, tuple[float, float] | None]:
     address, equals, value = text.partition("=")
     if not equals:
         return address, None
-    bounds = _numbers("--free", text, value.split(":"))
+    bounds = _numbers(option, text, value.split(":"))
     if len(bounds) != 2 or bounds[0] >= bounds[1]:
-        raise ValueError(f"--free {text}: bounds are LOW:HIGH, such as 5:20")
+        raise ValueError(f"{option} {text}: bounds are LOW:HIGH, such as 5:20")
     return address, (bounds[0], bounds[1])
+
+
+def range_of(option: str, text: str, words: str) -> tuple[float, float]:
+    """The two numbers of LOW:HIGH, a range in the words given. Raises ValueError otherwise."""
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        raise ValueError(f"{option} takes LOW:HIGH in {words}, not {text!r}") from None
+    return low, high
 
 
 def picture_path(output: Path | None, source: Path) -> Path:

@@ -43,6 +43,15 @@ class Design:
     slopes: Float[np.ndarray, "free choice"]
     case: Case
 
+    def to_dict(self) -> dict:
+        """Choices and standard errors, each before and after (SI units), as plain data."""
+        choices = zip(self.choices, self.before, self.after, strict=True)
+        errors = zip(self.addresses, self.errors_before, self.errors_after, strict=True)
+        return {
+            "choices": {name: {"before": a, "after": b} for name, a, b in choices},
+            "standard_errors": {name: {"before": a, "after": b} for name, a, b in errors},
+        }
+
     def __str__(self) -> str:
         rows = zip(self.choices, self.units, self.before, self.after, strict=True)
         lines = [f"{choice}: {a:.5g} -> {b:.5g} {unit}" for choice, unit, a, b in rows]

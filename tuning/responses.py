@@ -168,6 +168,15 @@ class ResponseFit:
         half = reach(self.freedom) * self.errors
         return np.stack([self.values - half, self.values + half], axis=1)
 
+    def to_dict(self) -> dict:
+        """Numbers with their intervals (SI units), misfits by pair and the verdict."""
+        rows = zip(self.addresses, self.values, self.intervals, strict=True)
+        return {
+            "numbers": {name: {"value": v, "interval_95": pair} for name, v, pair in rows},
+            "misfit": self.misfit,
+            "verdict": self.verdict,
+        }
+
     def __str__(self) -> str:
         width = max(map(len, self.addresses))
         lines = [

@@ -13,7 +13,17 @@ from typing import NoReturn
 
 from cyclopts import CycloptsError
 
-from jaxbeam.cli import checking, comparing, exporting, identifying, reproducing, simulating, tuning
+from jaxbeam.cli import (
+    checking,
+    comparing,
+    exporting,
+    identifying,
+    judging,
+    reproducing,
+    simulating,
+    tuning,
+    weighing,
+)
 from jaxbeam.cli.app import app, say
 
 __all__ = [
@@ -21,10 +31,12 @@ __all__ = [
     "comparing",
     "exporting",
     "identifying",
+    "judging",
     "main",
     "reproducing",
     "simulating",
     "tuning",
+    "weighing",
 ]
 
 

@@ -128,61 +128,6 @@ def identify(
     _identify_modes(logs, pictures, json_)
 
 
-@app.command
-def weigh(
-    case: Path,
-    log: Path,
-    /,
-    *,
-    speeds: str,
-    most: int = 3,
-    one_way: bool = False,
-    output: Output = None,
-    set_: Settings = (),
-    overwrite: Overwrite = False,
-    json_: Json = False,
-) -> None:
-    """Weigh the loads that crossed a known beam: their number, masses, speeds and entry times.
-
-    Parameters
-    ----------
-    case
-        Case file, TOML, with sensors of deflection; its loads are not used.
-    log
-        Their readings.
-    speeds
-        LOW:HIGH: the speeds (m/s) that come into question.
-    most
-        How many loads to look for at most.
-    one_way
-        Look for loads from the left only.
-    output
-        Write the case with the loads found to this file, TOML.
-    """
-    import tuning
-    from jaxbeam.casefile import save_case
-
-    check_outputs(overwrite, output)
-    found = tuning.weigh(
-        read_case(case, set_), tuning.read_log(log), _range(speeds), most, both_ways=not one_way
-    )
-    if output:
-        save_case(found.fit.case, output, overwrite=True)  # checked before the work
-    if json_:
-        print_json(found.to_dict())
-    else:
-        print(found)
-        print_written(output)
-
-
-def _range(speeds: str) -> tuple[float, float]:
-    try:
-        low, high = map(float, speeds.split(":"))
-    except ValueError:
-        raise ValueError(f"--speeds takes LOW:HIGH in m/s, such as 0.5:3, not {speeds!r}") from None
-    return low, high
-
-
 def _beside(output: Path | None, suffix: str) -> Path | None:
     return None if output is None else output.with_suffix(suffix)
 

@@ -99,29 +99,3 @@ REFUSED = [
 def test_wrong_options_end_in_one_sentence(call, options, words):
     code, out, err = call(f"identify case.toml runs.csv {options}")
     assert code == 1 and out == "" and words in err and err.count("\n") == 1
-
-
-def test_weighing(call, tmp_path, monkeypatch):
-    fit = stand_in.fit()
-    asked = {}
-
-    class Weighed:
-        def __init__(self, *given, **settings):
-            asked.update(given=given, settings=settings)
-            self.fit = fit
-
-        def to_dict(self):
-            return {"loads": np.ones(2)}
-
-        def __str__(self):
-            return "one load found"
-
-    monkeypatch.setattr(tuning, "weigh", Weighed)
-    (tmp_path / "log.csv").write_text("t [s],a [mm]\n0,1\n1,2\n2,1\n")
-    code, out, _ = call("weigh case.toml log.csv --speeds 0.5:3 --one-way -o found.toml")
-    assert (code, out) == (0, "one load found\nwritten: found.toml\n")
-    assert asked["given"][2:] == ((0.5, 3.0), 3) and asked["settings"] == {"both_ways": False}
-    code, out, _ = call("weigh case.toml log.csv --speeds 0.5:3 --json")
-    assert json.loads(out) == {"loads": [1.0, 1.0]}
-    code, _, err = call("weigh case.toml log.csv --speeds fast")
-    assert code == 1 and "--speeds takes LOW:HIGH in m/s, such as 0.5:3, not 'fast'" in err
