@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments import published
 from experiments.ripple import gain_margin, rippled
+from experiments.scheduling import STRONGER, by_statics, derived, switched
 from experiments.verdicts import Experiment, Outcome, finding
 from jaxbeam.plan import make_plan
 from jaxbeam.plot.style import colour, name, styled
@@ -24,8 +25,6 @@ ONE_CUTOFF, TWO_CUTOFF = 10.0, 20.0  # Hz
 CORRECTIONS = (0.32, 0.39, 0.5)  # c_p of 2.4.2, that of two spans, and one that fits Fig. 6.7
 GAPS = (0.3, 0.6, 0.9, 1.2, 1.5)  # s between two masses
 LATER, LESS_DAMPING = 0.03, 0.01  # s and 1: what section 6.2 does not print, and would explain it
-STRONGER = (3.0, 4.5)  # V/mm, gains of the linear law as it may be scheduled
-GAINS = (1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)  # V per mm or mm^3, tried for each mass
 TOLERANCE = 1e-4
 
 
@@ -54,9 +53,9 @@ def runs(case: jb.Case, changes) -> list[jb.Record]:
 
 def run(load) -> Outcome:
     """Peaks without control and under both laws, on rigs B and C."""
-    one, one_figures = _one_span(load("B"))
+    one, one_figures, remarks = _one_span(load("B"))
     two, two_figures = _two_spans(load("C"))
-    return Outcome((*two, *one), two_figures | one_figures)
+    return Outcome((*two, *one), two_figures | one_figures, remarks)
 
 
 def _less(free, other):
@@ -163,15 +162,13 @@ def _one_span(case: jb.Case):
     peaks = [[float(r.peak_deflection[0]) for r in row] for row in found]
     shape = len(CORRECTIONS), len(MASSES)
     linear, cubic = (_less(peaks[0], row).reshape(shape) for row in peaks[1:])
-    linears = [np.reshape(peaks[1], shape)]
+    stronger = []
     for gain in STRONGER:
         higher = [change | {"controller.gains.0": gain * 1e3} for change in changes]
         records = runs(controlled(case, 1, ONE_CUTOFF), higher)
-        linears.append(np.reshape([float(r.peak_deflection[0]) for r in records], shape))
-    cubic_peaks = np.reshape(peaks[2], shape)
-    behind = np.array(linears) - cubic_peaks  # gain, c_p, mass: what linear lacks, in m
-    switches = [[_zero(MASSES, behind[k, i]) for k in (0, 1)] for i in range(len(CORRECTIONS))]
-    last = [[_zero((GAIN, *STRONGER), lack)] for lack in behind[:, :, -1].T]
+        stronger.append(np.reshape([float(r.peak_deflection[0]) for r in records], shape))
+    switches, last = switched(MASSES, np.reshape(peaks, (3, *shape)), np.array(stronger))
+    schedule, remark = derived(controlled(case, 1, ONE_CUTOFF), MASSES, runs)
     words = [f"c_p {share:g}" for share in CORRECTIONS]
 
     def by_correction(printed, values):
@@ -194,36 +191,16 @@ def _one_span(case: jb.Case):
     oscillating, oscillation = rippled(controlled(case, 3, ONE_CUTOFF), runs)
     findings += oscillating
     heaviest = {word: row[len(MASSES) - 1] for word, row in zip(LAWS, found, strict=True)}
-    return findings, {
-        "one-span": _draw(heaviest, "One span, 0.509 kg (Figs 6.3, 6.5)"),
-        "filters": oscillation,
-        "reductions": _draw_reductions(linear[0], cubic[0]),
-        "schedule": _draw_schedule(peaks[0][: len(MASSES)], *_by_gain(case)),
-    }
-
-
-def _zero(places, values) -> float:
-    """Where the polynomial through some values is zero between the first and last; or NaN."""
-    through = np.polynomial.Polynomial.fit(places, values, len(places) - 1)
-    roots = through.roots()
-    inside = (abs(roots.imag) < 1e-9) & (roots.real > places[0]) & (roots.real < places[-1])
-    return float(roots.real[inside][0]) if inside.any() else np.nan
-
-
-def _by_gain(case: jb.Case) -> tuple[np.ndarray, np.ndarray]:
-    """Peaks (mass, gain; m) under the linear and under the cubic law, infinite if one diverges."""
-    found = []
-    for power in (1, 3):
-        changes = [
-            {"loads.0.mass": mass, "controller.gains.0": gain * 1e3**power}
-            for mass in MASSES
-            for gain in GAINS
-        ]
-        records = runs(controlled(case, power, ONE_CUTOFF), changes)
-        peaks = np.array([float(r.peak_deflection[0]) for r in records])
-        found.append(np.nan_to_num(peaks, nan=np.inf).reshape(len(MASSES), len(GAINS)))
-    linear, cubic = found
-    return linear, cubic
+    return (
+        findings,
+        {
+            "one-span": _draw(heaviest, "One span, 0.509 kg (Figs 6.3, 6.5)"),
+            "filters": oscillation,
+            "reductions": _draw_reductions(linear[0], cubic[0]),
+            "schedule": schedule,
+        },
+        (by_statics(case, MASSES[-1]), remark),
+    )
 
 
 @styled
@@ -268,25 +245,6 @@ def _draw_reductions(linear, cubic) -> Figure:
     axes.set(xlabel="mass (kg)", ylabel="reduction of the peak (%)")
     axes.legend(loc="upper left")
     name(figure, "One span, c_p 0.32 (Fig. 6.6)")
-    return figure
-
-
-@styled
-def _draw_schedule(free, linear, cubic) -> Figure:
-    """Fig. 6.7: for each mass the gain with the lowest peak, and how far it reduces that."""
-    figure = Figure(figsize=(7.2, 3.0))
-    left, right = figure.subplots(1, 2)
-    for i, (peaks, word) in enumerate(((linear, "linear"), (cubic, "cubic"))):
-        best = np.argmin(peaks, axis=1)
-        lowest = peaks[np.arange(len(MASSES)), best]
-        left.step(MASSES, np.array(GAINS)[best], "o-", where="mid", color=colour(i), label=word)
-        right.plot(MASSES, _less(free, lowest), "o-", color=colour(i))
-        constant = _less(free, peaks[:, GAINS.index(GAIN)])
-        right.plot(MASSES, constant, "--", color=colour(i))
-    left.set(xlabel="mass (kg)", ylabel="best gain (V/mm, V/mm^3)")
-    right.set(xlabel="mass (kg)", ylabel="reduction of the peak (%)")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    name(figure, "One span, gain by mass; dashed: k = 2 (Fig. 6.7)")
     return figure
 
 
