@@ -93,7 +93,8 @@ def costs_to_go(
     """P at the start of each of successive stretches and, last, at the end, where it is given.
 
     One after the other; or `parallel` in time, in twice the logarithm of their number of steps
-    and about three times the work, which pays on a GPU.
+    and about three times the work. On two CPU cores that takes as long and compiles some ten
+    times as long; it can pay only where many more cores than designs are idle.
     """
     if parallel:
 

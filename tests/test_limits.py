@@ -11,7 +11,8 @@ import scipy.optimize
 import jaxbeam as jb
 from jaxbeam.cli import main
 from jaxbeam.limits import LoadLimits, load_limits, streaming
-from jaxbeam.stability import frozen_poles, stream
+from jaxbeam.stability import frozen_poles, growth, stream
+from tests import test_stability as oracle
 from tests.test_stability import LENGTH, MASS, SPEED, regulator, rig, written_out
 
 STATES = np.diag([1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0])
@@ -129,6 +130,23 @@ def test_a_stream_may_be_stable_where_frozen_poles_are_not():
     limit = scipy.optimize.brentq(lambda v: largest_frozen(row, v, MASS), 6.0, 12.0, rtol=1e-7)
     found = load_limits(dataclasses.replace(case, loads=(slow,)), most=3.0, points=3)
     assert found.speed == pytest.approx(limit, rel=1e-5)
+
+
+def test_a_crossing_may_amplify_where_every_frozen_pole_decays(monkeypatch):
+    """Deviations leave over twenty times larger, though no frozen pole is right of -2.5 1/s."""
+    monkeypatch.setattr(oracle, "DAMPER", 166.8)
+    row, speed, mass = np.array([[-1740.0, 7280.0, -45.0, -290.0, 0.0]]), 10.77, 0.125
+    case = streamed(row, speed, mass)
+    found, worst = growth(case, 20), frozen_poles(case).largest.max()
+    assert worst == pytest.approx(largest_frozen(row, speed, mass), rel=1e-6) and worst < -2.5
+    n, half = np.arange(1, 3) * np.pi / LENGTH, oracle.DENSITY * LENGTH / 2
+    pushed = np.sin(n * oracle.PLACE)
+    stiffness = half * np.diag(n**4 * oracle.RIGIDITY / oracle.DENSITY)
+    stiffness += oracle.SPRING * np.outer(pushed, pushed)
+    root = np.linalg.cholesky(scipy.linalg.block_diag(stiffness, half * np.eye(2))).T
+    whole = period(row, speed, mass, LENGTH / speed)[:4, :4]
+    expected = np.linalg.norm(root @ whole @ np.linalg.inv(root), 2)
+    assert found.factor[-1] == pytest.approx(expected, rel=1e-4) and expected > 20
 
 
 def test_the_command_tells_limits_and_multipliers(tmp_path, capsys):

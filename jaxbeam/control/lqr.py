@@ -190,7 +190,8 @@ class AbstractForesighted(AbstractScheduledRegulator):
 
     `terminal_weight` is the diagonal of F, eq. (3.3) of the thesis; Q if left out. The gains are
     right to 1e-8 of their largest, if a stretch of the table lasts no longer than seven time
-    constants of the fastest lag.
+    constants of the fastest lag. `in_time` is for devices with many cores: see
+    `stretches.costs_to_go`; the gains are the same.
     """
 
     terminal_weight: Float[Array, " state"] | None = number(
