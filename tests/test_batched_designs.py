@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.control import DiscreteLQR, ScheduledLQR
 from jaxbeam.controller import Measurement
+from jaxbeam.estimation import Kalman, Observer
 from jaxbeam.modes import lay_out
 from tests.differences import central
 
@@ -89,3 +90,34 @@ def test_slopes_by_loads_weights_and_plant(design):
 def test_in_parallel_the_gains_are_the_same():
     one, other = (jax.jit(answers(name))(np.ones(5)) for name in ("lqr-augmented", "parallel"))
     assert_allclose(one, other, rtol=1e-10)
+
+
+NOISY = {
+    "kalman": (Kalman(0.02, 1e-5), 2e-3),
+    "kalman at every instant": (Kalman(0.02, measurement_intensity=1e-13), None),
+    "observer": (Observer(speed=2.0), 2e-3),
+    "observer at every instant": (Observer(speed=2.0), None),
+}
+
+
+@pytest.mark.parametrize("name", NOISY)
+def test_gains_of_estimators_over_the_plant(name):
+    """At once for many rigidities and places of the sensor, and their slopes."""
+    estimator, period = NOISY[name]
+    case = rig(jb.LQR(**WEIGHTS, period=period, estimator=estimator))
+    layout = lay_out(case)
+
+    def gain(point):
+        values = {"beam.flexural_rigidity": 11.68 * point[0], "sensors.0.position": point[1] / 4}
+        changed = jb.replace(case, values)
+        model = jb.state_space(changed, layout=layout)
+        found = changed.controller.estimator.init(model).gain[:4, 0]
+        return found / jnp.array([1.0, 1.0, 200.0, 800.0])
+
+    alone, points = jax.jit(gain), np.array([[1.0, 1.0], [0.8, 1.1], [1.3, 0.7]])
+    expected = np.stack([alone(point) for point in points])
+    together = jax.jit(jax.vmap(gain))(points)
+    scale = np.abs(expected).max()
+    assert_allclose(together, expected, rtol=0, atol=1e-9 * scale)
+    slopes, differences = jax.jit(jax.jacfwd(gain))(points[0]), central(alone, points[0], 2e-3)
+    assert_allclose(slopes, differences, rtol=0, atol=1e-6 * np.abs(differences).max())
