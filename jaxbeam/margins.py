@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 import scipy.optimize
 from jaxtyping import Array, Float
 
@@ -18,6 +19,7 @@ from jaxbeam.linear_loop import LinearLoop
 from jaxbeam.statespace import StateSpace
 
 POINTS = 400  # frequencies around each pole
+DEFECTIVE = 1e12  # conditioning of eigenvectors beyond which they are too few
 BELOW = 1e-3  # lowest frequency looked at, relative to the lowest pole
 DOUBLINGS = 60
 VANISHED = 1e-9  # norm of a power of the state matrix that adds nothing any more
@@ -50,14 +52,11 @@ def margins(loop: LinearLoop, actuator: int = 0) -> Margins:
     others = np.arange(B.shape[1]) != actuator
     A = A + B[:, others] @ K[others]
     column, row = B[:, actuator], K[actuator]
-    values, vectors = np.linalg.eig(A)
-    # In its eigenvectors: one division for each frequency and pole.
-    parts = (row @ vectors) * np.linalg.solve(vectors, column.astype(complex))
+    values, transfer = _transfer(A, column, row)
 
     def response(omega):
         s = 1j * np.atleast_1d(omega)
-        s = s if loop.period is None else np.exp(s * loop.period)
-        return (parts / (s[:, None] - values)).sum(axis=1)
+        return transfer(s if loop.period is None else np.exp(s * loop.period))
 
     omega = _frequencies(values, loop.period)
     curve = response(omega)
@@ -91,6 +90,27 @@ def margins(loop: LinearLoop, actuator: int = 0) -> Margins:
         distance=min(least.fun, abs(1 - curve[near])),
     )
     return Margins(*map(float, found))
+
+
+def _transfer(A, column, row):
+    """The poles of row (s - A)^-1 column, and that as a function of many s (rad/s, or z)."""
+    values, vectors = np.linalg.eig(A)
+    if np.linalg.cond(vectors) < DEFECTIVE:
+        # In its eigenvectors: one division for each frequency and pole.
+        parts = (row @ vectors) * np.linalg.solve(vectors, column.astype(complex))
+        return values, lambda s: (parts / (s[:, None] - values)).sum(axis=1)
+    # What waits for several periods has too few eigenvectors: by back substitution then.
+    triangle, basis = scipy.linalg.schur(A, output="complex")
+    row, column = row @ basis, basis.conj().T @ column
+
+    def transfer(s):
+        found = np.zeros((column.size, s.size), complex)
+        for i in reversed(range(column.size)):
+            rest = column[i] + triangle[i, i + 1 :] @ found[i + 1 :]
+            found[i] = rest / (s - triangle[i, i])
+        return row @ found
+
+    return np.diag(triangle), transfer
 
 
 def _frequencies(poles, period) -> np.ndarray:

@@ -1,0 +1,54 @@
+"""Margins of loops with commands that wait for periods, against matrices written out."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.signal
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.linear_loop import linear_loop
+from jaxbeam.margins import margins
+from tests.loop_as_oracle import span_of
+
+PERIOD, GAIN = 0.002, 200.0
+
+
+def rig(delay) -> jb.Case:
+    return jb.Case(
+        jb.Beam(0.6, 13.211, 0.812, 0.03, modes=2),
+        actuators=[jb.Patch(0.2575, 0.3425, 8.292e-4, correction=0.32, amplifier_gain=200.0)],
+        sensors=[jb.Sensor(0.3)],
+        controller=jb.Feedback([GAIN], period=PERIOD, delay=delay),
+        run=jb.Run(1.0),
+    )
+
+
+def critical(case: jb.Case, waiting: int) -> float:
+    """The gain with which the loop turns unstable, commands waiting for whole periods."""
+    span = span_of(case)
+    n, pull = span.modes, span.shapes(0.2575, 1) - span.shapes(0.3425, 1)
+    lower = -np.hstack([np.diag(span.frequencies**2), span.damping])
+    a = np.vstack([np.eye(n, 2 * n, k=n), lower])
+    b = np.append(np.zeros(n), 8.292e-4 * 0.32 * 200.0 * pull)[:, None]
+    c = np.append(span.shapes(0.3), np.zeros(n))
+    system = scipy.signal.cont2discrete((a, b, c[None], np.zeros((1, 1))), PERIOD)
+    drift, push = np.asarray(system[0]), np.asarray(system[1])[:, 0]
+    size = 2 * n + waiting  # the commands that wait come last, the newest first
+    whole = np.zeros((size, size))
+    whole[: 2 * n, : 2 * n], whole[: 2 * n, -1] = drift, push
+    whole[2 * n + 1 :, 2 * n : -1] = np.eye(waiting - 1)
+
+    def beyond(gain):
+        whole[2 * n, : 2 * n] = -gain * c
+        return np.abs(np.linalg.eigvals(whole)).max() - 1
+
+    return scipy.optimize.brentq(beyond, 0.0, 1e4)
+
+
+@pytest.mark.parametrize("waiting", [1, 2, 5])
+def test_commands_that_wait_for_several_periods(waiting):
+    """Their chain of states has a single eigenvector."""
+    case = rig(waiting * PERIOD)
+    found = margins(linear_loop(case, 0.0))
+    assert_allclose(found.gain, critical(case, waiting) / GAIN, rtol=1e-8)
