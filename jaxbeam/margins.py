@@ -100,7 +100,8 @@ def _transfer(A, column, row):
         parts = (row @ vectors) * np.linalg.solve(vectors, column.astype(complex))
         return values, lambda s: (parts / (s[:, None] - values)).sum(axis=1)
     # What waits for several periods has too few eigenvectors: by back substitution then.
-    triangle, basis = scipy.linalg.schur(A, output="complex")
+    found = scipy.linalg.schur(A, output="complex")
+    triangle, basis = np.asarray(found[0]), np.asarray(found[1])
     row, column = row @ basis, basis.conj().T @ column
 
     def transfer(s):
