@@ -11,6 +11,7 @@ from jaxbeam.control import DiscreteLQR, StateFeedback
 from jaxbeam.control.gains import Schedule
 from jaxbeam.control.lqr import LQR, AbstractScheduledRegulator
 from jaxbeam.control.scheduled import Family, ScheduledLQR
+from jaxbeam.estimation import Observer
 from jaxbeam.export.gains import Gains
 from jaxbeam.fields import known
 from jaxbeam.modes import lay_out
@@ -19,12 +20,14 @@ from jaxbeam.statespace import state_space
 
 
 def export_gains(case: Case, points: int = 1001) -> Gains:
-    """The gains of a case's controller, designed, and the digital filters of its sensors.
+    """The gains of a case's controller, designed, its estimator, and its sensors' digital filters.
 
     Gains that change over the crossing are tabulated at so many `points`. Where the controller
     recognises its loads, that is left to the one who runs the table: there is no command before
-    the second gate, and the lightest mass is taken until the mass is told. Raises ValueError for a
-    faulty case, a controller without a period, and one that is no table of gains.
+    the second gate, and the lightest mass is taken until the mass is told. An estimator whose gain
+    does not change goes along, with what it knows of filters and delays of the sensors; before it
+    runs, the filters do. Raises ValueError for a faulty case, a controller without a period, one
+    that is no table of gains, and another estimator.
     """
     check(case)
     law = case.controller
@@ -36,10 +39,16 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
         )
     if law.period is None:
         raise ValueError("controller.period is missing: a real controller samples; give its period")
+    own = law.estimator
+    if not (own is None or isinstance(own, Observer) or getattr(own, "loads", "") == "ignored"):
+        raise ValueError(
+            "controller.estimator cannot be exported: its gain must not change; take 'observer', or"
+            " 'kalman' with loads = 'ignored', or leave it out to write the gains alone"
+        )
     if points < 2:
         raise ValueError(f"a table needs at least two points, not {points}")
     shares = np.linspace(0, 1, points) if tabled else np.zeros(1)
-    plant, grid, table, rest, crossing = _designed(case, lay_out(case), shares)
+    (plant, grid, table, rest, crossing), estimator = _designed(case, lay_out(case), shares)
     columns, commands = plant.states, plant.inputs
     more = table.shape[-1] - len(columns)
     if more and tabled:
@@ -60,6 +69,8 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
         law.between if isinstance(law, ScheduledLQR) else "interpolated",
         tuple(tuple(column) for column in columns),
         tuple(tuple(command) for command in commands),
+        np.asarray(estimator),
+        len(case.sensors) if estimator.size else 0,
     )
 
 
@@ -75,12 +86,26 @@ def _filters(case: Case) -> np.ndarray:
 
 @compiled
 def _designed(case: Case, layout, shares):
+    """What gains are made of, see `_tabulated`, and the estimator (see `Gains`)."""
+    model, law = state_space(case, layout=layout), case.controller
+    designed = law.believed(model)
+    estimator = jnp.zeros((0, 0))
+    if law.estimator is not None:
+        made = law.estimator.init(designed)
+        step, sensors = made.transition, made.C.shape[0]
+        offset = jnp.zeros((sensors, sensors)).at[:, 0].set(made.offset)
+        estimator = jnp.block([
+            [step.drift, step.before, step.after, made.gain],
+            [made.C, jnp.zeros_like(made.D), made.D, offset],
+        ])  # fmt: skip
+    return _tabulated(law, model, designed, shares), estimator
+
+
+def _tabulated(law, model, designed, shares):
     """The plant designed for; masses and speeds; gains over a crossing and after it; its time (s).
 
     Tables and gains have a mass and a speed as their first axes.
     """
-    model, law = state_space(case, layout=layout), case.controller
-    designed = law.believed(model)
     memory = law.gain if isinstance(law, StateFeedback) else law.prepare(model, designed)
     one = jnp.zeros(1), jnp.zeros(1)
     if isinstance(memory, Family):

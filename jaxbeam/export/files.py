@@ -18,7 +18,7 @@ import scipy.io
 from jaxbeam.export.gains import ARRAYS, Gains
 from jaxbeam.export.header import header
 
-FORMAT = "jaxbeam gains 2"
+FORMAT = "jaxbeam gains 3"
 COEFFICIENTS = ("b0", "b1", "b2", "a0", "a1", "a2")
 
 
@@ -54,7 +54,8 @@ def read_gains(path: str | os.PathLike) -> Gains:
         gains, checks = _restored(*READERS[path.suffix](path))
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{path}: this is no file of gains that jaxbeam wrote") from None
-    if (gains.checksum, gains.test_command.tolist()) != checks:
+    found = gains.checksum, gains.test_command.tolist(), gains.test_estimate.tolist()
+    if found != checks:
         raise ValueError(f"{path}: the numbers do not give the check values; the file was changed")
     return gains
 
@@ -79,8 +80,10 @@ def _restored(about: dict[str, Any], arrays: dict[str, Any]) -> tuple[Gains, tup
         about["between"],
         columns,
         commands,
+        np.reshape(arrays["estimator"], about["estimator_shape"]),
+        about["readings"],
     )
-    return gains, (about["crc32"], about["test_command"])
+    return gains, (about["crc32"], about["test_command"], about["test_estimate"])
 
 
 def _about(gains: Gains) -> dict[str, Any]:
@@ -99,6 +102,10 @@ def _about(gains: Gains) -> dict[str, Any]:
         "filters": ["sensor", *COEFFICIENTS],
         "test_input": gains.test_input,
         "test_command": gains.test_command.tolist(),
+        "estimator": "[[A, B, B', L], [C, 0, D, o]]: x = A x + B u + B' u'; x += L (y-C x-D u'-o)",
+        "readings": gains.readings,
+        "estimator_shape": gains.estimator.shape,
+        "test_estimate": gains.test_estimate.tolist(),
         "crc32": gains.checksum,
     }
 
@@ -116,6 +123,7 @@ def _csv(gains: Gains) -> bytes:
             rows += [["gain", mass, speed, share, *gain.ravel()] for share, gain in whole]
             rows += [["rest", mass, speed, "", *gains.rest[i, j].ravel()]]
     rows += [["filter", "", "", *row] for row in gains.filters]
+    rows += [["estimator", "", "", "", *row] for row in gains.estimator]
     lines = [f"# {json.dumps(_about(gains))}"]
     lines += [",".join(map(_text, row)) for row in rows]
     return ("\n".join(lines) + "\n").encode()
@@ -128,7 +136,7 @@ def _text(entry: Any) -> str:
 def _from_csv(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     first, _, *lines = path.read_text(encoding="utf-8").splitlines()
     about = json.loads(first.removeprefix("# "))
-    found = {"gain": [], "rest": [], "filter": []}
+    found = {"gain": [], "rest": [], "filter": [], "estimator": []}
     for kind, _, _, *entries in csv.reader(lines):
         found[kind].append([float(entry) for entry in entries if entry])
     designs = len(about["masses_kg"]) * len(about["speeds_m_per_s"])
@@ -139,6 +147,7 @@ def _from_csv(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         "table": [row[1:] for row in found["gain"]],
         "rest": found["rest"],
         "filters": found["filter"],
+        "estimator": found["estimator"],
     }
     return about, arrays
 

@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 from numpy.typing import ArrayLike
 
-ARRAYS = ("masses", "speeds", "shares", "table", "rest", "filters")
+ARRAYS = ("masses", "speeds", "shares", "table", "rest", "filters", "estimator")
 TEST_SHARE = 0.37  # of the crossing
 TEST_PLACE = 0.3  # of the way from the smallest to the largest mass, and speed
 
@@ -26,6 +26,11 @@ class Gains:
     `crossing` (s) is that of the load designed for, zero for a constant gain; a crossing of another
     length stretches the table. `columns` and `commands` are (name, unit). Rows of `filters` are the
     index of a sensor and its section b0, b1, b2, a0, a1, a2.
+
+    The `estimator`, empty if there is none, is [[A, B, B', L], [C, 0, D, o]]: from tick to tick its
+    states x become A x + B u + B' u', u being the commands that acted until the tick before and u'
+    those until this, and then, with so many `readings` y, by L (y - C x - D u' - o) more (o is the
+    first column of its block). The first of them are the first `columns`.
     """
 
     masses: np.ndarray
@@ -40,6 +45,8 @@ class Gains:
     between: str
     columns: tuple[tuple[str, str], ...]
     commands: tuple[tuple[str, str], ...]
+    estimator: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    readings: int = 0
 
     def command(
         self,
@@ -66,6 +73,29 @@ class Gains:
         for column, value in zip(gain.T, np.asarray(state, float), strict=True):
             total = total - column * value
         return total
+
+    @property
+    def estimated(self) -> int:
+        """How many states the estimator has."""
+        return self.estimator.shape[0] - self.readings
+
+    def estimate(
+        self, state: ArrayLike, before: ArrayLike, now: ArrayLike, readings: ArrayLike
+    ) -> np.ndarray:
+        """The estimator's states at a tick, from those at the tick before; zero at the start.
+
+        `before` are the commands that acted until the tick before, `now` those until this one. Sums
+        are taken one by one, as the C header does.
+        """
+        size, inputs = self.estimated, len(self.commands)
+        if not size:
+            return np.zeros(0)
+        given = np.concatenate([np.ravel(state), np.ravel(before), np.ravel(now)])
+        prior = _summed(np.zeros(size), self.estimator[:size], given)
+        expected, last = self.estimator[size:], size + 2 * inputs
+        seen = np.concatenate([prior, np.zeros(inputs), np.ravel(now)])
+        surprise = _summed(np.ravel(readings) - expected[:, last], -expected, seen)
+        return _summed(prior, self.estimator[:size, last:], surprise)
 
     def _member(self, i: int, j: int, share: float, since_exit: float) -> np.ndarray:
         """The gain of one mass and speed of the grid."""
@@ -98,11 +128,24 @@ class Gains:
         return self.command(**self.test_input)
 
     @property
+    def test_estimate(self) -> np.ndarray:
+        """The estimator's states after 1, 1/2, 1/3, ... in each: states, commands and readings."""
+        counts = self.estimated, len(self.commands), len(self.commands)
+        return self.estimate(*(1 / np.arange(1.0, n + 1) for n in (*counts, self.readings)))
+
+    @property
     def checksum(self) -> int:
         """CRC-32 of period, crossing, fade and all arrays in turn, as little-endian doubles."""
         numbers = [self.period, self.crossing, self.fade]
         parts = [numbers, *(getattr(self, name) for name in ARRAYS)]
         return zlib.crc32(b"".join(np.ravel(part).astype("<f8").tobytes() for part in parts))
+
+
+def _summed(total: np.ndarray, matrix: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A sum and the products of a matrix, whose further columns do not count, one by one."""
+    for column, value in zip(matrix.T, values, strict=False):
+        total = total + column * value
+    return total
 
 
 def _bracket(grid: np.ndarray, value: float) -> tuple[int, float]:

@@ -18,12 +18,14 @@ def header(gains: Gains, about: dict[str, Any]) -> str:
     sizes |= {"ACTUATORS": actuators, "COLUMNS": columns}
     sizes |= {"NEAREST": int(gains.between == "nearest")}
     sizes |= {"FILTERS": len(gains.filters), "CHECK_CRC32": f"{gains.checksum}u"}
+    if gains.estimated:
+        sizes |= {"ESTIMATED": gains.estimated, "READINGS": gains.readings}
     sizes |= {"PERIOD": repr(gains.period), "CROSSING": repr(gains.crossing)}
     sizes |= {"FADE": repr(gains.fade)} if math.isfinite(gains.fade) else {}
     sizes |= {f"TEST_{name.upper()}": repr(test[name]) for name in ("share", "mass", "speed")}
     defines = [f"#define JAXBEAM_{name} {value}" for name, value in sizes.items()]
     arrays = {name: getattr(gains, name) for name in ARRAYS}
-    arrays |= {"test_command": gains.test_command}
+    arrays |= {"test_command": gains.test_command, "test_estimate": gains.test_estimate}
     texts = [
         f"static const double jaxbeam_{name}[] = {{{', '.join(map(_number, np.ravel(numbers)))}}};"
         for name, numbers in arrays.items()
@@ -113,4 +115,36 @@ static inline void jaxbeam_command(double mass, double speed, double share, doub
         }
     }
 }
+
+#ifdef JAXBEAM_ESTIMATED
+/* The estimator's states from those at the tick before, for the commands that acted until then and
+   until now, and the readings. Zero at the start; the first of them are those of the gains. */
+static inline void jaxbeam_estimate(double *state, const double *before, const double *now,
+                                    const double *readings)
+{
+    const int size = JAXBEAM_ESTIMATED, inputs = JAXBEAM_ACTUATORS;
+    const int wide = size + 2 * inputs + JAXBEAM_READINGS;
+    double prior[JAXBEAM_ESTIMATED], surprise[JAXBEAM_READINGS];
+    const double *row;
+    int i, j;
+    for (i = 0; i < size; i++) {
+        row = jaxbeam_estimator + i * wide;
+        prior[i] = 0.0;
+        for (j = 0; j < size; j++) prior[i] += row[j] * state[j];
+        for (j = 0; j < inputs; j++) prior[i] += row[size + j] * before[j];
+        for (j = 0; j < inputs; j++) prior[i] += row[size + inputs + j] * now[j];
+    }
+    for (i = 0; i < JAXBEAM_READINGS; i++) {
+        row = jaxbeam_estimator + (size + i) * wide;
+        surprise[i] = readings[i] - row[size + 2 * inputs];
+        for (j = 0; j < size; j++) surprise[i] -= row[j] * prior[j];
+        for (j = 0; j < inputs; j++) surprise[i] -= row[size + inputs + j] * now[j];
+    }
+    for (i = 0; i < size; i++) {
+        row = jaxbeam_estimator + i * wide + size + 2 * inputs;
+        state[i] = prior[i];
+        for (j = 0; j < JAXBEAM_READINGS; j++) state[i] += row[j] * surprise[j];
+    }
+}
+#endif
 """
