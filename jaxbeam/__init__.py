@@ -2,6 +2,10 @@
 
 import os
 
+# Matrices are small here, and runs share the cores already: threads of LAPACK would wait for each
+# other, on a busy machine for minutes. LAPACK reads this as it is loaded; a setting given stays.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 
 # Peaks to one part in a million need double precision; whoever asks JAX for single keeps it.

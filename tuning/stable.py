@@ -59,25 +59,30 @@ class Stable:
         shares = np.diag(list(self.spread.values()))
         factors = 1 + np.concatenate([np.zeros((1, len(shares))), shares, -shares])
 
+        def rates(values, case, factor, times):
+            """Of each clock at each time (clock, time)."""
+            case = replace(case, values)
+            believed = {a: value_at(case, a) for a in self.spread} | dict(nominal or {})
+            pairs = zip(self.spread, factor, strict=True)
+            changed = replace(case, {a: f * value_at(case, a) for a, f in pairs})
+            loop = open_loop(believing(changed, believed, layout), layout)
+
+            def at(own):
+                return jax.vmap(lambda t: linear(loop, own, t).rate())(times)
+
+            return jnp.stack([at(own) for own in clocks])
+
         def violation(values: Mapping[str, Any]) -> Float[Array, ""]:
-            def varied(case, times, factor):
-                believed = {a: value_at(case, a) for a in self.spread} | dict(nominal or {})
-                pairs = zip(self.spread, factor, strict=True)
-                changed = replace(case, {a: f * value_at(case, a) for a, f in pairs})
-                loop = open_loop(believing(changed, believed, layout), layout)
-                return jnp.stack(
-                    [
-                        jax.vmap(lambda t, own=own: linear(loop, own, t).rate())(times)
-                        for own in clocks
-                    ]
-                )
-
-            def single(run):
-                case, times = run
-                case = replace(case, values)
-                return jax.lax.map(lambda factor: varied(case, times, factor), jnp.asarray(factors))
-
-            worst = jnp.max(jax.lax.map(single, (stacked, instants)))
+            # Slopes of poles cost more than poles do, and only those of the worst are wanted.
+            fixed = jax.lax.stop_gradient(dict(values))
+            rows = jnp.asarray(factors)
+            found = jax.lax.map(
+                lambda run: jax.lax.map(lambda factor: rates(fixed, run[0], factor, run[1]), rows),
+                (stacked, instants),
+            )
+            run, row, own, place = jnp.unravel_index(jnp.argmax(found), found.shape)
+            case = jax.tree.map(lambda leaf: leaf[run], stacked)
+            worst = rates(values, case, rows[row], instants[run, place][None])[own, 0]
             return jnp.maximum(worst - self.largest, 0.0)
 
         return violation
