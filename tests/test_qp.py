@@ -76,13 +76,17 @@ def test_solutions_against_another_solver_and_by_their_certificates(kind, size, 
     assert_allclose(pull, 0, atol=1e-9 * scale)
     assert np.min(slack) > -1e-9 * scale
     assert_allclose(np.minimum(slack, multipliers), 0, atol=1e-9 * scale)
-    for i in range(0, COUNT, 5):
+    lost = 0  # by the other, now and then, where limits are degenerate
+    for i in range(0, COUNT, 2):
         other = by_clarabel(H[i], f[i], M[i], gamma[i])
-        assert str(other.status) in ("Solved", "AlmostSolved")
+        if str(other.status) not in ("Solved", "AlmostSolved"):
+            lost += 1
+            continue
         least = x[i] @ H[i] @ x[i] / 2 + f[i] @ x[i]
         assert_allclose(least, other.obj_val, rtol=1e-8, atol=1e-8)
         # Its gap of 1e-8 leaves x open by sqrt(2 gap / least eigenvalue of H) or less.
         assert_allclose(x[i], other.x, rtol=0, atol=(2e-8 / np.linalg.eigvalsh(H[i])[0]) ** 0.5)
+    assert lost <= COUNT // 100
 
 
 @pytest.mark.parametrize("kind", FEASIBLE)
