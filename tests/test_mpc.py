@@ -239,6 +239,7 @@ def test_records_count_steps_without_a_solution():
     stuck = dataclasses.replace(PATCH, limits=jnp.array([1.0, 2.0]), rate_limit=jnp.array(10.0))
     record = run(rig(mpc(), modes=1, patch=stuck, duration=0.05), 1)
     assert_array_equal(record.failures, np.arange(1, 7))
+    assert_array_equal(record.command, 1.0)  # what is held, 0 V, within the limits
     assert "no solution in 6 of its steps" in record.verdict
     assert record.to_xarray().failures.dims == ("time",)
 

@@ -94,6 +94,12 @@ def test_no_solution_holds_the_last_command_and_is_counted():
     wanted, failures = commands(mpc(), jnp.zeros((2, 6)), stuck, failing=True)
     assert_array_equal(wanted, 0.0)
     assert_array_equal(failures, [1.0, 2.0])
+    case = rig(mpc(), patch=stuck)
+    seen = Measurement(jnp.zeros(1), 1e-3 * jnp.ones(6), jnp.array([0.7]))  # 0.3 V from the limits
+    memory = case.controller.init(jb.state_space(case))
+    command, memory = eqx.filter_jit(case.controller.step)(memory, seen, jnp.zeros(()))
+    assert_array_equal(command, 0.7)
+    assert case.controller.failures(memory) == 1
 
 
 def test_case_files_hold_it():
