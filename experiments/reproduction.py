@@ -18,6 +18,7 @@ MODULES = (
     "amplification",
     "shaker",
     "optimal_control",
+    "streams",
     "feedback",
     "predictive_control",
     "tuned",
