@@ -2,8 +2,8 @@
 
 Beyond the thesis, whose augmented regulator (5.8) knows one mass. Here it is designed for three,
 and runs by the clock of what is predicted of them: the times at which they enter, or their masses,
-are wrong by some error, the same for all three. Masses believed to be heavier are answered by higher
-voltage: the peak is lower then, though not the cost that the regulator minimises.
+are wrong by some error, the same for all three. Masses believed to be heavier are answered by
+higher voltage: the peak is lower then, though not the cost that the regulator minimises.
 """
 
 import dataclasses
@@ -111,6 +111,6 @@ def _draw(entries, masses, blind: float, records) -> Figure:
 EXPERIMENT = Experiment(
     "streams",
     "beyond eq. (5.8): several masses at once, whose entries are predicted",
-    "The regulator that knows its loads works for streams; entries may be 50 ms off at little cost.",
+    "The regulator that knows its loads works for streams; entries 50 ms off cost little.",
     run,
 )
