@@ -108,7 +108,7 @@ def measure(controller: AbstractController) -> StepTimes:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table. Raises SystemExit if a kind of controller is missing from it."""
     left_out = set(KINDS.values()) - {type(law) for law in CONTROLLERS.values()}
     if left_out:
         raise SystemExit(f"no controller of kind {', '.join(k.__name__ for k in left_out)}")
