@@ -16,7 +16,7 @@ import jaxbeam as jb
 from experiments import published
 from experiments.moving_point import deepest_place, modes_kept
 from experiments.observed import observed
-from experiments.regulator_limits import frozen, sampled
+from experiments.regulator_limits import Loops, draw_poles, frozen, grown, sampled
 from experiments.shaker import data_physics_v4
 from experiments.verdicts import Experiment, Finding, Outcome, finding
 from jaxbeam.compiling import compiled
@@ -42,6 +42,7 @@ READINGS = {  # N/V that the plant has, R, N/m of the suspension, shares fed bac
     "R = 5e-4, 3500 N/m, all states": (4.6, 5e-4, 3500.0, ALL),
 }
 FULL = "full model of the shaker, Table 2.3"
+UNDAMPED = "R = 3e-4, 2.5 N/V, 80 N s/m in the plant only"  # for stability alone
 REFITTED = "full model, 12000 N/m and 80 N s/m with its back-EMF"
 
 
@@ -62,14 +63,17 @@ class Prepared(AbstractController):
         return self.law.step(memory, measurement, t)
 
 
-def law(kind: str, effort: float, shares) -> AbstractController:
-    """One of the regulators of chapter 5, designed for 4.6 N/V whatever the plant has."""
+def law(kind: str, effort: float, shares, damping: float | None = None) -> AbstractController:
+    """One of the regulators of chapter 5, designed for 4.6 N/V whatever the plant has.
+
+    And for another `damping` (N s/m) of the suspension, if that is given.
+    """
     return LAWS[kind](
         state_weight=WEIGHTS,
         command_weight=[effort],
         feedback=shares,
         coordinates="sine",
-        design=Beliefs(force_per_volt=4.6),
+        design=Beliefs(force_per_volt=4.6, damping=damping),
     )
 
 
@@ -127,10 +131,17 @@ def run(load) -> Outcome:
     findings += [deepest_place(slow), modes_kept(load)]
     gains = sampled(rig, WEIGHTS)
     findings += [*gains, observed(rig, WEIGHTS, EFFORT, gains[-1].obstacle)]
-    findings += frozen({name: _loops(simple[name], READINGS[name][1], FED_BACK) for name in simple})
+    loops = {name: _loops(simple[name], READINGS[name][1]) for name in simple}
+    other = _loops(simple["2.5 N/V reach the beam"], 3e-4, damping=0.0)
+    loops |= {UNDAMPED: other, f"{UNDAMPED}, but for the last tenth": other._replace(share=0.9)}
+    findings += frozen(loops)
     shown = {kind: runs.records[REFITTED, kind, SPEEDS[1], MASSES[-1]] for kind in (FREE, *LAWS)}
-    figures = {"deflections": _draw(shown), "readings": _draw_readings(tables, ratios)}
-    return Outcome(tuple(findings), figures, (_misses(findings[:6], plants),))
+    figures = {
+        "deflections": _draw(shown),
+        "readings": _draw_readings(tables, ratios),
+        "poles": draw_poles(other.few, UNDAMPED),
+    }
+    return Outcome(tuple(findings), figures, (_misses(findings[:6], plants), grown(loops)))
 
 
 def _scheduled(runs: "_Runs", plants) -> Finding:
@@ -174,11 +185,10 @@ def _scatter(both, ratios) -> str:
     )
 
 
-def _loops(case: jb.Case, effort: float, shares) -> tuple[jb.Case, jb.Case]:
+def _loops(case: jb.Case, effort: float, damping: float | None = None) -> Loops:
     """The time-varying loop with some states fed back, and with all."""
-    laws = (law("time-varying", effort, share) for share in (shares, ALL))
-    few, every = (dataclasses.replace(case, controller=one) for one in laws)
-    return few, every
+    laws = (law("time-varying", effort, shares, damping) for shares in (FED_BACK, ALL))
+    return Loops(*(dataclasses.replace(case, controller=one) for one in laws))
 
 
 def _full_shakers(rig: jb.Case) -> dict[str, jb.Electrodynamic]:
