@@ -168,29 +168,6 @@ def test_a_c_program_gives_the_same_commands(gains, tmp_path):
     assert_array_equal(found, [*expected, gains.test_command])
 
 
-@pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
-def test_a_c_program_estimates_the_same(tmp_path):
-    write_gains(ESTIMATED, tmp_path / "gains.h")
-    (tmp_path / "run.c").write_text(
-        '#include <stdio.h>\n#include "gains.h"\nint main(void) {\n'
-        "double x[] = {1.0, 1.0/2, 1.0/3, 1.0/4, 1.0/5}, u[] = {1.0, 1.0/2};\n"
-        "double y[] = {1.0, 1.0/2, 1.0/3}; int i; jaxbeam_estimate(x, u, u, y);\n"
-        'for (i = 0; i < JAXBEAM_ESTIMATED; i++) printf("%a\\n", x[i]); return 0; }\n'
-    )
-    build = [COMPILER, "-std=c99", "-O2", "-ffp-contract=off", "-o", "run", "run.c"]
-    subprocess.run(build, cwd=tmp_path, check=True)
-    printed = subprocess.run(
-        [tmp_path / "run"], capture_output=True, text=True, check=True
-    ).stdout.split()
-    assert_array_equal([float.fromhex(word) for word in printed], ESTIMATED.test_estimate)
-    A, B, late, L = np.split(ESTIMATED.estimator[:5], [5, 7, 9], axis=1)
-    C, _, D, offset = np.split(ESTIMATED.estimator[5:], [5, 7, 9], axis=1)
-    x, u, y = (1 / np.arange(1.0, n + 1) for n in (5, 2, 3))
-    prior = A @ x + (B + late) @ u
-    expected = prior + L @ (y - C @ prior - D @ u - offset[:, 0])
-    assert_allclose(ESTIMATED.test_estimate, expected, rtol=1e-12)
-
-
 def rig(controller):
     return jb.Case(
         jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
@@ -222,30 +199,6 @@ def test_the_command_line_writes_what_was_designed(sampled, tmp_path, capsys):
     _, expected = scipy.signal.freqz_sos(taps, [10.0, 60.0], fs=500.0)
     _, found = scipy.signal.freqz_sos(gains.filters[:, 1:], [10.0, 60.0], fs=500.0)
     assert_allclose(found, expected, rtol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("estimator", [jb.Kalman(0.02, 1e-5), jb.Observer(speed=2.0)])
-def test_estimators_run_as_in_a_simulation(estimator, tmp_path):
-    """A filter and a delay in the loop: from readings alone, the commands of the run."""
-    law = jb.LQR(**WEIGHTS, delay=1e-3, estimator=estimator)
-    case = rig(law)
-    if isinstance(estimator, jb.Kalman):
-        late = dataclasses.replace(case.sensors[0], delay=jnp.asarray(1e-3))
-        case = dataclasses.replace(case, sensors=(late, case.sensors[1]))
-    write_gains(export_gains(case), tmp_path / "gains.csv")
-    gains = read_gains(tmp_path / "gains.csv")
-    times = 2e-3 * jnp.arange(60)
-    record = jb.simulate(case, times)
-    # A command begins half a period after its tick: at the next tick it acts, and not before.
-    sent, state = [np.zeros(1), np.zeros(1)], np.zeros(gains.estimated)
-    for reading in np.asarray(record.measured):
-        state = gains.estimate(state, sent[-2], sent[-1], reading)
-        sent.append(gains.command(state[: len(gains.columns)]))
-    found = np.array(sent[1:-1])[:, 0]
-    size = np.max(np.abs(record.command))
-    assert size > 0
-    assert_allclose(found, record.command[:, 0], rtol=0, atol=1e-9 * size)
 
 
 @pytest.mark.slow
