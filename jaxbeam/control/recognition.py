@@ -145,8 +145,8 @@ class Recognised(NamedTuple):
 def recognised(record: Any, settings: Recognition) -> Recognised:
     """What the readings and commands of a record say of its first load, and how wrong that is.
 
-    As the law hears them, if the record has a sample at every tick. The true speed is that at
-    entry. Raises ValueError for settings that do not suit the case.
+    As the law hears them, if the record has a sample at every tick and commands change at ticks
+    only. The true speed is that at entry. Raises ValueError for settings that do not suit the case.
     """
     case = record.case
     fault = settings.fault(case)
@@ -170,6 +170,8 @@ def _replayed(settings: Recognition, case: Case, layout, record):
         heard = eqx.tree_at(lambda r: r.fit, start, fit)
         return heard.hear(Measurement(readings, still, command), t).fit, None
 
-    fit, _ = jax.lax.scan(tick, start.fit, (record.measured, record.command, record.times))
+    # A sample holds the command from its tick on; the law heard the one before.
+    before = jnp.concatenate([jnp.zeros_like(record.command[:1]), record.command[:-1]])
+    fit, _ = jax.lax.scan(tick, start.fit, (record.measured, before, record.times))
     last = eqx.tree_at(lambda r: r.fit, start, fit)
     return last.mass, last.speed
