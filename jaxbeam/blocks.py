@@ -65,12 +65,15 @@ class Work:
         self.form = Form(layout, couples(case), slots)
 
         design = case, self.form, self.addresses[0]
-        # All is compiled side by side: it is known before what a rig looks like.
+        # All is compiled side by side: it is known before what a rig looks like. The block takes
+        # longest, so it is traced first, with nothing beside it.
         with ThreadPoolExecutor(2) as pool:
             alike = programs.rigs.blank(*design, tasks.heavy[:1])[0]
-            compiling = pool.map(lambda work: work[0].ahead(*work[1]), self._programs(alike))
+            given = self._programs(alike)
+            compiling = [pool.submit(program.ahead(*work)) for program, work in given]
             found = [programs.rigs(*design, tasks.heavy[part]) for part in parts]
-        list(compiling)  # raises what went wrong
+        for program in compiling:
+            program.result()  # raises what went wrong
         self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
         limits = limits[self.rig_of]
         limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
@@ -136,7 +139,7 @@ class Work:
         with jax.enable_x64(False) if single else contextlib.nullcontext():
             with self._compiling:  # others wait for the first, instead of compiling the same again
                 if (substeps, single) not in self._ready:
-                    programs.block.ahead(*arguments)
+                    programs.block.ahead(*arguments)()
                     self._ready.add((substeps, single))
             results = programs.block(*arguments)
         return {name: np.asarray(values) for name, values in results.items()}

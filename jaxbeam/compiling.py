@@ -69,10 +69,13 @@ class Compiled(Generic[P, R]):
         arrays, kept = (self._plain if _tracing(arrays) else self._quick)(arrays, tuple(rest))
         return _together(arrays, *kept.rest)
 
-    def ahead(self, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Compile for arguments of the structure and shapes of these: calls then need not."""
+    def ahead(self, *args: P.args, **kwargs: P.kwargs) -> Callable[[], Any]:
+        """Trace for arguments of the structure and shapes of these; what it returns compiles.
+
+        Calls then need not. Tracing holds Python's lock, compiling leaves it to others.
+        """
         arrays, *rest = _apart((args, kwargs))
-        self._quick.lower(arrays, tuple(rest)).compile()
+        return self._quick.lower(arrays, tuple(rest)).compile
 
     def blank(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """What a call would return, with zeros for its numbers: known without compiling."""

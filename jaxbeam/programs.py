@@ -78,7 +78,7 @@ def riggings(case, addresses, schedule, substeps, rigs, heavy, longest):
     return jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2), made)
 
 
-@compiled_with(**SIDE_BY_SIDE)
+@compiled
 def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, light, longest):
     """Results of some tasks: lanes side by side, tasks one after the other, shared by devices."""
     heavy_addresses, light_addresses = addresses
