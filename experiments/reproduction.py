@@ -1,11 +1,17 @@
 """The thesis, reproduced: all experiments by name, run and written up in one report."""
 
+import dataclasses
 import importlib
 import json
 import time
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
+
+import jax
 
 import jaxbeam as jb
 from experiments import writeup
@@ -63,27 +69,61 @@ def reproduce(
     folder: str | Path = FOLDER,
     overwrite: bool = False,
     tell: Callable[[str], None] = print,
+    processes: int = 1,
 ) -> list[Run]:
     """Run experiments and write figures, numbers and one report into a folder.
 
-    Each is told as text as soon as it is done. Raises ValueError for an unknown name,
+    So many `processes` share the experiments; each is told as text as soon as it and all before
+    it are done. Raises ValueError for an unknown name,
     FileExistsError if the folder is not empty and may not be overwritten.
     """
-    wanted, folder = chosen(names), Path(folder)
+    wanted, folder = [one.name for one in chosen(names)], Path(folder)
     if folder.exists() and any(folder.iterdir()) and not overwrite:
         raise FileExistsError(f"the folder {folder} is not empty; choose another, or --overwrite")
     folder.mkdir(parents=True, exist_ok=True)
     runs = []
-    for experiment in wanted:
-        run = perform(experiment)
-        for name, figure in run.outcome.figures.items():
-            figure.savefig(folder / f"{experiment.name}-{name}.png")
+    for run in _performed(wanted, folder, processes):
         tell(writeup.text(run))
         runs.append(run)
     (folder / "report.md").write_text(writeup.markdown(runs), encoding="utf-8")
     (folder / "report.html").write_text(writeup.html(runs), encoding="utf-8")
     (folder / "report.json").write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
     return runs
+
+
+def _performed(names: Sequence[str], folder: Path, processes: int) -> Iterator[Run]:
+    """Runs of experiments, in their order, with their figures in the folder."""
+    if processes == 1:
+        yield from (_draw(perform(one), folder) for one in chosen(names))
+        return
+    # Each process has a Python lock of its own, under which programs are traced.
+    settings = (jax.config.jax_compilation_cache_dir,)
+    pool = ProcessPoolExecutor(processes, get_context("spawn"), _begin, settings)
+    with pool:
+        parts = pool.map(_apart, names, [folder] * len(names))
+        for one, part in zip(chosen(names), parts, strict=True):
+            yield Run(one, *part)
+
+
+def _apart(name: str, folder: Path) -> tuple:
+    """What a process brings back of an experiment: all but the experiment itself."""
+    (one,) = chosen([name])
+    _, *rest = _draw(perform(one), folder)
+    return tuple(rest)
+
+
+def _draw(run: Run, folder: Path) -> Run:
+    """Write the figures of a run; only their names are kept, for the report."""
+    for name, figure in run.outcome.figures.items():
+        figure.savefig(folder / f"{run.experiment.name}-{name}.png")
+    names = dict.fromkeys(run.outcome.figures)
+    return run._replace(outcome=dataclasses.replace(run.outcome, figures=names))
+
+
+def _begin(programs: str | None) -> None:
+    """Set a process up as the command line is: compiled programs are kept, warnings are short."""
+    jax.config.update("jax_compilation_cache_dir", programs)
+    warnings.formatwarning = lambda message, *_: f"jaxbeam: warning: {message}\n"
 
 
 def as_dict(runs: Sequence[Run]) -> dict:

@@ -161,7 +161,7 @@ class Outcome:
     """What an experiment found: numbers beside printed ones, figures by name, remarks."""
 
     findings: tuple[Finding, ...]
-    figures: Mapping[str, Figure]
+    figures: Mapping[str, Figure | None]  # None once drawn to a file
     remarks: tuple[str, ...] = ()
 
 

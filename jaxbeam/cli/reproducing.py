@@ -9,6 +9,8 @@ from jaxbeam.arguments import refuse
 from jaxbeam.cli.app import Json, Overwrite, app, say
 from jaxbeam.printing import print_json, print_table
 
+TOGETHER = 2  # experiments at once, each of which takes a core and up to 2 GB
+
 
 @app.command
 def reproduce(
@@ -50,6 +52,7 @@ def reproduce(
         output,
         overwrite,
         (lambda text: None) if json_ else print,
+        processes=min(TOGETHER, len(known) if all_ else len(names)),
     )
     if json_:
         print_json(reproduction.as_dict(runs))

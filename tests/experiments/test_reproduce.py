@@ -130,3 +130,18 @@ def test_list(capsys):
     with pytest.raises(SystemExit, match="1"):
         main(["reproduce"])
     assert "--list" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_experiments_side_by_side(tmp_path):
+    """Processes bring back, in order, what one alone finds; figures and report are written."""
+    names = ["patches", "frequencies"]
+    runs = reproduction.reproduce(names, tmp_path, processes=2, tell=lambda text: None)
+    assert [run.experiment.name for run in runs] == names
+    alone = reproduction.perform(reproduction.chosen(names[:1])[0])
+    assert [judged.words for judged in runs[0].judged] == [j.words for j in alone.judged]
+    report = (tmp_path / "report.md").read_text(encoding="utf-8")
+    for run in runs:
+        for figure in run.outcome.figures:
+            assert (tmp_path / f"{run.experiment.name}-{figure}.png").stat().st_size > 1000
+            assert f"{run.experiment.name}-{figure}.png" in report
