@@ -23,6 +23,7 @@ MODULES = (
     "patches",
     "amplification",
     "shaker",
+    "identification",
     "optimal_control",
     "streams",
     "feedback",

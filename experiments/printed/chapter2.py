@@ -1,6 +1,6 @@
 """Chapter 2: modes, critical speeds, moving force and mass, shaker, patches."""
 
-from experiments.printed.tolerances import CURVE, EXACT, FORMULA, HZ, SAME_MODEL
+from experiments.printed.tolerances import BY_HAND, CURVE, EXACT, FORMULA, HZ, SAME_MODEL
 from experiments.verdicts import Printed, Tolerance
 
 EIGHT = "1 2 3 4 5 6 7 8"
@@ -189,4 +189,35 @@ PARKED_DROP = Printed(
 PARKED_PEAK = Printed("Fig. 2.16", "peak with 0.5 kg at 0.3 m", "N/V", "computed", CURVE, "32.5")
 PARKED_PLACE = Printed(
     "Fig. 2.16", "the peak with 0.5 kg at 0.3 m is at", HZ, "computed", CURVE, "27"
+)
+
+# Fitted by hand.
+SHAKER_BY_HAND = Printed(
+    "2.1.2, 2.2.4",
+    "damping ratio, and stiffness (N/m) and damping (N s/m) of the active shaker, by hand",
+    "SI",
+    "measured",
+    BY_HAND,
+    "0.03 3500 80",
+    "damping_ratio stiffness damping",
+)
+PATCH_BY_HAND = Printed(
+    "2.4.2",
+    "damping ratio, and correction factor of the patch on one span, by hand",
+    "1",
+    "measured",
+    BY_HAND,
+    "0.03 0.32",
+    "damping_ratio c_p",
+    "the damping ratio is that of 2.1.2",
+)
+RAIL_BY_HAND = Printed(
+    "2.4.2",
+    "correction factors of patches on two spans, by hand",
+    "1",
+    "measured",
+    BY_HAND,
+    "0.39 0.68",
+    "with_rail without",
+    "one patch of each kind, so that one log shows both",
 )

@@ -12,6 +12,7 @@ POINTS = Tolerance("a computed reduction in percent, to one point", absolute=1.0
 MEASURED = Tolerance("measured; supports alone are quoted to yield by 0.1 mm", relative=0.05)
 RUNS = Tolerance("a measured reduction, mean of few runs, to three points", absolute=3.0)
 VOLTS = Tolerance("a measured voltage", relative=0.1)
+BY_HAND = Tolerance("fitted by hand, as well as an eye can tell", relative=0.05)
 EITHER = Tolerance("yes or no", absolute=0.5)
 
 HZ = "Hz"
