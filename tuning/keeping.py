@@ -57,7 +57,12 @@ def load_fit(path: str | os.PathLike) -> Fit:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: there is no such fit")
-    arrays = load(path, FORMAT)
+    try:
+        arrays = load(path, FORMAT)
+    except ValueError:  # what it says of searches would have a fit, or a case, deleted
+        raise ValueError(
+            f"{path} is no fit, or is damaged; name the .npz file that identify wrote"
+        ) from None
     about = json.loads(str(arrays["about"]))
     logs = [_log(i, entry, about["given"]["beam"], arrays) for i, entry in enumerate(about["logs"])]
     numbers = [Free(**{**n, "belief": Belief(**n["belief"])}) for n in about["numbers"]]

@@ -259,7 +259,7 @@ def test_a_fit_is_kept_to_the_last_bit(plain, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="there is no such fit"):
         keeping.load_fit(tmp_path / "other.npz")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "fit.npz").read_bytes()[:900])
-    with pytest.raises(ValueError, match="is damaged"):
+    with pytest.raises(ValueError, match="is no fit, or is damaged; name the .npz"):
         keeping.load_fit(tmp_path / "cut.npz")
 
 
