@@ -39,13 +39,10 @@ def arrange(
     """
     is_light = np.array([bool(LIGHT.fullmatch(address)) and not alone for address in addresses])
     heavy, light = runs[:, ~is_light], runs[:, is_light]
-    _, group = np.unique(heavy, axis=0, return_inverse=True)
-    if heavy.shape[1] == 0:
-        group = np.zeros(runs.shape[0], int)
-    order = np.argsort(group.ravel(), kind="stable")
-    sizes = np.bincount(group.ravel())
-    lanes = min(LANES, int(sizes.max()))
-    members = np.split(order, np.cumsum(sizes)[:-1])
+    order = np.lexsort((np.zeros(len(runs)), *heavy.T[::-1]))
+    apart = np.any(np.diff(heavy[order], axis=0) != 0, axis=1)
+    members = np.split(order, np.flatnonzero(apart) + 1)
+    lanes = min(LANES, max(part.size for part in members))
     rows = [part[i : i + lanes] for part in members for i in range(0, part.size, lanes)]
     index = np.full((len(rows), lanes), -1)
     for row, runs_of_row in zip(index, rows, strict=True):

@@ -1,6 +1,7 @@
 """What is to be swept, checked before anything compiles, and known again by its fingerprint."""
 
 import dataclasses
+import functools
 import hashlib
 import importlib.metadata
 import json
@@ -90,9 +91,14 @@ class Order:
         """A number for all that shapes the results: case, values, settings and versions."""
         content = self.to_dict() | {
             "blocks": [RUNS, LANES, len(jax.local_devices())],
-            "versions": [importlib.metadata.version("jaxbeam"), jax.__version__],
+            "versions": [_version(), jax.__version__],
         }
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
+@functools.cache
+def _version() -> str:
+    return importlib.metadata.version("jaxbeam")
 
 
 def order_from_dict(content: dict[str, Any]) -> Order:
