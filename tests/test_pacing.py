@@ -64,6 +64,31 @@ def test_a_wrong_measure_is_found_on_the_random_few():
     assert np.all((steps / best) ** ORDER <= 1e-5)
 
 
+def test_settled_runs_are_not_measured_again():
+    """The quickest alone starts with a step that is too long: it alone is tried again."""
+    paces, best = np.geomspace(1, 10, 4), np.full(4, 0.1)
+    tried, measure = [], task(paces, best)
+
+    def watched(chosen, steps):
+        tried.append(set(np.asarray(chosen).tolist()))
+        return measure(chosen, steps)
+
+    guesses = np.full(4, 0.75 * 0.1 * (1e-7 / 4) ** (1 / ORDER))
+    guesses[-1] *= 2
+    choose_steps(watched, paces, guesses, np.ones(4), 4, 1e-7)
+    # Twice each, coarse and fine: all of them, the quickest, and the random few at the end.
+    assert tried == [{0, 1, 2, 3}] * 2 + [{3}] * 2 + [{0, 1, 2, 3}] * 2
+
+
+def test_a_guess_that_is_good_but_short_is_made_longer():
+    paces, best = np.geomspace(1, 10, 20), np.full(20, 0.1)
+    longest = 0.1 * (1e-7 / 4) ** (1 / ORDER)
+    steps, error = choose_steps(
+        task(paces, best), paces, np.full(20, 0.7 * longest), np.ones(20), 4, 1e-7
+    )
+    assert np.all(steps > 0.9 * longest) and error <= 1e-7 / 4
+
+
 def test_no_step_will_do():
     def measure(chosen, steps):
         return np.random.default_rng(int(1e9 * steps[0])).uniform(size=(len(chosen), 1, 1))
