@@ -4,7 +4,8 @@ One table of commands over the deflection under the load (`jaxbeam.control.relie
 and speeds, tuned by gradients on the bench (`experiments.sensed_search`): noise of 4 um, filters
 of tenth order at 10 Hz (one span) and 20 Hz (two), a command every 10 ms in steps of 10 mV, 20 ms
 late. No gate, no mass and no speed is told. It is proven on loads, entries and noise that it was
-not tuned on; then also 10 ms later, and on a beam that is 10 % stiffer or softer than it believes.
+not tuned on; then also 10 ms later, on a beam that is 10 % stiffer or softer than it believes, and
+as it is at the other corners of the bench: a command every 15 ms, and the filter of the other rig.
 
 Its margin: the largest real part of the frozen poles along all these crossings, with 10 ms more
 delay and the beam as believed, stiffer and softer, beside that of the beams without control. At
@@ -18,7 +19,7 @@ import numpy as np
 import jaxbeam as jb
 import tuning
 from experiments.feedback import controlled
-from experiments.sensed_search import DELAY, FOLDER, on_bench
+from experiments.sensed_search import BESIDE, CUTOFF, DELAY, FOLDER, on_bench
 from experiments.tuned import (
     CUBIC,
     CUTOFFS,
@@ -34,7 +35,7 @@ from experiments.tuned import (
     peaks,
     told,
 )
-from experiments.tuned_search import MODES
+from experiments.tuned_search import MODES, PERIOD
 from experiments.verdicts import Experiment, Outcome
 from jaxbeam.case import known_case
 from jaxbeam.modes import lay_out
@@ -46,8 +47,8 @@ from tuning.load_cases import apply
 SENSED = "tuned, sensors only"
 LAWS = (CUBIC, SENSED, LATE)
 SEED = 1  # of the noise; tuned with another
-PLACES = 12  # along each crossing, for the margin
-BESIDE = 1e-5  # m: a table shifted by so much bends beside the rest without load, not at it
+PLACES = 24  # along each crossing, for the margin
+SLOWER = 0.015  # s: the longest sampling period of the bench
 
 
 def run(load) -> Outcome:
@@ -88,6 +89,10 @@ def study(rig: str, case: jb.Case) -> Study:
         SENSED: best,
         LATE: make_bench(dataclasses.replace(real, controller=later), loads),
     }
+    for word, (period, cutoff) in corners(rig).items():
+        slow = dataclasses.replace(law, period=np.asarray(period))
+        other = dataclasses.replace(filtered(real, cutoff), controller=slow)
+        benches[word] = make_bench(other, loads)
     # Of other beams the law believes that they are as those of the case.
     for word, factor in STIFFER.items():
         changed = {RIGIDITY: factor * float(case.beam.flexural_rigidity)}
@@ -102,6 +107,20 @@ def study(rig: str, case: jb.Case) -> Study:
         },
         records={name: found[-1] for name, found in records.items()},
     )
+
+
+def corners(rig: str) -> dict[str, tuple[float, float]]:
+    """Sampling periods (s) and cutoffs (Hz) that the law was not tuned for, by name."""
+    own = CUTOFF[rig]
+    (other,) = set(CUTOFF.values()) - {own}
+    pairs = [(SLOWER, own), (PERIOD, other), (SLOWER, other)]
+    return {f"{1e3 * period:g} ms, {cutoff:g} Hz": (period, cutoff) for period, cutoff in pairs}
+
+
+def filtered(case: jb.Case, cutoff: float) -> jb.Case:
+    """The case with another cutoff (Hz) of the filters of all its sensors."""
+    addresses = [f"sensors.{i}.filter.cutoff" for i in range(len(case.sensors))]
+    return jb.replace(case, dict.fromkeys(addresses, cutoff))
 
 
 def margin(rig: str, case: jb.Case) -> tuple[float, float]:

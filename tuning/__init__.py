@@ -18,6 +18,7 @@ from tuning.posterior import sample
 from tuning.profile import profile
 from tuning.proof import Tuned
 from tuning.reading import read_log, read_logs
+from tuning.reduced import tune_reduced
 from tuning.responses import Responses, identify_responses, responses_of
 from tuning.stable import Stable
 from tuning.tune import tune
@@ -58,6 +59,7 @@ __all__ = [
     "sharpen",
     "tune",
     "tune_choices",
+    "tune_reduced",
     "weigh",
     "write_report",
 ]

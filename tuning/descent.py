@@ -18,7 +18,6 @@ from tuning.checkpoint import load, save
 from tuning.free import Free
 from tuning.methods import method_of
 from tuning.objective import Objective, Target
-from tuning.stable import STEEP
 
 SHARPNESS = (30.0, 1000.0)  # of smooth maxima, at the first step and the last
 SETTLED = 0.7  # share of the steps in which sharpness rises, for methods with stages of it
@@ -55,15 +54,14 @@ class Form:
     numbers: tuple[Free, ...]
     over: str
     share: float
-    violation: Callable | None
+    price: Callable | None
 
     def judge(self, point, bench: Bench, target: Target, *sharpnesses):
         """The price of a point, once for each sharpness of maxima."""
         pairs = zip(self.numbers, point, strict=True)
         values = {number.address: number.outward(y) for number, y in pairs}
         found = bench.histories(values)
-        # So steep that what violates it is never the best, unless everything does.
-        price = 0.0 if self.violation is None else STEEP * self.violation(values)
+        price = 0.0 if self.price is None else self.price(values)
         own = Objective(over=self.over, share=self.share)
         return tuple(
             own.with_price(bench.judge(found, sharp), target, sharp) + price
@@ -94,7 +92,7 @@ def _true(form: Form, bench: Bench, points, target):
 class Descent:
     """Searches over free numbers on a bench; compiled once for all targets and starts.
 
-    `violation` is a further price, as a function of values by address. With `batch` each step
+    `price` is added to the objective, as a function of values by address. With `batch` each step
     looks at so many of the runs only, drawn by the seed, and all runs are judged once in a while.
     """
 
@@ -103,7 +101,7 @@ class Descent:
         bench: Bench,
         numbers: list[Free],
         objective: Objective,
-        violation=None,
+        price: Callable | None = None,
         method: str = "adam",
         steps: int = 80,
         batch: int | None = None,
@@ -117,7 +115,7 @@ class Descent:
         least = np.nan_to_num(bench.free["least"])
         bench = dataclasses.replace(bench, runs=(), free=bench.free | {"least": least})
 
-        form = Form(tuple(map(_shape_of, numbers)), objective.over, objective.share, violation)
+        form = Form(tuple(map(_shape_of, numbers)), objective.over, objective.share, price)
         self._slope = functools.partial(_slope, form, batch is not None, bench)
         self._true = functools.partial(_true, form, bench)
         own = self.method

@@ -14,6 +14,8 @@ from jaxbeam.linear_loop import linear, open_loop, prepared
 from jaxbeam.loads import motion
 from jaxbeam.modes import lay_out
 from tuning.believing import believing
+from tuning.bench import Bench
+from tuning.load_cases import Values, apply
 
 STEEP = 1.0  # of the objective, for each 1/s of too large a real part
 
@@ -24,13 +26,15 @@ class Stable:
 
     They are looked at without loads and at `places` instants along each crossing; also with each
     of the numbers in `spread` changed by its share up and down, and, for a controller that
-    samples, with a `delay` (s) on top of its own.
+    samples, with a `delay` (s) on top of its own. Poles cost more than runs: `crossings`, numbers
+    by address like those of load cases, may take the place of all training runs.
     """
 
     largest: float = 0.0
     delay: float = 0.0
     spread: dict[str, float] = dataclasses.field(default_factory=dict)
     places: int = 7
+    crossings: tuple[Values, ...] = ()
 
     def __post_init__(self):
         if self.delay < 0 or self.places < 1 or any(not 0 < s < 1 for s in self.spread.values()):
@@ -38,6 +42,12 @@ class Stable:
                 "stable takes a delay that is not negative, at least one place, and spreads"
                 " between 0 and 1"
             )
+
+    def of_problem(self, case: Case, bench: Bench):
+        """`violation` for a case under tuning, along the crossings or all runs of its bench."""
+        if self.crossings:
+            return self.violation([apply(case, run) for run in self.crossings])
+        return self.violation(bench.cases, bench.nominal)
 
     def violation(self, cases: list[Case], nominal: Mapping[str, Any] | None = None):
         """Function of values by address: by how much (1/s) the worst pole is too far right.

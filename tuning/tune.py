@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +27,7 @@ from tuning.methods import method_of
 from tuning.objective import Objective
 from tuning.plants import adopt, draw_plants
 from tuning.proof import Minimum, Outcome, Tuned
-from tuning.stable import Stable
+from tuning.stable import STEEP, Stable
 
 if TYPE_CHECKING:
     from tuning.identify import Fit
@@ -45,6 +45,7 @@ def tune(
     plant: Fit | Posterior | None = None,
     plants: int = 4,
     stable: Stable | None = None,
+    price: Callable | None = None,
     places: Sequence[float] | None = None,
     method: str = "adam",
     steps: int = 80,
@@ -65,7 +66,8 @@ def tune(
     numbers and from `starts` - 1 random ones at once. What is kept is the best that was met by the
     true objective, the start included. `places` (m) are where deflections count, the sensors' if
     left out. `stable` asks for a loop that stays stable along the crossings, with room to spare
-    (what violates it is kept only where nothing met satisfies it, and the result says so). With
+    (what violates it is kept only where nothing met satisfies it, and the result says so). A
+    `price`, a differentiable function of the values by address, is added to the objective. With
     `bounds` every run is also held against the least peak that is possible.
 
     The method is "adam" or "lbfgs" (optax) or "bfgs" (optimistix); each step simulates all runs
@@ -90,7 +92,9 @@ def tune(
     file = None if checkpoint is None else Path(checkpoint)
     if file is not None and file.exists() and not resume:
         raise FileExistsError(f"{file} exists; resume the search, or name another file")
-    problem = Problem(case, free, cases, objective, stable, places, bounds)
+    if file is not None and price is not None:
+        raise ValueError("a search with a price of its own cannot be kept: leave out checkpoint")
+    problem = Problem(case, free, cases, objective, stable, places, bounds, price)
     descent = problem.descent(method, steps, batch)
     mark = fingerprint(problem.about | {"settings": [method, steps, batch, starts, seed]})
     points = descent.points(starts, seed)
@@ -144,14 +148,15 @@ class Problem:
         stable: Stable | None = None,
         places: Sequence[float] | None = None,
         bounds: bool = True,
+        price: Callable | None = None,
     ):
         self.case, self.cases, self.objective = case, cases, objective
-        self.places, self.bounds = places, bounds
+        self.places, self.bounds, self.price = places, bounds, price
         self.numbers = free_numbers([case], dict(free), 1.0)
         self.bench = make_bench(case, cases.training, places, bounds)
         self.violation = None
         if stable is not None:
-            self.violation = stable.violation(self.bench.cases, self.bench.nominal)
+            self.violation = stable.of_problem(case, self.bench)
         self.about = {
             "case": case_to_dict(case),
             "free": {n.address: [n.low, n.high] for n in self.numbers},
@@ -165,8 +170,18 @@ class Problem:
     def descent(self, method: str, steps: int, batch: int | None = None) -> Descent:
         """A search of this problem."""
         return Descent(
-            self.bench, self.numbers, self.objective, self.violation, method, steps, batch
+            self.bench, self.numbers, self.objective, self._price(), method, steps, batch
         )
+
+    def _price(self) -> Callable | None:
+        """What a search pays on top of the objective, as a function of values by address."""
+        own, violation = self.price, self.violation
+        # So steep that what violates stability is never the best, unless everything does.
+        if violation is None:
+            return own
+        if own is None:
+            return lambda values: STEEP * violation(values)
+        return lambda values: STEEP * violation(values) + own(values)
 
     def proven(self, descent: Descent, state: State, objective: Objective) -> Tuned:
         """What a search came to, on training and held-out runs."""

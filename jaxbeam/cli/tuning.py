@@ -30,6 +30,7 @@ def tune(
     rank: str = "",
     front: str = "",
     choose: tuple[str, ...] = (),
+    keep: int | None = None,
     plant: Path | None = None,
     plants: int = 4,
     sampled: bool = False,
@@ -74,6 +75,8 @@ def tune(
     choose
         ADDRESS=NUMBER,NUMBER,...: whole numbers to try, such as controller.horizon=4,6,8; repeat it
         for all combinations.
+    keep
+        How many states a regulator, such as kind lqr, is to feed back: which, is found as well.
     plant
         FIT.npz, or the FIT.toml beside it, of jaxbeam identify: the plant that was identified.
     plants
@@ -115,13 +118,13 @@ def tune(
     shares = dict(_weight(text) for text in spread)
     refuse(stable is None and bool(reserve or shares), "--reserve and --spread need --stable")
     refuse(plant is None and sampled, "--sampled draws from a posterior: it needs --plant")
-    many = [name for name, given in (("--rank", rank), ("--front", front), ("--choose", choose))
-            if given]  # fmt: skip
+    ways = {"--rank": rank, "--front": front, "--choose": choose, "--keep": keep is not None}
+    many = [name for name, given in ways.items() if given]
     refuse(len(many) > 1, f"{' and '.join(many)} do not go together; give one of them")
     refuse(bool(rank and (weights or limits)), "--rank takes the place of --objective and --limit")
     alone = batch is not None or starts > 1 or resume
     refuse(
-        bool(many and many != ["--choose"] and alone),
+        bool(many and (many[0] in ("--rank", "--front") or resume) and alone),
         f"--batch, --starts and --resume are for a single search, not for {''.join(many)}",
     )
     picture = picture_path(output, case.with_suffix(".tuned")) if plot else None
@@ -151,6 +154,10 @@ def tune(
         more = {"batch": batch, "starts": starts}
         found = tuning.tune_choices(rig, chosen, *given[1:], goal, **more, **common)
         results = (found.best,)
+    elif keep is not None:
+        more = {"batch": batch, "starts": starts}
+        found = tuning.tune_reduced(rig, keep, *given[1:], goal, **more, **common)
+        results = (found.tuned,)
     else:
         checkpoint = None if output is None else output.with_suffix(".search.npz")
         if checkpoint and checkpoint.exists() and overwrite and not resume:

@@ -25,10 +25,10 @@ class Watch(eqx.Module):
     """
 
     lift: Float[Array, "actuator actuator"]
-    filters: tuple[Float[Array, "section 6"] | None, ...]
-    notches: Float[Array, "section 6"] | None
-    passed: tuple[Float[Array, "section 2"] | None, ...]
-    notched: Float[Array, "section 2 actuator"] | None
+    filters: tuple[Float[Array, "_ 6"] | None, ...]
+    notches: Float[Array, "notch 6"] | None
+    passed: tuple[Float[Array, "_ 2"] | None, ...]
+    notched: Float[Array, "notch 2 actuator"] | None
 
 
 class Relief(AbstractController):

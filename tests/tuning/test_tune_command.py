@@ -94,11 +94,21 @@ def test_ranks_and_choices_are_handed_on(call, monkeypatch):
         asked["choose"] = given[1], options["method"]
         return Chosen()
 
+    def tune_reduced(*given, **options):
+        asked["keep"] = given[1], list(given[2]), options["starts"]
+        return Reduced()
+
+    class Reduced:
+        tuned = Told()
+
     monkeypatch.setattr(tuning, "lexicographic", lexicographic)
+    monkeypatch.setattr(tuning, "tune_reduced", tune_reduced)
     monkeypatch.setattr(tuning, "tune_choices", tune_choices)
     assert json.loads(call(f"{TUNE} --rank peak,effort --json")[1]) == {"verdict": "fine"}
     assert json.loads(call(f"{TUNE} --choose controller.power=1,3 --json")[1])
+    assert json.loads(call(f"{TUNE} --keep 1 --starts 2 --json")[1]) == {"verdict": "fine"}
     assert asked == {
+        "keep": (1, [GAIN], 2),
         "rank": (["peak", "effort"], "worst"),
         "choose": ({"controller.power": [1, 3]}, "adam"),
     }
@@ -109,6 +119,8 @@ REFUSED = {
     "--front effort=0.1 --rank peak": "--rank and --front do not go together",
     "--rank peak --objective rms=1": "--rank takes the place of --objective",
     "--front effort=0.1 --starts 3": "are for a single search, not for --front",
+    "--choose controller.power=1 --resume": "are for a single search, not for --choose",
+    "--keep 1": "only regulators, such as kind 'lqr', have states to leave out",
     "--choose controller.power=one": "--choose takes ADDRESS=NUMBER",
     "--sampled": "it needs --plant",
     "--reserve 0.01": "--reserve and --spread need --stable",
