@@ -84,6 +84,23 @@ def test_the_lightest_is_assumed_until_the_mass_is_recognised(heard):
     assert_allclose(heard.command[:, 0], wanted, rtol=4e-5, atol=1e-12)
 
 
+def test_a_record_replayed_tells_the_mass_that_the_law_was_told(heard):
+    """Read off the gains with which the law answered; without what it commanded, it is another."""
+    recognition = heard.case.controller.recognition
+    times, readings = np.asarray(heard.times), np.asarray(heard.measured)[:, 0]
+    told = (times - 0.05) * 2.0 / 0.6 > 0.3 + 1e-9
+
+    def answers(mass):
+        gains = np.interp(mass, MASSES, GAINS[0])
+        return np.clip(-gains * readings[told], -2.5, 7.5)
+
+    mass = jb.recognised(heard, recognition).mass
+    assert np.sum((answers(mass) < 7.5) & (answers(mass) > 0.1)) >= 3
+    assert_allclose(heard.command[told, 0], answers(mass), rtol=1e-10, atol=1e-12)
+    deaf = eqx.tree_at(lambda r: r.command, heard, jnp.zeros_like(heard.command))
+    assert abs(jb.recognised(deaf, recognition).mass / mass - 1) > 0.02
+
+
 def test_a_case_file_keeps_it():
     case = rig(law(between="stepped", recognition=jb.Recognition(gates=[-0.1, -0.05])))
     check(case)
