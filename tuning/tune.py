@@ -242,7 +242,8 @@ def _outcome(name, bench: Bench, objective, before, after) -> Outcome:
 
 def _peaks(bench: Bench, records) -> Float[np.ndarray, " run"]:
     """Largest deflection of each run: between samples at sensors, at samples elsewhere."""
-    sensors = np.array([float(sensor.position) for sensor in bench.cases[0].sensors])
+    # Those of the records: a tuning may have moved them away from where deflections count.
+    sensors = np.array([float(sensor.position) for sensor in records[0].case.sensors])
     if np.array_equal(sensors, np.asarray(bench.places)):
         return np.array([float(np.max(record.peak_deflection)) for record in records])
     return np.array([float(np.max(np.abs(record.at(bench.places)))) for record in records])
