@@ -42,10 +42,15 @@ def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
 @jax.named_scope("collocation")
 def _contact(tables: Tables, inertia, weight, state, commands):
     """Contact forces (row, lane) of a step from this state under these commands, if any."""
-    felt = tables.respond @ state
-    if commands is not None:
-        felt = felt + tables.commands.respond @ commands
-    return solve_contact(tables.gains, inertia, weight + inertia * felt)
+
+    def pressed():
+        felt = tables.respond @ state
+        if commands is not None:
+            felt = felt + tables.commands.respond @ commands
+        return solve_contact(tables.gains, inertia, weight + inertia * felt)
+
+    # Between loads and after the last there is nothing to solve, which saves half of such steps.
+    return jax.lax.cond(jnp.any(tables.active), pressed, lambda: jnp.zeros_like(weight))
 
 
 @jax.named_scope("propagation")
