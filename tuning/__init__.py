@@ -1,5 +1,12 @@
 """tuning: what measured logs say about a rig, and controllers tuned for it."""
 
+import os
+
+# XLA's threads hand each other the matrices of a batch and wait for them. Where all wait at once,
+# nothing goes on for ever, as was seen with two threads and gradients of many runs; with eight it
+# was not. XLA reads this before it computes anything; a setting given stays.
+os.environ.setdefault("PJRT_NPROC", str(max(8, os.cpu_count() or 1)))
+
 from tuning.account import write_report
 from tuning.belief import Belief
 from tuning.choices import tune_choices
