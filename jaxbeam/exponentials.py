@@ -13,7 +13,6 @@ of times, which holds for any damping, rigid-body modes and lags alike, and diff
 
 import functools
 import math
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -64,14 +63,10 @@ def at_ends() -> np.ndarray:
 
 
 def _multiply(a, b):
-    """Products of matrices (side, side, many) and (..., side, column, many).
-
-    Spelt out for the tiny blocks of single modes, many side by side.
-    """
-    side = a.shape[0]
-    if side > 3:
-        return jnp.einsum("ijn,...jcn->...icn", a, b)
-    return sum(a[:, i, None] * b[..., i : i + 1, :, :] for i in range(side))
+    """Matrix product over the last two axes; spelt out for the tiny blocks of single modes."""
+    if a.shape[-1] > 3:
+        return a @ b
+    return sum(a[..., :, i, None] * b[..., None, i, :] for i in range(a.shape[-1]))
 
 
 def norm(rig: Rig) -> Float[Array, ""]:
@@ -101,45 +96,42 @@ def propagators(
     Inputs are the forces on the modes, and after them, if the rig is `driven`, the commands.
     """
     balance = _balance(rig)
-    blocks, side, _ = rig.state_matrix.shape
+    side, each = rig.state_matrix.shape[1], rig.modes_per_block
     matrix = rig.state_matrix * balance[:, :, None] / balance[:, None, :]
-    force = jnp.eye(side)[:, 1 : 2 * rig.modes_per_block : 2]
+    force = jnp.eye(side)[:, 1 : 2 * each : 2]
     if driven:
         force = jnp.concatenate([force, rig.command_matrix], axis=1)
     fractions = np.concatenate([GAUSS, np.arange(points) / max(points, 1), [1.0]])
-    spans = lengths.reshape(-1, 1) * fractions
-    x = jnp.moveaxis(matrix, 0, -1)[:, :, None, None] * spans[..., None] / 2**DOUBLINGS
-    small = _series(x.reshape(side, side, -1), force)
-    ended: Any = jax.lax.scan(_double, small, length=DOUBLINGS)
-    drift, pushes = ended[0]
+    spans = lengths[..., None] * fractions
+    x = matrix * spans[..., None, None, None] / 2**DOUBLINGS
+    drift, pushes = _series(x, force)
+    (drift, pushes), _ = jax.lax.scan(_double, (drift, pushes), length=DOUBLINGS)
     powers = np.arange(NODES)
     weights = _lagrange() * np.array([math.factorial(p) for p in powers])  # force, power
     weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
-    pushes = pushes.reshape(*pushes.shape[:-1], *spans.shape, blocks)
-    push = jnp.einsum("cfp,psmlcb->clfbsm", weights, pushes)
+    push = jnp.einsum("cfp,p...cbsm->...cfbsm", weights, pushes)
     # Inputs act on speeds and actuators' own states, which the balance leaves as they are.
-    push = push * spans.T[..., None, None, None, None] / balance[:, :, None]
-    drift = drift.reshape(side, side, *spans.shape, blocks).transpose(3, 2, 4, 0, 1)
+    push = push * spans[..., None, None, None, None] / balance[:, :, None]
     drift = drift * balance[:, None, :] / balance[:, :, None]
+    first = jnp.moveaxis(drift, -4, 0), jnp.moveaxis(push, -5, 0)  # fractions first
 
-    def back(part):
-        return jnp.moveaxis(part.reshape(-1, *lengths.shape, *part.shape[2:]), 0, lengths.ndim)
+    def back(part, axis):
+        return jnp.moveaxis(part, 0, axis)
 
     return Step(
-        drift_nodes=back(drift[:NODES]),
-        push_nodes=back(push[:NODES]),
-        drift_end=drift[-1].reshape(*lengths.shape, *drift.shape[2:]),
-        push_end=push[-1].reshape(*lengths.shape, *push.shape[2:]),
-        drift_points=back(drift[NODES:]),
-        push_points=back(push[NODES:]),
+        drift_nodes=back(first[0][:NODES], -4),
+        push_nodes=back(first[1][:NODES], -5),
+        drift_end=first[0][-1],
+        push_end=first[1][-1],
+        drift_points=back(first[0][NODES:], -4),
+        push_points=back(first[1][NODES:], -5),
     )
 
 
 def _series(x, force):
-    """exp(x) (..., many), and phi_1 ... phi_NODES of x times the force matrix, for small x."""
-    side = x.shape[0]
-    identity = jnp.broadcast_to(jnp.eye(side)[:, :, None], x.shape)
-    force = jnp.broadcast_to(force[:, :, None], (*force.shape, x.shape[-1]))
+    """exp(x), and phi_1 ... phi_NODES of x times the force matrix (phi, ...), for small x."""
+    identity = jnp.broadcast_to(jnp.eye(x.shape[-1]), x.shape)
+    force = jnp.broadcast_to(force, (*x.shape[:-1], force.shape[-1]))
 
     def horner(sums, k):
         exponential, top = sums
@@ -159,7 +151,8 @@ def _double(functions, _):
     drift, pushes = functions
     doubled = _multiply(drift, pushes) + jnp.tensordot(_doubling(), pushes, axes=1)
     halves = 0.5 ** np.arange(1, NODES + 1)
-    return (_multiply(drift, drift), doubled * halves[:, None, None, None]), None
+    shape = (NODES,) + (1,) * (pushes.ndim - 1)
+    return (_multiply(drift, drift), doubled * halves.reshape(shape)), None
 
 
 @functools.cache
