@@ -21,7 +21,10 @@ FIRST = 4096  # runs of the sweep by which everything is compiled
 
 
 def measure(runs: int) -> dict[str, float]:
-    """Seconds of the first sweep and of one of so many runs, and MiB before and at the peak."""
+    """Seconds of the first sweep and of one of so many runs, and MiB before and at the peak.
+
+    Raises RuntimeError if a run fails.
+    """
     from experiments.benchmarks.cluster import grid
     from experiments.benchmarks.sweep import rig
     from jaxbeam import sweep
