@@ -60,25 +60,35 @@ class Work:
         moving = all(name.startswith(outside) for name in self.addresses[0])
         self.rig_of = np.zeros(count, int) if moving else np.arange(count)
         parts = [[0]] if moving else np.resize(np.arange(count), (self.blocks, self.each))
-        windows = np.asarray(programs.windows(case, self.addresses[0], tasks.heavy))
-        slots = max(most_at_once(window) for window in windows)
-        self.form = Form(layout, couples(case), slots)
 
+        def windows():
+            return np.asarray(programs.windows(case, self.addresses[0], tasks.heavy))
+
+        # One load takes one slot, whenever it comes: what is compiled below need not wait for that.
+        slots = len(case.loads)
+        if slots > 1:
+            slots = max(most_at_once(window) for window in windows())
+        self.form = Form(layout, couples(case), slots)
         design = case, self.form, self.addresses[0]
-        # All is compiled side by side: it is known before what a rig looks like. The block takes
-        # longest, so it is traced first, with nothing beside it.
+        # Known before what rigs look like. While one program compiles, the next is traced.
         with ThreadPoolExecutor(2) as pool:
-            alike = programs.rigs.blank(*design, tasks.heavy[:1])[0]
-            given = self._programs(alike)
-            compiling = [pool.submit(program.ahead(*work)) for program, work in given]
-            found = [programs.rigs(*design, tasks.heavy[part]) for part in parts]
+            compiling = []
+
+            def begin(program, arguments):
+                compiling.append(pool.submit(program.ahead(*arguments)))
+                return program.blank(*arguments)
+
+            alike, _ = begin(programs.rigs, (*design, tasks.heavy[parts[0]]))
+            self._begin(begin, alike)
+            entries, exits = np.moveaxis(windows(), 2, 0)
         for program in compiling:
             program.result()  # raises what went wrong
+        found = [programs.rigs(*design, tasks.heavy[part]) for part in parts]
         self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
         limits = limits[self.rig_of]
         limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
         duration = _values(case, tasks, "run.duration")
-        spans = np.minimum(windows[:, :, 1], duration[:, None]) - windows[:, :, 0]
+        spans = np.minimum(exits, duration[:, None]) - entries
         spans = np.where(spans > 0, spans, duration[:, None])
         crossing = np.min(spans, axis=1, initial=np.inf)
         crossing = np.where(np.isfinite(crossing), crossing, duration)
@@ -123,13 +133,12 @@ class Work:
             substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
         return self._run(chosen, steps[chosen], substeps, self.single)
 
-    def _programs(self, alike):
-        """What finds the steps, with arguments made from what rigs look like."""
+    def _begin(self, begin, alike):
+        """Begin to compile what finds the steps, with arguments made from what rigs look like."""
         first, steps = np.zeros(self.each, int), np.ones(self.each)
         given = self._rigging(first, steps, None, alike, first)
-        riggings = None if given is None else programs.riggings.blank(*given)
-        block = programs.block, self._block(first, steps, None, riggings)
-        return [block] if given is None else [block, (programs.riggings, given)]
+        riggings = None if given is None else begin(programs.riggings, given)
+        begin(programs.block, self._block(first, steps, None, riggings))
 
     def _run(self, chosen, steps, substeps, single):
         given = self._rigging(chosen, steps, substeps, self.rigs, self.rig_of[chosen])

@@ -100,7 +100,7 @@ def _check_clock(address: str, sensor: Sensor, case: Case) -> None:
     elif case.controller is not None and case.controller.period is not None:
         period = case.controller.period
     elif case.controller is None or case.controller.blind:
-        period = 1 / run.sample_rate
+        period = 1 / known(run.sample_rate) if is_known(run.sample_rate) else None
     filter = sensor.filter
     if filter is None or filter.realisation != "digital" or period is None:
         return
