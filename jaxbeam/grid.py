@@ -16,6 +16,8 @@ from jaxbeam.loads import motion
 from jaxbeam.rig import Rig
 from jaxbeam.schedule import Schedule
 
+FEW = 64  # panels
+
 
 class Grid(eqx.Module):
     """Panels, each with a number of equal steps; step lengths are shared among panels.
@@ -50,7 +52,9 @@ class Grid(eqx.Module):
     def steps(self, index: Int[Array, " step"]):
         """Panel, start time (s) and kind of length of the steps with these indices."""
         beyond = index >= self.total
-        panel = jnp.searchsorted(self.ends, index, side="right")
+        # Few are compared with all, which compiles sooner; among many one is sought by halves.
+        method = "compare_all" if self.ends.shape[0] <= FEW else "scan"
+        panel = jnp.searchsorted(self.ends, index, side="right", method=method)
         panel = jnp.minimum(panel, self.counts.shape[0] - 1)
         kind = jnp.where(beyond, self.lengths.shape[0] - 1, self.kind[panel])
         start = self.edges[panel] + (index - self._first(panel)) * self.lengths[self.kind[panel]]

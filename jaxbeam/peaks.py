@@ -1,6 +1,8 @@
 """Largest value of a smooth curve known at a few equal points, absolute unless asked otherwise."""
 
+import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,15 +12,27 @@ from jaxtyping import Array, Float
 STARTS = 17  # places from which a peak is sought: closer than the extrema of the curve can be
 
 
-def _polynomial(samples: Float[Array, "point *rest"]) -> list:
-    """Coefficients, lowest power first, of the polynomial in 2 c - 1 through equal samples."""
-    points = samples.shape[0]
+class Curve(NamedTuple):
+    """A polynomial in 2 c - 1 and its first two derivatives: coefficients, lowest power first."""
+
+    value: list
+    slope: list
+    bend: list
+
+
+@functools.cache
+def _through(points: int) -> np.ndarray:
+    """What gives all coefficients of the curve through equal samples, one after the other."""
     nodes = np.linspace(-1.0, 1.0, points)
-    return list(jnp.tensordot(np.linalg.inv(nodes[:, None] ** np.arange(points)), samples, axes=1))
+    value = np.linalg.inv(nodes[:, None] ** np.arange(points))
+    slope = np.polynomial.polynomial.polyder(value)
+    return np.concatenate([value, slope, np.polynomial.polynomial.polyder(slope)])
 
 
-def _differentiate(coefficients: list) -> list:
-    return [power * c for power, c in enumerate(coefficients)][1:]
+def _curve(samples: Float[Array, "point *rest"]) -> Curve:
+    points = samples.shape[0]
+    rows = list(jnp.tensordot(_through(points), samples, axes=1))
+    return Curve(rows[:points], rows[points : 2 * points - 1], rows[2 * points - 1 :])
 
 
 def _value(coefficients: list, place):
@@ -29,15 +43,13 @@ def _value(coefficients: list, place):
     return value
 
 
-def _climb(curve: list, start, reach: float, rounds: int):
+def _climb(curve: Curve, start, reach: float, rounds: int):
     """Where the curve is flat near the start, by rounds of Newton's method within reach."""
-    slope = _differentiate(curve)
-    bend = _differentiate(slope)
 
     def closer(_, place):
-        steep = _value(bend, place)
+        steep = _value(curve.bend, place)
         flat = steep == 0
-        step = jnp.where(flat, 0.0, _value(slope, place) / jnp.where(flat, 1.0, steep))
+        step = jnp.where(flat, 0.0, _value(curve.slope, place) / jnp.where(flat, 1.0, steep))
         return jnp.clip(place - jnp.clip(step, -reach, reach), -1.0, 1.0)
 
     return jax.lax.fori_loop(0, rounds, closer, start)
@@ -53,9 +65,9 @@ def vertex(
     sizes = size(samples)
     highest = jnp.max(sizes, axis=0)
     start = jnp.linspace(-1.0, 1.0, sizes.shape[0])[jnp.argmax(sizes, axis=0)]
-    curve = _polynomial(samples)
+    curve = _curve(samples)
     place = _climb(curve, start, 1 / sizes.shape[0], rounds=2)
-    return jnp.maximum(size(_value(curve, place)), highest)
+    return jnp.maximum(size(_value(curve.value, place)), highest)
 
 
 @jax.named_scope("peaks")
@@ -67,13 +79,13 @@ def refine(
     The derivative is that at the fixed place of the peak, which is exact where the peak is a
     maximum inside the curve and where it is at an end that stays.
     """
-    curve = _polynomial(samples)
-    frozen = [jax.lax.stop_gradient(coefficient) for coefficient in curve]
+    curve = _curve(samples)
+    frozen = jax.lax.stop_gradient(curve)
     # From everywhere, as peaks may tie; at an end Newton's method may run away to a lower place.
     starts = np.linspace(-1.0, 1.0, STARTS).reshape(-1, *(1,) * (samples.ndim - 1))
     starts = jnp.broadcast_to(starts.astype(samples.dtype), (STARTS, *samples.shape[1:]))
     places = jnp.concatenate([starts, _climb(frozen, starts, 2 / STARTS, rounds=5)])
-    best = jnp.argmax(size(_value(frozen, places)), axis=0)
+    best = jnp.argmax(size(_value(frozen.value, places)), axis=0)
     place = jnp.take_along_axis(places, best[None], axis=0)[0]
     place = jax.lax.optimization_barrier(jax.lax.stop_gradient(place))
-    return size(_value(curve, place)), (place + 1) / 2
+    return size(_value(curve.value, place)), (place + 1) / 2
