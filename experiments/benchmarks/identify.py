@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import jaxbeam as jb
-from experiments.benchmarks.baselines import Rig, crossing_rate
+from experiments.benchmarks.crossing import Rig, crossing_rate
 from tuning import Log
 from tuning.campaign import prepare
 from tuning.free import free_numbers

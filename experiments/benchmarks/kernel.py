@@ -19,8 +19,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from experiments.benchmarks import baselines
+from experiments.benchmarks.crossing import GRAVITY, Rig
 from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, rig, sweep_peaks
+from experiments.benchmarks.timing import best_in_turn
 from jaxbeam import programs
 from jaxbeam.exponentials import GAUSS, POINTS
 from jaxbeam.order import make_order
@@ -51,13 +52,13 @@ def prepare(modes: int) -> tuple[np.ndarray, list]:
     everything = np.arange(SPEEDS.size)
     given = work._rigging(everything, steps, None, work.rigs, work.rig_of[everything])
     riggings = jax.tree.map(np.asarray, programs.riggings(*given))
-    plain = baselines.Rig(modes)
+    plain = Rig(modes)
     rates = riggings.rig.state_matrix[0, :, 1, :]
     powers = np.linalg.inv(np.linspace(-1, 1, POINTS + 1)[:, None] ** np.arange(POINTS + 1))
     # Signs of modes are free: those of jaxbeam are seen in its rows for the sensors at rest.
     seen, angles = riggings.watch[0, 0, :3, :, 0], np.outer(plain.sensors, plain.wavenumbers)
     signs = np.where(np.sum(seen * np.sin(angles), axis=0) < 0, -1.0, 1.0)
-    numbers = [plain.length, baselines.GRAVITY], plain.amplitude * signs, GAUSS, powers, rates
+    numbers = [plain.length, GRAVITY], plain.amplitude * signs, GAUSS, powers, rates
     parts = [*numbers, plain.frequencies**2, riggings.flexibility[0]]
     beam = np.concatenate([np.ravel(part) for part in parts])
     crossings = []
@@ -116,7 +117,7 @@ def main() -> None:
                 lambda _, m=modes: sweep_peaks(m),
                 lambda _, part=(library, beam, crossings): peaks(*part),
             ]
-            first, second = baselines.best_in_turn(functions, None)
+            first, second = best_in_turn(functions, None)
             row = f"{first:.3f} s | {second:.3f} s | {first / second:.2f} | {apart:.0e}"
             print(f"| {modes} modes | {row} |", flush=True)
 

@@ -18,6 +18,8 @@ import xarray
 
 import jaxbeam as jb
 from experiments.benchmarks import baselines
+from experiments.benchmarks.crossing import Rig
+from experiments.benchmarks.timing import best_in_turn, time_call
 from jaxbeam.compiling import compiled
 from jaxbeam.plan import make_plan
 from jaxbeam.simulate import readings
@@ -62,23 +64,23 @@ def sweep_peaks(modes: int) -> np.ndarray:
 
 def compare(modes: int) -> list[tuple[str, float, float, float]]:
     """Name, seconds, ratio to jaxbeam and largest relative error of each solver."""
-    reference = baselines.reference_peaks(MASSES, SPEEDS[CHECKED], modes)
+    reference = baselines.reference_peaks(Rig(modes), MASSES, SPEEDS[CHECKED])
 
     def worst(peaks):
         return float(np.max(np.abs(peaks / reference - 1)))
 
-    ours = baselines.time_call(sweep_peaks, modes)
+    ours = time_call(sweep_peaks, modes)
     rows = [("jaxbeam", ours.run, worst(sweep_peaks(modes)[:, CHECKED]))]
     repeat = 3 if modes < 6 else 1
     for name, shared in (("diffrax, vmapped", False), ("diffrax, shared steps", True)):
 
         def others(shared=shared):
-            return baselines.diffrax_peaks(MASSES, SPEEDS, modes, shared_steps=shared)
+            return baselines.diffrax_peaks(Rig(modes), MASSES, SPEEDS, shared_steps=shared)
 
-        took = baselines.time_call(others, repeat=repeat)
+        took = time_call(others, repeat=repeat)
         rows.append((name, took.run, worst(np.asarray(others())[:, CHECKED])))
-    scaled = baselines.scipy_time(MASSES, SPEEDS, modes)
-    some = baselines.scipy_peaks(MASSES[::21], SPEEDS[CHECKED], modes)
+    scaled = baselines.scipy_time(baselines.scipy_peaks, Rig(modes), MASSES, SPEEDS)
+    some = baselines.scipy_peaks(Rig(modes), MASSES[::21], SPEEDS[CHECKED])
     rows.append(("scipy DOP853, scaled", scaled, float(np.max(np.abs(some / reference[::21] - 1)))))
     print(f"{modes} modes: the sweep compiles in {ours.compile:.1f} s")
     return [(name, took, took / ours.run, error) for name, took, error in rows]
@@ -103,7 +105,7 @@ def derivatives() -> list[tuple[str, float]]:
         return jax.jvp(misfit, (values,), (jnp.ones_like(values),))
 
     functions = [compiled(function) for function in (misfit, along, jax.jacfwd(residual))]
-    plain, jvp, jacobian = baselines.best_in_turn(functions, start)
+    plain, jvp, jacobian = best_in_turn(functions, start)
     return [("jvp of a misfit", jvp / plain), ("Jacobian over six numbers", jacobian / plain)]
 
 

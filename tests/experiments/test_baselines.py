@@ -7,15 +7,13 @@ from scipy.integrate import solve_ivp
 
 from experiments.benchmarks import baselines
 from experiments.benchmarks.baselines import (
-    Rig,
     diffrax_peaks,
-    free_times,
-    hermite_peaks,
     reference_peaks,
     scipy_peaks,
     scipy_time,
-    time_call,
 )
+from experiments.benchmarks.crossing import Rig, free_times, hermite_peaks
+from experiments.benchmarks.timing import Timing, time_call
 
 MASSES = np.array([0.1, 0.55, 1.0])
 # The heavier masses peak after the exit at 5.3 and 10 m/s, all others while they cross.
@@ -24,16 +22,16 @@ SPEEDS = np.array([0.8, 2.2, 5.3, 10.0])
 
 @pytest.fixture(scope="module")
 def reference():
-    return reference_peaks(MASSES, SPEEDS, modes=3)
+    return reference_peaks(Rig(3), MASSES, SPEEDS)
 
 
 def test_scipy_agrees_to_one_in_a_million(reference):
-    np.testing.assert_allclose(scipy_peaks(MASSES, SPEEDS, modes=3), reference, rtol=1e-6)
+    np.testing.assert_allclose(scipy_peaks(Rig(3), MASSES, SPEEDS), reference, rtol=1e-6)
 
 
 @pytest.mark.parametrize("shared_steps", [False, True])
 def test_diffrax_agrees_to_one_in_a_million(reference, shared_steps):
-    peaks = diffrax_peaks(MASSES, SPEEDS, modes=3, shared_steps=shared_steps)
+    peaks = diffrax_peaks(Rig(3), MASSES, SPEEDS, shared_steps=shared_steps)
     np.testing.assert_allclose(peaks, reference, rtol=1e-6)
 
 
@@ -69,7 +67,7 @@ def test_reference_agrees_with_the_coupled_equations_sampled_finely():
         sensors = np.sin(np.outer([0.15, 0.3, 0.45], wavenumber))
         largest = np.maximum(largest, np.abs(sensors @ run.y[:modes]).max(axis=1))
         state = run.y[:, -1]
-    expected = reference_peaks([mass], [speed], modes)[0, 0]
+    expected = reference_peaks(Rig(modes), [mass], [speed])[0, 0]
     np.testing.assert_allclose(largest, expected, rtol=1e-7)
 
 
@@ -99,9 +97,9 @@ def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
     """Costs of the form it assumes are added up exactly."""
     masses, speeds = np.linspace(0.1, 1, 5), np.linspace(0.3, 10, 9)
 
-    def known_cost(function, masses, speeds, modes, repeat):
-        return baselines.Timing(run=0.01 + 0.02 / speeds[0], compile=0.0)
+    def known_cost(function, rig, masses, speeds, repeat):
+        return Timing(run=0.01 + 0.02 / speeds[0], compile=0.0)
 
     monkeypatch.setattr(baselines, "time_call", known_cost)
     whole = np.sum(0.01 + 0.02 / speeds) * len(masses)
-    np.testing.assert_allclose(scipy_time(masses, speeds, modes=1, runs=4), whole)
+    np.testing.assert_allclose(scipy_time(scipy_peaks, Rig(1), masses, speeds, runs=4), whole)

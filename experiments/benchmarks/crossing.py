@@ -1,0 +1,218 @@
+"""The speed benchmark's problem, and the closed forms that all solvers of it may use.
+
+A point mass m enters a pinned beam at t = 0 and crosses at constant speed v; the beam has one span,
+or two over a support in the middle. With mass-normalised modes phi_j and x = v t,
+
+    q_j'' + 2 zeta w_j q_j' + w_j^2 q_j = -phi_j(x) R + p_j,
+    R = m (g + w_tt + 2 v w_xt + v^2 w_xx)  at x,
+
+which is the moving mass with its full convective acceleration. w_tt holds the unknown q'', but only
+along phi, so R has a closed form (Sherman and Morrison 1950); `crossing_rate` below is that form,
+shared by all. p are forces of patches under control, if there are any.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import brentq
+
+GRAVITY = 9.81  # m/s^2
+SPAN = 0.6  # m
+PATCH = 0.2575, 0.3425  # m, edges of the patch on each span
+MOMENT = 8.292e-4 * 0.35 * 200.0  # N m of a patch per volt of command
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The pinned rig of the benchmark, in SI units, with `modes` modes; its spans are equal.
+
+    With a `gain` (V/m) a patch on each span answers the sensor of its number, u = -gain y: every
+    `period` (s), held in between, or at every instant without one.
+    """
+
+    modes: int
+    length: float = SPAN
+    flexural_rigidity: float = 11.68
+    mass_per_length: float = 0.535
+    damping_ratio: float = 0.03
+    sensors: tuple[float, ...] = (0.15, 0.3, 0.45)
+    spans: int = 1
+    gain: float | None = None
+    period: float | None = None
+
+    @cached_property
+    def wavenumbers(self):
+        """Of the modes, (mode,) in 1/m.
+
+        Two spans, each of length a: sines, k a = n pi, and, as if the middle were clamped,
+        tan k a = tanh k a, in turn.
+        """
+        if self.spans == 1:
+            return np.arange(1, self.modes + 1) * np.pi / self.length
+
+        def clamped(x):
+            return np.sin(x) - np.cos(x) * np.tanh(x)
+
+        turns = np.arange(1, self.modes // 2 + 2) * np.pi
+        held = [brentq(clamped, turn + 0.1, turn + np.pi / 2, xtol=1e-14) for turn in turns]
+        return 2 / self.length * np.transpose([turns, np.array(held)]).ravel()[: self.modes]
+
+    @cached_property
+    def held(self):
+        """The share h (mode,) of sinh k s in modes of two spans that are clamped in the middle."""
+        if self.spans == 1:
+            return np.zeros(self.modes)
+        angles = self.wavenumbers * self.length / 2
+        return np.where(np.arange(self.modes) % 2 == 0, 0.0, np.sin(angles) / np.sinh(angles))
+
+    @cached_property
+    def frequencies(self):
+        """Undamped natural angular frequencies, (mode,) in rad/s."""
+        return self.wavenumbers**2 * np.sqrt(self.flexural_rigidity / self.mass_per_length)
+
+    @cached_property
+    def amplitude(self):
+        """What makes the modal masses one, (mode,) in 1/sqrt(kg)."""
+        return np.sqrt(2 / (self.mass_per_length * self.length * (1 - self.held**2)))
+
+    def shapes(self, place, derivative=0):
+        """Mode shapes or slopes at a place (m) of the beam, (mode,) in 1/sqrt(kg), or by 1/m."""
+        right = self.spans == 2 and place > self.length / 2
+        s, k = (self.length - place if right else place), self.wavenumbers
+        wave, grown = (np.sin, np.sinh) if derivative == 0 else (np.cos, np.cosh)
+        shape = k**derivative * self.amplitude * (wave(k * s) - self.held * grown(k * s))
+        return self.mirrored * (-1) ** derivative * shape if right else shape
+
+    @cached_property
+    def mirrored(self):
+        """The sign of each mode at the mirrored place, (mode,)."""
+        return np.where(np.arange(self.modes) % 2 == 0, -1.0, 1.0)
+
+    @cached_property
+    def sensor_shapes(self):
+        """Mode shapes at the sensors, (sensor, mode) in 1/sqrt(kg)."""
+        return np.array([self.shapes(place) for place in self.sensors])
+
+    @cached_property
+    def patch_shapes(self):
+        """Modal force of each patch per volt, (mode, patch) in 1/sqrt(kg) N/V."""
+        starts = np.arange(self.spans) * self.length / self.spans
+        edges = [[self.shapes(start + edge, 1) for edge in PATCH] for start in starts]
+        return MOMENT * np.array([left - right for left, right in edges]).T
+
+    @cached_property
+    def exponents(self):
+        """-zeta w + i w_d of the free vibration of every mode, (mode,) in 1/s."""
+        zeta = self.damping_ratio
+        return self.frequencies * (-zeta + 1j * np.sqrt(1 - zeta**2))
+
+    @cached_property
+    def state_sizes(self):
+        """Scale of [q, q'] per kg of load, (2, mode): the first mode under it at rest.
+
+        Errors are measured against it in every mode, since all add to the deflection alike.
+        """
+        size = GRAVITY * self.amplitude[0] / self.frequencies[0] ** 2
+        return size * np.stack([np.ones(self.modes), self.frequencies])
+
+    def answer(self, q):
+        """Commands (patch, run) to coordinates (mode, run)."""
+        return -self.gain * (self.sensor_shapes[: self.spans] @ q)
+
+
+def crossing_rate(rig, masses, speed, span: int | None = 0, push=None):
+    """The function (t, [q, q']) -> [q', q''] of all `masses` at one speed; (2, mode, run) each.
+
+    It holds while they are on the span of that number, or with None on no span. `push` gives the
+    modal forces (mode, run) that coordinates meet with, if there are any.
+    """
+    damping = (2 * rig.damping_ratio * rig.frequencies)[:, None]
+    stiffness = (rig.frequencies**2)[:, None]
+    away, span = span is None, span or 0
+    k = rig.wavenumbers
+    tall = rig.amplitude * (rig.mirrored if span else 1.0)
+    slant = 2 * speed * (-1) ** span * tall * k
+    bend = -((speed * k) ** 2)
+    bent = np.any(rig.held != 0)
+
+    def accelerations(q, velocity):
+        """Those without a mass, (mode, run)."""
+        free = -damping * velocity - stiffness * q
+        return free if push is None else free + push(q)
+
+    def unloaded(t, state):
+        xp = state.__array_namespace__()
+        return xp.concatenate((state[1], accelerations(*state))).reshape(state.shape)
+
+    def rate(t, state):
+        xp = state.__array_namespace__()
+        q, velocity = state
+        angle = k * (rig.length - speed * t) if span else k * speed * t
+        phi, two_speed_slope = tall * xp.sin(angle), slant * xp.cos(angle)
+        curvature = bend * phi  # times speed^2
+        if bent:
+            grown = tall * rig.held * xp.sinh(angle)
+            phi, curvature = phi - grown, curvature + bend * grown
+            two_speed_slope = two_speed_slope - slant * rig.held * xp.cosh(angle)
+        free = accelerations(q, velocity)
+        convected = phi @ free + curvature @ q + two_speed_slope @ velocity
+        force = masses * (GRAVITY + convected) / (1 + masses * (phi @ phi))
+        return xp.concatenate((velocity, free - phi[:, None] * force)).reshape(state.shape)
+
+    return unloaded if away else rate
+
+
+def hermite_peaks(interval, value, rate):
+    """Largest absolute value of the cubics through `value` and `rate` at successive times.
+
+    `interval` is (time - 1,), `value` and `rate` are (time, ...); returns (...). The stationary
+    point taken in each interval is the first of the kind its left slope leads to.
+    """
+    xp = value.__array_namespace__()
+    interval = interval.reshape((-1,) + (1,) * (value.ndim - 1))
+    left, right = interval * rate[:-1], interval * rate[1:]
+    rise = value[1:] - value[:-1]
+    square, cube = 3 * rise - 2 * left - right, left + right - 2 * rise
+    root = xp.sqrt(xp.maximum(square**2 - 3 * cube * left, 0))
+    denominator = root - xp.sign(left) * square
+    s = xp.minimum(abs(left) / xp.maximum(denominator, 1e-300), 1)
+    inside = value[:-1] + s * (left + s * (square + s * cube))
+    return xp.maximum(abs(value).max(0), abs(inside).max(0))
+
+
+def free_times(rig, free, tolerance=1e-7):
+    """Times at which cubics through the free vibration are right to `tolerance`, (time,) in s.
+
+    A cubic errs by h^4 w'''' / 384. Mode j is taken to start with w_1 / w_j of the peak, which
+    grants every mode the same largest bending moment; as high modes die out, h grows.
+    """
+    ratio = rig.frequencies / rig.frequencies[0]
+    times = [0.0]
+    while times[-1] < free:
+        alive = np.exp(-rig.damping_ratio * rig.frequencies * times[-1]) / ratio
+        times.append(times[-1] + (384 * tolerance / (alive @ rig.frequencies**4)) ** 0.25)
+    return np.array([*times[:-1], free])
+
+
+def free_vibration(rig, times, q, velocity):
+    """Deflections and their rates (time, sensor, run) in free vibration, in m and m/s.
+
+    q_j = Re(a_j exp(p_j t)) with p_j = -zeta w_j + i w_d, from `q` and `velocity`, (mode, run),
+    at time zero.
+    """
+    xp = q.__array_namespace__()
+    exponents = rig.exponents[:, None]
+    start = q - 1j * (velocity - exponents.real * q) / exponents.imag
+    start = rig.sensor_shapes[:, :, None] * start  # (sensor, mode, run)
+    decay = np.exp(np.outer(times, rig.exponents))
+    return tuple(
+        xp.einsum("tm,smr->tsr", table.real, start.real)
+        - xp.einsum("tm,smr->tsr", table.imag, start.imag)
+        for table in (decay, decay * rig.exponents)
+    )
+
+
+def free_peaks(rig, times, q, velocity):
+    """Largest absolute deflection in free vibration, (sensor, run) in m, times by `free_times`."""
+    return hermite_peaks(np.diff(times), *free_vibration(rig, times, q, velocity))
