@@ -1,6 +1,6 @@
 """Time and peak memory of a sweep as it grows, and what compiling it takes.
 
-    python -m experiments.benchmarks.growth [--runs 4096 40000 400000]
+    python -m experiments.benchmarks.growth [--runs 4096 40000 400000 4000000]
 
 Masses by speeds of the one-span rig with three modes, peaks at three sensors. Every size is swept
 in a process of its own, whose peak memory is told by the operating system, so that no size hides in
@@ -59,7 +59,7 @@ def apart(runs: int, cache: str) -> dict[str, float]:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, nargs="+", default=[4096, 40_000, 400_000])
+    parser.add_argument("--runs", type=int, nargs="+", default=[4096, 40_000, 400_000, 4_000_000])
     parser.add_argument("--measure", type=int, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.measure is not None:

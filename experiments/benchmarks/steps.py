@@ -9,11 +9,10 @@ crossing, on one core, compiled (see `jaxbeam.step_times`): the median and the w
 the time for each of 256 at once.
 """
 
-import os
+from experiments.benchmarks.cores import one_core
 
-if __name__ == "__main__":  # one core: before JAX looks
-    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+if __name__ == "__main__":
+    one_core()  # before JAX looks
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Speed of a sweep against scipy and diffrax, and of derivatives against plain runs.
+"""Speed of a sweep against scipy, diffrax and numba, and of derivatives against plain runs.
 
     python -m experiments.benchmarks.sweep [--modes 3 12]
 
@@ -17,7 +17,7 @@ import numpy as np
 import xarray
 
 import jaxbeam as jb
-from experiments.benchmarks import baselines
+from experiments.benchmarks import baselines, by_numba
 from experiments.benchmarks.crossing import Rig
 from experiments.benchmarks.timing import best_in_turn, time_call
 from jaxbeam.compiling import compiled
@@ -79,6 +79,17 @@ def compare(modes: int) -> list[tuple[str, float, float, float]]:
 
         took = time_call(others, repeat=repeat)
         rows.append((name, took.run, worst(np.asarray(others())[:, CHECKED])))
+    package = by_numba.numba()
+    if package is None:
+        print("numba is left out: it is not installed (uv sync --extra benchmarks)")
+    else:
+        fill = by_numba.program(package)
+
+        def loops():
+            return by_numba.numba_peaks(fill, Rig(modes), MASSES, SPEEDS)
+
+        took = time_call(loops, repeat=repeat)
+        rows.append(("numba, parallel over runs", took.run, worst(loops()[:, CHECKED])))
     scaled = baselines.scipy_time(baselines.scipy_peaks, Rig(modes), MASSES, SPEEDS)
     some = baselines.scipy_peaks(Rig(modes), MASSES[::21], SPEEDS[CHECKED])
     rows.append(("scipy DOP853, scaled", scaled, float(np.max(np.abs(some / reference[::21] - 1)))))

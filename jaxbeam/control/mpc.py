@@ -227,8 +227,12 @@ class MPC(AbstractStateLaw):
         Q = seen.T @ (self._weights(C.shape[0])[-1, :, None] * seen)
         return dare(A, B, Q, jnp.diag(jnp.broadcast_to(self.move_weight, B.shape[1])))
 
-    def _move(self, design, prediction, known, before):
-        """The first move, and whether there is one that solves the problem."""
+    def program(self, design: Design, prediction: Prediction, known, before):
+        """The quadratic program of a tick: H, f, M and gamma of `solve_qp`.
+
+        `known` is what the free response follows from, the state, its change that the model does
+        not explain, the command `before`, and 1.
+        """
         free = prediction.F @ known
         weight, Phi, steps = self._weights(free.shape[1]), prediction.Phi, design.steps
         if design.tail is not None:
@@ -241,11 +245,17 @@ class MPC(AbstractStateLaw):
             pull = prediction.end_phi.T @ design.tail
             H, f = H + pull @ prediction.end_phi, f + pull @ (prediction.end @ known)
         H, f = 2 * H, 2 * f
-        if self.solver == "unconstrained":
-            return steps[0] @ -jnp.linalg.solve(H, f), jnp.ones((), bool)
         M, gamma = design.rows, design.top - design.side @ before
+        if self.solver == "unconstrained":
+            return H, f, M[:0], gamma[:0]
         if self.soft_limit is not None:
-            H, f, M, gamma = self._softened(H, f, M, gamma, Phi, free)
+            return self._softened(H, f, M, gamma, Phi, free)
+        return H, f, M, gamma
+
+    def _move(self, design, prediction, known, before):
+        """The first move, and whether there is one that solves the problem."""
+        H, f, M, gamma = self.program(design, prediction, known, before)
+        steps = design.steps
         if M.shape[0] == 0:
             return steps[0] @ -jnp.linalg.solve(H, f), jnp.ones((), bool)
         found = solve_qp(H, f, M, gamma, self.solver)

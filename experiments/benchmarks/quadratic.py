@@ -1,0 +1,157 @@
+"""Quadratic programs of predictive control against OSQP: those of a crossing, to one accuracy.
+
+    python -m experiments.benchmarks.quadratic
+
+The rig of `steps` under predictive control of 4 to 8 variables with limits; the programs are those
+of the ticks of its crossing, scaled so that the largest entry of H is one. OSQP is set up once and
+told by vectors what is new at a tick; it starts from the last solution, keeps its factors, and
+polishes. Given are its own account of updates and solutions, and what a call takes from Python.
+jaxbeam starts anew each time: on one core, compiled, one after the other in a loop and 256 at once.
+Without OSQP the benchmark says so and ends.
+"""
+
+from experiments.benchmarks.cores import one_core
+
+if __name__ == "__main__":
+    one_core()  # before JAX looks
+
+import contextlib
+import importlib
+import os
+import sys
+import time
+import warnings
+from types import ModuleType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+import jaxbeam as jb
+from experiments.benchmarks.steps import PREDICTIVE, rig
+from experiments.benchmarks.timing import time_call
+from jaxbeam.compiling import compiled
+from jaxbeam.control import SamplingWarning
+from jaxbeam.control.qp import solve_qp
+from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.statespace import state_space
+
+SIZES = {4: 6, 6: 8, 8: 10}  # variables, and periods ahead
+MANY, ROUNDS = 256, 20
+ACCURACY = 1e-7  # of OSQP's residuals, before it polishes
+AGREED = 1e-6  # share of the largest move by which solutions may differ
+MOST = 100_000  # iterations of OSQP
+
+
+def osqp() -> ModuleType | None:
+    """The package, if it is installed."""
+    try:
+        return importlib.import_module("osqp")
+    except ImportError:
+        return None
+
+
+def programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """H (variable, variable), f (tick, variable), M and gamma (tick, row) of a crossing."""
+    case = rig(jb.MPC(horizon=SIZES[variables], moves=variables, **PREDICTIVE))
+    with warnings.catch_warnings():
+        for kind in (ContactLossWarning, SamplingWarning):
+            warnings.simplefilter("ignore", kind)
+        record = jb.simulate(case, tolerance=1e-4)
+    law, _ = case.controller.init(state_space(case))
+    design = law.design
+    states = jnp.concatenate([record.coordinates, record.rates], axis=1)
+    before = jnp.concatenate([jnp.zeros((1, 1)), record.command[:-1]])
+
+    @compiled
+    def program(design, state, last, before):
+        explained = design.plant.A @ last + design.plant.B @ before
+        known = jnp.concatenate([state, state - explained, before, jnp.ones(1)])
+        return case.controller.program(design, design.prediction, known, before)
+
+    last = jnp.concatenate([jnp.zeros((1, states.shape[1])), states[:-1]])
+    found = [program(design, *each) for each in zip(states, last, before, strict=True)]
+    H, f, M, gamma = (np.array(part) for part in zip(*found, strict=True))
+    return H[0], f, M[0], gamma
+
+
+def by_jaxbeam(H, f, M, gamma) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Solutions, whether limits are felt, and seconds of each: one by one, and of many at once."""
+
+    @compiled
+    def in_turn(H, f, M, gamma):
+        return jax.lax.map(lambda each: solve_qp(H, each[0], M, each[1]), (f, gamma))
+
+    @compiled
+    def at_once(H, f, M, gamma):
+        return jax.vmap(lambda f, gamma: solve_qp(H, f, M, gamma))(f, gamma)
+
+    found = in_turn(H, f, M, gamma)
+    if not found.solved.all():
+        raise RuntimeError(f"jaxbeam left {int((~found.solved).sum())} programs unsolved")
+    many = np.resize(np.arange(len(f)), MANY)
+    batch = time_call(at_once, H, f[many], M, gamma[many], repeat=ROUNDS).run / MANY
+    single = time_call(in_turn, H, f, M, gamma, repeat=ROUNDS).run / len(f)
+    return np.asarray(found.x), np.asarray(found.steps) > 0, single, batch
+
+
+def by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, float, float]:
+    """Solutions, and seconds of each: by its own account, and called from Python."""
+    solver = package.OSQP()
+    matrices = scipy.sparse.csc_matrix(np.triu(H)), scipy.sparse.csc_matrix(M)
+    free = np.full(gamma.shape[1], -np.inf)
+    settings = {"eps_abs": ACCURACY, "eps_rel": ACCURACY, "max_iter": MOST}
+    settings |= {"polishing": True, "warm_starting": True, "verbose": False}
+    solver.setup(matrices[0], f[0], matrices[1], free, gamma[0], **settings)
+    times = []
+    for _ in range(ROUNDS):
+        x, own, start = [], 0.0, time.perf_counter()
+        with _silent():
+            for one, top in zip(f, gamma, strict=True):
+                solver.update(q=one, u=top)
+                found = solver.solve(raise_error=True)
+                x.append(found.x)
+                own += found.info.update_time + found.info.solve_time + found.info.polish_time
+        times.append((own / len(f), (time.perf_counter() - start) / len(f)))
+    return np.array(x), *np.median(times, axis=0)
+
+
+@contextlib.contextmanager
+def _silent():
+    """Nothing is printed, by C neither: OSQP tells of its polishing whatever it is asked."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 1)
+            os.close(kept)
+
+
+def main() -> None:
+    """Print the table. Raises RuntimeError if the solutions differ."""
+    package = osqp()
+    if package is None:
+        print("OSQP is not installed (uv sync --extra benchmarks): nothing to compare with")
+        return
+    print("| variables | limits felt | jaxbeam, one by one | 256 at once | OSQP, own account"
+          " | OSQP, called from Python | largest difference |")  # fmt: skip
+    print("| ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
+    for variables in SIZES:
+        H, f, M, gamma = programs(variables)
+        H, f = H / np.max(np.abs(H)), f / np.max(np.abs(H))
+        ours, felt, single, batch = by_jaxbeam(H, f, M, gamma)
+        theirs, own, called = by_osqp(package, H, f, M, gamma)
+        apart = np.max(np.abs(theirs - ours)) / np.max(np.abs(ours))
+        if apart > AGREED:
+            raise RuntimeError(f"{variables} variables: solutions differ by {apart:.0e}")
+        times = " | ".join(f"{1e6 * t:.1f} us" for t in (single, batch, own, called))
+        print(f"| {variables} | {np.mean(felt):.0%} of {len(f)} | {times} | {apart:.0e} |",
+              flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
