@@ -4,14 +4,14 @@
 
 Masses by speeds of the one-span rig with three modes, peaks at three sensors. Every size is swept
 in a process of its own, whose peak memory is told by the operating system, so that no size hides in
-what another took; a grid of 64 by 64 is swept first, so that all is compiled. That first sweep is
-timed in two processes that share a new persistent cache: the first compiles, the second reads.
+what another took; all is compiled before, by a sweep of 64 by 64 and one of all masses and a few of
+the speeds. The first is timed in two processes that share a new persistent cache: one compiles, the
+other reads.
 """
 
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -27,19 +27,22 @@ def measure(runs: int) -> dict[str, float]:
     """
     from experiments.benchmarks.cluster import grid
     from experiments.benchmarks.sweep import rig
+    from experiments.benchmarks.timing import peak_memory
     from jaxbeam import sweep
 
-    case, took = rig(3), []
+    case, took, over = rig(3), [], grid(runs)
+    # Blocks depend on how many masses there are: with all of them, some speeds compile all.
+    some = over | {"loads.0.speed": over["loads.0.speed"][:: -(-len(over["loads.0.speed"]) // 16)]}
     before = 0.0
-    for count in (FIRST, FIRST, runs):
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    for given in (grid(FIRST), grid(FIRST), some, over):
+        before = peak_memory()
         start = time.perf_counter()
-        found = sweep(case, grid(count), progress=False)
+        found = sweep(case, given, progress=False)
         took.append(time.perf_counter() - start)
         if found.failed.any():
             raise RuntimeError(f"{int(found.failed.sum())} runs failed")
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"first": took[0], "again": took[1], "run": took[2], "before": before, "peak": peak}
+    peak = peak_memory()
+    return {"first": took[0], "again": took[1], "run": took[3], "before": before, "peak": peak}
 
 
 def apart(runs: int, cache: str) -> dict[str, float]:
