@@ -15,6 +15,7 @@ ORDER = 9  # at which errors are taken to fall with the step; the true order is 
 FINER = 1.25  # how much finer the runs are with which others are compared
 ROUNDS = 12
 MARGIN = 4  # how much smaller errors must be where they are looked for than they may be elsewhere
+SURE = 1.3  # how far a guess must exceed the limit of a step for that to be taken unmeasured
 SMALL = 1e-6  # of a run's largest peak: smaller ones need not be right to the tolerance
 
 Measure = Callable[[Int[np.ndarray, " task"], Float[np.ndarray, " task"]], np.ndarray]
@@ -97,7 +98,8 @@ def choose_steps(
         worst = float(np.max(np.where(np.isnan(error), 0.0, error)))
         if worst <= aim:
             return steps, worst
-        steps = steps * 0.7
+        with np.errstate(divide="ignore"):
+            steps = steps * max(0.7, 0.95 * (aim / worst) ** (1 / ORDER))
     raise _hopeless(tolerance)
 
 
@@ -107,9 +109,12 @@ def _search(measure: Measure, tasks, guesses, limits, tolerance: float):
     Tasks go from slow to quick.
     """
     steps = np.minimum(guesses, limits)
-    good, bad = np.zeros(tasks.size), np.full(tasks.size, np.inf)
-    error, settled = np.zeros(tasks.size), np.zeros(tasks.size, bool)
-    for _ in range(ROUNDS):
+    # Slow tasks take longest, and what limits their steps is not the error.
+    settled = guesses >= SURE * limits
+    good, bad = np.where(settled, limits, 0.0), np.full(tasks.size, np.inf)
+    error = np.zeros(tasks.size)
+    change = np.ones(tasks.size)
+    for _ in range(0 if settled.all() else ROUNDS):
         # As many as ever are measured: in place of the settled the quickest, which costs least.
         places = np.where(settled, tasks.size - 1, np.arange(tasks.size))
         found = errors(measure, tasks[places], steps[places])
