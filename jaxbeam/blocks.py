@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam import programs
+from jaxbeam import native, programs
 from jaxbeam.case import Case, replace, value_at
 from jaxbeam.exponentials import NODES
 from jaxbeam.lanes import Tasks
@@ -68,7 +68,7 @@ class Work:
         slots = len(case.loads)
         if slots > 1:
             slots = max(most_at_once(window) for window in windows())
-        self.form = Form(layout, couples(case), slots)
+        self.form = Form(layout, couples(case), slots, native.ready())
         design = case, self.form, self.addresses[0]
         # Known before what rigs look like. While one program compiles, the next is traced.
         with ThreadPoolExecutor(2) as pool:
@@ -96,7 +96,7 @@ class Work:
         self.limits = np.minimum(limits, duration)
         # As found for beams of 3 and 12 modes at fast and slow crossings, errors of 1e-7.
         modes = case.beam.modes
-        self.guesses = crossing / (14 * modes + 13 + 1.25 * crossing / limits / np.sqrt(modes))
+        self.guesses = crossing / (22 * modes + 5 + 1.25 * crossing / limits / np.sqrt(modes))
         self.guesses *= (tolerance / 1e-7) ** (1 / (2 * NODES))
 
     def steps(self) -> tuple[Float[np.ndarray, " task"], float]:

@@ -83,8 +83,9 @@ def work_off(blocks: list[int], mark: str, path: Path) -> list[int]:
     work, made = _work(mark, keeper)
     if made != mark:
         raise ValueError(
-            "a worker has another version of jaxbeam or JAX than that which began the sweep;"
-            " install the same everywhere"
+            "a worker has another version of jaxbeam or JAX than that which began the sweep, or"
+            " only one of them has the steps that `jaxbeam native` compiles; install the same"
+            " everywhere"
         )
     for block in blocks:
         if not keeper.done(block):

@@ -3,6 +3,7 @@
 import functools
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -25,6 +26,11 @@ ROUGHLY = {"xla_backend_optimization_level": 0}
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+def cache_folder() -> Path:
+    """Where what is compiled is kept for later: in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxbeam"
 
 
 def options(**settings: bool | int) -> dict[str, bool | int]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxbeam.exponentials import GAUSS, POINTS
 from jaxbeam.motion import NEVER
 from jaxbeam.peaks import refine, vertex
-from jaxbeam.tables import Tables
+from jaxbeam.tables import Path, Tables
 
 NEAR = 1.1  # a peak between samples is less than this above the highest of them
 
@@ -41,9 +41,10 @@ class Extremes(eqx.Module):
 
 
 @jax.named_scope("extremes")
-def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) -> Extremes:
+def fold(best: Extremes, tables: Tables, path: Path, states, forces, commands) -> Extremes:
     """Extremes of the run so far, from those up to a chunk of steps and the chunk itself."""
     steps, lanes = states.shape[0], states.shape[-1]
+    start, span = path.start, path.span
     parts = (states, forces) if commands is None else (states, forces, commands)
     seen = tables.watch @ jnp.concatenate(parts, axis=1)
     samples = jax.lax.optimization_barrier(seen.reshape(steps, POINTS + 1, -1, lanes))
@@ -73,7 +74,7 @@ def fold(best: Extremes, tables: Tables, states, forces, commands, start, span) 
     best = jax.lax.cond(jnp.any(highest * NEAR > best.score), raised, lambda best: best, best)
     pressing = jnp.min(-forces.reshape(steps, -1, len(GAUSS), lanes), axis=2)
     # A load that is not on the beam, or has no slot, does not count.
-    here = (tables.slots[:, :, None] == np.arange(best.lowest.shape[0])) & tables.active[..., None]
+    here = (path.slots[:, :, None] == np.arange(best.lowest.shape[0])) & path.active[..., None]
     least = jnp.where(here[..., None], pressing[:, :, None], jnp.inf)
     lowest = jnp.minimum(best.lowest, jnp.min(least, axis=(0, 1), initial=jnp.inf))
 

@@ -16,15 +16,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbeam import native
 from jaxbeam.driver import AbstractDriver, Moment
 from jaxbeam.dynamics import Traffic, solve_contact
 from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
 from jaxbeam.extremes import Extremes, fold, nothing_seen
 from jaxbeam.loads import AbstractLoad, MovingMass
 from jaxbeam.rig import Rig
-from jaxbeam.tables import Rigging, Tables, tabulate
+from jaxbeam.tables import CHUNK, Path, Rigging, Tables, follow, tabulate
 
-CHUNK = 8
 # Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
 # a polynomial in each step, misses that mode's oscillation and feeds it.
 RESOLVED = 1.9 * NODES
@@ -50,7 +50,7 @@ def _contact(tables: Tables, inertia, weight, state, commands):
         return solve_contact(tables.gains, inertia, weight + inertia * felt)
 
     # Between loads and after the last there is nothing to solve, which saves half of such steps.
-    return jax.lax.cond(jnp.any(tables.active), pressed, lambda: jnp.zeros_like(weight))
+    return jax.lax.cond(tables.active, pressed, lambda: jnp.zeros_like(weight))
 
 
 @jax.named_scope("propagation")
@@ -91,35 +91,73 @@ def _driven(driver: AbstractDriver, carry, step):
     return (after, memory), (state, forces, commands, driver.shows(memory, moment))
 
 
-def _rows(loads: Float[Array, "load lane"], tables: Tables) -> Float[Array, "step row lane"]:
+def _rows(loads: Float[Array, "load lane"], path: Path) -> Float[Array, "step row lane"]:
     """A property of the loads for every row of the contact equations; zero for idle slots."""
-    chosen = jnp.where(tables.active[..., None], loads[tables.slots], 0.0)
+    chosen = jnp.where(path.active[..., None], loads[path.slots], 0.0)
     return jnp.repeat(chosen, len(GAUSS), axis=1)
 
 
-def _stepper(rigging: Rigging, traffic: Traffic, slots: int, driver: AbstractDriver | None):
+def _undriven(rigging: Rigging, path: Path, inertia, weight, state, best: Any):
+    """A chunk of steps without a driver: state and extremes after it, and the states before each.
+
+    Without extremes so far, None, none are looked for.
+    """
+    tables = tabulate(rigging, path)
+    loads = _rows(inertia, path), _rows(weight, path)
+    state, (states, forces) = jax.lax.scan(_advance, state, (tables, *loads, None))
+    if best is not None:
+        best = fold(best, tables, path, states, forces, None)
+    return (state, best), states
+
+
+@jax.custom_jvp
+def _native(prepared, rigging: Rigging, path: Path, inertia, weight, state, best: Any):
+    """The state and the extremes after a chunk of steps, by C."""
+    return native.chunk(prepared, path, inertia, weight, state, best)
+
+
+@_native.defjvp
+def _native_jvp(given, changes):
+    """C is not differentiated, but what it stands for."""
+    return jax.jvp(lambda *given: _undriven(*given)[0], given[1:], changes[1:])
+
+
+def _stepper(
+    rigging: Rigging,
+    traffic: Traffic,
+    slots: int,
+    driver: AbstractDriver | None,
+    by_hand: bool = False,
+):
     """Function that takes state, memory and extremes through the chunk from a given step on.
 
-    It returns them with the time (s) at its end, and with what may be kept of it.
+    It returns them with the time (s) at its end, and with what may be kept of it, which is nothing
+    if the steps are those written `by_hand`.
     """
+    by_hand = by_hand and driver is None and traffic.inertia.dtype == jnp.float64
+    prepared = native.prepare(rigging) if by_hand else None
 
     def chunk(state, memory, best: Any, first):
         index = first + jnp.arange(CHUNK)
-        tables, start, span = tabulate(rigging, traffic, slots, index)
-        loads = _rows(traffic.inertia, tables), _rows(traffic.weight, tables)
-        if driver is None:
-            commands = shown = None
-            state, (states, forces) = jax.lax.scan(_advance, state, (tables, *loads, None))
-        else:
-            moments = Moment(start, span, rigging.grid.edge(index))
+        path = follow(rigging, traffic, slots, index)
+        given = rigging, path, traffic.inertia, traffic.weight, state, best
+        states = commands = shown = None
+        if driver is not None:
+            tables = tabulate(rigging, path)
+            loads = _rows(traffic.inertia, path), _rows(traffic.weight, path)
+            moments = Moment(path.start, path.span, rigging.grid.edge(index))
             (state, memory), (states, forces, commands, shown) = jax.lax.scan(
                 lambda carry, step: _driven(driver, carry, step),
                 (state, memory),
                 (tables, *loads, moments),
             )
-        if best is not None:
-            best = fold(best, tables, states, forces, commands, start, span)
-        return state, memory, best, start[-1] + span[-1], (states, commands, shown)
+            if best is not None:
+                best = fold(best, tables, path, states, forces, commands)
+        elif prepared is not None:
+            state, best = _native(prepared, *given)
+        else:
+            (state, best), states = _undriven(*given)
+        return state, memory, best, path.start[-1] + path.span[-1], (states, commands, shown)
 
     return chunk
 
@@ -168,6 +206,7 @@ def march(
     *,
     slots: int,
     driver: AbstractDriver | None = None,
+    by_hand: bool = False,
 ) -> tuple[Extremes, Any]:
     """Integrate from rest over a grid, keeping only extremes at the watched places.
 
@@ -175,9 +214,10 @@ def march(
 
     The loop runs as long as it must: it ends early when all lanes are given up, and without a
     driver when the energy left after the last exit cannot raise any peak. `slots` is how many
-    loads may be on the beam at once. Forward mode only.
+    loads may be on the beam at once. Steps written `by_hand` in C do the same sooner, if they are
+    `native.ready`. Forward mode only.
     """
-    chunk = _stepper(rigging, traffic, slots, driver)
+    chunk = _stepper(rigging, traffic, slots, driver, by_hand)
     grid, stiffness = rigging.grid, rigging.rig.stiffness()
     size = 2 * stiffness.shape[0]
 

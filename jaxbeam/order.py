@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam import native
 from jaxbeam.blocks import RUNS, Work
 from jaxbeam.case import Case, replace, value_at
 from jaxbeam.casefile import case_from_dict, case_to_dict
@@ -91,7 +92,7 @@ class Order:
         """A number for all that shapes the results: case, values, settings and versions."""
         content = self.to_dict() | {
             "blocks": [RUNS, LANES, len(jax.local_devices())],
-            "versions": [_version(), jax.__version__],
+            "versions": [_version(), jax.__version__, native.ready()],
         }
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 

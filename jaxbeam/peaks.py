@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+VERTEX_ROUNDS = 2  # of Newton's method for a close estimate
 STARTS = 17  # places from which a peak is sought: closer than the extrema of the curve can be
 
 
@@ -21,8 +22,8 @@ class Curve(NamedTuple):
 
 
 @functools.cache
-def _through(points: int) -> np.ndarray:
-    """What gives all coefficients of the curve through equal samples, one after the other."""
+def through(points: int) -> np.ndarray:
+    """Matrix from equal samples to the coefficients of their curve, its slope and its bend."""
     nodes = np.linspace(-1.0, 1.0, points)
     value = np.linalg.inv(nodes[:, None] ** np.arange(points))
     slope = np.polynomial.polynomial.polyder(value)
@@ -31,7 +32,7 @@ def _through(points: int) -> np.ndarray:
 
 def _curve(samples: Float[Array, "point *rest"]) -> Curve:
     points = samples.shape[0]
-    rows = list(jnp.tensordot(_through(points), samples, axes=1))
+    rows = list(jnp.tensordot(through(points), samples, axes=1))
     return Curve(rows[:points], rows[points : 2 * points - 1], rows[2 * points - 1 :])
 
 
@@ -66,7 +67,7 @@ def vertex(
     highest = jnp.max(sizes, axis=0)
     start = jnp.linspace(-1.0, 1.0, sizes.shape[0])[jnp.argmax(sizes, axis=0)]
     curve = _curve(samples)
-    place = _climb(curve, start, 1 / sizes.shape[0], rounds=2)
+    place = _climb(curve, start, 1 / sizes.shape[0], rounds=VERTEX_ROUNDS)
     return jnp.maximum(size(_value(curve.value, place)), highest)
 
 
@@ -85,7 +86,8 @@ def refine(
     starts = np.linspace(-1.0, 1.0, STARTS).reshape(-1, *(1,) * (samples.ndim - 1))
     starts = jnp.broadcast_to(starts.astype(samples.dtype), (STARTS, *samples.shape[1:]))
     places = jnp.concatenate([starts, _climb(frozen, starts, 2 / STARTS, rounds=5)])
-    best = jnp.argmax(size(_value(frozen.value, places)), axis=0)
-    place = jnp.take_along_axis(places, best[None], axis=0)[0]
+    sizes = size(_value(frozen.value, places))
+    # Found so, and not by argmax, which looks at one number after the other.
+    place = jnp.max(jnp.where(sizes == jnp.max(sizes, axis=0), places, -1.0), axis=0)
     place = jax.lax.optimization_barrier(jax.lax.stop_gradient(place))
     return size(_value(curve.value, place)), (place + 1) / 2

@@ -38,11 +38,15 @@ PROBES = (0.13, 0.29, 0.47, 0.62, 0.88)  # of the length: where errors are looke
 
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """What decides array shapes: order of the supports, coupling, loads on the beam at once."""
+    """What decides array shapes: order of the supports, coupling, loads on the beam at once.
+
+    And whether steps without a driver are those written by hand, see `native`.
+    """
 
     layout: Layout
     coupled: bool
     slots: int
+    by_hand: bool = False
 
 
 def form(case: Case) -> Form:

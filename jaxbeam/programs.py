@@ -99,7 +99,9 @@ def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, l
             given = driver.rig, heavy, longest, driver
             rigging = _prepare(case, heavy_addresses, schedule, substeps, *given)
         if substeps is None:
-            best, memory = march(rigging, loads, slots=form.slots, driver=driver)
+            best, memory = march(
+                rigging, loads, slots=form.slots, driver=driver, by_hand=form.by_hand
+            )
             history = {}
         else:
             grid = rigging.grid

@@ -22,6 +22,8 @@ from jaxbeam.exponentials import GAUSS, POINTS, Step, propagators
 from jaxbeam.grid import Grid
 from jaxbeam.rig import Rig
 
+CHUNK = 8  # steps that are tabulated at once
+
 
 class CommandTables(eqx.Module):
     """How commands at the nodes act: on the contact law, and on the state at the end."""
@@ -42,7 +44,7 @@ class Tables(eqx.Module):
     """Matrices of each step of a chunk. Rows are (slot, node), commands (node, actuator).
 
     What is watched follows from state at the start, contact forces and commands, one after the
-    other.
+    other. Steps are active with a load on the beam.
     """
 
     respond: Float[Array, "step row state"]
@@ -52,8 +54,7 @@ class Tables(eqx.Module):
     watch: Float[Array, "step looked all"] | None
     commands: CommandTables | None
     inner: InnerTables | None
-    slots: Int[Array, "step slot"]
-    active: Bool[Array, "step slot"]
+    active: Bool[Array, " step"]
 
 
 class Rigging(eqx.Module):
@@ -101,18 +102,27 @@ def make_rigging(
     watch = jnp.einsum("wbm,lpbmj->lpwbj", rows, step.drift_points[..., places, :])
     push = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, step.push_points[..., places, :])
     flat = (grid.lengths.shape[0], -1)
-    # Not a number for rigid-body modes, which no energy bounds.
-    bent = solve_triangular(jnp.linalg.cholesky(rig.stiffness()), shapes.T, lower=True)
     return Rigging(
         rig,
         grid,
         step,
         watch.reshape(*flat, *watch.shape[3:]),
         push.reshape(*flat, *push.shape[3:]),
-        jnp.sum(bent**2, axis=0),
+        _flexibility(rig, shapes),
         commands,
         inner,
     )
+
+
+def _flexibility(rig: Rig, shapes: Float[Array, "place mode"]) -> Float[Array, " place"]:
+    """Static deflection at places under a unit force there; no number if a mode has no stiffness.
+
+    Modes that nothing couples need no factorisation, which takes longer than all the rest.
+    """
+    if rig.modes_per_block == 1:
+        return jnp.sum(shapes**2 / -rig.state_matrix[:, 1, 0], axis=1)
+    bent = solve_triangular(jnp.linalg.cholesky(rig.stiffness()), shapes.T, lower=True)
+    return jnp.sum(bent**2, axis=0)
 
 
 def both_sides(rigging: Rigging) -> Rigging:
@@ -132,9 +142,25 @@ def both_sides(rigging: Rigging) -> Rigging:
     )
 
 
+class Path(eqx.Module):
+    """Where the loads are in each step of a chunk, and what the contact law feels of the rig there.
+
+    `kind` says which of the grid's lengths a step has; the times of its start and its length are in
+    s. Rows of idle slots are zero.
+    """
+
+    kind: Int[Array, " step"]
+    start: Float[Array, " step"]
+    span: Float[Array, " step"]
+    slots: Int[Array, "step slot"]
+    active: Bool[Array, "step slot"]
+    shape: Float[Array, "step slot node block mode"]
+    rows: Float[Array, "step slot node block side"]
+
+
 @jax.named_scope("path")
-def tabulate(rigging: Rigging, traffic: Traffic, slots: int, index: Int[Array, " step"]):
-    """Tables of the steps with the given indices, and their start times and lengths (s)."""
+def follow(rigging: Rigging, traffic: Traffic, slots: int, index: Int[Array, " step"]) -> Path:
+    """The path of the loads in the steps with the given indices."""
     rig, grid = rigging.rig, rigging.grid
     panel, start, kind = grid.steps(index)
     span = grid.lengths[kind]
@@ -154,9 +180,15 @@ def tabulate(rigging: Rigging, traffic: Traffic, slots: int, index: Int[Array, "
         chosen = jnp.broadcast_to(jnp.arange(slots), active.shape)
     on = jnp.broadcast_to(active[:, :, None], position.shape)
     shape, rows = contact_rows(rig, position, speed, acceleration, on)
+    return Path(kind, start, span, chosen, active, shape, rows)
+
+
+@jax.named_scope("path")
+def tabulate(rigging: Rigging, path: Path) -> Tables:
+    """Tables of the steps of a chunk."""
 
     def alike(_):
-        return _of_one_kind(rigging, kind[0], shape, rows)
+        return _of_one_kind(rigging, path.kind[0], path.shape, path.rows)
 
     def one_by_one(_):
         def single(step):
@@ -164,11 +196,11 @@ def tabulate(rigging: Rigging, traffic: Traffic, slots: int, index: Int[Array, "
             tables = _of_one_kind(rigging, kind, shape[None], rows[None])
             return jax.tree.map(lambda table: table[0], tables)
 
-        return jax.lax.map(single, (kind, shape, rows))
+        return jax.lax.map(single, (path.kind, path.shape, path.rows))
 
     # Mostly all steps of a chunk are equally long, and then share their propagators.
-    tables: Any = jax.lax.cond(jnp.all(kind == kind[0]), alike, one_by_one, None)
-    return Tables(*tables, slots=chosen, active=active), start, span
+    tables: Any = jax.lax.cond(jnp.all(path.kind == path.kind[0]), alike, one_by_one, None)
+    return Tables(*tables, active=jnp.any(path.active, axis=1))
 
 
 def _of_one_kind(rigging: Rigging, kind, shape, rows):

@@ -8,7 +8,6 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NoReturn
 
 from cyclopts import CycloptsError
@@ -16,6 +15,7 @@ from cyclopts import CycloptsError
 from jaxbeam.cli import (
     checking,
     comparing,
+    compiling,
     exporting,
     identifying,
     judging,
@@ -29,6 +29,7 @@ from jaxbeam.cli.app import app, say
 __all__ = [
     "checking",
     "comparing",
+    "compiling",
     "exporting",
     "identifying",
     "judging",
@@ -73,7 +74,8 @@ def _keep_compiled() -> None:
     """
     import jax
 
+    from jaxbeam.compiling import cache_folder
+
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(cache / "jaxbeam"))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

@@ -1,0 +1,28 @@
+"""The command that compiles the steps of sweeps for this machine."""
+
+from jaxbeam.cli.app import Json, app
+from jaxbeam.printing import print_json
+
+
+@app.command
+def native(*, remove: bool = False, json_: Json = False) -> None:
+    """Compile the steps of sweeps for this machine: needs a C compiler, once; sweeps are quicker.
+
+    Parameters
+    ----------
+    remove
+        Remove what was compiled; sweeps do without again.
+    """
+    from jaxbeam import native as compiled
+
+    path = compiled.library()
+    if remove:
+        compiled.remove()
+    else:
+        compiled.build()
+    if json_:
+        print_json({"library": str(path), "compiled": not remove})
+    elif remove:
+        print(f"removed {path}: sweeps do without")
+    else:
+        print(f"compiled {path}: sweeps on this machine use it from now on")

@@ -1,0 +1,182 @@
+"""A chunk of steps by hand-written C (`native.c`), where that was compiled for this machine.
+
+XLA makes of a step some forty small loops over the lanes; by hand it is one. The C is compiled
+once, when asked for, by the C compiler of the machine, into the user's cache folder; sweeps then
+use it for runs in double precision without a controller, on CPUs. Nobody needs it.
+"""
+
+import ctypes
+import functools
+import hashlib
+import os
+import pathlib
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.compiling import cache_folder
+from jaxbeam.exponentials import GAUSS, NODES, POINTS
+from jaxbeam.extremes import NEAR, Extremes
+from jaxbeam.peaks import VERTEX_ROUNDS, through
+from jaxbeam.tables import CHUNK, Path, Rigging
+
+SOURCE = pathlib.Path(__file__).with_suffix(".c")
+HEADER = SOURCE.with_name("native_lanes.h")
+WIDE = 8  # lanes that are worked on at once
+CONSTANTS = {
+    "WIDE": WIDE,
+    "STEPS": CHUNK,
+    "NODES": NODES,
+    "POINTS": POINTS + 1,
+    "NEAR": NEAR,
+    "ROUNDS": VERTEX_ROUNDS,
+}
+FLAGS = (
+    *("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC"),
+    *(f"-D{name}={value}" for name, value in CONSTANTS.items()),
+)
+TARGETS = {jnp.abs: "chunk_of_both_sides", jnp.positive: "chunk_of_one_side"}
+
+
+def library() -> pathlib.Path:
+    """Where the compiled C is, or would be: a file for this source, this machine and this JAX."""
+    return cache_folder() / f"native-{_mark()}.so"
+
+
+def build() -> pathlib.Path:
+    """Compile the C for this machine and return the library's path; sweeps use it from then on.
+
+    The compiler is the one that CC names, or cc, gcc or clang. Raises RuntimeError if there is
+    none, or with what it complains of; OSError if the cache folder cannot be written.
+    """
+    found = (shutil.which(name) for name in ("cc", "gcc", "clang"))
+    compiler = os.environ.get("CC") or next(filter(None, found), None)
+    if compiler is None:
+        raise RuntimeError("there is no C compiler here: install gcc or clang, or name one in CC")
+    target = library()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # Made beside its place and moved there, so that nobody ever loads half of it.
+    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+        made = pathlib.Path(folder) / target.name
+        command = [*compiler.split(), str(SOURCE), *FLAGS, "-I", jax.ffi.include_dir()]
+        try:
+            done = subprocess.run([*command, "-o", str(made)], capture_output=True, text=True)
+        except OSError as error:
+            raise RuntimeError(f"the C compiler {compiler} cannot be run: {error}") from None
+        if done.returncode or not made.exists():
+            said = done.stderr.strip()[-500:]
+            raise RuntimeError(f"the C compiler {compiler} cannot compile {SOURCE}: {said}")
+        _digest(target).write_text(hashlib.sha256(made.read_bytes()).hexdigest())
+        os.replace(made, target)
+    return target
+
+
+def remove() -> None:
+    """Remove what was compiled for this machine, if it was: sweeps do without again."""
+    for path in (library(), _digest(library())):
+        path.unlink(missing_ok=True)
+
+
+def ready() -> bool:
+    """Whether the C is compiled for this machine, and of use: computing on a CPU."""
+    return jax.default_backend() == "cpu" and _sound(library()) and _registered()
+
+
+def _sound(path: pathlib.Path) -> bool:
+    """Whether there is a library, undamaged: to load one that is not would end the process."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest() == _digest(path).read_text()
+    except OSError:
+        return False
+
+
+@functools.cache
+def _registered() -> bool:
+    """Load the library and tell XLA of it, which takes each name once in a process."""
+    loaded = ctypes.CDLL(str(library()))
+    for name in TARGETS.values():
+        jax.ffi.register_ffi_target(_target(name), jax.ffi.pycapsule(getattr(loaded, name)))
+    return True
+
+
+def _digest(path: pathlib.Path) -> pathlib.Path:
+    """Where the check value of a library is."""
+    return path.with_suffix(".sha256")
+
+
+def _target(name: str) -> str:
+    """The name under which XLA knows a function of the library."""
+    return f"jaxbeam_{name}_{_mark()}"
+
+
+@functools.cache
+def _mark() -> str:
+    """A number for the source, the machine and JAX."""
+    written = SOURCE.read_text() + HEADER.read_text()
+    marks = [written, *FLAGS, jax.__version__, sys.platform, platform.machine(), _cpu()]
+    return hashlib.sha256("\n".join(marks).encode()).hexdigest()[:16]
+
+
+def _cpu() -> str:
+    """What tells this processor from others, for which the same library may not run."""
+    try:
+        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return "".join(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
+
+
+def prepare(rigging: Rigging) -> tuple:
+    """The propagators as `chunk` takes them."""
+    step = rigging.step
+    return (
+        _last(step.drift_nodes, 1),
+        _last(step.push_nodes, 2),
+        step.drift_end,
+        _last(step.push_end, 1),
+        rigging.watch,
+        _last(rigging.watch_push, 1),
+    )
+
+
+def _last(part, axis: int):
+    """With an axis as the last, padded to fill registers."""
+    part = jnp.moveaxis(part, axis, -1)
+    return jnp.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, -part.shape[-1] % WIDE)])
+
+
+@jax.named_scope("native")
+def chunk(
+    prepared: tuple,
+    path: Path,
+    inertia: Float[Array, "load lane"],
+    weight: Float[Array, "load lane"],
+    state: Float[Array, "state lane"],
+    best: Extremes,
+) -> tuple[Float[Array, "state lane"], Extremes]:
+    """The state after a chunk of steps, and the extremes so far, from those before it.
+
+    Steps without commands of a driver, in double precision; only if `ready`. `prepared` is what
+    `prepare` makes of the rigging.
+    """
+    changed = state, *jax.tree.leaves(best)
+    shape, rows = _last(path.shape, 2), _last(path.rows, 2)
+    given = (
+        *(*prepared, path.kind, path.start, path.span, path.slots, path.active, shape, rows),
+        *(inertia, weight, np.asarray(GAUSS), through(POINTS + 1)[: POINTS + 1]),
+    )
+    call = jax.ffi.ffi_call(
+        _target(TARGETS[best.size]),
+        [jax.ShapeDtypeStruct(part.shape, part.dtype) for part in changed],
+        vmap_method="sequential",
+        input_output_aliases={len(given) + i: i for i in range(len(changed))},
+    )
+    state, *leaves = call(*given, *changed)
+    return state, jax.tree.unflatten(jax.tree.structure(best), leaves)

@@ -1,0 +1,194 @@
+"""Steps by hand-written C: the same results as without, on every kind of rig and path."""
+
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam import native
+from jaxbeam.case import replace
+from jaxbeam.cli import main
+from jaxbeam.dynamics import traffic
+from jaxbeam.grid import even_grid
+from jaxbeam.integrate import march
+from jaxbeam.order import make_order
+from jaxbeam.plan import form
+from jaxbeam.rig import rig
+from jaxbeam.sweep_store import FINGERPRINT
+from jaxbeam.tables import both_sides, make_rigging
+
+pytestmark = pytest.mark.skipif(
+    not any(shutil.which(name) for name in ("cc", "gcc", "clang")), reason="no C compiler here"
+)
+
+BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
+SENSORS = [jb.Sensor(0.15), jb.Sensor(0.3), jb.Sensor(0.41)]
+PLAIN = jb.Case(BEAM, sensors=SENSORS, loads=[jb.MovingMass(mass=0.5, speed=1.0)], run=jb.Run(1.0))
+# One block of states, of which some are an actuator's own; a patch and a damper couple all modes.
+COUPLED = jb.Case(
+    BEAM,
+    supports=[jb.Support(0.25), jb.Support(0.5, stiffness=2e4, damping=30.0)],
+    actuators=[
+        jb.Electrodynamic(0.1, resistance=4.0, inductance=1e-3, force_constant=5.0, mass=0.02),
+        jb.Patch(0.3, 0.4, moment_per_volt=1e-4, added_mass=0.01, added_rigidity=0.5),
+    ],
+    sensors=SENSORS[:2],
+    loads=[jb.MovingMass(mass=0.5, speed=1.0)],
+    run=jb.Run(1.0),
+)
+# Three loads, two of them on the beam at once, one braking, one coming the other way.
+STREAM = jb.Case(
+    BEAM,
+    sensors=SENSORS[:1],
+    loads=[
+        jb.MovingMass(mass=0.5, speed=2.0, deceleration=2.0),
+        jb.MovingForce(force=3.0, speed=-1.5, entry_time=0.1),
+        jb.MovingMass(mass=0.2, speed=1.0, entry_time=0.6),
+    ],
+    run=jb.Run(1.5),
+)
+# A heavy mass at high speed: it would have to pull, and not all of its runs stay finite.
+WILD = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, modes=6, damping_ratio=0.0),
+    sensors=SENSORS,
+    loads=[jb.MovingMass(mass=5.0, speed=20.0)],
+    run=jb.Run(0.2),
+)
+FEW = {"loads.0.mass": [0.1, 0.5], "loads.2.speed": [0.8, 1.2]}
+GRID = {"loads.0.mass": np.linspace(0.05, 1.0, 13), "loads.0.speed": [1.0, 2.0, 7.0]}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def folder(tmp_path_factory):
+    """The C, compiled into a cache folder of these tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        assert not native.ready()
+        assert native.build() == native.library()
+        assert native.ready()
+        yield native.library().parent
+
+
+def swept(case, over):
+    with_it = jb.sweep(case, over, progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(native, "ready", lambda: False)
+        return with_it, jb.sweep(case, over, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("case", "over"),
+    [
+        pytest.param(PLAIN, GRID, id="plain"),
+        pytest.param(COUPLED, GRID | {"beam.flexural_rigidity": [9.0, 12.0]}, id="coupled"),
+        pytest.param(
+            STREAM, {"loads.0.mass": [0.1, 0.5], "loads.2.speed": [0.8, 1.2]}, id="stream"
+        ),
+        pytest.param(WILD, {"loads.0.mass": [0.5, 5.0, 60.0]}, id="wild"),
+    ],
+)
+def test_results_are_those_without_it(case, over):
+    by_hand, plain = swept(case, over)
+    assert_allclose(by_hand.peak_deflection, plain.peak_deflection, rtol=1e-11)
+    assert_allclose(by_hand.lowest_contact_force, plain.lowest_contact_force, rtol=1e-9, atol=1e-9)
+    assert_allclose(by_hand.contact_lost_time, plain.contact_lost_time, rtol=1e-9)
+    assert (by_hand.failed == plain.failed).all()
+    # Where a curve is flat, its peak is known to the root of what its height is.
+    assert_allclose(by_hand.peak_time, plain.peak_time, atol=2e-7)
+    # Another step would be another result, and a sweep that took no steps by C the very same.
+    assert np.any(by_hand.peak_deflection != plain.peak_deflection)
+    assert by_hand.attrs[FINGERPRINT] != plain.attrs[FINGERPRINT]
+
+
+def test_some_of_these_cases_lose_contact():
+    lost = jb.sweep(WILD, {"loads.0.mass": [0.5, 5.0]}, progress=False).contact_lost_time
+    assert np.isfinite(lost).any()
+
+
+def marched(case, by_hand, sides=lambda rigging: rigging):
+    """Peaks at the sensors of a single run, as a function of its mass (kg)."""
+    known = form(case)
+
+    def peaks(mass):
+        varied = replace(case, {"loads.0.mass": mass})
+        assembled = rig(varied, known.layout, known.coupled)
+        grid = even_grid(varied, assembled, jnp.asarray(1e-3))
+        rigging = sides(make_rigging(assembled, grid, varied.sensor_places))
+        best, _ = march(rigging, traffic(varied), slots=known.slots, by_hand=by_hand)
+        return best.peak()[0][:, 0]
+
+    return jax.jit(peaks)
+
+
+@pytest.mark.parametrize("case", [PLAIN, COUPLED], ids=["plain", "coupled"])
+def test_derivatives_are_those_without_it(case):
+    mass = jnp.asarray(0.4)
+    value, slope = jax.jvp(marched(case, True), (mass,), (jnp.ones(()),))
+    plain, slope_without = jax.jvp(marched(case, False), (mass,), (jnp.ones(()),))
+    assert_allclose(value, plain, rtol=1e-11)
+    assert_allclose(slope, slope_without, rtol=1e-9)
+    step = 1e-4
+    above, below = (marched(case, True)(mass + sign * step) for sign in (1, -1))
+    assert_allclose(slope, (above - below) / (2 * step), rtol=1e-6)
+
+
+def test_sides_of_the_beam_are_told_apart():
+    up_and_down = [marched(STREAM, by_hand, both_sides)(0.5) for by_hand in (True, False)]
+    assert_allclose(*up_and_down, rtol=1e-11)
+    assert up_and_down[0][0] != up_and_down[0][1]
+
+
+def test_batched_runs_take_one_after_the_other():
+    masses = jnp.linspace(0.1, 1.0, 3)
+    together = jax.vmap(marched(PLAIN, True))(masses)
+    assert_allclose(together, jnp.stack([marched(PLAIN, True)(m) for m in masses]), rtol=1e-12)
+
+
+def test_a_resumed_sweep_keeps_to_what_began_it():
+    """Steps by C round otherwise: results of both must not meet in one store."""
+    marks = []
+    for ready in (True, False):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(native, "ready", lambda ready=ready: ready)
+            marks.append(make_order(PLAIN, GRID, False, False, 1e-7, "double").fingerprint())
+    assert marks[0] != marks[1]
+
+
+def test_what_cannot_be_loaded_is_left_alone(folder, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    native.library().parent.mkdir()
+    native.library().write_bytes((folder / native.library().name).read_bytes()[:1000])
+    assert not native.ready()
+
+
+def test_compilers_that_fail_are_told_of(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("CC", "false")
+    with pytest.raises(RuntimeError, match="the C compiler false cannot compile .*native.c"):
+        native.build()
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    with pytest.raises(RuntimeError, match="the C compiler /nowhere/cc cannot be run"):
+        native.build()
+    monkeypatch.delenv("CC")
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    with pytest.raises(RuntimeError, match="there is no C compiler here: install gcc or clang"):
+        native.build()
+    assert not native.library().exists()
+
+
+def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pytest.raises(SystemExit, match="0"):
+        main(["native", "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    assert answer == {"library": str(native.library()), "compiled": True}
+    assert native.library().exists() and native.ready()
+    with pytest.raises(SystemExit, match="0"):
+        main(["native", "--remove"])
+    assert "sweeps do without" in capsys.readouterr().out
+    assert not native.library().exists()
