@@ -5,15 +5,19 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from experiments.benchmarks import baselines
+from experiments.benchmarks import baselines, by_numba, cases
 from experiments.benchmarks.baselines import (
     diffrax_peaks,
     reference_peaks,
     scipy_peaks,
     scipy_time,
 )
-from experiments.benchmarks.crossing import Rig, free_times, hermite_peaks
+from experiments.benchmarks.crossing import Rig, crossing_rate, free_times, hermite_peaks
 from experiments.benchmarks.timing import Timing, time_call
+from tests.oracles.closed_loop import Actuator, Clock, Sensor, respond
+from tests.oracles.loads import Load
+from tests.oracles.modal_equations import Span
+from tests.oracles.two_spans import TwoSpans
 
 MASSES = np.array([0.1, 0.55, 1.0])
 # The heavier masses peak after the exit at 5.3 and 10 m/s, all others while they cross.
@@ -103,3 +107,59 @@ def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
     monkeypatch.setattr(baselines, "time_call", known_cost)
     whole = np.sum(0.01 + 0.02 / speeds) * len(masses)
     np.testing.assert_allclose(scipy_time(scipy_peaks, Rig(1), masses, speeds, runs=4), whole)
+
+
+@pytest.mark.parametrize("place", [0.1, 0.55, 0.7, 1.15])
+def test_modes_of_two_spans_are_those_of_the_oracle(place):
+    rig, oracle = Rig(6, 1.2, spans=2), TwoSpans(1.2, 11.68, 0.535, 6, 0.03)
+    np.testing.assert_allclose(rig.frequencies, oracle.frequencies, rtol=1e-12)
+    for order in (0, 1):
+        expected = oracle.shapes(place, order)
+        atol = 1e-12 * np.max(np.abs(expected))
+        np.testing.assert_allclose(rig.shapes(place, order), expected, atol=atol)
+
+
+@pytest.mark.parametrize("spans", [1, 2])
+def test_scipy_histories_under_control_are_those_of_the_oracle(spans):
+    """Through the full mass matrix, with sensors, clock and patches of its own."""
+    rig = cases.plain(spans, "sampled", 4)
+    kind = TwoSpans if spans == 2 else Span
+    beam = kind(rig.length, rig.flexural_rigidity, rig.mass_per_length, 4, rig.damping_ratio)
+    edges = [(0.6 * i + 0.2575, 0.6 * i + 0.3425) for i in range(spans)]
+    patches = [Actuator([(a, 1, 1.0), (b, 1, -1.0)], 8.292e-4 * 0.35 * 200) for a, b in edges]
+    times = np.arange(0.0, 0.5, 0.02)
+    expected = respond(
+        beam,
+        [Load(0.7, 4.0)],
+        patches,
+        [Sensor(x) for x in rig.sensors],
+        lambda readings, *_: -1e3 * readings[:spans],
+        times.tolist(),
+        Clock(0.01),
+    )
+    found = baselines.scipy_histories(rig, [0.7], [4.0], times)[0, 0]
+    size = np.max(np.abs(expected.deflection))
+    np.testing.assert_allclose(found, expected.deflection, atol=1e-6 * size)
+
+
+def test_a_rate_off_the_beam_is_that_of_a_mass_of_none():
+    rig = Rig(3)
+    state = np.random.default_rng(0).normal(size=(2, 3, 1))
+    away = crossing_rate(rig, np.ones(1), 1.0, None)(0.2, state)
+    np.testing.assert_allclose(away, crossing_rate(rig, np.zeros(1), 1.0)(0.2, state))
+
+
+@pytest.mark.parametrize("modes", [3, 6])
+def test_loops_for_numba_find_the_peaks_uncompiled_too(modes):
+    rig = Rig(modes)
+    expected = reference_peaks(rig, MASSES, SPEEDS)
+    found = by_numba.numba_peaks(by_numba.program(None), rig, MASSES, SPEEDS)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_numba_finds_what_the_same_loops_find_uncompiled():
+    package = pytest.importorskip("numba")
+    found, plain = (
+        by_numba.numba_peaks(by_numba.program(p), Rig(3), MASSES, SPEEDS) for p in (package, None)
+    )
+    np.testing.assert_allclose(found, plain, rtol=1e-9)

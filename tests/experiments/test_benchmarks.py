@@ -1,4 +1,4 @@
-"""Each benchmark on its cheapest real path; baselines against what shares no code with them."""
+"""Each benchmark on its cheapest real path; for their baselines see `test_baselines`."""
 
 import subprocess
 import sys
@@ -12,8 +12,6 @@ import jaxbeam as jb
 from experiments import benchmarks
 from experiments.benchmarks import (
     __main__,
-    baselines,
-    by_numba,
     cases,
     growth,
     identify,
@@ -22,13 +20,6 @@ from experiments.benchmarks import (
     steps,
     tuners,
 )
-from experiments.benchmarks.crossing import Rig, crossing_rate
-from tests.oracles.closed_loop import Actuator, Clock, Sensor, respond
-from tests.oracles.loads import Load
-from tests.oracles.modal_equations import Span
-from tests.oracles.two_spans import TwoSpans
-
-MASSES, SPEEDS = np.array([0.1, 1.0]), np.array([2.2, 10.0])
 
 
 def test_one_command_runs_all_benchmarks_there_are(capsys, monkeypatch):
@@ -50,46 +41,6 @@ def test_options_that_make_benchmarks_short_are_known_to_them():
         assert all(f'"{word}"' in source for word in quick.split() if word.startswith("--"))
 
 
-@pytest.mark.parametrize("place", [0.1, 0.55, 0.7, 1.15])
-def test_modes_of_two_spans_are_those_of_the_oracle(place):
-    rig, oracle = Rig(6, 1.2, spans=2), TwoSpans(1.2, 11.68, 0.535, 6, 0.03)
-    np.testing.assert_allclose(rig.frequencies, oracle.frequencies, rtol=1e-12)
-    for order in (0, 1):
-        expected = oracle.shapes(place, order)
-        atol = 1e-12 * np.max(np.abs(expected))
-        np.testing.assert_allclose(rig.shapes(place, order), expected, atol=atol)
-
-
-@pytest.mark.parametrize("spans", [1, 2])
-def test_scipy_histories_under_control_are_those_of_the_oracle(spans):
-    """Through the full mass matrix, with sensors, clock and patches of its own."""
-    rig = cases.plain(spans, "sampled", 4)
-    kind = TwoSpans if spans == 2 else Span
-    beam = kind(rig.length, rig.flexural_rigidity, rig.mass_per_length, 4, rig.damping_ratio)
-    edges = [(0.6 * i + 0.2575, 0.6 * i + 0.3425) for i in range(spans)]
-    patches = [Actuator([(a, 1, 1.0), (b, 1, -1.0)], 8.292e-4 * 0.35 * 200) for a, b in edges]
-    times = np.arange(0.0, 0.5, 0.02)
-    expected = respond(
-        beam,
-        [Load(0.7, 4.0)],
-        patches,
-        [Sensor(x) for x in rig.sensors],
-        lambda readings, *_: -1e3 * readings[:spans],
-        times.tolist(),
-        Clock(0.01),
-    )
-    found = baselines.scipy_histories(rig, [0.7], [4.0], times)[0, 0]
-    size = np.max(np.abs(expected.deflection))
-    np.testing.assert_allclose(found, expected.deflection, atol=1e-6 * size)
-
-
-def test_a_rate_off_the_beam_is_that_of_a_mass_of_none():
-    rig = Rig(3)
-    state = np.random.default_rng(0).normal(size=(2, 3, 1))
-    away = crossing_rate(rig, np.ones(1), 1.0, None)(0.2, state)
-    np.testing.assert_allclose(away, crossing_rate(rig, np.zeros(1), 1.0)(0.2, state))
-
-
 @pytest.mark.parametrize("kind", [(2, "open", "peaks"), (1, "sampled", "histories")])
 @pytest.mark.filterwarnings("ignore::jaxbeam.control.SamplingWarning")
 def test_sweeps_of_the_table_are_right_and_all_is_told(kind):
@@ -100,22 +51,6 @@ def test_sweeps_of_the_table_are_right_and_all_is_told(kind):
     times = [found[name] for name in ("run", "compile", "scipy")]
     assert all(np.isfinite(time) and time > 0 for time in times)
     assert found["memory"] > 50  # MiB; JAX alone takes as much
-
-
-@pytest.mark.parametrize("modes", [3, 6])
-def test_loops_for_numba_find_the_peaks_uncompiled_too(modes):
-    rig = Rig(modes)
-    expected = baselines.reference_peaks(rig, MASSES, SPEEDS)
-    found = by_numba.numba_peaks(by_numba.program(None), rig, MASSES, SPEEDS)
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
-
-
-def test_numba_finds_what_the_same_loops_find_uncompiled():
-    package = pytest.importorskip("numba")
-    found, plain = (
-        by_numba.numba_peaks(by_numba.program(p), Rig(3), MASSES, SPEEDS) for p in (package, None)
-    )
-    np.testing.assert_allclose(found, plain, rtol=1e-9)
 
 
 @pytest.fixture(scope="module")
