@@ -27,7 +27,7 @@ BENCHMARKS = {
     "identify": Benchmark("identification: scipy's least squares"),
     "riccati": Benchmark("designs of regulators, many at once"),
     "quadratic": Benchmark("programs of predictive control: OSQP"),
-    "steps": Benchmark("steps of controllers"),
+    "steps": Benchmark("steps of controllers", "--only feedback"),
     "tuners": Benchmark("tuning by gradients, beside differential evolution"),
     "profile": Benchmark("where the time of a sweep goes"),
     "cluster": Benchmark("a sweep of a million runs on workers", "--runs 40000"),

@@ -142,7 +142,7 @@ def main() -> None:
     )
     parser.add_argument("--modes", type=int, nargs="+", default=[3, 6, 12])
     parser.add_argument("--side", type=int, default=64, help="masses, and speeds")
-    parser.add_argument("--quick", action="store_true", help="3 modes, 16 by 16")
+    parser.add_argument("--quick", action="store_true", help="3 modes, 8 by 8")
     parser.add_argument("--measure", nargs=5, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.measure:
@@ -150,7 +150,7 @@ def main() -> None:
         print(json.dumps(measure(int(spans), loop, kept, int(modes), int(side))))
         return
     if given.quick:
-        given.modes, given.side = [3], 16
+        given.modes, given.side = [3], 8
     began = time.perf_counter()
     print(f"{given.side**2} crossings; scipy and diffrax in times jaxbeam's, errors behind\n")
     print("| spans | loop | kept | modes | jaxbeam | error | compiling | peak MiB"

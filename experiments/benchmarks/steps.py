@@ -1,6 +1,6 @@
 """Time per step of every kind of controller: one by one, typical and worst, and 256 at once.
 
-    python -m experiments.benchmarks.steps
+    python -m experiments.benchmarks.steps [--only TEXT]
 
 The one-span rig with a patch and five modes, crossed by 0.509 kg at 1 m/s, five sensors read every
 10 ms. A step is all that a controller does between a measurement and a command, estimator and
@@ -14,6 +14,7 @@ from experiments.benchmarks.cores import one_core
 if __name__ == "__main__":
     one_core()  # before JAX looks
 
+import argparse
 import warnings
 
 import numpy as np
@@ -108,6 +109,9 @@ def measure(controller: AbstractController) -> StepTimes:
 
 def main() -> None:
     """Print the table. Raises SystemExit if a kind of controller is missing from it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", default="", help="text in the names of those that are timed")
+    only = parser.parse_args().only
     left_out = set(KINDS.values()) - {type(law) for law in CONTROLLERS.values()}
     if left_out:
         raise SystemExit(f"no controller of kind {', '.join(k.__name__ for k in left_out)}")
@@ -115,6 +119,8 @@ def main() -> None:
         f"{'microseconds per step':40} {'median':>9} {'worst':>9} {'256 at once':>12} {'worst':>9}"
     )
     for name, controller in CONTROLLERS.items():
+        if only not in name:
+            continue
         found = 1e6 * np.array(measure(controller))
         print(
             f"{name:40} {found[0]:9.2f} {found[1]:9.2f} {found[2]:12.2f} {found[3]:9.2f}",
