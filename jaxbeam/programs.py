@@ -4,8 +4,6 @@ A case comes with the addresses of what varies and, task by task, its values the
 `heavy` values, which decide the path and the rig, and the lanes of a task in `light` ones.
 """
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,8 +19,6 @@ from jaxbeam.loop import make_loop
 from jaxbeam.record import never_as_nan
 from jaxbeam.rig import rig
 from jaxbeam.tables import make_rigging
-
-TOGETHER = 4  # tasks prepared at once, or fewer
 
 
 def _varied(case, addresses, values):
@@ -67,15 +63,10 @@ def _prepare(case, addresses, schedule, substeps, assembled, heavy, longest, dri
 def riggings(case, addresses, schedule, substeps, rigs, heavy, longest):
     """Rigs on the grids of some tasks, several at once because each is little work."""
 
-    def group(values):
-        return jax.vmap(lambda task: _prepare(case, addresses, schedule, substeps, *task))(values)
+    def task(values):
+        return _prepare(case, addresses, schedule, substeps, *values)
 
-    count, size = longest.shape[0], math.gcd(TOGETHER, longest.shape[0])
-    parts = jax.tree.map(
-        lambda part: part.reshape(count // size, size, *part.shape[1:]), (rigs, heavy, longest)
-    )
-    made = jax.lax.map(group, parts)
-    return jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2), made)
+    return jax.lax.map(task, (rigs, heavy, longest))
 
 
 @compiled
