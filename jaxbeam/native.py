@@ -50,29 +50,34 @@ def library() -> pathlib.Path:
     return cache_folder() / f"native-{_mark()}.so"
 
 
+def compiler() -> str | None:
+    """The C compiler of this machine: that named in CC, or cc, gcc or clang, if there is one."""
+    found = (shutil.which(name) for name in ("cc", "gcc", "clang"))
+    return os.environ.get("CC") or next(filter(None, found), None)
+
+
 def build() -> pathlib.Path:
     """Compile the C for this machine and return the library's path; sweeps use it from then on.
 
-    The compiler is the one that CC names, or cc, gcc or clang. Raises RuntimeError if there is
-    none, or with what it complains of; OSError if the cache folder cannot be written.
+    Raises RuntimeError without a C compiler, or with what it complains of; OSError if the cache
+    folder cannot be written.
     """
-    found = (shutil.which(name) for name in ("cc", "gcc", "clang"))
-    compiler = os.environ.get("CC") or next(filter(None, found), None)
-    if compiler is None:
+    command = compiler()
+    if command is None:
         raise RuntimeError("there is no C compiler here: install gcc or clang, or name one in CC")
     target = library()
     target.parent.mkdir(parents=True, exist_ok=True)
     # Made beside its place and moved there, so that nobody ever loads half of it.
     with tempfile.TemporaryDirectory(dir=target.parent) as folder:
         made = pathlib.Path(folder) / target.name
-        command = [*compiler.split(), str(SOURCE), *FLAGS, "-I", jax.ffi.include_dir()]
+        words = [*command.split(), str(SOURCE), *FLAGS, "-I", jax.ffi.include_dir()]
         try:
-            done = subprocess.run([*command, "-o", str(made)], capture_output=True, text=True)
+            done = subprocess.run([*words, "-o", str(made)], capture_output=True, text=True)
         except OSError as error:
-            raise RuntimeError(f"the C compiler {compiler} cannot be run: {error}") from None
+            raise RuntimeError(f"the C compiler {command} cannot be run: {error}") from None
         if done.returncode or not made.exists():
             said = done.stderr.strip()[-500:]
-            raise RuntimeError(f"the C compiler {compiler} cannot compile {SOURCE}: {said}")
+            raise RuntimeError(f"the C compiler {command} cannot compile {SOURCE}: {said}")
         _digest(target).write_text(hashlib.sha256(made.read_bytes()).hexdigest())
         os.replace(made, target)
     return target

@@ -22,9 +22,7 @@ from jaxbeam.rig import rig
 from jaxbeam.sweep_store import FINGERPRINT
 from jaxbeam.tables import both_sides, make_rigging
 
-pytestmark = pytest.mark.skipif(
-    not any(shutil.which(name) for name in ("cc", "gcc", "clang")), reason="no C compiler here"
-)
+pytestmark = pytest.mark.skipif(native.compiler() is None, reason="no C compiler here")
 
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
 SENSORS = [jb.Sensor(0.15), jb.Sensor(0.3), jb.Sensor(0.41)]
