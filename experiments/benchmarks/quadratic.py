@@ -77,7 +77,10 @@ def programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def by_jaxbeam(H, f, M, gamma) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Solutions, whether limits are felt, and seconds of each: one by one, and of many at once."""
+    """Solutions, whether limits are felt, and seconds of each: one by one, and of many at once.
+
+    Raises RuntimeError if a program is left unsolved.
+    """
 
     @compiled
     def in_turn(H, f, M, gamma):
