@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbeam.exponentials import GAUSS, POINTS
 from jaxbeam.motion import NEVER
-from jaxbeam.peaks import refine, vertex
+from jaxbeam.peaks import highest, refine, vertex
 from jaxbeam.tables import Path, Tables
 
 NEAR = 1.1  # a peak between samples is less than this above the highest of them
@@ -53,13 +53,12 @@ def fold(best: Extremes, tables: Tables, path: Path, states, forces, commands) -
         score = jax.lax.optimization_barrier(
             jax.vmap(lambda step: vertex(step, best.size))(samples)
         )
-        highest = jnp.max(score, axis=0)
-        # Found so, and not by argmax, which looks at one number after the other.
-        top = jnp.max(jnp.where(score == highest, np.arange(steps)[:, None, None], 0), axis=0)
-        better = highest > best.score
+        best_score, top = highest(score)
+        top = jnp.max(jnp.where(top, np.arange(steps)[:, None, None], 0), axis=0)
+        better = best_score > best.score
         chosen = jnp.take_along_axis(samples, top[None, None], axis=0)[0]
         return Extremes(
-            jnp.where(better, highest, best.score),
+            jnp.where(better, best_score, best.score),
             jnp.where(better, chosen, best.samples),
             jnp.where(better, start[top], best.start),
             jnp.where(better, span[top], best.span),
@@ -70,8 +69,8 @@ def fold(best: Extremes, tables: Tables, path: Path, states, forces, commands) -
         )
 
     # Most chunks come nowhere near the peak so far, or press all along: they end here.
-    highest = jnp.max(jnp.abs(samples), axis=(0, 1))
-    best = jax.lax.cond(jnp.any(highest * NEAR > best.score), raised, lambda best: best, best)
+    largest = jnp.max(jnp.abs(samples), axis=(0, 1))
+    best = jax.lax.cond(jnp.any(largest * NEAR > best.score), raised, lambda best: best, best)
     pressing = jnp.min(-forces.reshape(steps, -1, len(GAUSS), lanes), axis=2)
     # A load that is not on the beam, or has no slot, does not count.
     here = (path.slots[:, :, None] == np.arange(best.lowest.shape[0])) & path.active[..., None]
@@ -87,7 +86,7 @@ def fold(best: Extremes, tables: Tables, path: Path, states, forces, commands) -
         return jnp.minimum(first, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
 
     first = jax.lax.cond(jnp.any(lowest < 0), lost, lambda first: first, best.lost)
-    sound = best.sound & jnp.all(jnp.isfinite(highest), axis=0)
+    sound = best.sound & jnp.all(jnp.isfinite(largest), axis=0)
     return eqx.tree_at(lambda b: (b.lowest, b.lost, b.sound), best, (lowest, first, sound))
 
 

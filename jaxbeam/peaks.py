@@ -7,9 +7,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 VERTEX_ROUNDS = 2  # of Newton's method for a close estimate
+ROUNDINGS = 8  # by which equal numbers may differ
 STARTS = 17  # places from which a peak is sought: closer than the extrema of the curve can be
 
 
@@ -56,6 +57,19 @@ def _climb(curve: Curve, start, reach: float, rounds: int):
     return jax.lax.fori_loop(0, rounds, closer, start)
 
 
+def highest(
+    values: Float[Array, "some *rest"],
+) -> tuple[Float[Array, " *rest"], Bool[Array, "some *rest"]]:
+    """The highest of some values, and which of them are: quicker than `argmax`.
+
+    Those that differ by rounding count, as XLA may compute what is compared here once for the
+    maximum and once more, rounded otherwise, for the comparison.
+    """
+    top = jnp.max(values, axis=0)
+    slack = ROUNDINGS * jnp.finfo(values.dtype).eps
+    return top, values >= top - slack * jnp.abs(top)
+
+
 def vertex(
     samples: Float[Array, "point *rest"], size: Callable = jnp.abs
 ) -> Float[Array, " *rest"]:
@@ -64,11 +78,11 @@ def vertex(
     Cheap, to tell which of many steps holds the peak; `refine` then finds it.
     """
     sizes = size(samples)
-    highest = jnp.max(sizes, axis=0)
+    largest = jnp.max(sizes, axis=0)
     start = jnp.linspace(-1.0, 1.0, sizes.shape[0])[jnp.argmax(sizes, axis=0)]
     curve = _curve(samples)
     place = _climb(curve, start, 1 / sizes.shape[0], rounds=VERTEX_ROUNDS)
-    return jnp.maximum(size(_value(curve.value, place)), highest)
+    return jnp.maximum(size(_value(curve.value, place)), largest)
 
 
 @jax.named_scope("peaks")
@@ -86,8 +100,12 @@ def refine(
     starts = np.linspace(-1.0, 1.0, STARTS).reshape(-1, *(1,) * (samples.ndim - 1))
     starts = jnp.broadcast_to(starts.astype(samples.dtype), (STARTS, *samples.shape[1:]))
     places = jnp.concatenate([starts, _climb(frozen, starts, 2 / STARTS, rounds=5)])
-    sizes = size(_value(frozen.value, places))
-    # Found so, and not by argmax, which looks at one number after the other.
-    place = jnp.max(jnp.where(sizes == jnp.max(sizes, axis=0), places, -1.0), axis=0)
+    _, top = highest(size(_value(frozen.value, places)))
+    place = jnp.max(jnp.where(top, places, -1.0), axis=0)
+    # Places of one height may lie apart by the root of a rounding: one round more brings them
+    # together, unless the peak is at an end and there is nothing flat nearby.
+    flat = _climb(frozen, place, 2 / STARTS, rounds=1)
+    _, ahead = highest(size(_value(frozen.value, jnp.stack([flat, place]))))
+    place = jnp.where(ahead[0], flat, place)
     place = jax.lax.optimization_barrier(jax.lax.stop_gradient(place))
     return size(_value(curve.value, place)), (place + 1) / 2

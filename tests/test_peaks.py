@@ -33,6 +33,7 @@ def highest(curve):
 
 
 @hypothesis.given(st.lists(st.floats(-1.0, 1.0), min_size=POINTS, max_size=POINTS))
+@hypothesis.example([0.0, 0.25, 0.0, -0.75, 0.0, 0.0, 0.0])  # equally high at both sides
 @hypothesis.example([-1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 5e-05])  # three peaks that differ by 6e-9
 def test_peak_of_a_polynomial_is_exact(coefficients):
     # Falling as in a smooth curve; the last are what the estimate leaves out.
