@@ -41,7 +41,13 @@ def test_options_that_make_benchmarks_short_are_known_to_them():
         assert all(f'"{word}"' in source for word in quick.split() if word.startswith("--"))
 
 
-@pytest.mark.parametrize("kind", [(2, "open", "peaks"), (1, "sampled", "histories")])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        (2, "open", "peaks"),
+        pytest.param((1, "sampled", "histories"), marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.filterwarnings("ignore::jaxbeam.control.SamplingWarning")
 def test_sweeps_of_the_table_are_right_and_all_is_told(kind):
     found = cases.measure(*kind, modes=2, side=2)
