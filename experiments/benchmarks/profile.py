@@ -16,7 +16,10 @@ import re
 import tempfile
 from pathlib import Path
 
-STAGES = ("modes", "rig", "propagators", "path", "collocation", "propagation", "extremes", "peaks")
+STAGES = (
+    *("modes", "rig", "propagators", "path", "collocation", "propagation", "extremes", "peaks"),
+    "native",
+)
 CONTAINERS = re.compile(r"(while|cond|call|conditional)[.\d]*$")
 
 
