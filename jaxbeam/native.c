@@ -152,17 +152,20 @@ static void raise(const Work *w, const Step *steps, const Lanes *seen, ptrdiff_t
     for (int place = 0; place < w->places; place++) {
         ptrdiff_t at = place * w->lanes + first;
         double *start = w->out[BEST_START - STATE] + at, *span = w->out[BEST_SPAN - STATE] + at;
-        Lanes score = load(w->out[SCORE - STATE] + at, many), near = score, highest[STEPS];
+        Lanes score = load(w->out[SCORE - STATE] + at, many), least = score, most[STEPS];
         for (int t = 0; t < STEPS; t++) {
-            highest[t] = all(0);
-            for (int p = 0; steps[t].taken && p < POINTS; p++)
-                highest[t] =
-                    greater(absolute(seen[(t * POINTS + p) * w->places + place]), highest[t]);
-            near = greater(highest[t], near);
+            Lanes highest = {0}, largest = {0};
+            for (int p = 0; steps[t].taken && p < POINTS; p++) {
+                Lanes sample = seen[(t * POINTS + p) * w->places + place];
+                highest = greater(size_of(sample, w->both), highest);
+                largest = greater(absolute(sample), largest);
+            }
+            least = greater(highest, least);
+            most[t] = highest + (NEAR - 1) * largest; /* between samples */
         }
-        /* Only what comes near the highest of all samples can be the peak. */
+        /* Only steps that may come above the highest of all samples can have the peak. */
         for (int t = 0; t < STEPS; t++) {
-            if (!any((highest[t] * NEAR > near) & (highest[t] * NEAR > score))) continue;
+            if (!any(most[t] > least)) continue;
             Lanes samples[POINTS];
             for (int p = 0; p < POINTS; p++)
                 samples[p] = seen[(t * POINTS + p) * w->places + place];
