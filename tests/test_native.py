@@ -142,7 +142,7 @@ def test_sides_of_the_beam_are_told_apart(speed):
     by_hand, plain = (marched(case, hand, both_sides, 8e-3)(0.5) for hand in (True, False))
     assert_allclose(by_hand, plain, rtol=1e-11)
     up, down = by_hand[: len(SENSORS)], by_hand[len(SENSORS) :]
-    assert np.all((0 < up) & (up < 0.9 * down))
+    assert np.all((up > 0) & (up < 0.9 * down))
 
 
 def test_batched_runs_take_one_after_the_other():
