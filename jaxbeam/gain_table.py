@@ -8,12 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.flows import NODES
 from jaxbeam.riccati import lqr
-from jaxbeam.stretches import NODES, Commands, Square, costs_to_go, riccati_rate, stretches
+from jaxbeam.stretches import Commands, Square
 
-# Backward in time P hastens, right before an event, to what the plant from then on demands: in the
-# last stretches, so many of them, edges come ever closer, each by a factor, so many times.
-LAST, CLOSER, LAYER = 8, 0.9, 105
 INSIDE = 1e-9  # of a stretch: how far within it its ends are looked at, step by step
 
 # State matrix and command matrix at a time (s).
@@ -49,57 +47,6 @@ def even(count: int) -> Float[np.ndarray, " share"]:
     return np.arange(count) / count
 
 
-def hastening(count: int) -> Float[np.ndarray, " share"]:
-    """Shares for so many equal stretches, but for the fine layer at the end."""
-    return np.concatenate([even(count)[: -min(LAST, count)], 1 - layer(count)])
-
-
-def layer(count: int) -> Float[np.ndarray, " edge"]:
-    """Edges of the fine layer before an event, as shares of the time since the one before."""
-    return min(LAST, count) / count * CLOSER ** np.arange(LAYER + 1)
-
-
-def finite_time(
-    plant: Plant,
-    edges: Float[Array, " edge"],
-    Q: Square,
-    R: Commands,
-    terminal: Square,
-    parallel: bool = False,
-) -> tuple[GainTable, Float[Array, "edge state state"]]:
-    """Gains that minimise x'Fx at the last edge plus the integral of x'Qx + u'Ru, and P at edges.
-
-    Eqs (3.3) to (3.9) of the thesis, (3.8) with its sign corrected; F is `terminal`. P is carried
-    from stretch to stretch one after the other, or in `parallel` (see `costs_to_go`).
-    """
-    lengths = jnp.diff(edges)
-    times = edges[:-1, None] + lengths[:, None] * NODES
-    A, B = jax.vmap(jax.vmap(plant))(times)
-    costs = costs_to_go(stretches(A, B, Q, R, lengths), terminal, parallel)
-    # The plant at the ends of a stretch, and its rates, from what it is at the nodes within.
-    A, B = (jnp.einsum("erj,sj...->esr...", AT_ENDS, part) for part in (A, B))
-
-    def gains(A, B, cost, length):
-        """The gain, its rate and the rate of that, as the plant is given, by share of a stretch."""
-
-        def rate(cost, A, B):
-            return length * riccati_rate(cost, A, B, Q, R)
-
-        first = rate(cost, A[0], B[0])
-        second = jax.jvp(rate, (cost, A[0], B[0]), (first, A[1], B[1]))[1]
-        rows = [
-            B[0].T @ cost,
-            B[1].T @ cost + B[0].T @ first,
-            B[2].T @ cost + 2 * B[1].T @ first + B[0].T @ second,
-        ]
-        return jax.vmap(lambda row: jnp.linalg.solve(R, row))(jnp.stack(rows))
-
-    every = jax.vmap(gains)
-    starts = every(A[0], B[0], costs[:-1], lengths)
-    ends = every(A[1], B[1], costs[1:], lengths)
-    return _table(edges, starts, ends), costs
-
-
 def step_by_step(plant: Plant, edges: Float[Array, " edge"], Q: Square, R: Commands) -> GainTable:
     """Gains for the plant frozen at each time, eqs (3.10) and (3.11) of the thesis."""
 
@@ -111,14 +58,27 @@ def step_by_step(plant: Plant, edges: Float[Array, " edge"], Q: Square, R: Comma
         return jnp.stack([gain, rate])
 
     every = jax.vmap(gains)
-    return _table(edges, every(edges[:-1] + nudge, lengths), every(edges[1:] - nudge, lengths))
-
-
-def _table(edges, starts, ends) -> GainTable:
-    """Polynomials through gains and their rates (stretch, rate, ...) at both ends of stretches."""
-    low, high = _hermite(starts.shape[1])
-    pieces = jnp.einsum("pr,sriz->spiz", low, starts) + jnp.einsum("pr,sriz->spiz", high, ends)
+    pieces = polynomials(every(edges[:-1] + nudge, lengths), every(edges[1:] - nudge, lengths))
     return GainTable((edges - edges[0]) / (edges[-1] - edges[0]), pieces)
+
+
+def polynomials(
+    starts: Float[Array, "stretch rate input state"], ends: Float[Array, "stretch rate input state"]
+) -> Float[Array, "stretch power input state"]:
+    """Polynomials through values and their rates at both ends of stretches."""
+    low, high = _hermite(starts.shape[1])
+    return jnp.einsum("pr,sriz->spiz", low, starts) + jnp.einsum("pr,sriz->spiz", high, ends)
+
+
+def from_nodes(
+    values: Float[Array, "stretch stage row column"],
+) -> Float[Array, "edge rate row column"]:
+    """What takes values at nodes, with its first two rates, at the starts of stretches and the end.
+
+    That of the last stretch, if others follow.
+    """
+    starts = jnp.einsum("rj,sjab->srab", AT_ENDS[0], values)
+    return jnp.concatenate([starts, jnp.einsum("rj,jab->rab", AT_ENDS[1], values[-1])[None]])
 
 
 def _rates(at: float, orders: int, powers: int) -> Float[np.ndarray, "order power"]:

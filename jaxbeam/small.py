@@ -3,7 +3,9 @@
 A library's factorisation would seek pivots in each of them; that takes longer, to compile as well.
 """
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -56,3 +58,47 @@ def _inverse(matrix):
     ]
     adjugate = jnp.stack([jnp.stack(row) for row in minors])
     return adjugate / jnp.sum(matrix[0] * adjugate[:, 0], axis=0)
+
+
+def solve_any(
+    matrix: Float[Array, "row row"], right: Float[Array, "row column"]
+) -> Float[Array, "row column"]:
+    """Solve a system of any size; under `vmap` many at a time, with the systems as the last axis.
+
+    As `solve_small` without pivots, but by a loop, which compiles quickly for larger matrices too.
+    Where a library's factorisations of batches run side by side, their threads may wait for each
+    other for ever (jaxlib's hand parts of a batch to the threads that they are waiting on).
+    """
+    return jax.lax.custom_linear_solve(
+        lambda x: matrix @ x,
+        right,
+        lambda _, b: _eliminated(matrix, b),
+        lambda _, b: _eliminated(matrix.T, b),
+    )
+
+
+@jax.custom_batching.custom_vmap
+def _eliminated(matrix, right):
+    """Gauss and Jordan's elimination of systems (row, column, *lane)."""
+    size = matrix.shape[0]
+    rows = np.arange(size).reshape(-1, *[1] * (matrix.ndim - 1))
+
+    def step(k, both):
+        row = jax.lax.dynamic_index_in_dim(both, k, 0, keepdims=False)
+        row = row / jax.lax.dynamic_index_in_dim(row, k, 0)
+        column = jax.lax.dynamic_index_in_dim(both, k, 1)
+        return jnp.where(rows == k, row, both - column * row)
+
+    both = jnp.concatenate([matrix, right], axis=1)
+    return jax.lax.fori_loop(0, size, step, both)[:, size:]
+
+
+@_eliminated.def_vmap
+def _(count, batched, *systems):
+    lanes = [
+        jnp.moveaxis(part, 0, -1)
+        if has
+        else jnp.broadcast_to(part[..., None], (*part.shape, count))
+        for part, has in zip(systems, batched, strict=True)
+    ]
+    return jnp.moveaxis(_eliminated(*lanes), -1, 0), True

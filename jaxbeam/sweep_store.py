@@ -277,8 +277,9 @@ def prepare(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> str:
         )
     if found[1] != fingerprint:
         raise ValueError(
-            f"{path} holds a sweep of another case, other values or settings, or by another "
-            "version: it cannot be resumed with these; choose another name, or overwrite it"
+            f"{path} holds a sweep of another case, other values or settings, or by another"
+            " version (steps that `jaxbeam native` has compiled are one): it cannot be resumed with"
+            " these; choose another name, or overwrite it"
         )
     return "complete" if found[0] == "complete" else "resume"
 

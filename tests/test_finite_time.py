@@ -81,3 +81,77 @@ def test_gains_are_right_to_1e_8(rig):
     expected = [parts(s, y)[3] for s, y in zip(asked, solution.y.T, strict=True)][::-1]
     far = [np.max(np.abs(a - b)) / np.max(np.abs(b)) for a, b in zip(found, expected, strict=True)]
     assert np.max(far) < 1e-8
+
+
+RIGIDITY, DENSITY, SPEED, MASS, EFFORT = 13.211, 0.812, 2.0, 0.4, 1e-3
+WAVES = np.arange(1, 8) * np.pi / 0.6
+FASTEST = WAVES[-1] ** 2 * np.sqrt(RIGIDITY / DENSITY)
+WEIGHTS = [1e6] * 7 + [10.0] * 7
+# Many before the end, where gains ring and, last, hasten.
+BEFORE_END = np.geomspace(0.3, 1e-6, 1500)
+CROSSED = np.sort(np.concatenate([np.linspace(0.0, 0.999, 1500), 1 - BEFORE_END]))
+
+
+@pytest.fixture(scope="module")
+def seven_modes():
+    """Gains of a point force on pinned ends over a crossing, by scipy's DOP853 at 1e-10.
+
+    The equations of motion are written out: (1 + m s s') q'' + ... for a row s of mode shapes.
+    """
+    norm, upper, end = np.sqrt(2 / (DENSITY * 0.6)), np.triu_indices(14), 0.6 / SPEED
+    pushed, squares = norm * np.sin(0.25 * WAVES), WAVES**4 * RIGIDITY / DENSITY
+
+    def plant(t):
+        s, slope = norm * np.sin(SPEED * t * WAVES), norm * WAVES * np.cos(SPEED * t * WAVES)
+        stiff = np.diag(squares) - MASS * SPEED**2 * np.outer(s, WAVES**2 * s)
+        damped = np.diag(0.06 * np.sqrt(squares)) + 2 * MASS * SPEED * np.outer(s, slope)
+        share = MASS * s / (1 + MASS * s @ s)
+        law = -np.hstack([stiff, damped])
+        A = np.vstack([np.hstack([np.zeros((7, 7)), np.eye(7)]), law - np.outer(share, s @ law)])
+        return A, np.append(np.zeros(7), pushed - share * (s @ pushed))
+
+    def parts(since, packed):
+        A, B = plant(end - since)
+        P = np.zeros((14, 14))
+        P[upper] = packed
+        P.T[upper] = packed
+        return A, P, P @ B
+
+    def rate(since, packed):
+        A, P, seen = parts(since, packed)
+        half = P @ A
+        return (half + half.T + np.diag(WEIGHTS) - np.outer(seen, seen) / EFFORT)[upper]
+
+    asked, first = end * (1 - CROSSED[::-1]), np.diag(WEIGHTS)[upper]
+    tight = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-10}
+    solution = solve_ivp(rate, (0.0, end), first, t_eval=asked, **tight)
+    gains = [parts(s, y)[2] / EFFORT for s, y in zip(asked, solution.y.T, strict=True)]
+    return np.array(gains)[::-1]
+
+
+@pytest.mark.parametrize(("turn", "error"), [(3.0, 3e-4), (1.0, 2e-6), (0.5, 1e-7)])
+def test_gains_are_right_between_edges_too(seven_modes, turn, error):
+    """Compared with the largest gain within a hundredth of the crossing."""
+    points = int(np.ceil(FASTEST * 0.6 / SPEED / turn))
+    case = jb.Case(
+        jb.Beam(0.6, RIGIDITY, DENSITY, 0.03, modes=7),
+        actuators=[jb.PointForce(0.25)],
+        loads=[jb.MovingMass(mass=MASS, speed=SPEED)],
+        controller=FiniteLQR(WEIGHTS, [EFFORT], points=points),
+    )
+    found = jax.jit(lambda: jax.vmap(case.controller.gains(jb.state_space(case)))(CROSSED))()
+    sizes = np.max(np.abs(seven_modes), axis=1)
+    near = [np.max(sizes[np.abs(CROSSED - share) < 0.01]) for share in CROSSED]
+    assert np.max(np.max(np.abs(found[:, 0] - seven_modes), axis=1) / near) < error
+
+
+def test_many_designs_at_once_ask_no_library_for_factors():
+    """On two threads those of its batches wait for each other for ever."""
+    case, regulator = two_spans()
+    model = jb.state_space(case)
+
+    def gains(effort):
+        return eqx.tree_at(lambda r: r.command_weight, regulator, effort).gains(model).pieces
+
+    told = jax.jit(jax.vmap(gains)).lower(jnp.ones((4, 2))).as_text()
+    assert "custom_call" not in told

@@ -13,9 +13,12 @@ LAYERS = """
 jaxbeam.compiling  jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.fields  jaxbeam.holds
 jaxbeam.small
 jaxbeam.faults  jaxbeam.piecewise  jaxbeam.stretches
+jaxbeam.flows
+jaxbeam.coupled
 jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
 jaxbeam.estimator  jaxbeam.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.sensors
 jaxbeam.case  jaxbeam.gain_table  jaxbeam.sensing
+jaxbeam.finite_time
 jaxbeam.checks
 jaxbeam.modes
 jaxbeam.measuring  jaxbeam.rig

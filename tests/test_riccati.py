@@ -9,8 +9,8 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
+from jaxbeam.flows import NODES, costs_to_go, flows
 from jaxbeam.riccati import care, dare, dlqr, lqr, lyapunov, stein
-from jaxbeam.stretches import NODES, costs_to_go, stretches
 from tests.differences import central
 
 R = jnp.array([[0.1, 0.02], [0.02, 0.3]])
@@ -120,7 +120,7 @@ def test_backward_equation_as_a_stiff_integrator_solves_it(parallel):
     @jax.jit
     def solve():
         A, B = jax.vmap(jax.vmap(varying))(edges[:-1, None] + lengths[:, None] * NODES)
-        parts = stretches(A, B, jnp.asarray(Q), jnp.asarray(weight), lengths)
+        parts = flows(A, B, jnp.asarray(Q), jnp.asarray(weight), lengths)
         return costs_to_go(parts, jnp.asarray(Q), parallel)
 
     def back(s, cost):

@@ -18,7 +18,7 @@ from jaxbeam.estimation.observability import modes_of, unseen_fault
 from jaxbeam.estimation.sampled import ROUNDING, ticks
 from jaxbeam.estimator import AbstractEstimator, Estimate
 from jaxbeam.fields import POSITIVE, choice, count, is_known, known, number
-from jaxbeam.gain_table import edges_between, finite_time, hastening
+from jaxbeam.finite_time import finite_time
 from jaxbeam.holds import balance
 from jaxbeam.statespace import LoadedBeam
 from jaxbeam.stretches import symmetric
@@ -124,9 +124,8 @@ class Kalman(AbstractEstimator):
 
         windows = jnp.array([path.window() for path in wide.traffic.motions]).reshape(-1)
         events = jnp.concatenate([jnp.zeros(1), jnp.clip(windows, 0.0, end), end[None]])
-        edges = edges_between(jnp.sort(end - events), hastening(self.points))
         first, Q = jnp.diag(jnp.append(none, spread)), jnp.pad(intensity, (0, loads))
-        table = finite_time(dual, edges, Q, noise, first)[0]
+        table = finite_time(dual, jnp.sort(end - events), self.points, Q, noise, first)[0]
         return Flowing(
             offset,
             jnp.append(none, model.weights),
