@@ -1,0 +1,90 @@
+"""Flows over stretches, against scipy's integration of the plant and of what it costs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+from scipy.interpolate import BarycentricInterpolator
+
+from jaxbeam.coupled import Coupling, Plant, answers, coupled_flows
+from jaxbeam.flows import NODES, costs_to_go, flows
+
+STATES, INPUTS, DIRECTIONS, FORCES, HALVINGS = 4, 2, 3, 2, 3
+START, LENGTH = 0.4, 0.1
+RANDOM = np.random.default_rng(0)
+PLANT = Plant(
+    *(jnp.asarray(2 * RANDOM.normal(size=(STATES, n))) for n in (STATES, INPUTS, DIRECTIONS))
+)
+Q, R = jnp.asarray(np.eye(STATES) + 0.2), jnp.array([[0.3, 0.1], [0.1, 0.5]])
+PHASES = [
+    RANDOM.uniform(0, 6, size)
+    for size in [(DIRECTIONS, FORCES), (FORCES, STATES), (FORCES, INPUTS), (FORCES, FORCES)]
+]
+
+
+def coupling(t):
+    """Two forces, each of which also feels the other."""
+    sizes = zip((1.0, 2.0, 1.0, 0.2), PHASES, strict=True)
+    return Coupling(*(size * jnp.sin(2 * t + phase) for size, phase in sizes))
+
+
+def matrices(t):
+    """The same plant, its forces eliminated."""
+    part = coupling(t)
+    law = jnp.linalg.solve(
+        jnp.eye(FORCES) + part.back, jnp.concatenate([part.rows, part.direct], axis=1)
+    )
+    push = PLANT.E @ part.shape
+    return PLANT.A + push @ law[:, :STATES], PLANT.B + push @ law[:, STATES:]
+
+
+def nodes(count):
+    """Gauss nodes of so many stretches over the time that is looked at."""
+    return START + LENGTH * (np.arange(count)[:, None] + NODES) / count
+
+
+def by_collocation(count):
+    at = jax.vmap(jax.vmap(matrices))(nodes(count))
+    return flows(*at, Q, R, jnp.full(count, LENGTH / count))
+
+
+def by_forces(count):
+    """With the answers for a stretch of this length, as it is halved from a longer one."""
+    length, kind = jnp.asarray(LENGTH / count), HALVINGS - 1
+    answer = answers(PLANT, Q, length * 2**kind, HALVINGS)
+    parts = jax.vmap(jax.vmap(coupling))(nodes(count))
+    return coupled_flows(PLANT, jax.tree.map(lambda x: x[kind], answer), parts, R, length)
+
+
+@pytest.mark.parametrize("made", [by_collocation, by_forces])
+def test_a_flow_is_what_the_plant_does_and_costs(made):
+    flow = jax.jit(made, static_argnums=0)(1)
+    # Of a degree that Gauss's rule for the cost, too, is exact for.
+    start, powers = RANDOM.normal(size=STATES), NODES[:, None] ** np.arange(4)
+    values = powers @ RANDOM.normal(size=(4, INPUTS))
+    command, plant = BarycentricInterpolator(START + LENGTH * NODES, values), jax.jit(matrices)
+
+    def rate(t, state):
+        (A, B), x, u = plant(t), state[:STATES], command(t)
+        return np.append(A @ x + B @ u, x @ Q @ x + u @ R @ u)
+
+    span, tight = (START, START + LENGTH), {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
+    expected = solve_ivp(rate, span, np.append(start, 0.0), **tight).y[:, -1]
+    both = np.append(start, values)
+    assert_allclose(flow.drift[0] @ start + flow.push[0] @ both[STATES:], expected[:-1], rtol=1e-9)
+    assert_allclose(both @ flow.toll[0] @ both, expected[-1], rtol=1e-9)
+
+
+def test_both_lead_to_the_same_costs():
+    """Also in parallel, and where stretches have no length."""
+    costs = [
+        jax.jit(lambda made=made, parallel=parallel: costs_to_go(made(4), Q, parallel))()
+        for made in (by_collocation, by_forces)
+        for parallel in (False, True)
+    ]
+    for other in costs[1:]:
+        assert_allclose(other, costs[0], rtol=1e-10)
+    still = flows(*jax.vmap(jax.vmap(matrices))(nodes(1)), Q, R, jnp.zeros(1))
+    assert_allclose(costs_to_go(still, 3 * Q)[0], 3 * Q, rtol=1e-14)
