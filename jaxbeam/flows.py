@@ -80,7 +80,8 @@ def costs_to_go(
 
     One after the other; or `parallel` in time, in twice the logarithm of their number of steps
     and about ten times the work. It compiles some ten times as long, and can pay only where many
-    more cores than designs are idle.
+    more cores than designs are idle. Its batches are solved by a library, whose threads may wait
+    for each other for ever where several programs run at once on few cores.
     """
     if parallel:
 

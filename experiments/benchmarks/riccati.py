@@ -60,14 +60,14 @@ def timed(function, batches, share: float = 1.0, threads: int = THREADS) -> Time
     return Times(compiled, min(runs) * len(batches) / (each * threads))
 
 
-def rig(modes: int, points: int, form: str = "sequential") -> jb.Case:
+def rig(modes: int, points: int) -> jb.Case:
     """The rig with a regulator to be designed."""
     weights = [1e6] * modes + [10.0] * modes
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=modes),
         actuators=[jb.PointForce(0.25)],
         loads=[jb.MovingMass(mass=0.4, speed=SPEEDS[0])],
-        controller=jb.FiniteLQR(weights, [1e-3], points=points, in_time=form),
+        controller=jb.FiniteLQR(weights, [1e-3], points=points),
     )
 
 
@@ -93,9 +93,9 @@ def stretches(modes: int, turn: float) -> int:
     return math.ceil(fastest * length / SPEEDS[0] / turn)
 
 
-def designs(modes: int, points: int, shared: bool, share: float, form="sequential") -> Times:
+def designs(modes: int, points: int, shared: bool, share: float) -> Times:
     """Time finite-time designs: those of the grid, which share much, or others."""
-    case = rig(modes, points, form)
+    case = rig(modes, points)
     layout = lay_out(case)
 
     def one(mass, speed, effort):
@@ -139,8 +139,6 @@ def main() -> None:
             points = stretches(modes, turn)
             row(f"{name}, grid", designs(modes, points, True, 1 / 4))
             row(f"{name}, all different", designs(modes, points, False, 1 / 16))
-        parallel = designs(modes, points, True, 1 / 128, "parallel")
-        row(f"{name}, grid, parallel in time", parallel)
 
 
 if __name__ == "__main__":
