@@ -94,6 +94,8 @@ class Work:
         crossing = np.where(np.isfinite(crossing), crossing, duration)
         self.paces = 1 / crossing
         self.limits = np.minimum(limits, duration)
+        if case.controller is not None:  # between its samples there is a step at least
+            self.limits = np.minimum(self.limits, self.schedule.lengths.max())
         # As found for beams of 3 and 12 modes at fast and slow crossings, errors of 1e-7.
         modes = case.beam.modes
         self.guesses = crossing / (22 * modes + 5 + 1.25 * crossing / limits / np.sqrt(modes))
@@ -106,9 +108,9 @@ class Work:
         """
         batches = -(-PACES // self.each)
 
-        def measure(chosen, steps, single=False):
+        def measure(chosen, steps, more=0, single=False):
             parts = zip(np.split(chosen, batches), np.split(steps, batches), strict=True)
-            found = [self._run(*part, None, single)["peak_deflection"] for part in parts]
+            found = [self._run(*part, None, single, more)["peak_deflection"] for part in parts]
             return np.concatenate(found)
 
         count = batches * self.each
@@ -116,7 +118,9 @@ class Work:
         steps, error = choose_steps(measure, *given)
         if self.single:
             some = drawn(self.paces.size, count)
-            error += rounding(*(measure(some, steps[some], single) for single in (False, True)))
+            error += rounding(
+                *(measure(some, steps[some], single=single) for single in (False, True))
+            )
         return steps, error
 
     def runs(self, number: int) -> int:
@@ -135,15 +139,17 @@ class Work:
 
     def _begin(self, begin, alike):
         """Begin to compile what finds the steps, with arguments made from what rigs look like."""
-        first, steps = np.zeros(self.each, int), np.ones(self.each)
-        given = self._rigging(first, steps, None, alike, first)
+        first = np.zeros(self.each, int)
+        pace = np.ones(self.each), first
+        given = self._rigging(first, pace, None, alike, first)
         riggings = None if given is None else begin(programs.riggings, given)
-        begin(programs.block, self._block(first, steps, None, riggings))
+        begin(programs.block, self._block(first, pace, None, riggings))
 
-    def _run(self, chosen, steps, substeps, single):
-        given = self._rigging(chosen, steps, substeps, self.rigs, self.rig_of[chosen])
+    def _run(self, chosen, steps, substeps, single, more=0):
+        pace = np.asarray(steps), np.full(chosen.size, more)
+        given = self._rigging(chosen, pace, substeps, self.rigs, self.rig_of[chosen])
         riggings = None if given is None else programs.riggings(*given)
-        arguments = self._block(chosen, steps, substeps, riggings)
+        arguments = self._block(chosen, pace, substeps, riggings)
         arguments = jax.tree.map(_shortened, arguments) if single else arguments
         with jax.enable_x64(False) if single else contextlib.nullcontext():
             with self._compiling:  # others wait for the first, instead of compiling the same again
@@ -153,17 +159,17 @@ class Work:
             results = programs.block(*arguments)
         return {name: np.asarray(values) for name, values in results.items()}
 
-    def _rigging(self, chosen, steps, substeps, rigs, rig_of):
+    def _rigging(self, chosen, pace, substeps, rigs, rig_of):
         """Arguments of `programs.riggings`; None with a controller, which has a rig of its own."""
         if self.case.controller is not None:
             return None
         rigs = jax.tree.map(lambda leaf: leaf[rig_of], rigs)
         heavy, names = self.tasks.heavy[chosen], self.addresses[0]
-        return self.case, names, *self._clock(substeps), rigs, heavy, np.asarray(steps)
+        return self.case, names, *self._clock(substeps), rigs, heavy, pace
 
-    def _block(self, chosen, steps, substeps, riggings):
+    def _block(self, chosen, pace, substeps, riggings):
         """Arguments of `programs.block`."""
-        tasks = self.tasks.heavy[chosen], self.tasks.light[chosen], np.asarray(steps)
+        tasks = self.tasks.heavy[chosen], self.tasks.light[chosen], pace
         settings = self.case, self.form, self.addresses, self.devices, *self._clock(substeps)
         return *settings, riggings, *tasks
 

@@ -88,13 +88,19 @@ def _activity(windows, edges):
     return (windows[:, 0] < middle[:, None]) & (middle[:, None] < windows[:, 1])
 
 
-def even_grid(case: Case, rig: Rig, longest: Float[Array, ""]) -> Grid:
-    """Panels from event to event, with as many steps as keep them below `longest` (s)."""
+def even_grid(
+    case: Case, rig: Rig, longest: Float[Array, ""], more: int | Int[Array, ""] = 0
+) -> Grid:
+    """Panels from event to event, with as many steps as keep them below `longest` (s), and `more`.
+
+    To see what finer steps change, `more` is one: a short panel has the same whole number of steps
+    of many lengths.
+    """
     windows, events = _events(case, rig)
     end = case.run.duration
     edges = jnp.concatenate([jnp.zeros(1), jnp.clip(jnp.sort(events), 0.0, end), end[None]])
     spans = jnp.diff(edges)
-    counts = jnp.ceil(jax.lax.stop_gradient(spans / longest)).astype(int)
+    counts = jnp.ceil(jax.lax.stop_gradient(spans / longest)).astype(int) + more * (spans > 0)
     lengths = spans / jnp.maximum(counts, 1)
     kind = jnp.arange(spans.shape[0])
     lengths = jnp.append(lengths, 0.0)

@@ -18,7 +18,8 @@ MARGIN = 4  # how much smaller errors must be where they are looked for than the
 SURE = 1.3  # how far a guess must exceed the limit of a step for that to be taken unmeasured
 SMALL = 1e-6  # of a run's largest peak: smaller ones need not be right to the tolerance
 
-Measure = Callable[[Int[np.ndarray, " task"], Float[np.ndarray, " task"]], np.ndarray]
+# Of tasks, their steps (s), and how many steps more between events.
+Measure = Callable[[Int[np.ndarray, " task"], Float[np.ndarray, " task"], int], np.ndarray]
 
 
 def spread(paces: Float[np.ndarray, " task"], count: int) -> Int[np.ndarray, " chosen"]:
@@ -34,10 +35,11 @@ def spread(paces: Float[np.ndarray, " task"], count: int) -> Int[np.ndarray, " c
 def errors(measure: Measure, tasks, steps) -> Float[np.ndarray, " task"]:
     """How much the peaks of tasks, (task, lane, sensor), change with finer steps than these (s).
 
-    The largest relative change in each task. Runs that fail are left out; NaN if all do.
+    The largest relative change in each task. Runs that fail are left out; NaN if all do. Finer is
+    one step more between events at least, or between samples of a loop: there may be few of them.
     """
     with ThreadPoolExecutor(2) as pool:
-        coarse, fine = pool.map(measure, (tasks, tasks), (steps, steps / FINER))
+        coarse, fine = pool.map(measure, (tasks, tasks), (steps, steps / FINER), (0, 1))
     return _changes(coarse, fine)
 
 
@@ -73,7 +75,8 @@ def choose_steps(
 ) -> tuple[Float[np.ndarray, " task"], float]:
     """Longest steps (s) of all tasks for a tolerance, and the error seen on a random few.
 
-    `measure` takes `count` tasks and their steps and returns their peaks. `paces` (1/s) order the
+    `measure` takes `count` tasks, their steps and how many more between events, and returns their
+    peaks. `paces` (1/s) order the
     tasks, `guesses` start the search, `limits` (s) cap it. Raises RuntimeError if no step meets
     the tolerance.
     """

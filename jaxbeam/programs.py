@@ -48,34 +48,35 @@ def windows(case, addresses, heavy):
     return jax.vmap(task)(heavy)
 
 
-def _prepare(case, addresses, schedule, substeps, assembled, heavy, longest, driver=None):
-    """A rig on the grid of one task."""
+def _prepare(case, addresses, schedule, substeps, assembled, heavy, pace, driver=None):
+    """A rig on the grid of one task. Its pace: the longest step (s), and how many more between."""
     varied = _varied(case, addresses, heavy)
+    longest, more = pace
     if schedule is None:
-        grid = even_grid(varied, assembled, longest)
+        grid = even_grid(varied, assembled, longest, more)
     else:
-        finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int)
+        finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int) + more
         grid = scheduled_grid(varied, assembled, schedule, substeps or finer)
     return make_rigging(assembled, grid, varied.sensor_places, driver)
 
 
 @compiled_with(**SIDE_BY_SIDE)
-def riggings(case, addresses, schedule, substeps, rigs, heavy, longest):
-    """Rigs on the grids of some tasks, several at once because each is little work."""
+def riggings(case, addresses, schedule, substeps, rigs, heavy, pace):
+    """Rigs on the grids of some tasks."""
 
     def task(values):
         return _prepare(case, addresses, schedule, substeps, *values)
 
-    return jax.lax.map(task, (rigs, heavy, longest))
+    return jax.lax.map(task, (rigs, heavy, pace))
 
 
 @compiled
-def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, light, longest):
+def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, light, pace):
     """Results of some tasks: lanes side by side, tasks one after the other, shared by devices."""
     heavy_addresses, light_addresses = addresses
 
     def task(values):
-        rigging, heavy, light, longest = values
+        rigging, heavy, light, pace = values
         varied = _varied(case, heavy_addresses, heavy)
 
         def press(values):
@@ -87,7 +88,7 @@ def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, l
         driver = None
         if rigging is None:
             driver = make_loop(varied, form.layout, loads, schedule)
-            given = driver.rig, heavy, longest, driver
+            given = driver.rig, heavy, pace, driver
             rigging = _prepare(case, heavy_addresses, schedule, substeps, *given)
         if substeps is None:
             best, memory = march(
@@ -121,4 +122,4 @@ def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, l
     if devices > 1:
         mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
         part = jax.shard_map(part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    return part((riggings, heavy, light, longest))
+    return part((riggings, heavy, light, pace))

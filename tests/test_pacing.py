@@ -11,7 +11,7 @@ ORDER = 12
 def task(paces, best, order=ORDER, failing=()):
     """A measure whose relative error is (step / best)^order: peaks (task, lane, sensor)."""
 
-    def measure(chosen, steps):
+    def measure(chosen, steps, more=0):
         error = (np.asarray(steps) / best[chosen]) ** order
         peaks = np.repeat((1 + error)[:, None, None] * 1e-3, 2, axis=1)
         peaks[np.isin(chosen, failing)] = np.nan
@@ -90,7 +90,7 @@ def test_a_guess_that_is_good_but_short_is_made_longer():
 
 
 def test_no_step_will_do():
-    def measure(chosen, steps):
+    def measure(chosen, steps, more=0):
         return np.random.default_rng(int(1e9 * steps[0])).uniform(size=(len(chosen), 1, 1))
 
     paces = np.geomspace(1, 10, 8)
@@ -99,7 +99,7 @@ def test_no_step_will_do():
 
 
 def test_error_is_that_of_the_worst_lane():
-    def measure(chosen, steps):
+    def measure(chosen, steps, more=0):
         peaks = np.ones((len(chosen), 2, 1))
         peaks[:, 1] += steps[:, None]
         return peaks

@@ -226,3 +226,20 @@ def test_longest_steps_do_not_blow_up(modes, damping):
     peaks = work.block(0, work.limits)["peak_deflection"]  # speed, mass, sensor
     ratio = peaks / (masses[:, None] * np.asarray(static_peak(case, np.array([0.15, 0.3]))))
     assert ratio.min() > 0.99 and ratio.max() < 1.15
+
+
+def test_errors_are_seen_where_few_steps_lie_between_samples():
+    """Of one or two steps a hold: finer ones must not come out as the same number."""
+    looped = dataclasses.replace(
+        CASE,
+        actuators=[jb.PointForce(0.3)],
+        sensors=[jb.Sensor(0.3)],
+        controller=jb.Feedback(gains=[200.0], period=0.02),
+        run=jb.Run(0.5, sample_rate=50.0),
+    )
+    over = {"loads.0.speed": np.linspace(2.0, 6.0, 6)}
+    rough, fine = (
+        jb.sweep(looped, over, progress=False, tolerance=tolerance) for tolerance in (1e-2, 1e-9)
+    )
+    error = np.max(np.abs(rough.peak_deflection / fine.peak_deflection - 1))
+    assert 1e-9 < error < 2 * rough.error_estimate

@@ -50,7 +50,8 @@ def prepare(modes: int) -> tuple[np.ndarray, list]:
     work = make_order(case, over, False, False, TOLERANCE, "double").work()
     steps, _ = work.steps()
     everything = np.arange(SPEEDS.size)
-    given = work._rigging(everything, steps, None, work.rigs, work.rig_of[everything])
+    pace = steps, np.zeros(steps.size, int)
+    given = work._rigging(everything, pace, None, work.rigs, work.rig_of[everything])
     riggings = jax.tree.map(np.asarray, programs.riggings(*given))
     plain = Rig(modes)
     rates = riggings.rig.state_matrix[0, :, 1, :]
