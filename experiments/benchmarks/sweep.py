@@ -83,7 +83,6 @@ def compare(modes: int) -> list[tuple[str, float, float, float]]:
         by_hand = time_call(sweep_peaks, modes, repeat=SHORT)
         rows.append(("jaxbeam native", by_hand.run, worst(sweep_peaks(modes)[:, CHECKED])))
         native.remove()
-        print(f"{modes} modes: the sweep with steps in C compiles in {by_hand.compile:.1f} s")
     repeat = 3 if modes < 6 else 1
 
     def rival(solve):
