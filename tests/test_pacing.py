@@ -69,7 +69,7 @@ def test_settled_runs_are_not_measured_again():
     paces, best = np.geomspace(1, 10, 4), np.full(4, 0.1)
     tried, measure = [], task(paces, best)
 
-    def watched(chosen, steps):
+    def watched(chosen, steps, more=0):
         tried.append(set(np.asarray(chosen).tolist()))
         return measure(chosen, steps)
 
