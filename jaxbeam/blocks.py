@@ -68,7 +68,7 @@ class Work:
         slots = len(case.loads)
         if slots > 1:
             slots = max(most_at_once(window) for window in windows())
-        self.form = Form(layout, couples(case), slots, native.ready())
+        self.form = Form(layout, couples(case), slots, native.serves(case))
         design = case, self.form, self.addresses[0]
         # Known before what rigs look like. While one program compiles, the next is traced.
         with ThreadPoolExecutor(2) as pool:

@@ -1,8 +1,9 @@
 """A chunk of steps by hand-written C (`native.c`), where that was compiled for this machine.
 
 XLA makes of a step some forty small loops over the lanes; by hand it is one. The C is compiled
-once, when asked for, by the C compiler of the machine, into the user's cache folder; sweeps then
-use it for runs in double precision without a controller, on CPUs. Nobody needs it.
+once, when asked for, by the C compiler of the machine, into the user's cache folder. Sweeps then
+use it where they look for peaks alone (not histories), without a controller, in double precision,
+on CPUs. Nobody needs it.
 """
 
 import ctypes
@@ -21,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.case import Case
 from jaxbeam.compiling import cache_folder
 from jaxbeam.exponentials import GAUSS, NODES, POINTS
 from jaxbeam.extremes import NEAR, Extremes
@@ -45,7 +47,7 @@ FLAGS = (
 TARGETS = {jnp.abs: "chunk_of_both_sides", jnp.positive: "chunk_of_one_side"}
 
 
-def library() -> pathlib.Path:
+def binary() -> pathlib.Path:
     """Where the compiled C is, or would be: a file for this source, this machine and this JAX."""
     return cache_folder() / f"native-{_mark()}.so"
 
@@ -65,7 +67,7 @@ def build() -> pathlib.Path:
     command = compiler()
     if command is None:
         raise RuntimeError("there is no C compiler here: install gcc or clang, or name one in CC")
-    target = library()
+    target = binary()
     target.parent.mkdir(parents=True, exist_ok=True)
     # Made beside its place and moved there, so that nobody ever loads half of it.
     with tempfile.TemporaryDirectory(dir=target.parent) as folder:
@@ -85,13 +87,18 @@ def build() -> pathlib.Path:
 
 def remove() -> None:
     """Remove what was compiled for this machine, if it was: sweeps do without again."""
-    for path in (library(), _digest(library())):
+    for path in (binary(), _digest(binary())):
         path.unlink(missing_ok=True)
+
+
+def serves(case: Case) -> bool:
+    """Whether steps of this case, if its peaks are swept, are those in C."""
+    return case.controller is None and ready()
 
 
 def ready() -> bool:
     """Whether the C is compiled for this machine, and of use: computing on a CPU."""
-    return jax.default_backend() == "cpu" and _sound(library()) and _registered()
+    return jax.default_backend() == "cpu" and _sound(binary()) and _registered()
 
 
 def _sound(path: pathlib.Path) -> bool:
@@ -105,7 +112,7 @@ def _sound(path: pathlib.Path) -> bool:
 @functools.cache
 def _registered() -> bool:
     """Load the library and tell XLA of it, which takes each name once in a process."""
-    loaded = ctypes.CDLL(str(library()))
+    loaded = ctypes.CDLL(str(binary()))
     for name in TARGETS.values():
         jax.ffi.register_ffi_target(_target(name), jax.ffi.pycapsule(getattr(loaded, name)))
     return True

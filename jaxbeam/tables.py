@@ -115,7 +115,7 @@ def make_rigging(
 
 
 def _flexibility(rig: Rig, shapes: Float[Array, "place mode"]) -> Float[Array, " place"]:
-    """Static deflection at places under a unit force there; no number if a mode has no stiffness.
+    """Static deflection at places under a unit force there; not finite if a mode has no stiffness.
 
     Modes that nothing couples need no factorisation, which takes longer than all the rest.
     """

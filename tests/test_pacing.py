@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxbeam.pacing import choose_steps, errors, spread
+from jaxbeam.pacing import SURE, choose_steps, errors, spread
 
 ORDER = 12
 
@@ -39,6 +39,24 @@ def test_limits_are_kept():
     limits = np.linspace(0.01, 0.02, 20)
     steps, _ = choose_steps(task(paces, np.ones(20)), paces, np.full(20, 5.0), limits, 4, 1e-6)
     assert np.all(steps <= limits) and np.all(steps > 0.95 * limits)
+
+
+@pytest.mark.parametrize("best", [1.0, 1e-3])
+def test_steps_far_below_their_guess_are_checked_but_not_searched(best):
+    """Where a limit rules, a search has nothing to find; if it is too long, the check tells."""
+    tried, paces, limits = [], np.geomspace(1, 10, 20), np.full(20, 0.01)
+    measure = task(paces, np.full(20, best))
+
+    def watched(chosen, steps, more=0):
+        tried.append(steps.max())
+        return measure(chosen, steps)
+
+    steps, error = choose_steps(watched, paces, SURE * limits, limits, 4, 1e-6)
+    assert error <= 1e-6
+    if best == 1.0:
+        assert np.all(steps == limits) and len(tried) == 2  # coarse and fine, of the check
+    else:
+        assert np.all(steps < best) and len(tried) > 2
 
 
 def test_failed_runs_do_not_decide():

@@ -15,13 +15,13 @@ def native(*, remove: bool = False, json_: Json = False) -> None:
     """
     from jaxbeam import native as compiled
 
-    path = compiled.library()
+    path = compiled.binary()
     if remove:
         compiled.remove()
     else:
         compiled.build()
     if json_:
-        print_json({"library": str(path), "compiled": not remove})
+        print_json({"path": str(path), "compiled": not remove})
     elif remove:
         print(f"removed {path}: sweeps do without")
     else:
