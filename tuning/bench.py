@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam.case import Case, replace, value_at
 from jaxbeam.compiling import compiled
-from jaxbeam.control.bound import HELD, bound
+from jaxbeam.control.bound import HELD, least_achievable
 from jaxbeam.dynamics import traffic
 from jaxbeam.plan import Plan, make_plan, sample_times
 from jaxbeam.record import Record
@@ -109,10 +110,13 @@ def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = F
         raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")
     cases = [apply(case, run) for run in runs]
     times = sample_times(case)
-    plan, error = _common_plan(cases)
-    plain = [dataclasses.replace(own, controller=None) for own in cases]
-    still, _ = _common_plan(plain)
-    deflection = np.asarray(_deflections(stacked_cases(plain), times, still, places))
+    # What takes long is compiling programs that have nothing to do with each other.
+    with ThreadPoolExecutor(3) as pool:
+        planned = pool.submit(_common_plan, cases)
+        deflecting = pool.submit(_uncontrolled, cases, times, places)
+        least = pool.submit(_least_peaks, cases, places) if bounds else None
+    plan, error = planned.result()
+    deflection = deflecting.result()
     varied = dict.fromkeys(a for run in runs for a in run if a.startswith(PLANT))
     leaves = np.array([_last_exit(own) for own in cases])
     limits = [actuator.command_limits() for actuator in case.actuators]
@@ -126,7 +130,7 @@ def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = F
         free={
             "peak": np.abs(deflection).max(axis=(1, 2)),
             "rms": np.sqrt((deflection**2).mean(axis=(1, 2))),
-            "least": _least_peaks(cases, places) if bounds else np.full(len(runs), np.nan),
+            "least": np.full(len(runs), np.nan) if least is None else least.result(),
         },
         after=(np.asarray(times) > leaves[:, None]).astype(float),
         ranges=np.array([1.0 if pair is None else np.abs(pair).max() for pair in limits]),
@@ -134,10 +138,17 @@ def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = F
     )
 
 
+def _uncontrolled(cases: list[Case], times, places) -> Float[np.ndarray, "run time place"]:
+    """Deflections (m) of runs without their controllers."""
+    plain = [dataclasses.replace(own, controller=None) for own in cases]
+    plan, _ = _common_plan(plain)
+    return np.asarray(_deflections(stacked_cases(plain), times, plan, places))
+
+
 def _least_peaks(cases: list[Case], places) -> Float[np.ndarray, " run"]:
     period = cases[0].controller.period
     held = HELD if period is None else float(period)
-    return np.array([bound(own, places, held).peak for own in cases])
+    return np.array([least_achievable(own, places, held) for own in cases])
 
 
 def stacked_cases(cases: list[Case]) -> Case:

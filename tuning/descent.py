@@ -116,7 +116,7 @@ class Descent:
         bench = dataclasses.replace(bench, runs=(), free=bench.free | {"least": least})
 
         form = Form(tuple(map(_shape_of, numbers)), objective.over, objective.share, price)
-        self._slope = functools.partial(_slope, form, batch is not None, bench)
+        self._given = form, batch is not None, bench
         self._true = functools.partial(_true, form, bench)
         own = self.method
         self._init = compiled(lambda points: jax.vmap(own.init)(points))
@@ -141,6 +141,11 @@ class Descent:
             for n in self.numbers
         ]
         return np.concatenate([own[None], np.array(spread).reshape(len(own), -1).T])
+
+    def compile(self, target: Target, points: Float[np.ndarray, "start free"]) -> None:
+        """Compile the program of every step, of whose results nothing is wanted yet."""
+        rows = jnp.asarray(self._rows(0, 0))
+        _slope.ahead(*self._given, jnp.asarray(points), jnp.asarray(SHARPNESS[0]), rows, target)()
 
     def run(
         self,
@@ -192,8 +197,12 @@ class Descent:
         sharpness, fresh = self._sharpness(state.step)
         rows = self._rows(state.step, seed)
         # Arrays: plain numbers would be part of the program, compiled anew at every step.
-        (value, true), slope = self._slope(
-            jnp.asarray(state.point), jnp.asarray(sharpness), jnp.asarray(rows), target
+        (value, true), slope = _slope(
+            *self._given,
+            jnp.asarray(state.point),
+            jnp.asarray(sharpness),
+            jnp.asarray(rows),
+            target,
         )
         value, true, slope = np.asarray(value), np.asarray(true), np.asarray(slope)
         sound = np.isfinite(true) & np.isfinite(value) & np.isfinite(slope).all(axis=1)
@@ -228,7 +237,8 @@ class Descent:
             return np.asarray(self._true(jnp.asarray(points), target))
         # By the program that steps need anyway.
         sharpness, rows = jnp.asarray(SHARPNESS[0]), jnp.arange(self.runs)
-        return np.asarray(self._slope(jnp.asarray(points), sharpness, rows, target)[0][1])
+        found = _slope(*self._given, jnp.asarray(points), sharpness, rows, target)
+        return np.asarray(found[0][1])
 
     def _sharpness(self, step: int) -> tuple[float, bool]:
         """How sharp maxima are at a step, and whether they have become so with it."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,8 @@ from jaxtyping import Float
 from jaxbeam.case import Case, replace
 from jaxbeam.casefile import case_to_dict
 from jaxbeam.compiling import compiled
-from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.record import Record
+from jaxbeam.simulate import ContactLossWarning, Histories
 from tuning.bench import Bench, make_bench
 from tuning.checkpoint import fingerprint
 from tuning.descent import Descent, State
@@ -98,6 +100,12 @@ def tune(
     descent = problem.descent(method, steps, batch)
     mark = fingerprint(problem.about | {"settings": [method, steps, batch, starts, seed]})
     points = descent.points(starts, seed)
+    # The runs of the proof are simulated while the search compiles; what is wrong with them is
+    # told before it begins.
+    with ThreadPoolExecutor(1) as pool:
+        proof = pool.submit(lambda: problem.held_out if cases.held_out else None)
+        descent.compile(objective.target, points)
+        proof.result()
     state = descent.run(objective.target, points, seed, file=file, mark=mark, progress=progress)
     return problem.proven(descent, state, objective)
 
@@ -165,7 +173,6 @@ class Problem:
             "stable": None if stable is None else dataclasses.asdict(stable),
             "places": places,
         }
-        self._held_out = None
 
     def descent(self, method: str, steps: int, batch: int | None = None) -> Descent:
         """A search of this problem."""
@@ -183,6 +190,11 @@ class Problem:
             return lambda values: STEEP * violation(values)
         return lambda values: STEEP * violation(values) + own(values)
 
+    @functools.cached_property
+    def held_out(self) -> Bench:
+        """The runs that the search does not see, prepared. Raises ValueError if there are none."""
+        return make_bench(self.case, self.cases.held_out, self.places, self.bounds)
+
     def proven(self, descent: Descent, state: State, objective: Objective) -> Tuned:
         """What a search came to, on training and held-out runs."""
         values = descent.values(state)
@@ -190,10 +202,7 @@ class Problem:
         after = dict(zip(before, map(float, values), strict=True))
         outcomes = [_outcome("training", self.bench, objective, before, after)]
         if self.cases.held_out:
-            if self._held_out is None:
-                runs = self.cases.held_out
-                self._held_out = make_bench(self.case, runs, self.places, self.bounds)
-            outcomes.append(_outcome("held out", self._held_out, objective, before, after))
+            outcomes.append(_outcome("held out", self.held_out, objective, before, after))
         order = np.argsort(state.best_value).tolist()
         return Tuned(
             case=replace(self.case, after),
@@ -211,8 +220,8 @@ class Problem:
 
 
 @compiled
-def _merits(bench: Bench, values):
-    return bench.merits(values)
+def _merits(bench: Bench, found: Histories):
+    return bench.judge(found)
 
 
 def _outcome(name, bench: Bench, objective, before, after) -> Outcome:
@@ -221,10 +230,9 @@ def _outcome(name, bench: Bench, objective, before, after) -> Outcome:
         warnings.simplefilter("ignore", ContactLossWarning)
         pairs = [bench.records(values) for values in (before, after)]
     peaks = [_peaks(bench, records) for records in pairs]
-    arrays = [jax.tree.map(jnp.asarray, values) for values in (before, after)]
     # What is compiled must not depend on what the runs are called.
     nameless = dataclasses.replace(bench, runs=())
-    merits = [_merits(nameless, v) for v in arrays]
+    merits = [_merits(nameless, _histories(records, bench.places)) for records in pairs]
     values = [np.asarray(objective.of_run(found)) for found in merits]
     return Outcome(
         name=name,
@@ -238,6 +246,12 @@ def _outcome(name, bench: Bench, objective, before, after) -> Outcome:
         objective=[float(objective.of_runs(jnp.asarray(v))) for v in values],
         merits={name: float(objective.of_runs(part)) for name, part in merits[1].items()},
     )
+
+
+def _histories(records: list[Record], places) -> Histories:
+    """Histories of all runs, along a first axis, at some places (m)."""
+    parts = [(record.at(places), record.command, record.contact_force) for record in records]
+    return Histories(*map(np.stack, zip(*parts, strict=True)))
 
 
 def _peaks(bench: Bench, records) -> Float[np.ndarray, " run"]:

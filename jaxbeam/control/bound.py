@@ -10,6 +10,7 @@ at every place x and instant t. No controller that holds its commands over the s
 below p, however it measures, estimates or predicts.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -31,6 +32,8 @@ from jaxbeam.ports import takes_commands
 from jaxbeam.record import Record
 
 HELD = 0.01  # s: over which commands are held, where no controller says
+
+_extremes = compiled(run_extremes)
 
 
 class Binding(NamedTuple):
@@ -110,6 +113,17 @@ def bound(
     for times that are not positive, for limits that rates cannot reach from zero, and under
     differentiation (it has no derivatives); RuntimeError if the linear program fails.
     """
+    found = _bound(case, places, period, spacing)
+    return dataclasses.replace(found, uncontrolled=_uncontrolled(case, found.places))
+
+
+def least_achievable(case: Case, places: ArrayLike | None, period: float) -> float:
+    """The peak of `bound` alone (m), sooner; raises what that raises."""
+    return _bound(case, places, period, None).peak
+
+
+def _bound(case: Case, places, period, spacing) -> Bound:
+    """The bound of a case, but for the peak without commands."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(case)):
         raise ValueError("a bound cannot be differentiated or compiled; call it on plain numbers")
     check(case)
@@ -138,7 +152,7 @@ def bound(
     when, where = np.nonzero(weights)
     return Bound(
         peak=float(peak),
-        uncontrolled=_uncontrolled(case, places),
+        uncontrolled=np.nan,
         places=places,
         times=found.holds,
         commands=commands,
@@ -164,7 +178,7 @@ def _uncontrolled(case: Case, places) -> float:
     plain = eqx.tree_at(lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None)
     shape = form(plain)
     step, _ = suitable_step(plain, shape, TOLERANCE)
-    best = compiled(run_extremes)(plain, shape, jnp.asarray(step), jnp.asarray(places))
+    best = _extremes(plain, shape, jnp.asarray(step), jnp.asarray(places))
     return float(jnp.max(best.peak()[0]))
 
 

@@ -224,6 +224,13 @@ def test_what_cannot_be_tuned_is_refused(changes, message):
         tuning.tune(**given, progress=False)
 
 
+def test_runs_that_cannot_be_proven_are_told_before_the_search(tmp_path):
+    slow = tuning.LoadCases(training=RUNS, held_out=tuning.grid({"loads.0.speed": [0.7]}))
+    with pytest.raises(ValueError, match="with loads.0.speed = 0.7 the last load leaves only at"):
+        tuning.tune(rig(), FREE, slow, bounds=False, checkpoint=tmp_path / "search.npz")
+    assert not list(tmp_path.iterdir())
+
+
 def test_load_cases_from_a_file(tmp_path):
     file = tmp_path / "loads.toml"
     file.write_text(
