@@ -23,7 +23,7 @@ from experiments.benchmarks.crossing import (
     free_vibration,
     hermite_peaks,
 )
-from experiments.benchmarks.timing import time_call
+from experiments.benchmarks.timing import Timing, time_call
 
 FREE = 0.5  # s of vibration after the exit
 TIGHT = 1e-12  # tolerance of references
@@ -63,18 +63,23 @@ def scipy_histories(rig, masses, speeds, times, tolerance=LOOSE):
     return np.array([[run(mass, speed) for speed in speeds] for mass in masses])
 
 
-def scipy_time(solve, rig, masses, speeds, runs=12, repeat=3):
-    """Seconds `solve(rig, masses, speeds)` would take for all of these, from a sample of `runs`.
+def scipy_time(solve, rig, masses, speeds, runs=12, repeat=3, beside=None):
+    """What `solve(rig, masses, speeds)` would take for all of these, from a sample of `runs`.
 
     The cost of a run is a constant plus a share that grows with its duration, L / v; both are
-    fitted to runs spread over the speeds, each with another mass, each timed `repeat` times.
+    fitted to runs spread over the speeds, each with another mass, each timed `repeat` times; and,
+    if asked for, compared with the function `beside`.
     """
     chosen = np.linspace(0, len(speeds) - 1, runs).round().astype(int)
     mixed = np.resize(np.asarray(masses)[:: max(len(masses) // runs, 1)], runs)
     pairs = zip(mixed, np.asarray(speeds)[chosen], strict=True)
-    costs = [time_call(solve, rig, [m], [v], repeat=repeat).run for m, v in pairs]
-    growing, constant = np.polyfit(1 / np.asarray(speeds)[chosen], costs, 1)
-    return len(masses) * np.sum(constant + growing / np.asarray(speeds))
+    found = [time_call(solve, rig, [m], [v], repeat=repeat, beside=beside) for m, v in pairs]
+
+    def whole(costs):
+        growing, constant = np.polyfit(1 / np.asarray(speeds)[chosen], costs, 1)
+        return float(len(masses) * np.sum(constant + growing / np.asarray(speeds)))
+
+    return Timing(whole([t.run for t in found]), ratio=whole([t.ratio for t in found]))
 
 
 @partial(jax.jit, static_argnames=("rig", "free", "shared_steps"))

@@ -76,7 +76,7 @@ def case(rig: Rig) -> jb.Case:
 
 
 def measure(spans: int, loop: str, kept: str, modes: int, side: int) -> dict[str, float]:
-    """Times (s), memory (MiB) and errors of one kind of sweep over `side` masses by speeds."""
+    """Times (s; of others in ours), memory (MiB), errors of a kind of sweep, `side` by `side`."""
     rig, histories = plain(spans, loop, modes), kept == "histories"
     masses, speeds = np.linspace(0.1, 1.0, side), np.linspace(SLOWEST, FASTEST, side)
     over, whole = {"loads.0.mass": masses, "loads.0.speed": speeds}, case(rig)
@@ -106,13 +106,13 @@ def measure(spans: int, loop: str, kept: str, modes: int, side: int) -> dict[str
     else:
         size = strict = baselines.reference_peaks(rig, *chosen)
         error = worst(found.peak_deflection.values[some])
-    scaled = baselines.scipy_time(solve, rig, masses, speeds, TIMED, 1)
+    scaled = baselines.scipy_time(solve, rig, masses, speeds, TIMED, 1, ours)
     row = {
         "run": took.run,
         "compile": took.compile,
         "memory": memory,
         "error": error,
-        "scipy": scaled,
+        "scipy": scaled.ratio,
         "scipy_error": worst(solve(rig, *chosen)),
     }
     if loop == "open" and not histories:
@@ -120,7 +120,7 @@ def measure(spans: int, loop: str, kept: str, modes: int, side: int) -> dict[str
         def others():
             return baselines.diffrax_peaks(rig, masses, speeds, shared_steps=True)
 
-        row["diffrax"] = time_call(others, repeat=1).run
+        row["diffrax"] = time_call(others, repeat=1, beside=ours).ratio
         row["diffrax_error"] = worst(np.asarray(others())[some])
     return row
 
@@ -159,7 +159,7 @@ def main() -> None:
     for kind in itertools.product(given.spans, given.loops, given.keep, given.modes):
         row = apart(*kind, given.side)
         rivals = [
-            f"{row[name] / row['run']:.3g} ({row[name + '_error']:.0e})" if name in row else ""
+            f"{row[name]:.3g} ({row[name + '_error']:.0e})" if name in row else ""
             for name in ("scipy", "diffrax")
         ]
         print(f"| {' | '.join(map(str, kind))} | {row['run']:.3g} s | {row['error']:.0e} |"

@@ -3,13 +3,16 @@
     python -m experiments.benchmarks.sweep [--modes 3 12]
 
 4096 crossings of the one-span rig, 64 masses by 64 speeds, peaks at three sensors with free
-vibration, to one part in a million; everything timed in one run, compiling apart. Runs are medians,
-derivatives the best of calls in turn, as they take milliseconds. scipy is timed on twelve runs and
-scaled; the accuracy of all is checked against a reference. Where there is a C compiler, sweeps are
-timed again with the steps that `jaxbeam native` compiles.
+vibration, to one part in a million; everything timed in one run, compiling apart. Each call of
+another solver is timed between two of ours and compared with these: machines are faster at one
+moment than at another. Runs and ratios are medians, derivatives the best of calls in turn, as they
+take milliseconds. scipy is timed on twelve runs and scaled; the accuracy of all is checked against
+a reference. Where there is a C compiler, sweeps are timed again with the steps that `jaxbeam
+native` compiles.
 """
 
 import argparse
+import contextlib
 import os
 import tempfile
 import time
@@ -22,7 +25,7 @@ import xarray
 import jaxbeam as jb
 from experiments.benchmarks import baselines, by_numba
 from experiments.benchmarks.crossing import Rig
-from experiments.benchmarks.timing import best_in_turn, time_call
+from experiments.benchmarks.timing import Timing, best_in_turn, time_call
 from jaxbeam import native
 from jaxbeam.compiling import compiled
 from jaxbeam.plan import make_plan
@@ -67,51 +70,65 @@ def sweep_peaks(modes: int) -> np.ndarray:
     return found.peak_deflection.values
 
 
-def compare(modes: int) -> list[tuple[str, float, float, float]]:
-    """Name, seconds, ratio to jaxbeam and largest relative error of each solver."""
-    reference = baselines.reference_peaks(Rig(modes), MASSES, SPEEDS[CHECKED])
+def compare(modes: int) -> list[tuple[str, Timing, float]]:
+    """Name, times (and how many of jaxbeam's) and largest relative error of each solver."""
+    reference, found = baselines.reference_peaks(Rig(modes), MASSES, SPEEDS[CHECKED]), []
 
-    def worst(peaks):
-        return float(np.max(np.abs(peaks / reference - 1)))
+    def plain():
+        return sweep_peaks(modes)
 
-    ours = time_call(sweep_peaks, modes, repeat=SHORT)
-    rows = [("jaxbeam", ours.run, worst(sweep_peaks(modes)[:, CHECKED]))]
+    def timed(name, solve, repeat=3 if modes < 6 else 1):
+        """A row of the table; the last run is the one that is checked."""
+        kept = []
+        took = time_call(
+            lambda: kept.append(jax.block_until_ready(solve())), repeat=repeat, beside=plain
+        )
+        error = np.max(np.abs(np.asarray(kept[-1])[:, CHECKED] / reference - 1))
+        found.append((name, took, float(error)))
+
+    timed("jaxbeam", plain, SHORT)
     if native.compiler() is None:
         print("steps in C are left out: there is no C compiler here")
     else:
-        native.build()
-        by_hand = time_call(sweep_peaks, modes, repeat=SHORT)
-        rows.append(("jaxbeam native", by_hand.run, worst(sweep_peaks(modes)[:, CHECKED])))
-        native.remove()
-    repeat = 3 if modes < 6 else 1
+        with tempfile.TemporaryDirectory() as folder, cached_in(folder):
+            native.build()
 
-    def rival(solve):
-        """Seconds and error; a slow one need not run again to be checked."""
-        found = []
-        took = time_call(lambda: found.append(jax.block_until_ready(solve())), repeat=repeat)
-        return took.run, worst(np.asarray(found[-1])[:, CHECKED])
+            def by_hand():
+                with cached_in(folder):
+                    return sweep_peaks(modes)
 
+            timed("jaxbeam native", by_hand, SHORT)
     for name, shared in (("diffrax, vmapped", False), ("diffrax, shared steps", True)):
 
         def others(shared=shared):
             return baselines.diffrax_peaks(Rig(modes), MASSES, SPEEDS, shared_steps=shared)
 
-        rows.append((name, *rival(others)))
+        timed(name, others)
     package = by_numba.numba()
     if package is None:
         print("numba is left out: it is not installed (uv sync --extra benchmarks)")
     else:
         fill = by_numba.program(package)
-
-        def loops():
-            return by_numba.numba_peaks(fill, Rig(modes), MASSES, SPEEDS)
-
-        rows.append(("numba, parallel over runs", *rival(loops)))
-    scaled = baselines.scipy_time(baselines.scipy_peaks, Rig(modes), MASSES, SPEEDS)
+        timed(
+            "numba, parallel over runs",
+            lambda: by_numba.numba_peaks(fill, Rig(modes), MASSES, SPEEDS),
+        )
+    scaled = baselines.scipy_time(baselines.scipy_peaks, Rig(modes), MASSES, SPEEDS, beside=plain)
     some = baselines.scipy_peaks(Rig(modes), MASSES[::21], SPEEDS[CHECKED])
-    rows.append(("scipy DOP853, scaled", scaled, float(np.max(np.abs(some / reference[::21] - 1)))))
-    print(f"{modes} modes: the sweep compiles in {ours.compile:.1f} s")
-    return [(name, took, took / ours.run, error) for name, took, error in rows]
+    error = float(np.max(np.abs(some / reference[::21] - 1)))
+    return [*found, ("scipy DOP853, scaled", scaled, error)]
+
+
+@contextlib.contextmanager
+def cached_in(folder: str):
+    """Look for steps in C in another folder."""
+    before = os.environ.get("XDG_CACHE_HOME")
+    os.environ["XDG_CACHE_HOME"] = folder
+    try:
+        yield
+    finally:
+        os.environ.pop("XDG_CACHE_HOME")
+        os.environ.update({} if before is None else {"XDG_CACHE_HOME": before})
 
 
 def derivatives() -> list[tuple[str, float]]:
@@ -139,8 +156,7 @@ def derivatives() -> list[tuple[str, float]]:
 
 def main() -> None:
     """Run the benchmark and print its tables."""
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["XDG_CACHE_HOME"] = folder  # where steps in C are looked for
+    with tempfile.TemporaryDirectory() as folder, cached_in(folder):  # without steps in C
         _compare_all()
 
 
@@ -152,8 +168,10 @@ def _compare_all() -> None:
     for modes in parser.parse_args().modes:
         print(f"\n| {modes} modes, 4096 crossings | seconds | times jaxbeam | largest error |")
         print("| --- | ---: | ---: | ---: |")
-        for name, took, ratio, error in compare(modes):
-            print(f"| {name} | {took:.3g} | {ratio:.3g} | {error:.1e} |", flush=True)
+        rows = compare(modes)
+        for name, took, error in rows:
+            print(f"| {name} | {took.run:.3g} | {took.ratio:.3g} | {error:.1e} |")
+        print(f"\n{modes} modes: the sweep compiles in {rows[0][1].compile:.1f} s", flush=True)
     print("\n| derivatives | plain runs |\n| --- | ---: |")
     for name, ratio in derivatives():
         print(f"| {name} | {ratio:.2g} |")

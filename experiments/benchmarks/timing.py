@@ -10,23 +10,41 @@ import numpy as np
 
 
 class Timing(NamedTuple):
-    """Seconds of wall time: the median of warm calls, and what the first took beyond that."""
+    """Seconds of wall time: the median of warm calls, and what the first took beyond that.
+
+    And the median of how many times as long as another function they took.
+    """
 
     run: float
-    compile: float
+    compile: float = 0.0
+    ratio: float = float("nan")
 
 
-def time_call(function, *args, repeat=5):
-    """Time `function(*args)` until its results are ready: once cold, then `repeat` times warm."""
+def time_call(function, *args, repeat=5, beside=None):
+    """Time `function(*args)` until its results are ready: once cold, then `repeat` times warm.
 
-    def seconds():
+    With a function `beside` it is compared with that, which is called before and after each: a
+    machine that is faster at one moment than at another is so for both.
+    """
+
+    def seconds(function, *args):
         start = time.perf_counter()
         jax.block_until_ready(function(*args))
         return time.perf_counter() - start
 
-    cold = seconds()
-    run = statistics.median(seconds() for _ in range(repeat))
-    return Timing(run, max(cold - run, 0.0))
+    cold, times = seconds(function, *args), []
+    others = [seconds(beside or _nothing)]
+    for _ in range(repeat):
+        times.append(seconds(function, *args))
+        others.append(seconds(beside or _nothing))
+    run = statistics.median(times)
+    around = np.add(others[:-1], others[1:]) / 2
+    ratio = float("nan") if beside is None else float(np.median(np.divide(times, around)))
+    return Timing(run, max(cold - run, 0.0), ratio)
+
+
+def _nothing() -> None:
+    pass
 
 
 def best_in_turn(functions, *args, rounds=40):

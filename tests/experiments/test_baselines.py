@@ -1,5 +1,7 @@
 """The baselines of the speed benchmark solve the same problem, and solve it right."""
 
+import time
+
 import jax
 import numpy as np
 import pytest
@@ -95,18 +97,34 @@ def test_free_times_cover_the_time_asked_for_and_thin_out_as_high_modes_die():
 def test_time_call_keeps_compiling_apart():
     timing = time_call(jax.jit(lambda x: x @ x), np.eye(50))
     assert 0 < timing.run < timing.compile
+    assert np.isnan(timing.ratio)
+
+
+def test_time_call_compares_with_what_runs_beside(monkeypatch):
+    """A clock that all run slower by, and ever more so: the ratio stays."""
+    now, pace = [0.0], [1.0]
+
+    def passing(seconds):
+        now[0] += seconds * pace[0]
+        pace[0] *= 1.1
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    timing = time_call(passing, 6.0, repeat=3, beside=lambda: passing(2.0))
+    assert timing.ratio == pytest.approx(3.0, rel=0.01)
+    assert timing.run > 7.0
 
 
 def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
     """Costs of the form it assumes are added up exactly."""
     masses, speeds = np.linspace(0.1, 1, 5), np.linspace(0.3, 10, 9)
 
-    def known_cost(function, rig, masses, speeds, repeat):
-        return Timing(run=0.01 + 0.02 / speeds[0], compile=0.0)
+    def known_cost(function, rig, masses, speeds, repeat, beside):
+        return Timing(run=0.01 + 0.02 / speeds[0], ratio=3 / speeds[0])
 
     monkeypatch.setattr(baselines, "time_call", known_cost)
-    whole = np.sum(0.01 + 0.02 / speeds) * len(masses)
-    np.testing.assert_allclose(scipy_time(scipy_peaks, Rig(1), masses, speeds, runs=4), whole)
+    found = scipy_time(scipy_peaks, Rig(1), masses, speeds, runs=4)
+    np.testing.assert_allclose(found.run, np.sum(0.01 + 0.02 / speeds) * len(masses))
+    np.testing.assert_allclose(found.ratio, np.sum(3 / speeds) * len(masses))
 
 
 @pytest.mark.parametrize("place", [0.1, 0.55, 0.7, 1.15])
