@@ -91,10 +91,9 @@ class Campaign:
             samples = jax.lax.map(lambda part: simulated(*part), (runs, table[:, columns]))
             return samples + offsets(table)
 
-        @predict.defjvp
-        def _(primals, tangents):
-            table, change = jax.jvp(gather, primals, tangents)
-
+        # A function of its own is traced once for all programs that it is a part of.
+        @jax.jit
+        def linearised(runs, table):
             def both(part):
                 run, values = part
                 basis = jnp.eye(len(moving))
@@ -102,10 +101,14 @@ class Campaign:
                 def along(direction):
                     return jax.jvp(lambda v: simulated(run, v), (values,), (direction,))
 
-                samples, slopes = jax.vmap(along, out_axes=(None, -1))(basis)
-                return samples, slopes
+                return jax.vmap(along, out_axes=(None, -1))(basis)
 
-            samples, slopes = jax.lax.map(both, (runs, table[:, columns]))
+            return jax.lax.map(both, (runs, table))
+
+        @predict.defjvp
+        def _(primals, tangents):
+            table, change = jax.jvp(gather, primals, tangents)
+            samples, slopes = linearised(runs, table[:, columns])
             moved = jnp.einsum("ltca,la->ltc", slopes, change[:, columns])
             # Offsets only shift: their derivative is that of the shift.
             shift = offsets(change) - offsets(jnp.zeros_like(change))

@@ -124,13 +124,15 @@ class Search:
         """The two compiled programs: samples with derivatives, and the whole search."""
         count, samples = len(self.numbers), jnp.zeros(self.campaign.measured.shape)
         point = jnp.zeros(count)
-        lowered = (
-            jax.jit(self._linear).lower(point),
-            jax.jit(self._minimise).lower(point, point, samples, samples, jnp.zeros(count, bool)),
-        )
-        # Compiling takes most of the time of a small fit: both at once, each on its own core.
-        with ThreadPoolExecutor(2) as pool:
-            return tuple(pool.map(lambda program: program.compile(options()), lowered))
+        given = point, point, samples, samples, jnp.zeros(count, bool)
+        # Compiling takes most of the time of a small fit: one beside the other, and its tracing.
+        # JAX takes up what it has traced before only under the same mesh, and optimistix traces
+        # under one that is empty.
+        empty = jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ()))
+        with ThreadPoolExecutor(1) as pool, empty:
+            linear = pool.submit(jax.jit(self._linear).lower(point).compile, options())
+            minimise = jax.jit(self._minimise).lower(*given).compile(options())
+            return linear.result(), minimise
 
     def estimate(
         self,
@@ -154,8 +156,13 @@ class Search:
         real = self.campaign.real
         real = real if use is None else real * use[:, None, None]
         noise = self.first_noise(measured)
+        jacobian = None
         for _ in range(ROUNDS):
-            y, converged = self._search(y, noise, measured, real, free)
+            scale = self.scale(y, noise, real, jacobian)
+            points, found = self.minimise(
+                y[None], scale[None], self.weights(noise, real), measured, free
+            )
+            y, converged = points[0], found[0]
             values = self.values_at(y)
             predicted, jacobian = self.linearised(values)
             residuals = measured - predicted
@@ -185,14 +192,17 @@ class Search:
         """Values of the numbers at a point of the search."""
         return np.asarray(self._values_at(jnp.asarray(y)))
 
-    def scale(self, y: Float[np.ndarray, " free"], noise, real=None) -> Float[np.ndarray, " free"]:
+    def scale(
+        self, y: Float[np.ndarray, " free"], noise, real=None, jacobian=None
+    ) -> Float[np.ndarray, " free"]:
         """Size of steps of the search: a thousand of the standard errors each would have alone.
 
         In these units all numbers are of one size, and the solver's first damping, one, hardly
-        shortens its first step.
+        shortens its first step. The `jacobian` at the point need not be known.
         """
         weights = self.weights(noise, real)
-        _, jacobian = self.linearised(self.values_at(y))
+        if jacobian is None:
+            _, jacobian = self.linearised(self.values_at(y))
         rows = jacobian * weights[..., None] * np.asarray(self._slopes(y))
         strength = np.sqrt(np.sum(rows**2, axis=(0, 1, 2)))
         return 1e3 / np.maximum(strength, max(1e-9 * strength.max(), 1e-300))
@@ -225,14 +235,6 @@ class Search:
             ]
         )  # fmt: skip
         return np.maximum(1.4826 * levels / np.sqrt(6), self._floor(1e-6))
-
-    def _search(self, y, noise, measured, real, free):
-        """Search point of the least squares for these noise levels, and whether it converged."""
-        scale = self.scale(y, noise, real)
-        points, converged = self.minimise(
-            y[None], scale[None], self.weights(noise, real), measured, free
-        )
-        return points[0], converged[0]
 
     def minimise(
         self,
