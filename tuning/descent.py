@@ -22,6 +22,7 @@ from tuning.objective import Objective, Target
 SHARPNESS = (30.0, 1000.0)  # of smooth maxima, at the first step and the last
 SETTLED = 0.7  # share of the steps in which sharpness rises, for methods with stages of it
 EVERY = 5  # steps between checkpoints
+FEW = 4  # free numbers up to which slopes are found forward, which takes less time to compile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,10 +79,19 @@ def _shape_of(number: Free) -> Free:
 def _slope(form: Form, some: bool, bench: Bench, points, sharpness, rows, target):
     """Values, smooth and true, with slopes of the smooth ones, of all or some runs."""
     bench = bench.at(rows) if some else bench
-    single = jax.value_and_grad(
-        lambda point: form.judge(point, bench, target, sharpness, None), has_aux=True
-    )
-    return jax.vmap(single)(points)
+
+    def judge(point):
+        return form.judge(point, bench, target, sharpness, None)
+
+    def forward(point):
+        def along(way):
+            return jax.jvp(judge, (point,), (way,), has_aux=True)
+
+        value, slope, true = jax.vmap(along, out_axes=(None, 0, None))(jnp.eye(point.size))
+        return (value, true), slope
+
+    few = points.shape[1] <= FEW
+    return jax.vmap(forward if few else jax.value_and_grad(judge, has_aux=True))(points)
 
 
 @compiled

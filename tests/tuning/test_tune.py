@@ -13,9 +13,13 @@ import jaxbeam as jb
 import tuning
 from jaxbeam.stability import frozen_poles
 from tests.differences import central
+from tuning import descent
 from tuning.bench import make_bench
 from tuning.checkpoint import load, save
+from tuning.descent import Descent
+from tuning.free import free_numbers
 from tuning.load_cases import apply
+from tuning.objective import Objective
 
 GAIN = "controller.gains.0"
 RUNS = tuning.grid({"loads.0.mass": [0.3, 0.5], "loads.0.speed": [1.5]})
@@ -85,6 +89,27 @@ def test_gradients_of_the_objectives(bench):
 
     expected = central(lambda point: value(point[0]), [4000.0], step=1.0)[0]
     assert jax.jit(jax.grad(value))(4000.0) == pytest.approx(expected, rel=1e-6)
+
+
+def test_slopes_of_few_and_of_many_numbers_are_the_same(bench, monkeypatch):
+    """The one found forward, the other in reverse; and those of differences."""
+    target = Objective().target
+    numbers = free_numbers([rig()], dict(FREE), 1.0)
+    search = Descent(bench, numbers, Objective())
+    points = jnp.asarray(search.points(2, 1))
+    sharpness, rows = jnp.asarray(40.0), jnp.arange(len(RUNS))
+
+    def found(points):
+        return descent._slope.__wrapped__(*search._given, points, sharpness, rows, target)
+
+    (smooth, true), forward = jax.jit(found)(points)
+    monkeypatch.setattr(descent, "FEW", 0)
+    in_reverse = jax.jit(lambda points: found(points))
+    (again, truly), backward = in_reverse(points)
+    np.testing.assert_allclose([smooth, true], [again, truly], rtol=1e-12)
+    np.testing.assert_allclose(forward, backward, rtol=1e-9)
+    expected = central(lambda y: in_reverse(y[:, None])[0][0].sum(), points[:, 0], step=1e-4)
+    np.testing.assert_allclose(forward[:, 0], expected, rtol=1e-5)
 
 
 def test_smooth_maxima_come_to_the_true_ones(bench):
