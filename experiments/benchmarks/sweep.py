@@ -90,8 +90,9 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
     if native.compiler() is None:
         print("steps in C are left out: there is no C compiler here")
     else:
-        with tempfile.TemporaryDirectory() as folder, cached_in(folder):
-            native.build()
+        with tempfile.TemporaryDirectory() as folder:
+            with cached_in(folder):
+                native.build()
 
             def by_hand():
                 with cached_in(folder):
