@@ -4,6 +4,8 @@ Commands are in one file for each kind of work. Libraries are imported inside th
 help and complaints come at once.
 """
 
+import atexit
+import gc
 import os
 import sys
 import warnings
@@ -55,6 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
     warnings.showwarning = warn
     if arguments is None:
+        _collect_rarely()
         _keep_compiled()
     try:
         app(arguments, exit_on_error=False, print_error=False)
@@ -65,6 +68,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         say(" ".join(str(error).split()))
         sys.exit(1)
     sys.exit(0)
+
+
+def _collect_rarely() -> None:
+    """Look for garbage rarely, and not at the end: tracing makes very many objects, hardly any of
+    them garbage, and to look through all of them again when the process ends takes a second.
+    """
+    gc.set_threshold(50_000, 20, 100)
+    atexit.register(gc.freeze)
 
 
 def _keep_compiled() -> None:
