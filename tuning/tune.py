@@ -192,7 +192,7 @@ class Problem:
 
     @functools.cached_property
     def held_out(self) -> Bench:
-        """The runs that the search does not see, prepared. Raises ValueError if there are none."""
+        """The runs that the search does not see, prepared; there must be some."""
         return make_bench(self.case, self.cases.held_out, self.places, self.bounds)
 
     def proven(self, descent: Descent, state: State, objective: Objective) -> Tuned:

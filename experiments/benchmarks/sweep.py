@@ -12,10 +12,10 @@ native` compiles.
 """
 
 import argparse
-import contextlib
 import os
 import tempfile
 import time
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -120,16 +120,9 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
     return [*found, ("scipy DOP853, scaled", scaled, error)]
 
 
-@contextlib.contextmanager
 def cached_in(folder: str):
-    """Look for steps in C in another folder."""
-    before = os.environ.get("XDG_CACHE_HOME")
-    os.environ["XDG_CACHE_HOME"] = folder
-    try:
-        yield
-    finally:
-        os.environ.pop("XDG_CACHE_HOME")
-        os.environ.update({} if before is None else {"XDG_CACHE_HOME": before})
+    """A context in which steps in C are looked for in another folder."""
+    return mock.patch.dict(os.environ, XDG_CACHE_HOME=folder)
 
 
 def derivatives() -> list[tuple[str, float]]:
