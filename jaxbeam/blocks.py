@@ -13,11 +13,10 @@ from jaxtyping import Float
 
 from jaxbeam import native, programs
 from jaxbeam.case import Case, replace, value_at
-from jaxbeam.exponentials import NODES
 from jaxbeam.lanes import Tasks
 from jaxbeam.loop import loop_schedule
 from jaxbeam.modes import Layout, lay_out
-from jaxbeam.pacing import choose_steps, drawn, rounding
+from jaxbeam.pacing import ORDER, choose_steps, drawn, rounding
 from jaxbeam.plan import Form, most_at_once, sample_times
 from jaxbeam.rig import couples
 from jaxbeam.schedule import sampled
@@ -96,10 +95,11 @@ class Work:
         self.limits = np.minimum(limits, duration)
         if case.controller is not None:  # between its samples there is a step at least
             self.limits = np.minimum(self.limits, self.schedule.lengths.max())
-        # As found for beams of 3 and 12 modes at fast and slow crossings, errors of 1e-7.
+        # As found for beams of one and two spans, 1 to 12 modes, at fast and slow crossings, errors
+        # of 1e-7.
         modes = case.beam.modes
-        self.guesses = crossing / (22 * modes + 5 + 1.25 * crossing / limits / np.sqrt(modes))
-        self.guesses *= (tolerance / 1e-7) ** (1 / (2 * NODES))
+        self.guesses = crossing / (20 * modes + 1.84 * crossing / limits / np.sqrt(modes))
+        self.guesses *= (tolerance / 1e-7) ** (1 / ORDER)
 
     def steps(self) -> tuple[Float[np.ndarray, " task"], float]:
         """Time steps (s) of all tasks, and the relative error of peaks seen with them.

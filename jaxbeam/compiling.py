@@ -1,5 +1,6 @@
 """Compiling, with settings that suit programs of many small kernels."""
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable
@@ -78,17 +79,49 @@ class Compiled(Generic[P, R]):
     def ahead(self, *args: P.args, **kwargs: P.kwargs) -> Callable[[], Any]:
         """Trace for arguments of the structure and shapes of these; what it returns compiles.
 
-        Calls then need not. Tracing holds Python's lock, compiling leaves it to others.
+        Calls then need not. Tracing holds Python's lock, compiling leaves it to others. Done once,
+        it need not be done again.
         """
         arrays, *rest = _apart((args, kwargs))
-        return self._quick.lower(arrays, tuple(rest)).compile
+        state = _state_of(self, _identity(arrays, rest))
+        if state.compiled:
+            return lambda: None
+        traced = self._quick.lower(arrays, tuple(rest))
+
+        def compile_traced():
+            traced.compile()
+            state.compiled = True
+
+        return compile_traced
 
     def blank(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """What a call would return, with zeros for its numbers: known without compiling."""
         arrays, *rest = _apart((args, kwargs))
-        shapes, kept = self._quick.eval_shape(arrays, tuple(rest))
+        state = _state_of(self, _identity(arrays, rest))
+        returns = state.returns or self._quick.eval_shape(arrays, tuple(rest))
+        state.returns = shapes, kept = returns
         zeros = [None if leaf is None else np.zeros(leaf.shape, leaf.dtype) for leaf in shapes]
         return _together(zeros, *kept.rest)
+
+
+@dataclasses.dataclass(eq=False)
+class _State:
+    """What is known of a program: whether it is compiled, and the shapes of what it returns."""
+
+    compiled: bool = False
+    returns: tuple[list, _Kept] | None = None
+
+
+@functools.cache
+def _state_of(function: Compiled, identity: tuple) -> _State:
+    """What is known of a function for some arguments; JAX takes a hundred times as long to tell."""
+    return _State()
+
+
+def forget() -> None:
+    """Drop all that was compiled in this process: programs of many cases take gigabytes."""
+    jax.clear_caches()
+    _state_of.cache_clear()
 
 
 def compiled(function: Callable[P, R]) -> Compiled[P, R]:
@@ -112,6 +145,12 @@ def _apart(tree) -> tuple[list, tuple, Any]:
     arrays = [leaf if is_array else None for leaf, is_array in zip(leaves, are, strict=True)]
     rest = tuple(None if is_array else leaf for leaf, is_array in zip(leaves, are, strict=True))
     return arrays, rest, structure
+
+
+def _identity(arrays, rest) -> tuple:
+    """What tells programs apart: all but the numbers in the arrays, and the mode of precision."""
+    shapes = tuple(None if leaf is None else (leaf.shape, leaf.dtype) for leaf in arrays)
+    return shapes, *rest, jax.config.jax_enable_x64
 
 
 def _together(arrays, rest, structure):

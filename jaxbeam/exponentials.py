@@ -23,27 +23,27 @@ from jaxtyping import Array, Float
 from jaxbeam.rig import Rig
 
 NODES = 6  # Gauss nodes a step; the integrator is of order 12
-POINTS = 6  # equal intervals a step at whose ends the deflection is looked at for its peak
 DOUBLINGS = 7
 TERMS = 14
 LONGEST = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is right to rounding
 
 GAUSS = (np.polynomial.legendre.leggauss(NODES)[0] + 1) / 2
+# Where in a step the deflection is looked at for its peak: the ends, and the nodes, of which the
+# propagators are needed anyway. Curves through these wiggle less than those through equal points.
+LOOKED = (0.0, *(float(node) for node in GAUSS), 1.0)
 
 
 class Step(eqx.Module):
-    """Propagators over steps of given lengths: at the Gauss nodes, at the end, at equal points.
+    """Propagators over steps of given lengths: at the Gauss nodes, and at the end.
 
     `drift_*` take the state at the start, `push_*` the inputs at the Gauss nodes; in the blocks of
-    the rig. `points` run from the start to the end of the step, both included.
+    the rig.
     """
 
     drift_nodes: Float[Array, "*length node block side side"]
     push_nodes: Float[Array, "*length node force block side input"]
     drift_end: Float[Array, "*length block side side"]
     push_end: Float[Array, "*length force block side input"]
-    drift_points: Float[Array, "*length point block side side"]
-    push_points: Float[Array, "*length point force block side input"]
 
 
 @functools.cache
@@ -87,12 +87,9 @@ def _balance(rig: Rig):
 
 
 @jax.named_scope("propagators")
-def propagators(
-    rig: Rig, lengths: Float[Array, " *length"], points: int = 0, driven: bool = False
-) -> Step:
+def propagators(rig: Rig, lengths: Float[Array, " *length"], driven: bool = False) -> Step:
     """Propagators of the rig over steps of the given lengths (s), zero included.
 
-    `points` is the number of equal intervals at whose ends the state is wanted within a step.
     Inputs are the forces on the modes, and after them, if the rig is `driven`, the commands.
     """
     balance = _balance(rig)
@@ -101,7 +98,7 @@ def propagators(
     force = jnp.eye(side)[:, 1 : 2 * each : 2]
     if driven:
         force = jnp.concatenate([force, rig.command_matrix], axis=1)
-    fractions = np.concatenate([GAUSS, np.arange(points) / max(points, 1), [1.0]])
+    fractions = np.append(GAUSS, 1.0)
     spans = lengths[..., None] * fractions
     x = matrix * spans[..., None, None, None] / 2**DOUBLINGS
     drift, pushes = _series(x, force)
@@ -123,8 +120,6 @@ def propagators(
         push_nodes=back(first[1][:NODES], -5),
         drift_end=first[0][-1],
         push_end=first[1][-1],
-        drift_points=back(first[0][NODES:], -4),
-        push_points=back(first[1][NODES:], -5),
     )
 
 

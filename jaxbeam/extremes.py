@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxbeam.exponentials import GAUSS, POINTS
+from jaxbeam.exponentials import GAUSS, LOOKED
 from jaxbeam.motion import NEVER
 from jaxbeam.peaks import highest, refine, vertex
 from jaxbeam.tables import Path, Tables
@@ -19,9 +19,9 @@ NEAR = 1.1  # a peak between samples is less than this above the highest of them
 class Extremes(eqx.Module):
     """What is kept of a run.
 
-    `samples` are the deflections at equal points of the step with the largest `size` of deflection
-    of each watched place, `start` (s) and `span` (s) that step. Contact forces are those with
-    which a load presses on the beam; `lost` (s) is the first time it would have to pull.
+    `samples` are the deflections at the points looked at in the step with the largest `size` of
+    deflection of each watched place, `start` (s) and `span` (s) that step. Contact forces are those
+    with which a load presses on the beam; `lost` (s) is the first time it would have to pull.
     """
 
     score: Float[Array, "sensor lane"]
@@ -35,7 +35,7 @@ class Extremes(eqx.Module):
 
     def peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
         """Largest size of deflection (m) of each watched place, and when (s); NaN if not sound."""
-        value, place = refine(self.samples, self.size)
+        value, place = refine(self.samples, LOOKED, self.size)
         time = self.start + place * self.span
         return jnp.where(self.sound, value, jnp.nan), jnp.where(self.sound, time, jnp.nan)
 
@@ -47,11 +47,11 @@ def fold(best: Extremes, tables: Tables, path: Path, states, forces, commands) -
     start, span = path.start, path.span
     parts = (states, forces) if commands is None else (states, forces, commands)
     seen = tables.watch @ jnp.concatenate(parts, axis=1)
-    samples = jax.lax.optimization_barrier(seen.reshape(steps, POINTS + 1, -1, lanes))
+    samples = jax.lax.optimization_barrier(seen.reshape(steps, len(LOOKED), -1, lanes))
 
     def raised(best):
         score = jax.lax.optimization_barrier(
-            jax.vmap(lambda step: vertex(step, best.size))(samples)
+            jax.vmap(lambda step: vertex(step, LOOKED, best.size))(samples)
         )
         best_score, top = highest(score)
         top = jnp.max(jnp.where(top, np.arange(steps)[:, None, None], 0), axis=0)
@@ -95,7 +95,7 @@ def nothing_seen(places: int, loads: int, lanes: int, size: Callable) -> Extreme
     nothing = jnp.zeros((places, lanes))
     return Extremes(
         nothing,
-        jnp.zeros((POINTS + 1, places, lanes)),
+        jnp.zeros((len(LOOKED), places, lanes)),
         nothing,
         nothing,
         jnp.full((loads, lanes), jnp.inf),

@@ -11,7 +11,7 @@
 #include "xla/ffi/api/c_api.h"
 
 /* native.py tells on the command line: WIDE (lanes of a group), STEPS (of a chunk), NODES (Gauss nodes
-   a step), POINTS (looked at in a step, both ends among them), NEAR (as in extremes.py) and ROUNDS
+   a step), POINTS (looked at in a step, both ends among them), NEAR (as in extremes.py), ROUNDS and REACH
    (of Newton's method in peaks.vertex). Where nodes are the last axis they are padded to WIDE. */
 
 static inline Lanes value(const Lanes *coefficients, int terms, Lanes place) {
@@ -25,14 +25,14 @@ static inline Lanes size_of(Lanes deflection, int both) {
 }
 
 /* Largest size of a value of the curve through samples, as peaks.vertex has it. */
-static Lanes vertex(const Lanes *samples, const double *curve, int both) {
+static Lanes vertex(const Lanes *samples, const double *curve, const double *points, int both) {
     Lanes highest = size_of(samples[0], both), place = all(-1);
-    Lanes powers[POINTS], slope[POINTS - 1], bend[POINTS - 2], reach = all(1.0 / POINTS);
+    Lanes powers[POINTS], slope[POINTS - 1], bend[POINTS - 2], reach = all(REACH);
     for (int p = 1; p < POINTS; p++) {
         Lanes size = size_of(samples[p], both);
         Mask higher = size > highest;
         highest = either(higher, size, highest);
-        place = either(higher, all(2.0 * p / (POINTS - 1) - 1), place);
+        place = either(higher, all(2 * points[p] - 1), place);
     }
     memset(powers, 0, sizeof powers);
     add_product(powers, curve, POINTS, samples, POINTS);
@@ -50,7 +50,7 @@ static Lanes vertex(const Lanes *samples, const double *curve, int both) {
 
 /* The arguments: propagators by kind of step, the path, loads, numbers, and what changes. */
 enum { DRIFT_NODES, PUSH_NODES, DRIFT, PUSH, WATCH, WATCH_PUSH, KIND, START, SPAN, SLOTS, ACTIVE,
-       SHAPE, ROWS, INERTIA, WEIGHT, GAUSS, CURVE,
+       SHAPE, ROWS, INERTIA, WEIGHT, GAUSS, CURVE, LOOKED,
        STATE, SCORE, SAMPLES, BEST_START, BEST_SPAN, LOWEST, LOST, SOUND, ARGUMENTS };
 enum { KEPT = ARGUMENTS - STATE };
 
@@ -169,7 +169,7 @@ static void raise(const Work *w, const Step *steps, const Lanes *seen, ptrdiff_t
             Lanes samples[POINTS];
             for (int p = 0; p < POINTS; p++)
                 samples[p] = seen[(t * POINTS + p) * w->places + place];
-            Lanes found = vertex(samples, w->in[CURVE], w->both);
+            Lanes found = vertex(samples, w->in[CURVE], w->in[LOOKED], w->both);
             Mask better = found > score;
             if (!any(better)) continue;
             score = either(better, found, score);

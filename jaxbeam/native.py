@@ -24,9 +24,9 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
 from jaxbeam.compiling import cache_folder
-from jaxbeam.exponentials import GAUSS, NODES, POINTS
+from jaxbeam.exponentials import GAUSS, LOOKED, NODES
 from jaxbeam.extremes import NEAR, Extremes
-from jaxbeam.peaks import VERTEX_ROUNDS, through
+from jaxbeam.peaks import VERTEX_ROUNDS, reach, through
 from jaxbeam.tables import CHUNK, Path, Rigging
 
 SOURCE = pathlib.Path(__file__).with_suffix(".c")
@@ -36,8 +36,9 @@ CONSTANTS = {
     "WIDE": WIDE,
     "STEPS": CHUNK,
     "NODES": NODES,
-    "POINTS": POINTS + 1,
+    "POINTS": len(LOOKED),
     "NEAR": NEAR,
+    "REACH": reach(LOOKED),
     "ROUNDS": VERTEX_ROUNDS,
 }
 FLAGS = (
@@ -182,7 +183,7 @@ def chunk(
     shape, rows = _last(path.shape, 2), _last(path.rows, 2)
     given = (
         *(*prepared, path.kind, path.start, path.span, path.slots, path.active, shape, rows),
-        *(inertia, weight, np.asarray(GAUSS), through(POINTS + 1)[: POINTS + 1]),
+        *(inertia, weight, np.asarray(GAUSS), through(LOOKED)[: len(LOOKED)], np.asarray(LOOKED)),
     )
     call = jax.ffi.ffi_call(
         _target(TARGETS[best.size]),

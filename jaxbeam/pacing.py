@@ -15,6 +15,7 @@ ORDER = 9  # at which errors are taken to fall with the step; the true order is 
 FINER = 1.25  # how much finer the runs are with which others are compared
 ROUNDS = 12
 MARGIN = 4  # how much smaller errors must be where they are looked for than they may be elsewhere
+TIGHT = 3e-3  # of the error allowed: with less, longer steps are measured before they are trusted
 SURE = 1.3  # how far a guess must exceed the limit of a step for that to be taken unmeasured
 SMALL = 1e-6  # of a run's largest peak: smaller ones need not be right to the tolerance
 
@@ -128,7 +129,7 @@ def _search(measure: Measure, tasks, guesses, limits, tolerance: float):
         with np.errstate(divide="ignore"):
             change = np.clip((0.3 * tolerance / error) ** (1 / ORDER), 0.5, 1.5)
         # A step is long enough if the error says so, or a longer one was bad or makes no sense.
-        tight = ~(error < tolerance * 1e-2) | (bad < np.inf) | (good >= limits)
+        tight = ~(error < tolerance * TIGHT) | (bad < np.inf) | (good >= limits)
         settled = (good > 0) & tight
         if settled.all():
             break

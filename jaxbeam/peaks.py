@@ -1,4 +1,4 @@
-"""Largest value of a smooth curve known at a few equal points, absolute unless asked otherwise."""
+"""Largest value of a smooth curve known at a few points, absolute unless asked otherwise."""
 
 import functools
 from collections.abc import Callable
@@ -23,18 +23,26 @@ class Curve(NamedTuple):
 
 
 @functools.cache
-def through(points: int) -> np.ndarray:
-    """Matrix from equal samples to the coefficients of their curve, its slope and its bend."""
-    nodes = np.linspace(-1.0, 1.0, points)
-    value = np.linalg.inv(nodes[:, None] ** np.arange(points))
+def through(points: tuple[float, ...]) -> np.ndarray:
+    """Matrix from samples at points in [0, 1] to coefficients of their curve, slope and bend."""
+    value = np.linalg.inv(_centred(points)[:, None] ** np.arange(len(points)))
     slope = np.polynomial.polynomial.polyder(value)
     return np.concatenate([value, slope, np.polynomial.polynomial.polyder(slope)])
 
 
-def _curve(samples: Float[Array, "point *rest"]) -> Curve:
-    points = samples.shape[0]
+def reach(points: tuple[float, ...]) -> float:
+    """How far a step towards the peak may go in `vertex`: a few cross half of any gap."""
+    return float(np.diff(_centred(points)).max()) / 3
+
+
+def _centred(points: tuple[float, ...]) -> np.ndarray:
+    return 2 * np.array(points) - 1
+
+
+def _curve(samples: Float[Array, "point *rest"], points: tuple[float, ...]) -> Curve:
+    count = len(points)
     rows = list(jnp.tensordot(through(points), samples, axes=1))
-    return Curve(rows[:points], rows[points : 2 * points - 1], rows[2 * points - 1 :])
+    return Curve(rows[:count], rows[count : 2 * count - 1], rows[2 * count - 1 :])
 
 
 def _value(coefficients: list, place):
@@ -71,7 +79,7 @@ def highest(
 
 
 def vertex(
-    samples: Float[Array, "point *rest"], size: Callable = jnp.abs
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], size: Callable = jnp.abs
 ) -> Float[Array, " *rest"]:
     """Largest size of a value, closely estimated: sought from the largest sample alone.
 
@@ -79,32 +87,33 @@ def vertex(
     """
     sizes = size(samples)
     largest = jnp.max(sizes, axis=0)
-    start = jnp.linspace(-1.0, 1.0, sizes.shape[0])[jnp.argmax(sizes, axis=0)]
-    curve = _curve(samples)
-    place = _climb(curve, start, 1 / sizes.shape[0], rounds=VERTEX_ROUNDS)
+    start = jnp.asarray(_centred(points), samples.dtype)[jnp.argmax(sizes, axis=0)]
+    curve = _curve(samples, points)
+    place = _climb(curve, start, reach(points), rounds=VERTEX_ROUNDS)
     return jnp.maximum(size(_value(curve.value, place)), largest)
 
 
 @jax.named_scope("peaks")
 def refine(
-    samples: Float[Array, "point *rest"], size: Callable = jnp.abs
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], size: Callable = jnp.abs
 ) -> tuple[Float[Array, " *rest"], ...]:
     """Largest size of a value of the polynomial through the samples, and where in [0, 1] it is.
 
-    The derivative is that at the fixed place of the peak, which is exact where the peak is a
-    maximum inside the curve and where it is at an end that stays.
+    `points` are where in [0, 1] the samples are, in order and with both ends. The derivative is
+    that at the fixed place of the peak, which is exact where the peak is a maximum inside the curve
+    and where it is at an end that stays.
     """
-    curve = _curve(samples)
+    curve = _curve(samples, points)
     frozen = jax.lax.stop_gradient(curve)
     # From everywhere, as peaks may tie; at an end Newton's method may run away to a lower place.
     starts = np.linspace(-1.0, 1.0, STARTS).reshape(-1, *(1,) * (samples.ndim - 1))
     starts = jnp.broadcast_to(starts.astype(samples.dtype), (STARTS, *samples.shape[1:]))
-    places = jnp.concatenate([starts, _climb(frozen, starts, 2 / STARTS, rounds=5)])
+    places = jnp.concatenate([starts, _climb(frozen, starts, 2 / STARTS, rounds=3)])
     _, top = highest(size(_value(frozen.value, places)))
     place = jnp.max(jnp.where(top, places, -1.0), axis=0)
-    # Places of one height may lie apart by the root of a rounding: one round more brings them
-    # together, unless the peak is at an end and there is nothing flat nearby.
-    flat = _climb(frozen, place, 2 / STARTS, rounds=1)
+    # The height is right by now to nearly rounding, the place to the root of that: further rounds
+    # mend this, unless the peak is at an end and there is nothing flat nearby.
+    flat = _climb(frozen, place, 2 / STARTS, rounds=3)
     _, ahead = highest(size(_value(frozen.value, jnp.stack([flat, place]))))
     place = jnp.where(ahead[0], flat, place)
     place = jax.lax.optimization_barrier(jax.lax.stop_gradient(place))

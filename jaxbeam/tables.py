@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.driver import AbstractDriver
 from jaxbeam.dynamics import Traffic, contact_rows
-from jaxbeam.exponentials import GAUSS, POINTS, Step, propagators
+from jaxbeam.exponentials import GAUSS, LOOKED, Step, propagators
 from jaxbeam.grid import Grid
 from jaxbeam.rig import Rig
 
@@ -90,7 +90,7 @@ def make_rigging(
     """Propagators for all step lengths of a grid; deflections are watched at some places (m)."""
     driven = driver is not None
     inner = driver is not None and driver.inner
-    step = propagators(rig, grid.lengths, 0 if watched is None else POINTS, driven=driven)
+    step = propagators(rig, grid.lengths, driven)
     each = rig.modes_per_block
     commands = rig.command_matrix[1 : 2 * each : 2] if driven else None
     if watched is None:
@@ -98,9 +98,9 @@ def make_rigging(
     blocks = rig.state_matrix.shape[0]
     shapes = rig.shapes(watched, (0,))[0]
     rows = shapes.reshape(-1, blocks, each)
-    places = np.arange(0, 2 * each, 2)
-    watch = jnp.einsum("wbm,lpbmj->lpwbj", rows, step.drift_points[..., places, :])
-    push = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, step.push_points[..., places, :])
+    drifts, pushes = _looked(step, np.arange(0, 2 * each, 2))
+    watch = jnp.einsum("wbm,lpbmj->lpwbj", rows, drifts)
+    push = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, pushes)
     flat = (grid.lengths.shape[0], -1)
     return Rigging(
         rig,
@@ -112,6 +112,14 @@ def make_rigging(
         commands,
         inner,
     )
+
+
+def _looked(step: Step, places):
+    """Rows of the propagators, (length, point, ...), at the points looked at, start to end."""
+    start = jnp.broadcast_to(jnp.eye(step.drift_end.shape[-1]), step.drift_end.shape)
+    drifts = jnp.concatenate([start[:, None], step.drift_nodes, step.drift_end[:, None]], axis=1)
+    ends = jnp.zeros_like(step.push_end)[:, None], step.push_nodes, step.push_end[:, None]
+    return drifts[..., places, :], jnp.concatenate(ends, axis=1)[..., places, :]
 
 
 def _flexibility(rig: Rig, shapes: Float[Array, "place mode"]) -> Float[Array, " place"]:
@@ -129,7 +137,7 @@ def both_sides(rigging: Rigging) -> Rigging:
     """A rigging that watches every place twice: how far up the beam goes, then how far down."""
 
     def twice(rows):
-        split = rows.reshape(rows.shape[0], POINTS + 1, rigging.places, *rows.shape[2:])
+        split = rows.reshape(rows.shape[0], len(LOOKED), rigging.places, *rows.shape[2:])
         both = jnp.concatenate([split, -split], axis=2)
         return both.reshape(rows.shape[0], -1, *rows.shape[2:])
 

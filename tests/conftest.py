@@ -60,5 +60,7 @@ def _close_figures():
 def _forget_compiled():
     """Drop what a file compiled: kept for all files it would take several gigabytes."""
     yield
-    if "jax" in sys.modules:
+    if "jaxbeam.compiling" in sys.modules:
+        sys.modules["jaxbeam.compiling"].forget()
+    elif "jax" in sys.modules:
         sys.modules["jax"].clear_caches()

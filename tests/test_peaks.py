@@ -9,13 +9,18 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import jaxbeam.peaks
+from jaxbeam.exponentials import LOOKED
 
-POINTS = 7
-refine, vertex = (jax.jit(f) for f in (jaxbeam.peaks.refine, jaxbeam.peaks.vertex))
+EQUAL = tuple(float(share) for share in np.linspace(0.0, 1.0, 7))
+EITHER = pytest.mark.parametrize("points", [EQUAL, LOOKED], ids=["equal", "of a step"])
+refine, vertex = (
+    jax.jit(function, static_argnames="points")
+    for function in (jaxbeam.peaks.refine, jaxbeam.peaks.vertex)
+)
 
 
-def samples(curve):
-    return jnp.asarray(curve(np.linspace(0.0, 1.0, POINTS)))[:, None]
+def samples(curve, points):
+    return jnp.asarray(curve(np.array(points)))[:, None]
 
 
 def highest(curve):
@@ -32,25 +37,34 @@ def highest(curve):
     return max(-found.fun, ends), found.x
 
 
-@hypothesis.given(st.lists(st.floats(-1.0, 1.0), min_size=POINTS, max_size=POINTS))
-@hypothesis.example([0.0, 0.25, 0.0, -0.75, 0.0, 0.0, 0.0])  # equally high at both sides
-@hypothesis.example([-1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 5e-05])  # three peaks that differ by 6e-9
-def test_peak_of_a_polynomial_is_exact(coefficients):
+@EITHER
+@hypothesis.given(coefficients=st.lists(st.floats(-1.0, 1.0), min_size=7, max_size=7))
+@hypothesis.example(
+    coefficients=[0.0, 0.25, 0.0, -0.75, 0.0, 0.0, 0.0]
+)  # equally high at both sides
+@hypothesis.example(
+    coefficients=[-1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 5e-05]
+)  # three peaks that differ by 6e-9
+def test_peak_of_a_polynomial_is_exact(points, coefficients):
     # Falling as in a smooth curve; the last are what the estimate leaves out.
     polynomial = np.polynomial.Chebyshev(
-        np.array(coefficients) * 0.2 ** np.arange(POINTS), domain=[0, 1]
+        np.array(coefficients) * 0.2 ** np.arange(7), domain=[0, 1]
     )
     top, _ = highest(polynomial)
     hypothesis.assume(top > 1e-3)
-    value, place = refine(samples(polynomial))
+    value, place = refine(samples(polynomial, points), points)
     assert value[0] == pytest.approx(top, rel=1e-10)
     assert abs(polynomial(float(place[0]))) == pytest.approx(top, rel=1e-10)
 
 
+@EITHER
 @hypothesis.given(
-    st.floats(0.02, 0.1), st.floats(0.0, 2 * np.pi), st.floats(-0.5, 0.5), st.floats(0.0, 2 * np.pi)
+    waves=st.floats(0.02, 0.1),
+    phase=st.floats(0.0, 2 * np.pi),
+    share=st.floats(-0.5, 0.5),
+    other=st.floats(0.0, 2 * np.pi),
 )
-def test_estimate_tells_steps_apart(waves, phase, share, other):
+def test_estimate_tells_steps_apart(points, waves, phase, share, other):
     """The estimate picks the step with the peak: it must be right to less than peaks differ."""
 
     def curve(c):
@@ -60,26 +74,31 @@ def test_estimate_tells_steps_apart(waves, phase, share, other):
     top, _ = highest(curve)
     hypothesis.assume(top > 0.1)
     # What the polynomial through the samples cannot follow: its remainder near an end.
-    remainder = 1e-6 * (2 * np.pi * waves) ** POINTS * (1 + abs(share) * 2**POINTS) / top
-    assert refine(samples(curve))[0][0] == pytest.approx(top, rel=remainder + 1e-14)
-    assert vertex(samples(curve))[0] == pytest.approx(top, rel=10 * remainder + 1e-14)
+    count = len(points)
+    remainder = 1e-6 * (2 * np.pi * waves) ** count * (1 + abs(share) * 2**count) / top
+    found = samples(curve, points)
+    assert refine(found, points)[0][0] == pytest.approx(top, rel=remainder + 1e-14)
+    assert vertex(found, points)[0] == pytest.approx(top, rel=10 * remainder + 1e-14)
 
 
-def test_peak_at_a_kink_belongs_to_the_step_that_rises():
+@EITHER
+def test_peak_at_a_kink_belongs_to_the_step_that_rises(points):
     """A peak just after a step's start is above the end of the step before, however little."""
 
     def after(c):
         return 1.0 - (c - 0.004) ** 2
 
-    before = jnp.linspace(0.5, after(0.0), POINTS)[:, None]
-    assert vertex(samples(after))[0] > vertex(before)[0]
-    assert vertex(samples(after))[0] == pytest.approx(1.0, rel=1e-14)
+    before = samples(lambda c: 0.5 + (after(0.0) - 0.5) * c, points)
+    found = vertex(samples(after, points), points)[0]
+    assert found > vertex(before, points)[0]
+    assert found == pytest.approx(1.0, rel=1e-14)
 
 
-def test_straight_and_flat_curves():
-    assert vertex(jnp.zeros((POINTS, 1)))[0] == 0
-    assert refine(jnp.zeros((POINTS, 1)))[0][0] == 0
-    line = jnp.linspace(-3.0, 1.0, POINTS)[:, None]
-    assert vertex(line)[0] == pytest.approx(3.0)
-    value, place = refine(line)
+@EITHER
+def test_straight_and_flat_curves(points):
+    flat = jnp.zeros((len(points), 1))
+    assert vertex(flat, points)[0] == refine(flat, points)[0][0] == 0
+    line = samples(lambda c: 4 * c - 3.0, points)
+    assert vertex(line, points)[0] == pytest.approx(3.0)
+    value, place = refine(line, points)
     assert value[0] == pytest.approx(3.0) and place[0] == 0

@@ -1,14 +1,14 @@
 /* The method of jaxbeam's integrator by hand, for one pinned span and LANES masses at one speed.
 
    Exact propagation of the modes, contact forces collocated at Gauss nodes, peaks between samples
-   from the polynomial through equal points of a step. Propagators come from outside (kernel.py);
+   from the polynomial through the points looked at in a step. Propagators come from outside (kernel.py);
    all that depends on the path is worked out here, once for all lanes. */
 
 #include <math.h>
 
 #define LANES 64
 #define NODES 6
-#define POINTS 7
+#define POINTS (NODES + 2)
 #define SENSORS 3
 #define LOOKED (POINTS * SENSORS)
 #define CHUNK 8
@@ -26,7 +26,8 @@ typedef struct {
 } Answers;
 
 typedef struct {
-    double length, gravity, amplitude[MODES], gauss[NODES], to_powers[POINTS][POINTS];
+    double length, gravity, amplitude[MODES], gauss[NODES];
+    double places[POINTS], to_powers[POINTS][POINTS], reach;
     double rates[MODES][2], stiffness[MODES], flexibility[SENSORS];
 } Beam;
 
@@ -167,10 +168,10 @@ static void fold(const Beam *beam, const Path *path, int pressed, Lanes *state, 
             double mine[POINTS], c[POINTS], top = -1, at = 0;
             for (int p = 0; p < POINTS; p++) {
                 mine[p] = samples[p][l];
-                if (fabs(mine[p]) > top) top = fabs(mine[p]), at = 2.0 * p / (POINTS - 1) - 1;
+                if (fabs(mine[p]) > top) top = fabs(mine[p]), at = 2 * beam->places[p] - 1;
             }
             powers(beam, mine, c);
-            double score = fmax(top, climb(c, at, 1.0 / POINTS, 2));
+            double score = fmax(top, climb(c, at, beam->reach, 2));
             if (score <= best->score[w][l]) continue;
             best->score[w][l] = score;
             for (int p = 0; p < POINTS; p++) best->samples[w][p][l] = mine[p];

@@ -23,8 +23,9 @@ from experiments.benchmarks.crossing import GRAVITY, Rig
 from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, rig, sweep_peaks
 from experiments.benchmarks.timing import best_in_turn
 from jaxbeam import programs
-from jaxbeam.exponentials import GAUSS, POINTS
+from jaxbeam.exponentials import GAUSS, LOOKED
 from jaxbeam.order import make_order
+from jaxbeam.peaks import reach, through
 
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", "-lm")
 Library = Callable[..., None]
@@ -55,11 +56,11 @@ def prepare(modes: int) -> tuple[np.ndarray, list]:
     riggings = jax.tree.map(np.asarray, programs.riggings(*given))
     plain = Rig(modes)
     rates = riggings.rig.state_matrix[0, :, 1, :]
-    powers = np.linalg.inv(np.linspace(-1, 1, POINTS + 1)[:, None] ** np.arange(POINTS + 1))
+    looked = np.array(LOOKED), through(LOOKED)[: len(LOOKED)], reach(LOOKED)
     # Signs of modes are free: those of jaxbeam are seen in its rows for the sensors at rest.
     seen, angles = riggings.watch[0, 0, :3, :, 0], np.outer(plain.sensors, plain.wavenumbers)
     signs = np.where(np.sum(seen * np.sin(angles), axis=0) < 0, -1.0, 1.0)
-    numbers = [plain.length, GRAVITY], plain.amplitude * signs, GAUSS, powers, rates
+    numbers = [plain.length, GRAVITY], plain.amplitude * signs, GAUSS, *looked, rates
     parts = [*numbers, plain.frequencies**2, riggings.flexibility[0]]
     beam = np.concatenate([np.ravel(part) for part in parts])
     crossings = []
