@@ -69,16 +69,12 @@ class Work:
             slots = max(most_at_once(window) for window in windows())
         self.form = Form(layout, couples(case), slots, native.serves(case))
         design = case, self.form, self.addresses[0]
-        # Known before what rigs look like. While one program compiles, the next is traced.
+        # What takes longest to compile goes first; meanwhile the others are made ready for it.
         with ThreadPoolExecutor(2) as pool:
-            compiling = []
-
-            def begin(program, arguments):
-                compiling.append(pool.submit(program.ahead(*arguments)))
-                return program.blank(*arguments)
-
-            alike, _ = begin(programs.rigs, (*design, tasks.heavy[parts[0]]))
-            self._begin(begin, alike)
+            compiling = [
+                pool.submit(program.ahead(*arguments))
+                for program, arguments in self._programs((*design, tasks.heavy[parts[0]]))
+            ]
             entries, exits = np.moveaxis(windows(), 2, 0)
         for program in compiling:
             program.result()  # raises what went wrong
@@ -137,13 +133,17 @@ class Work:
             substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
         return self._run(chosen, steps[chosen], substeps, self.single)
 
-    def _begin(self, begin, alike):
-        """Begin to compile what finds the steps, with arguments made from what rigs look like."""
+    def _programs(self, design):
+        """What finds the steps, slowest to compile first, with arguments of the right shapes."""
+        alike, _ = programs.rigs.blank(*design)
         first = np.zeros(self.each, int)
         pace = np.ones(self.each), first
         given = self._rigging(first, pace, None, alike, first)
-        riggings = None if given is None else begin(programs.riggings, given)
-        begin(programs.block, self._block(first, pace, None, riggings))
+        riggings = None if given is None else programs.riggings.blank(*given)
+        yield programs.block, self._block(first, pace, None, riggings)
+        if given is not None:
+            yield programs.riggings, given
+        yield programs.rigs, design
 
     def _run(self, chosen, steps, substeps, single, more=0):
         pace = np.asarray(steps), np.full(chosen.size, more)

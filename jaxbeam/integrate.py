@@ -23,6 +23,7 @@ from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
 from jaxbeam.extremes import Extremes, fold, nothing_seen
 from jaxbeam.loads import AbstractLoad, MovingMass
 from jaxbeam.rig import Rig
+from jaxbeam.small import product
 from jaxbeam.tables import CHUNK, Path, Rigging, Tables, follow, tabulate
 
 # Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
@@ -44,7 +45,7 @@ def _contact(tables: Tables, inertia, weight, state, commands):
     """Contact forces (row, lane) of a step from this state under these commands, if any."""
 
     def pressed():
-        felt = tables.respond @ state
+        felt = product(tables.respond, state)
         if commands is not None:
             felt = felt + tables.commands.respond @ commands
         return solve_contact(tables.gains, inertia, weight + inertia * felt)
@@ -64,7 +65,7 @@ def _advance(state, step):
         drifted = tables.drift[:, :, :1] * split[:, :1] + tables.drift[:, :, 1:] * split[:, 1:]
     else:
         drifted = tables.drift @ split
-    after = drifted.reshape(state.shape) + tables.push @ forces
+    after = drifted.reshape(state.shape) + product(tables.push, forces)
     if commands is not None:
         after = after + tables.commands.push @ commands
     return after, (state, forces)

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+FEW = 12  # terms; XLA calls a library for products, which takes as long as adding these
+
 
 def solve_small(
     matrix: Float[Array, "row row lane"], right: Float[Array, "row column lane"]
@@ -58,6 +60,15 @@ def _inverse(matrix):
     ]
     adjugate = jnp.stack([jnp.stack(row) for row in minors])
     return adjugate / jnp.sum(matrix[0] * adjugate[:, 0], axis=0)
+
+
+def product(
+    matrix: Float[Array, "row column"], lanes: Float[Array, "column lane"]
+) -> Float[Array, "row lane"]:
+    """Product of a matrix with many columns, spelt out where few terms are added."""
+    if not 0 < lanes.shape[0] <= FEW:
+        return matrix @ lanes
+    return _times(matrix[..., None], lanes[:, None])[:, 0]
 
 
 def solve_any(

@@ -46,6 +46,24 @@ def test_what_it_will_return_is_known_before_it_is_compiled():
     assert blank["half"].shape == (1,) and blank["half"].dtype == real["half"].dtype
 
 
+def test_what_was_compiled_ahead_is_not_traced_again():
+    traced = []
+
+    @compiled
+    def counted(x):
+        traced.append(x.shape)
+        return 2 * x
+
+    for _ in range(3):
+        counted.ahead(POINTS)()
+        assert_allclose(counted(POINTS), 2 * POINTS)
+    counted.ahead(POINTS[:2])()
+    assert traced == [(3,), (2,)]
+    compiling.forget()
+    counted.ahead(POINTS)()
+    assert traced == [(3,), (2,), (3,)]
+
+
 def test_settings_that_are_not_known_are_left_out(monkeypatch):
     monkeypatch.setattr(compiling, "OPTIONS", {"xla_no_such_setting": True})
     compiling._known.cache_clear()

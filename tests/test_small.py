@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.small import solve_any
+from jaxbeam.small import FEW, product, solve_any
 from tests.differences import central
 
 RANDOM = np.random.default_rng(0)
@@ -26,6 +26,13 @@ def test_systems_of_any_size_and_in_any_number(size):
     assert_allclose(jax.vmap(jax.vmap(solve_any))(matrix, right), expected, rtol=1e-9)
     shared = jax.vmap(solve_any, (None, 0), 2)(matrix[0, 0], right[:, 0])
     assert_allclose(shared[..., 1], np.linalg.solve(matrix[0, 0], right[1, 0]), rtol=1e-9)
+
+
+@pytest.mark.parametrize("columns", [0, 1, FEW, FEW + 1])
+def test_products_spelt_out_or_not(columns):
+    matrix, lanes = RANDOM.normal(size=(5, columns)), RANDOM.normal(size=(columns, 4))
+    found = product(jnp.asarray(matrix), jnp.asarray(lanes))
+    assert_allclose(found, matrix @ lanes, rtol=1e-13, atol=1e-14)
 
 
 def test_slopes_forward_and_in_reverse():
