@@ -79,7 +79,12 @@ def scipy_time(solve, rig, masses, speeds, runs=12, repeat=3, beside=None):
         growing, constant = np.polyfit(1 / np.asarray(speeds)[chosen], costs, 1)
         return float(len(masses) * np.sum(constant + growing / np.asarray(speeds)))
 
-    return Timing(whole([t.run for t in found]), ratio=whole([t.ratio for t in found]))
+    return Timing(
+        whole([t.run for t in found]),
+        ratio=whole([t.ratio for t in found]),
+        shortest=whole([t.shortest for t in found]),
+        shortest_beside=min(t.shortest_beside for t in found),
+    )
 
 
 @partial(jax.jit, static_argnames=("rig", "free", "shared_steps"))

@@ -12,12 +12,20 @@ import numpy as np
 class Timing(NamedTuple):
     """Seconds of wall time: the median of warm calls, and what the first took beyond that.
 
-    And the median of how many times as long as another function they took.
+    And the median of how many times as long as another function they took; the shortest times of
+    both, which the machine disturbed least.
     """
 
     run: float
     compile: float = 0.0
     ratio: float = float("nan")
+    shortest: float = float("nan")
+    shortest_beside: float = float("nan")
+
+    @property
+    def ratio_of_shortest(self) -> float:
+        """How many times as long as the other function it takes, both undisturbed."""
+        return self.shortest / self.shortest_beside
 
 
 def time_call(function, *args, repeat=5, beside=None):
@@ -39,8 +47,10 @@ def time_call(function, *args, repeat=5, beside=None):
         others.append(seconds(beside or _nothing))
     run = statistics.median(times)
     around = np.add(others[:-1], others[1:]) / 2
-    ratio = float("nan") if beside is None else float(np.median(np.divide(times, around)))
-    return Timing(run, max(cold - run, 0.0), ratio)
+    compiling, ratio, other = max(cold - run, 0.0), float("nan"), float("nan")
+    if beside is not None:
+        ratio, other = float(np.median(np.divide(times, around))), min(others)
+    return Timing(run, compiling, ratio, min(times), other)
 
 
 def _nothing() -> None:

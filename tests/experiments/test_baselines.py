@@ -112,6 +112,8 @@ def test_time_call_compares_with_what_runs_beside(monkeypatch):
     timing = time_call(passing, 6.0, repeat=3, beside=lambda: passing(2.0))
     assert timing.ratio == pytest.approx(3.0, rel=0.01)
     assert timing.run > 7.0
+    # The shortest are not of one moment: the other's first call comes just before ours.
+    assert timing.ratio_of_shortest == pytest.approx(3.0 * 1.1)
 
 
 def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
@@ -119,12 +121,14 @@ def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
     masses, speeds = np.linspace(0.1, 1, 5), np.linspace(0.3, 10, 9)
 
     def known_cost(function, rig, masses, speeds, repeat, beside):
-        return Timing(run=0.01 + 0.02 / speeds[0], ratio=3 / speeds[0])
+        cost = 0.01 + 0.02 / speeds[0]
+        return Timing(run=cost, ratio=3 / speeds[0], shortest=cost / 2, shortest_beside=0.1)
 
     monkeypatch.setattr(baselines, "time_call", known_cost)
     found = scipy_time(scipy_peaks, Rig(1), masses, speeds, runs=4)
     np.testing.assert_allclose(found.run, np.sum(0.01 + 0.02 / speeds) * len(masses))
     np.testing.assert_allclose(found.ratio, np.sum(3 / speeds) * len(masses))
+    np.testing.assert_allclose(found.ratio_of_shortest, found.run / 2 / 0.1)
 
 
 @pytest.mark.parametrize("place", [0.1, 0.55, 0.7, 1.15])
