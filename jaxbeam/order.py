@@ -136,7 +136,6 @@ def make_order(
     if not case.sensors:
         raise ValueError("the case has no sensors, and peaks are taken there; add one to `sensors`")
     axes = {address: _values(case, address, given) for address, given in over.items()}
-    _check_ranges(case, axes)
     for address in axes:
         if histories and address in ("run.duration", "run.sample_rate"):
             raise ValueError(
@@ -174,18 +173,9 @@ def _values(case: Case, address: str, given: Any) -> Float[np.ndarray, " value"]
             f"{address} sets the clock of the run, which all runs with a controller share:"
             " make a sweep for each of its values"
         )
-    return values
-
-
-def _check_ranges(case: Case, axes: dict[str, Float[np.ndarray, " value"]]) -> None:
-    """Check values that are right or wrong by themselves.
-
-    What is allowed is a range, from which zero may be left out.
-    """
-    alone = {name: values for name, values in axes.items() if not TOGETHER.fullmatch(name)}
-    for ends in (np.min, np.max):
-        check(replace(case, {name: ends(values) for name, values in alone.items()}))
-    for name, values in alone.items():
+    if not TOGETHER.fullmatch(address):
+        # What is allowed is a range, from which zero may be left out.
         odd = values[~np.isfinite(values) | (values == 0)]
-        for value in odd[:1]:
-            check(replace(case, {name: value}))
+        for value in {values.min(), values.max(), *odd[:1]}:
+            check(replace(case, {address: value}))
+    return values
