@@ -13,6 +13,7 @@ from jaxbeam.casefile import case_from_dict
 from jaxbeam.fields import known
 from jaxbeam.plot.style import ALARM, FAINT, INK, colour, digits, margin_labels, name, scale, styled
 
+EDGE = 0.06  # of a map, where the number of a line might stick out
 MARKED = 40  # runs; each is a dot on a curve of so few
 
 
@@ -123,7 +124,11 @@ def _maps(peaks, over, unit, case):
         filled = axes.contourf(x, y, values, levels=fills, cmap="YlGnBu")
         drawn = axes.contour(x, y, values, levels=lines[1:-1], colors=INK, linewidths=0.5)
         texts = axes.clabel(drawn, fontsize=7, fmt="%.4g")
+        corner, size = np.array([x[0], y[0]]), np.array([np.ptp(x), np.ptp(y)])
         for text in texts:
+            # Cut off at an edge a number would be another one.
+            inside = (np.array(text.get_position()) - corner) / size
+            text.set_visible(bool(np.all((inside > EDGE) & (inside < 1 - EDGE))))
             text.set_path_effects([withStroke(linewidth=2, foreground="white")])
         if np.any(np.isfinite(values)):
             row, column = np.unravel_index(np.nanargmax(values), values.shape)
