@@ -102,18 +102,18 @@ class Work:
 
         Raises RuntimeError if no time step meets the tolerance.
         """
-        batches = -(-PACES // self.each)
+        count = -(-PACES // self.each) * self.each
 
         def measure(chosen, steps, more=0, single=False):
+            batches = chosen.size // self.each
             parts = zip(np.split(chosen, batches), np.split(steps, batches), strict=True)
             found = [self._run(*part, None, single, more)["peak_deflection"] for part in parts]
             return np.concatenate(found)
 
-        count = batches * self.each
         given = self.paces, self.guesses, self.limits, count, self.tolerance
         steps, error = choose_steps(measure, *given)
         if self.single:
-            some = drawn(self.paces.size, count)
+            some = drawn(self.paces, count)
             error += rounding(
                 *(measure(some, steps[some], single=single) for single in (False, True))
             )

@@ -63,8 +63,9 @@ def check_fields(address: str, part: Any) -> None:
 
     Raises ValueError naming the address.
     """
+    values = vars(part)  # attributes of a module take many times as long to get
     for field in dataclasses.fields(part):
-        check_field(f"{address}.{field.name}", getattr(part, field.name), field)
+        check_field(f"{address}.{field.name}", values[field.name], field)
 
 
 def check_field(address: str, value: Any, field: dataclasses.Field) -> None:

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from jaxbeam.pacing import SURE, choose_steps, errors, spread
+from jaxbeam.pacing import MARGIN, SURE, choose_steps, drawn, errors, spread
 
 ORDER = 12
 
@@ -91,7 +93,7 @@ def test_settled_runs_are_not_measured_again():
         tried.append(set(np.asarray(chosen).tolist()))
         return measure(chosen, steps)
 
-    guesses = np.full(4, 0.75 * 0.1 * (1e-7 / 4) ** (1 / ORDER))
+    guesses = np.full(4, 0.9 * 0.1 * (1e-7 / MARGIN) ** (1 / ORDER))
     guesses[-1] *= 2
     choose_steps(watched, paces, guesses, np.ones(4), 4, 1e-7)
     # Twice each, coarse and fine: all of them, the quickest, and the random few at the end.
@@ -100,11 +102,11 @@ def test_settled_runs_are_not_measured_again():
 
 def test_a_guess_that_is_good_but_short_is_made_longer():
     paces, best = np.geomspace(1, 10, 20), np.full(20, 0.1)
-    longest = 0.1 * (1e-7 / 4) ** (1 / ORDER)
+    longest = 0.1 * (1e-7 / MARGIN) ** (1 / ORDER)
     steps, error = choose_steps(
         task(paces, best), paces, np.full(20, 0.7 * longest), np.ones(20), 4, 1e-7
     )
-    assert np.all(steps > 0.9 * longest) and error <= 1e-7 / 4
+    assert np.all(steps > 0.9 * longest) and error <= 1e-7 / MARGIN
 
 
 def test_no_step_will_do():
@@ -127,6 +129,42 @@ def test_error_is_that_of_the_worst_lane():
 
 
 def test_spread_is_even_in_log_pace():
-    paces = np.geomspace(1, 1000, 31)[np.random.default_rng(1).permutation(31)]
-    np.testing.assert_allclose(paces[spread(paces, 4)], [1, 10, 100, 1000])
+    """From half a gap above the slowest to the quickest."""
+    paces = np.geomspace(1, 1e7, 71)[np.random.default_rng(1).permutation(71)]
+    np.testing.assert_allclose(np.log10(paces[spread(paces, 3)]), [1.2, 4.1, 7.0])
     assert len(spread(np.ones(5), 3)) == 3
+
+
+@given(st.integers(1, 200), st.integers(1, 30), st.integers(0, 2**32 - 1))
+def test_one_is_drawn_from_each_part(tasks, count, seed):
+    paces = np.random.default_rng(seed).permutation(np.geomspace(1, 10, tasks))
+    ranks = np.sort(paces).searchsorted(paces[drawn(paces, count)])
+    edges = np.arange(count + 1) * tasks / count
+    assert np.all((ranks + 1 > edges[:-1]) & (ranks < edges[1:]))
+    np.testing.assert_array_equal(drawn(paces, count), drawn(paces, count))
+
+
+def test_the_more_tasks_the_more_are_tried():
+    for tasks, tried in ((64, 4), (1024, 16), (16384, 64)):
+        asked, paces = [], np.geomspace(1, 10, tasks)
+        measure = task(paces, np.full(tasks, 0.1))
+
+        def watched(chosen, steps, more=0, asked=asked, measure=measure):
+            asked.append(len(chosen))
+            return measure(chosen, steps)
+
+        choose_steps(watched, paces, np.full(tasks, 0.01), np.ones(tasks), 4, 1e-7)
+        assert asked[-1] == tried
+
+
+def test_between_two_paces_the_shorter_step_holds():
+    """Runs between may be worse than both, so nothing is interpolated."""
+    paces = np.geomspace(1, 10, 41)
+    measured = np.sort(spread(paces, 4))
+    best = np.full(41, 0.2)
+    best[measured[2]] = 0.1
+    guesses = np.full(41, 0.02)
+    steps, _ = choose_steps(task(paces, best), paces, guesses, np.ones(41), 4, 1e-7)
+    near = np.arange(measured[1] + 1, measured[3])
+    np.testing.assert_allclose(steps[near], steps[measured[2]])
+    assert np.all(steps[[measured[1], measured[3]]] > 1.4 * steps[measured[2]])
