@@ -189,6 +189,25 @@ def test_sweep_over_two_addresses():
     assert bar.get_ylabel() == "peak deflection (mm)"
 
 
+def test_no_number_of_a_line_is_cut_off_at_an_edge():
+    """A "1.2" of which only the "2" is seen would be another number."""
+    masses, speeds = np.linspace(0.1, 0.6, 12), np.linspace(1.0, 6.0, 9)
+    dataset = swept(loads_0_mass=masses.tolist(), loads_0_speed=speeds.tolist())
+    flat = 1e-3 * masses[:, None] * (1 + 0.02 * np.sin(2 * speeds))
+    dataset["peak_deflection"][...] = np.stack([flat, flat * np.sqrt(speeds)], axis=-1)
+    figure = plot_sweep(dataset)
+    figure.canvas.draw()
+    shown = 0
+    for axes in figure.axes[:2]:
+        frame = axes.get_window_extent()
+        for text in filter(Text.get_visible, axes.texts):
+            shown += 1
+            extent = text.get_window_extent()
+            assert frame.x0 < extent.x0 < extent.x1 < frame.x1
+            assert frame.y0 < extent.y0 < extent.y1 < frame.y1
+    assert shown
+
+
 def test_sweep_held_at_a_value():
     dataset = swept(loads_0_mass=[0.1, 0.2], loads_0_speed=[1.0, 2.0], run_duration=[1.0])
     assert len(plot_sweep(dataset).axes) == 3

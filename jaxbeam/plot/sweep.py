@@ -123,13 +123,13 @@ def _maps(peaks, over, unit, case):
         axes.set_facecolor(FAINT)  # seen where runs failed
         filled = axes.contourf(x, y, values, levels=fills, cmap="YlGnBu")
         drawn = axes.contour(x, y, values, levels=lines[1:-1], colors=INK, linewidths=0.5)
-        texts = axes.clabel(drawn, fontsize=7, fmt="%.4g")
+        texts = axes.clabel(drawn, inline=False, fontsize=7, fmt="%.4g")
         corner, size = np.array([x[0], y[0]]), np.array([np.ptp(x), np.ptp(y)])
         for text in texts:
             # Cut off at an edge a number would be another one.
             inside = (np.array(text.get_position()) - corner) / size
             text.set_visible(bool(np.all((inside > EDGE) & (inside < 1 - EDGE))))
-            text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+            text.set_path_effects([withStroke(linewidth=3, foreground="white")])
         if np.any(np.isfinite(values)):
             row, column = np.unravel_index(np.nanargmax(values), values.shape)
             axes.plot(x[column], y[row], "o", color=ALARM, markeredgecolor="white", clip_on=False)
