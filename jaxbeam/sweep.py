@@ -52,7 +52,7 @@ def sweep(
     Runs are computed in blocks on all cores, compiled once, with time steps as long as errors of
     peaks below `tolerance` (relative) allow. Errors are measured on some of the runs, drawn at
     random, where a sixth of that is the most; `error_estimate` is the largest seen. Others may err
-    up to ten times as much, near critical speeds of heavy masses above all. In `precision` "single"
+    ten times as much, and more, near critical speeds of heavy masses. In `precision` "single"
     rigs and propagators are still made in double, but runs are integrated in half the bits, which
     is faster where arithmetic is what costs, most of all on a GPU. Results are float32 then; what
     rounding does to peaks, a few parts in a million, is measured and part of `error_estimate`.
