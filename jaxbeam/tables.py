@@ -194,14 +194,16 @@ def follow(rigging: Rigging, traffic: Traffic, slots: int, index: Int[Array, " s
 @jax.named_scope("path")
 def tabulate(rigging: Rigging, path: Path) -> Tables:
     """Tables of the steps of a chunk."""
+    # Chosen out here, because derivatives of what a branch chooses from go all the way into it.
+    first = _of_kind(rigging, path.kind[0])
 
     def alike(_):
-        return _of_one_kind(rigging, path.kind[0], path.shape, path.rows)
+        return _of_one_kind(rigging, first, path.shape, path.rows)
 
     def one_by_one(_):
         def single(step):
             kind, shape, rows = step
-            tables = _of_one_kind(rigging, kind, shape[None], rows[None])
+            tables = _of_one_kind(rigging, _of_kind(rigging, kind), shape[None], rows[None])
             return jax.tree.map(lambda table: table[0], tables)
 
         return jax.lax.map(single, (path.kind, path.shape, path.rows))
@@ -211,12 +213,17 @@ def tabulate(rigging: Rigging, path: Path) -> Tables:
     return Tables(*tables, active=jnp.any(path.active, axis=1))
 
 
-def _of_one_kind(rigging: Rigging, kind, shape, rows):
-    """Tables of steps of one length, from the shape and contact rows (step, slot, node, ...)."""
-    step, watch, watch_push = jax.tree.map(
+def _of_kind(rigging: Rigging, kind):
+    """Propagators of steps of one length, and what they do to what is watched."""
+    return jax.tree.map(
         lambda table: jax.lax.dynamic_index_in_dim(table, kind, keepdims=False),
         (rigging.step, rigging.watch, rigging.watch_push),
     )
+
+
+def _of_one_kind(rigging: Rigging, propagators, shape, rows):
+    """Tables of steps of one length, from the shape and contact rows (step, slot, node, ...)."""
+    step, watch, watch_push = propagators
     steps, slots, nodes, _, modes = shape.shape
     size = slots * nodes
     states = rows.shape[3] * rows.shape[4]
