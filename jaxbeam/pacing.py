@@ -20,7 +20,7 @@ MARGIN = 6  # how much smaller errors must be where they are looked for than the
 AIMED = 0.6  # of the error allowed: what longer steps aim at
 TIGHT = 3e-3  # of the error allowed: with less, longer steps are measured before they are trusted
 SURE = 1.3  # how far a guess must exceed the limit of a step for that to be taken unmeasured
-TRIED = 4  # roots of all tasks, over those that are tried
+TRIED = 4  # those tried grow with the root of the number of tasks, divided by this
 SMALL = 1e-6  # of a run's largest peak: smaller ones need not be right to the tolerance
 
 # Of tasks, their steps (s), and how many steps more between events.
