@@ -16,8 +16,6 @@ from jaxbeam.loads import motion
 from jaxbeam.rig import Rig
 from jaxbeam.schedule import Schedule
 
-FEW = 64  # panels
-
 
 class Grid(eqx.Module):
     """Panels, each with a number of equal steps; step lengths are shared among panels.
@@ -52,9 +50,10 @@ class Grid(eqx.Module):
     def steps(self, index: Int[Array, " step"]):
         """Panel, start time (s) and kind of length of the steps with these indices."""
         beyond = index >= self.total
-        # Few are compared with all, which compiles sooner; among many one is sought by halves.
-        method = "compare_all" if self.ends.shape[0] <= FEW else "scan"
-        panel = jnp.searchsorted(self.ends, index, side="right", method=method)
+        if self.opens is None:
+            panel = jnp.searchsorted(self.ends, index, side="right", method="compare_all")
+        else:  # there may be many, all alike
+            panel = index // self.counts[0]
         panel = jnp.minimum(panel, self.counts.shape[0] - 1)
         kind = jnp.where(beyond, self.lengths.shape[0] - 1, self.kind[panel])
         start = self.edges[panel] + (index - self._first(panel)) * self.lengths[self.kind[panel]]

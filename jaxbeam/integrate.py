@@ -17,14 +17,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam import native
+from jaxbeam.advance import advance, contact, undriven
 from jaxbeam.driver import AbstractDriver, Moment
-from jaxbeam.dynamics import Traffic, solve_contact
+from jaxbeam.dynamics import Traffic
 from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
 from jaxbeam.extremes import Extremes, fold, nothing_seen
 from jaxbeam.loads import AbstractLoad, MovingMass
 from jaxbeam.rig import Rig
-from jaxbeam.small import product
-from jaxbeam.tables import CHUNK, Path, Rigging, Tables, follow, tabulate
+from jaxbeam.tables import CHUNK, Path, Rigging, follow, tabulate
 
 # Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
 # a polynomial in each step, misses that mode's oscillation and feeds it.
@@ -40,37 +40,6 @@ def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
     return jax.lax.stop_gradient(limit)
 
 
-@jax.named_scope("collocation")
-def _contact(tables: Tables, inertia, weight, state, commands):
-    """Contact forces (row, lane) of a step from this state under these commands, if any."""
-
-    def pressed():
-        felt = product(tables.respond, state)
-        if commands is not None:
-            felt = felt + tables.commands.respond @ commands
-        return solve_contact(tables.gains, inertia, weight + inertia * felt)
-
-    # Between loads and after the last there is nothing to solve, which saves half of such steps.
-    return jax.lax.cond(tables.active, pressed, lambda: jnp.zeros_like(weight))
-
-
-@jax.named_scope("propagation")
-def _advance(state, step):
-    """One step of all lanes: the contact forces at the nodes, and the state at the end."""
-    tables, inertia, weight, commands = step
-    forces = _contact(tables, inertia, weight, state, commands)
-    blocks, side, _ = tables.drift.shape
-    split = state.reshape(blocks, side, -1)
-    if side == 2:
-        drifted = tables.drift[:, :, :1] * split[:, :1] + tables.drift[:, :, 1:] * split[:, 1:]
-    else:
-        drifted = tables.drift @ split
-    after = drifted.reshape(state.shape) + product(tables.push, forces)
-    if commands is not None:
-        after = after + tables.commands.push @ commands
-    return after, (state, forces)
-
-
 def _driven(driver: AbstractDriver, carry, step):
     """One step of all lanes under the commands of a driver."""
     state, memory = carry
@@ -78,14 +47,14 @@ def _driven(driver: AbstractDriver, carry, step):
 
     def states(commands):
         commands = jax.lax.collapse(commands, 0, 2)
-        forces = _contact(tables, inertia, weight, state, commands)
+        forces = contact(tables, inertia, weight, state, commands)
         inner = tables.inner
         flat = inner.drift @ state + inner.push @ forces + inner.command @ commands
         return flat.reshape(len(GAUSS), *state.shape)
 
     given, memory = driver.drive(memory, state, moment, states)
     commands = jax.lax.collapse(given, 0, 2)
-    after, (state, forces) = _advance(state, (tables, inertia, weight, commands))
+    after, (state, forces) = advance(state, (tables, inertia, weight, commands))
     # A loop that diverges ends here, in its own lane, instead of running into overflow.
     lost = jnp.any(~(jnp.abs(after) <= driver.bound[:, None]), axis=0)
     after = jnp.where(lost, jnp.nan, after)
@@ -105,7 +74,7 @@ def _undriven(rigging: Rigging, path: Path, inertia, weight, state, best: Any):
     """
     tables = tabulate(rigging, path)
     loads = _rows(inertia, path), _rows(weight, path)
-    state, (states, forces) = jax.lax.scan(_advance, state, (tables, *loads, None))
+    state, states, forces = undriven(tables, *loads, state)
     if best is not None:
         best = fold(best, tables, path, states, forces, None)
     return (state, best), states

@@ -1,4 +1,4 @@
-/* A chunk of steps for all lanes of a task, by hand: what tables.tabulate, integrate._advance and
+/* A chunk of steps for all lanes of a task, by hand: what tables.tabulate, advance.advance and
    extremes.fold do for steps without a driver.
 
    What depends on the path alone is worked out first. Lanes are then taken in groups that fill a

@@ -27,11 +27,38 @@ def piecewise(nodes, series, x, derivatives) -> Float[Array, "order *place colum
     series = jnp.stack(stretched, axis=2).reshape(segments, terms, len(derivatives) * modes)
     segment = jnp.sum(x[..., None] >= nodes[1:-1], axis=-1)
     local = (x - nodes[segment]) / size[segment] - 1
+    values = _sums(series, local, segment)
+    return jnp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
+
+
+@jax.custom_jvp
+def _sums(series, local, segment):
+    """The series of the segment of each place, summed at that place, -1 to 1, in its segment."""
+    return _added(_terms(series, local, segment), series)
+
+
+@_sums.defjvp
+def _sums_jvp(given, changes):
+    """What moves along a series meets its derivative: nothing else need be differentiated."""
+    series, local, segment = given
+    change, moved, _ = changes
+    table = _terms(series, local, segment)
+    steeper = jnp.asarray(_differentiate(series.shape[1], 1), series.dtype) @ series
+    values, slopes = jnp.split(_added(table, jnp.concatenate([series, steeper], axis=2)), 2, -1)
+    return values, _added(table, change) + slopes * moved[..., None]
+
+
+def _added(table, series):
+    return table @ series.reshape(-1, series.shape[2])
+
+
+def _terms(series, local, segment):
+    """The polynomials of all segments, zero but for those of the segment of each place."""
+    segments, terms, _ = series.shape
     table = _chebyshev_table(local, terms)
     masks = (segment[..., None] == s for s in range(segments))
     parts = [jnp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
-    values = jnp.concatenate(parts, axis=-1) @ series.reshape(segments * terms, -1)
-    return jnp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
+    return jnp.concatenate(parts, axis=-1)
 
 
 @functools.cache

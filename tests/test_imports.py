@@ -29,7 +29,7 @@ jaxbeam.reference  jaxbeam.statespace  jaxbeam.static  jaxbeam.tables
 jaxbeam.sensed
 jaxbeam.estimation
 jaxbeam.control  jaxbeam.extremes
-jaxbeam.casefile  jaxbeam.native
+jaxbeam.advance  jaxbeam.casefile  jaxbeam.native
 jaxbeam.integrate
 jaxbeam.export  jaxbeam.loop  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
 jaxbeam.linear_loop  jaxbeam.plan  jaxbeam.programs

@@ -3,9 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-import jaxbeam as jb
 from jaxbeam.controller import AbstractController
 from jaxbeam.step_times import WALKED, _changes, _ticks, timed
 
@@ -48,21 +46,3 @@ def test_ticks_are_the_samples_at_multiples_of_the_period():
     times = np.arange(0, 1001) / 1000
     assert _ticks(times, jnp.asarray(0.01)).tolist() == list(range(0, 1001, 10))
     assert _ticks(times, None).tolist() == list(range(WALKED))
-
-
-@pytest.mark.slow
-def test_a_step_of_predictive_control_takes_less_than_100_microseconds():
-    """Of 8 variables, its limits felt in part; the fastest of a few tries for each step."""
-    law = jb.MPC(horizon=10, moves=8, move_weight=1e-11, period=0.01)
-    case = jb.Case(
-        jb.Beam(0.6, 13.211, 0.812, 0.03, modes=3),
-        actuators=[jb.Patch(0.2575, 0.3425, 5.3e-2, limits=[-2.5, 7.5])],
-        sensors=[jb.Sensor(0.3)],
-        controller=law,
-    )
-    states = np.random.default_rng(0).normal(size=(40, 6)) * ([3e-4] * 3 + [6e-3] * 3)
-    seen = jnp.zeros((40, 1)), jnp.asarray(states), jnp.zeros((40, 1))
-    memory = law.init(jb.state_space(case))
-    found = timed(law, memory, seen, jnp.arange(40) * 0.01)
-    assert found.median < 1e-4
-    assert found.batched < 1e-4
