@@ -49,7 +49,8 @@ def _sums_jvp(given, changes):
 
 
 def _added(table, series):
-    return table @ series.reshape(-1, series.shape[2])
+    segments, terms, columns = series.shape
+    return table @ series.reshape(segments * terms, columns)
 
 
 def _terms(series, local, segment):
