@@ -1,11 +1,10 @@
-"""Estimators at every instant, in closed loops: plant and estimator written out, by scipy's Radau.
+"""Estimators at every instant, in closed loops: plant and estimator written out, by scipy's DOP853.
 
 The beam has a mode more than the design knows of, which believes in another mass, that enters at
 another time.
 """
 
 import dataclasses
-import functools
 
 import control
 import jax
@@ -82,10 +81,6 @@ class WrittenOut:
         still, moving = SampledPlant(inner, [], *parts), name in ("known", "estimated")
         guessed = dataclasses.replace(loads[0], mass=BELIEVED["mass"], entry_time=ENTRY + 0.01)
         self.model = SampledPlant(inner, [guessed], *parts) if moving else still
-        # A stiff integrator asks for slopes many times at one time.
-        self.truth_at, self.model_at = map(
-            functools.lru_cache(8), (self.truth.matrices, self.model.matrices)
-        )
         A, B, C, _ = still.matrices(0.0)
         self.gain = control.lqr(A, B, np.diag(WEIGHTS), EFFORT * np.eye(1))[0]
         size, self.moving = self.model.size, moving
@@ -99,7 +94,7 @@ class WrittenOut:
 
     def rate(self, t, y):
         n, m = self.truth.size, self.model.size
-        (A, B, C, _), (F, G, H, _) = self.truth_at(t), self.model_at(t)
+        (A, B, C, _), (F, G, H, _) = self.truth.matrices(t), self.model.matrices(t)
         x, X, listen, change = y[:n], y[n : n + m], self.listen, np.zeros(0)
         if self.moving:
             P = y[n + m :].reshape(m, m)
@@ -119,7 +114,7 @@ class WrittenOut:
             asked = TIMES[(early - 1e-12 <= TIMES) & (late - 1e-12 > TIMES)]
             ticks = np.append(np.maximum(asked, early), late - 1e-12)
             part = solve_ivp(
-                self.rate, (early, late - 1e-12), y, "Radau", ticks, rtol=1e-9, atol=1e-14
+                self.rate, (early, late - 1e-12), y, "DOP853", ticks, rtol=1e-9, atol=1e-14
             )
             found |= dict(zip(asked, part.y.T, strict=False))
             y = part.y[:, -1]

@@ -16,7 +16,7 @@ import scipy.signal
 from scipy.integrate import solve_ivp
 
 from tests.oracles.loads import GRAVITY, Load
-from tests.oracles.modal_equations import Span
+from tests.oracles.modal_equations import Span, under
 
 DIGITS = 12  # times that agree to so many decimals are one
 
@@ -188,10 +188,10 @@ class _Plant:
         force = force - self.damping @ u - self.stiffness @ q
         for load in active:
             x, dx, ddx = load.motion(t, self.span.length, t > load.stop_time)
-            phi, slope, curvature = (self.span.shapes(x, d) for d in range(3))
+            phi, slope, curvature = under(self.span, float(x))
             force = force - load.mass * GRAVITY * phi
             if load.kind == "mass":
-                mass += load.mass * np.outer(phi, phi)
+                mass += load.mass * phi[:, None] * phi
                 follow = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
                 force = force - load.mass * follow * phi
         return np.linalg.solve(mass, force)

@@ -10,6 +10,7 @@ for a force), weight P, position x(t) and column phi = phi(x(t)),
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,16 +30,16 @@ class Span:
     modes: int
     damping_ratio: float = 0.0
 
-    @property
+    @functools.cached_property
     def wavenumbers(self) -> np.ndarray:
         return np.arange(1, self.modes + 1) * np.pi / self.length
 
-    @property
+    @functools.cached_property
     def frequencies(self) -> np.ndarray:
         """Angular, rad/s."""
         return self.wavenumbers**2 * np.sqrt(self.flexural_rigidity / self.mass_per_length)
 
-    @property
+    @functools.cached_property
     def damping(self) -> np.ndarray:
         """Damping matrix in 1/s."""
         return np.diag(2 * self.damping_ratio * self.frequencies)
@@ -48,6 +49,12 @@ class Span:
         k = self.wavenumbers
         phase = np.multiply.outer(x, k) + 0.5 * np.pi * derivative
         return np.sqrt(2.0 / (self.mass_per_length * self.length)) * k**derivative * np.sin(phase)
+
+
+@functools.lru_cache(16)  # solvers ask many times for the same place
+def under(span, x: float) -> tuple[np.ndarray, ...]:
+    """Modes, slopes and curvatures of any span at a place, not to be changed."""
+    return tuple(span.shapes(x, derivative) for derivative in range(3))
 
 
 @dataclass(frozen=True)
@@ -108,10 +115,10 @@ class _System:
 
     def _shapes_under(self, i: int, t: float) -> tuple:
         x, dx, ddx = self.loads[i].motion(t, self.span.length, self.stopped[i])
-        return (*(self.span.shapes(x, d) for d in range(3)), dx, ddx)
+        return *under(self.span, float(x)), dx, ddx
 
     def rate(self, t: float, state: np.ndarray) -> np.ndarray:
-        q, u = np.split(state, 2)
+        q, u = state[: self.span.modes], state[self.span.modes :]
         mass, force = np.eye(len(q)), -self.damping * u - self.stiffness * q
         for i, load in enumerate(self.loads):
             if not self.on[i]:
@@ -119,10 +126,10 @@ class _System:
             phi, slope, curvature, dx, ddx = self._shapes_under(i, t)
             force = force - load.mass * GRAVITY * phi
             if load.kind == "mass":
-                mass += load.mass * np.outer(phi, phi)
+                mass += load.mass * phi[:, None] * phi
                 follow = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
                 force = force - load.mass * follow * phi
-        return np.append(u, np.linalg.solve(mass, force))
+        return np.concatenate([u, np.linalg.solve(mass, force)])
 
     def contact_forces(self, t: float, state: np.ndarray) -> np.ndarray:
         """Weight times (1 + acceleration along the path / gravity), of the loads on the beam."""

@@ -35,12 +35,12 @@ class TwoSpans:
             numbers += [n * np.pi, brentq(clamped, n * np.pi + 0.1, (n + 0.5) * np.pi, xtol=1e-14)]
         return np.array(numbers[: self.modes]) / (self.length / 2)
 
-    @property
+    @cached_property
     def frequencies(self) -> np.ndarray:
         """Angular, rad/s."""
         return self.wavenumbers**2 * np.sqrt(self.flexural_rigidity / self.mass_per_length)
 
-    @property
+    @cached_property
     def damping(self) -> np.ndarray:
         """Damping matrix in 1/s."""
         return np.diag(2 * self.damping_ratio * self.frequencies)
@@ -82,11 +82,11 @@ class ProjectedSines:
     sines: int
     damping_ratio: float = 0.0
 
-    @property
+    @cached_property
     def modes(self) -> int:
         return self.sines - 1
 
-    @property
+    @cached_property
     def _whole(self) -> np.ndarray:
         """Wavenumbers of the sines."""
         return np.arange(1, self.sines + 1) * np.pi / self.length
@@ -100,12 +100,12 @@ class ProjectedSines:
         squares, vectors = eigh(kept.T @ (stiffness[:, None] * kept), size * np.eye(self.modes))
         return squares, kept @ vectors
 
-    @property
+    @cached_property
     def frequencies(self) -> np.ndarray:
         """Angular, rad/s."""
         return np.sqrt(self._solved[0])
 
-    @property
+    @cached_property
     def damping(self) -> np.ndarray:
         """That of the sines without the support, each with the damping ratio, projected."""
         turn = self._whole**2 * np.sqrt(self.flexural_rigidity / self.mass_per_length)
