@@ -21,7 +21,11 @@ from jaxbeam.plan import Form, most_at_once, sample_times
 from jaxbeam.rig import couples
 from jaxbeam.schedule import sampled
 
-RUNS = 256  # in a block, about: its states stay in the cache, its results are one write
+RUNS = 512  # in a block, at most, about: each is one call and one write
+BLOCKS = (
+    8  # at least, if they then have more runs than are tried at once: all cores have their part
+)
+TRIED = 256  # runs, about, at once while time steps are looked for
 PACES = 4  # at which time steps are measured, at least
 PLACE = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
 
@@ -49,16 +53,16 @@ class Work:
         self._compiling, self._ready = threading.Lock(), {(None, False)}
         # Each device takes an equal part of a block.
         self.devices = len(jax.local_devices())
-        self.each = min(count, max(1, RUNS * self.devices // lanes))
-        self.each += -self.each % self.devices
+        most, tried = (max(1, runs * self.devices // lanes) for runs in (RUNS, TRIED))
+        self.tried = _filled(min(count, tried), self.devices)
+        self.each = max(self.tried, _filled(min(count // BLOCKS, most), self.devices))
         self.blocks = -(-count // self.each)
         self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
         layout = _common_layout(case, tasks)
         # Loads, settings of the run and controllers leave the rig as it is: one serves all tasks.
         outside = ("loads.", "run.", "controller.")
-        moving = all(name.startswith(outside) for name in self.addresses[0])
-        self.rig_of = np.zeros(count, int) if moving else np.arange(count)
-        parts = [[0]] if moving else np.resize(np.arange(count), (self.blocks, self.each))
+        self.shared = all(name.startswith(outside) for name in self.addresses[0])
+        parts = [[0]] if self.shared else np.resize(np.arange(count), (self.blocks, self.each))
 
         def windows():
             return np.asarray(programs.windows(case, self.addresses[0], tasks.heavy))
@@ -80,7 +84,10 @@ class Work:
             program.result()  # raises what went wrong
         found = [programs.rigs(*design, tasks.heavy[part]) for part in parts]
         self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
-        limits = limits[self.rig_of]
+        if self.shared:  # repeated once, where it will be used
+            repeated = jax.tree.map(lambda leaf: np.repeat(leaf, self.each, axis=0), self.rigs)
+            self.rigs, limits = jax.device_put(repeated), np.repeat(limits, count)
+        limits = limits[:count]
         limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
         duration = _values(case, tasks, "run.duration")
         spans = np.minimum(exits, duration[:, None]) - entries
@@ -102,10 +109,10 @@ class Work:
 
         Raises RuntimeError if no time step meets the tolerance.
         """
-        count = -(-PACES // self.each) * self.each
+        count = _filled(PACES, self.tried)
 
         def measure(chosen, steps, more=0, single=False):
-            batches = chosen.size // self.each
+            batches = chosen.size // self.tried
             parts = zip(np.split(chosen, batches), np.split(steps, batches), strict=True)
             found = [self._run(*part, None, single, more)["peak_deflection"] for part in parts]
             return np.concatenate(found)
@@ -138,18 +145,25 @@ class Work:
         alike, _ = programs.rigs.blank(*design)
         first = np.zeros(self.each, int)
         pace = np.ones(self.each), first
-        given = self._rigging(first, pace, None, alike, first)
+        wanted, alike = first > 0, jax.tree.map(lambda leaf: leaf[first], alike)
+        given = self._rigging(first, wanted, pace, None, alike)
         riggings = None if given is None else programs.riggings.blank(*given)
-        yield programs.block, self._block(first, pace, None, riggings)
+        yield programs.block, self._block(first, wanted, pace, None, riggings)
         if given is not None:
             yield programs.riggings, given
         yield programs.rigs, design
 
     def _run(self, chosen, steps, substeps, single, more=0):
-        pace = np.asarray(steps), np.full(chosen.size, more)
-        given = self._rigging(chosen, pace, substeps, self.rigs, self.rig_of[chosen])
+        # What is not a whole block is spread over it, so that each device has its part.
+        places = np.arange(chosen.size) * self.each // chosen.size
+        wanted = np.zeros(self.each, bool)
+        wanted[places] = True
+        among = np.cumsum(wanted) - 1
+        chosen, steps = chosen[among], steps[among]
+        pace = steps, np.full(chosen.size, more)
+        given = self._rigging(chosen, wanted, pace, substeps, self._rigs_of(chosen))
         riggings = None if given is None else programs.riggings(*given)
-        arguments = self._block(chosen, pace, substeps, riggings)
+        arguments = self._block(chosen, wanted, pace, substeps, riggings)
         arguments = jax.tree.map(_shortened, arguments) if single else arguments
         with jax.enable_x64(False) if single else contextlib.nullcontext():
             with self._compiling:  # others wait for the first, instead of compiling the same again
@@ -157,25 +171,33 @@ class Work:
                     programs.block.ahead(*arguments)()
                     self._ready.add((substeps, single))
             results = programs.block(*arguments)
-        return {name: np.asarray(values) for name, values in results.items()}
+        return {name: np.asarray(values)[places] for name, values in results.items()}
 
-    def _rigging(self, chosen, pace, substeps, rigs, rig_of):
+    def _rigs_of(self, chosen):
+        """Rigs of some tasks."""
+        return self.rigs if self.shared else jax.tree.map(lambda leaf: leaf[chosen], self.rigs)
+
+    def _rigging(self, chosen, wanted, pace, substeps, rigs):
         """Arguments of `programs.riggings`; None with a controller, which has a rig of its own."""
         if self.case.controller is not None:
             return None
-        rigs = jax.tree.map(lambda leaf: leaf[rig_of], rigs)
         heavy, names = self.tasks.heavy[chosen], self.addresses[0]
-        return self.case, names, *self._clock(substeps), rigs, heavy, pace
+        return self.case, names, *self._clock(substeps), wanted, rigs, heavy, pace
 
-    def _block(self, chosen, pace, substeps, riggings):
+    def _block(self, chosen, wanted, pace, substeps, riggings):
         """Arguments of `programs.block`."""
         tasks = self.tasks.heavy[chosen], self.tasks.light[chosen], pace
         settings = self.case, self.form, self.addresses, self.devices, *self._clock(substeps)
-        return *settings, riggings, *tasks
+        return *settings, wanted, riggings, *tasks
 
     def _clock(self, substeps):
         scheduled = substeps is not None or self.case.controller is not None
         return (self.schedule if scheduled else None), substeps
+
+
+def _filled(count: int, unit: int) -> int:
+    """The next multiple of a unit."""
+    return -(-count // unit) * unit
 
 
 def _values(case: Case, tasks: Tasks, address: str) -> np.ndarray:

@@ -10,9 +10,10 @@
 #include "native_lanes.h"
 #include "xla/ffi/api/c_api.h"
 
-/* native.py tells on the command line: WIDE (lanes of a group), STEPS (of a chunk), NODES (Gauss nodes
-   a step), POINTS (looked at in a step, both ends among them), NEAR (as in extremes.py), ROUNDS and REACH
-   (of Newton's method in peaks.vertex). Where nodes are the last axis they are padded to WIDE. */
+/* native.py tells on the command line: STEPS (of a chunk), NODES (Gauss nodes a step), POINTS (looked at in
+   a step, both ends among them), NEAR (as in extremes.py), ROUNDS and REACH (of Newton's method in
+   peaks.vertex). Where nodes or points are the last axis it is padded to a multiple of FILL. */
+enum { PADDED = (NODES + FILL - 1) / FILL * FILL };
 
 static inline Lanes value(const Lanes *coefficients, int terms, Lanes place) {
     Lanes sum = coefficients[terms - 1];
@@ -25,7 +26,8 @@ static inline Lanes size_of(Lanes deflection, int both) {
 }
 
 /* Largest size of a value of the curve through samples, as peaks.vertex has it. */
-static Lanes vertex(const Lanes *samples, const double *curve, const double *points, int both) {
+static inline Lanes vertex(const Lanes *samples, const double *curve, const double *points,
+                           int both) {
     Lanes highest = size_of(samples[0], both), place = all(-1);
     Lanes powers[POINTS], slope[POINTS - 1], bend[POINTS - 2], reach = all(REACH);
     for (int p = 1; p < POINTS; p++) {
@@ -55,7 +57,7 @@ enum { DRIFT_NODES, PUSH_NODES, DRIFT, PUSH, WATCH, WATCH_PUSH, KIND, START, SPA
 enum { KEPT = ARGUMENTS - STATE };
 
 typedef struct {
-    int rows, states, blocks, side, modes, slots, places, looked, both; /* modes of a block */
+    int rows, states, blocks, side, modes, slots, places, looked; /* modes of a block */
     int64_t lanes;
     const double *in[ARGUMENTS];
     const int64_t *kind, *slot;
@@ -82,72 +84,86 @@ static size_t tables_of(const Work *w) {
     return (size_t)w->rows * (size_t)(2 * w->states + w->rows + w->looked);
 }
 
-/* Numbers come with the nodes, or what is looked at, as their last axis: these fill a register. */
+/* The nodes from a given one on, as many as fill a register, of one load: the state that each feels, the
+   rig's answer to its force, and what the forces at all nodes do there. Nodes are the last axis. */
+static void tabulate_nodes(const Work *w, const Step *step, ptrdiff_t kind, ptrdiff_t load_of, int p,
+                           int first, Lanes *felt) {
+    const int side = w->side, modes = w->modes, all_modes = w->blocks * modes;
+    const int rows = w->rows, states = w->states, last = NODES - first;
+    const int many = last < WIDE ? last : WIDE;
+    const double *drift_nodes = w->in[DRIFT_NODES] + kind * states * side * PADDED + first;
+    const double *push_nodes = w->in[PUSH_NODES] + kind * NODES * states * modes * PADDED + first;
+    const double *push_end = w->in[PUSH] + kind * states * modes * PADDED + first;
+    const double *shape = w->in[SHAPE] + load_of * all_modes * PADDED + first;
+    const double *feels = w->in[ROWS] + load_of * states * PADDED + first;
+    double *respond = step->respond + p * NODES + first, *push = step->push + p * NODES + first;
+    for (int i = 0; i < states; i++) {
+        const double *rows_of = feels + i / side * side * PADDED;
+        const double *drifts = drift_nodes + i / side * side * side * PADDED + i % side * PADDED;
+        Lanes responds = {0}, pushes = {0};
+        for (int j = 0; j < side; j++)
+            responds += whole(rows_of + j * PADDED) * whole(drifts + j * side * PADDED);
+        for (int m = 0; m < modes; m++)
+            pushes += whole(shape + (i / side * modes + m) * PADDED) *
+                      whole(push_end + (i * modes + m) * PADDED);
+        store(respond + i * rows, responds, many);
+        store(push + i * rows, pushes, many);
+    }
+    for (int c = 0; c < NODES; c++) {
+        const double *there = shape - first + c, *feels_there = feels - first + c;
+        Lanes here = {0}; /* the force itself bends the beam under it, at once */
+        if (c >= first && c < first + WIDE) here[c - first] = 1;
+        for (int m = 0; m < all_modes; m++) {
+            const int from = m / modes * side;
+            const double *pushes = push_nodes + (c * states * modes + m % modes) * PADDED;
+            Lanes sum = here * there[m * PADDED];
+            for (int i = from; i < from + side; i++)
+                sum += feels_there[i * PADDED] * whole(pushes + i * modes * PADDED);
+            felt[m] = sum;
+        }
+        for (int q = 0; q < w->slots; q++) {
+            const double *under = shape + (q - p) * all_modes * PADDED;
+            Lanes gains = {0};
+            for (int m = 0; m < all_modes; m++) gains += felt[m] * whole(under + m * PADDED);
+            store(step->gains + (p * NODES + c) * rows + q * NODES + first, gains, many);
+        }
+    }
+}
+
 static void tabulate(const Work *w, int t, Step *step, Lanes *felt, double *room) {
-    const int blocks = w->blocks, side = w->side, modes = w->modes, all_modes = blocks * modes;
-    const int rows = w->rows, states = w->states, looked = w->looked, fill = (looked + WIDE - 1) / WIDE;
+    const int all_modes = w->blocks * w->modes, rows = w->rows, states = w->states;
+    const int looked = w->looked, filled = (looked + FILL - 1) / FILL * FILL;
     const ptrdiff_t kind = (ptrdiff_t)w->kind[t];
     step->taken = w->in[SPAN][t] != 0; /* steps of no length fill up a chunk */
     step->pressed = step->taken && loaded(w, t);
-    step->drift = w->in[DRIFT] + kind * states * side;
+    step->drift = w->in[DRIFT] + kind * states * w->side;
     step->watch = w->in[WATCH] + kind * looked * states;
     step->respond = room;
     step->gains = step->respond + rows * states;
     step->push = step->gains + rows * rows;
     step->seen = step->push + rows * states;
     if (!step->pressed) return;
-    const double *drift_nodes = w->in[DRIFT_NODES] + kind * states * side * WIDE;
-    const double *push_nodes = w->in[PUSH_NODES] + kind * NODES * states * modes * WIDE;
-    const double *push_end = w->in[PUSH] + kind * states * modes * WIDE;
-    const double *sights = w->in[WATCH_PUSH] + kind * NODES * all_modes * fill * WIDE;
+    const double *sights = w->in[WATCH_PUSH] + kind * NODES * all_modes * filled;
     for (int p = 0; p < w->slots; p++) {
-        const double *shape = w->in[SHAPE] + ((ptrdiff_t)t * w->slots + p) * all_modes * WIDE;
-        const double *feels = w->in[ROWS] + ((ptrdiff_t)t * w->slots + p) * states * WIDE;
-        for (int i = 0; i < states; i++) {
-            const double *rows_of = feels + i / side * side * WIDE;
-            const double *drifts = drift_nodes + i / side * side * side * WIDE + i % side * WIDE;
-            Lanes respond = {0}, push = {0};
-            for (int j = 0; j < side; j++)
-                respond += load(rows_of + j * WIDE, WIDE) * load(drifts + j * side * WIDE, WIDE);
-            for (int m = 0; m < modes; m++)
-                push += load(shape + (i / side * modes + m) * WIDE, WIDE) *
-                        load(push_end + (i * modes + m) * WIDE, WIDE);
-            store(step->respond + i * rows + p * NODES, respond, NODES);
-            store(step->push + i * rows + p * NODES, push, NODES);
-        }
-        for (int c = 0; c < NODES; c++) {
-            Lanes here = {0}; /* the force itself bends the beam under it, at once */
-            here[c] = 1;
-            for (int m = 0; m < all_modes; m++) {
-                const int first = m / modes * side;
-                const double *pushes = push_nodes + (c * states * modes + m % modes) * WIDE;
-                Lanes sum = here * shape[m * WIDE + c];
-                for (int i = first; i < first + side; i++)
-                    sum += feels[i * WIDE + c] * load(pushes + i * modes * WIDE, WIDE);
-                felt[m] = sum;
-            }
-            for (int q = 0; q < w->slots; q++) {
-                const double *under = shape + (q - p) * all_modes * WIDE;
-                Lanes gains = {0};
-                for (int m = 0; m < all_modes; m++) gains += felt[m] * load(under + m * WIDE, WIDE);
-                store(step->gains + (p * NODES + c) * rows + q * NODES, gains, NODES);
-            }
-        }
+        const ptrdiff_t load_of = (ptrdiff_t)t * w->slots + p;
+        const double *shape = w->in[SHAPE] + load_of * all_modes * PADDED;
+        for (int first = 0; first < NODES; first += WIDE)
+            tabulate_nodes(w, step, kind, load_of, p, first, felt);
         for (int f = 0; f < NODES; f++)
-            for (int l = 0; l < fill; l++) {
-                const double *sight = sights + (f * all_modes * fill + l) * WIDE;
+            for (int l = 0; l < looked; l += WIDE) {
+                const double *sight = sights + f * all_modes * filled + l;
                 Lanes seen = {0};
                 for (int m = 0; m < all_modes; m++)
-                    seen += shape[m * WIDE + f] * load(sight + m * fill * WIDE, WIDE);
-                int many = looked - l * WIDE;
-                double *kept = step->seen + (p * NODES + f) * looked + l * WIDE;
-                store(kept, seen, many < WIDE ? many : WIDE);
+                    seen += shape[m * PADDED + f] * whole(sight + m * filled);
+                double *kept = step->seen + (p * NODES + f) * looked + l;
+                store(kept, seen, looked - l < WIDE ? looked - l : WIDE);
             }
     }
 }
 
 /* The peaks so far, from the samples (step, point, place) of all steps. */
-static void raise(const Work *w, const Step *steps, const Lanes *seen, ptrdiff_t first, int many) {
+static inline ALWAYS void raise(const Work *w, const Step *steps, const Lanes *seen, ptrdiff_t first,
+                                int many, int both) {
     ptrdiff_t plane = (ptrdiff_t)w->places * w->lanes;
     for (int place = 0; place < w->places; place++) {
         ptrdiff_t at = place * w->lanes + first;
@@ -157,8 +173,8 @@ static void raise(const Work *w, const Step *steps, const Lanes *seen, ptrdiff_t
             Lanes highest = {0}, largest = {0};
             for (int p = 0; steps[t].taken && p < POINTS; p++) {
                 Lanes sample = seen[(t * POINTS + p) * w->places + place];
-                highest = greater(size_of(sample, w->both), highest);
                 largest = greater(absolute(sample), largest);
+                highest = both ? largest : greater(sample, highest);
             }
             least = greater(highest, least);
             most[t] = highest + (NEAR - 1) * largest; /* between samples */
@@ -169,7 +185,7 @@ static void raise(const Work *w, const Step *steps, const Lanes *seen, ptrdiff_t
             Lanes samples[POINTS];
             for (int p = 0; p < POINTS; p++)
                 samples[p] = seen[(t * POINTS + p) * w->places + place];
-            Lanes found = vertex(samples, w->in[CURVE], w->in[LOOKED], w->both);
+            Lanes found = vertex(samples, w->in[CURVE], w->in[LOOKED], both);
             Mask better = found > score;
             if (!any(better)) continue;
             score = either(better, found, score);
@@ -217,10 +233,10 @@ static void drift(const Work *w, const double *rows, const Lanes *state, Lanes *
 }
 
 /* All steps of the chunk for one group of lanes. */
-static void group(const Work *w, const Step *steps, ptrdiff_t first, int many, Lanes *room) {
+static inline ALWAYS void group(const Work *w, const Step *steps, ptrdiff_t first, int many, Lanes *room,
+                                int both) {
     Lanes *state = room, *forces = state + w->states, *after = forces + w->rows;
     Lanes *matrix = after + w->states, *samples = matrix + w->rows * w->rows;
-    Lanes nothing = {0}; /* unless a sample is infinite or not a number */
     for (int i = 0; i < w->states; i++) state[i] = load(w->in[STATE] + i * w->lanes + first, many);
     for (int t = 0; t < STEPS; t++) {
         const Step *step = steps + t;
@@ -248,13 +264,16 @@ static void group(const Work *w, const Step *steps, ptrdiff_t first, int many, L
         add_product(seen, step->watch, w->looked, state, w->states);
         if (step->pressed)
             product(seen, step->seen, w->looked, 1, w->looked, forces, w->rows);
-        for (int i = 0; i < w->looked; i++) nothing += 0 * seen[i];
         drift(w, step->drift, state, after);
         if (step->pressed) add_product(after, step->push, w->states, forces, w->rows);
         memcpy(state, after, (size_t)w->states * sizeof *state);
     }
-    raise(w, steps, samples, first, many);
-    for (int i = 0; i < w->states; i++) store(w->out[0] + i * w->lanes + first, state[i], many);
+    raise(w, steps, samples, first, many, both);
+    Lanes nothing = {0}; /* unless a state is infinite or not a number, as it then stays */
+    for (int i = 0; i < w->states; i++) {
+        store(w->out[0] + i * w->lanes + first, state[i], many);
+        nothing += 0 * state[i];
+    }
     for (int l = 0; l < many; l++)
         w->sound[first + l] = w->sound_in[first + l] && nothing[l] == 0;
 }
@@ -265,7 +284,7 @@ static XLA_FFI_Error *fault(const XLA_FFI_CallFrame *frame, const char *message)
     return frame->api->XLA_FFI_Error_Create(&args);
 }
 
-static XLA_FFI_Error *run(XLA_FFI_CallFrame *frame, int both) {
+static inline ALWAYS XLA_FFI_Error *run(XLA_FFI_CallFrame *frame, int both) {
     if (frame->extension_start && frame->extension_start->type == XLA_FFI_Extension_Metadata) {
         /* XLA asks for which version of its interface this was compiled. */
         XLA_FFI_Metadata *about = ((XLA_FFI_Metadata_Extension *)frame->extension_start)->metadata;
@@ -284,7 +303,6 @@ static XLA_FFI_Error *run(XLA_FFI_CallFrame *frame, int both) {
     }
     w->kind = (const int64_t *)w->in[KIND];
     w->slot = (const int64_t *)w->in[SLOTS];
-    w->both = both;
     w->active = (const uint8_t *)w->in[ACTIVE];
     w->sound_in = (const uint8_t *)w->in[SOUND];
     w->blocks = (int)dims[DRIFT][1], w->side = (int)dims[DRIFT][2], w->modes = (int)dims[SHAPE][3];
@@ -308,7 +326,7 @@ static XLA_FFI_Error *run(XLA_FFI_CallFrame *frame, int both) {
         tabulate(w, t, steps + t, scratch, (double *)(scratch + room) + (size_t)t * tables_of(w));
     for (int64_t first = 0; first < w->lanes; first += WIDE) {
         int64_t left = w->lanes - first;
-        group(w, steps, first, left < WIDE ? (int)left : WIDE, scratch);
+        group(w, steps, first, left < WIDE ? (int)left : WIDE, scratch, both);
     }
     free(scratch);
     return NULL;

@@ -31,9 +31,9 @@ from jaxbeam.tables import CHUNK, Path, Rigging
 
 SOURCE = pathlib.Path(__file__).with_suffix(".c")
 HEADER = SOURCE.with_name("native_lanes.h")
-WIDE = 8  # lanes that are worked on at once
+FILL = 8  # numbers that fill whole vector registers of any machine
 CONSTANTS = {
-    "WIDE": WIDE,
+    "FILL": FILL,
     "STEPS": CHUNK,
     "NODES": NODES,
     "POINTS": len(LOOKED),
@@ -162,7 +162,7 @@ def prepare(rigging: Rigging) -> tuple:
 def _last(part, axis: int):
     """With an axis as the last, padded to fill registers."""
     part = jnp.moveaxis(part, axis, -1)
-    return jnp.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, -part.shape[-1] % WIDE)])
+    return jnp.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, -part.shape[-1] % FILL)])
 
 
 @jax.named_scope("native")

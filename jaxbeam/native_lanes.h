@@ -1,10 +1,25 @@
 /* Numbers of several runs side by side, as many as fill a vector register, and their arithmetic.
 
-   WIDE, how many, and NODES, the size of most systems of equations, come from the command line. */
+   NODES, the size of most systems of equations, comes from the command line. */
 
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
+
+/* Wider than a register, compilers make of them what they would of single numbers, or worse. */
+#if defined __AVX512F__
+#include <immintrin.h>
+#define REGISTER(name) _mm512_##name##_pd
+enum { WIDE = 8 };
+#elif defined __AVX2__
+#include <immintrin.h>
+#define REGISTER(name) _mm256_##name##_pd
+enum { WIDE = 4 };
+#else
+enum { WIDE = 2 };
+#endif
+
+#define ALWAYS __attribute__((always_inline))
 
 typedef double Lanes __attribute__((vector_size(8 * WIDE)));
 typedef int64_t Mask __attribute__((vector_size(8 * WIDE)));
@@ -13,8 +28,13 @@ static inline Lanes all(double value) { return (Lanes){0} + value; }
 static inline Lanes either(Mask which, Lanes yes, Lanes no) {
     return (Lanes)(((Mask)yes & which) | ((Mask)no & ~which));
 }
+#ifdef REGISTER /* in one instruction, where there is one that treats what is no number alike */
+static inline Lanes greater(Lanes a, Lanes b) { return REGISTER(max)(a, b); }
+static inline Lanes less(Lanes a, Lanes b) { return REGISTER(min)(a, b); }
+#else
 static inline Lanes greater(Lanes a, Lanes b) { return either(a > b, a, b); }
 static inline Lanes less(Lanes a, Lanes b) { return either(a < b, a, b); }
+#endif
 static inline Lanes absolute(Lanes a) { return (Lanes)((Mask)a & INT64_MAX); }
 static inline int any(Mask mask) {
     int64_t sum = 0;
@@ -30,6 +50,7 @@ static inline Lanes load(const double *from, int many) {
     memcpy(&lanes, from, 8 * (size_t)many);
     return lanes;
 }
+static inline Lanes whole(const double *from) { return load(from, WIDE); }
 static inline void store(double *to, Lanes lanes, int many) {
     if (many == WIDE) *(Loose *)to = lanes;
     else memcpy(to, &lanes, 8 * (size_t)many);
@@ -37,9 +58,8 @@ static inline void store(double *to, Lanes lanes, int many) {
 
 /* sums += rows @ values, rows `down` numbers apart and their entries `along`; four rows at a time
    keep the adders busy. */
-static inline __attribute__((always_inline)) void product(Lanes *sums, const double *rows, int count,
-                                                          int down, int along, const Lanes *values,
-                                                          int size) {
+static inline ALWAYS void product(Lanes *sums, const double *rows, int count, int down, int along,
+                                  const Lanes *values, int size) {
     int r = 0;
     for (; r + 4 <= count; r += 4) {
         const double *row = rows + (ptrdiff_t)r * down;
@@ -62,7 +82,7 @@ static void add_product(Lanes *sums, const double *rows, int count, const Lanes 
 }
 
 /* Forces of (1 + m_i G_ij) r_j = -d_i, eliminated in place without pivots; see dynamics.py. */
-static inline __attribute__((always_inline)) void eliminate(Lanes *matrix, Lanes *right, int size) {
+static inline ALWAYS void eliminate(Lanes *matrix, Lanes *right, int size) {
 #pragma GCC unroll 8
     for (int i = 0; i < size; i++) {
         Lanes inverse = 1 / matrix[i * size + i];

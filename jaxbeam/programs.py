@@ -1,7 +1,8 @@
 """The programs of a sweep, each compiled once for all its blocks.
 
 A case comes with the addresses of what varies and, task by task, its values there. Tasks differ in
-`heavy` values, which decide the path and the rig, and the lanes of a task in `light` ones.
+`heavy` values, which decide the path and the rig, and the lanes of a task in `light` ones. Of the
+tasks that a program is given only those `wanted` are worked out; the others come out as zeros.
 """
 
 import jax
@@ -60,18 +61,31 @@ def _prepare(case, addresses, schedule, substeps, assembled, heavy, pace, driver
     return make_rigging(assembled, grid, varied.sensor_places, driver)
 
 
+def _map(task, wanted, values):
+    """What `task` makes of each of the values that are wanted, one after the other."""
+    task = jax.jit(task)  # which is then traced once
+    shapes = jax.eval_shape(task, jax.tree.map(lambda leaf: leaf[0], values))
+
+    def nothing(values):
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    return jax.lax.map(
+        lambda given: jax.lax.cond(given[0], task, nothing, given[1]), (wanted, values)
+    )
+
+
 @compiled_with(**SIDE_BY_SIDE)
-def riggings(case, addresses, schedule, substeps, rigs, heavy, pace):
+def riggings(case, addresses, schedule, substeps, wanted, rigs, heavy, pace):
     """Rigs on the grids of some tasks."""
 
     def task(values):
         return _prepare(case, addresses, schedule, substeps, *values)
 
-    return jax.lax.map(task, (rigs, heavy, pace))
+    return _map(task, wanted, (rigs, heavy, pace))
 
 
 @compiled
-def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, light, pace):
+def block(case, form, addresses, devices, schedule, substeps, wanted, riggings, heavy, light, pace):
     """Results of some tasks: lanes side by side, tasks one after the other, shared by devices."""
     heavy_addresses, light_addresses = addresses
 
@@ -116,10 +130,10 @@ def block(case, form, addresses, devices, schedule, substeps, riggings, heavy, l
             **history,
         }
 
-    def part(values):
-        return jax.lax.map(task, values)
+    def part(wanted, values):
+        return _map(task, wanted, values)
 
     if devices > 1:
         mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
         part = jax.shard_map(part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    return part((riggings, heavy, light, pace))
+    return part(wanted, (riggings, heavy, light, pace))

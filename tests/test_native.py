@@ -2,12 +2,17 @@
 
 import dataclasses
 import json
+import pathlib
+import platform
 import shutil
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
@@ -25,6 +30,7 @@ from jaxbeam.tables import both_sides, make_rigging
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="no C compiler here")
 
+ROOT = pathlib.Path(__file__).parents[1]
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
 SENSORS = [jb.Sensor(0.15), jb.Sensor(0.3), jb.Sensor(0.41)]
 PLAIN = jb.Case(BEAM, sensors=SENSORS, loads=[jb.MovingMass(mass=0.5, speed=1.0)], run=jb.Run(1.0))
@@ -100,6 +106,32 @@ def test_results_are_those_without_it(case, over):
     # Another step would be another result, and a sweep that took no steps by C the very same.
     assert np.any(by_hand.peak_deflection != plain.peak_deflection)
     assert by_hand.attrs[FINGERPRINT] != plain.attrs[FINGERPRINT]
+
+
+NARROW = """
+import sys
+import jaxbeam as jb
+from jaxbeam import native
+from tests.test_native import COUPLED, GRID
+native.build()
+assert native.ready()
+jb.sweep(COUPLED, GRID, progress=False).to_netcdf(sys.argv[1], engine="h5netcdf")
+"""
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="options of other compilers")
+@pytest.mark.parametrize("without", ["avx512f", "avx"])
+def test_narrower_machines_compute_the_same(without, tmp_path, monkeypatch):
+    """In another process: one takes the steps of only one compiled library."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("CC", f"{native.compiler()} -mno-{without}")
+    path = tmp_path / "found.nc"
+    subprocess.run([sys.executable, "-c", NARROW, str(path)], check=True, cwd=ROOT)
+    monkeypatch.setattr(native, "ready", lambda: False)
+    plain = jb.sweep(COUPLED, GRID, progress=False).peak_deflection
+    with xarray.open_dataset(path, engine="h5netcdf") as found:
+        assert_allclose(found.peak_deflection, plain, rtol=1e-11)
+        assert np.any(found.peak_deflection != plain)
 
 
 def test_some_of_these_cases_lose_contact():

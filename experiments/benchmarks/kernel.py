@@ -50,9 +50,10 @@ def prepare(modes: int) -> tuple[np.ndarray, list]:
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
     work = make_order(case, over, False, False, TOLERANCE, "double").work()
     steps, _ = work.steps()
-    everything = np.arange(SPEEDS.size)
+    everything, wanted = np.arange(SPEEDS.size), np.ones(SPEEDS.size, bool)
+    rigs = jax.tree.map(lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), work.rigs)
     pace = steps, np.zeros(steps.size, int)
-    given = work._rigging(everything, pace, None, work.rigs, work.rig_of[everything])
+    given = work._rigging(everything, wanted, pace, None, rigs)
     riggings = jax.tree.map(np.asarray, programs.riggings(*given))
     plain = Rig(modes)
     rates = riggings.rig.state_matrix[0, :, 1, :]
