@@ -3,6 +3,7 @@
 float64 is not set here: importing `jaxbeam` sets it, and the tests rely on that as users do.
 """
 
+import gc
 import os
 import sys
 import tempfile
@@ -33,6 +34,10 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 import hypothesis
 import pytest
+
+# Tracing makes millions of small objects that live on: to look through them for garbage as often
+# as Python does otherwise takes up to a tenth of the time, and finds next to nothing.
+gc.set_threshold(100_000, 20, 100)
 
 # The same examples in every run, so a red test stays red until it is mended. No deadline:
 # the first example pays for compiling. No database: with fixed examples there is nothing
