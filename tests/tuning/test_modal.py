@@ -124,7 +124,10 @@ def test_decay_intervals_cover_the_truth():
 
 @pytest.mark.slow
 def test_ambient_intervals_cover_the_truth():
-    fits = [identify_modes(ambient(seed)) for seed in range(100)]
+    """Of 100 logs; that these are no free decays, a fifth must find: it takes longest."""
+    kinds = [None] * 20 + ["ambient"] * 80
+    fits = [identify_modes(ambient(seed), kind=kind) for seed, kind in enumerate(kinds)]
+    assert all(fit.kind == "ambient" for fit in fits)
     share = np.mean([covered(fit, [3.0, 7.0], [0.02, 0.01]) for fit in fits], axis=(0, 1))
     assert np.all((share >= 0.90) & (share <= 0.98)), share
 
