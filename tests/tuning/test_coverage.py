@@ -1,5 +1,7 @@
 """Intervals mean what they say: over many simulated campaigns they cover the truth."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -51,8 +53,13 @@ class Rehearsal:
 
 
 @pytest.fixture(scope="module")
-def rehearsal() -> Rehearsal:
-    return Rehearsal()
+def rehearsal():
+    """Its search is run six hundred times, and so worth compiling well, as for users."""
+    roughly = "--xla_backend_optimization_level=0"  # of `conftest`
+    made = Rehearsal()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"].replace(roughly, ""))
+        yield made
 
 
 def coloured(white, memory: float):
