@@ -8,11 +8,14 @@ what is left to be done one after the other is little, and is little the other w
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from jaxbeam.dynamics import solve_contact
 from jaxbeam.small import FEW, product, solve_small
 from jaxbeam.tables import Tables
+
+KEPT = "steps"  # states and forces in rows of steps, which reverse mode need not work out again
 
 
 @jax.named_scope("collocation")
@@ -67,6 +70,7 @@ def _undriven_jvp(given, changes):
     tables, inertia, weight, state = given
     moved, heavier, weightier, before = changes
     after, states, forces = undriven(*given)
+    states, forces = checkpoint_name(states, KEPT), checkpoint_name(forces, KEPT)
     # Systems of all steps and lanes side by side.
     rows = forces.shape[1]
     matrix = inertia[:, :, None] * tables.gains[..., None] + np.eye(rows)[:, :, None]

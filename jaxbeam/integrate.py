@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam import native
-from jaxbeam.advance import advance, contact, undriven
+from jaxbeam.advance import KEPT, advance, contact, undriven
 from jaxbeam.driver import AbstractDriver, Moment
 from jaxbeam.dynamics import Traffic
 from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
@@ -146,7 +146,7 @@ def trace(
     (step, command, lane) those at the nodes of every step, None without a `driver`; what it shows
     is kept for every step, its memory that at the end. Extremes are those at the watched places,
     None if there are none. `slots` is how many loads may be on the beam at once. Reverse mode
-    stores one state a chunk.
+    keeps the state and the contact forces of every step, under a driver one state a chunk.
     """
     chunk = _stepper(rigging, traffic, slots, driver)
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
@@ -162,9 +162,8 @@ def trace(
     memory = None if driver is None else driver.start(lanes)
     rest = jnp.zeros((rigging.rig.states, lanes))
     firsts = jnp.arange(0, steps, CHUNK)
-    (state, memory, best), history = jax.lax.scan(
-        jax.checkpoint(whole), (rest, memory, best), firsts
-    )
+    again = jax.checkpoint(whole, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
+    (state, memory, best), history = jax.lax.scan(again, (rest, memory, best), firsts)
     history = jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2)[:steps], history)
     states, commands, shown = history
     return best, jnp.concatenate([states, state[None]]), commands, shown, memory

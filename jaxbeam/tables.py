@@ -22,7 +22,7 @@ from jaxbeam.exponentials import GAUSS, LOOKED, Step, propagators
 from jaxbeam.grid import Grid
 from jaxbeam.rig import Rig
 
-CHUNK = 8  # steps that are tabulated at once
+CHUNK = 16  # steps that are tabulated at once
 
 
 class CommandTables(eqx.Module):

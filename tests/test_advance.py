@@ -5,8 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxbeam as jb
 from jaxbeam.advance import advance, undriven
+from jaxbeam.simulate import readings
 from jaxbeam.tables import Tables
+from tests.runs import plan_of
 
 STEPS, LANES = 5, 3
 
@@ -103,3 +106,22 @@ def test_backward_is_forward_turned_round(shape):
     forward, bend = jax.jvp(lambda *g: jax.jvp(misfit, g, changes)[1], given, changes)
     np.testing.assert_allclose(along(*given), forward, rtol=1e-10)
     np.testing.assert_allclose(jax.jvp(along, given, changes)[1], bend, rtol=1e-9)
+
+
+def test_backward_keeps_little_of_each_step():
+    """Its state and its forces, 12 numbers, and what the result has; its matrices alone are 150."""
+    beam = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
+    load = jb.MovingMass(mass=0.5, speed=1.0)
+    case = jb.Case(beam, sensors=[jb.Sensor(0.3)], loads=[load], run=jb.Run(0.5))
+
+    def memory(count):
+        times = jnp.linspace(0.0, 0.5, count)
+        plan = plan_of(case, substeps=1)
+
+        def misfit(mass):
+            varied = jb.replace(case, {"loads.0.mass": mass})
+            return jnp.sum(readings(varied, times, plan) ** 2)
+
+        return jax.jit(jax.grad(misfit)).lower(0.5).compile().memory_analysis().temp_size_in_bytes
+
+    assert (memory(3201) - memory(1601)) / 1600 < 8 * 40
