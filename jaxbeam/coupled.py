@@ -134,9 +134,9 @@ def coupled_flows(
         jnp.moveaxis(part, -1, 0) for part in (table[:states], table[states : states + known], own)
     )
     end = answer.end[:, :known] + push @ force
-    spent = on_commands(R, states, length)
-    toll = answer.toll[:known, :known] + spent
-    toll = toll + mixed @ force + transposed(force) @ (transposed(mixed) + own @ force)
+    spent = jnp.pad(on_commands(R, length), (states, 0))
+    turn = transposed(force) @ (transposed(mixed) + own @ force / 2)
+    toll = answer.toll[:known, :known] + spent + turn + transposed(turn)
     return Flow(end[..., :states], end[..., states:], toll)
 
 

@@ -7,18 +7,20 @@ Eqs (3.3) to (3.9) of the thesis, (3.8) with its sign corrected:
 Stretches come in groups of equal length, a group at a time is worked out.
 """
 
+import functools
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.coupled import Coupling, Plant, answers, coupled_flows, law_solved
-from jaxbeam.flows import NODES, costs_to_go, flows
+from jaxbeam.flows import NODES, carried, costs_to_go, flows, on_commands
 from jaxbeam.gain_table import GainTable, from_nodes, polynomials
-from jaxbeam.small import solve_any
-from jaxbeam.stretches import Commands, Square, symmetric
+from jaxbeam.small import each_lane, in_lanes, joined, lanes_of, solve_any, times, turned
+from jaxbeam.stretches import Commands, Square
 
 GROUP = 8  # stretches
 # Backward in time P hastens, right before an event, to what the plant from then on demands, and
@@ -71,7 +73,7 @@ def finite_time(
     inputs = R.shape[0]
     still = Plant(jnp.zeros_like(Q), jnp.zeros((Q.shape[0], inputs)), jnp.eye(Q.shape[0]))
 
-    def make(times, length, kind):
+    def make(R, times, length, kind):
         A, B = every(times)
         whole = jnp.broadcast_to(still.E, A.shape)
         law = jnp.concatenate([A, B], axis=3)
@@ -95,7 +97,7 @@ def finite_time_coupled(
     every = jax.vmap(lambda length: answers(plant, Q, length, HALVINGS))(longest)
     every = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), every)
 
-    def make(times, length, kind):
+    def make(R, times, length, kind):
         answer = jax.tree.map(
             lambda part: jax.lax.dynamic_index_in_dim(part, kind, 0, False), every
         )
@@ -117,25 +119,18 @@ def _backward(make, plant, events, count, Q, R, terminal, parallel):
     given = times, lengths, jnp.asarray(kinds)
     groups = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), given)
     inverse = solve_any(R, jnp.eye(R.shape[0]))
-
-    def gains(shape, law, costs, length):
-        return _pieces(plant, shape, law, costs, length, Q, inverse)
-
+    make = eqx.filter_closure_convert(make, R, *jax.tree.map(lambda part: part[0], groups))
     if parallel:
-        parts, shape, law = jax.lax.map(lambda group: make(*group), groups)
+        parts, shape, law = jax.lax.map(lambda group: make(R, *group), groups)
         whole = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), parts)
         costs = costs_to_go(whole, terminal, True)
         first = costs[:-1].reshape(-1, GROUP, *Q.shape)
         grouped = jnp.concatenate([first, costs[GROUP::GROUP, None]], axis=1)
-        pieces = jax.lax.map(lambda given: gains(*given), (shape, law, grouped, groups[1]))
+        given = plant, shape, law, grouped, groups[1], Q, inverse
+        axes = None, 0, 0, 0, 0, None, None
+        pieces = jax.vmap(functools.partial(in_lanes, _pieces), axes)(*given)
     else:
-
-        def back(cost, group):
-            part, shape, law = make(*group)
-            costs = costs_to_go(part, cost)
-            return symmetric(costs[0]), (costs[:-1], gains(shape, law, costs, group[1]))
-
-        _, (costs, pieces) = jax.lax.scan(back, terminal, groups, reverse=True)
+        costs, pieces = in_lanes(_swept, make, plant, groups, Q, R, inverse, terminal)
         costs = jnp.concatenate([costs.reshape(-1, *Q.shape), terminal[None]])
     inner = events[:-1, None] + spans[:, None] * edges[:-1]
     marks = jnp.append(inner.reshape(-1), events[-1])
@@ -143,19 +138,37 @@ def _backward(make, plant, events, count, Q, R, terminal, parallel):
     return GainTable(marks, pieces.reshape(-1, *pieces.shape[2:])), costs
 
 
+def _swept(make, plant, groups, Q, R, inverse, terminal):
+    """P at the starts of stretches and polynomials of the gain, of all groups, in lanes."""
+    free = jnp.zeros((*R.shape[:2], 1))  # commands, so that lanes with other R share the flows
+
+    def back(cost, group):
+        length = group[1]
+        parts, shape, law = each_lane(lambda make, *rest: make(*rest), make, free, *group)
+        costs = carried(parts, each_lane(on_commands, R, length), cost)
+        edges = jnp.concatenate([costs, cost[None]])
+        pieces = _pieces(plant, shape, law, edges, length, Q, inverse)
+        return (costs[0] + turned(costs[0])) / 2, (costs, pieces)
+
+    given = make, plant, groups, Q, R, terminal
+    wide = jnp.broadcast_to(terminal, (*terminal.shape[:2], lanes_of(given)))
+    return jax.lax.scan(back, wide, groups, reverse=True)[1]
+
+
 def _pieces(plant, shape, law, costs, length, Q, inverse):
-    """Polynomials of the gain over a group of stretches, from P at its edges.
+    """Polynomials of the gain over a group of stretches, from P at its edges, in lanes.
 
     The rate of the state is that by the constant part of the `plant`, plus E shape law (x, u); what
     changes is known at the nodes, and wanted, with its rates, at the edges.
     """
-    push, law = from_nodes(plant.E @ shape), from_nodes(law)  # edge, rate, ...
+    shape, law = from_nodes(shape), from_nodes(law)  # edge, rate, ...
+    push = jax.vmap(jax.vmap(lambda part: times(plant.E, part)))(shape)
 
     def at_edge(push, law, cost):
         return _gains(plant, push, law, cost, length, Q, inverse)
 
-    gains = jax.vmap(at_edge)(push, law, costs)
-    return polynomials(gains[:-1], gains[1:])
+    gains = jax.vmap(at_edge, out_axes=1)(push, law, costs)
+    return polynomials(gains[:, :-1], gains[:, 1:])
 
 
 def _gains(plant, push, law, cost, length, Q, inverse):
@@ -164,23 +177,28 @@ def _gains(plant, push, law, cost, length, Q, inverse):
     A = plant.A + push law_x and B = plant.B + push law_u, with rates. P is never differentiated as
     a whole, but only what it does to a few columns.
     """
-    states, inputs = plant.B.shape
-    (W, W_1, W_2), (V, V_1, _), (D, D_1, D_2) = push, law[..., :states], law[..., states:]
-    B, B_1 = plant.B + W @ D, W_1 @ D + W @ D_1
-    B_2 = W_2 @ D + 2 * (W_1 @ D_1) + W @ D_2
-    once, turned = plant.A @ B + W @ (V @ B), W_1 @ (V @ B) + W @ (V_1 @ B)  # A B, A_1 B
-    more = jnp.concatenate([B_1, once], axis=1)
-    twice = plant.A @ more + W @ (V @ more)
-    few = jnp.concatenate([B, more], axis=1)
-    held = cost @ jnp.concatenate([few, once, twice, turned, B_2], axis=1)
-    seen, far = held[:, :inputs], 3 * inputs
-    back = plant.A.T @ held[:, :far] + V.T @ (W.T @ held[:, :far])
-    spent = seen @ (inverse @ (seen.T @ few))
-    falls = length * (spent - held[:, far : 2 * far] - back - Q @ few)
-    faster = falls[:, :inputs] + held[:, inputs : 2 * inputs]  # the rate of P B
-    fall = falls[:, :inputs]
-    back = plant.A.T @ fall + V.T @ (W.T @ fall + W_1.T @ seen) + V_1.T @ (W.T @ seen)
-    mixed = faster @ (inverse @ (seen.T @ B)) + seen @ (inverse @ (faster.T @ B))
-    bends = length * (mixed - falls[:, 2 * inputs :] - held[:, -2 * inputs : -inputs] - back)
-    last = held[:, -inputs:] + 2 * falls[:, inputs : 2 * inputs] + bends
-    return inverse @ jnp.stack([seen.T, faster.T, last.T])
+    states, inputs = plant.B.shape[:2]
+    (W, W_1, W_2), (V, V_1, _), (D, D_1, D_2) = push, law[:, :, :states], law[:, :, states:]
+    B, B_1 = plant.B + times(W, D), times(W_1, D) + times(W, D_1)
+    B_2 = times(W_2, D) + 2 * times(W_1, D_1) + times(W, D_2)
+    seen = times(V, B)
+    once, turn = times(plant.A, B) + times(W, seen), times(W_1, seen) + times(W, times(V_1, B))
+    more = joined(B_1, once)
+    twice = times(plant.A, more) + times(W, times(V, more))
+    rows = turned(joined(B, more, once, twice, turn, B_2))
+    few = rows[: 3 * inputs]
+    held = times(rows, cost)  # P is symmetric
+    seen, first, then = held[:inputs], held[: 3 * inputs], held[3 * inputs : 6 * inputs]
+    onto = times(inverse, seen)
+    back = times(first, plant.A) + times(times(first, W), V)
+    spent = times(times(few, turned(seen)), onto)
+    falls = length * (spent - then - back - times(few, Q))
+    fall, rest, twice_fall = (falls[k * inputs : (k + 1) * inputs] for k in range(3))
+    faster = fall + held[inputs : 2 * inputs]  # the rate of P B
+    felt = times(fall, W) + times(seen, W_1)
+    back = times(fall, plant.A) + times(felt, V) + times(times(seen, W), V_1)
+    mixed = times(times(few[:inputs], turned(onto)), faster)
+    mixed = mixed + times(times(few[:inputs], turned(faster)), onto)
+    bends = length * (mixed - twice_fall - held[6 * inputs : 7 * inputs] - back)
+    last = held[7 * inputs :] + 2 * rest + bends
+    return jnp.stack([onto, times(inverse, faster), times(inverse, last)])

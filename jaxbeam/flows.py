@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.holds import balance
-from jaxbeam.small import solve_any
+from jaxbeam.small import in_lanes, lanes_of, solve_any, solve_lanes, times, turned
 from jaxbeam.stretches import Commands, Square, Stretch, symmetric, transposed
 
 STAGES = 6  # Gauss nodes of a stretch; order 12
@@ -96,18 +96,32 @@ def costs_to_go(
         onward = jax.lax.associative_scan(join, even, reverse=True)
         costs = jax.vmap(lambda part: part.before(terminal * outer))(onward) / outer
     else:
-        states = terminal.shape[0]
-        both = jnp.concatenate([parts.drift, parts.push], axis=-1)
-
-        def back(cost, part):
-            both, across, toll = part
-            total = toll + (across @ cost) @ both
-            answer = solve_any(total[states:, states:], total[states:, :states])
-            cost = total[:states, :states] - total[:states, states:] @ answer
-            return cost, cost
-
-        _, costs = jax.lax.scan(back, terminal, (both, transposed(both), parts.toll), reverse=True)
+        costs = in_lanes(carried, parts, jnp.zeros((1, 1)), terminal)
     return jnp.concatenate([costs, terminal[None]])
+
+
+def carried(
+    parts: Flow,
+    effort: Float[Array, "#value #value #lane"],
+    terminal: Float[Array, "state state #lane"],
+) -> Float[Array, "stretch state state lane"]:
+    """P at the start of each of successive stretches, with lanes as the last axis.
+
+    Commands also cost `effort`, which lanes that share the flows need not share.
+    """
+    states = terminal.shape[0]
+
+    def back(cost, part):
+        across, toll = part
+        total = toll + times(across, turned(times(across, cost)))
+        mixed = total[states:, :states]
+        answer = solve_lanes(total[states:, states:] + effort, mixed)
+        cost = total[:states, :states] - times(turned(mixed), answer)
+        return cost, cost
+
+    across = jnp.concatenate([parts.drift, parts.push], axis=2).swapaxes(1, 2)
+    wide = jnp.broadcast_to(terminal, (states, states, lanes_of(parts, effort, terminal)))
+    return jax.lax.scan(back, wide, (across, parts.toll), reverse=True)[1]
 
 
 def _collocated(matrix, column, length, Q, R) -> Flow:
@@ -130,15 +144,15 @@ def _collocated(matrix, column, length, Q, R) -> Flow:
     end = start + jnp.tensordot(_WEIGHTS, rates, axes=1)
     weighted = _WEIGHTS[:, None, None] * (Q @ states)
     spent = symmetric(jnp.tensordot(transposed(states), weighted, ((0, 2), (0, 1))))
-    toll = length * spent + on_commands(R, size, length)
+    toll = length * spent + jnp.pad(on_commands(R, length), (size, 0))
     return Flow(end[:, :size], end[:, size:], toll)
 
 
-def on_commands(R: Commands, states: int, length: Float[Array, ""]) -> Float[Array, "both both"]:
+def on_commands(R: Commands, length: Float[Array, ""]) -> Float[Array, "value value"]:
     """What the commands cost over a stretch (s); Gauss's rule is exact for their squares."""
     # Where a stretch has no length they do nothing, and must not seem to be free.
     span = jnp.where(length > 0, length, 1.0)
-    return jnp.pad(span * jnp.kron(np.diag(_WEIGHTS), R), (states, 0))
+    return span * jnp.kron(np.diag(_WEIGHTS), R)
 
 
 def _gauss_tableau():

@@ -57,28 +57,28 @@ def step_by_step(plant: Plant, edges: Float[Array, " edge"], Q: Square, R: Comma
         gain, rate = jax.jvp(lambda t: lqr(*plant(t), Q, R)[0], (time,), (length,))
         return jnp.stack([gain, rate])
 
-    every = jax.vmap(gains)
+    every = jax.vmap(gains, out_axes=1)
     pieces = polynomials(every(edges[:-1] + nudge, lengths), every(edges[1:] - nudge, lengths))
     return GainTable((edges - edges[0]) / (edges[-1] - edges[0]), pieces)
 
 
 def polynomials(
-    starts: Float[Array, "stretch rate input state"], ends: Float[Array, "stretch rate input state"]
-) -> Float[Array, "stretch power input state"]:
+    starts: Float[Array, "rate stretch *gain"], ends: Float[Array, "rate stretch *gain"]
+) -> Float[Array, "stretch power *gain"]:
     """Polynomials through values and their rates at both ends of stretches."""
-    low, high = _hermite(starts.shape[1])
-    return jnp.einsum("pr,sriz->spiz", low, starts) + jnp.einsum("pr,sriz->spiz", high, ends)
+    low, high = _hermite(starts.shape[0])
+    return jnp.moveaxis(jnp.tensordot(low, starts, 1) + jnp.tensordot(high, ends, 1), 0, 1)
 
 
 def from_nodes(
-    values: Float[Array, "stretch stage row column"],
-) -> Float[Array, "edge rate row column"]:
+    values: Float[Array, "stretch stage *value"],
+) -> Float[Array, "edge rate *value"]:
     """What takes values at nodes, with its first two rates, at the starts of stretches and the end.
 
     That of the last stretch, if others follow.
     """
-    starts = jnp.einsum("rj,sjab->srab", AT_ENDS[0], values)
-    return jnp.concatenate([starts, jnp.einsum("rj,jab->rab", AT_ENDS[1], values[-1])[None]])
+    starts = jnp.einsum("rj,sj...->sr...", AT_ENDS[0], values)
+    return jnp.concatenate([starts, jnp.einsum("rj,j...->r...", AT_ENDS[1], values[-1])[None]])
 
 
 def _rates(at: float, orders: int, powers: int) -> Float[np.ndarray, "order power"]:

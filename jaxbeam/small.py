@@ -3,6 +3,10 @@
 A library's factorisation would seek pivots in each of them; that takes longer, to compile as well.
 """
 
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,3 +117,97 @@ def _(count, batched, *systems):
         for part, has in zip(systems, batched, strict=True)
     ]
     return jnp.moveaxis(_eliminated(*lanes), -1, 0), True
+
+
+def times(
+    a: Float[Array, "row term _"], b: Float[Array, "term column _"]
+) -> Float[Array, "row column lane"]:
+    """Products, spelt out where few terms are added, else by a library."""
+    if a.shape[2] == 1:
+        return jnp.tensordot(a[..., 0], b, 1)
+    if b.shape[2] == 1:
+        return jnp.moveaxis(jnp.tensordot(a, b[..., 0], ((1,), (0,))), -1, 1)
+    return _times(a, b) if b.shape[0] <= FEW else jnp.einsum("ik...,kj...->ij...", a, b)
+
+
+def turned(matrix: Float[Array, "row column lane"]) -> Float[Array, "column row lane"]:
+    """The transposes."""
+    return jnp.swapaxes(matrix, 0, 1)
+
+
+def joined(*parts: Float[Array, "row _ _"]) -> Float[Array, "row column lane"]:
+    """Matrices side by side."""
+    lanes = lanes_of(parts)
+    return jnp.concatenate(
+        [jnp.broadcast_to(part, (*part.shape[:2], lanes)) for part in parts], axis=1
+    )
+
+
+def solve_lanes(
+    matrix: Float[Array, "row row _"], right: Float[Array, "row column _"]
+) -> Float[Array, "row column lane"]:
+    """As `solve_any`, with the systems as the last axis."""
+    lanes = lanes_of(matrix, right)
+    matrix, right = (jnp.broadcast_to(x, (*x.shape[:2], lanes)) for x in (matrix, right))
+    return jax.lax.custom_linear_solve(
+        lambda x: _times(matrix, x),
+        right,
+        lambda _, b: _eliminated(matrix, b),
+        lambda _, b: _eliminated(turned(matrix), b),
+    )
+
+
+def lanes_of(*args: Any) -> int:
+    """How many lanes there are."""
+    return max(part.shape[-1] for part in jax.tree.leaves(eqx.filter(args, eqx.is_array)))
+
+
+def each_lane(function: Callable, *args: Any) -> Any:
+    """What a function of arrays without lanes returns for each lane of these.
+
+    What lanes share has a last axis of length one, here and in `in_lanes`.
+    """
+    arrays, rest = eqx.partition(args, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    axes = [None if leaf.shape[-1] == 1 else -1 for leaf in leaves]
+    bare = [leaf[..., 0] if axis is None else leaf for leaf, axis in zip(leaves, axes, strict=True)]
+
+    def alone(*given):
+        return function(*eqx.combine(jax.tree.unflatten(structure, given), rest))
+
+    if set(axes) == {None}:
+        return jax.tree.map(lambda part: part[..., None], alone(*bare))
+    return jax.vmap(alone, axes, -1)(*bare)
+
+
+def in_lanes(function: Callable, *args: Any) -> Any:
+    """Call a function of trees of arrays (..., lane) with arrays that have no lanes.
+
+    Under `vmap` what is mapped is the lanes: matrices are small, so what is done for an element of
+    all of them at once are the long loops. Derivatives are those of a single lane, mapped.
+    """
+    arrays, rest = eqx.partition(args, eqx.is_array)
+
+    def laid(lanes):
+        return function(*eqx.combine(lanes, rest))
+
+    def alone(given):
+        found = laid(jax.tree.map(lambda part: part[..., None], given))
+        return jax.tree.map(lambda part: part[..., 0], found)
+
+    many = jax.custom_batching.custom_vmap(alone)
+
+    @many.def_vmap
+    def _(count, mapped, given):
+        def last(part, has):
+            return jnp.moveaxis(part, 0, -1) if has else part[..., None]
+
+        def first(part):
+            return jnp.moveaxis(jnp.broadcast_to(part, (*part.shape[:-1], count)), -1, 0)
+
+        found = jax.tree.map(first, laid(jax.tree.map(last, given, *mapped)))
+        return found, jax.tree.map(lambda _: True, found)
+
+    whole = jax.custom_jvp(lambda given: many(given))
+    whole.defjvp(lambda given, rates: jax.jvp(alone, given, rates))
+    return whole(arrays)
