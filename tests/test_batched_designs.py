@@ -1,5 +1,7 @@
 """Designs over masses, speeds and weights at once, and their slopes by what they follow from."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.control import DiscreteLQR, ScheduledLQR
+from jaxbeam.control.lqr import optimal
 from jaxbeam.controller import Measurement
 from jaxbeam.estimation import Kalman, Observer
 from jaxbeam.modes import lay_out
@@ -85,6 +88,38 @@ def test_slopes_by_loads_weights_and_plant(design):
     at = jnp.ones(SIZES.size)
     found, expected = jax.jit(jax.jacfwd(alone))(at), central(alone, at, 2e-3)
     assert_allclose(found, expected, rtol=0, atol=1e-6 * np.max(np.abs(expected)))
+
+
+ACTUATORS = {
+    "at once": (jb.PointForce(0.22), 4),
+    "lagging": (jb.Shaker(0.22, 2000.0, 5.0, force_per_volt=4.6, bandwidth=500.0), 5),
+}
+
+
+@pytest.mark.parametrize("varied", ["loads.0.mass", "controller.command_weight.0"])
+@pytest.mark.parametrize("actuator", ACTUATORS)
+def test_what_designs_share_makes_no_difference(actuator, varied):
+    """Only one number varies from design to design; slopes in reverse, too."""
+    part, states = ACTUATORS[actuator]
+    law = jb.FiniteLQR(WEIGHTS["state_weight"][:states], [1e-3], points=20)
+    case = dataclasses.replace(rig(law), actuators=[part])
+    layout, start = lay_out(case), float(jb.addresses(case)[varied])
+
+    def pieces(share):
+        changed = jb.replace(case, {varied: share * start})
+        return optimal(changed.controller, jb.state_space(changed, layout=layout))[0].pieces
+
+    def size(share):
+        return jnp.sum(pieces(share)[:, 0] ** 2)
+
+    shares, alone = np.array([0.8, 1.0, 1.3]), jax.jit(pieces)
+    expected = np.stack([alone(share) for share in shares])
+    found = jax.jit(jax.vmap(pieces))(shares)
+    assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+    slopes = jax.jit(jax.vmap(jax.grad(size)))(shares)
+    plain = jax.jit(size)
+    expected = [central(lambda x: plain(x[0]), [share], step=1e-3)[0] for share in shares]
+    assert_allclose(slopes, expected, rtol=1e-6)
 
 
 def test_in_parallel_the_gains_are_the_same():
