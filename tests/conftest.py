@@ -25,10 +25,12 @@ os.environ["XLA_FLAGS"] = " ".join(
     ]
 )
 # What one process has compiled, the other test processes, later files, and commands that tests
-# start need not compile again. Set before these are started, they all use the same folder.
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    _programs = tempfile.TemporaryDirectory(prefix="compiled", ignore_cleanup_errors=True)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs.name
+# start need not compile again: they use the same folder, set before the test processes start. It
+# is also their cache folder, as what a user compiled by `jaxbeam native` must not change a test.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    _cache = tempfile.TemporaryDirectory(prefix="compiled", ignore_cleanup_errors=True)
+    os.environ["XDG_CACHE_HOME"] = _cache.name
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _cache.name)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
