@@ -22,9 +22,7 @@ from jaxbeam.rig import couples
 from jaxbeam.schedule import sampled
 
 RUNS = 512  # in a block, at most, about: each is one call and one write
-BLOCKS = (
-    8  # at least, if they then have more runs than are tried at once: all cores have their part
-)
+BLOCKS = 8  # at least, if each then has more runs than are tried at once: for all cores
 TRIED = 256  # runs, about, at once while time steps are looked for
 PACES = 4  # at which time steps are measured, at least
 PLACE = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
@@ -171,7 +169,9 @@ class Work:
                     programs.block.ahead(*arguments)()
                     self._ready.add((substeps, single))
             results = programs.block(*arguments)
-        return {name: np.asarray(values)[places] for name, values in results.items()}
+        found = {name: np.asarray(values) for name, values in results.items()}
+        # Histories are large, and copied only where some of them were not wanted.
+        return found if wanted.all() else {name: found[name][places] for name in found}
 
     def _rigs_of(self, chosen):
         """Rigs of some tasks."""

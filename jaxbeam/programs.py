@@ -5,6 +5,8 @@ A case comes with the addresses of what varies and, task by task, its values the
 tasks that a program is given only those `wanted` are worked out; the others come out as zeros.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -130,9 +132,7 @@ def block(case, form, addresses, devices, schedule, substeps, wanted, riggings, 
             **history,
         }
 
-    def part(wanted, values):
-        return _map(task, wanted, values)
-
+    part = functools.partial(_map, task)
     if devices > 1:
         mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
         part = jax.shard_map(part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
