@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam import kept_programs
+
 # XLA's newer code generator for CPUs takes twice as long to compile the programs here, and its
 # last level of optimisation a third longer; they run no faster for the one, 3 % for the other. In
 # the 32 parts into which it would cut a program, a quarter more work is done than in two.
@@ -27,11 +29,6 @@ ROUGHLY = {"xla_backend_optimization_level": 0}
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-
-def cache_folder() -> Path:
-    """Where what is compiled is kept for later: in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxbeam"
 
 
 def options(**settings: bool | int) -> dict[str, bool | int]:
@@ -55,67 +52,104 @@ class Compiled(Generic[P, R]):
 
     def __init__(self, function: Callable[P, R], settings: dict[str, bool | int]):
         functools.update_wrapper(self, function)
-        self._settings = settings
+        self.settings = settings
 
         def program(arrays, given):
             args, kwargs = _together(arrays, *given)
             arrays, *rest = _apart(function(*args, **kwargs))  # type: ignore[call-arg]
             return arrays, _Kept(tuple(rest))
 
-        # Its name is the function's in what JAX tells of it.
-        program.__name__ = program.__qualname__ = function.__name__
         self._program = program
-        self._plain = jax.jit(program, static_argnums=1)
+        self._plain = jax.jit(_named(program, function.__name__), static_argnums=1)
 
     @functools.cached_property
-    def _quick(self):  # at the first call, because to ask for the options starts JAX's machinery
-        return jax.jit(self._program, static_argnums=1, compiler_options=options(**self._settings))
+    def quick(self):  # at the first call, because to ask for the options starts JAX's machinery
+        """The function as JAX compiles it, of arrays and constants apart."""
+        return self.called(self.__name__)
+
+    def called(self, name: str):
+        """The same, as a program of that name."""
+        chosen = options(**self.settings)
+        return jax.jit(_named(self._program, name), static_argnums=1, compiler_options=chosen)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         arrays, *rest = _apart((args, kwargs))
-        arrays, kept = (self._plain if _tracing(arrays) else self._quick)(arrays, tuple(rest))
+        if _tracing(arrays):
+            arrays, kept = self._plain(arrays, tuple(rest))
+        elif kept_programs.folder() and (state := self._state(arrays, rest)).place:
+            self._prepared(state, arrays, rest)()
+            arrays, kept = state.program(arrays)
+        else:
+            arrays, kept = self.quick(arrays, tuple(rest))
         return _together(arrays, *kept.rest)
 
     def ahead(self, *args: P.args, **kwargs: P.kwargs) -> Callable[[], Any]:
         """Trace for arguments of the structure and shapes of these; what it returns compiles.
 
         Calls then need not. Tracing holds Python's lock, compiling leaves it to others. Done once,
-        it need not be done again.
+        it need not be done again, nor if an earlier process has (`kept_programs`).
         """
         arrays, *rest = _apart((args, kwargs))
-        state = _state_of(self, _identity(arrays, rest))
+        return self._prepared(self._state(arrays, rest), arrays, rest)
+
+    def _prepared(self, state, arrays, rest):
+        """See `ahead`."""
         if state.compiled:
             return lambda: None
-        traced = self._quick.lower(arrays, tuple(rest))
+        if not state.code:
+            lowered = state.quick.lower(arrays, tuple(rest))
+            return lambda: self._compile(state, lowered)
 
-        def compile_traced():
-            traced.compile()
-            state.compiled = True
+        def restore():
+            try:
+                state.program = kept_programs.load(state.code, (arrays,), state.returns)
+                state.compiled = True
+            except jax.errors.JaxRuntimeError:
+                self._compile(state, state.quick.lower(arrays, tuple(rest)))
 
-        return compile_traced
+        return restore
+
+    def _compile(self, state, lowered):
+        program = lowered.compile()
+        if state.place is not None:
+            kept_programs.write(state.place, program, lowered.out_info)
+            state.program = program
+        state.compiled = True
 
     def blank(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """What a call would return, with zeros for its numbers: known without compiling."""
         arrays, *rest = _apart((args, kwargs))
-        state = _state_of(self, _identity(arrays, rest))
-        returns = state.returns or self._quick.eval_shape(arrays, tuple(rest))
+        state = self._state(arrays, rest)
+        returns = state.returns or state.quick.eval_shape(arrays, tuple(rest))
         state.returns = shapes, kept = returns
         zeros = [None if leaf is None else np.zeros(leaf.shape, leaf.dtype) for leaf in shapes]
         return _together(zeros, *kept.rest)
 
+    def _state(self, arrays, rest):
+        return _state_of(self, _identity(arrays, rest))
+
 
 @dataclasses.dataclass(eq=False)
 class _State:
-    """What is known of a program: whether it is compiled, and the shapes of what it returns."""
+    """What is known of a function for some arguments."""
 
+    quick: Any  # what is compiled for them
+    place: Path | None  # where the program is kept for later processes
+    code: bytes  # the program that an earlier process has kept, if there is one
+    returns: tuple[list, _Kept] | None  # shapes of what it returns
     compiled: bool = False
-    returns: tuple[list, _Kept] | None = None
+    program: Any = None  # if it is not found by calling `quick`
 
 
 @functools.cache
 def _state_of(function: Compiled, identity: tuple) -> _State:
     """What is known of a function for some arguments; JAX takes a hundred times as long to tell."""
-    return _State()
+    place = kept_programs.place(function, identity)
+    if place is None:
+        return _State(function.quick, None, b"", None)
+    # What JAX reads from its own cache cannot be kept once more: no name is used twice.
+    quick = function.called(f"{function.__name__}_{os.urandom(8).hex()}")
+    return _State(quick, place, *(kept_programs.read(place) or (b"", None)))
 
 
 def forget() -> None:
@@ -136,6 +170,13 @@ def compiled(function: Callable[P, R]) -> Compiled[P, R]:
 def compiled_with(**settings: bool | int) -> Callable[[Callable[P, R]], Compiled[P, R]]:
     """`compiled`, with some settings of XLA of its own."""
     return lambda function: Compiled(function, settings)
+
+
+def _named(program, name: str):
+    """A function under the name that it has in what JAX tells of it."""
+    program = functools.partial(program)
+    program.__name__ = program.__qualname__ = name  # type: ignore[attr-defined]
+    return program
 
 
 def _apart(tree) -> tuple[list, tuple, Any]:

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.fields import POSITIVE, choice, count, is_known, known, number

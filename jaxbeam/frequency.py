@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Complex, Float
-from scipy.linalg import eigvals
 
 from jaxbeam.case import Case
 from jaxbeam.checks import check
@@ -231,7 +231,7 @@ def poles(case: Case, parked: Parked = ()) -> Complex[np.ndarray, " state"]:
     """
     check(case)
     matrix, inertia = _matrices(_compiled_rig(case, lay_out(case)), _parked(case, parked))
-    return _sorted(eigvals(np.asarray(matrix), np.asarray(inertia)))
+    return _sorted(scipy.linalg.eigvals(np.asarray(matrix), np.asarray(inertia)))
 
 
 def zeros(case: Case, pair: tuple[str, str], parked: Parked = ()) -> Complex[np.ndarray, " zero"]:
@@ -249,9 +249,9 @@ def zeros(case: Case, pair: tuple[str, str], parked: Parked = ()) -> Complex[np.
     through = jnp.atleast_1d(direct @ command)
     still = jnp.block([[matrix, pushed[:, None]], [place, through]])
     moving = jnp.block([[inertia, jnp.zeros_like(pushed)[:, None]], [-rate, jnp.zeros(1)]])
-    found = eigvals(np.asarray(still), np.asarray(moving))
+    found = scipy.linalg.eigvals(np.asarray(still), np.asarray(moving))
     # Zeros at infinity come out as such, or as numbers far beyond anything that moves.
-    fastest = np.abs(eigvals(np.asarray(matrix))).max()
+    fastest = np.abs(scipy.linalg.eigvals(np.asarray(matrix))).max()
     return _sorted(found[np.abs(found) < 1e4 * fastest])
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
+import scipy
 
 from jaxbeam.case import Case, replace
 from jaxbeam.fields import known

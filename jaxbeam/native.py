@@ -9,12 +9,11 @@ on CPUs. Nobody needs it.
 import ctypes
 import functools
 import hashlib
+import operator
 import os
 import pathlib
-import platform
 import shutil
 import subprocess
-import sys
 import tempfile
 
 import jax
@@ -23,9 +22,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
-from jaxbeam.compiling import cache_folder
 from jaxbeam.exponentials import GAUSS, LOOKED, NODES
 from jaxbeam.extremes import NEAR, Extremes
+from jaxbeam.kept_programs import cache_folder, machine
 from jaxbeam.peaks import VERTEX_ROUNDS, reach, through
 from jaxbeam.tables import CHUNK, Path, Rigging
 
@@ -45,7 +44,7 @@ FLAGS = (
     *("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC"),
     *(f"-D{name}={value}" for name, value in CONSTANTS.items()),
 )
-TARGETS = {jnp.abs: "chunk_of_both_sides", jnp.positive: "chunk_of_one_side"}
+TARGETS = {abs: "chunk_of_both_sides", operator.pos: "chunk_of_one_side"}
 
 
 def binary() -> pathlib.Path:
@@ -133,17 +132,8 @@ def _target(name: str) -> str:
 def _mark() -> str:
     """A number for the source, the machine and JAX."""
     written = SOURCE.read_text() + HEADER.read_text()
-    marks = [written, *FLAGS, jax.__version__, sys.platform, platform.machine(), _cpu()]
+    marks = [written, *FLAGS, jax.__version__, machine()]
     return hashlib.sha256("\n".join(marks).encode()).hexdigest()[:16]
-
-
-def _cpu() -> str:
-    """What tells this processor from others, for which the same library may not run."""
-    try:
-        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return "".join(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
 
 
 def prepare(rigging: Rigging) -> tuple:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.io
+import scipy
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 

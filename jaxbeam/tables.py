@@ -6,6 +6,7 @@ what the contact law feels at the nodes, the state at the end, the watched defle
 """
 
 import dataclasses
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -73,7 +74,7 @@ class Rigging(eqx.Module):
     flexibility: Float[Array, " place"] | None
     commands: Float[Array, "mode actuator"] | None
     inner: bool = eqx.field(static=True)
-    size: Callable = eqx.field(static=True, default=jnp.abs)
+    size: Callable = eqx.field(static=True, default=abs)
 
     @property
     def places(self) -> int:
@@ -146,7 +147,7 @@ def both_sides(rigging: Rigging) -> Rigging:
         watch=twice(rigging.watch),
         watch_push=twice(rigging.watch_push),
         flexibility=jnp.tile(rigging.flexibility, 2),
-        size=jnp.positive,
+        size=operator.pos,
     )
 
 

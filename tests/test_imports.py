@@ -10,8 +10,9 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.compiling  jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.fields  jaxbeam.holds
-jaxbeam.small
+jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.fields  jaxbeam.holds
+jaxbeam.kept_programs  jaxbeam.small
+jaxbeam.compiling
 jaxbeam.faults  jaxbeam.piecewise  jaxbeam.stretches
 jaxbeam.flows
 jaxbeam.coupled

@@ -8,9 +8,8 @@ on changes and sizes makes one of the calm ones best, and the rows settle in few
 """
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # whose parts are loaded when used: all of them take a third of a second
 from jaxtyping import Float
-from scipy.optimize import linprog
 
 from jaxbeam.control.reach import Reach
 
@@ -86,7 +85,9 @@ class _Program:
         exact = {"primal_feasibility_tolerance": EXACT, "dual_feasibility_tolerance": EXACT}
         bounds = self._bounds()
         for method in METHODS:
-            best = linprog(cost, matrix, right, bounds=bounds, method=method, options=exact)
+            best = scipy.optimize.linprog(
+                cost, matrix, right, bounds=bounds, method=method, options=exact
+            )
             if best.status in (SOLVED, INFEASIBLE):
                 break
         if best.status == INFEASIBLE:
@@ -103,6 +104,7 @@ class _Program:
 
     def _matrix(self):
         """Rows for changes and sizes of the commands, then for the deflections taken in so far."""
+        sp = scipy.sparse
         holds, actuators = self.shape
         # Commands begin at zero and, for the sake of calm, end there.
         step = sp.eye(holds + 1, holds) - sp.eye(holds + 1, holds, k=-1)

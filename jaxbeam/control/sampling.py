@@ -8,7 +8,7 @@ import warnings
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
+import scipy
 
 from jaxbeam.export.gains import ARRAYS, Gains
 from jaxbeam.export.header import header

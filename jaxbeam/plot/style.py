@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from cycler import cycler
 from jaxtyping import Float
 from matplotlib import rc_context
-from scipy.optimize import isotonic_regression
 
 INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, which can be told apart with any kind of colour vision.
@@ -100,7 +100,7 @@ def spread(wanted, gap: float) -> Float[np.ndarray, " label"]:
     steps = gap * np.arange(wanted.size)
     places = np.empty_like(wanted)
     # The gaps taken away, "at least a gap apart" means "not falling": a monotone regression.
-    places[order] = isotonic_regression(wanted[order] - steps).x + steps
+    places[order] = scipy.optimize.isotonic_regression(wanted[order] - steps).x + steps
     return places
 
 
