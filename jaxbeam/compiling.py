@@ -133,23 +133,28 @@ class Compiled(Generic[P, R]):
 class _State:
     """What is known of a function for some arguments."""
 
-    quick: Any  # what is compiled for them
+    function: Compiled
     place: Path | None  # where the program is kept for later processes
     code: bytes  # the program that an earlier process has kept, if there is one
     returns: tuple[list, _Kept] | None  # shapes of what it returns
     compiled: bool = False
     program: Any = None  # if it is not found by calling `quick`
 
+    @functools.cached_property
+    def quick(self):
+        """What is compiled, with JAX's own cache or to be kept."""
+        if self.place is None:
+            return self.function.quick
+        # What JAX reads from its own cache cannot be kept once more: no name is used twice.
+        return self.function.called(f"{self.function.__name__}_{os.urandom(8).hex()}")
+
 
 @functools.cache
 def _state_of(function: Compiled, identity: tuple) -> _State:
     """What is known of a function for some arguments; JAX takes a hundred times as long to tell."""
     place = kept_programs.place(function, identity)
-    if place is None:
-        return _State(function.quick, None, b"", None)
-    # What JAX reads from its own cache cannot be kept once more: no name is used twice.
-    quick = function.called(f"{function.__name__}_{os.urandom(8).hex()}")
-    return _State(quick, place, *(kept_programs.read(place) or (b"", None)))
+    kept = None if place is None else kept_programs.read(place)
+    return _State(function, place, *(kept or (b"", None)))
 
 
 def forget() -> None:

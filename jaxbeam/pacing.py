@@ -46,9 +46,10 @@ def errors(measure: Measure, tasks, steps) -> Float[np.ndarray, " task"]:
     The largest relative change in each task. Runs that fail are left out; NaN if all do. Finer is
     one step more between events at least, or between samples of a loop: there may be few of them.
     """
-    with ThreadPoolExecutor(2) as pool:
-        coarse, fine = pool.map(measure, (tasks, tasks), (steps, steps / FINER), (0, 1))
-    return _changes(coarse, fine)
+    with ThreadPoolExecutor(1) as pool:  # the finer take longer, and go first
+        fine = pool.submit(measure, tasks, steps / FINER, 1)
+        coarse = measure(tasks, steps, 0)
+    return _changes(coarse, fine.result())
 
 
 def rounding(exact: Float[np.ndarray, "task lane sensor"], rounded: np.ndarray) -> float:
