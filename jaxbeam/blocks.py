@@ -63,9 +63,7 @@ class Work:
         parts = [[0]] if self.shared else np.resize(np.arange(count), (self.blocks, self.each))
 
         def windows():
-            given = case, self.addresses[0], tasks.heavy
-            programs.windows.ahead(*given)()
-            return np.asarray(programs.windows(*given))
+            return np.asarray(programs.windows(case, self.addresses[0], tasks.heavy))
 
         # One load takes one slot, whenever it comes: what is compiled below need not wait for that.
         slots = len(case.loads)

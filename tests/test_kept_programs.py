@@ -43,6 +43,12 @@ def roughly(x):
     return 2 * x
 
 
+@compiled
+def first_of(pair: Pair):
+    TRACED.append(pair.words)
+    return pair.first
+
+
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """A cache folder of its own; functions of this file are trusted not to change."""
@@ -195,6 +201,9 @@ def test_what_depends_on_code_of_others_is_not_kept(folder, monkeypatch):
         for _ in range(2):
             assert called(pairs, POINTS, constant)[1] == 1  # type: ignore[arg-type]
             again()
+    for _ in range(2):
+        assert called(first_of, Pair(POINTS, "a class of others"))[1] == 1
+        again()
     monkeypatch.setattr(kept_programs, "OURS", ("jaxbeam", "tuning"))
     assert called(roughly, POINTS)[1] == 1
     assert not kept(folder)
