@@ -11,7 +11,7 @@ code run: it is the user's own cache folder, never a folder of cases, logs or re
 
 import functools
 import hashlib
-import importlib
+import importlib.metadata
 import io
 import os
 import pathlib
@@ -26,8 +26,12 @@ import jax
 from jax.experimental import serialize_executable
 
 OURS = ("jaxbeam", "tuning")  # whose source is part of the mark
-VERSIONED = ("jax", "jaxlib", "equinox", "numpy", "scipy")
-SAFE = {*OURS, *VERSIONED, *sys.stdlib_module_names}
+# What a program may be made of, by us or by one of these; a test compares with what is declared.
+BENEATH = (
+    *("jax", "jaxlib", "numpy", "scipy", "jaxtyping", "equinox", "optax"),
+    *("diffrax", "optimistix", "lineax", "qpax", "blackjax"),
+)
+SAFE = {*OURS, "jax", "jaxlib", "equinox", "numpy", "scipy", *sys.stdlib_module_names}
 # Settings of JAX that change no program, or are told with each.
 ASIDE = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_enable_x64")
 
@@ -137,9 +141,10 @@ class _Pickler(pickle.Pickler):
 
         Raises _Foreign if it is code that others may change.
         """
-        if isinstance(obj, type | types.FunctionType | types.BuiltinFunctionType):
-            if str(obj.__module__).split(".")[0] not in SAFE:
-                raise _Foreign(obj)
+        named = isinstance(obj, type | types.FunctionType | types.BuiltinFunctionType)
+        if str((obj if named else type(obj)).__module__).split(".")[0] not in SAFE:
+            raise _Foreign(obj)
+        if named:
             return NotImplemented
         # Marks, such as equinox has for what is missing, stay the very same objects.
         if type(obj).__reduce__ is object.__reduce__:
@@ -163,11 +168,18 @@ def _settings() -> list[tuple[str, str]]:
     return [(name, repr(getattr(jax.config, name, None))) for name in names]
 
 
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:  # it is one of the extras
+        return ""
+
+
 @functools.cache
 def _surroundings() -> bytes:
     """A number for our source, the packages beneath it, and the machine."""
     marks = [machine(), jax.default_backend(), os.environ.get("XLA_FLAGS", ""), sys.version]
-    marks += [importlib.import_module(name).__version__ for name in VERSIONED]
+    marks += map(_version, BENEATH)
     found = hashlib.sha256("\n".join(marks).encode())
     home = pathlib.Path(__file__).parents[1]
     for path in sorted(path for package in OURS for path in (home / package).rglob("*")):

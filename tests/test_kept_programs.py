@@ -1,7 +1,9 @@
 """Programs kept for later processes: found where nothing has changed, and only there."""
 
 import dataclasses
+import importlib.metadata
 import os
+import re
 import subprocess
 import sys
 
@@ -40,6 +42,12 @@ def pairs(x, words: str, power: float = 1.0):
 @compiled_with(xla_backend_optimization_level=1)
 def roughly(x):
     TRACED.append(x.shape)
+    return 2 * x
+
+
+@compiled
+def doubled(x, about: object):
+    TRACED.append(about)
     return 2 * x
 
 
@@ -195,11 +203,34 @@ class Outsider:
     number: int = 1
 
 
+CONSTANT = Outsider(2)
+
+
+def test_versions_of_all_that_compiles_are_part_of_the_place(monkeypatch):
+    declared = {
+        re.split(r"[^\w.-]", one)[0] for one in importlib.metadata.requires("jaxbeam") or []
+    }
+    for name in declared & {one.name.lower() for one in importlib.metadata.distributions()}:
+        needs = importlib.metadata.requires(name) or []
+        if any(re.match(r"jax(lib)?\b(?!.*extra ==)", one) for one in needs):
+            assert name in kept_programs.BENEATH
+    before, version = kept_programs._surroundings(), importlib.metadata.version
+    for changed in ("diffrax", "jaxlib"):
+        kept_programs._surroundings.cache_clear()
+
+        def newer(name, changed=changed):
+            return "99" if name == changed else version(name)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(importlib.metadata, "version", newer)
+            assert kept_programs._surroundings() != before
+
+
 def test_what_depends_on_code_of_others_is_not_kept(folder, monkeypatch):
     monkeypatch.setattr(kept_programs, "SAFE", {"jaxbeam", "jax", "jaxlib", "numpy"})
-    for constant in (Outsider(), changed_flags):
+    for constant in (Outsider(), CONSTANT, changed_flags):
         for _ in range(2):
-            assert called(pairs, POINTS, constant)[1] == 1  # type: ignore[arg-type]
+            assert called(doubled, POINTS, constant)[1] == 1
             again()
     for _ in range(2):
         assert called(first_of, Pair(POINTS, "a class of others"))[1] == 1
