@@ -125,29 +125,31 @@ def propagators(rig: Rig, lengths: Float[Array, " *length"], driven: bool = Fals
 
 def _series(x, force):
     """exp(x), and phi_1 ... phi_NODES of x times the force matrix (phi, ...), for small x."""
-    identity = jnp.broadcast_to(jnp.eye(x.shape[-1]), x.shape)
-    force = jnp.broadcast_to(force, (*x.shape[:-1], force.shape[-1]))
+    side, inputs = force.shape[-2:]
+    # Side by side, as they are summed alike; only what the terms are divided by differs.
+    force = jnp.broadcast_to(force, (*x.shape[:-1], inputs))
+    both = jnp.concatenate([jnp.broadcast_to(jnp.eye(side), x.shape), force], axis=-1)
+    ahead = np.repeat([0, NODES], [side, inputs])
 
-    def horner(sums, k):
-        exponential, top = sums
-        exponential = identity + _multiply(x, exponential) / (k + 1)
-        top = force + _multiply(x, top) / (NODES + k + 1)
-        return (exponential, top), None
+    def horner(sums, divisors):
+        return both + _multiply(x, sums) / divisors, None
 
-    sums, _ = jax.lax.scan(horner, (identity, force), jnp.arange(TERMS - 1, -1, -1.0))
-    pushes = [sums[1] / math.factorial(NODES)]
+    sums, _ = jax.lax.scan(horner, both, np.arange(TERMS, 0, -1.0)[:, None] + ahead)
+    exponential, top = sums[..., :side], sums[..., side:]
+    pushes = [top / math.factorial(NODES)]
     for p in range(NODES - 1, 0, -1):
         pushes.insert(0, force / math.factorial(p) + _multiply(x, pushes[0]))
-    return sums[0], jnp.stack(pushes)
+    return exponential, jnp.stack(pushes)
 
 
 def _double(functions, _):
     """The same functions of twice the argument."""
     drift, pushes = functions
-    doubled = _multiply(drift, pushes) + jnp.tensordot(_doubling(), pushes, axes=1)
-    halves = 0.5 ** np.arange(1, NODES + 1)
-    shape = (NODES,) + (1,) * (pushes.ndim - 1)
-    return (_multiply(drift, drift), doubled * halves.reshape(shape)), None
+    # Spelt out: as a product over the first axis it would be copied to and fro.
+    weights = _doubling().T.reshape(NODES, NODES, *(1,) * (pushes.ndim - 1))
+    doubled = sum(weight * push for weight, push in zip(weights, pushes, strict=True))
+    halves = 0.5 ** np.arange(1, NODES + 1).reshape(NODES, *(1,) * (pushes.ndim - 1))
+    return (_multiply(drift, drift), (_multiply(drift, pushes) + doubled) * halves), None
 
 
 @functools.cache

@@ -23,6 +23,7 @@ from jaxbeam.dynamics import Traffic
 from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
 from jaxbeam.extremes import Extremes, fold, nothing_seen
 from jaxbeam.loads import AbstractLoad, MovingMass
+from jaxbeam.peaks import find
 from jaxbeam.rig import Rig
 from jaxbeam.tables import CHUNK, Path, Rigging, follow, tabulate
 
@@ -102,9 +103,8 @@ def _stepper(
     """Function that takes state, memory and extremes through the chunk from a given step on.
 
     It returns them with the time (s) at its end, and with what may be kept of it, which is nothing
-    if the steps are those written `by_hand`.
+    if the steps are those written `by_hand`, without a driver and in double precision.
     """
-    by_hand = by_hand and driver is None and traffic.inertia.dtype == jnp.float64
     prepared = native.prepare(rigging) if by_hand else None
 
     def chunk(state, memory, best: Any, first):
@@ -186,6 +186,7 @@ def march(
     loads may be on the beam at once. Steps written `by_hand` in C do the same sooner, if they are
     `native.ready`. Forward mode only.
     """
+    by_hand = by_hand and driver is None and traffic.inertia.dtype == jnp.float64
     chunk = _stepper(rigging, traffic, slots, driver, by_hand)
     grid, stiffness = rigging.grid, rigging.rig.stiffness()
     size = 2 * stiffness.shape[0]
@@ -211,7 +212,8 @@ def march(
         return state, memory, best, first, going
 
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
-    best = nothing_seen(rigging.places, loads, lanes, rigging.size)
+    seek = native.find if by_hand else find
+    best = nothing_seen(rigging.places, loads, lanes, rigging.size, seek)
     memory = None if driver is None else driver.start(lanes)
     start = (
         jnp.zeros((rigging.rig.states, lanes)),

@@ -9,12 +9,16 @@ on CPUs. Nobody needs it.
 import ctypes
 import functools
 import hashlib
+import itertools
+import math
 import operator
 import os
 import pathlib
 import shutil
 import subprocess
+import sys
 import tempfile
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -25,11 +29,11 @@ from jaxbeam.case import Case
 from jaxbeam.exponentials import GAUSS, LOOKED, NODES
 from jaxbeam.extremes import NEAR, Extremes
 from jaxbeam.kept_programs import cache_folder, machine
-from jaxbeam.peaks import VERTEX_ROUNDS, reach, through
+from jaxbeam.peaks import CLIMBS, ROUNDINGS, STARTS, VERTEX_ROUNDS, reach, through
 from jaxbeam.tables import CHUNK, Path, Rigging
 
 SOURCE = pathlib.Path(__file__).with_suffix(".c")
-HEADER = SOURCE.with_name("native_lanes.h")
+HEADERS = [SOURCE.with_name(f"native_{name}.h") for name in ("lanes", "peaks", "tables")]
 FILL = 8  # numbers that fill whole vector registers of any machine
 CONSTANTS = {
     "FILL": FILL,
@@ -39,12 +43,17 @@ CONSTANTS = {
     "NEAR": NEAR,
     "REACH": reach(LOOKED),
     "ROUNDS": VERTEX_ROUNDS,
+    "STARTS": STARTS,
+    "CLIMBS": CLIMBS,
+    "SLACK": ROUNDINGS * sys.float_info.epsilon,
 }
 FLAGS = (
     *("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC"),
     *(f"-D{name}={value}" for name, value in CONSTANTS.items()),
 )
-TARGETS = {abs: "chunk_of_both_sides", operator.pos: "chunk_of_one_side"}
+# Deflections that count, by what makes them large.
+SIDES = {abs: "both_sides", operator.pos: "one_side"}
+PARTS = ("chunk", "places")  # of the work that are done in C
 
 
 def binary() -> pathlib.Path:
@@ -98,7 +107,7 @@ def serves(case: Case) -> bool:
 
 def ready() -> bool:
     """Whether the C is compiled for this machine, and of use: computing on a CPU."""
-    return jax.default_backend() == "cpu" and _sound(binary()) and _registered()
+    return jax.default_backend() == "cpu" and _sound(binary()) and bool(_library())
 
 
 def _sound(path: pathlib.Path) -> bool:
@@ -110,12 +119,14 @@ def _sound(path: pathlib.Path) -> bool:
 
 
 @functools.cache
-def _registered() -> bool:
-    """Load the library and tell XLA of it, which takes each name once in a process."""
+def _library() -> ctypes.CDLL:
+    """The library, of which XLA is told; it takes each name once in a process."""
     loaded = ctypes.CDLL(str(binary()))
-    for name in TARGETS.values():
-        jax.ffi.register_ffi_target(_target(name), jax.ffi.pycapsule(getattr(loaded, name)))
-    return True
+    loaded.chunk_room.restype = ctypes.c_int64
+    for part, size in itertools.product(PARTS, SIDES):
+        function = getattr(loaded, f"{part}_of_{SIDES[size]}")
+        jax.ffi.register_ffi_target(_target(part, size), jax.ffi.pycapsule(function))
+    return loaded
 
 
 def _digest(path: pathlib.Path) -> pathlib.Path:
@@ -123,16 +134,16 @@ def _digest(path: pathlib.Path) -> pathlib.Path:
     return path.with_suffix(".sha256")
 
 
-def _target(name: str) -> str:
+def _target(part: str, size: Callable) -> str:
     """The name under which XLA knows a function of the library."""
-    return f"jaxbeam_{name}_{_mark()}"
+    return f"jaxbeam_{part}_of_{SIDES[size]}_{_mark()}"
 
 
 @functools.cache
 def _mark() -> str:
     """A number for the source, the machine and JAX."""
-    written = SOURCE.read_text() + HEADER.read_text()
-    marks = [written, *FLAGS, jax.__version__, machine()]
+    written = [path.read_text() for path in (SOURCE, *HEADERS)]
+    marks = [*written, *FLAGS, jax.__version__, machine()]
     return hashlib.sha256("\n".join(marks).encode()).hexdigest()[:16]
 
 
@@ -142,9 +153,9 @@ def prepare(rigging: Rigging) -> tuple:
     return (
         _last(step.drift_nodes, 1),
         _last(step.push_nodes, 2),
-        step.drift_end,
+        step.drift_end.swapaxes(-1, -2),
         _last(step.push_end, 1),
-        rigging.watch,
+        jnp.moveaxis(rigging.watch, 1, -1),
         _last(rigging.watch_push, 1),
     )
 
@@ -173,13 +184,28 @@ def chunk(
     shape, rows = _last(path.shape, 2), _last(path.rows, 2)
     given = (
         *(*prepared, path.kind, path.start, path.span, path.slots, path.active, shape, rows),
-        *(inertia, weight, np.asarray(GAUSS), through(LOOKED)[: len(LOOKED)], np.asarray(LOOKED)),
+        *(inertia, weight, np.asarray(GAUSS), through(LOOKED)[: len(LOOKED)].T, np.asarray(LOOKED)),
     )
+    room = _library().chunk_room(state.shape[0], path.slots.shape[1], best.score.shape[0])
     call = jax.ffi.ffi_call(
-        _target(TARGETS[best.size]),
-        [jax.ShapeDtypeStruct(part.shape, part.dtype) for part in changed],
+        _target("chunk", best.size),
+        [jax.ShapeDtypeStruct(part.shape, part.dtype) for part in (*changed, np.empty(room))],
         vmap_method="sequential",
         input_output_aliases={len(given) + i: i for i in range(len(changed))},
     )
-    state, *leaves = call(*given, *changed)
+    state, *leaves, _ = call(*given, *changed)
     return state, jax.tree.unflatten(jax.tree.structure(best), leaves)
+
+
+@jax.named_scope("native")
+def find(
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], size: Callable
+) -> Float[Array, " *rest"]:
+    """What `peaks.find` finds, of samples at the points of a step that are looked at."""
+    rest = samples.shape[1:]
+    call = jax.ffi.ffi_call(
+        _target("places", size),
+        jax.ShapeDtypeStruct((math.prod(rest),), samples.dtype),
+        vmap_method="sequential",
+    )
+    return call(samples.reshape(len(points), -1), through(points)[: len(points)].T).reshape(rest)

@@ -2,6 +2,8 @@
 
    NODES, the size of most systems of equations, comes from the command line. */
 
+#pragma once
+
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
@@ -56,44 +58,41 @@ static inline void store(double *to, Lanes lanes, int many) {
     else memcpy(to, &lanes, 8 * (size_t)many);
 }
 
-/* sums += rows @ values, rows `down` numbers apart and their entries `along`; four rows at a time
-   keep the adders busy. */
-static inline ALWAYS void product(Lanes *sums, const double *rows, int count, int down, int along,
-                                  const Lanes *values, int size) {
+/* sums += table @ values for so many rows, which lie side by side in the table, `apart` numbers from
+   those for the next value. Eight sums at a time keep the adders busy. */
+static inline ALWAYS void add_rows(Lanes *sums, const double *table, int apart, const Lanes *values,
+                                   int size, int rows) {
+    Lanes sum[8];
+    for (int r = 0; r < rows; r++) sum[r] = sums[r];
+    for (int k = 0; k < size; k++, table += apart)
+        for (int r = 0; r < rows; r++) sum[r] += table[r] * values[k];
+    for (int r = 0; r < rows; r++) sums[r] = sum[r];
+}
+
+static inline ALWAYS void add_product(Lanes *sums, const double *table, int rows, const Lanes *values,
+                                      int size) {
     int r = 0;
-    for (; r + 4 <= count; r += 4) {
-        const double *row = rows + (ptrdiff_t)r * down;
-        Lanes a = sums[r], b = sums[r + 1], c = sums[r + 2], d = sums[r + 3];
-        for (int k = 0; k < size; k++, row += along) {
-            a += row[0] * values[k];
-            b += row[down] * values[k];
-            c += row[2 * down] * values[k];
-            d += row[3 * down] * values[k];
-        }
-        sums[r] = a, sums[r + 1] = b, sums[r + 2] = c, sums[r + 3] = d;
-    }
-    for (; r < count; r++)
-        for (int k = 0; k < size; k++)
-            sums[r] += rows[(ptrdiff_t)r * down + (ptrdiff_t)k * along] * values[k];
+    for (; r + 8 <= rows; r += 8) add_rows(sums + r, table + r, rows, values, size, 8);
+    if (r + 6 <= rows) add_rows(sums + r, table + r, rows, values, size, 6), r += 6;
+    if (r + 4 <= rows) add_rows(sums + r, table + r, rows, values, size, 4), r += 4;
+    if (r + 2 <= rows) add_rows(sums + r, table + r, rows, values, size, 2), r += 2;
+    if (r < rows) add_rows(sums + r, table + r, rows, values, size, 1);
 }
 
-static void add_product(Lanes *sums, const double *rows, int count, const Lanes *values, int size) {
-    product(sums, rows, count, size, 1, values, size);
-}
-
-/* Forces of (1 + m_i G_ij) r_j = -d_i, eliminated in place without pivots; see dynamics.py. */
+/* Forces of (1 + m_i G_ij) r_j = -d_i, eliminated in place without pivots, row by row; see
+   dynamics.py. */
 static inline ALWAYS void eliminate(Lanes *matrix, Lanes *right, int size) {
 #pragma GCC unroll 8
     for (int i = 0; i < size; i++) {
-        Lanes inverse = 1 / matrix[i * size + i];
-        matrix[i * size + i] = inverse;
+        Lanes *row = matrix + i * size;
 #pragma GCC unroll 8
-        for (int k = i + 1; k < size; k++) {
-            Lanes factor = matrix[k * size + i] * inverse;
+        for (int k = 0; k < i; k++) {
+            Lanes factor = row[k] * matrix[k * size + k]; /* the pivots are inverses by now */
 #pragma GCC unroll 8
-            for (int j = i + 1; j < size; j++) matrix[k * size + j] -= factor * matrix[i * size + j];
-            right[k] -= factor * right[i];
+            for (int j = k + 1; j < size; j++) row[j] -= factor * matrix[k * size + j];
+            right[i] -= factor * right[k];
         }
+        row[i] = 1 / row[i];
     }
 #pragma GCC unroll 8
     for (int j = size - 1; j >= 0; j--) {
@@ -101,16 +100,4 @@ static inline ALWAYS void eliminate(Lanes *matrix, Lanes *right, int size) {
 #pragma GCC unroll 8
         for (int i = 0; i < j; i++) right[i] -= matrix[i * size + j] * right[j];
     }
-}
-
-static void solve(Lanes *matrix, Lanes *right, int size) {
-    if (size != NODES) {
-        eliminate(matrix, right, size);
-        return;
-    }
-    Lanes own[NODES * NODES], forces[NODES]; /* one load: in registers */
-    memcpy(own, matrix, sizeof own);
-    memcpy(forces, right, sizeof forces);
-    eliminate(own, forces, NODES);
-    memcpy(right, forces, sizeof forces);
 }

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 VERTEX_ROUNDS = 2  # of Newton's method for a close estimate
 ROUNDINGS = 8  # by which equal numbers may differ
 STARTS = 17  # places from which a peak is sought: closer than the extrema of the curve can be
+CLIMBS = 3  # rounds of Newton's method from each, and once more from the best
 
 
 class Curve(NamedTuple):
@@ -94,27 +95,36 @@ def vertex(
 
 
 @jax.named_scope("peaks")
-def refine(
+def find(
     samples: Float[Array, "point *rest"], points: tuple[float, ...], size: Callable = jnp.abs
-) -> tuple[Float[Array, " *rest"], ...]:
-    """Largest size of a value of the polynomial through the samples, and where in [0, 1] it is.
-
-    `points` are where in [0, 1] the samples are, in order and with both ends. The derivative is
-    that at the fixed place of the peak, which is exact where the peak is a maximum inside the curve
-    and where it is at an end that stays.
-    """
+) -> Float[Array, " *rest"]:
+    """Where in [-1, 1] the polynomial through the samples has the largest size of a value."""
     curve = _curve(samples, points)
-    frozen = jax.lax.stop_gradient(curve)
     # From everywhere, as peaks may tie; at an end Newton's method may run away to a lower place.
     starts = np.linspace(-1.0, 1.0, STARTS).reshape(-1, *(1,) * (samples.ndim - 1))
     starts = jnp.broadcast_to(starts.astype(samples.dtype), (STARTS, *samples.shape[1:]))
-    places = jnp.concatenate([starts, _climb(frozen, starts, 2 / STARTS, rounds=3)])
-    _, top = highest(size(_value(frozen.value, places)))
+    places = jnp.concatenate([starts, _climb(curve, starts, 2 / STARTS, CLIMBS)])
+    _, top = highest(size(_value(curve.value, places)))
     place = jnp.max(jnp.where(top, places, -1.0), axis=0)
     # The height is right by now to nearly rounding, the place to the root of that: further rounds
     # mend this, unless the peak is at an end and there is nothing flat nearby.
-    flat = _climb(frozen, place, 2 / STARTS, rounds=3)
-    _, ahead = highest(size(_value(frozen.value, jnp.stack([flat, place]))))
-    place = jnp.where(ahead[0], flat, place)
+    flat = _climb(curve, place, 2 / STARTS, CLIMBS)
+    _, ahead = highest(size(_value(curve.value, jnp.stack([flat, place]))))
+    return jnp.where(ahead[0], flat, place)
+
+
+def refine(
+    samples: Float[Array, "point *rest"],
+    points: tuple[float, ...],
+    size: Callable = jnp.abs,
+    find: Callable = find,
+) -> tuple[Float[Array, " *rest"], ...]:
+    """Largest size of a value of the polynomial through the samples, and where in [0, 1] it is.
+
+    `points` are where in [0, 1] the samples are, in order and with both ends; `find` looks for the
+    place. The derivative is that at the fixed place of the peak, which is exact where the peak is a
+    maximum inside the curve and where it is at an end that stays.
+    """
+    place = find(jax.lax.stop_gradient(samples), points, size)
     place = jax.lax.optimization_barrier(jax.lax.stop_gradient(place))
-    return size(_value(curve.value, place)), (place + 1) / 2
+    return size(_value(_curve(samples, points).value, place)), (place + 1) / 2

@@ -83,7 +83,9 @@ def riggings(case, addresses, schedule, substeps, wanted, rigs, heavy, pace):
     def task(values):
         return _prepare(case, addresses, schedule, substeps, *values)
 
-    return _map(task, wanted, (rigs, heavy, pace))
+    given = rigs, heavy, pace
+    # Modes that nothing couples take so little that calling the kernels is what costs.
+    return jax.vmap(task)(given) if rigs.modes_per_block == 1 else _map(task, wanted, given)
 
 
 @compiled

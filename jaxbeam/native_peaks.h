@@ -1,0 +1,107 @@
+/* Peaks of the curve through the samples of a step, for lanes side by side: what peaks.py does.
+
+   The command line tells POINTS (looked at in a step, both ends among them), ROUNDS and REACH (of Newton's
+   method in peaks.vertex), STARTS and CLIMBS (in peaks.find), SLACK (of numbers that are equal). */
+
+#pragma once
+
+#include <math.h>
+
+#include "native_lanes.h"
+
+static inline Lanes value(const Lanes *coefficients, int terms, Lanes place) {
+    Lanes sum = coefficients[terms - 1];
+    for (int i = terms - 2; i >= 0; i--) sum = coefficients[i] + place * sum;
+    return sum;
+}
+
+static inline Lanes size_of(Lanes deflection, int both) {
+    return both ? absolute(deflection) : deflection;
+}
+
+/* A polynomial in 2 c - 1 and its derivatives: coefficients, lowest power first. */
+typedef struct {
+    Lanes value[POINTS], slope[POINTS - 1], bend[POINTS - 2];
+} Curve;
+
+static inline Curve curve_through(const Lanes *samples, const double *through) {
+    Curve curve = {0};
+    add_product(curve.value, through, POINTS, samples, POINTS);
+    for (int i = 1; i < POINTS; i++) curve.slope[i - 1] = i * curve.value[i];
+    for (int i = 1; i < POINTS - 1; i++) curve.bend[i - 1] = i * curve.slope[i];
+    return curve;
+}
+
+/* The size of a curve at a place. */
+static inline Lanes size_at(const Curve *curve, Lanes place, int both) {
+    return size_of(value(curve->value, POINTS, place), both);
+}
+
+/* Where the curve is flat near a place, by rounds of Newton's method within reach. */
+static inline Lanes climb(const Curve *curve, Lanes place, double within, int rounds) {
+    Lanes reach = all(within);
+    for (int r = 0; r < rounds; r++) {
+        Lanes steep = value(curve->bend, POINTS - 2, place);
+        Mask flat = steep == 0;
+        Lanes step = value(curve->slope, POINTS - 1, place) / either(flat, all(1), steep);
+        step = either(flat, all(0), less(greater(step, -reach), reach));
+        place = less(greater(place - step, all(-1)), all(1));
+    }
+    return place;
+}
+
+/* Largest size of a value of the curve through samples, as peaks.vertex has it. */
+static inline Lanes vertex(const Lanes *samples, const double *through, const double *points,
+                           int both) {
+    Lanes highest = size_of(samples[0], both), place = all(-1);
+    for (int p = 1; p < POINTS; p++) {
+        Lanes size = size_of(samples[p], both);
+        Mask higher = size > highest;
+        highest = either(higher, size, highest);
+        place = either(higher, all(2 * points[p] - 1), place);
+    }
+    Curve curve = curve_through(samples, through);
+    return greater(size_at(&curve, climb(&curve, place, REACH, ROUNDS), both), highest);
+}
+
+/* What is not below the largest, but for rounding. */
+static inline Mask as_large(Lanes size, Lanes largest) {
+    return size >= largest - SLACK * absolute(largest);
+}
+
+/* Where the curve through samples is largest, as peaks.find has it. */
+static inline Lanes find(const Lanes *samples, const double *through, int both) {
+    enum { PLACES = 2 * STARTS };
+    Curve curve = curve_through(samples, through);
+    Lanes places[PLACES], sizes[PLACES], largest = all(-INFINITY), place = all(-1);
+    for (int k = 0; k < STARTS; k++) {
+        places[k] = all(2.0 * k / (STARTS - 1) - 1);
+        places[STARTS + k] = climb(&curve, places[k], 2.0 / STARTS, CLIMBS);
+    }
+    for (int k = 0; k < PLACES; k++) {
+        sizes[k] = size_at(&curve, places[k], both);
+        largest = greater(sizes[k], largest);
+    }
+    for (int k = 0; k < PLACES; k++)
+        place = either(as_large(sizes[k], largest), greater(places[k], place), place);
+    Lanes flat = climb(&curve, place, 2.0 / STARTS, CLIMBS);
+    Lanes found = size_at(&curve, flat, both), before = size_at(&curve, place, both);
+    return either(as_large(found, greater(found, before)), flat, place);
+}
+
+/* Whether the curve through samples leaves every one of them below it: the largest is none of the ends,
+   or the curve rises from there into the step. */
+static inline Mask rises_within(const Lanes *samples, const double *ends, Lanes highest, int both) {
+    Lanes first = samples[0], last = samples[POINTS - 1], from_first = {0}, into_last = {0};
+    for (int p = 0; p < POINTS; p++) {
+        from_first += ends[p] * samples[p];
+        into_last += ends[POINTS + p] * samples[p];
+    }
+    if (both) { /* away from rest, whatever side that is */
+        from_first = either(first < 0, -from_first, from_first);
+        into_last = either(last < 0, -into_last, into_last);
+    }
+    Mask within = (size_of(first, both) < highest) | (from_first > 0);
+    return within & ((size_of(last, both) < highest) | (into_last < 0));
+}
+
