@@ -70,6 +70,8 @@ class Work:
         if slots > 1:
             slots = max(most_at_once(window) for window in windows())
         self.form = Form(layout, couples(case), slots, native.serves(case))
+        # Beside steps in C, calling one more program would be what costs.
+        self.apart = case.controller is None and (single or not self.form.by_hand)
         design = case, self.form, self.addresses[0]
         # What takes longest to compile goes first; meanwhile the others are made ready for it.
         with ThreadPoolExecutor(2) as pool:
@@ -145,9 +147,9 @@ class Work:
         pace = np.ones(self.each), first
         wanted, alike = first > 0, jax.tree.map(lambda leaf: leaf[first], alike)
         given = self._rigging(first, wanted, pace, None, alike)
-        riggings = None if given is None else programs.riggings.blank(*given)
-        yield programs.block, self._block(first, wanted, pace, None, riggings)
-        if given is not None:
+        rigs = programs.riggings.blank(*given) if self.apart else self._bare(alike)
+        yield programs.block, self._block(first, wanted, pace, None, rigs)
+        if self.apart:
             yield programs.riggings, given
         yield programs.rigs, design
 
@@ -159,9 +161,10 @@ class Work:
         among = np.cumsum(wanted) - 1
         chosen, steps = chosen[among], steps[among]
         pace = steps, np.full(chosen.size, more)
-        given = self._rigging(chosen, wanted, pace, substeps, self._rigs_of(chosen))
-        riggings = None if given is None else programs.riggings(*given)
-        arguments = self._block(chosen, wanted, pace, substeps, riggings)
+        rigs = self._rigs_of(chosen)
+        given = self._rigging(chosen, wanted, pace, substeps, rigs)
+        rigs = programs.riggings(*given) if self.apart else self._bare(rigs)
+        arguments = self._block(chosen, wanted, pace, substeps, rigs)
         arguments = jax.tree.map(_shortened, arguments) if single else arguments
         with jax.enable_x64(False) if single else contextlib.nullcontext():
             with self._compiling:  # others wait for the first, instead of compiling the same again
@@ -177,18 +180,20 @@ class Work:
         """Rigs of some tasks."""
         return self.rigs if self.shared else jax.tree.map(lambda leaf: leaf[chosen], self.rigs)
 
+    def _bare(self, rigs):
+        """Rigs that `programs.block` takes; none with a controller, which has one of its own."""
+        return rigs if self.case.controller is None else None
+
     def _rigging(self, chosen, wanted, pace, substeps, rigs):
-        """Arguments of `programs.riggings`; None with a controller, which has a rig of its own."""
-        if self.case.controller is not None:
-            return None
+        """Arguments of `programs.riggings`."""
         heavy, names = self.tasks.heavy[chosen], self.addresses[0]
         return self.case, names, *self._clock(substeps), wanted, rigs, heavy, pace
 
-    def _block(self, chosen, wanted, pace, substeps, riggings):
+    def _block(self, chosen, wanted, pace, substeps, rigs):
         """Arguments of `programs.block`."""
         tasks = self.tasks.heavy[chosen], self.tasks.light[chosen], pace
         settings = self.case, self.form, self.addresses, self.devices, *self._clock(substeps)
-        return *settings, wanted, riggings, *tasks
+        return *settings, wanted, rigs, *tasks
 
     def _clock(self, substeps):
         scheduled = substeps is not None or self.case.controller is not None

@@ -63,10 +63,10 @@ def at_ends() -> np.ndarray:
 
 
 def _multiply(a, b):
-    """Matrix product over the last two axes; spelt out for the tiny blocks of single modes."""
-    if a.shape[-1] > 3:
-        return a @ b
-    return sum(a[..., :, i, None] * b[..., None, i, :] for i in range(a.shape[-1]))
+    """Product of matrices (row, column, ...), many at once; spelt out for those of single modes."""
+    if a.shape[1] > 3:
+        return jnp.einsum("ij...,jk...->ik...", a, b)
+    return sum(a[:, i, None] * b[None, i] for i in range(a.shape[1]))
 
 
 def norm(rig: Rig) -> Float[Array, ""]:
@@ -93,63 +93,65 @@ def propagators(rig: Rig, lengths: Float[Array, " *length"], driven: bool = Fals
     Inputs are the forces on the modes, and after them, if the rig is `driven`, the commands.
     """
     balance = _balance(rig)
-    side, each = rig.state_matrix.shape[1], rig.modes_per_block
+    blocks, side, _ = rig.state_matrix.shape
+    each = rig.modes_per_block
     matrix = rig.state_matrix * balance[:, :, None] / balance[:, None, :]
     force = jnp.eye(side)[:, 1 : 2 * each : 2]
     if driven:
         force = jnp.concatenate([force, rig.command_matrix], axis=1)
     fractions = np.append(GAUSS, 1.0)
     spans = lengths[..., None] * fractions
-    x = matrix * spans[..., None, None, None] / 2**DOUBLINGS
+    # Blocks and spans are the last axes, along which processors compute many at a time.
+    x = jnp.moveaxis(matrix, 0, -1)[..., None] * spans.ravel() / 2**DOUBLINGS
     drift, pushes = _series(x, force)
     (drift, pushes), _ = jax.lax.scan(_double, (drift, pushes), length=DOUBLINGS)
+    pushes = pushes * spans.ravel()
+    drift, pushes = (part.reshape(*part.shape[:-1], *spans.shape) for part in (drift, pushes))
     powers = np.arange(NODES)
     weights = _lagrange() * np.array([math.factorial(p) for p in powers])  # force, power
     weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
-    push = jnp.einsum("cfp,p...cbsm->...cfbsm", weights, pushes)
+    push = jnp.einsum("cfp,psmb...c->...cfbsm", weights, pushes)
+    drift = jnp.einsum("stb...c->...cbst", drift)
     # Inputs act on speeds and actuators' own states, which the balance leaves as they are.
-    push = push * spans[..., None, None, None, None] / balance[:, :, None]
+    push = push / balance[:, :, None]
     drift = drift * balance[:, None, :] / balance[:, :, None]
-    first = jnp.moveaxis(drift, -4, 0), jnp.moveaxis(push, -5, 0)  # fractions first
-
-    def back(part, axis):
-        return jnp.moveaxis(part, 0, axis)
-
     return Step(
-        drift_nodes=back(first[0][:NODES], -4),
-        push_nodes=back(first[1][:NODES], -5),
-        drift_end=first[0][-1],
-        push_end=first[1][-1],
+        drift_nodes=drift[..., :NODES, :, :, :],
+        push_nodes=push[..., :NODES, :, :, :, :],
+        drift_end=drift[..., NODES, :, :, :],
+        push_end=push[..., NODES, :, :, :, :],
     )
 
 
 def _series(x, force):
     """exp(x), and phi_1 ... phi_NODES of x times the force matrix (phi, ...), for small x."""
-    side, inputs = force.shape[-2:]
+    side, inputs = force.shape
+    rest = x.shape[2:]
     # Side by side, as they are summed alike; only what the terms are divided by differs.
-    force = jnp.broadcast_to(force, (*x.shape[:-1], inputs))
-    both = jnp.concatenate([jnp.broadcast_to(jnp.eye(side), x.shape), force], axis=-1)
-    ahead = np.repeat([0, NODES], [side, inputs])
+    both = jnp.concatenate([jnp.eye(side), force], axis=1).reshape(side, -1, *(1,) * len(rest))
+    both = jnp.broadcast_to(both, (side, side + inputs, *rest))
+    ahead = np.repeat([0, NODES], [side, inputs]).reshape(-1, *(1,) * len(rest))
 
-    def horner(sums, divisors):
-        return both + _multiply(x, sums) / divisors, None
+    def horner(sums, term):
+        return both + _multiply(x, sums) / (term + ahead), None
 
-    sums, _ = jax.lax.scan(horner, both, np.arange(TERMS, 0, -1.0)[:, None] + ahead)
-    exponential, top = sums[..., :side], sums[..., side:]
+    sums, _ = jax.lax.scan(horner, both, np.arange(TERMS, 0, -1.0))
+    drift, top, force = sums[:, :side], sums[:, side:], both[:, side:]
     pushes = [top / math.factorial(NODES)]
     for p in range(NODES - 1, 0, -1):
         pushes.insert(0, force / math.factorial(p) + _multiply(x, pushes[0]))
-    return exponential, jnp.stack(pushes)
+    return drift, jnp.stack(pushes)
 
 
 def _double(functions, _):
     """The same functions of twice the argument."""
     drift, pushes = functions
+    ahead = jax.vmap(functools.partial(_multiply, drift))(pushes)
     # Spelt out: as a product over the first axis it would be copied to and fro.
-    weights = _doubling().T.reshape(NODES, NODES, *(1,) * (pushes.ndim - 1))
-    doubled = sum(weight * push for weight, push in zip(weights, pushes, strict=True))
-    halves = 0.5 ** np.arange(1, NODES + 1).reshape(NODES, *(1,) * (pushes.ndim - 1))
-    return (_multiply(drift, drift), (_multiply(drift, pushes) + doubled) * halves), None
+    weights = _doubling().T.reshape(NODES, NODES, *(1,) * drift.ndim)
+    doubled = ahead + sum(weight * push for weight, push in zip(weights, pushes, strict=True))
+    halves = 0.5 ** np.arange(1, NODES + 1).reshape(NODES, *(1,) * drift.ndim)
+    return (_multiply(drift, drift), doubled * halves), None
 
 
 @functools.cache

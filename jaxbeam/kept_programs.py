@@ -115,7 +115,8 @@ def read(path: pathlib.Path) -> tuple[bytes, Any] | None:
 
 def load(code: bytes, given: Any, returns: Any) -> jax.stages.Compiled:
     """The program, for arguments and results of the structure of these."""
-    _lapack()
+    if b"lapack" in code:  # only then, as it takes as long as loading all the rest
+        _lapack()
     trees = jax.tree.structure((given, {})), jax.tree.structure(returns)
     return serialize_executable.deserialize_and_load(code, *trees)
 

@@ -11,11 +11,11 @@
 
 enum { TURNS = 2 }; /* groups at once */
 
-/* What the lanes of a group go through; `forces` follow the state in memory. */
+/* What the lanes of a group go through. The contact forces of a step follow its state in memory. */
 typedef struct {
     ptrdiff_t first;
     int many;
-    Lanes *state, *forces, *after, *matrix;
+    Lanes *state, *after, *matrix;
     Lanes *samples;        /* (step, point, place) */
     Lanes *high, *largest; /* (step, place): the largest of these samples, and the largest by size */
 } Group;
@@ -23,7 +23,7 @@ typedef struct {
 /* In Lanes. */
 static size_t room_of(const Work *w) {
     int rows = w->rows, sights = w->looked + 2 * w->places;
-    return (size_t)(2 * w->states + rows + rows * rows + STEPS * sights);
+    return (size_t)(2 * (w->states + rows) + rows * rows + STEPS * sights);
 }
 
 /* How many numbers a call works on beside its arguments: their memory is XLA's, a result that nobody
@@ -37,7 +37,7 @@ int64_t chunk_room(int states, int slots, int places) {
 static void press(const Work *w, int t, const Group *g) {
     for (int s = 0; s < w->slots; s++) {
         if (!w->active[t * w->slots + s]) continue;
-        const Lanes *forces = g->forces + s * NODES;
+        const Lanes *forces = g->state + w->states + s * NODES;
         ptrdiff_t at = w->slot[t * w->slots + s] * w->lanes + g->first;
         double *lowest = w->out[LOWEST - STATE] + at, *lost = w->out[LOST - STATE] + at;
         Lanes pull = forces[0];
@@ -79,9 +79,9 @@ static void collocate(const Work *w, int t, const Step *step, const Group *g) {
     if (w->slots == 1) { /* in registers */
         Lanes matrix[NODES * NODES], forces[NODES];
         meet(w, t, step, g, 1, matrix, forces);
-        memcpy(g->forces, forces, sizeof forces);
+        memcpy(g->state + w->states, forces, sizeof forces);
     } else {
-        meet(w, t, step, g, w->slots, g->matrix, g->forces);
+        meet(w, t, step, g, w->slots, g->matrix, g->state + w->states);
     }
 }
 
@@ -89,8 +89,7 @@ static void collocate(const Work *w, int t, const Step *step, const Group *g) {
 static void watch(const Work *w, int t, const Step *step, const Group *g, int both) {
     Lanes *seen = g->samples + t * w->looked;
     memset(seen, 0, (size_t)w->looked * sizeof *seen);
-    add_product(seen, step->watch, w->looked, g->state, w->states);
-    if (step->pressed) add_product(seen, step->seen, w->looked, g->forces, w->rows);
+    add_product(seen, step->seen, w->looked, g->state, w->states + (step->pressed ? w->rows : 0));
     for (int place = 0; place < w->places; place++) {
         Lanes high = {0}, largest = {0};
         for (int i = place; i < w->looked; i += w->places) {
@@ -103,10 +102,9 @@ static void watch(const Work *w, int t, const Step *step, const Group *g, int bo
 }
 
 /* The state at the end of a step; without forces, modes that are not coupled are two states each. */
-static void move(const Work *w, const Step *step, const Group *g) {
+static void move(const Work *w, const Step *step, Group *g) {
     const double *drift = step->drift;
-    const Lanes *state = g->state;
-    Lanes *after = g->after;
+    Lanes *state = g->state, *after = g->after;
     if (w->side == 2) {
         for (int i = 0; i < w->states; i += 2, drift += 4) {
             after[i] = drift[0] * state[i] + drift[2] * state[i + 1];
@@ -117,8 +115,8 @@ static void move(const Work *w, const Step *step, const Group *g) {
         for (int i = 0; i < w->states; i += w->side, drift += w->side * w->side)
             add_product(after + i, drift, w->side, state + i, w->side);
     }
-    if (step->pressed) add_product(after, step->push, w->states, g->forces, w->rows);
-    memcpy(g->state, after, (size_t)w->states * sizeof *after);
+    if (step->pressed) add_product(after, step->push, w->states, state + w->states, w->rows);
+    g->state = after, g->after = state;
 }
 
 /* The peaks so far, from the samples of all steps. */
@@ -160,9 +158,8 @@ static void raise(const Work *w, const Step *steps, const Group *g, int place, i
 
 /* All steps of the chunk for a few groups of lanes, in turns: while one waits for its divisions, others
    have work. */
-static inline ALWAYS void take(const Work *w, const Step *steps, const Group *groups, int count,
-                               int both) {
-    const Group *end = groups + count;
+static inline ALWAYS void take(const Work *w, const Step *steps, Group *groups, int count, int both) {
+    Group *end = groups + count;
     for (const Group *g = groups; g < end; g++)
         for (int i = 0; i < w->states; i++)
             g->state[i] = load(w->in[STATE] + i * w->lanes + g->first, g->many);
@@ -174,7 +171,7 @@ static inline ALWAYS void take(const Work *w, const Step *steps, const Group *gr
             for (const Group *g = groups; g < end; g++) press(w, t, g);
         }
         for (const Group *g = groups; g < end; g++) watch(w, t, step, g, both);
-        for (const Group *g = groups; g < end; g++) move(w, step, g);
+        for (Group *g = groups; g < end; g++) move(w, step, g);
     }
     for (const Group *g = groups; g < end; g++) {
         for (int place = 0; place < w->places; place++) raise(w, steps, g, place, both);
@@ -247,8 +244,8 @@ static inline ALWAYS XLA_FFI_Error *run(XLA_FFI_CallFrame *frame, int both) {
     Group groups[TURNS];
     for (int k = 0; k < TURNS; k++) {
         Group *g = groups + k;
-        g->state = scratch + (size_t)k * room, g->forces = g->state + w->states;
-        g->after = g->forces + w->rows, g->matrix = g->after + w->states;
+        g->state = scratch + (size_t)k * room, g->after = g->state + w->states + w->rows;
+        g->matrix = g->after + w->states + w->rows;
         g->samples = g->matrix + w->rows * w->rows, g->high = g->samples + STEPS * w->looked;
         g->largest = g->high + STEPS * w->places;
     }

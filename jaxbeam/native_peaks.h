@@ -89,19 +89,17 @@ static inline Lanes find(const Lanes *samples, const double *through, int both) 
     return either(as_large(found, greater(found, before)), flat, place);
 }
 
-/* Whether the curve through samples leaves every one of them below it: the largest is none of the ends,
-   or the curve rises from there into the step. */
+/* Whether the curve through samples rises above all of them within the step: the largest is none of the ends,
+   or it rises from there. `ends` are the rows of its slope at both ends. */
 static inline Mask rises_within(const Lanes *samples, const double *ends, Lanes highest, int both) {
-    Lanes first = samples[0], last = samples[POINTS - 1], from_first = {0}, into_last = {0};
-    for (int p = 0; p < POINTS; p++) {
-        from_first += ends[p] * samples[p];
-        into_last += ends[POINTS + p] * samples[p];
+    Mask within = ~(Mask){0};
+    for (int end = 0; end < 2; end++, ends += POINTS) {
+        Lanes there = samples[end * (POINTS - 1)], slope = {0};
+        Mask top = size_of(there, both) >= highest;
+        if (!any(top)) continue;
+        for (int p = 0; p < POINTS; p++) slope += ends[p] * samples[p];
+        if (both) slope = either(there < 0, -slope, slope); /* away from rest, whatever side that is */
+        within &= ~top | (end ? slope < 0 : slope > 0);
     }
-    if (both) { /* away from rest, whatever side that is */
-        from_first = either(first < 0, -from_first, from_first);
-        into_last = either(last < 0, -into_last, into_last);
-    }
-    Mask within = (size_of(first, both) < highest) | (from_first > 0);
-    return within & ((size_of(last, both) < highest) | (into_last < 0));
+    return within;
 }
-

@@ -29,8 +29,9 @@ typedef struct {
 /* What a step needs of the path. Of no use without a load on the beam, but for drift and watch. */
 typedef struct {
     int taken, pressed;
-    const double *drift, *watch;
-    double *respond, *gains, *push, *seen; /* (state, row), (row, row), (row, state), (row, looked) */
+    const double *drift;
+    double *respond, *gains, *push; /* (state, row), (row, row), (row, state) */
+    double *seen;                   /* (state and row, looked) */
 } Step;
 
 static int loaded(const Work *w, int t) {
@@ -41,7 +42,7 @@ static int loaded(const Work *w, int t) {
 
 /* Numbers that the tables of a step take. */
 static size_t tables_of(const Work *w) {
-    return (size_t)w->rows * (size_t)(2 * w->states + w->rows + w->looked);
+    return (size_t)w->rows * (size_t)(2 * w->states + w->rows) + (size_t)w->looked * (size_t)(w->states + w->rows);
 }
 
 /* The nodes from a given one on, as many as fill a register, of one load: the state that each feels, the
@@ -98,11 +99,11 @@ static void tabulate(const Work *w, int t, Step *step, Lanes *felt, double *room
     step->taken = w->in[SPAN][t] != 0; /* steps of no length fill up a chunk */
     step->pressed = step->taken && loaded(w, t);
     step->drift = w->in[DRIFT] + kind * states * w->side;
-    step->watch = w->in[WATCH] + kind * looked * states;
     step->respond = room;
     step->gains = step->respond + rows * states;
     step->push = step->gains + rows * rows;
     step->seen = step->push + rows * states;
+    memcpy(step->seen, w->in[WATCH] + kind * looked * states, 8 * (size_t)(states * looked));
     if (!step->pressed) return;
     const double *sights = w->in[WATCH_PUSH] + kind * NODES * all_modes * filled;
     for (int p = 0; p < w->slots; p++) {
@@ -116,7 +117,7 @@ static void tabulate(const Work *w, int t, Step *step, Lanes *felt, double *room
                 Lanes seen = {0};
                 for (int m = 0; m < all_modes; m++)
                     seen += shape[m * PADDED + f] * whole(sight + m * filled);
-                double *kept = step->seen + (p * NODES + f) * looked + l;
+                double *kept = step->seen + (states + p * NODES + f) * looked + l;
                 store(kept, seen, looked - l < WIDE ? looked - l : WIDE);
             }
     }

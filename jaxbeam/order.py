@@ -150,11 +150,18 @@ def make_order(
             f"{math.prod(order.shape):.1e} combinations of values are too many; a sweep may have"
             f" {MOST_RUNS:.0e} runs: split it"
         )
-    names = list(axes)
-    joint = [i for i, name in enumerate(names) if TOGETHER.fullmatch(name)]
+    joint = [name for name in axes if TOGETHER.fullmatch(name)]
+    # What each number may be is a range: the ends of all values tell, of all addresses at once.
+    ends = {name: (axes[name].min(), axes[name].max()) for name in axes if name not in joint}
+    rows = [dict(zip(ends, row, strict=True)) for row in zip(*ends.values(), strict=True)]
+    columns = [list(axes).index(name) for name in joint]
     if joint:
-        for row in np.unique(order.runs()[:, joint], axis=0):
-            check(replace(case, dict(zip([names[i] for i in joint], row, strict=True))))
+        rows += [
+            dict(zip(joint, row, strict=True))
+            for row in np.unique(order.runs()[:, columns], axis=0)
+        ]
+    for row in rows:
+        check(replace(case, row))
     return order
 
 
@@ -174,8 +181,7 @@ def _values(case: Case, address: str, given: Any) -> Float[np.ndarray, " value"]
             " make a sweep for each of its values"
         )
     if not TOGETHER.fullmatch(address):
-        # What is allowed is a range, from which zero may be left out.
-        odd = values[~np.isfinite(values) | (values == 0)]
-        for value in {values.min(), values.max(), *odd[:1]}:
+        # Zero may be left out of what is allowed.
+        for value in values[~np.isfinite(values) | (values == 0)][:1]:
             check(replace(case, {address: value}))
     return values

@@ -20,7 +20,7 @@ from jaxbeam.integrate import longest_step, march, trace
 from jaxbeam.loads import motion
 from jaxbeam.loop import make_loop
 from jaxbeam.record import never_as_nan
-from jaxbeam.rig import rig
+from jaxbeam.rig import Rig, rig
 from jaxbeam.tables import make_rigging
 
 
@@ -89,9 +89,15 @@ def riggings(case, addresses, schedule, substeps, wanted, rigs, heavy, pace):
 
 
 @compiled
-def block(case, form, addresses, devices, schedule, substeps, wanted, riggings, heavy, light, pace):
-    """Results of some tasks: lanes side by side, tasks one after the other, shared by devices."""
+def block(case, form, addresses, devices, schedule, substeps, wanted, rigs, heavy, light, pace):
+    """Results of some tasks: lanes side by side, tasks one after the other, shared by devices.
+
+    `rigs` are on their grids, or bare, and are then put on them here.
+    """
     heavy_addresses, light_addresses = addresses
+    if isinstance(rigs, Rig):
+        given = case, heavy_addresses, schedule, substeps, wanted, rigs, heavy, pace
+        rigs = riggings(*given)
 
     def task(values):
         rigging, heavy, light, pace = values
@@ -138,4 +144,4 @@ def block(case, form, addresses, devices, schedule, substeps, wanted, riggings, 
     if devices > 1:
         mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
         part = jax.shard_map(part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    return part(wanted, (riggings, heavy, light, pace))
+    return part(wanted, (rigs, heavy, light, pace))
