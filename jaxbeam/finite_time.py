@@ -16,10 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxbeam import flows as plain_flows
+from jaxbeam import gain_pieces, native_designs
 from jaxbeam.coupled import Coupling, Plant, answers, coupled_flows, law_solved
-from jaxbeam.flows import NODES, carried, costs_to_go, flows, on_commands
-from jaxbeam.gain_table import GainTable, from_nodes, polynomials
-from jaxbeam.small import each_lane, in_lanes, joined, lanes_of, solve_any, times, turned
+from jaxbeam.flows import NODES, costs_to_go, flows, on_commands
+from jaxbeam.gain_table import GainTable
+from jaxbeam.small import each_lane, in_lanes, lanes_of, solve_any, turned
 from jaxbeam.stretches import Commands, Square
 
 GROUP = 8  # stretches
@@ -62,7 +64,7 @@ def finite_time(
     Q: Square,
     R: Commands,
     terminal: Square,
-    parallel: bool = False,
+    in_time: str = "sequential",
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """Gains that minimise x'Fx at the last event plus the integral of x'Qx + u'Ru, and P at edges.
 
@@ -79,7 +81,7 @@ def finite_time(
         law = jnp.concatenate([A, B], axis=3)
         return flows(A, B, Q, R, jnp.full(GROUP, length)), whole, law
 
-    return _backward(make, still, events, count, Q, R, terminal, parallel)
+    return _backward(make, still, events, count, Q, R, terminal, in_time)
 
 
 def finite_time_coupled(
@@ -90,7 +92,7 @@ def finite_time_coupled(
     Q: Square,
     R: Commands,
     terminal: Square,
-    parallel: bool = False,
+    in_time: str = "sequential",
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """The same for a plant that changes by a few forces; much faster, see `coupled`."""
     longest = jnp.diff(events) * (shares(count)[1] * 2.0 ** halvings(count)[0])
@@ -105,10 +107,10 @@ def finite_time_coupled(
         flow = coupled_flows(plant, answer, coupling, R, length)
         return flow, coupling.shape, law_solved(coupling)
 
-    return _backward(make, plant, events, count, Q, R, terminal, parallel)
+    return _backward(make, plant, events, count, Q, R, terminal, in_time)
 
 
-def _backward(make, plant, events, count, Q, R, terminal, parallel):
+def _backward(make, plant, events, count, Q, R, terminal, in_time):
     """Gains and P, from what `make` tells of a group: flows, and what changes at their nodes."""
     edges, spans = shares(count), jnp.diff(events)
     steps = np.diff(edges).reshape(-1, GROUP)
@@ -120,7 +122,7 @@ def _backward(make, plant, events, count, Q, R, terminal, parallel):
     groups = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), given)
     inverse = solve_any(R, jnp.eye(R.shape[0]))
     make = eqx.filter_closure_convert(make, R, *jax.tree.map(lambda part: part[0], groups))
-    if parallel:
+    if in_time == "parallel":
         parts, shape, law = jax.lax.map(lambda group: make(R, *group), groups)
         whole = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), parts)
         costs = costs_to_go(whole, terminal, True)
@@ -128,9 +130,10 @@ def _backward(make, plant, events, count, Q, R, terminal, parallel):
         grouped = jnp.concatenate([first, costs[GROUP::GROUP, None]], axis=1)
         given = plant, shape, law, grouped, groups[1], Q, inverse
         axes = None, 0, 0, 0, 0, None, None
-        pieces = jax.vmap(functools.partial(in_lanes, _pieces), axes)(*given)
+        pieces = jax.vmap(functools.partial(in_lanes, gain_pieces.pieces), axes)(*given)
     else:
-        costs, pieces = in_lanes(_swept, make, plant, groups, Q, R, inverse, terminal)
+        by_hand = in_time == "native"
+        costs, pieces = in_lanes(_swept, by_hand, make, plant, groups, Q, R, inverse, terminal)
         costs = jnp.concatenate([costs.reshape(-1, *Q.shape), terminal[None]])
     inner = events[:-1, None] + spans[:, None] * edges[:-1]
     marks = jnp.append(inner.reshape(-1), events[-1])
@@ -138,8 +141,10 @@ def _backward(make, plant, events, count, Q, R, terminal, parallel):
     return GainTable(marks, pieces.reshape(-1, *pieces.shape[2:])), costs
 
 
-def _swept(make, plant, groups, Q, R, inverse, terminal):
+def _swept(by_hand, make, plant, groups, Q, R, inverse, terminal):
     """P at the starts of stretches and polynomials of the gain, of all groups, in lanes."""
+    carried = native_designs.carried if by_hand else plain_flows.carried
+    fitted = native_designs.pieces if by_hand else gain_pieces.pieces
     free = jnp.zeros((*R.shape[:2], 1))  # commands, so that lanes with other R share the flows
 
     def back(cost, group):
@@ -147,58 +152,9 @@ def _swept(make, plant, groups, Q, R, inverse, terminal):
         parts, shape, law = each_lane(lambda make, *rest: make(*rest), make, free, *group)
         costs = carried(parts, each_lane(on_commands, R, length), cost)
         edges = jnp.concatenate([costs, cost[None]])
-        pieces = _pieces(plant, shape, law, edges, length, Q, inverse)
+        pieces = fitted(plant, shape, law, edges, length, Q, inverse)
         return (costs[0] + turned(costs[0])) / 2, (costs, pieces)
 
     given = make, plant, groups, Q, R, terminal
     wide = jnp.broadcast_to(terminal, (*terminal.shape[:2], lanes_of(given)))
     return jax.lax.scan(back, wide, groups, reverse=True)[1]
-
-
-def _pieces(plant, shape, law, costs, length, Q, inverse):
-    """Polynomials of the gain over a group of stretches, from P at its edges, in lanes.
-
-    The rate of the state is that by the constant part of the `plant`, plus E shape law (x, u); what
-    changes is known at the nodes, and wanted, with its rates, at the edges.
-    """
-    shape, law = from_nodes(shape), from_nodes(law)  # edge, rate, ...
-    push = jax.vmap(jax.vmap(lambda part: times(plant.E, part)))(shape)
-
-    def at_edge(push, law, cost):
-        return _gains(plant, push, law, cost, length, Q, inverse)
-
-    gains = jax.vmap(at_edge, out_axes=1)(push, law, costs)
-    return polynomials(gains[:, :-1], gains[:, 1:])
-
-
-def _gains(plant, push, law, cost, length, Q, inverse):
-    """The gain, its rate and the rate of that, by share of a stretch.
-
-    A = plant.A + push law_x and B = plant.B + push law_u, with rates. P is never differentiated as
-    a whole, but only what it does to a few columns.
-    """
-    states, inputs = plant.B.shape[:2]
-    (W, W_1, W_2), (V, V_1, _), (D, D_1, D_2) = push, law[:, :, :states], law[:, :, states:]
-    B, B_1 = plant.B + times(W, D), times(W_1, D) + times(W, D_1)
-    B_2 = times(W_2, D) + 2 * times(W_1, D_1) + times(W, D_2)
-    seen = times(V, B)
-    once, turn = times(plant.A, B) + times(W, seen), times(W_1, seen) + times(W, times(V_1, B))
-    more = joined(B_1, once)
-    twice = times(plant.A, more) + times(W, times(V, more))
-    rows = turned(joined(B, more, once, twice, turn, B_2))
-    few = rows[: 3 * inputs]
-    held = times(rows, cost)  # P is symmetric
-    seen, first, then = held[:inputs], held[: 3 * inputs], held[3 * inputs : 6 * inputs]
-    onto = times(inverse, seen)
-    back = times(first, plant.A) + times(times(first, W), V)
-    spent = times(times(few, turned(seen)), onto)
-    falls = length * (spent - then - back - times(few, Q))
-    fall, rest, twice_fall = (falls[k * inputs : (k + 1) * inputs] for k in range(3))
-    faster = fall + held[inputs : 2 * inputs]  # the rate of P B
-    felt = times(fall, W) + times(seen, W_1)
-    back = times(fall, plant.A) + times(felt, V) + times(times(seen, W), V_1)
-    mixed = times(times(few[:inputs], turned(onto)), faster)
-    mixed = mixed + times(times(few[:inputs], turned(faster)), onto)
-    bends = length * (mixed - twice_fall - held[6 * inputs : 7 * inputs] - back)
-    last = held[7 * inputs :] + 2 * rest + bends
-    return jnp.stack([onto, times(inverse, faster), times(inverse, last)])

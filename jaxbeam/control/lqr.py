@@ -195,7 +195,11 @@ class AbstractForesighted(AbstractScheduledRegulator):
         "s/unit of the state^2", "weight of each state at the end", NOT_NEGATIVE, default=None
     )
     in_time: str = choice(
-        "how P is carried backward", "sequential", "parallel", default="sequential"
+        "how P is carried backward",
+        "sequential",
+        "parallel",
+        "native",
+        default="sequential",
     )
 
     def fault(self, case):
@@ -251,7 +255,7 @@ def optimal(
     loads = len(model.case.loads) if regulator.feeds_loads_forward else 0
 
     Q, F = (jnp.pad(weight, (0, loads)) for weight in (Q, F))
-    rest = crossing(model), regulator.points, Q, R, F, regulator.in_time == "parallel"
+    rest = crossing(model), regulator.points, Q, R, F, regulator.in_time
     if model.rig.states == 2 * model.scale.shape[0]:
         return finite_time_coupled(*coupled_beam(model, loads > 0), *rest)
 

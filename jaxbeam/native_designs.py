@@ -1,0 +1,74 @@
+"""Optimal gains over a crossing by hand-written C, where that was compiled for this machine.
+
+Each function is one of those that XLA runs otherwise, whose derivative it has. Double precision on
+CPUs; nobody needs it.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam import flows, gain_pieces
+from jaxbeam.coupled import Plant
+from jaxbeam.gain_table import AT_ENDS, hermite
+from jaxbeam.native_library import Library
+from jaxbeam.small import lanes_of
+
+LIBRARY = Library(
+    name="designs",
+    sources=("native_carried.c", "native_pieces.c"),
+    headers=("native_matrices.h", "native_lanes.h"),
+    constants=(("NODES", flows.STAGES),),
+    targets=("carried", "pieces"),
+)
+
+
+def _call(name: str, shape: tuple[int, ...], *given):
+    """What a function of the library makes of arrays: one array."""
+    call = jax.ffi.ffi_call(
+        LIBRARY.target(name), jax.ShapeDtypeStruct(shape, float), vmap_method="sequential"
+    )
+    return call(*given)
+
+
+@jax.custom_jvp
+def carried(
+    parts: flows.Flow,
+    effort: Float[Array, "value value _"],
+    terminal: Float[Array, "state state _"],
+) -> Float[Array, "stretch state state lane"]:
+    """As `flows.carried`."""
+    across = jnp.concatenate([parts.drift, parts.push], axis=2).swapaxes(1, 2)
+    values = parts.push.shape[2]
+    effort = jnp.broadcast_to(effort, (values, values, effort.shape[2]))
+    shape = (*parts.drift.shape[:3], lanes_of(parts, effort, terminal))
+    return _call("carried", shape, across, parts.toll, effort, terminal)
+
+
+@carried.defjvp
+def _carried_jvp(given, changes):
+    return jax.jvp(flows.carried, given, changes)
+
+
+@jax.custom_jvp
+def pieces(
+    plant: Plant,
+    shape: Float[Array, "stretch stage direction force _"],
+    law: Float[Array, "stretch stage force both _"],
+    costs: Float[Array, "edge state state lane"],
+    length: Float[Array, " _"],
+    Q: Float[Array, "state state _"],
+    inverse: Float[Array, "input input _"],
+) -> Float[Array, "stretch power input state lane"]:
+    """As `gain_pieces.pieces`."""
+    given = plant.A, plant.B, plant.E, shape, law, costs, length, Q, inverse
+    states, inputs = plant.B.shape[:2]
+    fit = np.stack(hermite(AT_ENDS.shape[1]))
+    sizes = shape.shape[0], fit.shape[1], inputs, states, lanes_of(given)
+    return _call("pieces", sizes, *given, AT_ENDS, fit)
+
+
+@pieces.defjvp
+def _pieces_jvp(given, changes):
+    return jax.jvp(gain_pieces.pieces, given, changes)
