@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbeam.flows import NODES, STAGES, Flow, on_commands
 from jaxbeam.small import solve_any
@@ -138,6 +138,19 @@ def coupled_flows(
     turn = transposed(force) @ (transposed(mixed) + own @ force / 2)
     toll = answer.toll[:known, :known] + spent + turn + transposed(turn)
     return Flow(end[..., :states], end[..., states:], toll)
+
+
+def flows_of_kind(
+    plant: Plant,
+    every: Answers,
+    kind: Int[Array, ""],
+    coupling: Coupling,
+    R: Commands,
+    length: Float[Array, ""],
+) -> Flow:
+    """Those over stretches of one of the lengths that there are answers for."""
+    answer = jax.tree.map(lambda part: jax.lax.dynamic_index_in_dim(part, kind, 0, False), every)
+    return coupled_flows(plant, answer, coupling, R, length)
 
 
 def law_solved(coupling: Coupling) -> Float[Array, "stretch stage force both"]:

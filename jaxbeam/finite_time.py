@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam import flows as plain_flows
 from jaxbeam import gain_pieces, native_designs
-from jaxbeam.coupled import Coupling, Plant, answers, coupled_flows, law_solved
+from jaxbeam.coupled import Coupling, Plant, answers, flows_of_kind, law_solved
 from jaxbeam.flows import NODES, costs_to_go, flows, on_commands
 from jaxbeam.gain_table import GainTable
 from jaxbeam.small import each_lane, in_lanes, lanes_of, solve_any, turned
@@ -99,12 +99,13 @@ def finite_time_coupled(
     every = jax.vmap(lambda length: answers(plant, Q, length, HALVINGS))(longest)
     every = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), every)
 
+    flowing = flows_of_kind
+    if in_time == "native":
+        flowing = functools.partial(in_lanes, native_designs.coupled)
+
     def make(R, times, length, kind):
-        answer = jax.tree.map(
-            lambda part: jax.lax.dynamic_index_in_dim(part, kind, 0, False), every
-        )
         coupling = changes(times)
-        flow = coupled_flows(plant, answer, coupling, R, length)
+        flow = flowing(plant, every, kind, coupling, R, length)
         return flow, coupling.shape, law_solved(coupling)
 
     return _backward(make, plant, events, count, Q, R, terminal, in_time)

@@ -32,7 +32,8 @@ static void take_best(Lanes *cost, const Room *room, int states, int values) {
     }
     for (int i = 0, step; i < states; i += step) {
         step = taken(states - i);
-        few_rows(room->total + i * both, both, scaled + i * values, mixed, i + step, values, step);
+        few_rows(room->total + i * both, both, (Matrix){scaled + i * values, values, 1}, step,
+                 (Matrix){mixed, values, 1}, i + step, values);
     }
     for (int i = 0; i < states; i++)
         for (int j = 0; j <= i; j++)
@@ -48,12 +49,12 @@ static void carry(const Array *in, double *out, int states, int both, Span span,
         for (int i = 0, step; i < both; i += step) {
             step = taken(both - i);
             Lanes *total = room->total + i * both;
-            const Lanes *row = room->across + i * states;
+            const Matrix row = {room->across + i * states, states, 1}, held = {room->held, states, 1};
             for (int k = 0; k < step; k++)
                 fetch(total + k * both, in + TOLL, (s * both + i + k) * both, i + step, span);
             memset(room->held, 0, (size_t)(step * states) * sizeof(Lanes));
-            few_rows(room->held, states, row, room->cost, states, states, step);
-            few_rows(total, both, room->held, room->across, i + step, states, step);
+            few_rows(room->held, states, row, step, (Matrix){room->cost, states, 1}, states, states);
+            few_rows(total, both, held, step, (Matrix){room->across, states, 1}, i + step, states);
         }
         take_best(room->cost, room, states, values);
         for (int i = 0; i < square; i++) keep(out, s * square + i, room->cost[i], span);
@@ -65,21 +66,21 @@ XLA_FFI_Error *carried(XLA_FFI_CallFrame *frame) {
     Array in[ARGUMENTS];
     arrays(in, frame, ARGUMENTS);
     int64_t lanes;
-    double *out = result(frame, &lanes);
+    double *out = result(frame, 0, &lanes);
     const int both = (int)in[ACROSS].dims[1], states = (int)in[ACROSS].dims[2];
     const int values = both - states, square = states * states;
-    Lanes *room = numbers((size_t)(square + both * states + both * both + 4 * states +
-                                   2 * states * values + values * values));
-    if (!room) return fault(frame, "not enough memory for jaxbeam's designs");
-    Room parts = {.cost = room};
-    parts.across = parts.cost + square;
-    parts.total = parts.across + both * states;
-    parts.held = parts.total + both * both;
-    parts.mixed = parts.held + 4 * states;
-    parts.scaled = parts.mixed + states * values;
-    parts.spent = parts.scaled + states * values;
+    Room room;
+    const Room_part parts[] = {{&room.cost, square},
+                               {&room.across, both * states},
+                               {&room.total, both * both},
+                               {&room.held, 4 * states},
+                               {&room.mixed, states * values},
+                               {&room.scaled, states * values},
+                               {&room.spent, values * values}};
+    Lanes *all_room = divided(parts, sizeof parts / sizeof *parts, 0);
+    if (!all_room) return fault(frame, "not enough memory for jaxbeam's designs");
     for (int64_t first = 0; first < lanes; first += WIDE)
-        carry(in, out, states, both, span_of(first, lanes), &parts);
-    free(room);
+        carry(in, out, states, both, span_of(first, lanes), &room);
+    free(all_room);
     return NULL;
 }

@@ -7,29 +7,52 @@ CPUs; nobody needs it.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbeam import flows, gain_pieces
-from jaxbeam.coupled import Plant
+from jaxbeam.coupled import Answers, Coupling, Plant, flows_of_kind
 from jaxbeam.gain_table import AT_ENDS, hermite
 from jaxbeam.native_library import Library
-from jaxbeam.small import lanes_of
+from jaxbeam.small import each_lane, lanes_of
 
 LIBRARY = Library(
     name="designs",
-    sources=("native_carried.c", "native_pieces.c"),
+    sources=("native_carried.c", "native_flows.c", "native_pieces.c"),
     headers=("native_matrices.h", "native_lanes.h"),
     constants=(("NODES", flows.STAGES),),
-    targets=("carried", "pieces"),
+    targets=("carried", "coupled", "pieces"),
 )
 
 
-def _call(name: str, shape: tuple[int, ...], *given):
-    """What a function of the library makes of arrays: one array."""
-    call = jax.ffi.ffi_call(
-        LIBRARY.target(name), jax.ShapeDtypeStruct(shape, float), vmap_method="sequential"
-    )
-    return call(*given)
+def _call(name: str, shapes: list[tuple[int, ...]], *given):
+    """What a function of the library makes of arrays: arrays of these shapes."""
+    results = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
+    return jax.ffi.ffi_call(LIBRARY.target(name), results, vmap_method="sequential")(*given)
+
+
+@jax.custom_jvp
+def coupled(
+    plant: Plant,
+    every: Answers,
+    kind: Int[Array, " _"],
+    coupling: Coupling,
+    R: Float[Array, "input input _"],
+    length: Float[Array, " _"],
+) -> flows.Flow:
+    """As `coupled.flows_of_kind`, but with lanes as the last axis."""
+    effort = each_lane(flows.on_commands, R, length)
+    given = every.inner, every.end, every.toll, coupling.shape, coupling.rows, coupling.direct
+    lanes = lanes_of(given, coupling.back, effort)
+    count, (states, inputs) = coupling.shape.shape[0], plant.B.shape[:2]
+    values = flows.STAGES * inputs
+    sizes = (states, states), (states, values), (states + values, states + values)
+    shapes = [(count, *size, lanes) for size in sizes]
+    return flows.Flow(*_call("coupled", shapes, *given[:3], kind, *given[3:], coupling.back, effort))
+
+
+@coupled.defjvp
+def _coupled_jvp(given, changes):
+    return jax.jvp(lambda *given: each_lane(flows_of_kind, *given), given, changes)
 
 
 @jax.custom_jvp
@@ -43,7 +66,7 @@ def carried(
     values = parts.push.shape[2]
     effort = jnp.broadcast_to(effort, (values, values, effort.shape[2]))
     shape = (*parts.drift.shape[:3], lanes_of(parts, effort, terminal))
-    return _call("carried", shape, across, parts.toll, effort, terminal)
+    return _call("carried", [shape], across, parts.toll, effort, terminal)[0]
 
 
 @carried.defjvp
@@ -66,7 +89,7 @@ def pieces(
     states, inputs = plant.B.shape[:2]
     fit = np.stack(hermite(AT_ENDS.shape[1]))
     sizes = shape.shape[0], fit.shape[1], inputs, states, lanes_of(given)
-    return _call("pieces", sizes, *given, AT_ENDS, fit)
+    return _call("pieces", [sizes], *given, AT_ENDS, fit)[0]
 
 
 @pieces.defjvp

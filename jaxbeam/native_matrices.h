@@ -28,64 +28,110 @@ static inline Lanes entry(const Array *from, int64_t index, Span span) {
     return load(from->data + index * from->lanes + span.first, span.many);
 }
 
-static inline void fetch(Lanes *to, const Array *from, int64_t start, int64_t count, Span span) {
-    for (int64_t i = 0; i < count; i++) to[i] = entry(from, start + i, span);
+static inline void fetch(Lanes *to, const Array *from, int64_t start, int count, Span span) {
+    const double *first = from->data + start * from->lanes;
+    if (from->lanes == 1)
+        for (int i = 0; i < count; i++) to[i] = all(first[i]);
+    else if (span.many == WIDE)
+        for (int i = 0; i < count; i++) to[i] = whole(first + i * span.all + span.first);
+    else
+        for (int i = 0; i < count; i++) to[i] = load(first + i * span.all + span.first, span.many);
 }
 
 static inline void keep(double *to, int64_t index, Lanes lanes, Span span) {
     store(to + index * span.all + span.first, lanes, span.many);
 }
 
-/* A part of the products of rows of `left` with rows of `right`: as many sums as registers hold. */
-static inline ALWAYS void tile(Lanes *sums, int width, const Lanes *left, const Lanes *right, int terms,
-                               int down, int across) {
-    Lanes sum[16];
-#pragma GCC unroll 4
-    for (int i = 0; i < down; i++)
-#pragma GCC unroll 4
-        for (int j = 0; j < across; j++) sum[i * 4 + j] = sums[i * width + j];
-    for (int k = 0; k < terms; k++) {
-#pragma GCC unroll 4
-        for (int i = 0; i < down; i++)
-#pragma GCC unroll 4
-            for (int j = 0; j < across; j++)
-                sum[i * 4 + j] += left[i * terms + k] * right[j * terms + k];
-    }
-#pragma GCC unroll 4
-    for (int i = 0; i < down; i++)
-#pragma GCC unroll 4
-        for (int j = 0; j < across; j++) sums[i * width + j] = sum[i * 4 + j];
+/* Where the numbers of a matrix are: how far rows lie apart, and entries of a row. */
+typedef struct {
+    const void *data;
+    ptrdiff_t down, along;
+} Matrix;
+
+/* What kind of numbers: of each lane in a register, or in an array of XLA's, of which all lanes share
+   them, or whole registers are there, or not. */
+enum { REGISTERS, SHARED, OWN, PARTLY };
+
+static inline ALWAYS Lanes number(const Matrix *matrix, ptrdiff_t i, ptrdiff_t k, Span span, int kind) {
+    const ptrdiff_t at = i * matrix->down + k * matrix->along;
+    if (kind == REGISTERS) return ((const Lanes *)matrix->data)[at];
+    const double *from = (const double *)matrix->data;
+    if (kind == SHARED) return all(from[at]);
+    return load(from + at * span.all + span.first, kind == OWN ? WIDE : span.many);
 }
 
-static inline ALWAYS void strip(Lanes *sums, int width, const Lanes *left, const Lanes *right,
-                                int columns, int terms, int down) {
+/* sums += left right', a part of so many rows of both: their sums stay in registers. */
+static inline ALWAYS void tile(Lanes *sums, ptrdiff_t width, Matrix left, Matrix right, int terms,
+                               int rows, int columns, Span span, int kind) {
+    Lanes sum[16];
+#pragma GCC unroll 4
+    for (int i = 0; i < rows; i++)
+#pragma GCC unroll 4
+        for (int j = 0; j < columns; j++) sum[i * 4 + j] = sums[i * width + j];
+    for (int k = 0; k < terms; k++) {
+        Lanes with[4];
+#pragma GCC unroll 4
+        for (int j = 0; j < columns; j++) with[j] = number(&right, j, k, span, REGISTERS);
+#pragma GCC unroll 4
+        for (int i = 0; i < rows; i++) {
+            const Lanes one = number(&left, i, k, span, kind);
+#pragma GCC unroll 4
+            for (int j = 0; j < columns; j++) sum[i * 4 + j] += one * with[j];
+        }
+    }
+#pragma GCC unroll 4
+    for (int i = 0; i < rows; i++)
+#pragma GCC unroll 4
+        for (int j = 0; j < columns; j++) sums[i * width + j] = sum[i * 4 + j];
+}
+
+static inline Matrix below(Matrix matrix, ptrdiff_t rows) {
+    matrix.data = (const Lanes *)matrix.data + rows * matrix.down;
+    return matrix;
+}
+
+static inline ALWAYS void strip(Lanes *sums, ptrdiff_t width, Matrix left, Matrix right, int columns,
+                                int terms, int rows, Span span, int kind) {
     int j = 0;
-    for (; j + 4 <= columns; j += 4) tile(sums + j, width, left, right + j * terms, terms, down, 4);
+    for (; j + 4 <= columns; j += 4)
+        tile(sums + j, width, left, below(right, j), terms, rows, 4, span, kind);
     if (j + 2 <= columns) {
-        tile(sums + j, width, left, right + j * terms, terms, down, 2);
+        tile(sums + j, width, left, below(right, j), terms, rows, 2, span, kind);
         j += 2;
     }
-    if (j < columns) tile(sums + j, width, left, right + j * terms, terms, down, 1);
+    if (j < columns) tile(sums + j, width, left, below(right, j), terms, rows, 1, span, kind);
 }
 
 /* How many rows are taken at a time, of those that are left. */
 static inline int taken(int left) { return left >= 4 ? 4 : left >= 2 ? 2 : 1; }
 
-/* sums += left right' for one to four rows of `left`, as `taken` has it. */
-static void few_rows(Lanes *sums, int width, const Lanes *left, const Lanes *right, int columns,
-                     int terms, int rows) {
-    if (rows == 4) strip(sums, width, left, right, columns, terms, 4);
-    else if (rows == 2) strip(sums, width, left, right, columns, terms, 2);
-    else strip(sums, width, left, right, columns, terms, 1);
+/* sums += left right', for as many rows of `left` as are `taken` at a time. */
+static inline ALWAYS void some_rows(Lanes *sums, ptrdiff_t width, Matrix left, int rows, Matrix right,
+                                    int columns, int terms, Span span, int kind) {
+    if (rows == 4) strip(sums, width, left, right, columns, terms, 4, span, kind);
+    else if (rows == 2) strip(sums, width, left, right, columns, terms, 2, span, kind);
+    else strip(sums, width, left, right, columns, terms, 1, span, kind);
 }
 
-/* sums += left right': both are given by rows of so many terms, the sums by rows of `columns`. */
-static void add_dots(Lanes *sums, const Lanes *left, int rows, const Lanes *right, int columns,
+static void few_rows(Lanes *sums, ptrdiff_t width, Matrix left, int rows, Matrix right, int columns,
                      int terms) {
+    some_rows(sums, width, left, rows, right, columns, terms, (Span){0}, REGISTERS);
+}
+
+/* sums += left right'. */
+static void add_products(Lanes *sums, ptrdiff_t width, Matrix left, int rows, Matrix right, int columns,
+                         int terms) {
     for (int i = 0, step; i < rows; i += step) {
         step = taken(rows - i);
-        few_rows(sums + i * columns, columns, left + i * terms, right, columns, terms, step);
+        few_rows(sums + i * width, width, below(left, i), step, right, columns, terms);
     }
+}
+
+/* sums += left right', both given row by row. */
+static inline void add_dots(Lanes *sums, const Lanes *left, int rows, const Lanes *right, int columns,
+                            int terms) {
+    add_products(sums, columns, (Matrix){left, terms, 1}, rows, (Matrix){right, terms, 1}, columns,
+                 terms);
 }
 
 static inline void dots(Lanes *sums, const Lanes *left, int rows, const Lanes *right, int columns,
@@ -94,13 +140,11 @@ static inline void dots(Lanes *sums, const Lanes *left, int rows, const Lanes *r
     add_dots(sums, left, rows, right, columns, terms);
 }
 
-/* sums += shares right: `right` by its rows of so many columns. */
-static void add_rows(Lanes *sums, const Lanes *shares, int rows, const Lanes *right, int terms,
-                     int columns) {
-    for (int i = 0; i < rows; i++)
-        for (int k = 0; k < terms; k++)
-            for (int j = 0; j < columns; j++)
-                sums[i * columns + j] += shares[i * terms + k] * right[k * columns + j];
+/* sums += shares right, all given row by row. */
+static inline void add_rows(Lanes *sums, const Lanes *shares, int rows, const Lanes *right, int terms,
+                            int columns) {
+    add_products(sums, columns, (Matrix){shares, terms, 1}, rows, (Matrix){right, 1, columns}, columns,
+                 terms);
 }
 
 static XLA_FFI_Error *fault(const XLA_FFI_CallFrame *frame, const char *message) {
@@ -126,10 +170,24 @@ static void arrays(Array *to, const XLA_FFI_CallFrame *frame, int count) {
     }
 }
 
-static double *result(const XLA_FFI_CallFrame *frame, int64_t *lanes) {
-    const XLA_FFI_Buffer *buffer = frame->rets.rets[0];
+/* A result, and how many lanes it has. */
+static double *result(const XLA_FFI_CallFrame *frame, int which, int64_t *lanes) {
+    const XLA_FFI_Buffer *buffer = frame->rets.rets[which];
     *lanes = buffer->dims[buffer->rank - 1];
     return buffer->data;
 }
 
-static Lanes *numbers(size_t count) { return aligned_alloc(sizeof(Lanes), count * sizeof(Lanes)); }
+/* Some of the memory that a function works in: so many numbers of each lane. */
+typedef struct {
+    Lanes **start;
+    int count;
+} Room_part;
+
+/* Memory divided into parts, and more after the last; NULL if there is none, else to be freed. */
+static Lanes *divided(const Room_part *parts, int count, int more) {
+    size_t total = (size_t)more;
+    for (int i = 0; i < count; i++) total += (size_t)parts[i].count;
+    Lanes *memory = aligned_alloc(sizeof(Lanes), (total + 1) * sizeof(Lanes)), *next = memory;
+    for (int i = 0; memory && i < count; next += parts[i++].count) *parts[i].start = next;
+    return memory;
+}

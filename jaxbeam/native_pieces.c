@@ -175,7 +175,7 @@ XLA_FFI_Error *pieces(XLA_FFI_CallFrame *frame) {
     Array in[ARGUMENTS];
     arrays(in, frame, ARGUMENTS);
     int64_t lanes;
-    double *out = result(frame, &lanes);
+    double *out = result(frame, 0, &lanes);
     const int stretches = (int)in[SHAPE].dims[0];
     Sizes n = {.states = (int)in[B].dims[0], .inputs = (int)in[B].dims[1],
                .forces = (int)in[LAW].dims[2], .directions = (int)in[E].dims[1]};
@@ -185,10 +185,7 @@ XLA_FFI_Error *pieces(XLA_FFI_CallFrame *frame) {
     int shared = 1;
     for (int i = 0; i <= Q; i++) shared &= i == COSTS || in[i].lanes == 1;
     Room room;
-    struct {
-        Lanes **part;
-        int size;
-    } parts[] = {{&room.A, n.states * n.states},
+    const Room_part parts[] = {{&room.A, n.states * n.states},
                  {&room.turned, n.states * n.states},
                  {&room.Q, n.states * n.states},
                  {&room.cost, n.states * n.states},
@@ -203,16 +200,13 @@ XLA_FFI_Error *pieces(XLA_FFI_CallFrame *frame) {
                  {&room.back, FEW * n.row},
                  {&room.falls, FEW * n.row},
                  {&room.gains, 2 * RATES * n.row}};
-    enum { PARTS = sizeof parts / sizeof *parts };
-    int total = (stretches + 1) * of_edge;
-    for (int i = 0; i < PARTS; i++) total += parts[i].size;
-    Lanes *all_room = numbers((size_t)total), *next = all_room;
     Edge *edges = malloc((size_t)(stretches + 1) * sizeof *edges);
+    Lanes *all_room = divided(parts, sizeof parts / sizeof *parts, (stretches + 1) * of_edge);
     if (!all_room || !edges) {
         free(all_room), free(edges);
         return fault(frame, "not enough memory for jaxbeam's designs");
     }
-    for (int i = 0; i < PARTS; next += parts[i++].size) *parts[i].part = next;
+    Lanes *next = room.gains + 2 * RATES * n.row; /* after the last part */
     for (int s = 0; s <= stretches; s++, next += of_edge)
         edges[s] = (Edge){.push = next,
                           .seen = next + RATES * n.far,
