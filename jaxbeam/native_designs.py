@@ -62,11 +62,10 @@ def carried(
     terminal: Float[Array, "state state _"],
 ) -> Float[Array, "stretch state state lane"]:
     """As `flows.carried`."""
-    across = jnp.concatenate([parts.drift, parts.push], axis=2).swapaxes(1, 2)
     values = parts.push.shape[2]
     effort = jnp.broadcast_to(effort, (values, values, effort.shape[2]))
     shape = (*parts.drift.shape[:3], lanes_of(parts, effort, terminal))
-    return _call("carried", [shape], across, parts.toll, effort, terminal)[0]
+    return _call("carried", [shape], parts.drift, parts.push, parts.toll, effort, terminal)[0]
 
 
 @carried.defjvp

@@ -61,20 +61,11 @@ static void write(const Work *w, int which, int count, int i, Lanes value, int v
 /* sums (row, column) of answers, from a given entry on, with what lies in `right` by terms and columns. */
 static void answered(Lanes *sums, const Work *w, int which, int64_t first, Matrix left, int rows,
                      const Lanes *right, int columns, int terms, Span span) {
-    const Array *from = w->in + which;
     const Matrix by_column = {right, 1, columns};
-    left.data = from->data + first * from->lanes;
-    memset(sums, 0, (size_t)(rows * columns) * sizeof *sums);
     for (int i = 0, step; i < rows; i += step) {
         step = taken(rows - i);
-        Lanes *to = sums + i * columns;
-        if (from->lanes == 1)
-            some_rows(to, columns, left, step, by_column, columns, terms, span, SHARED);
-        else if (span.many == WIDE)
-            some_rows(to, columns, left, step, by_column, columns, terms, span, OWN);
-        else
-            some_rows(to, columns, left, step, by_column, columns, terms, span, PARTLY);
-        left.data = (const double *)left.data + step * left.down * from->lanes;
+        array_rows(sums + i * columns, columns, w->in + which, first + i * left.down, left, step, by_column,
+                   columns, terms, span, 0);
     }
 }
 

@@ -60,14 +60,14 @@ static inline ALWAYS Lanes number(const Matrix *matrix, ptrdiff_t i, ptrdiff_t k
     return load(from + at * span.all + span.first, kind == OWN ? WIDE : span.many);
 }
 
-/* sums += left right', a part of so many rows of both: their sums stay in registers. */
+/* sums = left right', or what is added to them, for a few rows of both: sums stay in registers. */
 static inline ALWAYS void tile(Lanes *sums, ptrdiff_t width, Matrix left, Matrix right, int terms,
-                               int rows, int columns, Span span, int kind) {
+                               int rows, int columns, Span span, int kind, int add) {
     Lanes sum[16];
 #pragma GCC unroll 4
     for (int i = 0; i < rows; i++)
 #pragma GCC unroll 4
-        for (int j = 0; j < columns; j++) sum[i * 4 + j] = sums[i * width + j];
+        for (int j = 0; j < columns; j++) sum[i * 4 + j] = add ? sums[i * width + j] : (Lanes){0};
     for (int k = 0; k < terms; k++) {
         Lanes with[4];
 #pragma GCC unroll 4
@@ -91,31 +91,46 @@ static inline Matrix below(Matrix matrix, ptrdiff_t rows) {
 }
 
 static inline ALWAYS void strip(Lanes *sums, ptrdiff_t width, Matrix left, Matrix right, int columns,
-                                int terms, int rows, Span span, int kind) {
+                                int terms, int rows, Span span, int kind, int add) {
     int j = 0;
     for (; j + 4 <= columns; j += 4)
-        tile(sums + j, width, left, below(right, j), terms, rows, 4, span, kind);
+        tile(sums + j, width, left, below(right, j), terms, rows, 4, span, kind, add);
     if (j + 2 <= columns) {
-        tile(sums + j, width, left, below(right, j), terms, rows, 2, span, kind);
+        tile(sums + j, width, left, below(right, j), terms, rows, 2, span, kind, add);
         j += 2;
     }
-    if (j < columns) tile(sums + j, width, left, below(right, j), terms, rows, 1, span, kind);
+    if (j < columns) tile(sums + j, width, left, below(right, j), terms, rows, 1, span, kind, add);
 }
 
 /* How many rows are taken at a time, of those that are left. */
 static inline int taken(int left) { return left >= 4 ? 4 : left >= 2 ? 2 : 1; }
 
-/* sums += left right', for as many rows of `left` as are `taken` at a time. */
+/* sums = left right', or added to them, for as many rows of `left` as are `taken` at a time. */
 static inline ALWAYS void some_rows(Lanes *sums, ptrdiff_t width, Matrix left, int rows, Matrix right,
-                                    int columns, int terms, Span span, int kind) {
-    if (rows == 4) strip(sums, width, left, right, columns, terms, 4, span, kind);
-    else if (rows == 2) strip(sums, width, left, right, columns, terms, 2, span, kind);
-    else strip(sums, width, left, right, columns, terms, 1, span, kind);
+                                    int columns, int terms, Span span, int kind, int add) {
+    if (rows == 4) strip(sums, width, left, right, columns, terms, 4, span, kind, add);
+    else if (rows == 2) strip(sums, width, left, right, columns, terms, 2, span, kind, add);
+    else strip(sums, width, left, right, columns, terms, 1, span, kind, add);
+}
+
+/* The same where `left` is a part of an array, whose entry `first` is the first of its own. */
+static void array_rows(Lanes *sums, ptrdiff_t width, const Array *from, int64_t first, Matrix left,
+                       int rows, Matrix right, int columns, int terms, Span span, int add) {
+    left.data = from->data + first * from->lanes;
+    if (from->lanes == 1) {
+        if (add) some_rows(sums, width, left, rows, right, columns, terms, span, SHARED, 1);
+        else some_rows(sums, width, left, rows, right, columns, terms, span, SHARED, 0);
+    } else if (span.many == WIDE) {
+        if (add) some_rows(sums, width, left, rows, right, columns, terms, span, OWN, 1);
+        else some_rows(sums, width, left, rows, right, columns, terms, span, OWN, 0);
+    } else {
+        some_rows(sums, width, left, rows, right, columns, terms, span, PARTLY, add);
+    }
 }
 
 static void few_rows(Lanes *sums, ptrdiff_t width, Matrix left, int rows, Matrix right, int columns,
                      int terms) {
-    some_rows(sums, width, left, rows, right, columns, terms, (Span){0}, REGISTERS);
+    some_rows(sums, width, left, rows, right, columns, terms, (Span){0}, REGISTERS, 1);
 }
 
 /* sums += left right'. */
@@ -134,10 +149,13 @@ static inline void add_dots(Lanes *sums, const Lanes *left, int rows, const Lane
                  terms);
 }
 
-static inline void dots(Lanes *sums, const Lanes *left, int rows, const Lanes *right, int columns,
-                        int terms) {
-    memset(sums, 0, (size_t)(rows * columns) * sizeof *sums);
-    add_dots(sums, left, rows, right, columns, terms);
+/* sums = left right', both given row by row. */
+static void dots(Lanes *sums, const Lanes *left, int rows, const Lanes *right, int columns, int terms) {
+    for (int i = 0, step; i < rows; i += step) {
+        step = taken(rows - i);
+        some_rows(sums + i * columns, columns, (Matrix){left + i * terms, terms, 1}, step,
+                  (Matrix){right, terms, 1}, columns, terms, (Span){0}, REGISTERS, 0);
+    }
 }
 
 /* sums += shares right, all given row by row. */
