@@ -152,9 +152,8 @@ def _swept(by_hand, make, plant, groups, Q, R, inverse, terminal):
         length = group[1]
         parts, shape, law = each_lane(lambda make, *rest: make(*rest), make, free, *group)
         costs = carried(parts, each_lane(on_commands, R, length), cost)
-        edges = jnp.concatenate([costs, cost[None]])
-        pieces = fitted(plant, shape, law, edges, length, Q, inverse)
-        return (costs[0] + turned(costs[0])) / 2, (costs, pieces)
+        pieces = fitted(plant, shape, law, costs, length, Q, inverse)
+        return (costs[0] + turned(costs[0])) / 2, (costs[:-1], pieces)
 
     given = make, plant, groups, Q, R, terminal
     wide = jnp.broadcast_to(terminal, (*terminal.shape[:2], lanes_of(given)))

@@ -98,10 +98,11 @@ XLA_FFI_Error *carried(XLA_FFI_CallFrame *frame) {
     for (int64_t first = 0; first < lanes; first += WIDE) {
         const Span span = span_of(first, lanes);
         fetch(room.cost, w->in + TERMINAL, 0, square, span);
-        for (int64_t s = w->in[PUSH].dims[0] - 1; s >= 0; s--) {
-            sum_up(w, &room, s, span);
-            take_best(w, &room, span);
+        for (int64_t s = w->in[PUSH].dims[0];; s--) {
             for (int i = 0; i < square; i++) keep(w->out, s * square + i, room.cost[i], span);
+            if (s == 0) break;
+            sum_up(w, &room, s - 1, span);
+            take_best(w, &room, span);
         }
     }
     free(all_room);

@@ -60,11 +60,12 @@ def carried(
     parts: flows.Flow,
     effort: Float[Array, "value value _"],
     terminal: Float[Array, "state state _"],
-) -> Float[Array, "stretch state state lane"]:
+) -> Float[Array, "edge state state lane"]:
     """As `flows.carried`."""
     values = parts.push.shape[2]
     effort = jnp.broadcast_to(effort, (values, values, effort.shape[2]))
-    shape = (*parts.drift.shape[:3], lanes_of(parts, effort, terminal))
+    edges = parts.drift.shape[0] + 1
+    shape = edges, *parts.drift.shape[1:3], lanes_of(parts, effort, terminal)
     return _call("carried", [shape], parts.drift, parts.push, parts.toll, effort, terminal)[0]
 
 
@@ -86,8 +87,8 @@ def pieces(
     """As `gain_pieces.pieces`."""
     given = plant.A, plant.B, plant.E, shape, law, costs, length, Q, inverse
     states, inputs = plant.B.shape[:2]
-    fit = np.stack(hermite(AT_ENDS.shape[1]))
-    sizes = shape.shape[0], fit.shape[1], inputs, states, lanes_of(given)
+    fit = np.stack(hermite(AT_ENDS.shape[1])).swapaxes(1, 2)
+    sizes = shape.shape[0], fit.shape[2], inputs, states, lanes_of(given)
     return _call("pieces", [sizes], *given, AT_ENDS, fit)[0]
 
 

@@ -95,20 +95,21 @@ static inline ALWAYS void strip(Lanes *sums, ptrdiff_t width, Matrix left, Matri
     int j = 0;
     for (; j + 4 <= columns; j += 4)
         tile(sums + j, width, left, below(right, j), terms, rows, 4, span, kind, add);
-    if (j + 2 <= columns) {
-        tile(sums + j, width, left, below(right, j), terms, rows, 2, span, kind, add);
-        j += 2;
-    }
-    if (j < columns) tile(sums + j, width, left, below(right, j), terms, rows, 1, span, kind, add);
+    const int rest = columns - j;
+    sums += j, right = below(right, j);
+    if (rest == 3) tile(sums, width, left, right, terms, rows, 3, span, kind, add);
+    if (rest == 2) tile(sums, width, left, right, terms, rows, 2, span, kind, add);
+    if (rest == 1) tile(sums, width, left, right, terms, rows, 1, span, kind, add);
 }
 
 /* How many rows are taken at a time, of those that are left. */
-static inline int taken(int left) { return left >= 4 ? 4 : left >= 2 ? 2 : 1; }
+static inline int taken(int left) { return left < 4 ? left : 4; }
 
 /* sums = left right', or added to them, for as many rows of `left` as are `taken` at a time. */
 static inline ALWAYS void some_rows(Lanes *sums, ptrdiff_t width, Matrix left, int rows, Matrix right,
                                     int columns, int terms, Span span, int kind, int add) {
     if (rows == 4) strip(sums, width, left, right, columns, terms, 4, span, kind, add);
+    else if (rows == 3) strip(sums, width, left, right, columns, terms, 3, span, kind, add);
     else if (rows == 2) strip(sums, width, left, right, columns, terms, 2, span, kind, add);
     else strip(sums, width, left, right, columns, terms, 1, span, kind, add);
 }

@@ -159,14 +159,16 @@ static void fit(const Array *in, double *out, int stretches, const Edge *edges, 
         const Lanes *ends[] = {room->gains + (s + 1) % 2 * RATES * row, gains};
         fetch(room->cost, in + COSTS, s * square, square, span);
         find_gains(gains, edges + s, length, room, n);
-        for (int p = 0; s > 0 && p < POWERS; p++)
-            for (int i = 0; i < row; i++) {
-                Lanes sum = {0};
-                for (int e = 0; e < 2; e++)
-                    for (int r = 0; r < RATES; r++)
-                        sum += in[HERMITE].data[(e * POWERS + p) * RATES + r] * ends[e][r * row + i];
-                keep(out, ((s - 1) * POWERS + p) * row + i, sum, span);
-            }
+        for (int i = 0; s > 0 && i < row; i++) {
+            Lanes sums[POWERS] = {{0}};
+            for (int e = 0; e < 2; e++)
+                for (int r = 0; r < RATES; r++) {
+                    const Lanes value = ends[e][r * row + i];
+                    for (int p = 0; p < POWERS; p++)
+                        sums[p] += in[HERMITE].data[(e * RATES + r) * POWERS + p] * value;
+                }
+            for (int p = 0; p < POWERS; p++) keep(out, ((s - 1) * POWERS + p) * row + i, sums[p], span);
+        }
     }
 }
 
