@@ -31,43 +31,58 @@ static int across(Lanes *sums, int width, const Work *w, int64_t s, int row, int
 /* toll + (drift, push)' P (drift, push), of a stretch. */
 static void sum_up(const Work *w, const Room *room, int64_t s, Span span) {
     const int states = w->states, both = w->both;
+    for (int j = 0; j < both; j++) { /* and what is left of the diagonal in the same strip of columns */
+        const int first = j < 3 ? 0 : j - 3;
+        fetch(room->total + j * both + first, w->in + TOLL, (s * both + j) * both + first, both - first, span);
+    }
     for (int i = 0, step; i < both; i += step) {
         step = across(room->held, states, w, s, i, both, (Matrix){room->cost, states, 1}, states, span, 0);
         Lanes *total = room->total + i;
-        for (int j = 0; j < i + step; j++)
-            fetch(total + j * both, w->in + TOLL, (s * both + j) * both + i, step, span);
         for (int j = 0; j < i + step;)
             j += across(total + j * both, both, w, s, j, i + step, (Matrix){room->held, states, 1}, step,
                         span, 1);
     }
 }
 
-/* P at the start: what is left of the total for the states when the best commands are taken, that is
-   total_xx - mixed spent^-1 mixed', by factors without pivots. */
-static void take_best(const Work *w, const Room *room, Span span) {
-    const int states = w->states, values = w->values, both = w->both;
-    Lanes *mixed = room->total + states, *scaled = room->scaled, *spent = room->spent;
-    fetch(spent, w->in + EFFORT, 0, values * values, span);
-    for (int a = 0; a < values; a++)
-        for (int b = a; b < values; b++) spent[a * values + b] += mixed[(states + a) * both + b];
+/* Factors without pivots of what commands cost: L' D L, with the shares L below the diagonal and -1 / D. */
+static inline ALWAYS void factor(Lanes *spent, int values) {
     for (int k = 0; k < values; k++) {
         Lanes *row = spent + k * values;
         const Lanes inverse = 1 / row[k];
         for (int a = k + 1; a < values; a++) {
             const Lanes share = row[a] * inverse;
             for (int b = a; b < values; b++) spent[a * values + b] -= share * row[b];
-            spent[a * values + k] = share; /* below the diagonal */
+            spent[a * values + k] = share;
         }
         row[k] = -inverse;
     }
-    for (int i = 0; i < states; i++, mixed += both)
-        for (int a = 0; a < values; a++) {
-            Lanes sum = mixed[a];
-            for (int k = 0; k < a; k++) sum -= spent[a * values + k] * mixed[k];
-            mixed[a] = sum;
-            scaled[i * values + a] = spent[a * values + a] * sum;
-        }
-    mixed = room->total + states;
+}
+
+/* A row of `mixed` by these factors, and the same times -1 / D. */
+static inline ALWAYS void part_row(Lanes *mixed, Lanes *scaled, const Lanes *spent, int values) {
+#pragma GCC unroll 6
+    for (int a = 0; a < values; a++) {
+        Lanes sum = mixed[a];
+#pragma GCC unroll 6
+        for (int k = 0; k < a; k++) sum -= spent[a * values + k] * mixed[k];
+        mixed[a] = sum;
+        scaled[a] = spent[a * values + a] * sum;
+    }
+}
+
+/* P at the start: what is left of the total for the states when the best commands are taken, that is
+   total_xx - mixed spent^-1 mixed'. */
+static void take_best(const Work *w, const Room *room, Span span) {
+    const int states = w->states, values = w->values, both = w->both;
+    Lanes *mixed = room->total + states, *scaled = room->scaled, *spent = room->spent;
+    fetch(spent, w->in + EFFORT, 0, values * values, span);
+    for (int a = 0; a < values; a++)
+        for (int b = a; b < values; b++) spent[a * values + b] += mixed[(states + a) * both + b];
+    if (values == NODES) factor(spent, NODES); /* one command: in registers */
+    else factor(spent, values);
+    for (int i = 0; i < states; i++)
+        if (values == NODES) part_row(mixed + i * both, scaled + i * NODES, spent, NODES);
+        else part_row(mixed + i * both, scaled + i * values, spent, values);
     for (int i = 0, step; i < states; i += step) {
         step = taken(states - i);
         few_rows(room->total + i * (both + 1), both, (Matrix){scaled + i * values, values, 1}, step,
