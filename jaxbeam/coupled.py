@@ -48,10 +48,11 @@ class Answers(eqx.Module):
     """What the constant part does over a stretch under inputs given at its Gauss nodes.
 
     `inner` and `end` take (x, commands, directed forces) to the state at the nodes and at the end,
-    `toll` is what they cost. Commands and forces are ordered by node.
+    `toll` is what they cost. Commands and forces are ordered by node. Contact laws see the states at
+    the nodes, so what these are made of lies together.
     """
 
-    inner: Float[Array, "*length stage state whole"]
+    inner: Float[Array, "*length stage whole state"]
     end: Float[Array, "*length state whole"]
     toll: Float[Array, "*length whole whole"]
 
@@ -97,7 +98,7 @@ def answers(plant: Plant, Q: Square, length: Float[Array, ""], halvings: int) ->
     both = _ordered(jnp.moveaxis(both, (1, 2), (-2, -1)), plant)
     top = jnp.concatenate([cost[:, :states, :states], mixed], axis=2)
     below = jnp.concatenate([transposed(mixed), both], axis=2)
-    return Answers(whole[:, :STAGES], whole[:, -1], jnp.concatenate([top, below], axis=1))
+    return Answers(transposed(whole[:, :STAGES]), whole[:, -1], jnp.concatenate([top, below], axis=1))
 
 
 def coupled_flows(
@@ -114,7 +115,7 @@ def coupled_flows(
     size = STAGES * forces
     # What the law of f sees, of what is known and of f itself. Stretches come last, for small sums.
     shape = jnp.moveaxis(coupling.shape, 0, -1)
-    seen = jnp.einsum("ciw,scri->cwrs", answer.inner, coupling.rows)
+    seen = jnp.einsum("cwi,scri->cwrs", answer.inner, coupling.rows)
     direct = jnp.moveaxis(coupling.direct, 0, -1).swapaxes(1, 2)  # stage, input, force, stretch
     at_once = np.eye(STAGES)[:, :, None, None, None] * direct[:, None]
     right = seen[:, :known].at[:, states:].add(at_once.reshape(STAGES, -1, forces, stretches))

@@ -72,8 +72,8 @@ static void answered(Lanes *sums, const Work *w, int which, int64_t first, Matri
 /* The law of the forces at a node: what they see of what is known, and of themselves. */
 static void demand(const Work *w, const Room *room, int node, Part part) {
     const int forces = w->forces, columns = forces * part.vectors, size = w->size, known = w->known;
-    const int64_t first = (w->kind * NODES + node) * w->states * w->whole;
-    answered(room->seen, w, INNER, first, (Matrix){NULL, 1, w->whole}, w->whole,
+    const int64_t first = (w->kind * NODES + node) * w->whole * w->states;
+    answered(room->seen, w, INNER, first, (Matrix){NULL, w->states, 1}, w->whole,
              room->rows + node * w->states * columns, columns, w->states, part.span);
     for (int v = 0; v < part.vectors; v++)
         for (int r = 0; r < forces; r++) {
