@@ -48,8 +48,8 @@ class Answers(eqx.Module):
     """What the constant part does over a stretch under inputs given at its Gauss nodes.
 
     `inner` and `end` take (x, commands, directed forces) to the state at the nodes and at the end,
-    `toll` is what they cost. Commands and forces are ordered by node. Contact laws see the states at
-    the nodes, so what these are made of lies together.
+    `toll` is what they cost. Commands and forces are ordered by node. What the state at
+    a node is made of lies together, as contact laws sum it.
     """
 
     inner: Float[Array, "*length stage whole state"]
@@ -98,7 +98,9 @@ def answers(plant: Plant, Q: Square, length: Float[Array, ""], halvings: int) ->
     both = _ordered(jnp.moveaxis(both, (1, 2), (-2, -1)), plant)
     top = jnp.concatenate([cost[:, :states, :states], mixed], axis=2)
     below = jnp.concatenate([transposed(mixed), both], axis=2)
-    return Answers(transposed(whole[:, :STAGES]), whole[:, -1], jnp.concatenate([top, below], axis=1))
+    return Answers(
+        transposed(whole[:, :STAGES]), whole[:, -1], jnp.concatenate([top, below], axis=1)
+    )
 
 
 def coupled_flows(

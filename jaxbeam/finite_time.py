@@ -69,7 +69,10 @@ def finite_time(
     """Gains that minimise x'Fx at the last event plus the integral of x'Qx + u'Ru, and P at edges.
 
     There are at least so many stretches, and a fine layer, between events (s); F is `terminal`. P
-    is carried from stretch to stretch one after the other, or in `parallel` (see `costs_to_go`).
+    is carried from stretch to stretch one after the other ("sequential"), the same in C ("native",
+    see `native_designs`), or in "parallel" (see `costs_to_go`).
+
+    Raises ValueError if there is no C to be had.
     """
     every = jax.vmap(jax.vmap(plant))
     inputs = R.shape[0]
@@ -99,9 +102,7 @@ def finite_time_coupled(
     every = jax.vmap(lambda length: answers(plant, Q, length, HALVINGS))(longest)
     every = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), every)
 
-    flowing = flows_of_kind
-    if in_time == "native":
-        flowing = functools.partial(in_lanes, native_designs.coupled)
+    flowing = native_designs.coupled if in_time == "native" else flows_of_kind
 
     def make(R, times, length, kind):
         coupling = changes(times)
@@ -113,6 +114,9 @@ def finite_time_coupled(
 
 def _backward(make, plant, events, count, Q, R, terminal, in_time):
     """Gains and P, from what `make` tells of a group: flows, and what changes at their nodes."""
+    lacking = native_designs.lacking() if in_time == "native" else None
+    if lacking is not None:
+        raise ValueError(lacking)
     edges, spans = shares(count), jnp.diff(events)
     steps = np.diff(edges).reshape(-1, GROUP)
     within = edges[:-1].reshape(-1, GROUP)[:, :, None] + steps[:, :, None] * NODES

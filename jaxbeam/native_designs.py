@@ -13,7 +13,8 @@ from jaxbeam import flows, gain_pieces
 from jaxbeam.coupled import Answers, Coupling, Plant, flows_of_kind
 from jaxbeam.gain_table import AT_ENDS, hermite
 from jaxbeam.native_library import Library
-from jaxbeam.small import each_lane, lanes_of
+from jaxbeam.small import each_lane, in_lanes, lanes_of
+from jaxbeam.stretches import Commands
 
 LIBRARY = Library(
     name="designs",
@@ -24,35 +25,54 @@ LIBRARY = Library(
 )
 
 
+def lacking() -> str | None:
+    """Why there are no designs in C here: a sentence, or None if there are."""
+    if not jax.config.jax_enable_x64:
+        return "in_time = 'native' computes in double precision only; take 'sequential'"
+    if not LIBRARY.ready():
+        return (
+            "in_time = 'native' takes what `jaxbeam native` compiles for this machine, on CPUs; run"
+            " that, or take 'sequential', which gives the same gains"
+        )
+    return None
+
+
 def _call(name: str, shapes: list[tuple[int, ...]], *given):
     """What a function of the library makes of arrays: arrays of these shapes."""
     results = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
     return jax.ffi.ffi_call(LIBRARY.target(name), results, vmap_method="sequential")(*given)
 
 
-@jax.custom_jvp
 def coupled(
     plant: Plant,
     every: Answers,
-    kind: Int[Array, " _"],
+    kind: Int[Array, ""],
     coupling: Coupling,
-    R: Float[Array, "input input _"],
-    length: Float[Array, " _"],
+    R: Commands,
+    length: Float[Array, ""],
 ) -> flows.Flow:
-    """As `coupled.flows_of_kind`, but with lanes as the last axis."""
+    """As `coupled.flows_of_kind`."""
+    return flows.Flow(*in_lanes(_coupled, plant, every, kind, coupling, R, length))
+
+
+@jax.custom_jvp
+def _coupled(plant, every, kind, coupling, R, length):
+    """The parts of flows, in lanes."""
     effort = each_lane(flows.on_commands, R, length)
-    given = every.inner, every.end, every.toll, coupling.shape, coupling.rows, coupling.direct
-    lanes = lanes_of(given, coupling.back, effort)
+    first, changing = (every.inner, every.end, every.toll), (coupling.shape, coupling.rows)
+    given = *first, kind, *changing, coupling.direct, coupling.back, effort
     count, (states, inputs) = coupling.shape.shape[0], plant.B.shape[:2]
     values = flows.STAGES * inputs
     sizes = (states, states), (states, values), (states + values, states + values)
-    shapes = [(count, *size, lanes) for size in sizes]
-    return flows.Flow(*_call("coupled", shapes, *given[:3], kind, *given[3:], coupling.back, effort))
+    return _call("coupled", [(count, *size, lanes_of(given)) for size in sizes], *given)
 
 
-@coupled.defjvp
+@_coupled.defjvp
 def _coupled_jvp(given, changes):
-    return jax.jvp(lambda *given: each_lane(flows_of_kind, *given), given, changes)
+    def plain(*given):
+        return jax.tree.leaves(each_lane(flows_of_kind, *given))
+
+    return jax.jvp(plain, given, changes)
 
 
 @jax.custom_jvp

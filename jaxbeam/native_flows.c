@@ -162,7 +162,7 @@ static void conclude(const Work *w, const Room *room, int v, Part part) {
                     room->table[(q * above + i) * columns + t * part.vectors + v];
     for (int i = 0; i < states; i++)
         fetch(sums + i * known, ends, (w->kind * states + i) * w->whole, known, part.span);
-    add_rows(sums, room->ends, states, force, size, known);
+    add_shares(sums, room->ends, states, force, size, known);
     for (int i = 0; i < states; i++) {
         for (int j = 0; j < states; j++)
             write(w, DRIFT, states * states, i * states + j, sums[i * known + j], v, part.span);

@@ -82,7 +82,11 @@ class Library(NamedTuple):
 
     def ready(self) -> bool:
         """Whether the C is compiled for this machine, and of use: computing on a CPU."""
-        return jax.default_backend() == "cpu" and _sound(self.binary()) and _registered(self)
+        return jax.default_backend() == "cpu" and _sound(self.binary()) and bool(_loaded(self))
+
+    def loaded(self) -> ctypes.CDLL:
+        """The library, of whose functions XLA has been told; only if it is `ready`."""
+        return _loaded(self)
 
 
 def compiler() -> str | None:
@@ -100,12 +104,12 @@ def _sound(path: pathlib.Path) -> bool:
 
 
 @functools.cache
-def _registered(library: Library) -> bool:
+def _loaded(library: Library) -> ctypes.CDLL:
     """Load a library and tell XLA of it, which takes each name once in a process."""
     loaded = ctypes.CDLL(str(library.binary()))
     for name in library.targets:
         jax.ffi.register_ffi_target(library.target(name), jax.ffi.pycapsule(getattr(loaded, name)))
-    return True
+    return loaded
 
 
 def _digest(path: pathlib.Path) -> pathlib.Path:

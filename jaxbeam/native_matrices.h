@@ -160,7 +160,7 @@ static void dots(Lanes *sums, const Lanes *left, int rows, const Lanes *right, i
 }
 
 /* sums += shares right, all given row by row. */
-static inline void add_rows(Lanes *sums, const Lanes *shares, int rows, const Lanes *right, int terms,
+static inline void add_shares(Lanes *sums, const Lanes *shares, int rows, const Lanes *right, int terms,
                             int columns) {
     add_products(sums, columns, (Matrix){shares, terms, 1}, rows, (Matrix){right, 1, columns}, columns,
                  terms);

@@ -44,7 +44,7 @@ static void add_driven(Lanes *to, const Lanes *rows, int count, const Edge *edge
                        const Sizes *n) {
     add_dots(to, rows, count, room->A, n->states, n->states);
     dots(room->share, rows, count, edge->seen, n->forces, n->states);
-    add_rows(to, room->share, count, edge->push, n->forces, n->states);
+    add_shares(to, room->share, count, edge->push, n->forces, n->states);
 }
 
 /* to += rows (A + W V). */
@@ -52,7 +52,7 @@ static void add_back(Lanes *to, const Lanes *rows, int count, const Edge *edge, 
                      const Sizes *n) {
     add_dots(to, rows, count, room->turned, n->states, n->states);
     dots(room->share, rows, count, edge->push, n->forces, n->states);
-    add_rows(to, room->share, count, edge->seen, n->forces, n->states);
+    add_shares(to, room->share, count, edge->seen, n->forces, n->states);
 }
 
 static void tabulate(const Edge *edge, const Room *room, const Sizes *n) {
@@ -79,13 +79,13 @@ static void tabulate(const Edge *edge, const Room *room, const Sizes *n) {
             for (int i = 0; i < inputs * forces; i++)
                 share[i] = (r == 2 && k == 1 ? 2 : 1) * room->direct[k * inputs * forces + i];
             Lanes *to = rows + (r == 2 ? BEND : r) * row;
-            add_rows(to, share, inputs, edge->push + (r - k) * far, forces, states);
+            add_shares(to, share, inputs, edge->push + (r - k) * far, forces, states);
         }
     add_driven(rows + ONCE * row, rows, inputs, edge, room, n);
     add_driven(rows + AFTER_RATE * row, rows + RATE * row, 2 * inputs, edge, room, n);
     for (int r = 0; r < 2; r++) {
         dots(share, rows, inputs, edge->seen + r * far, forces, states);
-        add_rows(rows + TURN * row, share, inputs, edge->push + (1 - r) * far, forces, states);
+        add_shares(rows + TURN * row, share, inputs, edge->push + (1 - r) * far, forces, states);
     }
     dots(edge->weighted, rows, FEW * inputs, room->Q, states, states);
 }
@@ -98,12 +98,12 @@ static void find_gains(Lanes *gains, const Edge *edge, Lanes length, const Room 
     const size_t bytes = (size_t)row * sizeof(Lanes);
     memset(gains, 0, RATES * bytes);
     dots(held, edge->rows, KINDS * inputs, room->cost, states, states);
-    add_rows(gains, room->inverse, inputs, held, inputs, states);
+    add_shares(gains, room->inverse, inputs, held, inputs, states);
     memset(back, 0, FEW * bytes);
     add_back(back, held, FEW * inputs, edge, room, n);
     memset(falls, 0, FEW * bytes);
     dots(share, edge->rows, FEW * inputs, held, inputs, states);
-    add_rows(falls, share, FEW * inputs, gains, inputs, states);
+    add_shares(falls, share, FEW * inputs, gains, inputs, states);
     for (int i = 0; i < FEW * row; i++)
         falls[i] = length * (falls[i] - held[ONCE * row + i] - back[i] - edge->weighted[i]);
     for (int i = 0; i < row; i++) faster[i] += falls[i]; /* now the rate of P B */
@@ -111,19 +111,19 @@ static void find_gains(Lanes *gains, const Edge *edge, Lanes length, const Room 
     add_back(back, falls, inputs, edge, room, n);
     for (int r = 0; r < 2; r++) {
         dots(share, held, inputs, edge->push + (1 - r) * far, n->forces, states);
-        add_rows(back, share, inputs, edge->seen + r * far, n->forces, states);
+        add_shares(back, share, inputs, edge->seen + r * far, n->forces, states);
     }
     Lanes *mixed = falls; /* what fell is known */
     memset(mixed, 0, bytes);
     dots(share, edge->rows, inputs, gains, inputs, states);
-    add_rows(mixed, share, inputs, faster, inputs, states);
+    add_shares(mixed, share, inputs, faster, inputs, states);
     dots(share, edge->rows, inputs, faster, inputs, states);
-    add_rows(mixed, share, inputs, gains, inputs, states);
+    add_shares(mixed, share, inputs, gains, inputs, states);
     for (int i = 0; i < row; i++)
         last[i] += 2 * falls[row + i] +
                    length * (mixed[i] - falls[2 * row + i] - held[TURN * row + i] - back[i]);
-    add_rows(gains + row, room->inverse, inputs, faster, inputs, states);
-    add_rows(gains + 2 * row, room->inverse, inputs, last, inputs, states);
+    add_shares(gains + row, room->inverse, inputs, faster, inputs, states);
+    add_shares(gains + 2 * row, room->inverse, inputs, last, inputs, states);
 }
 
 static void fetch_turned(Lanes *to, const Array *from, int rows, int columns, Span span) {

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam import native_designs
 from jaxbeam.control.contact import coupled_beam
 from jaxbeam.control.gains import Schedule, crossing
 from jaxbeam.control.sampling import warn_if_slow
@@ -187,8 +188,10 @@ class AbstractForesighted(AbstractScheduledRegulator):
     modes gains were right everywhere to 3e-4 of the largest nearby where the fastest mode turned by
     3 rad in a stretch of the table, to 3e-5 with 2 rad, 2e-6 with 1, and 1e-7 with 0.5; while P
     rings, before an event, the table has finer stretches. Where an actuator lags, they were right
-    to 1e-6 if a stretch lasted nine of its time constants, to 1e-8 with four. `in_time` is for
-    devices with many cores: see `flows.costs_to_go`; the gains are the same.
+    to 1e-6 if a stretch lasted nine of its time constants, to 1e-8 with four. `in_time`
+    makes no difference to the gains: "parallel" is for devices with many cores, see
+    `flows.costs_to_go`, and "native" takes what `jaxbeam native` has compiled from C, in about half
+    the time.
     """
 
     terminal_weight: Float[Array, " state"] | None = number(
@@ -203,7 +206,8 @@ class AbstractForesighted(AbstractScheduledRegulator):
     )
 
     def fault(self, case):
-        return super().fault(case) or too_coarse(self, case)
+        lacking = native_designs.lacking() if self.in_time == "native" else None
+        return super().fault(case) or lacking or too_coarse(self, case)
 
     def gains(self, model):
         return optimal(self, model)[0]
