@@ -21,7 +21,7 @@ from jaxbeam import gain_pieces, native_designs
 from jaxbeam.coupled import Coupling, Plant, answers, flows_of_kind, law_solved
 from jaxbeam.flows import NODES, costs_to_go, flows, on_commands
 from jaxbeam.gain_table import GainTable
-from jaxbeam.small import each_lane, in_lanes, lanes_of, solve_any, turned
+from jaxbeam.small import each_lane, few_lanes, in_lanes, lanes_of, solve_any, turned
 from jaxbeam.stretches import Commands, Square
 
 GROUP = 8  # stretches
@@ -30,6 +30,7 @@ GROUP = 8  # stretches
 # time since the event before are quartered, those of the tenth before halved, and what the last
 # group would last is cut into ever shorter stretches, so often halved.
 HALVINGS = 13
+FEW = 8  # lanes by C at a time, each with what its own plant does; a cache holds as much
 LAYER = [2, 2, 2, *range(3, HALVINGS + 1), HALVINGS]
 
 # What changes in a plant, at times (s) of any shape.
@@ -74,17 +75,16 @@ def finite_time(
 
     Raises ValueError if there is no C to be had.
     """
-    every = jax.vmap(jax.vmap(plant))
     inputs = R.shape[0]
     still = Plant(jnp.zeros_like(Q), jnp.zeros((Q.shape[0], inputs)), jnp.eye(Q.shape[0]))
 
-    def make(R, times, length, kind):
-        A, B = every(times)
+    def make(_, R, times, length, kind):
+        A, B = jax.vmap(jax.vmap(plant))(times)
         whole = jnp.broadcast_to(still.E, A.shape)
         law = jnp.concatenate([A, B], axis=3)
         return flows(A, B, Q, R, jnp.full(GROUP, length)), whole, law
 
-    return _backward(make, still, events, count, Q, R, terminal, in_time)
+    return _backward(lambda: None, make, still, events, count, Q, R, terminal, in_time)
 
 
 def finite_time_coupled(
@@ -98,22 +98,26 @@ def finite_time_coupled(
     in_time: str = "sequential",
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """The same for a plant that changes by a few forces; much faster, see `coupled`."""
-    longest = jnp.diff(events) * (shares(count)[1] * 2.0 ** halvings(count)[0])
-    every = jax.vmap(lambda length: answers(plant, Q, length, HALVINGS))(longest)
-    every = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), every)
-
     flowing = native_designs.coupled if in_time == "native" else flows_of_kind
 
-    def make(R, times, length, kind):
+    def prepare():
+        longest = jnp.diff(events) * (shares(count)[1] * 2.0 ** halvings(count)[0])
+        every = jax.vmap(lambda length: answers(plant, Q, length, HALVINGS))(longest)
+        return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), every)
+
+    def make(every, R, times, length, kind):
         coupling = changes(times)
         flow = flowing(plant, every, kind, coupling, R, length)
         return flow, coupling.shape, law_solved(coupling)
 
-    return _backward(make, plant, events, count, Q, R, terminal, in_time)
+    return _backward(prepare, make, plant, events, count, Q, R, terminal, in_time)
 
 
-def _backward(make, plant, events, count, Q, R, terminal, in_time):
-    """Gains and P, from what `make` tells of a group: flows, and what changes at their nodes."""
+def _backward(prepare, make, plant, events, count, Q, R, terminal, in_time):
+    """Gains and P, from what `make` tells of a group: flows, and what changes at their nodes.
+
+    It is given what `prepare` finds for all groups.
+    """
     lacking = native_designs.lacking() if in_time == "native" else None
     if lacking is not None:
         raise ValueError(lacking)
@@ -126,9 +130,12 @@ def _backward(make, plant, events, count, Q, R, terminal, in_time):
     given = times, lengths, jnp.asarray(kinds)
     groups = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), given)
     inverse = solve_any(R, jnp.eye(R.shape[0]))
-    make = eqx.filter_closure_convert(make, R, *jax.tree.map(lambda part: part[0], groups))
+    prepare = eqx.filter_closure_convert(prepare)
+    first = jax.tree.map(lambda part: part[0], groups)
+    make = eqx.filter_closure_convert(make, eqx.filter_eval_shape(prepare), R, *first)
     if in_time == "parallel":
-        parts, shape, law = jax.lax.map(lambda group: make(R, *group), groups)
+        known = prepare()
+        parts, shape, law = jax.lax.map(lambda group: make(known, R, *group), groups)
         whole = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), parts)
         costs = costs_to_go(whole, terminal, True)
         first = costs[:-1].reshape(-1, GROUP, *Q.shape)
@@ -138,7 +145,8 @@ def _backward(make, plant, events, count, Q, R, terminal, in_time):
         pieces = jax.vmap(functools.partial(in_lanes, gain_pieces.pieces), axes)(*given)
     else:
         by_hand = in_time == "native"
-        costs, pieces = in_lanes(_swept, by_hand, make, plant, groups, Q, R, inverse, terminal)
+        given = prepare, make, plant, groups, Q, R, inverse, terminal
+        costs, pieces = in_lanes(_few, by_hand, *given)
         costs = jnp.concatenate([costs.reshape(-1, *Q.shape), terminal[None]])
     inner = events[:-1, None] + spans[:, None] * edges[:-1]
     marks = jnp.append(inner.reshape(-1), events[-1])
@@ -146,19 +154,28 @@ def _backward(make, plant, events, count, Q, R, terminal, in_time):
     return GainTable(marks, pieces.reshape(-1, *pieces.shape[2:])), costs
 
 
-def _swept(by_hand, make, plant, groups, Q, R, inverse, terminal):
+def _few(by_hand, prepare, make, plant, groups, *rest):
+    """`_swept`, so many lanes at a time as caches hold, if these have answers of their own."""
+    given = by_hand, prepare, make, plant, groups, *rest
+    if not by_hand or lanes_of(prepare, groups) == 1:
+        return _swept(*given)
+    return few_lanes(_swept, FEW, *given)
+
+
+def _swept(by_hand, prepare, make, plant, groups, Q, R, inverse, terminal):
     """P at the starts of stretches and polynomials of the gain, of all groups, in lanes."""
     carried = native_designs.carried if by_hand else plain_flows.carried
     fitted = native_designs.pieces if by_hand else gain_pieces.pieces
+    known = each_lane(lambda prepare: prepare(), prepare)
     free = jnp.zeros((*R.shape[:2], 1))  # commands, so that lanes with other R share the flows
 
     def back(cost, group):
         length = group[1]
-        parts, shape, law = each_lane(lambda make, *rest: make(*rest), make, free, *group)
+        parts, shape, law = each_lane(lambda make, *rest: make(*rest), make, known, free, *group)
         costs = carried(parts, each_lane(on_commands, R, length), cost)
         pieces = fitted(plant, shape, law, costs, length, Q, inverse)
         return (costs[0] + turned(costs[0])) / 2, (costs[:-1], pieces)
 
-    given = make, plant, groups, Q, R, terminal
+    given = prepare, make, plant, groups, Q, R, terminal
     wide = jnp.broadcast_to(terminal, (*terminal.shape[:2], lanes_of(given)))
     return jax.lax.scan(back, wide, groups, reverse=True)[1]
