@@ -93,6 +93,22 @@ static void take_best(const Work *w, const Room *room, Span span) {
             room->cost[i * states + j] = room->cost[j * states + i] = room->total[i * both + j];
 }
 
+static int64_t lay_out(Room *room, int states, int values, Lanes *memory) {
+    const int both = states + values;
+    const Room_part parts[] = {{&room->cost, states * states},
+                               {&room->total, both * both},
+                               {&room->held, 4 * states},
+                               {&room->scaled, states * values},
+                               {&room->spent, values * values}};
+    return divide(parts, sizeof parts / sizeof *parts, memory);
+}
+
+/* How many numbers of memory a call needs. */
+int64_t carried_room(int states, int values) {
+    Room room;
+    return lay_out(&room, states, values, NULL);
+}
+
 XLA_FFI_Error *carried(XLA_FFI_CallFrame *frame) {
     if (asked(frame)) return NULL;
     Work work, *w = &work;
@@ -103,13 +119,7 @@ XLA_FFI_Error *carried(XLA_FFI_CallFrame *frame) {
     w->both = w->states + w->values;
     const int square = w->states * w->states;
     Room room;
-    const Room_part parts[] = {{&room.cost, square},
-                               {&room.total, w->both * w->both},
-                               {&room.held, 4 * w->states},
-                               {&room.scaled, w->states * w->values},
-                               {&room.spent, w->values * w->values}};
-    Lanes *all_room = divided(parts, sizeof parts / sizeof *parts, 0);
-    if (!all_room) return fault(frame, "not enough memory for jaxbeam's designs");
+    lay_out(&room, w->states, w->values, memory(frame, 1));
     for (int64_t first = 0; first < lanes; first += WIDE) {
         const Span span = span_of(first, lanes);
         fetch(room.cost, w->in + TERMINAL, 0, square, span);
@@ -120,6 +130,5 @@ XLA_FFI_Error *carried(XLA_FFI_CallFrame *frame) {
             take_best(w, &room, span);
         }
     }
-    free(all_room);
     return NULL;
 }

@@ -4,6 +4,8 @@ Each function is one of those that XLA runs otherwise, whose derivative it has. 
 CPUs; nobody needs it.
 """
 
+import ctypes
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,10 +39,16 @@ def lacking() -> str | None:
     return None
 
 
-def _call(name: str, shapes: list[tuple[int, ...]], *given):
-    """What a function of the library makes of arrays: arrays of these shapes."""
-    results = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
-    return jax.ffi.ffi_call(LIBRARY.target(name), results, vmap_method="sequential")(*given)
+def _call(name: str, shapes: list[tuple[int, ...]], sizes: tuple[int, ...], *given):
+    """What a function of the library makes of arrays: arrays of these shapes.
+
+    The sizes decide how much memory it works in.
+    """
+    room = getattr(LIBRARY.loaded(), f"{name}_room")
+    room.restype = ctypes.c_int64
+    results = [jax.ShapeDtypeStruct(shape, float) for shape in (*shapes, (room(*sizes),))]
+    call = jax.ffi.ffi_call(LIBRARY.target(name), results, vmap_method="sequential")
+    return call(*given)[:-1]
 
 
 def coupled(
@@ -63,8 +71,11 @@ def _coupled(plant, every, kind, coupling, R, length):
     given = *first, kind, *changing, coupling.direct, coupling.back, effort
     count, (states, inputs) = coupling.shape.shape[0], plant.B.shape[:2]
     values = flows.STAGES * inputs
-    sizes = (states, states), (states, values), (states + values, states + values)
-    return _call("coupled", [(count, *size, lanes_of(given)) for size in sizes], *given)
+    results = (states, states), (states, values), (states + values, states + values)
+    lanes = lanes_of(given)
+    shapes = [(count, *result, lanes) for result in results]
+    directions, forces = coupling.shape.shape[2:4]
+    return _call("coupled", shapes, (states, inputs, directions, forces, count, lanes), *given)
 
 
 @_coupled.defjvp
@@ -82,11 +93,11 @@ def carried(
     terminal: Float[Array, "state state _"],
 ) -> Float[Array, "edge state state lane"]:
     """As `flows.carried`."""
-    values = parts.push.shape[2]
+    count, states, values = parts.push.shape[:3]
     effort = jnp.broadcast_to(effort, (values, values, effort.shape[2]))
-    edges = parts.drift.shape[0] + 1
-    shape = edges, *parts.drift.shape[1:3], lanes_of(parts, effort, terminal)
-    return _call("carried", [shape], parts.drift, parts.push, parts.toll, effort, terminal)[0]
+    given = parts.drift, parts.push, parts.toll, effort, terminal
+    shape = count + 1, states, states, lanes_of(given)
+    return _call("carried", [shape], (states, values), *given)[0]
 
 
 @carried.defjvp
@@ -108,8 +119,10 @@ def pieces(
     given = plant.A, plant.B, plant.E, shape, law, costs, length, Q, inverse
     states, inputs = plant.B.shape[:2]
     fit = np.stack(hermite(AT_ENDS.shape[1])).swapaxes(1, 2)
-    sizes = shape.shape[0], fit.shape[2], inputs, states, lanes_of(given)
-    return _call("pieces", [sizes], *given, AT_ENDS, fit)[0]
+    count, _, directions, forces = shape.shape[:4]
+    found = count, fit.shape[2], inputs, states, lanes_of(given)
+    sizes = states, inputs, forces, directions, count
+    return _call("pieces", [found], sizes, *given, AT_ENDS, fit)[0]
 
 
 @pieces.defjvp

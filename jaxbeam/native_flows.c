@@ -13,6 +13,7 @@ enum { DRIFT, PUSH, TOLL, RESULTS };
 typedef struct {
     int states, inputs, forces, directions, stretches;
     int values, known, whole, size; /* of commands, with states, with directed forces; of forces */
+    int vectors; /* that are worked on together: of stretches, or each of the lanes of one */
     int64_t kind, lanes;
     Array in[ARGUMENTS];
     double *out[RESULTS];
@@ -225,36 +226,52 @@ static void flow(const Work *w, const Room *room, Part part) {
     for (int v = 0; v < part.vectors; v++) conclude(w, room, v, part);
 }
 
+static void measure(Work *w, int states, int inputs, int directions, int forces, int stretches,
+                    int64_t lanes) {
+    w->states = states, w->inputs = inputs, w->directions = directions, w->forces = forces;
+    w->stretches = stretches, w->lanes = lanes;
+    w->values = NODES * inputs, w->known = states + w->values, w->size = NODES * forces;
+    w->whole = w->known + NODES * directions;
+    w->vectors = lanes == 1 ? (stretches + WIDE - 1) / WIDE : stretches;
+}
+
+static int64_t lay_out(Room *room, const Work *w, Lanes *memory) {
+    const int columns = w->vectors * w->forces, size = w->size, known = w->known;
+    const Room_part parts[] = {{&room->rows, NODES * w->states * columns},
+                               {&room->shape, NODES * w->directions * columns},
+                               {&room->seen, w->whole * columns},
+                               {&room->table, NODES * (w->states + known) * columns},
+                               {&room->own, w->vectors * size * size},
+                               {&room->law, w->vectors * size * size},
+                               {&room->right, w->vectors * size * known},
+                               {&room->ends, w->states * size},
+                               {&room->left, known * 2 * size},
+                               {&room->turn, known * 2 * size},
+                               {&room->sums, known * (2 * size > known ? 2 * size : known)}};
+    return divide(parts, sizeof parts / sizeof *parts, memory);
+}
+
+/* How many numbers of memory a call needs. */
+int64_t coupled_room(int states, int inputs, int directions, int forces, int stretches, int lanes) {
+    Work work;
+    Room room;
+    measure(&work, states, inputs, directions, forces, stretches, lanes);
+    return lay_out(&room, &work, NULL);
+}
+
 XLA_FFI_Error *coupled(XLA_FFI_CallFrame *frame) {
     if (asked(frame)) return NULL;
     Work work, *w = &work;
-    arrays(w->in, frame, ARGUMENTS);
-    for (int i = 0; i < RESULTS; i++) w->out[i] = result(frame, i, &w->lanes);
-    w->stretches = (int)w->in[SHAPE].dims[0], w->states = (int)w->in[END].dims[1];
-    w->directions = (int)w->in[SHAPE].dims[2], w->forces = (int)w->in[SHAPE].dims[3];
-    w->inputs = (int)w->in[DIRECT].dims[3], w->values = NODES * w->inputs;
-    w->known = w->states + w->values, w->size = NODES * w->forces;
-    w->whole = w->known + NODES * w->directions;
-    w->kind = *(const int64_t *)w->in[KIND].data;
-    const int vectors = by_stretches(w) ? (w->stretches + WIDE - 1) / WIDE : w->stretches;
-    const int columns = vectors * w->forces, size = w->size, known = w->known;
-    const int kept = 2 * size > known ? 2 * size : known;
     Room room;
-    const Room_part parts[] = {{&room.rows, NODES * w->states * columns},
-                          {&room.shape, NODES * w->directions * columns},
-                          {&room.seen, w->whole * columns},
-                          {&room.table, NODES * (w->states + known) * columns},
-                          {&room.own, vectors * size * size},
-                          {&room.law, vectors * size * size},
-                          {&room.right, vectors * size * known},
-                          {&room.ends, w->states * size},
-                          {&room.left, known * 2 * size},
-                          {&room.turn, known * 2 * size},
-                          {&room.sums, known * kept}};
-    Lanes *all_room = divided(parts, sizeof parts / sizeof *parts, 0);
-    if (!all_room) return fault(frame, "not enough memory for jaxbeam's designs");
-    for (int64_t first = 0; first < w->lanes; first += WIDE)
-        flow(w, &room, (Part){vectors, span_of(first, w->lanes)});
-    free(all_room);
+    int64_t lanes;
+    arrays(w->in, frame, ARGUMENTS);
+    for (int i = 0; i < RESULTS; i++) w->out[i] = result(frame, i, &lanes);
+    const int64_t *shape = w->in[SHAPE].dims;
+    measure(w, (int)w->in[END].dims[1], (int)w->in[DIRECT].dims[3], (int)shape[2], (int)shape[3],
+            (int)shape[0], lanes);
+    w->kind = *(const int64_t *)w->in[KIND].data;
+    lay_out(&room, w, memory(frame, RESULTS));
+    for (int64_t first = 0; first < lanes; first += WIDE)
+        flow(w, &room, (Part){w->vectors, span_of(first, lanes)});
     return NULL;
 }

@@ -2,8 +2,6 @@
 
    An array of XLA's has the runs, its lanes, as its last axis, of length one where they share it. */
 
-#include <stdlib.h>
-
 #include "native_lanes.h"
 #include "xla/ffi/api/c_api.h"
 
@@ -166,12 +164,6 @@ static inline void add_shares(Lanes *sums, const Lanes *shares, int rows, const 
                  terms);
 }
 
-static XLA_FFI_Error *fault(const XLA_FFI_CallFrame *frame, const char *message) {
-    XLA_FFI_Error_Create_Args args = {XLA_FFI_Error_Create_Args_STRUCT_SIZE, NULL, message,
-                                      XLA_FFI_Error_Code_INTERNAL};
-    return frame->api->XLA_FFI_Error_Create(&args);
-}
-
 /* XLA asks for which version of its interface this was compiled. */
 static int asked(const XLA_FFI_CallFrame *frame) {
     if (!frame->extension_start || frame->extension_start->type != XLA_FFI_Extension_Metadata)
@@ -196,17 +188,22 @@ static double *result(const XLA_FFI_CallFrame *frame, int which, int64_t *lanes)
     return buffer->data;
 }
 
+/* The last result is memory to work in, from the first place on where registers may be kept. */
+static Lanes *memory(const XLA_FFI_CallFrame *frame, int which) {
+    const uintptr_t start = (uintptr_t)((const XLA_FFI_Buffer *)frame->rets.rets[which])->data;
+    return (Lanes *)((start + sizeof(Lanes) - 1) / sizeof(Lanes) * sizeof(Lanes));
+}
+
 /* Some of the memory that a function works in: so many numbers of each lane. */
 typedef struct {
     Lanes **start;
     int count;
 } Room_part;
 
-/* Memory divided into parts, and more after the last; NULL if there is none, else to be freed. */
-static Lanes *divided(const Room_part *parts, int count, int more) {
-    size_t total = (size_t)more;
-    for (int i = 0; i < count; i++) total += (size_t)parts[i].count;
-    Lanes *memory = aligned_alloc(sizeof(Lanes), (total + 1) * sizeof(Lanes)), *next = memory;
-    for (int i = 0; memory && i < count; next += parts[i++].count) *parts[i].start = next;
-    return memory;
+/* How many numbers the parts are; they are told where they start, if there is memory for them. */
+static int64_t divide(const Room_part *parts, int count, Lanes *memory) {
+    int64_t total = 0;
+    for (int i = 0; i < count; total += parts[i++].count)
+        if (memory) *parts[i].start = memory + total;
+    return (total + 1) * WIDE; /* one for the place where it starts */
 }

@@ -25,8 +25,16 @@ typedef struct {
 typedef struct {
     Lanes *A, *turned, *Q, *B, *E, *inverse; /* of the plant; B and E transposed */
     Lanes *shape, *law, *direct, *share;     /* for short */
-    Lanes *cost, *held, *back, *falls, *gains;
+    Lanes *cost, *held, *back, *falls, *gains, *edges;
 } Room;
+
+static int of_edge(const Sizes *n) { return 2 * RATES * n->far + (KINDS + FEW) * n->row; }
+
+static Edge edge_of(const Room *room, const Sizes *n, int s) {
+    Lanes *push = room->edges + s * of_edge(n), *seen = push + RATES * n->far;
+    Lanes *rows = seen + RATES * n->far;
+    return (Edge){push, seen, rows, rows + KINDS * n->row};
+}
 
 /* Values at an edge, and their rates, from those at the nodes of a stretch. */
 static void at_edge(Lanes *to, const Array *nodes, const double *weights, int64_t stretch, int size,
@@ -131,8 +139,7 @@ static void fetch_turned(Lanes *to, const Array *from, int rows, int columns, Sp
         for (int j = 0; j < columns; j++) to[j * rows + i] = entry(from, i * columns + j, span);
 }
 
-static void prepare(const Array *in, int stretches, Edge *edges, const Room *room, const Sizes *n,
-                    Span span) {
+static void prepare(const Array *in, int stretches, const Room *room, const Sizes *n, Span span) {
     const int states = n->states;
     fetch(room->A, in + A, 0, states * states, span);
     fetch_turned(room->turned, in + A, states, states, span);
@@ -144,12 +151,13 @@ static void prepare(const Array *in, int stretches, Edge *edges, const Room *roo
         const int nodes = s < stretches ? s : s - 1;
         at_edge(room->shape, in + SHAPE, weights, nodes, n->directions * n->forces, span);
         at_edge(room->law, in + LAW, weights, nodes, n->forces * (states + n->inputs), span);
-        tabulate(edges + s, room, n);
+        const Edge edge = edge_of(room, n, s);
+        tabulate(&edge, room, n);
     }
 }
 
-static void fit(const Array *in, double *out, int stretches, const Edge *edges, const Room *room,
-                const Sizes *n, Span span) {
+static void fit(const Array *in, double *out, int stretches, const Room *room, const Sizes *n,
+                Span span) {
     const int square = n->states * n->states, row = n->row;
     const Lanes length = entry(in + LENGTH, 0, span);
     fetch(room->inverse, in + INVERSE, 0, n->inputs * n->inputs, span);
@@ -158,7 +166,8 @@ static void fit(const Array *in, double *out, int stretches, const Edge *edges, 
         Lanes *gains = room->gains + s % 2 * RATES * row;
         const Lanes *ends[] = {room->gains + (s + 1) % 2 * RATES * row, gains};
         fetch(room->cost, in + COSTS, s * square, square, span);
-        find_gains(gains, edges + s, length, room, n);
+        const Edge edge = edge_of(room, n, s);
+        find_gains(gains, &edge, length, room, n);
         for (int i = 0; s > 0 && i < row; i++) {
             Lanes sums[POWERS] = {{0}};
             for (int e = 0; e < 2; e++)
@@ -172,53 +181,55 @@ static void fit(const Array *in, double *out, int stretches, const Edge *edges, 
     }
 }
 
+static Sizes sizes_of(int states, int inputs, int forces, int directions) {
+    return (Sizes){states, inputs, forces, directions, inputs * states, forces * states};
+}
+
+static int64_t lay_out(Room *room, const Sizes *n, int stretches, Lanes *memory) {
+    const int square = n->states * n->states, wide = n->forces > n->inputs ? n->forces : n->inputs;
+    const Room_part parts[] = {{&room->A, square},
+                               {&room->turned, square},
+                               {&room->Q, square},
+                               {&room->cost, square},
+                               {&room->B, n->row},
+                               {&room->E, n->directions * n->states},
+                               {&room->inverse, n->inputs * n->inputs},
+                               {&room->shape, RATES * n->directions * n->forces},
+                               {&room->law, RATES * n->forces * (n->states + n->inputs)},
+                               {&room->direct, RATES * n->inputs * n->forces},
+                               {&room->share, FEW * n->inputs * wide},
+                               {&room->held, KINDS * n->row},
+                               {&room->back, FEW * n->row},
+                               {&room->falls, FEW * n->row},
+                               {&room->gains, 2 * RATES * n->row},
+                               {&room->edges, (stretches + 1) * of_edge(n)}};
+    return divide(parts, sizeof parts / sizeof *parts, memory);
+}
+
+/* How many numbers of memory a call needs. */
+int64_t pieces_room(int states, int inputs, int forces, int directions, int stretches) {
+    Room room;
+    const Sizes n = sizes_of(states, inputs, forces, directions);
+    return lay_out(&room, &n, stretches, NULL);
+}
+
 XLA_FFI_Error *pieces(XLA_FFI_CallFrame *frame) {
     if (asked(frame)) return NULL;
     Array in[ARGUMENTS];
-    arrays(in, frame, ARGUMENTS);
+    Room room;
     int64_t lanes;
+    int shared = 1;
+    arrays(in, frame, ARGUMENTS);
     double *out = result(frame, 0, &lanes);
     const int stretches = (int)in[SHAPE].dims[0];
-    Sizes n = {.states = (int)in[B].dims[0], .inputs = (int)in[B].dims[1],
-               .forces = (int)in[LAW].dims[2], .directions = (int)in[E].dims[1]};
-    n.row = n.inputs * n.states, n.far = n.forces * n.states;
-    const int wide = n.forces > n.inputs ? n.forces : n.inputs;
-    const int of_edge = 2 * RATES * n.far + (KINDS + FEW) * n.row;
-    int shared = 1;
+    const Sizes n = sizes_of((int)in[B].dims[0], (int)in[B].dims[1], (int)in[LAW].dims[2],
+                             (int)in[E].dims[1]);
+    lay_out(&room, &n, stretches, memory(frame, 1));
     for (int i = 0; i <= Q; i++) shared &= i == COSTS || in[i].lanes == 1;
-    Room room;
-    const Room_part parts[] = {{&room.A, n.states * n.states},
-                 {&room.turned, n.states * n.states},
-                 {&room.Q, n.states * n.states},
-                 {&room.cost, n.states * n.states},
-                 {&room.B, n.row},
-                 {&room.E, n.directions * n.states},
-                 {&room.inverse, n.inputs * n.inputs},
-                 {&room.shape, RATES * n.directions * n.forces},
-                 {&room.law, RATES * n.forces * (n.states + n.inputs)},
-                 {&room.direct, RATES * n.inputs * n.forces},
-                 {&room.share, FEW * n.inputs * wide},
-                 {&room.held, KINDS * n.row},
-                 {&room.back, FEW * n.row},
-                 {&room.falls, FEW * n.row},
-                 {&room.gains, 2 * RATES * n.row}};
-    Edge *edges = malloc((size_t)(stretches + 1) * sizeof *edges);
-    Lanes *all_room = divided(parts, sizeof parts / sizeof *parts, (stretches + 1) * of_edge);
-    if (!all_room || !edges) {
-        free(all_room), free(edges);
-        return fault(frame, "not enough memory for jaxbeam's designs");
-    }
-    Lanes *next = room.gains + 2 * RATES * n.row; /* after the last part */
-    for (int s = 0; s <= stretches; s++, next += of_edge)
-        edges[s] = (Edge){.push = next,
-                          .seen = next + RATES * n.far,
-                          .rows = next + 2 * RATES * n.far,
-                          .weighted = next + 2 * RATES * n.far + KINDS * n.row};
     for (int64_t first = 0; first < lanes; first += WIDE) {
         const Span span = span_of(first, lanes);
-        if (!first || !shared) prepare(in, stretches, edges, &room, &n, span);
-        fit(in, out, stretches, edges, &room, &n, span);
+        if (!first || !shared) prepare(in, stretches, &room, &n, span);
+        fit(in, out, stretches, &room, &n, span);
     }
-    free(all_room), free(edges);
     return NULL;
 }
