@@ -1,7 +1,7 @@
 """Hand-written C, compiled for this machine when asked for, and found by later processes.
 
 A library lies in the user's cache folder under a name that tells its sources, the machine and the
-version of JAX. Nobody needs it.
+version of JAX. Functions that are called by XLA are its targets. Nobody needs it.
 """
 
 import ctypes
