@@ -33,7 +33,8 @@ static void sum_up(const Work *w, const Room *room, int64_t s, Span span) {
     const int states = w->states, both = w->both;
     for (int j = 0; j < both; j++) { /* and what is left of the diagonal in the same strip of columns */
         const int first = j < 3 ? 0 : j - 3;
-        fetch(room->total + j * both + first, w->in + TOLL, (s * both + j) * both + first, both - first, span);
+        fetch(room->total + j * both + first, w->in + TOLL, (s * both + j) * both + first, both - first,
+              span);
     }
     for (int i = 0, step; i < both; i += step) {
         step = across(room->held, states, w, s, i, both, (Matrix){room->cost, states, 1}, states, span, 0);

@@ -95,7 +95,8 @@ static void demand(const Work *w, const Room *room, int node, Part part) {
                     }
                     for (int d = 0; d < w->directions; d++) {
                         const int at = q * w->directions + d;
-                        sum -= seen[(known + at) * columns] * room->shape[at * columns + t * part.vectors + v];
+                        const Lanes shape = room->shape[at * columns + t * part.vectors + v];
+                        sum -= seen[(known + at) * columns] * shape;
                     }
                     law[q * forces + t] = sum;
                 }
