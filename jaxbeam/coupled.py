@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxbeam.flows import NODES, STAGES, Flow, on_commands
 from jaxbeam.small import solve_any
@@ -48,10 +48,11 @@ class Answers(eqx.Module):
     """What the constant part does over a stretch under inputs given at its Gauss nodes.
 
     `inner` and `end` take (x, commands, directed forces) to the state at the nodes and at the end,
-    `toll` is what they cost. Commands and forces are ordered by node.
+    `toll` is what they cost. Commands and forces are ordered by node. What the state at
+    a node is made of lies together, as contact laws sum it.
     """
 
-    inner: Float[Array, "*length stage state whole"]
+    inner: Float[Array, "*length stage whole state"]
     end: Float[Array, "*length state whole"]
     toll: Float[Array, "*length whole whole"]
 
@@ -97,7 +98,9 @@ def answers(plant: Plant, Q: Square, length: Float[Array, ""], halvings: int) ->
     both = _ordered(jnp.moveaxis(both, (1, 2), (-2, -1)), plant)
     top = jnp.concatenate([cost[:, :states, :states], mixed], axis=2)
     below = jnp.concatenate([transposed(mixed), both], axis=2)
-    return Answers(whole[:, :STAGES], whole[:, -1], jnp.concatenate([top, below], axis=1))
+    return Answers(
+        transposed(whole[:, :STAGES]), whole[:, -1], jnp.concatenate([top, below], axis=1)
+    )
 
 
 def coupled_flows(
@@ -114,7 +117,7 @@ def coupled_flows(
     size = STAGES * forces
     # What the law of f sees, of what is known and of f itself. Stretches come last, for small sums.
     shape = jnp.moveaxis(coupling.shape, 0, -1)
-    seen = jnp.einsum("ciw,scri->cwrs", answer.inner, coupling.rows)
+    seen = jnp.einsum("cwi,scri->cwrs", answer.inner, coupling.rows)
     direct = jnp.moveaxis(coupling.direct, 0, -1).swapaxes(1, 2)  # stage, input, force, stretch
     at_once = np.eye(STAGES)[:, :, None, None, None] * direct[:, None]
     right = seen[:, :known].at[:, states:].add(at_once.reshape(STAGES, -1, forces, stretches))
@@ -138,6 +141,19 @@ def coupled_flows(
     turn = transposed(force) @ (transposed(mixed) + own @ force / 2)
     toll = answer.toll[:known, :known] + spent + turn + transposed(turn)
     return Flow(end[..., :states], end[..., states:], toll)
+
+
+def flows_of_kind(
+    plant: Plant,
+    every: Answers,
+    kind: Int[Array, ""],
+    coupling: Coupling,
+    R: Commands,
+    length: Float[Array, ""],
+) -> Flow:
+    """Those over stretches of one of the lengths that there are answers for."""
+    answer = jax.tree.map(lambda part: jax.lax.dynamic_index_in_dim(part, kind, 0, False), every)
+    return coupled_flows(plant, answer, coupling, R, length)
 
 
 def law_solved(coupling: Coupling) -> Float[Array, "stretch stage force both"]:

@@ -16,10 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbeam.coupled import Coupling, Plant, answers, coupled_flows, law_solved
-from jaxbeam.flows import NODES, carried, costs_to_go, flows, on_commands
-from jaxbeam.gain_table import GainTable, from_nodes, polynomials
-from jaxbeam.small import each_lane, in_lanes, joined, lanes_of, solve_any, times, turned
+from jaxbeam import flows as plain_flows
+from jaxbeam import gain_pieces, native_designs
+from jaxbeam.coupled import Coupling, Plant, answers, flows_of_kind, law_solved
+from jaxbeam.flows import NODES, costs_to_go, flows, on_commands
+from jaxbeam.gain_table import GainTable
+from jaxbeam.small import each_lane, few_lanes, in_lanes, lanes_of, solve_any, turned
 from jaxbeam.stretches import Commands, Square
 
 GROUP = 8  # stretches
@@ -28,6 +30,7 @@ GROUP = 8  # stretches
 # time since the event before are quartered, those of the tenth before halved, and what the last
 # group would last is cut into ever shorter stretches, so often halved.
 HALVINGS = 13
+FEW = 8  # lanes by C at a time, each with what its own plant does; a cache holds as much
 LAYER = [2, 2, 2, *range(3, HALVINGS + 1), HALVINGS]
 
 # What changes in a plant, at times (s) of any shape.
@@ -62,24 +65,26 @@ def finite_time(
     Q: Square,
     R: Commands,
     terminal: Square,
-    parallel: bool = False,
+    in_time: str = "sequential",
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """Gains that minimise x'Fx at the last event plus the integral of x'Qx + u'Ru, and P at edges.
 
     There are at least so many stretches, and a fine layer, between events (s); F is `terminal`. P
-    is carried from stretch to stretch one after the other, or in `parallel` (see `costs_to_go`).
+    is carried from stretch to stretch one after the other ("sequential"), the same in C ("native",
+    see `native_designs`), or in "parallel" (see `costs_to_go`).
+
+    Raises ValueError if there is no C to be had.
     """
-    every = jax.vmap(jax.vmap(plant))
     inputs = R.shape[0]
     still = Plant(jnp.zeros_like(Q), jnp.zeros((Q.shape[0], inputs)), jnp.eye(Q.shape[0]))
 
-    def make(R, times, length, kind):
-        A, B = every(times)
+    def make(_, R, times, length, kind):
+        A, B = jax.vmap(jax.vmap(plant))(times)
         whole = jnp.broadcast_to(still.E, A.shape)
         law = jnp.concatenate([A, B], axis=3)
         return flows(A, B, Q, R, jnp.full(GROUP, length)), whole, law
 
-    return _backward(make, still, events, count, Q, R, terminal, parallel)
+    return _backward(lambda: None, make, still, events, count, Q, R, terminal, in_time)
 
 
 def finite_time_coupled(
@@ -90,26 +95,32 @@ def finite_time_coupled(
     Q: Square,
     R: Commands,
     terminal: Square,
-    parallel: bool = False,
+    in_time: str = "sequential",
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """The same for a plant that changes by a few forces; much faster, see `coupled`."""
-    longest = jnp.diff(events) * (shares(count)[1] * 2.0 ** halvings(count)[0])
-    every = jax.vmap(lambda length: answers(plant, Q, length, HALVINGS))(longest)
-    every = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), every)
+    flowing = native_designs.coupled if in_time == "native" else flows_of_kind
 
-    def make(R, times, length, kind):
-        answer = jax.tree.map(
-            lambda part: jax.lax.dynamic_index_in_dim(part, kind, 0, False), every
-        )
+    def prepare():
+        longest = jnp.diff(events) * (shares(count)[1] * 2.0 ** halvings(count)[0])
+        every = jax.vmap(lambda length: answers(plant, Q, length, HALVINGS))(longest)
+        return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), every)
+
+    def make(every, R, times, length, kind):
         coupling = changes(times)
-        flow = coupled_flows(plant, answer, coupling, R, length)
+        flow = flowing(plant, every, kind, coupling, R, length)
         return flow, coupling.shape, law_solved(coupling)
 
-    return _backward(make, plant, events, count, Q, R, terminal, parallel)
+    return _backward(prepare, make, plant, events, count, Q, R, terminal, in_time)
 
 
-def _backward(make, plant, events, count, Q, R, terminal, parallel):
-    """Gains and P, from what `make` tells of a group: flows, and what changes at their nodes."""
+def _backward(prepare, make, plant, events, count, Q, R, terminal, in_time):
+    """Gains and P, from what `make` tells of a group: flows, and what changes at their nodes.
+
+    It is given what `prepare` finds for all groups.
+    """
+    lacking = native_designs.lacking() if in_time == "native" else None
+    if lacking is not None:
+        raise ValueError(lacking)
     edges, spans = shares(count), jnp.diff(events)
     steps = np.diff(edges).reshape(-1, GROUP)
     within = edges[:-1].reshape(-1, GROUP)[:, :, None] + steps[:, :, None] * NODES
@@ -119,18 +130,23 @@ def _backward(make, plant, events, count, Q, R, terminal, parallel):
     given = times, lengths, jnp.asarray(kinds)
     groups = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), given)
     inverse = solve_any(R, jnp.eye(R.shape[0]))
-    make = eqx.filter_closure_convert(make, R, *jax.tree.map(lambda part: part[0], groups))
-    if parallel:
-        parts, shape, law = jax.lax.map(lambda group: make(R, *group), groups)
+    prepare = eqx.filter_closure_convert(prepare)
+    first = jax.tree.map(lambda part: part[0], groups)
+    make = eqx.filter_closure_convert(make, eqx.filter_eval_shape(prepare), R, *first)
+    if in_time == "parallel":
+        known = prepare()
+        parts, shape, law = jax.lax.map(lambda group: make(known, R, *group), groups)
         whole = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), parts)
         costs = costs_to_go(whole, terminal, True)
         first = costs[:-1].reshape(-1, GROUP, *Q.shape)
         grouped = jnp.concatenate([first, costs[GROUP::GROUP, None]], axis=1)
         given = plant, shape, law, grouped, groups[1], Q, inverse
         axes = None, 0, 0, 0, 0, None, None
-        pieces = jax.vmap(functools.partial(in_lanes, _pieces), axes)(*given)
+        pieces = jax.vmap(functools.partial(in_lanes, gain_pieces.pieces), axes)(*given)
     else:
-        costs, pieces = in_lanes(_swept, make, plant, groups, Q, R, inverse, terminal)
+        by_hand = in_time == "native"
+        given = prepare, make, plant, groups, Q, R, inverse, terminal
+        costs, pieces = in_lanes(_few, by_hand, *given)
         costs = jnp.concatenate([costs.reshape(-1, *Q.shape), terminal[None]])
     inner = events[:-1, None] + spans[:, None] * edges[:-1]
     marks = jnp.append(inner.reshape(-1), events[-1])
@@ -138,67 +154,28 @@ def _backward(make, plant, events, count, Q, R, terminal, parallel):
     return GainTable(marks, pieces.reshape(-1, *pieces.shape[2:])), costs
 
 
-def _swept(make, plant, groups, Q, R, inverse, terminal):
+def _few(by_hand, prepare, make, plant, groups, *rest):
+    """`_swept`, so many lanes at a time as caches hold, if these have answers of their own."""
+    given = by_hand, prepare, make, plant, groups, *rest
+    if not by_hand or lanes_of(prepare, groups) == 1:
+        return _swept(*given)
+    return few_lanes(_swept, FEW, *given)
+
+
+def _swept(by_hand, prepare, make, plant, groups, Q, R, inverse, terminal):
     """P at the starts of stretches and polynomials of the gain, of all groups, in lanes."""
+    carried = native_designs.carried if by_hand else plain_flows.carried
+    fitted = native_designs.pieces if by_hand else gain_pieces.pieces
+    known = each_lane(lambda prepare: prepare(), prepare)
     free = jnp.zeros((*R.shape[:2], 1))  # commands, so that lanes with other R share the flows
 
     def back(cost, group):
         length = group[1]
-        parts, shape, law = each_lane(lambda make, *rest: make(*rest), make, free, *group)
+        parts, shape, law = each_lane(lambda make, *rest: make(*rest), make, known, free, *group)
         costs = carried(parts, each_lane(on_commands, R, length), cost)
-        edges = jnp.concatenate([costs, cost[None]])
-        pieces = _pieces(plant, shape, law, edges, length, Q, inverse)
-        return (costs[0] + turned(costs[0])) / 2, (costs, pieces)
+        pieces = fitted(plant, shape, law, costs, length, Q, inverse)
+        return (costs[0] + turned(costs[0])) / 2, (costs[:-1], pieces)
 
-    given = make, plant, groups, Q, R, terminal
+    given = prepare, make, plant, groups, Q, R, terminal
     wide = jnp.broadcast_to(terminal, (*terminal.shape[:2], lanes_of(given)))
     return jax.lax.scan(back, wide, groups, reverse=True)[1]
-
-
-def _pieces(plant, shape, law, costs, length, Q, inverse):
-    """Polynomials of the gain over a group of stretches, from P at its edges, in lanes.
-
-    The rate of the state is that by the constant part of the `plant`, plus E shape law (x, u); what
-    changes is known at the nodes, and wanted, with its rates, at the edges.
-    """
-    shape, law = from_nodes(shape), from_nodes(law)  # edge, rate, ...
-    push = jax.vmap(jax.vmap(lambda part: times(plant.E, part)))(shape)
-
-    def at_edge(push, law, cost):
-        return _gains(plant, push, law, cost, length, Q, inverse)
-
-    gains = jax.vmap(at_edge, out_axes=1)(push, law, costs)
-    return polynomials(gains[:, :-1], gains[:, 1:])
-
-
-def _gains(plant, push, law, cost, length, Q, inverse):
-    """The gain, its rate and the rate of that, by share of a stretch.
-
-    A = plant.A + push law_x and B = plant.B + push law_u, with rates. P is never differentiated as
-    a whole, but only what it does to a few columns.
-    """
-    states, inputs = plant.B.shape[:2]
-    (W, W_1, W_2), (V, V_1, _), (D, D_1, D_2) = push, law[:, :, :states], law[:, :, states:]
-    B, B_1 = plant.B + times(W, D), times(W_1, D) + times(W, D_1)
-    B_2 = times(W_2, D) + 2 * times(W_1, D_1) + times(W, D_2)
-    seen = times(V, B)
-    once, turn = times(plant.A, B) + times(W, seen), times(W_1, seen) + times(W, times(V_1, B))
-    more = joined(B_1, once)
-    twice = times(plant.A, more) + times(W, times(V, more))
-    rows = turned(joined(B, more, once, twice, turn, B_2))
-    few = rows[: 3 * inputs]
-    held = times(rows, cost)  # P is symmetric
-    seen, first, then = held[:inputs], held[: 3 * inputs], held[3 * inputs : 6 * inputs]
-    onto = times(inverse, seen)
-    back = times(first, plant.A) + times(times(first, W), V)
-    spent = times(times(few, turned(seen)), onto)
-    falls = length * (spent - then - back - times(few, Q))
-    fall, rest, twice_fall = (falls[k * inputs : (k + 1) * inputs] for k in range(3))
-    faster = fall + held[inputs : 2 * inputs]  # the rate of P B
-    felt = times(fall, W) + times(seen, W_1)
-    back = times(fall, plant.A) + times(felt, V) + times(times(seen, W), V_1)
-    mixed = times(times(few[:inputs], turned(onto)), faster)
-    mixed = mixed + times(times(few[:inputs], turned(faster)), onto)
-    bends = length * (mixed - twice_fall - held[6 * inputs : 7 * inputs] - back)
-    last = held[7 * inputs :] + 2 * rest + bends
-    return jnp.stack([onto, times(inverse, faster), times(inverse, last)])

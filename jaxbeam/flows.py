@@ -95,17 +95,16 @@ def costs_to_go(
         even = Stretch(best.drift * scale / scale[:, None], best.reach / outer, best.toll * outer)
         onward = jax.lax.associative_scan(join, even, reverse=True)
         costs = jax.vmap(lambda part: part.before(terminal * outer))(onward) / outer
-    else:
-        costs = in_lanes(carried, parts, jnp.zeros((1, 1)), terminal)
-    return jnp.concatenate([costs, terminal[None]])
+        return jnp.concatenate([costs, terminal[None]])
+    return in_lanes(carried, parts, jnp.zeros((1, 1)), terminal)
 
 
 def carried(
     parts: Flow,
     effort: Float[Array, "#value #value #lane"],
     terminal: Float[Array, "state state #lane"],
-) -> Float[Array, "stretch state state lane"]:
-    """P at the start of each of successive stretches, with lanes as the last axis.
+) -> Float[Array, "edge state state lane"]:
+    """P at the start of each of successive stretches and at the end, with lanes as the last axis.
 
     Commands also cost `effort`, which lanes that share the flows need not share.
     """
@@ -121,7 +120,8 @@ def carried(
 
     across = jnp.concatenate([parts.drift, parts.push], axis=2).swapaxes(1, 2)
     wide = jnp.broadcast_to(terminal, (states, states, lanes_of(parts, effort, terminal)))
-    return jax.lax.scan(back, wide, (across, parts.toll), reverse=True)[1]
+    costs = jax.lax.scan(back, wide, (across, parts.toll), reverse=True)[1]
+    return jnp.concatenate([costs, wide[None]])
 
 
 def _collocated(matrix, column, length, Q, R) -> Flow:

@@ -66,7 +66,7 @@ def polynomials(
     starts: Float[Array, "rate stretch *gain"], ends: Float[Array, "rate stretch *gain"]
 ) -> Float[Array, "stretch power *gain"]:
     """Polynomials through values and their rates at both ends of stretches."""
-    low, high = _hermite(starts.shape[0])
+    low, high = hermite(starts.shape[0])
     return jnp.moveaxis(jnp.tensordot(low, starts, 1) + jnp.tensordot(high, ends, 1), 0, 1)
 
 
@@ -89,7 +89,7 @@ def _rates(at: float, orders: int, powers: int) -> Float[np.ndarray, "order powe
     return np.stack([factor * at**rest for factor, rest in zip(factors, left, strict=True)])
 
 
-def _hermite(orders: int) -> tuple[Float[np.ndarray, "power order"], ...]:
+def hermite(orders: int) -> tuple[Float[np.ndarray, "power order"], ...]:
     """What takes a value and its rates at 0, and those at 1, to the polynomial through them."""
     rows = [_rates(at, orders, 2 * orders) for at in (0.0, 1.0)]
     inverse = np.linalg.inv(np.concatenate(rows))

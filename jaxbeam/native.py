@@ -7,17 +7,11 @@ on CPUs. Nobody needs it.
 """
 
 import ctypes
-import functools
-import hashlib
 import itertools
 import math
 import operator
-import os
 import pathlib
-import shutil
-import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 
 import jax
@@ -28,12 +22,10 @@ from jaxtyping import Array, Float
 from jaxbeam.case import Case
 from jaxbeam.exponentials import GAUSS, LOOKED, NODES
 from jaxbeam.extremes import NEAR, Extremes
-from jaxbeam.kept_programs import cache_folder, machine
+from jaxbeam.native_library import Library
 from jaxbeam.peaks import CLIMBS, ROUNDINGS, STARTS, VERTEX_ROUNDS, reach, through
 from jaxbeam.tables import CHUNK, Path, Rigging
 
-SOURCE = pathlib.Path(__file__).with_suffix(".c")
-HEADERS = [SOURCE.with_name(f"native_{name}.h") for name in ("lanes", "peaks", "tables")]
 FILL = 8  # numbers that fill whole vector registers of any machine
 CONSTANTS = {
     "FILL": FILL,
@@ -47,24 +39,28 @@ CONSTANTS = {
     "CLIMBS": CLIMBS,
     "SLACK": ROUNDINGS * sys.float_info.epsilon,
 }
-FLAGS = (
-    *("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC"),
-    *(f"-D{name}={value}" for name, value in CONSTANTS.items()),
-)
 # Deflections that count, by what makes them large.
 SIDES = {abs: "both_sides", operator.pos: "one_side"}
 PARTS = ("chunk", "places")  # of the work that are done in C
 
 
+def _function(part: str, size: Callable) -> str:
+    """The function of the library for a part of the work and deflections that count."""
+    return f"{part}_of_{SIDES[size]}"
+
+
+LIBRARY = Library(
+    name="native",
+    sources=("native.c",),
+    headers=("native_lanes.h", "native_peaks.h", "native_tables.h"),
+    constants=tuple(CONSTANTS.items()),
+    targets=tuple(_function(*pair) for pair in itertools.product(PARTS, SIDES)),
+)
+
+
 def binary() -> pathlib.Path:
     """Where the compiled C is, or would be: a file for this source, this machine and this JAX."""
-    return cache_folder() / f"native-{_mark()}.so"
-
-
-def compiler() -> str | None:
-    """The C compiler of this machine: that named in CC, or cc, gcc or clang, if there is one."""
-    found = (shutil.which(name) for name in ("cc", "gcc", "clang"))
-    return os.environ.get("CC") or next(filter(None, found), None)
+    return LIBRARY.binary()
 
 
 def build() -> pathlib.Path:
@@ -73,31 +69,12 @@ def build() -> pathlib.Path:
     Raises RuntimeError without a C compiler, or with what it complains of; OSError if the cache
     folder cannot be written.
     """
-    command = compiler()
-    if command is None:
-        raise RuntimeError("there is no C compiler here: install gcc or clang, or name one in CC")
-    target = binary()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # Made beside its place and moved there, so that nobody ever loads half of it.
-    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-        made = pathlib.Path(folder) / target.name
-        words = [*command.split(), str(SOURCE), *FLAGS, "-I", jax.ffi.include_dir()]
-        try:
-            done = subprocess.run([*words, "-o", str(made)], capture_output=True, text=True)
-        except OSError as error:
-            raise RuntimeError(f"the C compiler {command} cannot be run: {error}") from None
-        if done.returncode or not made.exists():
-            said = done.stderr.strip()[-500:]
-            raise RuntimeError(f"the C compiler {command} cannot compile {SOURCE}: {said}")
-        _digest(target).write_text(hashlib.sha256(made.read_bytes()).hexdigest())
-        os.replace(made, target)
-    return target
+    return LIBRARY.build()
 
 
 def remove() -> None:
     """Remove what was compiled for this machine, if it was: sweeps do without again."""
-    for path in (binary(), _digest(binary())):
-        path.unlink(missing_ok=True)
+    LIBRARY.remove()
 
 
 def serves(case: Case) -> bool:
@@ -107,44 +84,12 @@ def serves(case: Case) -> bool:
 
 def ready() -> bool:
     """Whether the C is compiled for this machine, and of use: computing on a CPU."""
-    return jax.default_backend() == "cpu" and _sound(binary()) and bool(_library())
-
-
-def _sound(path: pathlib.Path) -> bool:
-    """Whether there is a library, undamaged: to load one that is not would end the process."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest() == _digest(path).read_text()
-    except OSError:
-        return False
-
-
-@functools.cache
-def _library() -> ctypes.CDLL:
-    """The library, of which XLA is told; it takes each name once in a process."""
-    loaded = ctypes.CDLL(str(binary()))
-    loaded.chunk_room.restype = ctypes.c_int64
-    for part, size in itertools.product(PARTS, SIDES):
-        function = getattr(loaded, f"{part}_of_{SIDES[size]}")
-        jax.ffi.register_ffi_target(_target(part, size), jax.ffi.pycapsule(function))
-    return loaded
-
-
-def _digest(path: pathlib.Path) -> pathlib.Path:
-    """Where the check value of a library is."""
-    return path.with_suffix(".sha256")
+    return LIBRARY.ready()
 
 
 def _target(part: str, size: Callable) -> str:
     """The name under which XLA knows a function of the library."""
-    return f"jaxbeam_{part}_of_{SIDES[size]}_{_mark()}"
-
-
-@functools.cache
-def _mark() -> str:
-    """A number for the source, the machine and JAX."""
-    written = [path.read_text() for path in (SOURCE, *HEADERS)]
-    marks = [*written, *FLAGS, jax.__version__, machine()]
-    return hashlib.sha256("\n".join(marks).encode()).hexdigest()[:16]
+    return LIBRARY.target(_function(part, size))
 
 
 def prepare(rigging: Rigging) -> tuple:
@@ -186,7 +131,9 @@ def chunk(
         *(*prepared, path.kind, path.start, path.span, path.slots, path.active, shape, rows),
         *(inertia, weight, np.asarray(GAUSS), through(LOOKED)[: len(LOOKED)].T, np.asarray(LOOKED)),
     )
-    room = _library().chunk_room(state.shape[0], path.slots.shape[1], best.score.shape[0])
+    room_of = LIBRARY.loaded().chunk_room
+    room_of.restype = ctypes.c_int64
+    room = room_of(state.shape[0], path.slots.shape[1], best.score.shape[0])
     call = jax.ffi.ffi_call(
         _target("chunk", best.size),
         [jax.ShapeDtypeStruct(part.shape, part.dtype) for part in (*changed, np.empty(room))],

@@ -26,7 +26,7 @@ enum { WIDE = 2 };
 typedef double Lanes __attribute__((vector_size(8 * WIDE)));
 typedef int64_t Mask __attribute__((vector_size(8 * WIDE)));
 
-static inline Lanes all(double value) { return (Lanes){0} + value; }
+static inline Lanes all(double value) { return value - (Lanes){0}; } /* + would ask for a sum */
 static inline Lanes either(Mask which, Lanes yes, Lanes no) {
     return (Lanes)(((Mask)yes & which) | ((Mask)no & ~which));
 }

@@ -14,11 +14,13 @@ jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.fields  jaxbeam.holds
 jaxbeam.kept_programs  jaxbeam.small
 jaxbeam.compiling
 jaxbeam.faults  jaxbeam.piecewise  jaxbeam.stretches
-jaxbeam.flows
+jaxbeam.flows  jaxbeam.native_library
 jaxbeam.coupled
 jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
 jaxbeam.estimator  jaxbeam.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.sensors
 jaxbeam.case  jaxbeam.gain_table  jaxbeam.sensing
+jaxbeam.gain_pieces
+jaxbeam.native_designs
 jaxbeam.finite_time
 jaxbeam.checks
 jaxbeam.modes

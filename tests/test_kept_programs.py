@@ -287,7 +287,7 @@ SWEPT = """
 import sys
 import numpy as np
 import jaxbeam as jb
-from jaxbeam import compiling, native
+from jaxbeam import compiling, native, native_library
 from tests.test_kept_programs import CASES, OVER
 
 compiled = []
@@ -298,7 +298,7 @@ def counted(self, state, lowered):
     compile(self, state, lowered)
 
 compiling.Compiled._compile = counted
-if native.compiler():
+if native_library.compiler():
     native.build()
 found = [jb.sweep(case, OVER, progress=False, **how) for case, how in CASES]
 names = ("peak_deflection", "lowest_contact_force", "deflection")

@@ -16,7 +16,7 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam import native
+from jaxbeam import native, native_library
 from jaxbeam.case import replace
 from jaxbeam.cli import main
 from jaxbeam.dynamics import traffic
@@ -28,7 +28,7 @@ from jaxbeam.rig import rig
 from jaxbeam.sweep_store import FINGERPRINT
 from jaxbeam.tables import both_sides, make_rigging
 
-pytestmark = pytest.mark.skipif(native.compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(native_library.compiler() is None, reason="no C compiler here")
 
 ROOT = pathlib.Path(__file__).parents[1]
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
@@ -111,7 +111,7 @@ def test_results_are_those_without_it(case, over):
 NARROW = """
 import sys
 import jaxbeam as jb
-from jaxbeam import native
+from jaxbeam import native, native_library
 from tests.test_native import COUPLED, GRID
 native.build()
 assert native.ready()
@@ -124,7 +124,7 @@ jb.sweep(COUPLED, GRID, progress=False).to_netcdf(sys.argv[1], engine="h5netcdf"
 def test_narrower_machines_compute_the_same(without, tmp_path, monkeypatch):
     """In another process: one takes the steps of only one compiled library."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("CC", f"{native.compiler()} -mno-{without}")
+    monkeypatch.setenv("CC", f"{native_library.compiler()} -mno-{without}")
     path = tmp_path / "found.nc"
     subprocess.run([sys.executable, "-c", NARROW, str(path)], check=True, cwd=ROOT)
     monkeypatch.setattr(native, "ready", lambda: False)

@@ -7,20 +7,24 @@ whole crossing; how right it is, between the edges of the table too, was found f
 scipy's DOP853 (`tests/test_finite_time.py`). Designs are those of a grid, as many masses as speeds
 as weights of the force, so that they share what depends on the speed or the mass alone; or all
 numbers of each are its own. They are worked out in batches, by a thread for each core. Some are
-timed, and scaled to 4096; compiling is told apart.
+timed, and scaled to 4096; compiling is told apart. Where there is a C compiler, finite-time designs
+are timed again with what `jaxbeam native` compiles.
 """
 
 import math
 import os
+import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
+from jaxbeam import native_designs, native_library
 from jaxbeam.compiling import options
 from jaxbeam.control.lqr import optimal
 from jaxbeam.modes import lay_out
@@ -60,14 +64,14 @@ def timed(function, batches, share: float = 1.0, threads: int = THREADS) -> Time
     return Times(compiled, min(runs) * len(batches) / (each * threads))
 
 
-def rig(modes: int, points: int) -> jb.Case:
+def rig(modes: int, points: int, in_time: str = "sequential") -> jb.Case:
     """The rig with a regulator to be designed."""
     weights = [1e6] * modes + [10.0] * modes
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=modes),
         actuators=[jb.PointForce(0.25)],
         loads=[jb.MovingMass(mass=0.4, speed=SPEEDS[0])],
-        controller=jb.FiniteLQR(weights, [1e-3], points=points),
+        controller=jb.FiniteLQR(weights, [1e-3], points=points, in_time=in_time),
     )
 
 
@@ -93,9 +97,9 @@ def stretches(modes: int, turn: float) -> int:
     return math.ceil(fastest * length / SPEEDS[0] / turn)
 
 
-def designs(modes: int, points: int, shared: bool, share: float) -> Times:
+def designs(modes: int, points: int, in_time: str, shared: bool, share: float) -> Times:
     """Time finite-time designs: those of the grid, which share much, or others."""
-    case = rig(modes, points)
+    case = rig(modes, points, in_time)
     layout = lay_out(case)
 
     def one(mass, speed, effort):
@@ -131,14 +135,32 @@ def row(name: str, found: Times) -> None:
 
 def main() -> None:
     """Print the table."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        mock.patch.dict(os.environ, XDG_CACHE_HOME=folder),
+    ):
+        ways = {"": "sequential"}
+        if native_library.compiler() is None:
+            print("designs in C are left out: there is no C compiler here")
+        else:
+            native_designs.LIBRARY.build()
+            ways[", in C"] = "native"
+        _print_table(ways)
+
+
+def _print_table(ways: dict[str, str]) -> None:
     print(f"{'':64} compiling (s)   {MANY} take (s)")
     for modes in SIZES:
         row(f"time-invariant, {2 * modes} states", invariant(modes))
         for turn, error in TURNS.items():
             name = f"finite-time, {2 * modes} states, to {error:.0e}"
             points = stretches(modes, turn)
-            row(f"{name}, grid", designs(modes, points, True, 1 / 4))
-            row(f"{name}, all different", designs(modes, points, False, 1 / 16))
+            for addition, way in ways.items():
+                row(f"{name}, grid{addition}", designs(modes, points, way, True, 1 / 4))
+                row(
+                    f"{name}, all different{addition}",
+                    designs(modes, points, way, False, 1 / 16),
+                )
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ import jaxbeam as jb
 from experiments.benchmarks import baselines, by_numba
 from experiments.benchmarks.crossing import Rig
 from experiments.benchmarks.timing import Timing, best_in_turn, time_call
-from jaxbeam import native
+from jaxbeam import native, native_library
 from jaxbeam.compiling import compiled
 from jaxbeam.plan import make_plan
 from jaxbeam.simulate import readings
@@ -88,7 +88,7 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
         found.append((name, took, float(error)))
 
     timed("jaxbeam", plain, SHORT)
-    if native.compiler() is None:
+    if native_library.compiler() is None:
         print("steps in C are left out: there is no C compiler here")
     else:
         with tempfile.TemporaryDirectory() as folder:

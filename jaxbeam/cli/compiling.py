@@ -1,4 +1,4 @@
-"""The command that compiles the steps of sweeps for this machine."""
+"""The command that compiles what is written in C for this machine."""
 
 from jaxbeam.cli.app import Json, app
 from jaxbeam.printing import print_json
@@ -6,7 +6,9 @@ from jaxbeam.printing import print_json
 
 @app.command
 def native(*, remove: bool = False, json_: Json = False) -> None:
-    """Compile the steps of sweeps for this machine: needs a C compiler, once; sweeps are quicker.
+    """Compile what is written in C for this machine: needs a C compiler, once.
+
+    Steps of sweeps, which use it from then on, and designs that ask for it (in_time = "native").
 
     Parameters
     ----------
@@ -14,12 +16,15 @@ def native(*, remove: bool = False, json_: Json = False) -> None:
         Remove what was compiled; sweeps do without again.
     """
     from jaxbeam import native as compiled
+    from jaxbeam import native_designs as designs
 
     path = compiled.binary()
     if remove:
         compiled.remove()
+        designs.LIBRARY.remove()
     else:
         compiled.build()
+        designs.LIBRARY.build()
     if json_:
         print_json({"path": str(path), "compiled": not remove})
     elif remove:

@@ -97,7 +97,7 @@ def test_steps_of_a_law_are_timed():
 
 
 def test_designs_are_timed():
-    for times in (riccati.invariant(2), riccati.designs(2, 8, True, 1 / 256)):
+    for times in (riccati.invariant(2), riccati.designs(2, 8, "sequential", True, 1 / 256)):
         assert times.compiling > 0 and times.run > 0
 
 
