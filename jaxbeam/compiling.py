@@ -215,9 +215,14 @@ _nought = jax.jit(lambda: 0.0)  # a seventh of the time that jnp.zeros takes
 
 @functools.cache
 def _known() -> dict[str, bool | int]:
-    """The settings, if this version of XLA knows them; names of settings come and go."""
-    try:
-        jax.jit(lambda: jnp.zeros(()), compiler_options=OPTIONS)()
-    except (ValueError, RuntimeError):
-        return {}
-    return OPTIONS
+    """The settings that this version of XLA knows; they come and go."""
+
+    def knows(settings):
+        try:
+            jax.jit(lambda: jnp.zeros(()), compiler_options=settings)()
+        except (ValueError, RuntimeError):
+            return False
+        return True
+
+    every = OPTIONS.items()
+    return OPTIONS if knows(OPTIONS) else dict(item for item in every if knows(dict([item])))
