@@ -16,8 +16,8 @@ typedef struct {
     ptrdiff_t first;
     int many;
     Lanes *state, *after, *matrix;
-    Lanes *samples;        /* (step, point, place) */
-    Lanes *high, *largest; /* (step, place): the largest of these samples, and the largest by size */
+    Lanes *samples;     /* (step, point, place) */
+    Lanes *high, *most; /* (step, place): the largest of these, and what may be between them */
 } Group;
 
 /* In Lanes. */
@@ -96,8 +96,10 @@ static void watch(const Work *w, int t, const Step *step, const Group *g, int bo
             largest = greater(absolute(seen[i]), largest);
             if (!both) high = greater(seen[i], high);
         }
-        g->high[t * w->places + place] = both ? largest : high;
-        g->largest[t * w->places + place] = largest;
+        high = both ? largest : high;
+        g->high[t * w->places + place] = high;
+        Lanes last = seen[w->looked - w->places + place];
+        g->most[t * w->places + place] = most_within(seen[place], last, high, largest, both);
     }
 }
 
@@ -131,7 +133,7 @@ static void raise(const Work *w, const Step *steps, const Group *g, int place, i
         if (!steps[t].taken) continue;
         /* Only steps that may come above the highest of all samples can have the peak. */
         Lanes found = g->high[t * w->places + place];
-        Mask maybe = found + (NEAR - 1) * g->largest[t * w->places + place] > least;
+        Mask maybe = g->most[t * w->places + place] > least;
         if (!any(maybe)) continue;
         Lanes samples[POINTS];
         for (int p = 0; p < POINTS; p++) samples[p] = seen[(t * POINTS + p) * w->places];
@@ -247,7 +249,7 @@ static inline ALWAYS XLA_FFI_Error *run(XLA_FFI_CallFrame *frame, int both) {
         g->state = scratch + (size_t)k * room, g->after = g->state + w->states + w->rows;
         g->matrix = g->after + w->states + w->rows;
         g->samples = g->matrix + w->rows * w->rows, g->high = g->samples + STEPS * w->looked;
-        g->largest = g->high + STEPS * w->places;
+        g->most = g->high + STEPS * w->places;
     }
     for (int64_t first = 0; first < w->lanes;) {
         int count = 0;

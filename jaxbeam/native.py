@@ -33,6 +33,7 @@ CONSTANTS = {
     "NODES": NODES,
     "POINTS": len(LOOKED),
     "NEAR": NEAR,
+    "BESIDE_END": (NEAR - 1) * float(np.diff(LOOKED)[0] / np.diff(LOOKED).max()) ** 2,
     "REACH": reach(LOOKED),
     "ROUNDS": VERTEX_ROUNDS,
     "STARTS": STARTS,

@@ -1,7 +1,7 @@
 /* Peaks of the curve through the samples of a step, for lanes side by side: what peaks.py does.
 
    The command line tells POINTS (looked at in a step, both ends among them), ROUNDS and REACH (of Newton's
-   method in peaks.vertex), STARTS and CLIMBS (in peaks.find), SLACK (of numbers that are equal). */
+   method in peaks.vertex), STARTS and CLIMBS (in peaks.find), SLACK (of numbers that are equal), NEAR (as in extremes.py). */
 
 #pragma once
 
@@ -69,24 +69,37 @@ static inline Mask as_large(Lanes size, Lanes largest) {
     return size >= largest - SLACK * absolute(largest);
 }
 
-/* Where the curve through samples is largest, as peaks.find has it. */
+/* Where the curve through samples is largest, as peaks.find has it. Only from places that are no lower than
+   those beside them is it worth looking further. */
 static inline Lanes find(const Lanes *samples, const double *through, int both) {
     enum { PLACES = 2 * STARTS };
     Curve curve = curve_through(samples, through);
     Lanes places[PLACES], sizes[PLACES], largest = all(-INFINITY), place = all(-1);
     for (int k = 0; k < STARTS; k++) {
         places[k] = all(2.0 * k / (STARTS - 1) - 1);
-        places[STARTS + k] = climb(&curve, places[k], 2.0 / STARTS, CLIMBS);
-    }
-    for (int k = 0; k < PLACES; k++) {
         sizes[k] = size_at(&curve, places[k], both);
         largest = greater(sizes[k], largest);
+    }
+    for (int k = 0; k < STARTS; k++) {
+        const int before = k ? k - 1 : 0, after = k < STARTS - 1 ? k + 1 : k, found = STARTS + k;
+        places[found] = places[k], sizes[found] = sizes[k];
+        if (!any((sizes[k] >= sizes[before]) & (sizes[k] >= sizes[after]))) continue;
+        places[found] = climb(&curve, places[k], 2.0 / STARTS, CLIMBS);
+        sizes[found] = size_at(&curve, places[found], both);
+        largest = greater(sizes[found], largest);
     }
     for (int k = 0; k < PLACES; k++)
         place = either(as_large(sizes[k], largest), greater(places[k], place), place);
     Lanes flat = climb(&curve, place, 2.0 / STARTS, CLIMBS);
     Lanes found = size_at(&curve, flat, both), before = size_at(&curve, place, both);
     return either(as_large(found, greater(found, before)), flat, place);
+}
+
+/* How large a value between samples may be: bumps grow with the square of the gap, so that one beside the
+   largest is small if that is an end. */
+static inline Lanes most_within(Lanes first, Lanes last, Lanes highest, Lanes largest, int both) {
+    Mask inner = (size_of(first, both) < highest) & (size_of(last, both) < highest);
+    return highest + either(inner, all(NEAR - 1), all(BESIDE_END)) * largest;
 }
 
 /* Whether the curve through samples rises above all of them within the step: the largest is none of the ends,

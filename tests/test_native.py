@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import operator
 import pathlib
 import platform
 import shutil
@@ -16,10 +17,11 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam import native, native_library
+from jaxbeam import native, native_library, peaks
 from jaxbeam.case import replace
 from jaxbeam.cli import main
 from jaxbeam.dynamics import traffic
+from jaxbeam.exponentials import LOOKED
 from jaxbeam.grid import even_grid
 from jaxbeam.integrate import march
 from jaxbeam.order import make_order
@@ -236,3 +238,15 @@ def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
         main(["native", "--remove"])
     assert "sweeps do without" in capsys.readouterr().out
     assert not native.binary().exists()
+
+
+def test_places_of_peaks_are_as_high_as_those_found_without_it():
+    """Of curves through any samples, on both sides of the beam and on one."""
+    curves = np.random.default_rng(0).normal(size=(len(LOOKED), 3, 5000))
+    curves[:, 1] = np.cumsum(curves[:, 1], axis=0)  # less wild
+    for size in (abs, operator.pos):
+        heights = [
+            peaks.refine(jnp.asarray(curves), LOOKED, size, find)[0]
+            for find in (native.find, peaks.find)
+        ]
+        assert_allclose(*heights, rtol=1e-11)
