@@ -84,9 +84,8 @@ class Work:
             program.result()  # raises what went wrong
         found = [programs.rigs(*design, tasks.heavy[part]) for part in parts]
         self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
-        if self.shared:  # repeated once, where it will be used
-            repeated = jax.tree.map(lambda leaf: np.repeat(leaf, self.each, axis=0), self.rigs)
-            self.rigs, limits = jax.device_put(repeated), np.repeat(limits, count)
+        if self.shared:  # put once where it will be used
+            self.rigs, limits = jax.device_put(self.rigs), np.repeat(limits, count)
         limits = limits[:count]
         limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
         duration = _values(case, tasks, "run.duration")
@@ -145,7 +144,8 @@ class Work:
         alike, _ = programs.rigs.blank(*design)
         first = np.zeros(self.each, int)
         pace = np.ones(self.each), first
-        wanted, alike = first > 0, jax.tree.map(lambda leaf: leaf[first], alike)
+        wanted = first > 0
+        alike = alike if self.shared else jax.tree.map(lambda leaf: leaf[first], alike)
         given = self._rigging(first, wanted, pace, None, alike)
         rigs = programs.riggings.blank(*given) if self.apart else self._bare(alike)
         yield programs.block, self._block(first, wanted, pace, None, rigs)

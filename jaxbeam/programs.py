@@ -78,14 +78,19 @@ def _map(task, wanted, values):
 
 @compiled_with(**SIDE_BY_SIDE)
 def riggings(case, addresses, schedule, substeps, wanted, rigs, heavy, pace):
-    """Rigs on the grids of some tasks."""
+    """Rigs on the grids of some tasks; a single rig is that of all."""
 
-    def task(values):
-        return _prepare(case, addresses, schedule, substeps, *values)
+    def task(rig, *values):
+        return _prepare(case, addresses, schedule, substeps, rig, *values)
 
-    given = rigs, heavy, pace
-    # Modes that nothing couples take so little that calling the kernels is what costs.
-    return jax.vmap(task)(given) if rigs.modes_per_block == 1 else _map(task, wanted, given)
+    shared = rigs.state_matrix.shape[0] == 1
+    if rigs.modes_per_block == 1:
+        # Modes that nothing couples take so little that calling the kernels is what costs.
+        rigs = jax.tree.map(lambda leaf: leaf[0], rigs) if shared else rigs
+        return jax.vmap(task, (None if shared else 0, 0, 0))(rigs, heavy, pace)
+    if shared:
+        rigs = jax.tree.map(lambda leaf: jnp.repeat(leaf, wanted.shape[0], axis=0), rigs)
+    return _map(lambda values: task(*values), wanted, (rigs, heavy, pace))
 
 
 @compiled
