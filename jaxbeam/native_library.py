@@ -82,7 +82,13 @@ class Library(NamedTuple):
 
     def ready(self) -> bool:
         """Whether the C is compiled for this machine, and of use: computing on a CPU."""
-        return jax.default_backend() == "cpu" and _sound(self.binary()) and bool(_loaded(self))
+        path = self.binary()
+        try:
+            about = path.stat()
+        except OSError:
+            return False
+        sound = _sound(path, about.st_mtime_ns, about.st_size)
+        return jax.default_backend() == "cpu" and sound and bool(_loaded(self))
 
     def loaded(self) -> ctypes.CDLL:
         """The library, of whose functions XLA has been told; only if it is `ready`."""
@@ -95,8 +101,12 @@ def compiler() -> str | None:
     return os.environ.get("CC") or next(filter(None, found), None)
 
 
-def _sound(path: pathlib.Path) -> bool:
-    """Whether there is a library, undamaged: to load one that is not would end the process."""
+@functools.cache
+def _sound(path: pathlib.Path, written: int, size: int) -> bool:
+    """Whether a library is undamaged: to load one that is not would end the process.
+
+    Looked into once for what was written then.
+    """
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest() == _digest(path).read_text()
     except OSError:

@@ -80,10 +80,15 @@ class Order:
         """
         return Work(self.case, self.tasks(), self.histories, self.tolerance, self.single)
 
+    @functools.cached_property
+    def words(self) -> dict[str, Any]:
+        """The case in plain words and numbers."""
+        return case_to_dict(self.case)
+
     def to_dict(self) -> dict[str, Any]:
         """The order in plain words and numbers, which `order_from_dict` makes an order again."""
         return {
-            "case": case_to_dict(self.case),
+            "case": self.words,
             "axes": {address: values.tolist() for address, values in self.axes.items()},
             "settings": [self.paired, self.histories, self.tolerance, self.single],
         }

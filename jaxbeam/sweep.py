@@ -15,7 +15,6 @@ from tqdm import tqdm
 from jaxbeam import cluster, sweep_store
 from jaxbeam.blocks import Work
 from jaxbeam.case import Case
-from jaxbeam.casefile import case_to_dict
 from jaxbeam.lanes import Tasks
 from jaxbeam.order import Order, make_order
 from jaxbeam.plan import TOLERANCE, sample_times
@@ -162,6 +161,6 @@ def _label(order: Order, tasks: Tasks, results: dict[str, np.ndarray]) -> "xarra
         coordinates["time"] = ("time", np.asarray(sample_times(case)), {"units": "s"})
     attributes = {
         "title": case.title,
-        "case": json.dumps(case_to_dict(case)),
+        "case": json.dumps(order.words),
     }
     return xarray.Dataset(variables, coordinates, attributes)
