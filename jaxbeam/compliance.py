@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
+from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, assemble, section, supported
 from jaxbeam.piecewise import piecewise
 
@@ -167,13 +168,19 @@ def _cubics(layout: Layout) -> Layout:
     return dataclasses.replace(layout, degrees=(3,) * len(layout.degrees))
 
 
+@compiled  # step by step, the many small programs take seconds to compile
+def _hold(case: Case, layout: Layout):
+    """Nodes, and what `_suspensions` returns."""
+    return assemble(case, _cubics(layout))[0], *_suspensions(case)
+
+
 def check_held(case: Case, layout: Layout) -> None:
     """Refuse a beam that can move rigidly, w = a + b x, because nothing resists the motion.
 
     Raises ValueError.
     """
     length, unit = case.beam.length, case.beam.length**3 / case.beam.rigidity
-    nodes, *_ = assemble(case, _cubics(layout))
+    nodes, points, factors, springs = _hold(case, layout)
     shift, turn = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     held = [
         (shift + x * turn, 1.0) for x, (fixed, _) in zip(nodes, layout.held, strict=True) if fixed
@@ -183,7 +190,6 @@ def check_held(case: Case, layout: Layout) -> None:
         if support.stiffness is not None:
             held.append((shift + nodes[node] * turn, support.stiffness * unit))
         held.append((turn, support.rotational_stiffness * unit / length**2))
-    points, factors, springs = _suspensions(case)
     moved = [
         (shift + x * turn, turn, 0 * turn, 0 * turn)[derivative]
         for x, derivative in zip(points.places, points.derivatives, strict=True)

@@ -25,7 +25,7 @@ from jaxbeam.faults import check_on_beam
 from jaxbeam.fields import is_known, known
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.ports import Pair, check_pairs, column, common_pairs, row
-from jaxbeam.rig import Rig, rig
+from jaxbeam.rig import Rig, rig, rig_in_one
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -230,7 +230,7 @@ def poles(case: Case, parked: Parked = ()) -> Complex[np.ndarray, " state"]:
     Plain numbers, not differentiable. Raises ValueError as `frequency_response` does.
     """
     check(case)
-    matrix, inertia = _matrices(_compiled_rig(case, lay_out(case)), _parked(case, parked))
+    matrix, inertia = _matrices(rig_in_one(case), _parked(case, parked))
     return _sorted(scipy.linalg.eigvals(np.asarray(matrix), np.asarray(inertia)))
 
 
@@ -242,7 +242,7 @@ def zeros(case: Case, pair: tuple[str, str], parked: Parked = ()) -> Complex[np.
     """
     check(case)
     (chosen,) = check_pairs(case, [pair])
-    model = _compiled_rig(case, lay_out(case))
+    model = rig_in_one(case)
     matrix, inertia = _matrices(model, _parked(case, parked))
     pushed, command = column(case, model, chosen.source)
     place, rate, direct = row(case, model, chosen.output)
@@ -253,9 +253,6 @@ def zeros(case: Case, pair: tuple[str, str], parked: Parked = ()) -> Complex[np.
     # Zeros at infinity come out as such, or as numbers far beyond anything that moves.
     fastest = np.abs(scipy.linalg.eigvals(np.asarray(matrix))).max()
     return _sorted(found[np.abs(found) < 1e4 * fastest])
-
-
-_compiled_rig = compiled(rig)  # in one piece, which takes less time than step by step
 
 
 def _sorted(values):

@@ -19,7 +19,7 @@ from jaxbeam.compiling import compiled
 from jaxbeam.controller import Measurement
 from jaxbeam.modes import Layout
 from jaxbeam.motion import NEVER, AbstractMotion
-from jaxbeam.rig import rig
+from jaxbeam.rig import rig_in_one
 from jaxbeam.sensed import sensed
 from jaxbeam.sensing import design, init, read
 from jaxbeam.statespace import LoadedBeam, loaded_beam
@@ -217,11 +217,7 @@ class OpenLoop(eqx.Module):
 
 def open_loop(case: Case, layout: Layout) -> OpenLoop:
     """The opened loop of a case with a controller. May be traced and batched."""
-    # Cases that differ in their controllers share what is compiled of the rig.
-    return _opened(case, _rig(eqx.tree_at(lambda c: c.controller, case, None), layout))
-
-
-_rig = compiled(rig)
+    return _opened(case, rig_in_one(case, layout))
 
 
 @compiled

@@ -21,8 +21,7 @@ from jaxbeam.case import Case, known_case
 from jaxbeam.checks import check
 from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, traffic
-from jaxbeam.modes import lay_out
-from jaxbeam.rig import Rig, rig
+from jaxbeam.rig import Rig, rig_in_one
 
 BREATH = 1e-14  # of the run: motions are asked for so far from their kinks, on the leg's own side
 
@@ -53,7 +52,7 @@ def simulate_adaptive(
     """
     check(case)
     case, times = known_case(case), jnp.asarray(times, float)
-    assembled, loads = rig(case, lay_out(case)), traffic(case)
+    assembled, loads = rig_in_one(case), traffic(case)
     windows, edges = _events(assembled, loads, float(times[-1]))
     allowed = tolerance * _size(case, assembled, loads, float(times[-1]))
     state, histories = jnp.zeros(assembled.states), []

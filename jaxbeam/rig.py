@@ -15,6 +15,7 @@ from jax.scipy.linalg import block_diag, solve_triangular
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
+from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, Modes, lay_out, modes
 
 
@@ -72,6 +73,19 @@ def rig(case: Case, layout: Layout | None = None, coupled: bool = True) -> Rig:
     """
     layout = lay_out(case) if layout is None else layout
     return assemble(case, modes(case, layout), coupled)
+
+
+_in_one = compiled(rig)
+
+
+def rig_in_one(case: Case, layout: Layout | None = None) -> Rig:
+    """The same rig by one program: step by step, the many small ones take seconds to compile.
+
+    Cases that differ in their controllers share it.
+    """
+    layout = lay_out(case) if layout is None else layout
+    bare = eqx.tree_at(lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None)
+    return _in_one(bare, layout)
 
 
 @jax.named_scope("rig")

@@ -18,11 +18,12 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from jaxbeam.case import Case
+from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, contact_rows, traffic
 from jaxbeam.fields import is_known, known
 from jaxbeam.holds import hold
 from jaxbeam.modes import Layout
-from jaxbeam.rig import Rig, rig
+from jaxbeam.rig import Rig, rig_in_one
 from jaxbeam.sensors import QUANTITIES
 from jaxbeam.small import solve_small
 
@@ -144,7 +145,7 @@ class LoadedBeam(eqx.Module):
 
         At the time at which a load enters or leaves it is that just after.
         """
-        return self._frozen(*self._contact(t))
+        return _at(self, jnp.asarray(t, float))
 
     def A(self, t: Float[Array, ""] | float) -> Float[Array, "state state"]:
         """State matrix A(t) with the masses on the beam."""
@@ -161,9 +162,7 @@ class LoadedBeam(eqx.Module):
     @property
     def unloaded(self) -> StateSpace:
         """The time-invariant system without loads; its inputs are the commands."""
-        modes, states = self.scale.shape[0], self.rig.states
-        nothing = jnp.zeros((0, modes)), jnp.zeros((0, states)), jnp.zeros(0)
-        return self._frozen(*nothing)
+        return _unloaded(self)
 
     def augmented(self, t: Float[Array, ""] | float) -> StateSpace:
         """The system with the weights as further, constant states, eq. (5.8) of the thesis.
@@ -198,11 +197,10 @@ class LoadedBeam(eqx.Module):
 
     def _contact(self, t):
         """Shape rows (load, mode), contact rows (load, state of the rig) and masses (kg) at t."""
-        time = jnp.asarray(t, float)
         loads = self.traffic
-        position, speed, acceleration = loads.travel(time)
+        position, speed, acceleration = loads.travel(t)
         windows = [path.window() for path in loads.motions]
-        active = jnp.array([(entry <= time) & (time < leave) for entry, leave in windows], bool)
+        active = jnp.array([(entry <= t) & (t < leave) for entry, leave in windows], bool)
         shape, rows = contact_rows(self.rig, position, speed, acceleration, active)
         count = len(loads.motions)
         mass = jnp.where(active, loads.inertia[:, 0], 0.0)
@@ -255,6 +253,18 @@ class LoadedBeam(eqx.Module):
         return rows, direct
 
 
+# One program each: done one by one, all these small operations would take seconds to compile.
+@compiled
+def _at(model: LoadedBeam, t) -> StateSpace:
+    return model._frozen(*model._contact(t))
+
+
+@compiled
+def _unloaded(model: LoadedBeam) -> StateSpace:
+    modes, states = model.scale.shape[0], model.rig.states
+    return model._frozen(jnp.zeros((0, modes)), jnp.zeros((0, states)), jnp.zeros(0))
+
+
 def _commands(case: Case) -> tuple[Signal, ...]:
     """The commands, in the unit in which the actuators' limits are given."""
     units = [type(a).__dataclass_fields__["limits"].metadata["unit"] for a in case.actuators]
@@ -271,7 +281,7 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
 
     Raises ValueError for other coordinates, and if the modes are no sines.
     """
-    return loaded_beam(case, rig(case, layout), coordinates)
+    return loaded_beam(case, rig_in_one(case, layout), coordinates)
 
 
 def loaded_beam(case: Case, model: Rig, coordinates: str = "modal") -> LoadedBeam:

@@ -3,6 +3,7 @@
 float64 is not set here: importing `jaxbeam` sets it, and the tests rely on that as users do.
 """
 
+import collections
 import gc
 import importlib.metadata
 import os
@@ -56,6 +57,12 @@ hypothesis.settings.register_profile(
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.load_profile("jaxbeam")
+
+
+def pytest_collection_modifyitems(items):
+    """Files with most slow tests first: at the end no process waits long for the other."""
+    slow = collections.Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(autouse=True)

@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 
 import control
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -158,7 +159,8 @@ def test_fits_see_the_readings_of_a_loop_without_noise():
     silent = LOOPS["delay beyond two periods, filter at the sensor's own clock"]
     noisy = dataclasses.replace(silent.sensors[0], noise=jnp.array(1e-3))
     case = dataclasses.replace(silent, sensors=(noisy,))
-    found = readings(case, jnp.asarray(TIMES), planned(case, TIMES, 2))
+    plan = planned(case, TIMES, 2)
+    found = jax.jit(lambda: readings(case, jnp.asarray(TIMES), plan))()
     truth = expected(silent, TIMES).shown
     assert_allclose(found, truth, rtol=0, atol=1e-9 * np.max(np.abs(truth)))
 

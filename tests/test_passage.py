@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,9 +34,14 @@ def rig(controller=LAW, loads=ONE):
 
 def commands(case, times):
     model = jb.state_space(case)
-    memory = case.controller.init(model)
     seen = Measurement(jnp.zeros(1), jnp.zeros(2), jnp.zeros(1))
-    return jax.vmap(lambda t: case.controller.step(memory, seen, t)[0])(times)[:, 0]
+
+    @eqx.filter_jit
+    def asked(law, model):
+        memory = law.init(model)
+        return jax.vmap(lambda t: law.step(memory, seen, t)[0])(times)[:, 0]
+
+    return asked(case.controller, model)
 
 
 def test_the_table_is_read_ahead_of_the_load_once_both_gates_are_passed():

@@ -17,6 +17,8 @@ from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.checks import check
 from jaxbeam.control import AugmentedLQR, ScheduledLQR
 from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.loop import loop_schedule
+from tests.runs import plan_of
 from tests.test_regulators import (
     ENTRIES,
     EVENTS,
@@ -96,10 +98,13 @@ def deflections(predicted):
 
 
 def simulated(predicted):
-    """The run on `EVERY` under the law for what is predicted."""
+    """The run on `EVERY` under the law for what is predicted, in single steps between them."""
     numbers = {"mass": "masses", "speed": "speeds", "entry_time": "entries"}
     beliefs = Beliefs(**{name: predicted[key] for name, key in numbers.items()})
-    return jb.simulate(rig(dataclasses.replace(LAW, design=beliefs)), jnp.asarray(EVERY))
+    case = rig(dataclasses.replace(LAW, design=beliefs))
+    plan = plan_of(case, substeps=1, even=False)
+    plan = dataclasses.replace(plan, schedule=loop_schedule(case, EVERY))
+    return jb.simulate(case, jnp.asarray(EVERY), plan)
 
 
 def test_what_is_predicted_runs_by_the_clock():

@@ -164,5 +164,5 @@ def test_slopes_of_a_loop_by_what_its_gains_were_designed_from(kind):
 
     both = jax.jit(jax.jacfwd(outputs, has_aux=True))  # one program for slopes and differences
     at = jnp.ones(len(sizes))
-    expected = central(lambda point: both(point)[1], at, step=2e-3)
+    expected = central(lambda point: both(point)[1], at, step=2e-3, order=4)
     assert_allclose(both(at)[0], expected, rtol=1e-6)

@@ -53,7 +53,7 @@ def _find_modes(spectrum: Spectrum, slopes) -> tuple[Mode, ...]:
     start = _refined(np.repeat([0.0, -2.0], channels), shape)
     best, parameters = start.fun, start.x
     while parameters.size < (channels + 2) * MOST_MODES:
-        ratio = power / _model(parameters, bins, slopes)[0]
+        ratio = power / _model(parameters, bins, slopes)[0].T
         starts = [np.append(parameters, guess) for guess in _guesses(ratio, bins)]
         trial = _refined(min(starts, key=lambda start: _cost(start, *shape)[0]), shape)
         if best - trial.fun < worth:
@@ -76,38 +76,40 @@ def _guesses(ratio, bins):
 
 
 def _model(parameters, bins, slopes):
-    """Power of each bin and channel, and its slopes by parameters.
+    """Power of each channel and bin, and its slopes by parameters (parameter, channel, bin).
 
     Parameters are logarithms: b and d of all channels, then of each mode f_k, z_k and a_kc.
     """
     channels = slopes.size
-    modes = parameters[2 * channels :].reshape(-1, channels + 2)
-    own = np.arange(channels)
-    noise = np.exp(parameters[:channels]) * np.ones((bins.size, 1))
-    drift = np.exp(parameters[channels : 2 * channels]) * ((bins[0] / bins) ** 2)[:, None]
-    model = noise + drift
-    gradient = np.zeros((bins.size, channels, parameters.size))
-    gradient[:, own, own] = noise
-    gradient[:, own, channels + own] = drift
-    for k, mode in enumerate(modes):
-        place = 2 * channels + k * (channels + 2)
-        square = (bins / np.exp(mode[0])) ** 2
-        damping = np.exp(mode[1])
+    gradient = np.zeros((parameters.size, channels, bins.size))
+    levels = np.exp(parameters[: 2 * channels])
+    drift = (bins[0] / bins) ** 2
+    for c in range(channels):
+        gradient[c, c] = levels[c]
+        gradient[channels + c, c] = levels[channels + c] * drift
+    model = gradient[: 2 * channels].sum(axis=0)
+    for place in range(2 * channels, parameters.size, channels + 2):
+        square = (bins / np.exp(parameters[place])) ** 2
+        damping = np.exp(parameters[place + 1])
         bottom = (1 - square) ** 2 + 4 * damping**2 * square
-        part = np.exp(mode[2:]) * square[:, None] ** (slopes / 2) / bottom[:, None]
+        shapes = {slope: square ** (slope // 2) / bottom for slope in set(slopes.tolist())}
         by_square = (-2 * (1 - square) + 4 * damping**2) * square / bottom
-        gradient[:, :, place] = part * -2 * (slopes / 2 - by_square[:, None])
-        gradient[:, :, place + 1] = part * (-8 * damping**2 * square / bottom)[:, None]
-        gradient[:, own, place + 2 + own] = part
-        model = model + part
+        by_damping = -8 * damping**2 * square / bottom
+        for c, slope in enumerate(slopes.tolist()):
+            part = np.exp(parameters[place + 2 + c]) * shapes[slope]
+            gradient[place, c] = part * (2 * by_square - slope)
+            gradient[place + 1, c] = part * by_damping
+            gradient[place + 2 + c, c] = part
+            model[c] += part
     return model, gradient
 
 
 def _cost(parameters, bins, power, slopes):
     """Minus the logarithm of the likelihood, and its gradient."""
     model, gradient = _model(parameters, bins, slopes)
-    cost = np.sum(np.log(model) + power / model)
-    return cost, np.einsum("jc,jcp->p", (1 - power / model) / model, gradient)
+    ratio = power.T / model
+    cost = np.sum(np.log(model) + ratio)
+    return cost, gradient.reshape(parameters.size, -1) @ ((1 - ratio) / model).ravel()
 
 
 def _refined(parameters, shape):
@@ -125,16 +127,15 @@ def _modes(parameters, shape, unit) -> tuple[Mode, ...]:
     bins, power, slopes = shape
     channels = slopes.size
     model, gradient = _model(parameters, bins, slopes)
-    relative = gradient / model[:, :, None]
-    information = np.einsum("jcp,jcq->pq", relative, relative)
-    together = relative.sum(axis=1)
-    inverse = np.linalg.pinv(information, hermitian=True)
-    covariance = inverse @ (together.T @ together) @ inverse
+    relative = gradient / model
+    apart, together = relative.reshape(parameters.size, -1), relative.sum(axis=1)
+    inverse = np.linalg.pinv(apart @ apart.T, hermitian=True)
+    covariance = inverse @ (together @ together.T) @ inverse
     deviation = np.sqrt(np.diag(covariance))
     found = []
     for place in range(2 * channels, parameters.size, channels + 2):
         frequency, damping = np.exp(parameters[place : place + 2])
-        part = gradient[:, np.arange(channels), place + 2 + np.arange(channels)]
+        part = gradient[place + 2 + np.arange(channels), np.arange(channels)].T
         found.append(
             Mode(
                 frequency=float(frequency),

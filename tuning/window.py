@@ -100,21 +100,20 @@ def free_decay(
     blocks = len(energy) // size
     level = np.log(energy[: blocks * size].reshape(blocks, size).mean(axis=1) + 1e-30)
     best, found = 0.0, None
-    for start in range(blocks - LEAST_BLOCKS):
-        for stop in range(start + LEAST_BLOCKS, blocks + 1):
-            piece = level[start:stop]
-            line, bend = _bases(piece.size)
-            piece = piece - piece.mean()
-            slope, curvature = line @ piece, max(bend @ piece, 0.0)
-            fitted = slope * line + curvature * bend
-            fall = fitted[0] - fitted[-1]
-            score = fall / (1 + np.mean((piece - fitted) ** 2) / UNEVEN**2)
+    for length in range(LEAST_BLOCKS, blocks + 1):
+        pieces = np.lib.stride_tricks.sliding_window_view(level, length)[: blocks - LEAST_BLOCKS]
+        line, bend = _bases(length)
+        centred = pieces - pieces.mean(axis=1, keepdims=True)
+        slopes, curvatures = centred @ line, np.maximum(centred @ bend, 0.0)
+        fitted = slopes[:, None] * line + curvatures[:, None] * bend
+        fall = fitted[:, 0] - fitted[:, -1]
+        score = fall / (1 + np.mean((centred - fitted) ** 2, axis=1) / UNEVEN**2)
+        for start in np.flatnonzero((fall > LEAST_FALL) & (score > best)):
             # Under steady excitation what fades soon swells again.
-            after = level[stop : stop + piece.size]
-            quiet = np.all(after < level[start:stop].max() - fall / 2)
-            if fall > LEAST_FALL and score > best and quiet:
+            after = level[start + length : start + 2 * length]
+            if score[start] > best and np.all(after < pieces[start].max() - fall[start] / 2):
                 # The excitation may end within the first block.
-                best, found = score, ((start + 1) * size, stop * size)
+                best, found = score[start], ((int(start) + 1) * size, (int(start) + length) * size)
     return found
 
 

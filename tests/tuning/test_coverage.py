@@ -1,13 +1,12 @@
 """Intervals mean what they say: over many simulated campaigns they cover the truth."""
 
-import os
-
 import numpy as np
 import pytest
 
 import jaxbeam as jb
 from jaxbeam.case import replace
 from tests.tuning.test_identify import NOISE, simulated_log, small
+from tests.well_compiled import well_compiled
 from tuning.campaign import prepare
 from tuning.free import free_numbers
 from tuning.identify import fit_of
@@ -55,10 +54,8 @@ class Rehearsal:
 @pytest.fixture(scope="module")
 def rehearsal():
     """Its search is run six hundred times, and so worth compiling well, as for users."""
-    roughly = "--xla_backend_optimization_level=0"  # of `conftest`
     made = Rehearsal()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"].replace(roughly, ""))
+    with well_compiled():
         yield made
 
 

@@ -50,9 +50,16 @@ def bench():
     return make_bench(rig(), RUNS, bounds=True)
 
 
+@pytest.fixture(scope="module")
+def merits(bench):
+    """Merits by gain and, if given, sharpness of the maxima: a program for all."""
+    program = jax.jit(lambda *given: bench.merits(*given))
+    return lambda gain, *sharp: program({GAIN: jnp.asarray(gain)}, *map(jnp.asarray, sharp))
+
+
 @pytest.mark.slow
-def test_merits_are_those_of_the_simulated_runs(bench):
-    merits = bench.merits({GAIN: 5000.0})
+def test_merits_are_those_of_the_simulated_runs(merits):
+    merits = merits(5000.0)
     for i, run in enumerate(RUNS):
         record = jb.simulate(jb.replace(apply(rig(), run), {GAIN: 5000.0}))
         plain = jb.simulate(apply(jb.Case(rig().beam, sensors=rig().sensors, loads=rig().loads,
@@ -112,10 +119,10 @@ def test_slopes_of_few_and_of_many_numbers_are_the_same(bench, monkeypatch):
     np.testing.assert_allclose(forward[:, 0], expected, rtol=1e-5)
 
 
-def test_smooth_maxima_come_to_the_true_ones(bench):
-    true = bench.merits({GAIN: 4000.0})["peak"]
+def test_smooth_maxima_come_to_the_true_ones(merits):
+    true = merits(4000.0)["peak"]
     for sharpness in (100.0, 1000.0):
-        smooth = bench.merits({GAIN: 4000.0}, sharpness)["peak"]
+        smooth = merits(4000.0, sharpness)["peak"]
         assert np.all(smooth >= true) and np.all(smooth - true < np.log(200) / sharpness)
 
 
@@ -128,14 +135,14 @@ def tuned():
     return tuning.tune(rig(), FREE, CASES, **OPTIONS)
 
 
-def test_finds_what_a_search_without_gradients_finds(bench, tuned):
-    peaks = jax.jit(lambda gain: jnp.max(bench.merits({GAIN: gain})["peak"]))
+def test_finds_what_a_search_without_gradients_finds(merits, tuned):
+    def peak(gain):
+        return float(np.max(merits(gain)["peak"]))
+
     gains = np.geomspace(500.0, 40000.0, 60)
-    values = [float(peaks(gain)) for gain in gains]
+    values = [peak(gain) for gain in gains]
     low, high = gains[max(np.argmin(values) - 1, 0)], gains[min(np.argmin(values) + 1, 59)]
-    best = scipy.optimize.minimize_scalar(
-        lambda gain: float(peaks(gain)), bounds=(low, high), method="bounded"
-    )
+    best = scipy.optimize.minimize_scalar(peak, bounds=(low, high), method="bounded")
     assert tuned.outcomes[0].objective[1] <= best.fun * 1.002
     assert tuned.outcomes[0].objective[1] < tuned.outcomes[0].objective[0]
 
