@@ -156,9 +156,13 @@ def make_order(
             f" {MOST_RUNS:.0e} runs: split it"
         )
     joint = [name for name in axes if TOGETHER.fullmatch(name)]
-    # What each number may be is a range: the ends of all values tell, of all addresses at once.
+    # What each number may be is a range: the ends of its values tell. In a grid these meet those of
+    # others, and are checked with them; of paired values they may never.
     ends = {name: (axes[name].min(), axes[name].max()) for name in axes if name not in joint}
-    rows = [dict(zip(ends, row, strict=True)) for row in zip(*ends.values(), strict=True)]
+    if paired:
+        rows = [{name: value} for name, values in ends.items() for value in values]
+    else:
+        rows = [dict(zip(ends, row, strict=True)) for row in zip(*ends.values(), strict=True)]
     columns = [list(axes).index(name) for name in joint]
     if joint:
         rows += [
