@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -47,6 +48,8 @@ class Work:
         elif histories:
             self.schedule = sampled(sample_times(case), True)
         count, lanes = tasks.index.shape
+        # Twice as many threads as cores: some hand over work while others wait for theirs.
+        self.pool = ThreadPoolExecutor(2 * (os.cpu_count() or 1))
         # What finds the steps is compiled below, all else when it is first wanted.
         self._compiling, self._ready = threading.Lock(), {(None, False)}
         # Each device takes an equal part of a block.
@@ -57,9 +60,11 @@ class Work:
         self.blocks = -(-count // self.each)
         self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
         layout = _common_layout(case, tasks)
-        # Loads, settings of the run and controllers leave the rig as it is: one serves all tasks.
+        # Loads, settings of the run and controllers leave the rig as it is: one serves all tasks,
+        # but not on several devices, each of which takes its part of them.
         outside = ("loads.", "run.", "controller.")
-        self.shared = all(name.startswith(outside) for name in self.addresses[0])
+        alike = all(name.startswith(outside) for name in self.addresses[0])
+        self.shared = alike and self.devices == 1
         parts = [[0]] if self.shared else np.resize(np.arange(count), (self.blocks, self.each))
 
         def windows():
@@ -74,18 +79,19 @@ class Work:
         self.apart = case.controller is None and (single or not self.form.by_hand)
         design = case, self.form, self.addresses[0]
         # What takes longest to compile goes first; meanwhile the others are made ready for it.
-        with ThreadPoolExecutor(2) as pool:
-            compiling = [
-                pool.submit(program.ahead(*arguments))
-                for program, arguments in self._programs((*design, tasks.heavy[parts[0]]))
-            ]
-            entries, exits = np.moveaxis(windows(), 2, 0)
+        compiling = [
+            self.pool.submit(program.ahead(*arguments))
+            for program, arguments in self._programs((*design, tasks.heavy[parts[0]]))
+        ]
+        entries, exits = np.moveaxis(windows(), 2, 0)
         for program in compiling:
             program.result()  # raises what went wrong
         found = [programs.rigs(*design, tasks.heavy[part]) for part in parts]
-        self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
-        if self.shared:  # put once where it will be used
-            self.rigs, limits = jax.device_put(self.rigs), np.repeat(limits, count)
+        if self.shared:
+            self.rigs, limit = found[0]
+            limits = np.repeat(np.asarray(limit), count)
+        else:
+            self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
         limits = limits[:count]
         limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
         duration = _values(case, tasks, "run.duration")
@@ -117,7 +123,7 @@ class Work:
             return np.concatenate(found)
 
         given = self.paces, self.guesses, self.limits, count, self.tolerance
-        steps, error = choose_steps(measure, *given)
+        steps, error = choose_steps(measure, *given, self.pool.map)
         if self.single:
             some = drawn(self.paces, count)
             error += rounding(
@@ -218,6 +224,8 @@ def _common_layout(case: Case, tasks: Tasks) -> Layout:
     Raises ValueError if places change their order along the beam within the sweep.
     """
     moved = [i for i, name in enumerate(tasks.heavy_addresses) if PLACE.fullmatch(name)]
+    if not moved:
+        return lay_out(case)
     values = np.unique(tasks.heavy[:, moved], axis=0)
     names = [tasks.heavy_addresses[i] for i in moved]
     layouts = [lay_out(replace(case, dict(zip(names, row, strict=True)))) for row in values]

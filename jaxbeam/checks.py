@@ -5,6 +5,7 @@ not known yet (a case inside `jit` or `vmap`) are passed over, so a case may be 
 """
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Iterator
 from typing import Any
@@ -69,11 +70,16 @@ def _parts(case: Case) -> Iterator[tuple[str, Any, type]]:
 
 
 def _check_places(address: str, part: Any, length: Float[Array, ""]) -> None:
-    for field in dataclasses.fields(part):
-        if field.metadata.get("must") == ON_BEAM:
-            value = getattr(part, field.name)
-            if value is not None:
-                check_on_beam(f"{address}.{field.name}", value, length)
+    for name in _places(type(part)):
+        value = getattr(part, name)
+        if value is not None:
+            check_on_beam(f"{address}.{name}", value, length)
+
+
+@functools.cache
+def _places(kind: type) -> list[str]:
+    """Fields that must lie on the beam."""
+    return [f.name for f in dataclasses.fields(kind) if f.metadata.get("must") == ON_BEAM]
 
 
 def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> None:

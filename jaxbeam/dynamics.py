@@ -40,6 +40,21 @@ class Traffic(eqx.Module):
         position, speed, acceleration = (jnp.stack(parts) for parts in paths)
         return position, speed, acceleration
 
+    def pieces(self) -> tuple[Float[Array, "load piece"], Float[Array, "load piece 4"]]:
+        """The paths as cubic polynomials, as many for each load.
+
+        Of loads as cases have them, see `motion.AbstractPieces`.
+        """
+        if not self.motions:
+            return jnp.zeros((0, 1)), jnp.zeros((0, 1, 4))
+        found = [path.pieces() for path in self.motions]
+        most = max(times.shape[0] for times, _ in found)
+        lacking = [(0, most - times.shape[0]) for times, _ in found]
+        pairs = list(zip(found, lacking, strict=True))
+        times = [jnp.pad(times, more, constant_values=np.inf) for (times, _), more in pairs]
+        cubics = [jnp.pad(cubics, [more, (0, 0)]) for (_, cubics), more in pairs]
+        return jnp.stack(times), jnp.stack(cubics)
+
     def on_beam(self, times: Float[Array, "*time"]) -> Bool[Array, "load *time"]:
         """Which loads are on the beam at given times (s): from entry until just before exit."""
         windows = [path.window() for path in self.motions]

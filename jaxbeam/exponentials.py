@@ -47,7 +47,7 @@ class Step(eqx.Module):
 
 
 @functools.cache
-def _lagrange() -> np.ndarray:
+def lagrange() -> np.ndarray:
     """Monomial coefficients (node, power) of the Lagrange polynomials through the Gauss nodes."""
     polynomials = []
     for k, node in enumerate(GAUSS):
@@ -58,7 +58,7 @@ def _lagrange() -> np.ndarray:
 
 def at_ends() -> np.ndarray:
     """Weights (node, end) of the values at the Gauss nodes for those at start and end of a step."""
-    coefficients = _lagrange()
+    coefficients = lagrange()
     return np.stack([coefficients[:, 0], coefficients.sum(axis=1)], axis=1)
 
 
@@ -108,7 +108,7 @@ def propagators(rig: Rig, lengths: Float[Array, " *length"], driven: bool = Fals
     pushes = pushes * spans.ravel()
     drift, pushes = (part.reshape(*part.shape[:-1], *spans.shape) for part in (drift, pushes))
     powers = np.arange(NODES)
-    weights = _lagrange() * np.array([math.factorial(p) for p in powers])  # force, power
+    weights = lagrange() * np.array([math.factorial(p) for p in powers])  # force, power
     weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
     push = jnp.einsum("cfp,psmb...c->...cfbsm", weights, pushes)
     drift = jnp.einsum("stb...c->...cbst", drift)

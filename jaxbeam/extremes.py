@@ -1,6 +1,7 @@
 """The largest deflections and smallest contact forces of a run, kept without storing it."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,19 +11,30 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbeam.exponentials import GAUSS, LOOKED
 from jaxbeam.motion import NEVER
-from jaxbeam.peaks import find, highest, refine, vertex
+from jaxbeam.peaks import highest, refine, vertex
 from jaxbeam.tables import Path, Tables
 
 NEAR = 1.1  # a peak between samples is less than this above the highest of them
+
+
+class Found(NamedTuple):
+    """Results of runs: peaks (m) and when they are (s), contact forces (N) and their loss (s).
+
+    NaN where a run failed, and for contact that is never lost.
+    """
+
+    peak_deflection: Float[Array, "*task lane sensor"]
+    peak_time: Float[Array, "*task lane sensor"]
+    lowest_contact_force: Float[Array, "*task lane load"]
+    contact_lost_time: Float[Array, "*task lane load"]
 
 
 class Extremes(eqx.Module):
     """What is kept of a run.
 
     `samples` are the deflections at the points looked at in the step with the largest `size` of
-    deflection of each watched place, `start` (s) and `span` (s) that step; `find` tells where in it
-    the peak is, as `peaks.find` does. Contact forces are those with which a load presses on the
-    beam; `lost` (s) is the first time it would have to pull.
+    deflection of each watched place, `start` (s) and `span` (s) that step. Contact forces are those
+    with which a load presses on the beam; `lost` (s) is the first time it would have to pull.
     """
 
     score: Float[Array, "sensor lane"]
@@ -33,13 +45,17 @@ class Extremes(eqx.Module):
     lost: Float[Array, "load lane"]
     sound: Bool[Array, " lane"]
     size: Callable = eqx.field(static=True)
-    find: Callable = eqx.field(static=True)
 
     def peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
         """Largest size of deflection (m) of each watched place, and when (s); NaN if not sound."""
-        value, place = refine(self.samples, LOOKED, self.size, self.find)
+        value, place = refine(self.samples, LOOKED, self.size)
         time = self.start + place * self.span
         return jnp.where(self.sound, value, jnp.nan), jnp.where(self.sound, time, jnp.nan)
+
+    def found(self) -> Found:
+        """All that is known at the end, with lanes first."""
+        lost = jnp.where(self.lost < NEVER, self.lost, jnp.nan)
+        return Found(*(part.T for part in (*self.peak(), self.lowest, lost)))
 
 
 @jax.named_scope("extremes")
@@ -68,7 +84,6 @@ def fold(best: Extremes, tables: Tables, path: Path, states, forces, commands) -
             best.lost,
             best.sound,
             best.size,
-            best.find,
         )
 
     # Most chunks come nowhere near the peak so far, or press all along: they end here.
@@ -93,13 +108,8 @@ def fold(best: Extremes, tables: Tables, path: Path, states, forces, commands) -
     return eqx.tree_at(lambda b: (b.lowest, b.lost, b.sound), best, (lowest, first, sound))
 
 
-def nothing_seen(
-    places: int, loads: int, lanes: int, size: Callable, find: Callable = find
-) -> Extremes:
-    """Extremes of a run that has not begun, by some size of deflection that is zero at rest.
-
-    `find` is what finds the place of a peak in its step, see `peaks.refine`.
-    """
+def nothing_seen(places: int, loads: int, lanes: int, size: Callable) -> Extremes:
+    """Extremes of a run that has not begun, by some size of deflection that is zero at rest."""
     nothing = jnp.zeros((places, lanes))
     return Extremes(
         nothing,
@@ -110,5 +120,4 @@ def nothing_seen(
         jnp.full((loads, lanes), NEVER),
         jnp.ones(lanes, bool),
         size,
-        find,
     )

@@ -5,6 +5,7 @@ names and counts are static. The metadata carries the SI unit and one line of me
 error messages, tables and plots read, so that each is written once.
 """
 
+import functools
 import typing
 
 import equinox as eqx
@@ -67,6 +68,7 @@ def dimensions(field) -> str:
     return next(iter(typing.get_args(field.type)), field.type).dim_str
 
 
+@functools.cache
 def fits(field, shape: tuple[int, ...]) -> bool:
     """Tell whether a number declared by this field may have this shape."""
     axes = dimensions(field).split()

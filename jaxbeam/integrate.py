@@ -16,14 +16,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam import native
 from jaxbeam.advance import KEPT, advance, contact, undriven
 from jaxbeam.driver import AbstractDriver, Moment
 from jaxbeam.dynamics import Traffic
 from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
 from jaxbeam.extremes import Extremes, fold, nothing_seen
 from jaxbeam.loads import AbstractLoad, MovingMass
-from jaxbeam.peaks import find
 from jaxbeam.rig import Rig
 from jaxbeam.tables import CHUNK, Path, Rigging, follow, tabulate
 
@@ -68,65 +66,29 @@ def _rows(loads: Float[Array, "load lane"], path: Path) -> Float[Array, "step ro
     return jnp.repeat(chosen, len(GAUSS), axis=1)
 
 
-def _undriven(rigging: Rigging, path: Path, inertia, weight, state, best: Any):
-    """A chunk of steps without a driver: state and extremes after it, and the states before each.
-
-    Without extremes so far, None, none are looked for.
-    """
-    tables = tabulate(rigging, path)
-    loads = _rows(inertia, path), _rows(weight, path)
-    state, states, forces = undriven(tables, *loads, state)
-    if best is not None:
-        best = fold(best, tables, path, states, forces, None)
-    return (state, best), states
-
-
-@jax.custom_jvp
-def _native(prepared, rigging: Rigging, path: Path, inertia, weight, state, best: Any):
-    """The state and the extremes after a chunk of steps, by C."""
-    return native.chunk(prepared, path, inertia, weight, state, best)
-
-
-@_native.defjvp
-def _native_jvp(given, changes):
-    """C is not differentiated, but what it stands for."""
-    return jax.jvp(lambda *given: _undriven(*given)[0], given[1:], changes[1:])
-
-
-def _stepper(
-    rigging: Rigging,
-    traffic: Traffic,
-    slots: int,
-    driver: AbstractDriver | None,
-    by_hand: bool = False,
-):
+def _stepper(rigging: Rigging, traffic: Traffic, slots: int, driver: AbstractDriver | None):
     """Function that takes state, memory and extremes through the chunk from a given step on.
 
-    It returns them with the time (s) at its end, and with what may be kept of it, which is nothing
-    if the steps are those written `by_hand`, without a driver and in double precision.
+    It returns them with the time (s) at its end, and with what may be kept of it.
     """
-    prepared = native.prepare(rigging) if by_hand else None
 
     def chunk(state, memory, best: Any, first):
         index = first + jnp.arange(CHUNK)
         path = follow(rigging, traffic, slots, index)
-        given = rigging, path, traffic.inertia, traffic.weight, state, best
-        states = commands = shown = None
-        if driver is not None:
-            tables = tabulate(rigging, path)
-            loads = _rows(traffic.inertia, path), _rows(traffic.weight, path)
+        tables = tabulate(rigging, path)
+        loads = _rows(traffic.inertia, path), _rows(traffic.weight, path)
+        commands = shown = None
+        if driver is None:
+            state, states, forces = undriven(tables, *loads, state)
+        else:
             moments = Moment(path.start, path.span, rigging.grid.edge(index))
             (state, memory), (states, forces, commands, shown) = jax.lax.scan(
                 lambda carry, step: _driven(driver, carry, step),
                 (state, memory),
                 (tables, *loads, moments),
             )
-            if best is not None:
-                best = fold(best, tables, path, states, forces, commands)
-        elif prepared is not None:
-            state, best = _native(prepared, *given)
-        else:
-            (state, best), states = _undriven(*given)
+        if best is not None:
+            best = fold(best, tables, path, states, forces, commands)
         return state, memory, best, path.start[-1] + path.span[-1], (states, commands, shown)
 
     return chunk
@@ -175,7 +137,6 @@ def march(
     *,
     slots: int,
     driver: AbstractDriver | None = None,
-    by_hand: bool = False,
 ) -> tuple[Extremes, Any]:
     """Integrate from rest over a grid, keeping only extremes at the watched places.
 
@@ -183,11 +144,9 @@ def march(
 
     The loop runs as long as it must: it ends early when all lanes are given up, and without a
     driver when the energy left after the last exit cannot raise any peak. `slots` is how many
-    loads may be on the beam at once. Steps written `by_hand` in C do the same sooner, if they are
-    `native.ready`. Forward mode only.
+    loads may be on the beam at once. Forward mode only.
     """
-    by_hand = by_hand and driver is None and traffic.inertia.dtype == jnp.float64
-    chunk = _stepper(rigging, traffic, slots, driver, by_hand)
+    chunk = _stepper(rigging, traffic, slots, driver)
     grid, stiffness = rigging.grid, rigging.rig.stiffness()
     size = 2 * stiffness.shape[0]
 
@@ -212,8 +171,7 @@ def march(
         return state, memory, best, first, going
 
     lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
-    seek = native.find if by_hand else find
-    best = nothing_seen(rigging.places, loads, lanes, rigging.size, seek)
+    best = nothing_seen(rigging.places, loads, lanes, rigging.size)
     memory = None if driver is None else driver.start(lanes)
     start = (
         jnp.zeros((rigging.rig.states, lanes)),

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.faults import either
 from jaxbeam.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
-from jaxbeam.motion import AbstractMotion, Braking, Tabulated
+from jaxbeam.motion import AbstractPieces, Braking, Tabulated
 
 
 class AbstractLoad(eqx.Module):
@@ -118,7 +118,7 @@ class MovingForce(AbstractLoad):
 KINDS = {"mass": MovingMass, "force": MovingForce}
 
 
-def motion(load: AbstractLoad, length: Float[Array, ""]) -> AbstractMotion:
+def motion(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPieces:
     """How the load travels along a beam of the given length (m)."""
     if load.times is not None:
         return Tabulated(load.times, load.positions, length)

@@ -28,7 +28,18 @@ class AbstractMotion(eqx.Module):
         """Times in s at which the motion is not smooth, or passes one of the places (m)."""
 
 
-class Braking(AbstractMotion):
+class AbstractPieces(AbstractMotion):
+    """A path that is made of cubic polynomials in time."""
+
+    @abc.abstractmethod
+    def pieces(self) -> tuple[Float[Array, " piece"], Float[Array, "piece 4"]]:
+        """The path as cubic polynomials in the time since each of some times (s), from then on.
+
+        Coefficients are in m/s^power, lowest power first. They hold while the load is on the beam.
+        """
+
+
+class Braking(AbstractPieces):
     """Constant deceleration from the speed at entry: x = v t - a t^2 / 2 until it stops.
 
     A negative speed enters at the right end and travels left. A negative deceleration speeds the
@@ -66,6 +77,17 @@ class Braking(AbstractMotion):
         braking = jnp.where(moving, -self.deceleration, 0.0)
         return start + way * distance, way * speed, way * braking
 
+    def pieces(self):
+        start = jnp.where(self.speed < 0, self.length, 0.0)
+        rate = -jnp.sign(self.speed) * self.deceleration / 2
+        stop = self._stop()
+        halt = start + jnp.where(stop < NEVER, self.speed * stop / 2, 0.0)
+        nought = jnp.zeros(())
+        moving = jnp.stack([start, self.speed, rate, nought])
+        standing = jnp.stack([halt, nought, nought, nought])
+        times = jnp.stack([self.entry_time, self.entry_time + stop])
+        return times, jnp.stack([moving, standing])
+
     def window(self):
         reach = self._reach(self.length)
         return self.entry_time, jnp.where(reach < NEVER, self.entry_time + reach, NEVER)
@@ -76,7 +98,7 @@ class Braking(AbstractMotion):
         return jnp.where(kinks < NEVER, self.entry_time + kinks, NEVER)
 
 
-class Tabulated(AbstractMotion):
+class Tabulated(AbstractPieces):
     """A path through given positions at given times: a not-a-knot cubic spline.
 
     The load is put on the beam at the first time (or enters when it passes an end) and, when the
@@ -106,25 +128,25 @@ class Tabulated(AbstractMotion):
         rows = rows.at[-1, -3:].set(jnp.stack([h[-1], -(h[-2] + h[-1]), h[-2]]))
         return jnp.linalg.solve(rows, jnp.zeros(n).at[inner].set(6 * jnp.diff(slope)))
 
-    def travel(self, t):
+    def pieces(self):
         knots, x, bend = self.times, self.positions, self._curvatures()
+        gap = jnp.diff(knots)
+        speed = jnp.diff(x) / gap - gap * (2 * bend[:-1] + bend[1:]) / 6
+        jerk = jnp.diff(bend) / gap
+        inner = jnp.stack([x[:-1], speed, bend[:-1] / 2, jerk / 6], axis=1)
+        end = jnp.zeros(4).at[0].set(x[-1])
+        return knots, jnp.concatenate([inner, end[None]])
+
+    def travel(self, t):
+        knots, cubics = self.pieces()
         on = (t >= knots[0]) & (t <= knots[-1])
         held = jnp.clip(t, knots[0], knots[-1])
         i = jnp.clip(jnp.searchsorted(knots, held, side="right") - 1, 0, knots.shape[0] - 2)
-        h = knots[i + 1] - knots[i]
-        after, before = held - knots[i], knots[i + 1] - held
-        position = (
-            (bend[i] * before**3 + bend[i + 1] * after**3) / (6 * h)
-            + (x[i] / h - bend[i] * h / 6) * before
-            + (x[i + 1] / h - bend[i + 1] * h / 6) * after
-        )
-        speed = (
-            (bend[i + 1] * after**2 - bend[i] * before**2) / (2 * h)
-            + (x[i + 1] - x[i]) / h
-            - (bend[i + 1] - bend[i]) * h / 6
-        )
-        acceleration = (bend[i] * before + bend[i + 1] * after) / h
-        return position, jnp.where(on, speed, 0.0), jnp.where(on, acceleration, 0.0)
+        since, (place, speed, half, sixth) = held - knots[i], jnp.moveaxis(cubics[i], -1, 0)
+        position = place + since * (speed + since * (half + since * sixth))
+        rate = speed + since * (2 * half + since * 3 * sixth)
+        acceleration = 2 * half + since * 6 * sixth
+        return position, jnp.where(on, rate, 0.0), jnp.where(on, acceleration, 0.0)
 
     def _pass(self, place):
         """First time at which the path passes a place: bisection, then one Newton step.

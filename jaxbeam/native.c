@@ -1,190 +1,116 @@
-/* A chunk of steps for all lanes of a task, by hand: what tables.tabulate, advance.advance and
-   extremes.fold do for steps without a driver.
+/* Peaks and contact forces of many tasks by hand: what integrate.march does for rigs without a driver.
 
-   What depends on the path alone is worked out first. Lanes are then taken in groups that fill a
-   vector register; two groups go through all steps of the chunk before the next begin, so that
-   their states stay where they are worked on. native.py compiles this file and gives the arguments. */
+   Steps are taken in chunks. What depends on the path alone is worked out first; lanes are then taken in
+   groups that fill a vector register, and a few groups go through all steps of the chunk before the next
+   begin, so that their states stay where they are worked on. native.py compiles this file and gives the
+   arguments. */
 
-#include "native_peaks.h"
-#include "native_tables.h"
-#include "xla/ffi/api/c_api.h"
+#include "native_steps.h"
 
-enum { TURNS = 2 }; /* groups at once */
-
-/* What the lanes of a group go through. The contact forces of a step follow its state in memory. */
-typedef struct {
-    ptrdiff_t first;
-    int many;
-    Lanes *state, *after, *matrix;
-    Lanes *samples;     /* (step, point, place) */
-    Lanes *high, *most; /* (step, place): the largest of these, and what may be between them */
-} Group;
-
-/* In Lanes. */
-static size_t room_of(const Work *w) {
-    int rows = w->rows, sights = w->looked + 2 * w->places;
-    return (size_t)(2 * (w->states + rows) + rows * rows + STEPS * sights);
+/* How much memory a call works in, in numbers. It is XLA's, a result that nobody reads: to allocate it in
+   every call would take long. */
+int64_t march_room(int64_t panels, int64_t blocks, int64_t side, int64_t modes, int64_t segments, int64_t terms,
+                   int64_t slots, int64_t loads, int64_t places, int64_t lanes) {
+    Work w = {.panels = (int)panels, .blocks = (int)blocks, .side = (int)side, .modes = (int)modes,
+              .segments = (int)segments, .terms = (int)terms, .slots = (int)slots, .loads = (int)loads,
+              .places = (int)places, .lanes = lanes};
+    complete(&w);
+    return (int64_t)((share(&w, 0) + sizeof(Lanes)) / 8);
 }
 
-/* How many numbers a call works on beside its arguments: their memory is XLA's, a result that nobody
-   reads. To allocate it in every call would take as long as all the rest. */
-int64_t chunk_room(int states, int slots, int places) {
-    Work w = {.rows = slots * NODES, .states = states, .places = places, .looked = POINTS * places};
-    return (int64_t)((TURNS * room_of(&w) + 1) * WIDE + STEPS * tables_of(&w));
+/* All is at rest, and nothing seen. */
+static void begin(Work *w) {
+    const size_t lanes = (size_t)w->lanes, seen = (size_t)w->places * lanes;
+    memset(w->state, 0, 8 * (size_t)w->states * lanes);
+    memset(w->samples, 0, 8 * POINTS * seen);
+    memset(w->score, 0, 8 * seen), memset(w->start, 0, 8 * seen), memset(w->span, 0, 8 * seen);
+    for (size_t i = 0; i < (size_t)w->loads * lanes; i++) w->lowest[i] = w->lost[i] = INFINITY;
+    for (size_t i = 0; i < lanes; i++) w->sound[i] = 1;
 }
 
-/* How little the loads have pressed so far, and when they first would have had to pull. */
-static void press(const Work *w, int t, const Group *g) {
-    for (int s = 0; s < w->slots; s++) {
-        if (!w->active[t * w->slots + s]) continue;
-        const Lanes *forces = g->state + w->states + s * NODES;
-        ptrdiff_t at = w->slot[t * w->slots + s] * w->lanes + g->first;
-        double *lowest = w->out[LOWEST - STATE] + at, *lost = w->out[LOST - STATE] + at;
-        Lanes pull = forces[0];
-        for (int k = 1; k < NODES; k++) pull = greater(forces[k], pull);
-        store(lowest, less(-pull, load(lowest, g->many)), g->many);
-        if (!any(pull > 0)) continue;
-        Lanes when = load(lost, g->many);
-        for (int k = 0; k < NODES; k++) {
-            Lanes time = all(w->in[START][t] + w->in[SPAN][t] * w->in[GAUSS][k]);
-            when = either(forces[k] > 0, less(time, when), when);
+/* The steps of the next chunk. Those of a panel, of which some are done, are all alike. */
+static int chunk(Work *w, int *panel, int64_t *done) {
+    int count = 0;
+    while (count < STEPS && *panel < w->panels) {
+        if (*done >= steps_of(w, *panel)) {
+            ++*panel, *done = 0;
+            continue;
         }
-        store(lost, when, g->many);
+        Step *step = w->steps + count++;
+        step->panel = *panel, step->span = w->in[LENGTHS][*panel];
+        step->start = w->in[EDGES][*panel] + (double)(*done)++ * step->span;
+        step->drift = w->drift + (size_t)*panel * drift_of(w);
+        step->loads = 0;
+        const uint8_t *active = (const uint8_t *)w->in[ACTIVE] + *panel * w->loads;
+        for (int l = 0; l < w->loads && step->loads < w->slots; l++)
+            if (active[l]) step->load[step->loads++] = l;
+        step->rows = step->loads * NODES;
+        tabulate(w, step);
     }
+    return count;
 }
 
-/* The contact forces at the nodes of a step. */
-static inline ALWAYS void meet(const Work *w, int t, const Step *step, const Group *g, int slots,
-                               Lanes *matrix, Lanes *forces) {
-    const int rows = slots * NODES;
-    memset(forces, 0, (size_t)rows * sizeof *forces);
-    add_product(forces, step->respond, rows, g->state, w->states);
-    for (int s = 0; s < slots; s++) {
-        ptrdiff_t at = w->slot[t * slots + s] * w->lanes + g->first;
-        Lanes mass = {0}, weight = {0};
-        if (w->active[t * slots + s]) {
-            mass = load(w->in[INERTIA] + at, g->many);
-            weight = load(w->in[WEIGHT] + at, g->many);
+/* After this no load is on the beam. */
+static double last_exit(const Work *w) {
+    double last = 0;
+    for (int l = 0; l < w->loads; l++) last = fmax(last, w->in[WINDOWS][2 * l + 1]);
+    return last;
+}
+
+static void run(Work *w) {
+    begin(w), shape_series(w), sights(w, (double *)w->product), propagators(w);
+    const double exit = last_exit(w);
+    int panel = 0;
+    int64_t done = 0;
+    for (int count; (count = chunk(w, &panel, &done));) {
+        for (ptrdiff_t first = 0; first < w->lanes;) {
+            int turns = 0;
+            for (; turns < TURNS && first < w->lanes; turns++, first += WIDE) {
+                w->groups[turns].first = first;
+                w->groups[turns].many = w->lanes - first < WIDE ? (int)(w->lanes - first) : WIDE;
+            }
+            take(w, count, w->groups, turns);
         }
-        for (int i = s * NODES; i < (s + 1) * NODES; i++) {
-            forces[i] = -(weight + mass * forces[i]);
-            for (int j = 0; j < rows; j++) matrix[i * rows + j] = mass * step->gains[i * rows + j];
-            matrix[i * rows + i] += 1;
+        const Step *last = w->steps + count - 1;
+        if (last->start + last->span >= exit && spent(w)) break;
+    }
+}
+
+/* Results of a task, with lanes first. */
+static void report(const Work *w, int64_t task) {
+    const ptrdiff_t lanes = w->lanes, plane = w->places * lanes, seen = task * plane, pressed = task * w->loads * lanes;
+    for (int place = 0; place < w->places; place++)
+        for (ptrdiff_t first = 0; first < lanes; first += WIDE) {
+            const int many = lanes - first < WIDE ? (int)(lanes - first) : WIDE;
+            const ptrdiff_t at = place * lanes + first;
+            Lanes samples[POINTS];
+            for (int p = 0; p < POINTS; p++) samples[p] = load(w->samples + p * plane + at, many);
+            const Curve curve = curve_through(samples, w->in[CURVE]);
+            const Lanes where = find(&curve), peak = size_at(&curve, where);
+            const Lanes time = load(w->start + at, many) + (where + 1) / 2 * load(w->span + at, many);
+            for (int l = 0; l < many; l++) {
+                const ptrdiff_t to = seen + (first + l) * w->places + place;
+                w->out[PEAK][to] = w->sound[first + l] ? peak[l] : NAN;
+                w->out[PEAK_TIME][to] = w->sound[first + l] ? time[l] : NAN;
+            }
         }
-    }
-    eliminate(matrix, forces, rows);
-}
-
-static void collocate(const Work *w, int t, const Step *step, const Group *g) {
-    if (w->slots == 1) { /* in registers */
-        Lanes matrix[NODES * NODES], forces[NODES];
-        meet(w, t, step, g, 1, matrix, forces);
-        memcpy(g->state + w->states, forces, sizeof forces);
-    } else {
-        meet(w, t, step, g, w->slots, g->matrix, g->state + w->states);
-    }
-}
-
-/* Deflections at the points of a step, and the largest of them. */
-static void watch(const Work *w, int t, const Step *step, const Group *g, int both) {
-    Lanes *seen = g->samples + t * w->looked;
-    memset(seen, 0, (size_t)w->looked * sizeof *seen);
-    add_product(seen, step->seen, w->looked, g->state, w->states + (step->pressed ? w->rows : 0));
-    for (int place = 0; place < w->places; place++) {
-        Lanes high = {0}, largest = {0};
-        for (int i = place; i < w->looked; i += w->places) {
-            largest = greater(absolute(seen[i]), largest);
-            if (!both) high = greater(seen[i], high);
+    for (int load = 0; load < w->loads; load++)
+        for (ptrdiff_t l = 0; l < lanes; l++) {
+            const double lost = w->lost[load * lanes + l];
+            w->out[LOWEST][pressed + l * w->loads + load] = w->lowest[load * lanes + l];
+            w->out[LOST][pressed + l * w->loads + load] = lost < INFINITY ? lost : NAN;
         }
-        high = both ? largest : high;
-        g->high[t * w->places + place] = high;
-        Lanes last = seen[w->looked - w->places + place];
-        g->most[t * w->places + place] = most_within(seen[place], last, high, largest, both);
-    }
 }
 
-/* The state at the end of a step; without forces, modes that are not coupled are two states each. */
-static void move(const Work *w, const Step *step, Group *g) {
-    const double *drift = step->drift;
-    Lanes *state = g->state, *after = g->after;
-    if (w->side == 2) {
-        for (int i = 0; i < w->states; i += 2, drift += 4) {
-            after[i] = drift[0] * state[i] + drift[2] * state[i + 1];
-            after[i + 1] = drift[1] * state[i] + drift[3] * state[i + 1];
-        }
-    } else {
-        memset(after, 0, (size_t)w->states * sizeof *after);
-        for (int i = 0; i < w->states; i += w->side, drift += w->side * w->side)
-            add_product(after + i, drift, w->side, state + i, w->side);
-    }
-    if (step->pressed) add_product(after, step->push, w->states, state + w->states, w->rows);
-    g->state = after, g->after = state;
-}
-
-/* The peaks so far, from the samples of all steps. */
-static void raise(const Work *w, const Step *steps, const Group *g, int place, int both) {
-    const int many = g->many;
-    const ptrdiff_t at = place * w->lanes + g->first, plane = (ptrdiff_t)w->places * w->lanes;
-    const Lanes *seen = g->samples + place;
-    Lanes before = load(w->out[SCORE - STATE] + at, many), least = before, score = before, top = {0};
-    for (int t = 0; t < STEPS; t++)
-        if (steps[t].taken) least = greater(g->high[t * w->places + place], least);
-    for (int t = 0; t < STEPS; t++) {
-        if (!steps[t].taken) continue;
-        /* Only steps that may come above the highest of all samples can have the peak. */
-        Lanes found = g->high[t * w->places + place];
-        Mask maybe = g->most[t * w->places + place] > least;
-        if (!any(maybe)) continue;
-        Lanes samples[POINTS];
-        for (int p = 0; p < POINTS; p++) samples[p] = seen[(t * POINTS + p) * w->places];
-        if (any(maybe & rises_within(samples, w->ends, found, both)))
-            found = vertex(samples, w->in[CURVE], w->in[LOOKED], both);
-        top = either(found > score, all(t), top);
-        score = greater(found, score);
-    }
-    Mask better = score > before;
-    if (!any(better)) return;
-    store(w->out[SCORE - STATE] + at, score, many);
-    double *start = w->out[BEST_START - STATE] + at, *span = w->out[BEST_SPAN - STATE] + at;
-    for (int t = 0; t < STEPS; t++) {
-        Mask here = better & (top == all(t));
-        if (!any(here)) continue;
+/* Slopes at both ends of the curve through samples. */
+static void slopes(Work *w) {
+    memset(w->ends, 0, sizeof w->ends);
+    for (int i = 1; i < POINTS; i++)
         for (int p = 0; p < POINTS; p++) {
-            double *kept = w->out[SAMPLES - STATE] + p * plane + at;
-            store(kept, either(here, seen[(t * POINTS + p) * w->places], load(kept, many)), many);
+            double slope = i * w->in[CURVE][p * POINTS + i]; /* of the power, at 1 */
+            w->ends[p] += i % 2 ? slope : -slope;
+            w->ends[POINTS + p] += slope;
         }
-        store(start, either(here, all(w->in[START][t]), load(start, many)), many);
-        store(span, either(here, all(w->in[SPAN][t]), load(span, many)), many);
-    }
-}
-
-/* All steps of the chunk for a few groups of lanes, in turns: while one waits for its divisions, others
-   have work. */
-static inline ALWAYS void take(const Work *w, const Step *steps, Group *groups, int count, int both) {
-    Group *end = groups + count;
-    for (const Group *g = groups; g < end; g++)
-        for (int i = 0; i < w->states; i++)
-            g->state[i] = load(w->in[STATE] + i * w->lanes + g->first, g->many);
-    for (int t = 0; t < STEPS; t++) {
-        const Step *step = steps + t;
-        if (!step->taken) continue;
-        if (step->pressed) {
-            for (const Group *g = groups; g < end; g++) collocate(w, t, step, g);
-            for (const Group *g = groups; g < end; g++) press(w, t, g);
-        }
-        for (const Group *g = groups; g < end; g++) watch(w, t, step, g, both);
-        for (Group *g = groups; g < end; g++) move(w, step, g);
-    }
-    for (const Group *g = groups; g < end; g++) {
-        for (int place = 0; place < w->places; place++) raise(w, steps, g, place, both);
-        Lanes nothing = {0}; /* unless a state is infinite or not a number, as it then stays */
-        for (int i = 0; i < w->states; i++) {
-            store(w->out[0] + i * w->lanes + g->first, g->state[i], g->many);
-            nothing += 0 * g->state[i];
-        }
-        for (int l = 0; l < g->many; l++)
-            w->sound[g->first + l] = w->sound_in[g->first + l] && nothing[l] == 0;
-    }
 }
 
 static XLA_FFI_Error *fault(const XLA_FFI_CallFrame *frame, const char *message) {
@@ -193,93 +119,30 @@ static XLA_FFI_Error *fault(const XLA_FFI_CallFrame *frame, const char *message)
     return frame->api->XLA_FFI_Error_Create(&args);
 }
 
-/* Whether XLA only asks for which version of its interface this was compiled; it is told. */
-static int asked(XLA_FFI_CallFrame *frame) {
-    if (!frame->extension_start || frame->extension_start->type != XLA_FFI_Extension_Metadata) return 0;
-    XLA_FFI_Metadata *about = ((XLA_FFI_Metadata_Extension *)frame->extension_start)->metadata;
-    about->api_version.major_version = XLA_FFI_API_MAJOR;
-    about->api_version.minor_version = XLA_FFI_API_MINOR;
-    return 1;
-}
-
-static inline ALWAYS XLA_FFI_Error *run(XLA_FFI_CallFrame *frame, int both) {
+XLA_FFI_Error *march(XLA_FFI_CallFrame *frame) {
     if (asked(frame)) return NULL;
-    if (frame->args.size != ARGUMENTS || frame->rets.size != KEPT + 1)
+    if (frame->args.size != ARGUMENTS || frame->rets.size != RESULTS)
         return fault(frame, "jaxbeam's kernel is of another version than jaxbeam: build it anew");
-    Work work, *w = &work;
     const int64_t *dims[ARGUMENTS];
-    for (int i = 0; i < ARGUMENTS; i++) {
-        XLA_FFI_Buffer *buffer = frame->args.args[i];
-        w->in[i] = buffer->data;
-        dims[i] = buffer->dims;
-    }
-    w->kind = (const int64_t *)w->in[KIND];
-    w->slot = (const int64_t *)w->in[SLOTS];
-    w->active = (const uint8_t *)w->in[ACTIVE];
-    w->sound_in = (const uint8_t *)w->in[SOUND];
-    w->blocks = (int)dims[DRIFT][1], w->side = (int)dims[DRIFT][2], w->modes = (int)dims[SHAPE][3];
-    w->slots = (int)dims[SLOTS][1], w->rows = w->slots * NODES, w->states = w->blocks * w->side;
-    w->places = (int)dims[SCORE][0], w->looked = POINTS * w->places, w->lanes = dims[STATE][1];
-    for (int i = 0; i < KEPT; i++) {
-        XLA_FFI_Buffer *buffer = frame->rets.rets[i];
-        w->out[i] = buffer->data;
-        size_t bytes = i == SOUND - STATE ? 1 : 8;
-        for (int64_t d = 0; d < buffer->rank; d++) bytes *= (size_t)buffer->dims[d];
-        /* Peaks so far are updated in place; XLA may give the same memory to argument and result. */
-        if (i && w->out[i] != w->in[STATE + i]) memcpy(w->out[i], w->in[STATE + i], bytes);
-    }
-    w->sound = (uint8_t *)w->out[SOUND - STATE];
-    memset(w->ends, 0, sizeof w->ends);
-    for (int i = 1; i < POINTS; i++)
-        for (int p = 0; p < POINTS; p++) {
-            double slope = i * w->in[CURVE][p * POINTS + i]; /* of the power, at 1 */
-            w->ends[p] += i % 2 ? slope : -slope;
-            w->ends[POINTS + p] += slope;
-        }
-    XLA_FFI_Buffer *spare = frame->rets.rets[KEPT]; /* may begin anywhere */
-    Lanes *scratch = (Lanes *)(((uintptr_t)spare->data + sizeof(Lanes) - 1) & -sizeof(Lanes));
-    const size_t room = room_of(w);
-    Step steps[STEPS];
-    double *tables = (double *)(scratch + TURNS * room);
-    for (int t = 0; t < STEPS; t++)
-        tabulate(w, t, steps + t, scratch, tables + (size_t)t * tables_of(w));
-    Group groups[TURNS];
-    for (int k = 0; k < TURNS; k++) {
-        Group *g = groups + k;
-        g->state = scratch + (size_t)k * room, g->after = g->state + w->states + w->rows;
-        g->matrix = g->after + w->states + w->rows;
-        g->samples = g->matrix + w->rows * w->rows, g->high = g->samples + STEPS * w->looked;
-        g->most = g->high + STEPS * w->places;
-    }
-    for (int64_t first = 0; first < w->lanes;) {
-        int count = 0;
-        for (; count < TURNS && first < w->lanes; count++, first += WIDE) {
-            int64_t left = w->lanes - first;
-            groups[count].first = first, groups[count].many = left < WIDE ? (int)left : WIDE;
-        }
-        take(w, steps, groups, count, both);
+    for (int i = 0; i < ARGUMENTS; i++) dims[i] = ((XLA_FFI_Buffer *)frame->args.args[i])->dims;
+    XLA_FFI_Buffer **results = (XLA_FFI_Buffer **)frame->rets.rets;
+    Work work = {
+        .panels = (int)dims[COUNTS][1], .blocks = (int)dims[STATE_MATRIX][1],
+        .side = (int)dims[STATE_MATRIX][2], .modes = (int)(dims[SERIES][3] / dims[STATE_MATRIX][1]),
+        .segments = (int)dims[SERIES][1], .terms = (int)dims[SERIES][2], .pieces = (int)dims[SINCE][2],
+        .slots = (int)*(const int64_t *)((const XLA_FFI_Scalar *)frame->attrs.attrs[0])->value,
+        .loads = (int)dims[INERTIA][1], .places = (int)dims[PLACES][1], .lanes = dims[INERTIA][2],
+    }, *w = &work;
+    complete(w);
+    for (int i = 0; i < RESULTS; i++) w->out[i] = results[i]->data;
+    share(w, (uintptr_t)memory(frame, ROOM));
+    const int64_t tasks = results[PEAK]->dims[0];
+    for (int64_t task = 0; task < tasks; task++) {
+        give(w, frame, task);
+        if (task == 0) slopes(w);
+        if (*(const uint8_t *)w->in[WANTED]) run(w);
+        else begin(w);
+        report(w, task);
     }
     return NULL;
 }
-
-/* Where the curves through samples (point, curve) are largest. */
-static inline ALWAYS XLA_FFI_Error *seek(XLA_FFI_CallFrame *frame, int both) {
-    if (asked(frame)) return NULL;
-    const XLA_FFI_Buffer *samples = frame->args.args[0], *through = frame->args.args[1];
-    XLA_FFI_Buffer *places = frame->rets.rets[0];
-    const int64_t count = samples->dims[1];
-    for (int64_t first = 0; first < count; first += WIDE) {
-        const int many = count - first < WIDE ? (int)(count - first) : WIDE;
-        Lanes curve[POINTS];
-        for (int p = 0; p < POINTS; p++)
-            curve[p] = load((const double *)samples->data + p * count + first, many);
-        store((double *)places->data + first, find(curve, through->data, both), many);
-    }
-    return NULL;
-}
-
-/* Deflections to both sides count, or only those upwards. */
-XLA_FFI_Error *places_of_both_sides(XLA_FFI_CallFrame *frame) { return seek(frame, 1); }
-XLA_FFI_Error *places_of_one_side(XLA_FFI_CallFrame *frame) { return seek(frame, 0); }
-XLA_FFI_Error *chunk_of_both_sides(XLA_FFI_CallFrame *frame) { return run(frame, 1); }
-XLA_FFI_Error *chunk_of_one_side(XLA_FFI_CallFrame *frame) { return run(frame, 0); }

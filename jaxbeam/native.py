@@ -1,36 +1,39 @@
-"""A chunk of steps by hand-written C (`native.c`), where that was compiled for this machine.
+"""Peaks of many runs by hand-written C (`native.c`), where that was compiled for this machine.
 
-XLA makes of a step some forty small loops over the lanes; by hand it is one. The C is compiled
-once, when asked for, by the C compiler of the machine, into the user's cache folder. Sweeps then
-use it where they look for peaks alone (not histories), without a controller, in double precision,
-on CPUs. Nobody needs it.
+XLA makes of a step some forty small loops over the lanes; by hand it is one, and so are all steps
+of all tasks. The C is compiled once, when asked for, by the C compiler of the machine, into the
+user's cache folder. Sweeps then use it where they look for peaks alone (not histories), without a
+controller, in double precision, on CPUs. Nobody needs it.
 """
 
 import ctypes
-import itertools
-import math
-import operator
+import functools
 import pathlib
 import sys
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case import Case
-from jaxbeam.exponentials import GAUSS, LOOKED, NODES
-from jaxbeam.extremes import NEAR, Extremes
+from jaxbeam.dynamics import Traffic
+from jaxbeam.exponentials import DOUBLINGS, GAUSS, LOOKED, NODES, TERMS, lagrange
+from jaxbeam.extremes import NEAR, Found
+from jaxbeam.grid import Grid
+from jaxbeam.integrate import march as plain_march
 from jaxbeam.native_library import Library
 from jaxbeam.peaks import CLIMBS, ROUNDINGS, STARTS, VERTEX_ROUNDS, reach, through
-from jaxbeam.tables import CHUNK, Path, Rigging
+from jaxbeam.rig import Rig
+from jaxbeam.tables import CHUNK, make_rigging
 
 FILL = 8  # numbers that fill whole vector registers of any machine
 CONSTANTS = {
     "FILL": FILL,
     "STEPS": CHUNK,
     "NODES": NODES,
+    "TERMS": TERMS,
+    "DOUBLINGS": DOUBLINGS,
     "POINTS": len(LOOKED),
     "NEAR": NEAR,
     "BESIDE_END": (NEAR - 1) * float(np.diff(LOOKED)[0] / np.diff(LOOKED).max()) ** 2,
@@ -40,22 +43,15 @@ CONSTANTS = {
     "CLIMBS": CLIMBS,
     "SLACK": ROUNDINGS * sys.float_info.epsilon,
 }
-# Deflections that count, by what makes them large.
-SIDES = {abs: "both_sides", operator.pos: "one_side"}
-PARTS = ("chunk", "places")  # of the work that are done in C
-
-
-def _function(part: str, size: Callable) -> str:
-    """The function of the library for a part of the work and deflections that count."""
-    return f"{part}_of_{SIDES[size]}"
-
-
+PARTS = ("exponentials", "lanes", "matrices", "path", "peaks", "steps", "tables", "work")
 LIBRARY = Library(
     name="native",
     sources=("native.c",),
-    headers=("native_lanes.h", "native_peaks.h", "native_tables.h"),
+    headers=tuple(
+        f"native_{part}.h" for part in ("lanes", "path", "peaks", "steps", "tables", "work")
+    ),
     constants=tuple(CONSTANTS.items()),
-    targets=tuple(_function(*pair) for pair in itertools.product(PARTS, SIDES)),
+    targets=("march",),
 )
 
 
@@ -88,72 +84,60 @@ def ready() -> bool:
     return LIBRARY.ready()
 
 
-def _target(part: str, size: Callable) -> str:
-    """The name under which XLA knows a function of the library."""
-    return LIBRARY.target(_function(part, size))
-
-
-def prepare(rigging: Rigging) -> tuple:
-    """The propagators as `chunk` takes them."""
-    step = rigging.step
-    return (
-        _last(step.drift_nodes, 1),
-        _last(step.push_nodes, 2),
-        step.drift_end.swapaxes(-1, -2),
-        _last(step.push_end, 1),
-        jnp.moveaxis(rigging.watch, 1, -1),
-        _last(rigging.watch_push, 1),
-    )
-
-
-def _last(part, axis: int):
-    """With an axis as the last, padded to fill registers."""
-    part = jnp.moveaxis(part, axis, -1)
-    return jnp.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, -part.shape[-1] % FILL)])
-
-
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 @jax.named_scope("native")
-def chunk(
-    prepared: tuple,
-    path: Path,
-    inertia: Float[Array, "load lane"],
-    weight: Float[Array, "load lane"],
-    state: Float[Array, "state lane"],
-    best: Extremes,
-) -> tuple[Float[Array, "state lane"], Extremes]:
-    """The state after a chunk of steps, and the extremes so far, from those before it.
+def march(
+    slots: int,
+    wanted: Bool[Array, " task"],
+    rigs: Rig,
+    grids: Grid,
+    watched: Float[Array, "task place"],
+    traffic: Traffic,
+) -> Found:
+    """What is found of tasks that C integrates one after the other, if it is `ready`.
 
-    Steps without commands of a driver, in double precision; only if `ready`. `prepared` is what
-    `prepare` makes of the rigging.
+    All have tasks as the first axis; a single rig is that of all. Grids are those of `even_grid`,
+    `watched` the places (m) at which peaks are looked for, on both sides of the beam; `slots` is
+    how many loads may be on the beam at once. No driver, double precision. Tasks that are not
+    wanted come out as at rest.
     """
-    changed = state, *jax.tree.leaves(best)
-    shape, rows = _last(path.shape, 2), _last(path.rows, 2)
+    shapes = rigs.modes.series
+    if rigs.mixing is not None:
+        shapes = shapes @ rigs.mixing[:, None]
+    numbers = np.asarray(GAUSS), lagrange(), through(LOOKED)[: len(LOOKED)].T, np.asarray(LOOKED)
     given = (
-        *(*prepared, path.kind, path.start, path.span, path.slots, path.active, shape, rows),
-        *(inertia, weight, np.asarray(GAUSS), through(LOOKED)[: len(LOOKED)].T, np.asarray(LOOKED)),
+        *(wanted, rigs.state_matrix, rigs.modes.nodes, shapes),
+        *(grids.edges, grids.counts, grids.lengths, grids.active, grids.windows),
+        *(*jax.vmap(Traffic.pieces)(traffic), traffic.inertia, traffic.weight, watched),
+        *(part[None] for part in numbers),
     )
-    room_of = LIBRARY.loaded().chunk_room
-    room_of.restype = ctypes.c_int64
-    room = room_of(state.shape[0], path.slots.shape[1], best.score.shape[0])
+    tasks, loads, lanes = traffic.inertia.shape
+    places, modes = watched.shape[1], shapes.shape[-1]
+    blocks, side = rigs.state_matrix.shape[1:3]
+    beam = grids.counts.shape[1], blocks, side, modes // blocks, *shapes.shape[1:3]
+    sizes = *beam, slots, loads, places, lanes
+    room = LIBRARY.loaded().march_room
+    room.restype, room.argtypes = ctypes.c_int64, [ctypes.c_int64] * len(sizes)
+    results = [(tasks, lanes, count) for count in (places, places, loads, loads)]
     call = jax.ffi.ffi_call(
-        _target("chunk", best.size),
-        [jax.ShapeDtypeStruct(part.shape, part.dtype) for part in (*changed, np.empty(room))],
-        vmap_method="sequential",
-        input_output_aliases={len(given) + i: i for i in range(len(changed))},
-    )
-    state, *leaves, _ = call(*given, *changed)
-    return state, jax.tree.unflatten(jax.tree.structure(best), leaves)
-
-
-@jax.named_scope("native")
-def find(
-    samples: Float[Array, "point *rest"], points: tuple[float, ...], size: Callable
-) -> Float[Array, " *rest"]:
-    """What `peaks.find` finds, of samples at the points of a step that are looked at."""
-    rest = samples.shape[1:]
-    call = jax.ffi.ffi_call(
-        _target("places", size),
-        jax.ShapeDtypeStruct((math.prod(rest),), samples.dtype),
+        LIBRARY.target("march"),
+        [jax.ShapeDtypeStruct(shape, float) for shape in (*results, (room(*sizes),))],
         vmap_method="sequential",
     )
-    return call(samples.reshape(len(points), -1), through(points)[: len(points)].T).reshape(rest)
+    return Found(*call(*given, slots=np.int64(slots))[:-1])
+
+
+@march.defjvp
+def _march_jvp(slots, given, changes):
+    """C is not differentiated, but what it stands for."""
+
+    def plain(wanted, rigs, *rest):
+        def task(rig, grid, watched, traffic):
+            rigging = make_rigging(rig, grid, watched)
+            return plain_march(rigging, traffic, slots=slots)[0].found()
+
+        tasks = wanted.shape[0]
+        rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape[1:])), rigs)
+        return jax.vmap(task)(rigs, *rest)
+
+    return jax.jvp(plain, given, changes)

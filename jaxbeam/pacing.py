@@ -8,7 +8,6 @@ ten times the error of one that is a little slower.
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -40,16 +39,16 @@ def spread(paces: Float[np.ndarray, " task"], count: int) -> Int[np.ndarray, " c
     return order[np.abs(logs[:, None] - wanted).argmin(axis=0)]
 
 
-def errors(measure: Measure, tasks, steps) -> Float[np.ndarray, " task"]:
+def errors(measure: Measure, tasks, steps, each=map) -> Float[np.ndarray, " task"]:
     """How much the peaks of tasks, (task, lane, sensor), change with finer steps than these (s).
 
     The largest relative change in each task. Runs that fail are left out; NaN if all do. Finer is
     one step more between events at least, or between samples of a loop: there may be few of them.
+    `each` calls a function as `map` does, maybe side by side.
     """
-    with ThreadPoolExecutor(1) as pool:  # the finer take longer, and go first
-        fine = pool.submit(measure, tasks, steps / FINER, 1)
-        coarse = measure(tasks, steps, 0)
-    return _changes(coarse, fine.result())
+    # The finer take longer, and go first.
+    fine, coarse = each(measure, (tasks, tasks), (steps / FINER, steps), (1, 0))
+    return _changes(coarse, fine)
 
 
 def rounding(exact: Float[np.ndarray, "task lane sensor"], rounded: np.ndarray) -> float:
@@ -99,16 +98,18 @@ def choose_steps(
     limits: Float[np.ndarray, " task"],
     count: int,
     tolerance: float,
+    each: Callable = map,
 ) -> tuple[Float[np.ndarray, " task"], float]:
     """Longest steps (s) of all tasks for a tolerance, and the error seen on a random few.
 
     `measure` takes tasks, a multiple of `count`, their steps and how many more between events, and
-    returns their peaks. `paces` (1/s) order the tasks, `guesses` start the search, `limits` (s) cap
-    it. Raises RuntimeError if no step meets the tolerance.
+    returns their peaks; `each` calls it several times, as `map` does. `paces` (1/s) order the
+    tasks, `guesses` start the search, `limits` (s) cap it. Raises RuntimeError if no step meets the
+    tolerance.
     """
     aim = tolerance / MARGIN
     chosen = spread(paces, count)
-    good, works = _search(measure, chosen, guesses[chosen], limits[chosen], aim)
+    good, works = _search(measure, chosen, guesses[chosen], limits[chosen], aim, each)
     if not np.all(good > 0):
         raise _hopeless(tolerance)
     if not works.any():
@@ -119,7 +120,7 @@ def choose_steps(
     steps = np.minimum(start * longer, limits)
     some = drawn(paces, count * max(1, round(np.sqrt(paces.size / count) / TRIED)))
     for _ in range(ROUNDS):
-        error = errors(measure, some, steps[some])
+        error = errors(measure, some, steps[some], each)
         worst = float(np.max(np.where(np.isnan(error), 0.0, error)))
         if worst <= aim:
             return steps, worst
@@ -128,7 +129,7 @@ def choose_steps(
     raise _hopeless(tolerance)
 
 
-def _search(measure: Measure, tasks, guesses, limits, tolerance: float):
+def _search(measure: Measure, tasks, guesses, limits, tolerance: float, each: Callable):
     """Long good steps (s) of some tasks, 0 if none was; which of these have a run that works.
 
     Tasks go from slow to quick.
@@ -142,7 +143,7 @@ def _search(measure: Measure, tasks, guesses, limits, tolerance: float):
     for _ in range(0 if settled.all() else ROUNDS):
         # As many as ever are measured: in place of the settled the quickest, which costs least.
         places = np.where(settled, tasks.size - 1, np.arange(tasks.size))
-        found = errors(measure, tasks[places], steps[places])
+        found = errors(measure, tasks[places], steps[places], each)
         error = np.where(settled, error, found)
         met = ~(error > tolerance)
         good = np.where(met, np.maximum(good, steps), good)

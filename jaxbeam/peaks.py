@@ -114,16 +114,13 @@ def find(
 
 
 def refine(
-    samples: Float[Array, "point *rest"],
-    points: tuple[float, ...],
-    size: Callable = jnp.abs,
-    find: Callable = find,
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], size: Callable = jnp.abs
 ) -> tuple[Float[Array, " *rest"], ...]:
     """Largest size of a value of the polynomial through the samples, and where in [0, 1] it is.
 
-    `points` are where in [0, 1] the samples are, in order and with both ends; `find` looks for the
-    place. The derivative is that at the fixed place of the peak, which is exact where the peak is a
-    maximum inside the curve and where it is at an end that stays.
+    `points` are where in [0, 1] the samples are, in order and with both ends. The derivative is
+    that at the fixed place of the peak, which is exact where the peak is a maximum inside the curve
+    and where it is at an end that stays.
     """
     place = find(jax.lax.stop_gradient(samples), points, size)
     place = jax.lax.optimization_barrier(jax.lax.stop_gradient(place))

@@ -5,13 +5,13 @@ A case comes with the addresses of what varies and, task by task, its values the
 tasks that a program is given only those `wanted` are worked out; the others come out as zeros.
 """
 
-import functools
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from jaxbeam import native
 from jaxbeam.case import replace
 from jaxbeam.compiling import ROUGHLY, SIDE_BY_SIDE, compiled, compiled_with
 from jaxbeam.dynamics import Traffic, traffic
@@ -19,7 +19,6 @@ from jaxbeam.grid import even_grid, scheduled_grid
 from jaxbeam.integrate import longest_step, march, trace
 from jaxbeam.loads import motion
 from jaxbeam.loop import make_loop
-from jaxbeam.record import never_as_nan
 from jaxbeam.rig import Rig, rig
 from jaxbeam.tables import make_rigging
 
@@ -51,16 +50,21 @@ def windows(case, addresses, heavy):
     return jax.vmap(task)(heavy)
 
 
-def _prepare(case, addresses, schedule, substeps, assembled, heavy, pace, driver=None):
-    """A rig on the grid of one task. Its pace: the longest step (s), and how many more between."""
+def _grid(case, addresses, schedule, substeps, assembled, heavy, pace):
+    """The grid of one task. Its pace: the longest step (s), and how many more between events."""
     varied = _varied(case, addresses, heavy)
     longest, more = pace
     if schedule is None:
-        grid = even_grid(varied, assembled, longest, more)
-    else:
-        finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int) + more
-        grid = scheduled_grid(varied, assembled, schedule, substeps or finer)
-    return make_rigging(assembled, grid, varied.sensor_places, driver)
+        return even_grid(varied, assembled, longest, more)
+    finer = jnp.ceil(jnp.max(schedule.lengths) / longest).astype(int) + more
+    return scheduled_grid(varied, assembled, schedule, substeps or finer)
+
+
+def _prepare(case, addresses, schedule, substeps, assembled, heavy, pace, driver=None):
+    """A rig on the grid of one task."""
+    grid = _grid(case, addresses, schedule, substeps, assembled, heavy, pace)
+    places = _varied(case, addresses, heavy).sensor_places
+    return make_rigging(assembled, grid, places, driver)
 
 
 def _map(task, wanted, values):
@@ -78,19 +82,36 @@ def _map(task, wanted, values):
 
 @compiled_with(**SIDE_BY_SIDE)
 def riggings(case, addresses, schedule, substeps, wanted, rigs, heavy, pace):
-    """Rigs on the grids of some tasks; a single rig is that of all."""
+    """Rigs on the grids of some tasks; a single rig is that of all, and stays single."""
 
     def task(rig, *values):
-        return _prepare(case, addresses, schedule, substeps, rig, *values)
+        rigging = _prepare(case, addresses, schedule, substeps, rig, *values)
+        return _without_rig(rigging)
 
-    shared = rigs.state_matrix.shape[0] == 1
-    if rigs.modes_per_block == 1:
+    shared, given = _shared(rigs)
+    if (shared or jax.tree.map(lambda leaf: leaf[0], rigs)).modes_per_block == 1:
         # Modes that nothing couples take so little that calling the kernels is what costs.
-        rigs = jax.tree.map(lambda leaf: leaf[0], rigs) if shared else rigs
-        return jax.vmap(task, (None if shared else 0, 0, 0))(rigs, heavy, pace)
-    if shared:
-        rigs = jax.tree.map(lambda leaf: jnp.repeat(leaf, wanted.shape[0], axis=0), rigs)
-    return _map(lambda values: task(*values), wanted, (rigs, heavy, pace))
+        found = jax.vmap(task, (None if shared else 0, 0, 0))(shared or given, heavy, pace)
+    else:
+        found = _map(
+            lambda values: task(shared or values[0], *values[1:]), wanted, (given, heavy, pace)
+        )
+    return _with_rig(found, rigs)
+
+
+def _without_rig(rigging):
+    return eqx.tree_at(lambda rigging: rigging.rig, rigging, None)
+
+
+def _with_rig(rigging, rig):
+    return eqx.tree_at(lambda rigging: rigging.rig, rigging, rig, is_leaf=lambda leaf: leaf is None)
+
+
+def _shared(rigs):
+    """The rig that all tasks share, if they do, and what is theirs otherwise."""
+    if rigs.state_matrix.shape[0] > 1:
+        return None, rigs
+    return jax.tree.map(lambda leaf: leaf[0], rigs), None
 
 
 @compiled
@@ -100,12 +121,10 @@ def block(case, form, addresses, devices, schedule, substeps, wanted, rigs, heav
     `rigs` are on their grids, or bare, and are then put on them here.
     """
     heavy_addresses, light_addresses = addresses
-    if isinstance(rigs, Rig):
-        given = case, heavy_addresses, schedule, substeps, wanted, rigs, heavy, pace
-        rigs = riggings(*given)
+    clocked = heavy_addresses, schedule, substeps
 
-    def task(values):
-        rigging, heavy, light, pace = values
+    def loads_of(heavy, light):
+        """The loads of a task, in all its lanes."""
         varied = _varied(case, heavy_addresses, heavy)
 
         def press(values):
@@ -113,16 +132,15 @@ def block(case, form, addresses, devices, schedule, substeps, wanted, rigs, heav
             return loads.inertia[:, 0], loads.weight[:, 0]
 
         inertia, weight = jax.vmap(press, out_axes=1)(light)
-        loads = Traffic(traffic(varied).motions, inertia, weight)
-        driver = None
+        return Traffic(traffic(varied).motions, inertia, weight)
+
+    def task(rigging, heavy, light, pace):
+        varied, loads, driver = _varied(case, heavy_addresses, heavy), loads_of(heavy, light), None
         if rigging is None:
             driver = make_loop(varied, form.layout, loads, schedule)
-            given = driver.rig, heavy, pace, driver
-            rigging = _prepare(case, heavy_addresses, schedule, substeps, *given)
+            rigging = _prepare(case, *clocked, driver.rig, heavy, pace, driver)
         if substeps is None:
-            best, memory = march(
-                rigging, loads, slots=form.slots, driver=driver, by_hand=form.by_hand
-            )
+            best, memory = march(rigging, loads, slots=form.slots, driver=driver)
             history = {}
         else:
             grid = rigging.grid
@@ -136,17 +154,37 @@ def block(case, form, addresses, devices, schedule, substeps, wanted, rigs, heav
             history = {"deflection": jnp.einsum("sm,tml->lts", rows, samples)}
         if driver is not None:
             history["controller_failures"] = driver.failures(memory)
-        peak, time = best.peak()
-        return {
-            "peak_deflection": peak.T,
-            "peak_time": time.T,
-            "lowest_contact_force": best.lowest.T,
-            "contact_lost_time": never_as_nan(best.lost).T,
-            **history,
-        }
+        return best.found()._asdict() | history
 
-    part = functools.partial(_map, task)
+    def by_hand(wanted, rigs, heavy, light, pace):
+        shared, given = _shared(rigs)
+
+        def around(rig, heavy, light, pace):
+            grid = _grid(case, *clocked, shared or rig, heavy, pace)
+            places = _varied(case, heavy_addresses, heavy).sensor_places
+            return grid, places, loads_of(heavy, light)
+
+        around_all = jax.vmap(around)(given, heavy, light, pace)
+        return native.march(form.slots, wanted, rigs, *around_all)._asdict()
+
+    def by_xla(wanted, rigs, heavy, light, pace):
+        if rigs is None:
+            return _map(lambda values: task(None, *values), wanted, (heavy, light, pace))
+        shared, own = _shared(rigs.rig)
+
+        def one(values):
+            rigging, own, *rest = values
+            return task(_with_rig(rigging, shared or own), *rest)
+
+        return _map(one, wanted, (_without_rig(rigs), own, heavy, light, pace))
+
+    if form.by_hand and substeps is None and light.dtype == jnp.float64:
+        part = by_hand
+    else:
+        part = by_xla
+        if isinstance(rigs, Rig):
+            rigs = riggings(case, *clocked, wanted, rigs, heavy, pace)
     if devices > 1:
         mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
         part = jax.shard_map(part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    return part(wanted, (rigs, heavy, light, pace))
+    return part(wanted, rigs, heavy, light, pace)

@@ -14,7 +14,6 @@ from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.fields import known
 from jaxbeam.measuring import history, measure
 from jaxbeam.modes import Modes
-from jaxbeam.motion import NEVER
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -295,8 +294,3 @@ def read_record(path: str | os.PathLike) -> Record:
 def sensor_labels(case: Case) -> np.ndarray:
     """A name for each sensor: its number and quantity, as in "0: deflection"."""
     return np.array([f"{i}: {s.quantity}" for i, s in enumerate(case.sensors)], dtype=str)
-
-
-def never_as_nan(times: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Times with NaN for those never reached."""
-    return jnp.where(times < NEVER, times, jnp.nan)

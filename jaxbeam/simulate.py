@@ -14,13 +14,14 @@ from jaxbeam.compiling import compiled
 from jaxbeam.driver import AbstractDriver
 from jaxbeam.dynamics import Traffic, at_instant, traffic
 from jaxbeam.exponentials import NODES, at_ends
+from jaxbeam.extremes import Found
 from jaxbeam.fields import is_known, known
 from jaxbeam.grid import scheduled_grid
 from jaxbeam.integrate import trace
 from jaxbeam.loop import make_loop
 from jaxbeam.measuring import measure
 from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
-from jaxbeam.record import Record, never_as_nan
+from jaxbeam.record import Record
 from jaxbeam.rig import Rig, rig
 from jaxbeam.schedule import sampled
 from jaxbeam.tables import Rigging, make_rigging
@@ -81,9 +82,8 @@ def _record(case: Case, plan: Plan, times, error) -> Record:
         commands = jnp.zeros((times.shape[0], len(case.actuators)))
     if failures is None:
         failures = jnp.zeros(times.shape)
-    peaks, peak_times = best.peak()
-    loads = traffic(case)
-    lost = never_as_nan(best.lost[:, 0])
+    found_peaks = Found(*(part[0] for part in best.found()))
+    loads, lost = traffic(case), found_peaks.contact_lost_time
     lost_position = jnp.array(
         [path.travel(time)[0] for path, time in zip(loads.motions, lost, strict=True)]
     ).reshape(-1)
@@ -99,10 +99,7 @@ def _record(case: Case, plan: Plan, times, error) -> Record:
         command=commands,
         failures=failures,
         shown=shown,
-        peak_deflection=peaks[:, 0],
-        peak_time=peak_times[:, 0],
-        lowest_contact_force=best.lowest[:, 0],
-        contact_lost_time=lost,
+        **found_peaks._asdict(),
         contact_lost_position=lost_position,
         error_estimate=error,
         steps=count,

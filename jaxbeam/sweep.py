@@ -4,7 +4,6 @@ import json
 import os
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -111,14 +110,12 @@ def _progress(work: Work, todo: list[int], shown: bool) -> tqdm:
 
 def _compute(work: Work, blocks: list[int], steps, keeper: sweep_store.Keeper) -> Iterator[int]:
     """Compute blocks on all cores and keep them, giving the number of each that is done."""
-    # Twice as many threads as cores: some hand over work while others wait for theirs.
-    with ThreadPoolExecutor(2 * (os.cpu_count() or 1)) as pool:
-        results = pool.map(lambda block: (block, work.block(block, steps)), blocks)
-        # Closed early, by an error or the keyboard, blocks not yet begun are called off.
-        with closing(results):  # type: ignore[type-var]
-            for block, result in results:
-                keeper.write(block, result)
-                yield block
+    results = work.pool.map(lambda block: (block, work.block(block, steps)), blocks)
+    # Closed early, by an error or the keyboard, blocks not yet begun are called off.
+    with closing(results):  # type: ignore[type-var]
+        for block, result in results:
+            keeper.write(block, result)
+            yield block
 
 
 _UNITS = {

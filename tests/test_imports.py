@@ -32,9 +32,9 @@ jaxbeam.reference  jaxbeam.statespace  jaxbeam.static  jaxbeam.tables
 jaxbeam.sensed
 jaxbeam.estimation
 jaxbeam.control  jaxbeam.extremes
-jaxbeam.advance  jaxbeam.casefile  jaxbeam.native
+jaxbeam.advance  jaxbeam.casefile
 jaxbeam.integrate
-jaxbeam.export  jaxbeam.loop  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
+jaxbeam.export  jaxbeam.loop  jaxbeam.native  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
 jaxbeam.linear_loop  jaxbeam.plan  jaxbeam.programs
 jaxbeam.margins  jaxbeam.stability  jaxbeam.step_times  jaxbeam.swings
 jaxbeam.limits  jaxbeam.reserve

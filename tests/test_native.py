@@ -1,8 +1,8 @@
 """Steps by hand-written C: the same results as without, on every kind of rig and path."""
 
+import ctypes
 import dataclasses
 import json
-import operator
 import pathlib
 import platform
 import shutil
@@ -28,7 +28,7 @@ from jaxbeam.order import make_order
 from jaxbeam.plan import form
 from jaxbeam.rig import rig
 from jaxbeam.sweep_store import FINGERPRINT
-from jaxbeam.tables import both_sides, make_rigging
+from jaxbeam.tables import make_rigging
 
 pytestmark = pytest.mark.skipif(native_library.compiler() is None, reason="no C compiler here")
 
@@ -66,6 +66,18 @@ WILD = jb.Case(
     loads=[jb.MovingMass(mass=5.0, speed=20.0)],
     run=jb.Run(0.2),
 )
+# Many modes and spans; a path that turns round on the beam, and a load that stands until it goes.
+LONG = jb.Case(
+    jb.Beam(3.0, 900.0, 2.0, damping_ratio=0.01, modes=14, ends="clamped-pinned"),
+    supports=[jb.Support(1.0), jb.Support(2.2)],
+    sensors=[jb.Sensor(0.5), jb.Sensor(1.7), jb.Sensor(2.9)],
+    loads=[
+        jb.MovingMass(mass=1.0, times=[0.0, 0.5, 1.0, 1.6], positions=[-0.1, 1.4, 0.9, 0.2]),
+        jb.MovingForce(mass=2.0, times=[0.0, 0.7, 1.5], positions=[1.5, 1.5, 3.2]),
+        jb.MovingMass(mass=0.3, speed=-2.0, entry_time=0.2, deceleration=-1.0),
+    ],
+    run=jb.Run(2.0),
+)
 FEW = {"loads.0.mass": [0.1, 0.5], "loads.2.speed": [0.8, 1.2]}
 GRID = {"loads.0.mass": np.linspace(0.05, 1.0, 13), "loads.0.speed": [1.0, 2.0, 7.0]}
 
@@ -94,6 +106,9 @@ def swept(case, over):
         pytest.param(PLAIN, GRID, id="plain"),
         pytest.param(COUPLED, GRID | {"beam.flexural_rigidity": [9.0, 12.0]}, id="coupled"),
         pytest.param(STREAM, FEW, id="stream"),
+        pytest.param(
+            LONG, {"loads.0.mass": [0.5, 2.0], "sensors.1.position": [1.5, 1.8]}, id="long"
+        ),
         pytest.param(WILD, {"loads.0.mass": [0.5, 5.0, 60.0]}, id="wild"),
     ],
 )
@@ -108,6 +123,12 @@ def test_results_are_those_without_it(case, over):
     # Another step would be another result, and a sweep that took no steps by C the very same.
     assert np.any(by_hand.peak_deflection != plain.peak_deflection)
     assert by_hand.attrs[FINGERPRINT] != plain.attrs[FINGERPRINT]
+
+
+def test_a_beam_without_loads_stays_at_rest():
+    case = dataclasses.replace(PLAIN, loads=[])
+    found = jb.sweep(case, {"beam.flexural_rigidity": [9.0, 12.0]}, progress=False)
+    assert np.all(found.peak_deflection == 0) and not found.failed.any()
 
 
 NARROW = """
@@ -141,17 +162,21 @@ def test_some_of_these_cases_lose_contact():
     assert np.isfinite(lost).any()
 
 
-def marched(case, by_hand, sides=lambda rigging: rigging, longest=1e-3):
+def marched(case, by_hand, longest=1e-3):
     """Peaks at the sensors of a single run, as a function of its mass (kg)."""
     known = form(case)
 
     def peaks(mass):
         varied = replace(case, {"loads.0.mass": mass})
         assembled = rig(varied, known.layout, known.coupled)
-        grid = even_grid(varied, assembled, jnp.asarray(longest))
-        rigging = sides(make_rigging(assembled, grid, varied.sensor_places))
-        best, _ = march(rigging, traffic(varied), slots=known.slots, by_hand=by_hand)
-        return best.peak()[0][:, 0]
+        grid, places = even_grid(varied, assembled, jnp.asarray(longest)), varied.sensor_places
+        loads = traffic(varied)
+        if not by_hand:
+            best, _ = march(make_rigging(assembled, grid, places), loads, slots=known.slots)
+            return best.peak()[0][:, 0]
+        given = jnp.ones((), bool), assembled, grid, places, loads
+        of_one = jax.tree.map(lambda leaf: leaf[None], given)
+        return native.march(known.slots, *of_one).peak_deflection[0, 0]
 
     return jax.jit(peaks)
 
@@ -168,20 +193,19 @@ def test_derivatives_are_those_without_it(case):
     assert_allclose(slope, (above - below) / (2 * step), rtol=1e-6)
 
 
-@pytest.mark.parametrize("speed", [0.7, 3.0, 9.0])
-def test_sides_of_the_beam_are_told_apart(speed):
-    """Down under the mass, and less far up when it has left: both within the steps of a chunk."""
-    case = replace(PLAIN, {"loads.0.speed": speed, "beam.damping_ratio": 0.1})
-    by_hand, plain = (marched(case, hand, both_sides, 8e-3)(0.5) for hand in (True, False))
-    assert_allclose(by_hand, plain, rtol=1e-11)
-    up, down = by_hand[: len(SENSORS)], by_hand[len(SENSORS) :]
-    assert np.all((up > 0) & (up < 0.9 * down))
-
-
 def test_batched_runs_take_one_after_the_other():
     masses = jnp.linspace(0.1, 1.0, 3)
     together = jax.vmap(marched(PLAIN, True))(masses)
     assert_allclose(together, jnp.stack([marched(PLAIN, True)(m) for m in masses]), rtol=1e-12)
+
+
+def test_tasks_that_are_not_wanted_leave_the_others_alone():
+    """Blocks that are not full, and those in which steps are measured, hold some of them."""
+    case = dataclasses.replace(PLAIN, run=jb.Run(0.4))
+    over = {"loads.0.mass": [0.2, 0.9], "loads.0.speed": np.linspace(1.0, 9.0, 1301)}
+    by_hand = jb.sweep(case, over, progress=False).peak_deflection
+    alone = jb.sweep(case, {**over, "loads.0.speed": over["loads.0.speed"][-3:]}, progress=False)
+    assert_allclose(by_hand[:, -3:], alone.peak_deflection, rtol=1e-6)
 
 
 def test_a_resumed_sweep_keeps_to_what_began_it():
@@ -240,13 +264,33 @@ def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
     assert not native.binary().exists()
 
 
-def test_places_of_peaks_are_as_high_as_those_found_without_it():
-    """Of curves through any samples, on both sides of the beam and on one."""
-    curves = np.random.default_rng(0).normal(size=(len(LOOKED), 3, 5000))
+SEEK = """
+#include "native_peaks.h"
+void seek(const double *samples, const double *through, double *heights, int count) {
+    for (int first = 0; first < count; first += WIDE) {
+        const int many = count - first < WIDE ? count - first : WIDE;
+        Lanes curve[POINTS];
+        for (int p = 0; p < POINTS; p++) curve[p] = load(samples + p * count + first, many);
+        const Curve found = curve_through(curve, through);
+        store(heights + first, size_at(&found, find(&found)), many);
+    }
+}
+"""
+
+
+def test_places_of_peaks_are_as_high_as_those_found_without_it(tmp_path):
+    """Of curves through any samples, many of which go up and down within a step."""
+    curves = np.random.default_rng(0).normal(size=(len(LOOKED), 2, 5000))
     curves[:, 1] = np.cumsum(curves[:, 1], axis=0)  # less wild
-    for size in (abs, operator.pos):
-        heights = [
-            peaks.refine(jnp.asarray(curves), LOOKED, size, find)[0]
-            for find in (native.find, peaks.find)
-        ]
-        assert_allclose(*heights, rtol=1e-11)
+    curves = curves.reshape(len(LOOKED), -1)
+    (tmp_path / "seek.c").write_text(SEEK)
+    headers = pathlib.Path(native_library.__file__).parent
+    words = [native_library.compiler(), *native.LIBRARY.flags, "-I", str(headers), "seek.c"]
+    subprocess.run([*words, "-o", "seek.so"], check=True, cwd=tmp_path)
+    pointer = np.ctypeslib.ndpointer(float, flags="C")
+    seek = ctypes.CDLL(str(tmp_path / "seek.so")).seek
+    seek.argtypes = [pointer, pointer, pointer, ctypes.c_int]
+    heights = np.empty(curves.shape[1])
+    through = np.ascontiguousarray(peaks.through(LOOKED)[: len(LOOKED)].T)
+    seek(curves, through, heights, heights.size)
+    assert_allclose(heights, peaks.refine(jnp.asarray(curves), LOOKED)[0], rtol=1e-11)
