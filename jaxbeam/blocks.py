@@ -77,16 +77,16 @@ class Work:
         self.form = Form(layout, couples(case), slots, native.serves(case))
         # Beside steps in C, calling one more program would be what costs.
         self.apart = case.controller is None and (single or not self.form.by_hand)
-        design = case, self.form, self.addresses[0]
+        job = self._job(None)
         # What takes longest to compile goes first; meanwhile the others are made ready for it.
         compiling = [
             self.pool.submit(program.ahead(*arguments))
-            for program, arguments in self._programs((*design, tasks.heavy[parts[0]]))
+            for program, arguments in self._programs(job, tasks.heavy[parts[0]])
         ]
         entries, exits = np.moveaxis(windows(), 2, 0)
         for program in compiling:
             program.result()  # raises what went wrong
-        found = [programs.rigs(*design, tasks.heavy[part]) for part in parts]
+        found = [programs.rigs(job, tasks.heavy[part]) for part in parts]
         if self.shared:
             self.rigs, limit = found[0]
             limits = np.repeat(np.asarray(limit), count)
@@ -145,19 +145,19 @@ class Work:
             substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
         return self._run(chosen, steps[chosen], substeps, self.single)
 
-    def _programs(self, design):
+    def _programs(self, job, heavy):
         """What finds the steps, slowest to compile first, with arguments of the right shapes."""
-        alike, _ = programs.rigs.blank(*design)
+        alike, _ = programs.rigs.blank(job, heavy)
         first = np.zeros(self.each, int)
         pace = np.ones(self.each), first
         wanted = first > 0
-        alike = alike if self.shared else jax.tree.map(lambda leaf: leaf[first], alike)
-        given = self._rigging(first, wanted, pace, None, alike)
-        rigs = programs.riggings.blank(*given) if self.apart else self._bare(alike)
-        yield programs.block, self._block(first, wanted, pace, None, rigs)
+        rigs = alike if self.shared else jax.tree.map(lambda leaf: leaf[first], alike)
+        given = job, wanted, rigs, self.tasks.heavy[first], pace
+        rigs = programs.riggings.blank(*given) if self.apart else self._bare(rigs)
+        yield programs.block, (job, self.devices, wanted, rigs, *self._values_of(first), pace)
         if self.apart:
             yield programs.riggings, given
-        yield programs.rigs, design
+        yield programs.rigs, (job, heavy)
 
     def _run(self, chosen, steps, substeps, single, more=0):
         # What is not a whole block is spread over it, so that each device has its part.
@@ -167,10 +167,10 @@ class Work:
         among = np.cumsum(wanted) - 1
         chosen, steps = chosen[among], steps[among]
         pace = steps, np.full(chosen.size, more)
-        rigs = self._rigs_of(chosen)
-        given = self._rigging(chosen, wanted, pace, substeps, rigs)
+        job, rigs = self._job(substeps), self._rigs_of(chosen)
+        given = job, wanted, rigs, self.tasks.heavy[chosen], pace
         rigs = programs.riggings(*given) if self.apart else self._bare(rigs)
-        arguments = self._block(chosen, wanted, pace, substeps, rigs)
+        arguments = job, self.devices, wanted, rigs, *self._values_of(chosen), pace
         arguments = jax.tree.map(_shortened, arguments) if single else arguments
         with jax.enable_x64(False) if single else contextlib.nullcontext():
             with self._compiling:  # others wait for the first, instead of compiling the same again
@@ -190,20 +190,14 @@ class Work:
         """Rigs that `programs.block` takes; none with a controller, which has one of its own."""
         return rigs if self.case.controller is None else None
 
-    def _rigging(self, chosen, wanted, pace, substeps, rigs):
-        """Arguments of `programs.riggings`."""
-        heavy, names = self.tasks.heavy[chosen], self.addresses[0]
-        return self.case, names, *self._clock(substeps), wanted, rigs, heavy, pace
+    def _values_of(self, chosen):
+        """What varies in some tasks, and in their lanes."""
+        return self.tasks.heavy[chosen], self.tasks.light[chosen]
 
-    def _block(self, chosen, wanted, pace, substeps, rigs):
-        """Arguments of `programs.block`."""
-        tasks = self.tasks.heavy[chosen], self.tasks.light[chosen], pace
-        settings = self.case, self.form, self.addresses, self.devices, *self._clock(substeps)
-        return *settings, wanted, rigs, *tasks
-
-    def _clock(self, substeps):
+    def _job(self, substeps):
         scheduled = substeps is not None or self.case.controller is not None
-        return (self.schedule if scheduled else None), substeps
+        clock = (self.schedule if scheduled else None), substeps
+        return programs.Job(self.case, self.form, *self.addresses, *clock)
 
 
 def _filled(count: int, unit: int) -> int:

@@ -78,7 +78,8 @@ static void run(Work *w) {
 
 /* Results of a task, with lanes first. */
 static void report(const Work *w, int64_t task) {
-    const ptrdiff_t lanes = w->lanes, plane = w->places * lanes, seen = task * plane, pressed = task * w->loads * lanes;
+    const ptrdiff_t lanes = w->lanes, plane = w->places * lanes;
+    const ptrdiff_t seen = task * plane, pressed = task * w->loads * lanes;
     for (int place = 0; place < w->places; place++)
         for (ptrdiff_t first = 0; first < lanes; first += WIDE) {
             const int many = lanes - first < WIDE ? (int)(lanes - first) : WIDE;

@@ -41,8 +41,8 @@ static void balance(const Work *w, const double *matrix) {
     }
 }
 
-static const double INVERSE_FACTORIAL[] = {1, 1, 1 / 2., 1 / 6., 1 / 24., 1 / 120., 1 / 720., 1 / 5040.};
-_Static_assert(NODES < sizeof INVERSE_FACTORIAL / sizeof *INVERSE_FACTORIAL, "factorials for all nodes");
+static const double INVERSE_FACTORIAL[] = {1, 1, 1 / 2., 1 / 6., 1 / 24., 1 / 120., 1 / 720.};
+_Static_assert(NODES < sizeof INVERSE_FACTORIAL / sizeof(double), "factorials for all nodes");
 
 /* Exponential (side, side) of a block over the fractions, and phi functions of it times the forces
    (side, phi and mode): a series for a part of them, doubled. */
@@ -127,13 +127,15 @@ static void keep_propagators(Work *w, int block, const Fractions *f) {
 
 /* What the powers of the polynomials count, for forces at the nodes: (force, power). */
 static void weigh(const Work *w, const Fractions *f) {
-    for (int force = 0; force < NODES; force++)
-        for (int l = 0; l < WIDE; l++) {
-            const double share = l < f->many && f->fraction[l] < NODES ? w->in[GAUSS][f->fraction[l]] : 1;
-            double power = f->span[l];
-            for (int p = 0; p < NODES; p++, power *= share)
-                w->weights[force * NODES + p][l] = w->in[LAGRANGE][force * NODES + p] / INVERSE_FACTORIAL[p] * power;
-        }
+    for (int l = 0; l < WIDE; l++) {
+        const double share = l < f->many && f->fraction[l] < NODES ? w->in[GAUSS][f->fraction[l]] : 1;
+        double power = f->span[l];
+        for (int p = 0; p < NODES; p++, power *= share)
+            for (int force = 0; force < NODES; force++) {
+                const int at = force * NODES + p;
+                w->weights[at][l] = w->in[LAGRANGE][at] / INVERSE_FACTORIAL[p] * power;
+            }
+    }
 }
 
 /* What is seen of the propagators at the places that are watched, at the points of a step. */
@@ -156,14 +158,14 @@ static void see(const Work *w, int panel) {
                 double sum = 0;
                 for (int m = 0; m < modes; m++) {
                     const int i = 2 * m;
-                    sum += sights[m] * (point == 0         ? i == j
-                                        : point == NODES + 1 ? drift[(b * side + j) * side + i]
-                                        : drift_nodes[((b * side + i) * side + j) * PADDED + node]);
+                    if (point == 0) sum += sights[m] * (i == j);
+                    else if (node == NODES) sum += sights[m] * drift[(b * side + j) * side + i];
+                    else sum += sights[m] * drift_nodes[((b * side + i) * side + j) * PADDED + node];
                 }
                 watch[state * looked + at] = sum;
             }
             if (point == 0) continue;
-            const double *pushes = point == NODES + 1 ? push : push_nodes + (size_t)node * push_of(w);
+            const double *pushes = node == NODES ? push : push_nodes + (size_t)node * push_of(w);
             for (int input = 0; input < all_modes; input++) {
                 const int b = input / modes, k = input % modes;
                 const double *sights = w->sights + place * all_modes + b * modes;

@@ -11,7 +11,7 @@ static void shape_series(Work *w) {
         const double half = (w->in[ENDS][s + 1] - w->in[ENDS][s]) / 2;
         double *series = w->series + (ptrdiff_t)s * terms * columns;
         for (int k = 0; k < terms; k++)
-            memcpy(series + k * columns, w->in[SERIES] + ((ptrdiff_t)s * terms + k) * modes, 8 * (size_t)modes);
+            memcpy(series + k * columns, w->in[SERIES] + (s * terms + k) * modes, 8 * (size_t)modes);
         for (int d = modes; d < columns; d += modes) {
             /* With T_k' as a sum of others: each coefficient from those above it. */
             double *here = series + d;

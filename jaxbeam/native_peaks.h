@@ -1,7 +1,8 @@
 /* Peaks of the curve through the samples of a step, for lanes side by side: what peaks.py does.
 
    The command line tells POINTS (looked at in a step, both ends among them), ROUNDS and REACH (of Newton's
-   method in peaks.vertex), STARTS and CLIMBS (in peaks.find), SLACK (of numbers that are equal), NEAR (as in extremes.py). */
+   method in peaks.vertex), STARTS and CLIMBS (in peaks.find), SLACK (of numbers that are equal), NEAR and
+   BESIDE_END (as in extremes.py). */
 
 #pragma once
 

@@ -35,8 +35,8 @@ jaxbeam.control  jaxbeam.extremes
 jaxbeam.advance  jaxbeam.casefile
 jaxbeam.integrate
 jaxbeam.export  jaxbeam.loop  jaxbeam.native  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
-jaxbeam.linear_loop  jaxbeam.plan  jaxbeam.programs
-jaxbeam.margins  jaxbeam.stability  jaxbeam.step_times  jaxbeam.swings
+jaxbeam.linear_loop  jaxbeam.plan
+jaxbeam.margins  jaxbeam.programs  jaxbeam.stability  jaxbeam.step_times  jaxbeam.swings
 jaxbeam.limits  jaxbeam.reserve
 jaxbeam.control.reach
 jaxbeam.control.least_peak

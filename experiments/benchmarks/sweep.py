@@ -174,7 +174,8 @@ def _compare_all() -> None:
         for name, took, error in rows:
             ratios = f"{took.ratio:.3g} | {took.ratio_of_shortest:.3g}"
             print(f"| {name} | {took.run:.3g} | {ratios} | {error:.1e} |")
-        print(f"\n{modes} modes: the sweep compiles in {rows[0][1].compile:.1f} s", flush=True)
+        compiling = [f"{name} {took.compile:.1f} s" for name, took, _ in rows if "jaxbeam" in name]
+        print(f"\n{modes} modes, compiling: {', '.join(compiling)}", flush=True)
     print("\n| derivatives | plain runs |\n| --- | ---: |")
     for name, ratio in derivatives():
         print(f"| {name} | {ratio:.2g} |")
