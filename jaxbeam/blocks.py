@@ -74,9 +74,9 @@ class Work:
         slots = len(case.loads)
         if slots > 1:
             slots = max(most_at_once(window) for window in windows())
-        self.form = Form(layout, couples(case), slots, native.serves(case))
-        # Beside steps in C, calling one more program would be what costs.
-        self.apart = case.controller is None and (single or not self.form.by_hand)
+        self.form = Form(layout, couples(case), slots, native.serves(case) and not single)
+        # C puts rigs on their steps itself.
+        self.apart = case.controller is None and not self.form.by_hand
         job = self._job(None)
         # What takes longest to compile goes first; meanwhile the others are made ready for it.
         compiling = [
