@@ -66,9 +66,9 @@ WILD = jb.Case(
     loads=[jb.MovingMass(mass=5.0, speed=20.0)],
     run=jb.Run(0.2),
 )
-# Many modes and spans; a path that turns round on the beam, and a load that stands until it goes.
+# Several spans; a path that turns round on the beam, and a load that stands until it goes.
 LONG = jb.Case(
-    jb.Beam(3.0, 900.0, 2.0, damping_ratio=0.01, modes=14, ends="clamped-pinned"),
+    jb.Beam(3.0, 900.0, 2.0, damping_ratio=0.01, modes=7, ends="clamped-pinned"),
     supports=[jb.Support(1.0), jb.Support(2.2)],
     sensors=[jb.Sensor(0.5), jb.Sensor(1.7), jb.Sensor(2.9)],
     loads=[
@@ -106,9 +106,7 @@ def swept(case, over):
         pytest.param(PLAIN, GRID, id="plain"),
         pytest.param(COUPLED, GRID | {"beam.flexural_rigidity": [9.0, 12.0]}, id="coupled"),
         pytest.param(STREAM, FEW, id="stream"),
-        pytest.param(
-            LONG, {"loads.0.mass": [0.5, 2.0], "sensors.1.position": [1.5, 1.8]}, id="long"
-        ),
+        pytest.param(LONG, {"loads.0.mass": [0.5, 2.0], "sensors.1.position": [1.8]}, id="long"),
         pytest.param(WILD, {"loads.0.mass": [0.5, 5.0, 60.0]}, id="wild"),
     ],
 )
