@@ -77,7 +77,7 @@ class Work:
         self.form = Form(layout, couples(case), slots, native.serves(case) and not single)
         # C puts rigs on their steps itself.
         self.apart = case.controller is None and not self.form.by_hand
-        job = self._job(None)
+        job = self.job()
         # What takes longest to compile goes first; meanwhile the others are made ready for it.
         compiling = [
             self.pool.submit(program.ahead(*arguments))
@@ -167,7 +167,7 @@ class Work:
         among = np.cumsum(wanted) - 1
         chosen, steps = chosen[among], steps[among]
         pace = steps, np.full(chosen.size, more)
-        job, rigs = self._job(substeps), self._rigs_of(chosen)
+        job, rigs = self.job(substeps), self._rigs_of(chosen)
         given = job, wanted, rigs, self.tasks.heavy[chosen], pace
         rigs = programs.riggings(*given) if self.apart else self._bare(rigs)
         arguments = job, self.devices, wanted, rigs, *self._values_of(chosen), pace
@@ -194,7 +194,8 @@ class Work:
         """What varies in some tasks, and in their lanes."""
         return self.tasks.heavy[chosen], self.tasks.light[chosen]
 
-    def _job(self, substeps):
+    def job(self, substeps: int | None = None) -> programs.Job:
+        """What all tasks share; with `substeps` from sample to sample histories are kept."""
         scheduled = substeps is not None or self.case.controller is not None
         clock = (self.schedule if scheduled else None), substeps
         return programs.Job(self.case, self.form, *self.addresses, *clock)

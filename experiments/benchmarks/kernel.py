@@ -50,11 +50,11 @@ def prepare(modes: int) -> tuple[np.ndarray, list]:
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
     work = make_order(case, over, False, False, TOLERANCE, "double").work()
     steps, _ = work.steps()
-    everything, wanted = np.arange(SPEEDS.size), np.ones(SPEEDS.size, bool)
+    wanted = np.ones(SPEEDS.size, bool)
     rigs = jax.tree.map(lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), work.rigs)
     pace = steps, np.zeros(steps.size, int)
-    given = work._rigging(everything, wanted, pace, None, rigs)
-    riggings = jax.tree.map(np.asarray, programs.riggings(*given))
+    found = programs.riggings(work.job(), wanted, rigs, work.tasks.heavy, pace)
+    riggings = jax.tree.map(np.asarray, found)
     plain = Rig(modes)
     rates = riggings.rig.state_matrix[0, :, 1, :]
     looked = np.array(LOOKED), through(LOOKED)[: len(LOOKED)], reach(LOOKED)

@@ -15,9 +15,11 @@ from experiments.benchmarks import (
     cases,
     growth,
     identify,
+    kernel,
     quadratic,
     riccati,
     steps,
+    sweep,
     tuners,
 )
 
@@ -83,6 +85,13 @@ def test_osqp_solves_the_same_programs(programs):
     ours = quadratic.by_jaxbeam(H, f, M, gamma)[0]
     np.testing.assert_allclose(x, ours, atol=quadratic.AGREED * np.max(np.abs(ours)))
     assert 0 < own < called
+
+
+@pytest.mark.skipif(kernel.compiler() is None, reason="no C compiler here")
+def test_the_same_method_by_hand_has_the_same_peaks(tmp_path):
+    beam, crossings = kernel.prepare(2)
+    by_hand = kernel.peaks(kernel.build(2, tmp_path), beam, crossings)
+    np.testing.assert_allclose(by_hand, sweep.sweep_peaks(2), rtol=1e-11)
 
 
 def test_growth_tells_times_and_memory():
