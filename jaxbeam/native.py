@@ -47,9 +47,7 @@ PARTS = ("exponentials", "lanes", "matrices", "path", "peaks", "steps", "tables"
 LIBRARY = Library(
     name="native",
     sources=("native.c",),
-    headers=tuple(
-        f"native_{part}.h" for part in ("lanes", "path", "peaks", "steps", "tables", "work")
-    ),
+    headers=tuple(f"native_{part}.h" for part in PARTS),
     constants=tuple(CONSTANTS.items()),
     targets=("march",),
 )

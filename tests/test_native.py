@@ -5,6 +5,7 @@ import dataclasses
 import json
 import pathlib
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam import native, native_library, peaks
+from jaxbeam import native, native_designs, native_library, peaks
 from jaxbeam.case import replace
 from jaxbeam.cli import main
 from jaxbeam.dynamics import traffic
@@ -232,6 +233,15 @@ def test_what_cannot_be_loaded_is_left_alone(folder, monkeypatch, tmp_path):
     native.binary().parent.mkdir()
     native.binary().write_bytes((folder / native.binary().name).read_bytes()[:1000])
     assert not native.ready()
+
+
+@pytest.mark.parametrize("library", [native.LIBRARY, native_designs.LIBRARY])
+def test_whatever_is_included_decides_the_name_of_a_library(library):
+    """Else one would be taken that was compiled from an older header."""
+    folder = pathlib.Path(native_library.__file__).parent
+    texts = [(folder / name).read_text() for name in library.sources + library.headers]
+    included = re.findall(r'#include "(native_\w+\.h)"', "".join(texts))
+    assert set(included) == set(library.headers)
 
 
 def test_compilers_that_fail_are_told_of(monkeypatch, tmp_path):
