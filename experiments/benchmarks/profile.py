@@ -20,7 +20,8 @@ STAGES = (
     *("modes", "rig", "propagators", "path", "collocation", "propagation", "extremes", "peaks"),
     "native",
 )
-CONTAINERS = re.compile(r"(while|cond|call|conditional)[.\d]*$")
+# What they take is told by what they call; a call that calls nothing is a kernel.
+CONTAINERS = re.compile(r"(while|cond|conditional)[.\d]*$")
 
 
 def stage_of(op_name: str) -> str:
@@ -30,13 +31,30 @@ def stage_of(op_name: str) -> str:
 
 
 def stages(dump: Path, module: str) -> dict[str, str]:
-    """The stage of every operation of a compiled module, from what XLA has dumped."""
-    found = {}
+    """The stage of every operation of a compiled module, from what XLA has dumped.
+
+    XLA may make one kernel of a whole loop, a call, which then is of all stages of what it calls.
+    """
+    found, calls = {}, {}
+    within = collections.defaultdict(set)  # what stages and computations a computation names
     for path in dump.glob(f"*{module}*after_optimizations.txt"):
+        computation = ""
         for line in path.read_text().splitlines():
-            named = re.match(r'\s+(?:ROOT )?%(\S+) = .*op_name="([^"]*)"', line)
-            if named:
+            if begins := re.match(r"(?:ENTRY )?%?(\S+) \(.*{$", line):
+                computation = begins[1]
+            within[computation] |= set(re.findall(r"(?:to_apply|body|calls)=%([^\s,]+)", line))
+            if named := re.match(r'\s+(?:ROOT )?%(\S+) = .*op_name="([^"]*)"', line):
                 found[named[1]] = stage_of(named[2])
+                within[computation].add(found[named[1]])
+                if called := re.search(r" call\(.*to_apply=%([^\s,]+)", line):
+                    calls[named[1]] = called[1]
+    for name, computation in calls.items():
+        inner, todo = set(), [computation]
+        while todo:
+            new = within[todo.pop()] - inner
+            inner |= new
+            todo += [part for part in new if part in within]
+        found[name] = " and ".join(sorted(inner & set(STAGES))) or found[name]
     return found
 
 
@@ -46,11 +64,20 @@ def shares(trace: Path, found: dict[str, str], module: str) -> dict[str, float]:
     with gzip.open(path) as file:
         events = json.load(file)["traceEvents"]
     times: collections.Counter[str] = collections.Counter()
-    for event in events:
+    open_until: dict[tuple, list] = collections.defaultdict(list)  # ends and stages of events
+    for event in sorted(events, key=lambda event: (event.get("ts", 0), -event.get("dur", 0))):
         about = event.get("args", {})
         name = about.get("hlo_op", "")
-        if about.get("hlo_module") == module and not CONTAINERS.match(name):
-            times[found.get(name, "the rest")] += event.get("dur", 0.0)
+        if about.get("hlo_module") != module or CONTAINERS.match(name):
+            continue
+        stage, took = found.get(name, "the rest"), event.get("dur", 0.0)
+        around = open_until[event["pid"], event["tid"]]
+        while around and around[-1][0] <= event["ts"]:
+            around.pop()
+        if around:  # it is told of by itself
+            times[around[-1][1]] -= took
+        around.append((event["ts"] + took, stage))
+        times[stage] += took
     return {stage: time / times.total() for stage, time in times.most_common()}
 
 

@@ -13,6 +13,8 @@ from jaxbeam.control.listening import Listener
 # A way is believed that scatters places by so much of the way listened to, after so many ticks with
 # deflections as large as the largest: at first the beam lags; its load seems to stay, or to jump.
 TRAVELLED, TICKS = 0.1, 8
+# Of the square of the largest deflection under a weight: that of rounding is less.
+ROUNDING = 1e-20
 
 
 class Follower(Listener):
@@ -51,7 +53,9 @@ class Follower(Listener):
         size = jnp.sum(self.line**2, axis=0)
         felt = deflections @ self.line
         # The place at which a weight explains most of the readings, to a share of the spacing.
-        explained = jnp.where(size > 0, felt**2 / jnp.where(size > 0, size, 1.0), 0.0)
+        # At a pin it bends nothing, but for rounding, which may look like any place.
+        bends = size > ROUNDING * jnp.max(size)
+        explained = jnp.where(bends, felt**2 / jnp.where(bends, size, 1.0), 0.0)
         best = jnp.clip(jnp.argmax(explained), 1, size.shape[0] - 2)
         before, here, after = (explained[best + k] for k in (-1, 0, 1))
         bend = before - 2 * here + after

@@ -15,11 +15,9 @@ from experiments.benchmarks import (
     cases,
     growth,
     identify,
-    kernel,
     quadratic,
     riccati,
     steps,
-    sweep,
     tuners,
 )
 
@@ -87,13 +85,6 @@ def test_osqp_solves_the_same_programs(programs):
     assert 0 < own < called
 
 
-@pytest.mark.skipif(kernel.compiler() is None, reason="no C compiler here")
-def test_the_same_method_by_hand_has_the_same_peaks(tmp_path):
-    beam, crossings = kernel.prepare(2)
-    by_hand = kernel.peaks(kernel.build(2, tmp_path), beam, crossings)
-    np.testing.assert_allclose(by_hand, sweep.sweep_peaks(2), rtol=1e-11)
-
-
 def test_growth_tells_times_and_memory():
     found = growth.measure(25)
     assert 0 < found["again"] < found["first"] and found["run"] > 0
@@ -132,5 +123,6 @@ def test_a_profile_puts_the_time_down_to_stages():
     told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     rows = dict(line.strip("| ").split(" | ") for line in told.splitlines()[2:])
     shares = {stage: float(share.rstrip("%")) for stage, share in rows.items()}
-    assert {"collocation", "propagation", "extremes"} <= set(shares)
+    told_of = " ".join(shares)  # XLA may have made one kernel of two stages
+    assert all(stage in told_of for stage in ("collocation", "propagation", "extremes"))
     assert 95 <= sum(shares.values()) <= 105
