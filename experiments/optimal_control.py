@@ -19,9 +19,9 @@ from experiments.observed import observed
 from experiments.regulator_limits import Loops, draw_poles, frozen, grown, sampled
 from experiments.shaker import data_physics_v4
 from experiments.verdicts import Experiment, Finding, Outcome, finding
+from jaxbeam.case.controller import AbstractController
 from jaxbeam.compiling import compiled
 from jaxbeam.control.beliefs import Beliefs
-from jaxbeam.controller import AbstractController
 from jaxbeam.modes import lay_out
 from jaxbeam.plan import make_plan
 from jaxbeam.plot.style import colour, name, styled

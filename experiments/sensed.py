@@ -37,7 +37,7 @@ from experiments.tuned import (
 )
 from experiments.tuned_search import MODES, PERIOD
 from experiments.verdicts import Experiment, Outcome
-from jaxbeam.case import known_case
+from jaxbeam.case.case import known_case
 from jaxbeam.modes import lay_out
 from jaxbeam.stability import frozen_poles
 from tuning.believing import believing

@@ -17,9 +17,9 @@ import scipy.sparse
 
 import jaxbeam as jb
 from jaxbeam import rigs
+from jaxbeam.case.filters import filter_history, initial, sections
 from jaxbeam.control.reach import reach
 from jaxbeam.estimation import kalman_gain, sampled_kalman_gain
-from jaxbeam.filters import filter_history, initial, sections
 from jaxbeam.plan import make_plan
 from jaxbeam.reference import simulate_adaptive
 from jaxbeam.static import static_peak

@@ -12,9 +12,12 @@ import jax
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
-from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
-from jaxbeam.beam import Beam, Support
-from jaxbeam.case import Case, Run, addresses, replace
+from jaxbeam.case.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.case import Case, Run, addresses, replace
+from jaxbeam.case.filters import Filter
+from jaxbeam.case.loads import MovingForce, MovingMass
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.casefile import load_case, save_case
 from jaxbeam.control import (
     LQR,
@@ -39,11 +42,8 @@ from jaxbeam.control import (
 )
 from jaxbeam.control.bound import bound
 from jaxbeam.estimation import Inversion, Kalman, Observer
-from jaxbeam.filters import Filter
-from jaxbeam.loads import MovingForce, MovingMass
 from jaxbeam.modes import modes
 from jaxbeam.record import Record, read_record
-from jaxbeam.sensors import Sensor
 from jaxbeam.simulate import simulate
 from jaxbeam.statespace import state_space
 from jaxbeam.sweep import sweep

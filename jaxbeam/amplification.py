@@ -6,9 +6,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.compiling import compiled
-from jaxbeam.faults import check_on_beam
 from jaxbeam.integrate import march
 from jaxbeam.plan import TOLERANCE, make_plan, sample_times
 from jaxbeam.simulate import prepare

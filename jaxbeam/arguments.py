@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.controller import AbstractController
 from jaxbeam.casefile import load_case, load_controller, with_settings
-from jaxbeam.controller import AbstractController
 from jaxbeam.lanes import MOST_RUNS
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam import native, programs
-from jaxbeam.case import Case, replace, value_at
+from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.lanes import Tasks
 from jaxbeam.loop import loop_schedule
 from jaxbeam.modes import Layout, lay_out

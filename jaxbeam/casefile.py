@@ -12,14 +12,15 @@ from typing import Any
 
 import tomli_w
 
-from jaxbeam import actuators, control, loads
-from jaxbeam.beam import Beam, Support
-from jaxbeam.case import Case, Run, unknown_address
-from jaxbeam.checks import check
-from jaxbeam.controller import AbstractController
-from jaxbeam.faults import check_field, in_words, missing, suggestion
-from jaxbeam.fields import fits, known, shape_in_words
-from jaxbeam.sensors import Sensor
+from jaxbeam import control
+from jaxbeam.case import actuators, loads
+from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.case import Case, Run, unknown_address
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.declared_checks import check_field, in_words, missing, suggestion
+from jaxbeam.case.fields import fits, known, shape_in_words
+from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.validation import check
 
 Kind = type | dict[str, type]  # one class, or the registry in which a `kind` is looked up
 

@@ -13,10 +13,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.loads import motion
 from jaxbeam.control.bound import HELD, Bound, bound
-from jaxbeam.controller import AbstractController
-from jaxbeam.loads import motion
 from jaxbeam.record import Record
 from jaxbeam.reserve import Reserve, reserve
 from jaxbeam.simulate import ContactLossWarning, simulate

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, assemble, section, supported
 from jaxbeam.piecewise import piecewise

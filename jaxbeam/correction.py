@@ -9,7 +9,7 @@ derivative, from which section forces follow, do.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.record import Record

@@ -13,9 +13,9 @@ import scipy
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxbeam.case import Case, replace
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import known
 from jaxbeam.control import Feedback, Recognition, ScheduledFeedback
-from jaxbeam.fields import known
 from jaxbeam.plan import make_plan
 from jaxbeam.reserve import reserve
 from jaxbeam.simulate import ContactLossWarning, simulate

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxbeam.case import Case
-from jaxbeam.loads import motion
-from jaxbeam.motion import AbstractMotion
+from jaxbeam.case.case import Case
+from jaxbeam.case.loads import motion
+from jaxbeam.case.trajectory import AbstractMotion
 from jaxbeam.rig import Rig
 from jaxbeam.small import solve_small
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxbeam.case.trajectory import NEVER
 from jaxbeam.exponentials import GAUSS, LOOKED
-from jaxbeam.motion import NEVER
 from jaxbeam.peaks import highest, refine, vertex
 from jaxbeam.tables import Path, Tables
 

@@ -18,11 +18,11 @@ import scipy
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Complex, Float
 
-from jaxbeam.case import Case
-from jaxbeam.checks import check
+from jaxbeam.case.case import Case
+from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.case.fields import is_known, known
+from jaxbeam.case.validation import check
 from jaxbeam.compiling import compiled
-from jaxbeam.faults import check_on_beam
-from jaxbeam.fields import is_known, known
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.ports import Pair, check_pairs, column, common_pairs, row
 from jaxbeam.rig import Rig, rig, rig_in_one

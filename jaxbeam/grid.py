@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbeam.case import Case
-from jaxbeam.loads import motion
+from jaxbeam.case.case import Case
+from jaxbeam.case.loads import motion
 from jaxbeam.rig import Rig
 from jaxbeam.schedule import Schedule
 

@@ -17,11 +17,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.advance import KEPT, advance, contact, undriven
+from jaxbeam.case.loads import AbstractLoad, MovingMass
 from jaxbeam.driver import AbstractDriver, Moment
 from jaxbeam.dynamics import Traffic
 from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
 from jaxbeam.extremes import Extremes, fold, nothing_seen
-from jaxbeam.loads import AbstractLoad, MovingMass
 from jaxbeam.rig import Rig
 from jaxbeam.tables import CHUNK, Path, Rigging, follow, tabulate
 

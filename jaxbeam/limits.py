@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from jaxbeam.case import Case, replace
-from jaxbeam.fields import known
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import known
 from jaxbeam.stability import frozen_poles, stream
 
 # What is above zero for an unstable case.

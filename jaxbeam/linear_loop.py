@@ -14,10 +14,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case, known_case
-from jaxbeam.checks import check
+from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.fields import known
+from jaxbeam.case.validation import check
 from jaxbeam.compiling import compiled
-from jaxbeam.fields import known
 from jaxbeam.modes import lay_out
 from jaxbeam.open_loop import ROUNDING, Clock, OpenLoop, open_loop
 

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
-from jaxbeam.controller import Measurement
+from jaxbeam.case.case import Case
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.fields import known
 from jaxbeam.driver import AbstractDriver, Moment
 from jaxbeam.dynamics import Traffic, at_instant
 from jaxbeam.exponentials import GAUSS, NODES
-from jaxbeam.fields import known
 from jaxbeam.modes import Layout
 from jaxbeam.rig import Rig
 from jaxbeam.schedule import Schedule, merged

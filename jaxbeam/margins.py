@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import known
+from jaxbeam.case.fields import known
 from jaxbeam.holds import balance
 from jaxbeam.linear_loop import LinearLoop
 from jaxbeam.statespace import StateSpace

@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.modes import Modes
 from jaxbeam.sensing import convert, needs_times, noise_samples, sense
-from jaxbeam.sensors import QUANTITIES
 
 
 def history(modes: Modes, motion, x, quantity: str, fibre_distance) -> Float[Array, "time ..."]:

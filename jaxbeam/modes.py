@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.polynomial import legendre
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import known
 from jaxbeam.eigen import SAME_EIGENVALUE, eigen
-from jaxbeam.fields import known
 from jaxbeam.piecewise import piecewise, to_chebyshev
 
 SAME_PLACE = 1e-9  # of the length: closer nodes are one node

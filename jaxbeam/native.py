@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from jaxbeam.dynamics import Traffic
 from jaxbeam.exponentials import DOUBLINGS, GAUSS, LOOKED, NODES, TERMS, lagrange
 from jaxbeam.extremes import NEAR, Found

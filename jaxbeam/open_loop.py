@@ -14,11 +14,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.trajectory import NEVER, AbstractMotion
 from jaxbeam.compiling import compiled
-from jaxbeam.controller import Measurement
 from jaxbeam.modes import Layout
-from jaxbeam.motion import NEVER, AbstractMotion
 from jaxbeam.rig import rig_in_one
 from jaxbeam.sensed import sensed
 from jaxbeam.sensing import design, init, read

@@ -15,10 +15,10 @@ from jaxtyping import Float
 
 from jaxbeam import native
 from jaxbeam.blocks import RUNS, Work
-from jaxbeam.case import Case, replace, value_at
+from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.case.declared_checks import in_words
+from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.checks import check
-from jaxbeam.faults import in_words
 from jaxbeam.lanes import LANES, MOST_RUNS, Tasks, arrange
 
 # Whether these are right depends on each other: places, and entries of a list.

@@ -13,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case, known_case
-from jaxbeam.checks import check
+from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.fields import known
+from jaxbeam.case.loads import motion
+from jaxbeam.case.validation import check
 from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.extremes import Extremes
-from jaxbeam.fields import known
 from jaxbeam.grid import even_grid, scheduled_grid
 from jaxbeam.integrate import at_edges, longest_step, march
-from jaxbeam.loads import motion
 from jaxbeam.loop import loop_schedule, make_loop
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.rig import couples, rig

@@ -20,11 +20,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.actuators import AbstractActuator, Electrodynamic
-from jaxbeam.case import Case
-from jaxbeam.faults import check_on_beam, suggestion
+from jaxbeam.case.actuators import AbstractActuator, Electrodynamic
+from jaxbeam.case.case import Case
+from jaxbeam.case.declared_checks import check_on_beam, suggestion
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.rig import Rig
-from jaxbeam.sensors import QUANTITIES
 
 AT_A_POINT = ("deflection", "velocity", "acceleration", "slope")  # strain also needs a fibre
 OF_ACTUATOR = ("current", "active_force", "transmitted_force")

@@ -15,12 +15,12 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxbeam import native
-from jaxbeam.case import Case, replace
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.loads import motion
 from jaxbeam.compiling import ROUGHLY, SIDE_BY_SIDE, compiled, compiled_with
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.grid import even_grid, scheduled_grid
 from jaxbeam.integrate import longest_step, march, trace
-from jaxbeam.loads import motion
 from jaxbeam.loop import make_loop
 from jaxbeam.plan import Form
 from jaxbeam.rig import Rig, rig

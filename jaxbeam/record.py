@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import known
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.fields import known
 from jaxbeam.measuring import history, measure
 from jaxbeam.modes import Modes
 

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case, known_case
-from jaxbeam.checks import check
+from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.validation import check
 from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.rig import Rig, rig_in_one

@@ -7,11 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.case import Case, known_case
+from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.fields import known
+from jaxbeam.case.loads import motion
 from jaxbeam.control import MPC
-from jaxbeam.fields import known
 from jaxbeam.linear_loop import LinearLoop, linear, prepared
-from jaxbeam.loads import motion
 from jaxbeam.margins import margins
 from jaxbeam.modes import lay_out
 from jaxbeam.open_loop import OpenLoop, open_loop

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import is_known, known
+from jaxbeam.case.fields import is_known, known
 from jaxbeam.holds import balance
 from jaxbeam.stretches import Commands, Inputs, Square, Stretch, even_units, symmetric
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax.scipy.linalg import block_diag, solve_triangular
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, Modes, lay_out, modes
 

@@ -6,7 +6,7 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
-from jaxbeam.filters import analogue
+from jaxbeam.case.filters import analogue
 from jaxbeam.rig import Rig
 from jaxbeam.statespace import LoadedBeam
 

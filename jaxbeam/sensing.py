@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import is_known, known
-from jaxbeam.filters import Filter, analogue, analogue_initial, filter_history, filter_step
-from jaxbeam.filters import initial as filter_initial
-from jaxbeam.filters import sections as filter_sections
+from jaxbeam.case.fields import is_known, known
+from jaxbeam.case.filters import Filter, analogue, analogue_initial, filter_history, filter_step
+from jaxbeam.case.filters import initial as filter_initial
+from jaxbeam.case.filters import sections as filter_sections
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.holds import cubics, evaluate, hold
-from jaxbeam.sensors import Sensor
 
 ROUNDING = 1e-6  # of a period: a sample this much before a tick of the clock is at the tick
 

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import is_known, known
 from jaxbeam.compiling import compiled
 from jaxbeam.driver import AbstractDriver
 from jaxbeam.dynamics import Traffic, at_instant, traffic
 from jaxbeam.exponentials import NODES, at_ends
 from jaxbeam.extremes import Found
-from jaxbeam.fields import is_known, known
 from jaxbeam.grid import scheduled_grid
 from jaxbeam.integrate import trace
 from jaxbeam.loop import make_loop

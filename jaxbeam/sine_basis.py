@@ -9,7 +9,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from jaxbeam.eigen import eigen
 from jaxbeam.modes import Modes, modes, oriented
 

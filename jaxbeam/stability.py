@@ -18,13 +18,13 @@ import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 
-from jaxbeam.case import Case, known_case
+from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.fields import known
+from jaxbeam.case.loads import motion
+from jaxbeam.case.trajectory import NEVER
 from jaxbeam.compiling import compiled
-from jaxbeam.fields import known
 from jaxbeam.linear_loop import linear, prepared
-from jaxbeam.loads import motion
 from jaxbeam.modes import lay_out
-from jaxbeam.motion import NEVER
 from jaxbeam.open_loop import Clock, OpenLoop, open_loop, through
 
 TURN = 0.15  # rad by which the fastest mode may turn in a step along a transition

@@ -17,14 +17,14 @@ import scipy
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import is_known, known
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.compiling import compiled
 from jaxbeam.dynamics import Traffic, contact_rows, traffic
-from jaxbeam.fields import is_known, known
 from jaxbeam.holds import hold
 from jaxbeam.modes import Layout
 from jaxbeam.rig import Rig, rig_in_one
-from jaxbeam.sensors import QUANTITIES
 from jaxbeam.small import solve_small
 
 

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case, known_case
-from jaxbeam.checks import check
+from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.case.fields import is_known
+from jaxbeam.case.loads import motion
+from jaxbeam.case.trajectory import NEVER
+from jaxbeam.case.validation import check
 from jaxbeam.compiling import compiled
 from jaxbeam.compliance import check_held, compliance
-from jaxbeam.faults import check_on_beam
-from jaxbeam.fields import is_known
-from jaxbeam.loads import motion
 from jaxbeam.modes import Layout, lay_out
-from jaxbeam.motion import NEVER
 from jaxbeam.peaks import refine
 
 # On a stretch of a crossing: a cubic of a cubic is known exactly by ten.

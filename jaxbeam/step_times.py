@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.case.controller import AbstractController, Measurement
+from jaxbeam.case.fields import known
 from jaxbeam.compiling import compiled
-from jaxbeam.controller import AbstractController, Measurement
-from jaxbeam.fields import known
 from jaxbeam.record import Record
 from jaxbeam.statespace import state_space
 

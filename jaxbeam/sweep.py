@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from jaxbeam import cluster, sweep_store
 from jaxbeam.blocks import Work
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from jaxbeam.lanes import Tasks
 from jaxbeam.order import Order, make_order
 from jaxbeam.plan import TOLERANCE, sample_times

@@ -1,6 +1,6 @@
 """A case in the words of the independent finite-element oracle."""
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from tests.oracles import finite_elements
 
 

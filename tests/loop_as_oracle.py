@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from jaxbeam.actuators import Shaker
-from jaxbeam.case import Case
+from jaxbeam.case.actuators import Shaker
+from jaxbeam.case.case import Case
+from jaxbeam.case.loads import MovingMass
 from jaxbeam.control import Feedback, StateFeedback
-from jaxbeam.loads import MovingMass
 from tests.oracles import closed_loop
 from tests.oracles.loads import Load
 from tests.oracles.modal_equations import Span

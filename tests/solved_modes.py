@@ -3,9 +3,9 @@
 import equinox as eqx
 import numpy as np
 
-from jaxbeam.actuators import Patch
-from jaxbeam.beam import ENDS, Beam, Support
-from jaxbeam.case import Case
+from jaxbeam.case.actuators import Patch
+from jaxbeam.case.beam import ENDS, Beam, Support
+from jaxbeam.case.case import Case
 from jaxbeam.modes import Modes, lay_out, modes
 
 STUFF = {"flexural_rigidity": 11.68, "mass_per_length": 0.535}

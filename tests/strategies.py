@@ -4,12 +4,12 @@ import itertools
 
 from hypothesis import strategies as st
 
-from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
-from jaxbeam.beam import ENDS, Beam, Support
-from jaxbeam.case import Case, Run
-from jaxbeam.filters import Filter
-from jaxbeam.loads import MovingForce, MovingMass
-from jaxbeam.sensors import QUANTITIES, Sensor
+from jaxbeam.case.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.case.beam import ENDS, Beam, Support
+from jaxbeam.case.case import Case, Run
+from jaxbeam.case.filters import Filter
+from jaxbeam.case.loads import MovingForce, MovingMass
+from jaxbeam.case.sensors import QUANTITIES, Sensor
 
 
 def numbers(low: float, high: float) -> st.SearchStrategy[float]:

@@ -9,9 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.case.controller import Measurement
 from jaxbeam.control import DiscreteLQR, ScheduledLQR
 from jaxbeam.control.lqr import optimal
-from jaxbeam.controller import Measurement
 from jaxbeam.estimation import Kalman, Observer
 from jaxbeam.modes import lay_out
 from tests.differences import central

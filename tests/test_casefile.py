@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from jaxbeam.actuators import Patch, PointForce, Shaker
-from jaxbeam.beam import Beam, Support
-from jaxbeam.case import Case, Run
+from jaxbeam.case.actuators import Patch, PointForce, Shaker
+from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.case import Case, Run
+from jaxbeam.case.loads import MovingForce, MovingMass
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.casefile import case_from_dict, case_to_dict, load_case, save_case, with_settings
-from jaxbeam.loads import MovingForce, MovingMass
-from jaxbeam.sensors import Sensor
 from tests.strategies import cases
 
 FULL = """

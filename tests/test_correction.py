@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case import replace
+from jaxbeam.case.case import replace
 from jaxbeam.correction import (
     bending_moment,
     corrected,

@@ -12,7 +12,7 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.checks import check
+from jaxbeam.case.validation import check
 from jaxbeam.cli import main
 from jaxbeam.control import LQR, DiscreteLQR, SamplingWarning
 from jaxbeam.control.discrete import sampled_problem

@@ -18,9 +18,9 @@ import scipy.signal
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.case.controller import Measurement
 from jaxbeam.cli import main
 from jaxbeam.control import DiscreteLQR, Feedback, FiniteLQR, ScheduledLQR
-from jaxbeam.controller import Measurement
 from jaxbeam.export import Gains, export_gains, read_gains, write_gains
 from jaxbeam.modes import lay_out
 

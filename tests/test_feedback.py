@@ -14,8 +14,8 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.checks import check
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.validation import check
 from jaxbeam.linear_loop import linear_loop
 from jaxbeam.loop import loop_schedule
 from jaxbeam.plan import Plan, form

@@ -10,7 +10,7 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case import replace
+from jaxbeam.case.case import replace
 from jaxbeam.correction import residual_lift
 from jaxbeam.frequency import (
     accelerance,

@@ -10,19 +10,19 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.fields  jaxbeam.holds
+jaxbeam.case.__init__  jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.case.fields  jaxbeam.holds
 jaxbeam.kept_programs  jaxbeam.small
 jaxbeam.compiling
-jaxbeam.faults  jaxbeam.piecewise  jaxbeam.stretches
+jaxbeam.case.declared_checks  jaxbeam.piecewise  jaxbeam.stretches
 jaxbeam.flows  jaxbeam.native_library
 jaxbeam.coupled
-jaxbeam.beam  jaxbeam.filters  jaxbeam.motion  jaxbeam.actuators  jaxbeam.controller
-jaxbeam.estimator  jaxbeam.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.sensors
-jaxbeam.case  jaxbeam.gain_table  jaxbeam.sensing
+jaxbeam.case.beam  jaxbeam.case.filters  jaxbeam.case.trajectory  jaxbeam.case.actuators  jaxbeam.case.controller
+jaxbeam.case.estimator  jaxbeam.case.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.case.sensors
+jaxbeam.case.case  jaxbeam.gain_table  jaxbeam.sensing
 jaxbeam.gain_pieces
 jaxbeam.native_designs
 jaxbeam.finite_time
-jaxbeam.checks
+jaxbeam.case.validation
 jaxbeam.modes
 jaxbeam.measuring  jaxbeam.rig
 jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.ports  jaxbeam.sine_basis

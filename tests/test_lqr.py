@@ -11,8 +11,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.checks import check
 from jaxbeam.control import LQR, AugmentedLQR, FiniteLQR, StepLQR
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.control.lqr import optimal

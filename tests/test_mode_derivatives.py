@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.actuators import Patch
-from jaxbeam.beam import Beam, Support
-from jaxbeam.case import Case, replace, value_at
+from jaxbeam.case.actuators import Patch
+from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.modes import Modes, lay_out, modes
 from tests.differences import central
 from tests.solved_modes import STUFF, solve

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from jaxbeam.actuators import Patch
-from jaxbeam.beam import Beam, Support
-from jaxbeam.case import Case
+from jaxbeam.case.actuators import Patch
+from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.case import Case
 from tests.as_oracle import as_oracle
 from tests.oracles.closed_forms import single_span_parameters, two_span_parameters
 from tests.oracles.exact_frequencies import exact_frequencies

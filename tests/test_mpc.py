@@ -15,7 +15,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
 from jaxbeam.loop import loop_schedule
 from jaxbeam.modes import lay_out
 from jaxbeam.plan import Plan, form

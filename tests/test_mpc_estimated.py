@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 from scipy.optimize import lsq_linear
 
 import jaxbeam as jb
+from jaxbeam.case.controller import Measurement
 from jaxbeam.control.beliefs import Beliefs
-from jaxbeam.controller import Measurement
 from jaxbeam.estimation import Kalman
 from tests.test_mpc import PATCH, PERIOD, THESIS, mpc, rig
 

@@ -16,7 +16,7 @@ import scipy.sparse
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
 from tests.loop_as_oracle import span_of
 
 PERIOD, LIMITS, RATE = 0.01, (-4.0, 6.0), 250.0

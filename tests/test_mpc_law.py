@@ -10,10 +10,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.checks import check
 from jaxbeam.control.prediction import incremental
-from jaxbeam.controller import Measurement
 from jaxbeam.riccati import dlqr
 from tests.test_mpc import PATCH, PERIOD, mpc, rig
 

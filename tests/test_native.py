@@ -19,7 +19,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam import native, native_designs, native_library, peaks
-from jaxbeam.case import replace
+from jaxbeam.case.case import replace
 from jaxbeam.cli import main
 from jaxbeam.dynamics import traffic
 from jaxbeam.exponentials import LOOKED

@@ -10,8 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.case.controller import Measurement
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.controller import Measurement
 
 SHARES = [0.0, 0.2, 0.7, 1.0]
 VALUES = [[0.5, 6.0, 4.0, 1.0]]

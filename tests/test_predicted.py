@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import block_diag
 
 import jaxbeam as jb
+from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.checks import check
 from jaxbeam.control import AugmentedLQR, ScheduledLQR
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.loop import loop_schedule

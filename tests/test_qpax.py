@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from jaxbeam.checks import check
+from jaxbeam.case.validation import check
 from jaxbeam.control import by_qpax
 from jaxbeam.control.qp import SOLVED, UNFINISHED, solve_qp
 from tests.differences import central

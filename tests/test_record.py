@@ -9,8 +9,8 @@ import xarray
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.record import record_from_xarray
-from jaxbeam.sensors import QUANTITIES
 
 CASE = jb.Case(
     jb.Beam(1.2, 11.68, 0.535, 0.02, modes=3),

@@ -10,11 +10,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.checks import check
 from jaxbeam.control import FiniteLQR, ScheduledLQR
 from jaxbeam.control.gains import Schedule
-from jaxbeam.controller import Measurement
 from jaxbeam.gain_table import GainTable
 from jaxbeam.modes import lay_out
 from jaxbeam.static import influence_line, static_lift

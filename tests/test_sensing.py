@@ -11,12 +11,12 @@ import scipy.signal
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.case.filters import Filter
+from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict
-from jaxbeam.checks import check
-from jaxbeam.filters import Filter
 from jaxbeam.measuring import measure
 from jaxbeam.sensing import convert, design, init, noise_samples, read, sense
-from jaxbeam.sensors import Sensor
 from tests.differences import central
 
 TIMES = jnp.arange(201) / 1000.0

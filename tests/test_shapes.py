@@ -5,9 +5,9 @@ import pytest
 from numpy.polynomial import legendre
 from numpy.testing import assert_allclose
 
-from jaxbeam.actuators import Patch
-from jaxbeam.beam import Beam, Support
-from jaxbeam.case import Case
+from jaxbeam.case.actuators import Patch
+from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.case import Case
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles.closed_forms import single_span_parameters

@@ -5,8 +5,8 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.linalg import eigh
 
-from jaxbeam.beam import Beam, Support
-from jaxbeam.case import Case, replace
+from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.case import Case, replace
 from jaxbeam.modes import modes
 from jaxbeam.sine_basis import sine_basis_modes
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.actuators import Patch, Shaker, SpringDamper
-from jaxbeam.beam import ENDS, Beam, Support
-from jaxbeam.case import Case, replace, value_at
-from jaxbeam.loads import MovingForce, MovingMass, motion
+from jaxbeam.case.actuators import Patch, Shaker, SpringDamper
+from jaxbeam.case.beam import ENDS, Beam, Support
+from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.case.loads import MovingForce, MovingMass, motion
 from jaxbeam.modes import lay_out
 from jaxbeam.static import influence_line, static_deflection, static_peak
 from tests.as_oracle import as_oracle

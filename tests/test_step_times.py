@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.controller import AbstractController
+from jaxbeam.case.controller import AbstractController
 from jaxbeam.step_times import WALKED, _changes, _ticks, timed
 
 

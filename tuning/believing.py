@@ -5,8 +5,8 @@ from typing import Any
 
 import equinox as eqx
 
-from jaxbeam.case import Case, replace
-from jaxbeam.controller import AbstractController
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.controller import AbstractController
 from jaxbeam.modes import Layout
 from jaxbeam.statespace import state_space
 

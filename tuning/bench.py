@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbeam.case import Case, replace, value_at
+from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.compiling import compiled
 from jaxbeam.control.bound import HELD, least_achievable
 from jaxbeam.dynamics import traffic

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case import Case, replace, value_at
-from jaxbeam.checks import check
+from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.case.validation import check
 from jaxbeam.plan import Plan, make_plan
 from jaxbeam.schedule import Schedule, stacked
 from jaxbeam.simulate import readings

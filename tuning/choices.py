@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from tuning.load_cases import LoadCases
 from tuning.objective import Objective
 from tuning.proof import Tuned

@@ -13,10 +13,10 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from jaxbeam.case import Case, replace, value_at
-from jaxbeam.checks import check
+from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.case.fields import known
+from jaxbeam.case.validation import check
 from jaxbeam.compiling import compiled
-from jaxbeam.fields import known
 from jaxbeam.plan import Plan, make_plan, sample_times
 from jaxbeam.simulate import readings
 from tuning.free import unit_at

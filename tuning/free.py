@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case, replace, value_at
-from jaxbeam.fields import known
-from jaxbeam.sensors import QUANTITIES, Sensor
+from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.case.fields import known
+from jaxbeam.case.sensors import QUANTITIES, Sensor
 from tuning.belief import Belief, as_belief
 
 OF_LOG = re.compile(r"logs\.(\d+)\.(.+)")

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case import Case, replace
-from jaxbeam.fields import known
-from jaxbeam.sensors import QUANTITIES
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import known
+from jaxbeam.case.sensors import QUANTITIES
 from tuning.belief import Belief
 from tuning.campaign import Campaign, prepare
 from tuning.checkpoint import fingerprint

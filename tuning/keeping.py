@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from tuning.belief import Belief
 from tuning.campaign import prepare

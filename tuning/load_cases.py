@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from scipy.stats.qmc import LatinHypercube
 
-from jaxbeam.case import Case, replace
-from jaxbeam.fields import known
-from jaxbeam.loads import motion
-from jaxbeam.motion import NEVER
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import known
+from jaxbeam.case.loads import motion
+from jaxbeam.case.trajectory import NEVER
 
 Values = dict[str, float]  # numbers of the case by address
 TABLES = ("training", "held_out")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.loads import AbstractLoad
+from jaxbeam.case.loads import AbstractLoad
 
 # Times may stray from an even grid by this share of a step: printed times are rounded.
 EVEN = 0.25
@@ -17,7 +17,7 @@ class Log:
     """Samples of some channels over time, in SI units.
 
     `times` (time,) in s, strictly increasing; `values` (time, channel) in the SI unit of each
-    channel's quantity; both are read-only. `quantities` are those of `jaxbeam.sensors.QUANTITIES`,
+    channel's quantity; both are read-only. `quantities` are those of `jaxbeam.case.sensors.QUANTITIES`,
     or force (N) or voltage (V); `units` are as read, for labels. `sensors` and `positions` (m)
     say which sensor of a case each channel is and where, None where that is not known;
     `actuators` say to which actuator of a case a channel is the command, None for readings;

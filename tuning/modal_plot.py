@@ -5,7 +5,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxbeam.sensors import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 
 INK, MODE, FIT, FAINT = "#333333", "#c0392b", "#1f6f8b", "#9aa5ab"
 MOST_POINTS = 4000  # a longer log is drawn as the range of each of so many pieces

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.case import Case, replace
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import known
+from jaxbeam.case.loads import AbstractLoad, motion
 from jaxbeam.control import Prescribed
-from jaxbeam.fields import known
-from jaxbeam.loads import AbstractLoad, motion
 from tuning.logs import Log
 
 LATEST = 10.0  # start of a log, in its own durations, that is still simulated from 0 on

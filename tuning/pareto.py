@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from tuning.load_cases import LoadCases
 from tuning.objective import MERITS, Objective
 from tuning.proof import Tuned

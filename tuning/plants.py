@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxbeam.case import Case, replace
+from jaxbeam.case.case import Case, replace
 from tuning.load_cases import PLANT, Values
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from tuning.free import Free
 from tuning.load_cases import Values, columns
 from tuning.objective import Objective

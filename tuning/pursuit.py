@@ -10,9 +10,9 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from jaxbeam.case import Case
-from jaxbeam.fields import known
-from jaxbeam.loads import MovingMass
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import known
+from jaxbeam.case.loads import MovingMass
 from jaxbeam.static import influence_line
 from tuning.logs import Log
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from jaxbeam.control.lqr import AbstractRegulator
 from tuning.load_cases import LoadCases
 from tuning.objective import Objective

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxbeam.sensors import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from tuning.criticism import channel_remarks, channels
 from tuning.faults import find_faults
 

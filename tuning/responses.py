@@ -15,7 +15,7 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Complex, Float
 
-from jaxbeam.case import Case, replace
+from jaxbeam.case.case import Case, replace
 from jaxbeam.frequency import Parked, frequency_response
 from jaxbeam.modes import lay_out
 from tuning.belief import Belief

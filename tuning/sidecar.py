@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from jaxbeam.case.loads import KINDS, AbstractLoad
 from jaxbeam.casefile import read_part
-from jaxbeam.loads import KINDS, AbstractLoad
 
 _KEYS = ("loads", "columns", "time", "runs")
 _COLUMN_KEYS = {

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case import Case, replace
+from jaxbeam.case.case import Case, replace
 from jaxbeam.casefile import case_to_dict
 from jaxbeam.compiling import compiled
 from jaxbeam.record import Record

@@ -7,9 +7,9 @@ Schwarz's criterion falls (see `criticism`).
 
 import dataclasses
 
-from jaxbeam.case import Case
-from jaxbeam.fields import known
-from jaxbeam.loads import AbstractLoad, MovingMass
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import known
+from jaxbeam.case.loads import AbstractLoad, MovingMass
 from tuning.criticism import DOUBTFUL, Rival, channels, compare_fits
 from tuning.identify import Fit, identify
 from tuning.logs import Log

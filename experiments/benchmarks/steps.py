@@ -20,8 +20,8 @@ import warnings
 import numpy as np
 
 import jaxbeam as jb
+from jaxbeam.case.controller import AbstractController
 from jaxbeam.control import KINDS, SamplingWarning
-from jaxbeam.controller import AbstractController
 from jaxbeam.simulate import ContactLossWarning
 from jaxbeam.step_times import StepTimes, step_times
 

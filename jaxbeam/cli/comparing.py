@@ -14,7 +14,7 @@ from jaxbeam.arguments import (
     refuse,
     sweep_values,
 )
-from jaxbeam.checks import check
+from jaxbeam.case.validation import check
 from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
 from jaxbeam.printing import print_json, print_table, print_written
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import NOT_NEGATIVE, count, number
+from jaxbeam.case.fields import NOT_NEGATIVE, count, number
 from jaxbeam.rig import assemble
 from jaxbeam.statespace import LoadedBeam, loaded_beam
 

@@ -20,13 +20,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxbeam.case import Case
-from jaxbeam.checks import check
+from jaxbeam.case.case import Case
+from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.case.validation import check
 from jaxbeam.compiling import compiled
 from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.reach import TOLERANCE, reach
-from jaxbeam.faults import check_on_beam
 from jaxbeam.plan import form, run_extremes, suitable_step
 from jaxbeam.ports import takes_commands
 from jaxbeam.record import Record

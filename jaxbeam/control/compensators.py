@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import polynomial
 
+from jaxbeam.case.controller import AbstractController, OwnFilter
+from jaxbeam.case.fields import POSITIVE, dimensions, is_known, known, number
+from jaxbeam.case.filters import filter_step
 from jaxbeam.control.feedback import pairing_fault
-from jaxbeam.controller import AbstractController, OwnFilter
-from jaxbeam.fields import POSITIVE, dimensions, is_known, known, number
-from jaxbeam.filters import filter_step
 
 Polynomials = Float[Array, "power actuator"]  # in s (rad/s), the coefficients ascending
 

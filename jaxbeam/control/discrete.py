@@ -5,9 +5,9 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
+from jaxbeam.case.fields import NOT_NEGATIVE, is_known, known, number
 from jaxbeam.control.lqr import AbstractRegulator
 from jaxbeam.estimation.sampled import ticks, whole_and_sum
-from jaxbeam.fields import NOT_NEGATIVE, is_known, known, number
 from jaxbeam.holds import balance
 from jaxbeam.riccati import dlqr
 from jaxbeam.stretches import Commands, Inputs, Square, symmetric

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.controller import AbstractController
-from jaxbeam.fields import count, number
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import count, number
 
 
 def pairing_fault(gains: Float[Array, " actuator"], case) -> str | None:

@@ -4,8 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbeam.case.trajectory import NEVER
 from jaxbeam.gain_table import GainTable
-from jaxbeam.motion import NEVER
 from jaxbeam.statespace import LoadedBeam
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
 
 
 class Listener(eqx.Module):

@@ -14,14 +14,23 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam import native_designs
+from jaxbeam.case.fields import (
+    NOT_NEGATIVE,
+    ON_BEAM,
+    POSITIVE,
+    choice,
+    count,
+    is_known,
+    known,
+    number,
+)
+from jaxbeam.case.loads import motion
 from jaxbeam.control.contact import coupled_beam
 from jaxbeam.control.gains import Schedule, crossing
 from jaxbeam.control.sampling import warn_if_slow
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, is_known, known, number
 from jaxbeam.finite_time import finite_time, finite_time_coupled, layer
 from jaxbeam.gain_table import GainTable, edges_between, even, step_by_step
-from jaxbeam.loads import motion
 from jaxbeam.riccati import lqr
 from jaxbeam.statespace import LoadedBeam
 

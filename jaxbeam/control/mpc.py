@@ -11,6 +11,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbeam.case.fields import (
+    NOT_NEGATIVE,
+    ON_BEAM,
+    POSITIVE,
+    choice,
+    count,
+    is_known,
+    known,
+    number,
+)
 from jaxbeam.control.by_qpax import installed
 from jaxbeam.control.prediction import (
     Prediction,
@@ -23,7 +33,6 @@ from jaxbeam.control.prediction import (
 )
 from jaxbeam.control.qp import METHODS, solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, count, is_known, known, number
 from jaxbeam.riccati import dare
 from jaxbeam.statespace import LoadedBeam
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.controller import AbstractController
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
-from jaxbeam.loads import motion
-from jaxbeam.motion import NEVER
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
+from jaxbeam.case.loads import motion
+from jaxbeam.case.trajectory import NEVER
 from jaxbeam.statespace import LoadedBeam
 
 

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.controller import AbstractController
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, number
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, number
 
 
 class Prescribed(AbstractController):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
 from jaxbeam.compiling import compiled
 from jaxbeam.driver import AbstractDriver
 from jaxbeam.dynamics import Traffic, traffic

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
+from jaxbeam.case.case import Case
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.fields import POSITIVE, is_known, known, number
 from jaxbeam.compiling import compiled
 from jaxbeam.control.following import Follower
 from jaxbeam.control.listening import Listener
-from jaxbeam.controller import Measurement
 from jaxbeam.estimation.fixed import offsets
 from jaxbeam.estimation.observability import deflections
-from jaxbeam.fields import POSITIVE, is_known, known, number
 from jaxbeam.modes import lay_out
 from jaxbeam.statespace import LoadedBeam, state_space
 

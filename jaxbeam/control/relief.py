@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.controller import AbstractController
-from jaxbeam.fields import INCREASING, POSITIVE, is_known, known, number
-from jaxbeam.filters import filter_step, initial, sections
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import INCREASING, POSITIVE, is_known, known, number
+from jaxbeam.case.filters import filter_step, initial, sections
 from jaxbeam.statespace import LoadedBeam
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from jaxbeam.case import Case
-from jaxbeam.checks import check
-from jaxbeam.fields import known
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import known
+from jaxbeam.case.validation import check
 from jaxbeam.statespace import StateSpace, state_space
 
 KEPT = 0.3  # of the reach of commands: less is worth a warning, so beyond 0.93 of the limit

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.case.fields import INCREASING, choice, is_known, known, number, part
 from jaxbeam.control.gains import Schedule
 from jaxbeam.control.listening import Listener
 from jaxbeam.control.lqr import FiniteLQR, too_coarse
 from jaxbeam.control.recognition import Recognition
 from jaxbeam.dynamics import traffic
-from jaxbeam.fields import INCREASING, choice, is_known, known, number, part
 from jaxbeam.statespace import LoadedBeam
 
 

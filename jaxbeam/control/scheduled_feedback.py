@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import INCREASING, choice, count, is_known, known, number, part
 from jaxbeam.control.feedback import Feedback, pairing_fault
 from jaxbeam.control.listening import Listener
 from jaxbeam.control.recognition import Recognition
-from jaxbeam.controller import AbstractController
-from jaxbeam.fields import INCREASING, choice, count, is_known, known, number, part
 
 
 class Told(eqx.Module):

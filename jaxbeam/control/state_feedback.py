@@ -2,8 +2,8 @@
 
 from jaxtyping import Array, Float
 
+from jaxbeam.case.fields import number
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.fields import number
 
 
 class StateFeedback(AbstractStateLaw):

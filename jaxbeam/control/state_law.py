@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.estimator import AbstractEstimator, Estimate
+from jaxbeam.case.fields import choice, is_known, known, part
+from jaxbeam.case.loads import motion
 from jaxbeam.compiling import compiled
 from jaxbeam.control.beliefs import Beliefs
-from jaxbeam.controller import AbstractController
 from jaxbeam.estimation import KINDS
 from jaxbeam.estimation.flowing import Flowing
-from jaxbeam.estimator import AbstractEstimator, Estimate
-from jaxbeam.fields import choice, is_known, known, part
-from jaxbeam.loads import motion
 from jaxbeam.modes import lay_out
 from jaxbeam.statespace import LoadedBeam, StateSpace, loaded_beam, state_space
 

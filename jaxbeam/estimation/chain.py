@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.case.filters import filter_step
 from jaxbeam.estimation.sampled import ROUNDING, Ticks, Transition
-from jaxbeam.filters import filter_step
 from jaxbeam.sensed import sensed
 from jaxbeam.sensing import Sections, design
 from jaxbeam.statespace import LoadedBeam, StateSpace

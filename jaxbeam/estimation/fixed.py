@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
 from jaxbeam.estimation.sampled import Transition
 from jaxbeam.statespace import LoadedBeam
 

@@ -11,8 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbeam.case.estimator import Estimate
 from jaxbeam.estimation.chain import Sight
-from jaxbeam.estimator import Estimate
 from jaxbeam.statespace import StateSpace
 
 

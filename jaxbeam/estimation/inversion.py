@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.estimator import AbstractEstimator, Estimate
+from jaxbeam.case.fields import POSITIVE, known, number
 from jaxbeam.estimation.fixed import offsets
 from jaxbeam.estimation.observability import (
     UNSEEN,
@@ -18,8 +20,6 @@ from jaxbeam.estimation.observability import (
     deflections,
 )
 from jaxbeam.estimation.sampled import Transition, ticks
-from jaxbeam.estimator import AbstractEstimator, Estimate
-from jaxbeam.fields import POSITIVE, known, number
 from jaxbeam.holds import balance
 
 WORST = 100.0  # conditioning beyond which there is a warning

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.estimator import AbstractEstimator, Estimate
+from jaxbeam.case.fields import POSITIVE, choice, count, is_known, known, number
 from jaxbeam.estimation.chain import Chain, Sight, chain, sight
 from jaxbeam.estimation.fixed import at_rest, offsets
 from jaxbeam.estimation.flowing import Flowing
 from jaxbeam.estimation.gains import filter_gain, kalman_gain, sampled_kalman_gain
 from jaxbeam.estimation.observability import modes_of, unseen_fault
 from jaxbeam.estimation.sampled import ROUNDING, ticks
-from jaxbeam.estimator import AbstractEstimator, Estimate
-from jaxbeam.fields import POSITIVE, choice, count, is_known, known, number
 from jaxbeam.finite_time import finite_time
 from jaxbeam.holds import balance
 from jaxbeam.statespace import LoadedBeam

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import known
+from jaxbeam.case.fields import known
 from jaxbeam.statespace import StateSpace
 
 UNSEEN = 1e-9  # of what a sensor sees of the mode it sees best: less is nothing

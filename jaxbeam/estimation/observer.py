@@ -4,13 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.case.estimator import AbstractEstimator, Estimate
+from jaxbeam.case.fields import POSITIVE, known, number
 from jaxbeam.estimation.fixed import FixedGain, at_rest, offsets
 from jaxbeam.estimation.flowing import Flowing
 from jaxbeam.estimation.gains import placed_gain
 from jaxbeam.estimation.observability import modes_of, unseen_fault
 from jaxbeam.estimation.sampled import Ticks, ticks
-from jaxbeam.estimator import AbstractEstimator, Estimate
-from jaxbeam.fields import POSITIVE, known, number
 from jaxbeam.holds import balance, hold
 from jaxbeam.statespace import StateSpace
 

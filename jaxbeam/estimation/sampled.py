@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxbeam.controller import AbstractController
+from jaxbeam.case.controller import AbstractController
 
 DOUBLINGS = 14  # of a short part of a period, until it is the whole
 TERMS = 10  # of the series for that part: it is right to rounding while its norm is below 0.05

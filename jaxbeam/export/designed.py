@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.case import Case
-from jaxbeam.checks import check
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import known
+from jaxbeam.case.validation import check
 from jaxbeam.compiling import compiled
 from jaxbeam.control import DiscreteLQR, StateFeedback
 from jaxbeam.control.gains import Schedule
@@ -13,7 +14,6 @@ from jaxbeam.control.lqr import LQR, AbstractScheduledRegulator
 from jaxbeam.control.scheduled import Family, ScheduledLQR
 from jaxbeam.estimation import Observer
 from jaxbeam.export.gains import Gains
-from jaxbeam.fields import known
 from jaxbeam.modes import lay_out
 from jaxbeam.sensing import design
 from jaxbeam.statespace import state_space

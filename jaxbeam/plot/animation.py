@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxbeam.fields import known
+from jaxbeam.case.fields import known
 from jaxbeam.plot.record import shade
 from jaxbeam.plot.schematic import BALL, DEVICE, draw_supports
 from jaxbeam.plot.style import (

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxbeam.case import Case
-from jaxbeam.fields import known
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import known
 from jaxbeam.modes import Modes
 from jaxbeam.modes import modes as find_modes
 from jaxbeam.plot.schematic import draw_supports

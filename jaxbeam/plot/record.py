@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxbeam.fields import known
-from jaxbeam.loads import motion
+from jaxbeam.case.fields import known
+from jaxbeam.case.loads import motion
 from jaxbeam.plot.schematic import draw_rig
 from jaxbeam.plot.style import (
     ALARM,

@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.path import Path
 
-from jaxbeam.case import Case
-from jaxbeam.fields import known
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import known
 from jaxbeam.plot.style import COLOURS, GREY, INK, colour, spread
 
 # Markers hang below the point of the beam that they hold, whatever the scale of the axes.

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from scipy.stats import chi2, norm
 
 import jaxbeam as jb
-from jaxbeam.checks import check
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.validation import check
 from jaxbeam.estimation import Kalman
 from jaxbeam.loop import loop_schedule
 from jaxbeam.modes import lay_out

@@ -16,8 +16,8 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
+from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.checks import check
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.estimation import Inversion, Kalman, Observer
 from jaxbeam.linear_loop import linear_loop

@@ -10,10 +10,10 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.checks import check
 from jaxbeam.control.beliefs import Beliefs
-from jaxbeam.controller import Measurement
 from jaxbeam.estimation import ConditioningWarning, Inversion, Kalman, Observer, conditioning
 from jaxbeam.modes import lay_out
 from tests.differences import central

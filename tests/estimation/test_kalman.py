@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.stats import chi2
 
 import jaxbeam as jb
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
 from jaxbeam.estimation import Kalman
 from jaxbeam.modes import lay_out
 from tests.differences import central

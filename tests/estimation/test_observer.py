@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.checks import check
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.validation import check
 from jaxbeam.estimation import Observer
 from jaxbeam.linear_loop import linear_loop
 from jaxbeam.modes import lay_out

@@ -8,7 +8,7 @@ import pytest
 import jaxbeam as jb
 from experiments import sensed, sensed_search, tuned
 from jaxbeam import rigs
-from jaxbeam.case import known_case
+from jaxbeam.case.case import known_case
 from jaxbeam.modes import lay_out
 from jaxbeam.stability import frozen_poles
 from tuning.believing import believing

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.signal
 
 import jaxbeam as jb
-from jaxbeam.case import replace
+from jaxbeam.case.case import replace
 from tests.oracles import crossing, finite_elements
 from tests.oracles.loads import Load
 from tuning import Fit, Log

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case import replace
+from jaxbeam.case.case import replace
 from tests.tuning.test_identify import NOISE, simulated_log, small
 from tests.well_compiled import well_compiled
 from tuning.campaign import prepare

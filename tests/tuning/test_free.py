@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case import replace
+from jaxbeam.case.case import replace
 from tuning.free import Free, free_numbers, insert, unit_at
 
 CASE = jb.Case(

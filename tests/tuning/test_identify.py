@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case import replace
+from jaxbeam.case.case import replace
 from tests.oracles import modal_equations
 from tests.oracles.loads import Load
 from tuning import Fit, Log, identify

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 import jaxbeam as jb
-from jaxbeam.case import replace
+from jaxbeam.case.case import replace
 from tests.tuning.rehearsals import NOISE, RATE, Plant, patch, plant
 from tuning import Log, identify
 from tuning.pairing import made_alike

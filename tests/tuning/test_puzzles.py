@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case import replace
+from jaxbeam.case.case import replace
 from tests.oracles import finite_elements
 from tests.tuning.rehearsals import SAGGING, SHAKER, Rehearsal, plant
 from tuning.criticism import compare_fits

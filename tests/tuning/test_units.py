@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from jaxbeam.sensors import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from tuning.units import UNITS, unit
 
 

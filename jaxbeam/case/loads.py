@@ -11,9 +11,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.faults import either
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
-from jaxbeam.motion import AbstractPieces, Braking, Tabulated
+from jaxbeam.case.declared_checks import either
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
+from jaxbeam.case.trajectory import AbstractPieces, Braking, Tabulated
 
 
 class AbstractLoad(eqx.Module):

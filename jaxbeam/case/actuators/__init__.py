@@ -1,11 +1,11 @@
 """Actuators, one kind a file, behind the interface in `base`."""
 
-from jaxbeam.actuators.base import AbstractActuator, Attachment, Bonded
-from jaxbeam.actuators.electrodynamic import Electrodynamic
-from jaxbeam.actuators.patch import Patch
-from jaxbeam.actuators.point import PointForce
-from jaxbeam.actuators.shaker import Shaker
-from jaxbeam.actuators.spring import SpringDamper
+from jaxbeam.case.actuators.base import AbstractActuator, Attachment, Bonded
+from jaxbeam.case.actuators.electrodynamic import Electrodynamic
+from jaxbeam.case.actuators.patch import Patch
+from jaxbeam.case.actuators.point import PointForce
+from jaxbeam.case.actuators.shaker import Shaker
+from jaxbeam.case.actuators.spring import SpringDamper
 
 KINDS = {
     "point": PointForce,

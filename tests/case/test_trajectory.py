@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 
+from jaxbeam.case.trajectory import Braking, Tabulated
 from jaxbeam.dynamics import Traffic
-from jaxbeam.motion import Braking, Tabulated
 
 LENGTH = jnp.asarray(2.0)
 KNOTS = np.array([0.0, 0.3, 0.7, 0.8, 1.5])

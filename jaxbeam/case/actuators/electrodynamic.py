@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.actuators.base import AbstractActuator, Attachment
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
+from jaxbeam.case.actuators.base import AbstractActuator, Attachment
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
 
 
 class Electrodynamic(AbstractActuator):

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.actuators import AbstractActuator
-from jaxbeam.beam import Beam, Support
-from jaxbeam.controller import AbstractController
-from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, choice, count, known, number
-from jaxbeam.loads import AbstractLoad
-from jaxbeam.sensors import Sensor
+from jaxbeam.case.actuators import AbstractActuator
+from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, count, known, number
+from jaxbeam.case.loads import AbstractLoad
+from jaxbeam.case.sensors import Sensor
 
 
 class Run(eqx.Module):

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
-from jaxbeam.fields import POSITIVE, choice, count, is_known, known, number
+from jaxbeam.case.fields import POSITIVE, choice, count, is_known, known, number
 
 
 class Filter(eqx.Module):

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import NOT_NEGATIVE, POSITIVE, number
+from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 
 
 class Measurement(eqx.Module):

@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxbeam.controller import Measurement
+from jaxbeam.case.controller import Measurement
 
 
 class Estimate(eqx.Module):

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 from numpy.testing import assert_allclose
 
-from jaxbeam.filters import (
+from jaxbeam.case.filters import (
     Filter,
     analogue,
     analogue_initial,

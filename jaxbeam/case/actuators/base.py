@@ -47,7 +47,7 @@ class Bonded(eqx.Module):
 class AbstractActuator(eqx.Module):
     """Interface of all actuators.
 
-    To add one, write a file with a subclass and name it in `jaxbeam.actuators.KINDS`.
+    To add one, write a file with a subclass and name it in `jaxbeam.case.actuators.KINDS`.
     """
 
     limits: eqx.AbstractVar[Float[Array, "2"] | None]

@@ -4,8 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, number, part
-from jaxbeam.filters import Filter
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, number, part
+from jaxbeam.case.filters import Filter
 
 QUANTITIES = {
     "deflection": "m",

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import pytest
 from hypothesis import given
 
-from jaxbeam.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
-from jaxbeam.beam import ENDS, Beam, Support
-from jaxbeam.case import Case, Run, replace
-from jaxbeam.checks import check
-from jaxbeam.loads import MovingForce, MovingMass
-from jaxbeam.sensors import Sensor
+from jaxbeam.case.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.case.beam import ENDS, Beam, Support
+from jaxbeam.case.case import Case, Run, replace
+from jaxbeam.case.loads import MovingForce, MovingMass
+from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.validation import check
 from tests.strategies import cases
 
 RIG = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}

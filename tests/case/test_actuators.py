@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
-from jaxbeam.case import addresses, replace
+from jaxbeam.case.case import addresses, replace
 from jaxbeam.modes import lay_out
 from jaxbeam.rig import rig
 

@@ -4,8 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.faults import described, suggestion
-from jaxbeam.fields import (
+from jaxbeam.case.declared_checks import described, suggestion
+from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     ON_BEAM,
     POSITIVE,

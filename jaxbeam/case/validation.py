@@ -12,14 +12,14 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from jaxbeam.actuators import AbstractActuator
-from jaxbeam.beam import Beam, Support
-from jaxbeam.case import Case, Run
-from jaxbeam.controller import AbstractController
-from jaxbeam.faults import ROUNDING, check_fields, check_on_beam, in_words
-from jaxbeam.fields import ON_BEAM, is_known, known
-from jaxbeam.loads import AbstractLoad
-from jaxbeam.sensors import Sensor
+from jaxbeam.case.actuators import AbstractActuator
+from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.case import Case, Run
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.declared_checks import ROUNDING, check_fields, check_on_beam, in_words
+from jaxbeam.case.fields import ON_BEAM, is_known, known
+from jaxbeam.case.loads import AbstractLoad
+from jaxbeam.case.sensors import Sensor
 
 # Parts that say themselves what belongs together within them.
 OUTSPOKEN = Beam | AbstractActuator | Sensor | AbstractLoad

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.actuators.base import AbstractActuator, Attachment, Bonded
-from jaxbeam.faults import described
-from jaxbeam.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, is_known, known, number
+from jaxbeam.case.actuators.base import AbstractActuator, Attachment, Bonded
+from jaxbeam.case.declared_checks import described
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, is_known, known, number
 
 # What the moment per volt follows from, where it is not given itself.
 MATERIAL = ("d33", "modulus", "electrode_spacing", "beam_height", "patch_height", "patch_width")

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.fields import (
+from jaxbeam.case.fields import (
     INCREASING,
     NOT_NEGATIVE,
     ON_BEAM,

@@ -1,0 +1,1 @@
+"""What a user describes: beam, loads, actuators, sensors, controller and estimator interfaces."""
