@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, assemble, section, supported
 from jaxbeam.piecewise import piecewise
+from jaxbeam.runtime.compiling import compiled
 
 SOFTEST = 1e-10  # stiffness against rigid-body motion in E I / L^3: less is an unstable beam
 

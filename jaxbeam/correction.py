@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.record import Record
 from jaxbeam.rig import rig
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.static import influence_line, static_lift
 
 

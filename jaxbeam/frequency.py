@@ -22,10 +22,10 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import is_known, known
 from jaxbeam.case.validation import check
-from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.ports import Pair, check_pairs, column, common_pairs, row
 from jaxbeam.rig import Rig, rig, rig_in_one
+from jaxbeam.runtime.compiling import compiled
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

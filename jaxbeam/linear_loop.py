@@ -17,9 +17,9 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
-from jaxbeam.compiling import compiled
 from jaxbeam.modes import lay_out
 from jaxbeam.open_loop import ROUNDING, Clock, OpenLoop, open_loop
+from jaxbeam.runtime.compiling import compiled
 
 SETTLING = 8  # steps of Newton's method towards the state about which a law is made linear
 NEAR = 1e-10  # to an eigenvalue, relative: where inverse iteration is centred

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from jaxbeam import flows, gain_pieces
 from jaxbeam.coupled import Answers, Coupling, Plant, flows_of_kind
 from jaxbeam.gain_table import AT_ENDS, hermite
-from jaxbeam.native_library import Library
+from jaxbeam.runtime.native_library import Library
 from jaxbeam.small import each_lane, in_lanes, lanes_of
 from jaxbeam.stretches import Commands
 

@@ -17,9 +17,9 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.trajectory import NEVER, AbstractMotion
-from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout
 from jaxbeam.rig import rig_in_one
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.sensed import sensed
 from jaxbeam.sensing import design, init, read
 from jaxbeam.statespace import LoadedBeam, loaded_beam

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import chebyshev, legendre
 
-from jaxbeam.compiling import compiled
+from jaxbeam.runtime.compiling import compiled
 
 
 @compiled  # many small operations, which one by one would take seconds to compile

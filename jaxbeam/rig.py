@@ -15,8 +15,8 @@ from jax.scipy.linalg import block_diag, solve_triangular
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.compiling import compiled
 from jaxbeam.modes import Layout, Modes, lay_out, modes
+from jaxbeam.runtime.compiling import compiled
 
 
 class Rig(eqx.Module):

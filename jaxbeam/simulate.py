@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import is_known, known
-from jaxbeam.compiling import compiled
 from jaxbeam.driver import AbstractDriver
 from jaxbeam.dynamics import Traffic, at_instant, traffic
 from jaxbeam.exponentials import NODES, at_ends
@@ -23,6 +22,7 @@ from jaxbeam.measuring import measure
 from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
 from jaxbeam.record import Record
 from jaxbeam.rig import Rig, rig
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.schedule import sampled
 from jaxbeam.tables import Rigging, make_rigging
 

@@ -13,10 +13,10 @@ from jaxbeam.case.fields import is_known
 from jaxbeam.case.loads import motion
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check
-from jaxbeam.compiling import compiled
 from jaxbeam.compliance import check_held, compliance
 from jaxbeam.modes import Layout, lay_out
 from jaxbeam.peaks import refine
+from jaxbeam.runtime.compiling import compiled
 
 # On a stretch of a crossing: a cubic of a cubic is known exactly by ten.
 POINTS = tuple(float(share) for share in np.linspace(0, 1, 10))

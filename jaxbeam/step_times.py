@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import AbstractController, Measurement
 from jaxbeam.case.fields import known
-from jaxbeam.compiling import compiled
 from jaxbeam.record import Record
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.statespace import state_space
 
 TIMED = 60  # steps of a run that are timed, evenly spread over it

@@ -16,7 +16,7 @@ os.environ["MPLBACKEND"] = "Agg"
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 # Test processes share the cores: threads for small matrices would wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Most of the time of the tests is compiling: as `jaxbeam.compiling` does for the library itself,
+# Most of the time of the tests is compiling: as `jaxbeam.runtime.compiling` does for the library itself,
 # and without the optimisations that small cases do not repay.
 os.environ["XLA_FLAGS"] = " ".join(
     [
@@ -77,7 +77,7 @@ def _close_figures():
 def _forget_compiled():
     """Drop what a file compiled: kept for all files it would take several gigabytes."""
     yield
-    if "jaxbeam.compiling" in sys.modules:
-        sys.modules["jaxbeam.compiling"].forget()
+    if "jaxbeam.runtime.compiling" in sys.modules:
+        sys.modules["jaxbeam.runtime.compiling"].forget()
     elif "jax" in sys.modules:
         sys.modules["jax"].clear_caches()

@@ -10,11 +10,11 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.case.__init__  jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.case.fields  jaxbeam.holds
-jaxbeam.kept_programs  jaxbeam.small
-jaxbeam.compiling
+jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.case.fields  jaxbeam.holds
+jaxbeam.runtime.compile_cache  jaxbeam.small
+jaxbeam.runtime.compiling
 jaxbeam.case.declared_checks  jaxbeam.piecewise  jaxbeam.stretches
-jaxbeam.flows  jaxbeam.native_library
+jaxbeam.flows  jaxbeam.runtime.native_library
 jaxbeam.coupled
 jaxbeam.case.beam  jaxbeam.case.filters  jaxbeam.case.trajectory  jaxbeam.case.actuators  jaxbeam.case.controller
 jaxbeam.case.estimator  jaxbeam.case.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.case.sensors

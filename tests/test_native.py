@@ -18,7 +18,7 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam import native, native_designs, native_library, peaks
+from jaxbeam import native, native_designs, peaks
 from jaxbeam.case.case import replace
 from jaxbeam.cli import main
 from jaxbeam.dynamics import traffic
@@ -28,6 +28,7 @@ from jaxbeam.integrate import march
 from jaxbeam.order import make_order
 from jaxbeam.plan import form
 from jaxbeam.rig import rig
+from jaxbeam.runtime import native_library
 from jaxbeam.sweep_store import FINGERPRINT
 from jaxbeam.tables import make_rigging
 

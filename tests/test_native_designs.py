@@ -12,11 +12,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam import native_library
 from jaxbeam.control import FiniteLQR
 from jaxbeam.control.lqr import optimal
 from jaxbeam.modes import lay_out
 from jaxbeam.native_designs import LIBRARY, lacking
+from jaxbeam.runtime import native_library
 from tests.differences import central
 from tests.modules import ROOT
 

@@ -184,7 +184,7 @@ def test_nothing_is_unpickled(copy, tmp_path):
 RUN = {"eval", "exec", "compile", "__import__"}
 UNPICKLE = {"pickle", "cloudpickle", "marshal", "shelve", "dill", "joblib"}
 # What reads machine code anyway, as JAX does: from the user's cache folder, nowhere else.
-COMPILED = "jaxbeam.kept_programs"
+COMPILED = "jaxbeam.runtime.compile_cache"
 
 
 def test_no_module_runs_what_it_reads():

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.compiling import compiled
 from jaxbeam.control.bound import HELD, least_achievable
 from jaxbeam.dynamics import traffic
 from jaxbeam.plan import Plan, make_plan, sample_times
 from jaxbeam.record import Record
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import Histories, histories, simulate
 from tuning.believing import believing
 from tuning.load_cases import PLANT, Values, apply

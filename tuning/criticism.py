@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
-from jaxbeam.compiling import compiled
+from jaxbeam.runtime.compiling import compiled
 from tuning.campaign import prepare
 from tuning.logs import Log
 from tuning.uncertainty import colour

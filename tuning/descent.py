@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from jaxbeam.compiling import compiled
+from jaxbeam.runtime.compiling import compiled
 from tuning.bench import Bench
 from tuning.checkpoint import load, save
 from tuning.free import Free

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
-from jaxbeam.compiling import compiled
 from jaxbeam.plan import Plan, make_plan, sample_times
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import readings
 from tuning.free import unit_at
 

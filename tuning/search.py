@@ -12,7 +12,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Bool, Float
 
-from jaxbeam.compiling import compiled, options
+from jaxbeam.runtime.compiling import compiled, options
 from tuning.free import Free
 from tuning.loss import check_loss, shaped, widening
 from tuning.uncertainty import Uncertainty, colour, uncertainty

@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.casefile import case_to_dict
-from jaxbeam.compiling import compiled
 from jaxbeam.record import Record
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import ContactLossWarning, Histories
 from tuning.bench import Bench, make_bench
 from tuning.checkpoint import fingerprint

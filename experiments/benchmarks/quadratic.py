@@ -31,9 +31,9 @@ import scipy.sparse
 import jaxbeam as jb
 from experiments.benchmarks.steps import PREDICTIVE, rig
 from experiments.benchmarks.timing import time_call
-from jaxbeam.compiling import compiled
 from jaxbeam.control import SamplingWarning
 from jaxbeam.control.qp import solve_qp
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import ContactLossWarning
 from jaxbeam.statespace import state_space
 

@@ -24,11 +24,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam import native_designs, native_library
-from jaxbeam.compiling import options
+from jaxbeam import native_designs
 from jaxbeam.control.lqr import optimal
 from jaxbeam.modes import lay_out
 from jaxbeam.riccati import lqr
+from jaxbeam.runtime import native_library
+from jaxbeam.runtime.compiling import options
 
 MANY, REPEATS, BATCH = 4096, 3, 16  # BATCH also is how many values a number has in the grid
 THREADS = os.cpu_count() or 1

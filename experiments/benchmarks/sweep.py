@@ -27,9 +27,10 @@ import jaxbeam as jb
 from experiments.benchmarks import baselines, by_numba
 from experiments.benchmarks.crossing import Rig
 from experiments.benchmarks.timing import Timing, best_in_turn, time_call
-from jaxbeam import native, native_library
-from jaxbeam.compiling import compiled
+from jaxbeam import native
 from jaxbeam.plan import make_plan
+from jaxbeam.runtime import native_library
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import readings
 
 MASSES = np.linspace(0.1, 1.0, 64)

@@ -24,7 +24,7 @@ import tuning
 from experiments.tuned_search import ENTRY, GATES, LEAD, LIMITS, PERIOD, STARTS
 from jaxbeam import rigs
 from jaxbeam.case.case import value_at
-from jaxbeam.compiling import compiled
+from jaxbeam.runtime.compiling import compiled
 from tuning.bench import make_bench
 from tuning.methods import METHODS
 

@@ -85,7 +85,7 @@ def _keep_compiled() -> None:
     """
     import jax
 
-    from jaxbeam.kept_programs import cache_folder
+    from jaxbeam.runtime.compile_cache import cache_folder
 
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))

@@ -23,13 +23,13 @@ from numpy.typing import ArrayLike
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check
-from jaxbeam.compiling import compiled
 from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.reach import TOLERANCE, reach
 from jaxbeam.plan import form, run_extremes, suitable_step
 from jaxbeam.ports import takes_commands
 from jaxbeam.record import Record
+from jaxbeam.runtime.compiling import compiled
 
 HELD = 0.01  # s: over which commands are held, where no controller says
 

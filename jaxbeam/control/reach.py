@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.compiling import compiled
 from jaxbeam.driver import AbstractDriver
 from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.exponentials import NODES
@@ -22,6 +21,7 @@ from jaxbeam.grid import scheduled_grid
 from jaxbeam.integrate import trace
 from jaxbeam.plan import Form, form, suitable_step
 from jaxbeam.rig import rig
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.schedule import Schedule, merged
 from jaxbeam.tables import make_rigging
 

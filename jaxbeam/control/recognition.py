@@ -14,12 +14,12 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.fields import POSITIVE, is_known, known, number
-from jaxbeam.compiling import compiled
 from jaxbeam.control.following import Follower
 from jaxbeam.control.listening import Listener
 from jaxbeam.estimation.fixed import offsets
 from jaxbeam.estimation.observability import deflections
 from jaxbeam.modes import lay_out
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.statespace import LoadedBeam, state_space
 
 PLACES = 201  # at which influence lines are kept

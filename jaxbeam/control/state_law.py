@@ -11,11 +11,11 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
 from jaxbeam.case.fields import choice, is_known, known, part
 from jaxbeam.case.loads import motion
-from jaxbeam.compiling import compiled
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.estimation import KINDS
 from jaxbeam.estimation.flowing import Flowing
 from jaxbeam.modes import lay_out
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.statespace import LoadedBeam, StateSpace, loaded_beam, state_space
 
 

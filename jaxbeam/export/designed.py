@@ -7,7 +7,6 @@ import numpy as np
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
-from jaxbeam.compiling import compiled
 from jaxbeam.control import DiscreteLQR, StateFeedback
 from jaxbeam.control.gains import Schedule
 from jaxbeam.control.lqr import LQR, AbstractScheduledRegulator
@@ -15,6 +14,7 @@ from jaxbeam.control.scheduled import Family, ScheduledLQR
 from jaxbeam.estimation import Observer
 from jaxbeam.export.gains import Gains
 from jaxbeam.modes import lay_out
+from jaxbeam.runtime.compiling import compiled
 from jaxbeam.sensing import design
 from jaxbeam.statespace import state_space
 

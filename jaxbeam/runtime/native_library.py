@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import jax
 
-from jaxbeam.kept_programs import cache_folder, machine
+from jaxbeam.runtime.compile_cache import cache_folder, machine
 
-HERE = pathlib.Path(__file__).parent
+HERE = pathlib.Path(__file__).parent / "native"
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC")
 
 

@@ -182,7 +182,7 @@ def _surroundings() -> bytes:
     marks = [machine(), jax.default_backend(), os.environ.get("XLA_FLAGS", ""), sys.version]
     marks += map(_version, BENEATH)
     found = hashlib.sha256("\n".join(marks).encode())
-    home = pathlib.Path(__file__).parents[1]
+    home = pathlib.Path(__file__).parents[2]
     for path in sorted(path for package in OURS for path in (home / package).rglob("*")):
         if path.suffix in (".py", ".c", ".h"):
             found.update(str(path.relative_to(home)).encode() + path.read_bytes())

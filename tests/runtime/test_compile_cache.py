@@ -15,8 +15,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam import compiling, kept_programs
-from jaxbeam.compiling import compiled, compiled_with
+from jaxbeam.runtime import compile_cache, compiling
+from jaxbeam.runtime.compiling import compiled, compiled_with
 from tests.modules import ROOT
 
 POINTS = np.array([[2.0, 0.5], [0.5, 3.0]])
@@ -60,8 +60,8 @@ def first_of(pair: Pair):
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """A cache folder of its own; functions of this file are trusted not to change."""
-    monkeypatch.setattr(kept_programs, "OURS", ("jaxbeam", "tuning", "tests"))
-    monkeypatch.setattr(kept_programs, "SAFE", {*kept_programs.SAFE, "tests"})
+    monkeypatch.setattr(compile_cache, "OURS", ("jaxbeam", "tuning", "tests"))
+    monkeypatch.setattr(compile_cache, "SAFE", {*compile_cache.SAFE, "tests"})
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     again()
@@ -73,7 +73,7 @@ def folder(tmp_path, monkeypatch):
 def again():
     """Forget all, as the next process would not know it."""
     compiling.forget()
-    kept_programs._surroundings.cache_clear()
+    compile_cache._surroundings.cache_clear()
     TRACED.clear()
 
 
@@ -155,12 +155,12 @@ def changed_setting(patch):
 
 
 def changed_source(patch):
-    before = kept_programs._surroundings()
-    patch.setattr(kept_programs, "_surroundings", lambda: before + b"changed")
+    before = compile_cache._surroundings()
+    patch.setattr(compile_cache, "_surroundings", lambda: before + b"changed")
 
 
 def changed_machine(patch):
-    patch.setattr(kept_programs, "machine", lambda: "another")
+    patch.setattr(compile_cache, "machine", lambda: "another")
 
 
 def changed_flags(patch):
@@ -184,15 +184,15 @@ def test_what_else_decides_a_program_is_part_of_its_place(folder, change, monkey
 
 
 def test_a_changed_source_is_noticed(folder, tmp_path, monkeypatch):
-    before = kept_programs._surroundings()
+    before = compile_cache._surroundings()
     home = tmp_path / "jaxbeam"
     home.mkdir()
-    monkeypatch.setattr(kept_programs, "__file__", str(home / "kept_programs.py"))
+    monkeypatch.setattr(compile_cache, "__file__", str(home / "kept_programs.py"))
     marks = [before]
     for text in ("a = 1\n", "a = 2\n"):
         (home / "modes.py").write_text(text)
-        kept_programs._surroundings.cache_clear()
-        marks.append(kept_programs._surroundings())
+        compile_cache._surroundings.cache_clear()
+        marks.append(compile_cache._surroundings())
     assert len(set(marks)) == 3
 
 
@@ -213,21 +213,21 @@ def test_versions_of_all_that_compiles_are_part_of_the_place(monkeypatch):
     for name in declared & {one.name.lower() for one in importlib.metadata.distributions()}:
         needs = importlib.metadata.requires(name) or []
         if any(re.match(r"jax(lib)?\b(?!.*extra ==)", one) for one in needs):
-            assert name in kept_programs.BENEATH
-    before, version = kept_programs._surroundings(), importlib.metadata.version
+            assert name in compile_cache.BENEATH
+    before, version = compile_cache._surroundings(), importlib.metadata.version
     for changed in ("diffrax", "jaxlib"):
-        kept_programs._surroundings.cache_clear()
+        compile_cache._surroundings.cache_clear()
 
         def newer(name, changed=changed):
             return "99" if name == changed else version(name)
 
         with monkeypatch.context() as patch:
             patch.setattr(importlib.metadata, "version", newer)
-            assert kept_programs._surroundings() != before
+            assert compile_cache._surroundings() != before
 
 
 def test_what_depends_on_code_of_others_is_not_kept(folder, monkeypatch):
-    monkeypatch.setattr(kept_programs, "SAFE", {"jaxbeam", "jax", "jaxlib", "numpy"})
+    monkeypatch.setattr(compile_cache, "SAFE", {"jaxbeam", "jax", "jaxlib", "numpy"})
     for constant in (Outsider(), CONSTANT, changed_flags):
         for _ in range(2):
             assert called(doubled, POINTS, constant)[1] == 1
@@ -235,7 +235,7 @@ def test_what_depends_on_code_of_others_is_not_kept(folder, monkeypatch):
     for _ in range(2):
         assert called(first_of, Pair(POINTS, "a class of others"))[1] == 1
         again()
-    monkeypatch.setattr(kept_programs, "OURS", ("jaxbeam", "tuning"))
+    monkeypatch.setattr(compile_cache, "OURS", ("jaxbeam", "tuning"))
     assert called(roughly, POINTS)[1] == 1
     assert not kept(folder)
 
@@ -267,7 +267,7 @@ def test_what_cannot_be_loaded_is_compiled_again(folder, monkeypatch):
     def fail(*_):
         raise jax.errors.JaxRuntimeError("made for another machine after all")
 
-    monkeypatch.setattr(kept_programs, "load", fail)
+    monkeypatch.setattr(compile_cache, "load", fail)
     found, traced = called(roughly, POINTS)
     assert_allclose(found, 2 * POINTS, rtol=0)
     assert traced == 1
@@ -288,7 +288,7 @@ import sys
 import numpy as np
 import jaxbeam as jb
 from jaxbeam import compiling, native, native_library
-from tests.test_kept_programs import CASES, OVER
+from tests.runtime.test_compile_cache import CASES, OVER
 
 compiled = []
 compile = compiling.Compiled._compile

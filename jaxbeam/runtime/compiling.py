@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam import kept_programs
+from jaxbeam.runtime import compile_cache
 
 # XLA's newer code generator for CPUs takes twice as long to compile the programs here, and its
 # last level of optimisation a third longer; they run no faster for the one, 3 % for the other. In
@@ -76,7 +76,7 @@ class Compiled(Generic[P, R]):
         arrays, *rest = _apart((args, kwargs))
         if _tracing(arrays):
             arrays, kept = self._plain(arrays, tuple(rest))
-        elif kept_programs.folder() and (state := self._state(arrays, rest)).place:
+        elif compile_cache.folder() and (state := self._state(arrays, rest)).place:
             self._prepared(state, arrays, rest)()
             arrays, kept = state.program(arrays)
         else:
@@ -102,7 +102,7 @@ class Compiled(Generic[P, R]):
 
         def restore():
             try:
-                state.program = kept_programs.load(state.code, (arrays,), state.returns)
+                state.program = compile_cache.load(state.code, (arrays,), state.returns)
                 state.compiled = True
             except jax.errors.JaxRuntimeError:
                 self._compile(state, state.quick.lower(arrays, tuple(rest)))
@@ -112,7 +112,7 @@ class Compiled(Generic[P, R]):
     def _compile(self, state, lowered):
         program = lowered.compile()
         if state.place is not None:
-            kept_programs.write(state.place, program, lowered.out_info)
+            compile_cache.write(state.place, program, lowered.out_info)
             state.program = program
         state.compiled = True
 
@@ -152,8 +152,8 @@ class _State:
 @functools.cache
 def _state_of(function: Compiled, identity: tuple) -> _State:
     """What is known of a function for some arguments; JAX takes a hundred times as long to tell."""
-    place = kept_programs.place(function, identity)
-    kept = None if place is None else kept_programs.read(place)
+    place = compile_cache.place(function, identity)
+    kept = None if place is None else compile_cache.read(place)
     return _State(function, place, *(kept or (b"", None)))
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam import compiling
-from jaxbeam.compiling import compiled
+from jaxbeam.runtime import compiling
+from jaxbeam.runtime.compiling import compiled
 
 POINTS = np.array([0.1, 0.7, 2.0])
 

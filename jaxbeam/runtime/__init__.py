@@ -1,0 +1,1 @@
+"""Compiling, its cache, the optional C."""
