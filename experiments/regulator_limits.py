@@ -15,8 +15,8 @@ import jaxbeam as jb
 from experiments import published
 from experiments.verdicts import Finding, finding
 from jaxbeam.limits import limit
+from jaxbeam.numerics.riccati import dlqr, stein
 from jaxbeam.plot.poles import plot_poles
-from jaxbeam.riccati import dlqr, stein
 from jaxbeam.stability import frozen_poles, growth
 
 EFFORT = 9e-8  # R of the example in 5.1

@@ -12,7 +12,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from jaxbeam.dynamics import solve_contact
-from jaxbeam.small import FEW, product, solve_small
+from jaxbeam.numerics.batched_linalg import FEW, product, solve_small
 from jaxbeam.tables import Tables
 
 KEPT = "steps"  # states and forces in rows of steps, which reverse mode need not work out again

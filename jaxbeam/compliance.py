@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.modes import Layout, assemble, section, supported
-from jaxbeam.piecewise import piecewise
+from jaxbeam.numerics.piecewise import piecewise
 from jaxbeam.runtime.compiling import compiled
 
 SOFTEST = 1e-10  # stiffness against rigid-body motion in E I / L^3: less is an unstable beam

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads import motion
 from jaxbeam.case.trajectory import AbstractMotion
+from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.rig import Rig
-from jaxbeam.small import solve_small
 
 
 class Traffic(eqx.Module):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.exponentials import GAUSS, LOOKED
-from jaxbeam.peaks import highest, refine, vertex
+from jaxbeam.numerics.peak_search import highest, refine, vertex
 from jaxbeam.tables import Path, Tables
 
 NEAR = 1.1  # a peak between samples is less than this above the highest of them

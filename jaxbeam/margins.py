@@ -13,8 +13,8 @@ import scipy
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import known
-from jaxbeam.holds import balance
 from jaxbeam.linear_loop import LinearLoop
+from jaxbeam.numerics.discretisation import balance
 from jaxbeam.statespace import StateSpace
 
 POINTS = 400  # frequencies around each pole

@@ -21,8 +21,8 @@ from numpy.polynomial import legendre
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
-from jaxbeam.eigen import SAME_EIGENVALUE, eigen
-from jaxbeam.piecewise import piecewise, to_chebyshev
+from jaxbeam.numerics.eigen import SAME_EIGENVALUE, eigen
+from jaxbeam.numerics.piecewise import piecewise, to_chebyshev
 
 SAME_PLACE = 1e-9  # of the length: closer nodes are one node
 HELD = {  # deflection, rotation

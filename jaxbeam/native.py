@@ -22,7 +22,7 @@ from jaxbeam.exponentials import DOUBLINGS, GAUSS, LOOKED, NODES, TERMS, lagrang
 from jaxbeam.extremes import NEAR, Found
 from jaxbeam.grid import Grid
 from jaxbeam.integrate import march as plain_march
-from jaxbeam.peaks import CLIMBS, ROUNDINGS, STARTS, VERTEX_ROUNDS, reach, through
+from jaxbeam.numerics.peak_search import CLIMBS, ROUNDINGS, STARTS, VERTEX_ROUNDS, reach, through
 from jaxbeam.rig import Rig
 from jaxbeam.runtime.native_library import Library
 from jaxbeam.tables import CHUNK, make_rigging

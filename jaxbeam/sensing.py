@@ -18,7 +18,7 @@ from jaxbeam.case.filters import Filter, analogue, analogue_initial, filter_hist
 from jaxbeam.case.filters import initial as filter_initial
 from jaxbeam.case.filters import sections as filter_sections
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.holds import cubics, evaluate, hold
+from jaxbeam.numerics.discretisation import cubics, evaluate, hold
 
 ROUNDING = 1e-6  # of a period: a sample this much before a tick of the clock is at the tick
 

@@ -15,7 +15,7 @@ from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check
 from jaxbeam.compliance import check_held, compliance
 from jaxbeam.modes import Layout, lay_out
-from jaxbeam.peaks import refine
+from jaxbeam.numerics.peak_search import refine
 from jaxbeam.runtime.compiling import compiled
 
 # On a stretch of a crossing: a cubic of a cubic is known exactly by ten.

@@ -10,22 +10,22 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.document  jaxbeam.driver  jaxbeam.eigen  jaxbeam.case.fields  jaxbeam.holds
-jaxbeam.runtime.compile_cache  jaxbeam.small
+jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.document  jaxbeam.driver  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
+jaxbeam.runtime.compile_cache  jaxbeam.numerics.batched_linalg
 jaxbeam.runtime.compiling
-jaxbeam.case.declared_checks  jaxbeam.piecewise  jaxbeam.stretches
-jaxbeam.flows  jaxbeam.runtime.native_library
-jaxbeam.coupled
+jaxbeam.case.declared_checks  jaxbeam.numerics.piecewise  jaxbeam.numerics.intervals
+jaxbeam.numerics.stages  jaxbeam.runtime.native_library
+jaxbeam.numerics.coupled_stages
 jaxbeam.case.beam  jaxbeam.case.filters  jaxbeam.case.trajectory  jaxbeam.case.actuators  jaxbeam.case.controller
-jaxbeam.case.estimator  jaxbeam.case.loads  jaxbeam.riccati  jaxbeam.schedule  jaxbeam.case.sensors
-jaxbeam.case.case  jaxbeam.gain_table  jaxbeam.sensing
-jaxbeam.gain_pieces
-jaxbeam.native_designs
-jaxbeam.finite_time
+jaxbeam.case.estimator  jaxbeam.case.loads  jaxbeam.numerics.riccati  jaxbeam.schedule  jaxbeam.case.sensors
+jaxbeam.case.case  jaxbeam.numerics.gain_table  jaxbeam.sensing
+jaxbeam.numerics.gain_polynomials
+jaxbeam.numerics.native_designs
+jaxbeam.numerics.finite_horizon
 jaxbeam.case.validation
 jaxbeam.modes
 jaxbeam.measuring  jaxbeam.rig
-jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.peaks  jaxbeam.ports  jaxbeam.sine_basis
+jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.numerics.peak_search  jaxbeam.ports  jaxbeam.sine_basis
 jaxbeam.frequency  jaxbeam.grid
 jaxbeam.dynamics
 jaxbeam.reference  jaxbeam.statespace  jaxbeam.static  jaxbeam.tables

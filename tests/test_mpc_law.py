@@ -14,7 +14,7 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control.prediction import incremental
-from jaxbeam.riccati import dlqr
+from jaxbeam.numerics.riccati import dlqr
 from tests.test_mpc import PATCH, PERIOD, mpc, rig
 
 

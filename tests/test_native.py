@@ -18,13 +18,14 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam import native, native_designs, peaks
+from jaxbeam import native
 from jaxbeam.case.case import replace
 from jaxbeam.cli import main
 from jaxbeam.dynamics import traffic
 from jaxbeam.exponentials import LOOKED
 from jaxbeam.grid import even_grid
 from jaxbeam.integrate import march
+from jaxbeam.numerics import native_designs, peak_search
 from jaxbeam.order import make_order
 from jaxbeam.plan import form
 from jaxbeam.rig import rig
@@ -178,7 +179,7 @@ def marched(case, by_hand, longest=1e-3):
         of_one = jax.tree.map(lambda leaf: leaf[None], given)
         return native.march(known.slots, *of_one).peak_deflection[0, 0]
 
-    return jax.jit(peaks)
+    return jax.jit(peak_search)
 
 
 @pytest.mark.parametrize("case", [PLAIN, COUPLED], ids=["plain", "coupled"])
@@ -300,6 +301,6 @@ def test_places_of_peaks_are_as_high_as_those_found_without_it(tmp_path):
     seek = ctypes.CDLL(str(tmp_path / "seek.so")).seek
     seek.argtypes = [pointer, pointer, pointer, ctypes.c_int]
     heights = np.empty(curves.shape[1])
-    through = np.ascontiguousarray(peaks.through(LOOKED)[: len(LOOKED)].T)
+    through = np.ascontiguousarray(peak_search.through(LOOKED)[: len(LOOKED)].T)
     seek(curves, through, heights, heights.size)
-    assert_allclose(heights, peaks.refine(jnp.asarray(curves), LOOKED)[0], rtol=1e-11)
+    assert_allclose(heights, peak_search.refine(jnp.asarray(curves), LOOKED)[0], rtol=1e-11)

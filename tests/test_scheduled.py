@@ -15,8 +15,8 @@ from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control import FiniteLQR, ScheduledLQR
 from jaxbeam.control.gains import Schedule
-from jaxbeam.gain_table import GainTable
 from jaxbeam.modes import lay_out
+from jaxbeam.numerics.gain_table import GainTable
 from jaxbeam.static import influence_line, static_lift
 
 WEIGHTS = {

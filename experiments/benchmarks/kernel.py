@@ -24,8 +24,8 @@ from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, rig, sweep_p
 from experiments.benchmarks.timing import best_in_turn
 from jaxbeam import programs
 from jaxbeam.exponentials import GAUSS, LOOKED
+from jaxbeam.numerics.peak_search import reach, through
 from jaxbeam.order import make_order
-from jaxbeam.peaks import reach, through
 
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", "-lm")
 Library = Callable[..., None]

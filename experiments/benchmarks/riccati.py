@@ -4,7 +4,7 @@
 
 The one-span rig with a point force, crossed by a mass. A design is the table of gains along the
 whole crossing; how right it is, between the edges of the table too, was found for 7 modes by
-scipy's DOP853 (`tests/test_finite_time.py`). Designs are those of a grid, as many masses as speeds
+scipy's DOP853 (`tests/numerics/test_finite_horizon.py`). Designs are those of a grid, as many masses as speeds
 as weights of the force, so that they share what depends on the speed or the mass alone; or all
 numbers of each are its own. They are worked out in batches, by a thread for each core. Some are
 timed, and scaled to 4096; compiling is told apart. Where there is a C compiler, finite-time designs
@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam import native_designs
 from jaxbeam.control.lqr import optimal
 from jaxbeam.modes import lay_out
-from jaxbeam.riccati import lqr
+from jaxbeam.numerics import native_designs
+from jaxbeam.numerics.riccati import lqr
 from jaxbeam.runtime import native_library
 from jaxbeam.runtime.compiling import options
 

@@ -16,7 +16,7 @@ def native(*, remove: bool = False, json_: Json = False) -> None:
         Remove what was compiled; sweeps do without again.
     """
     from jaxbeam import native as compiled
-    from jaxbeam import native_designs as designs
+    from jaxbeam.numerics import native_designs as designs
 
     path = compiled.binary()
     if remove:

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.coupled import Coupling, Plant
 from jaxbeam.dynamics import contact_rows
-from jaxbeam.finite_time import Changes
+from jaxbeam.numerics.coupled_stages import Coupling, Plant
+from jaxbeam.numerics.finite_horizon import Changes
 from jaxbeam.statespace import LoadedBeam
 
 

@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 from jaxbeam.case.fields import NOT_NEGATIVE, is_known, known, number
 from jaxbeam.control.lqr import AbstractRegulator
 from jaxbeam.estimation.sampled import ticks, whole_and_sum
-from jaxbeam.holds import balance
-from jaxbeam.riccati import dlqr
-from jaxbeam.stretches import Commands, Inputs, Square, symmetric
+from jaxbeam.numerics.discretisation import balance
+from jaxbeam.numerics.intervals import Commands, Inputs, Square, symmetric
+from jaxbeam.numerics.riccati import dlqr
 
 # With the command before among the states.
 Both = Float[Array, "both both"]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.gain_table import GainTable
+from jaxbeam.numerics.gain_table import GainTable
 from jaxbeam.statespace import LoadedBeam
 
 

@@ -33,7 +33,7 @@ from jaxbeam.control.prediction import (
 )
 from jaxbeam.control.qp import METHODS, solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.riccati import dare
+from jaxbeam.numerics.riccati import dare
 from jaxbeam.statespace import LoadedBeam
 
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.holds import hold
+from jaxbeam.numerics.discretisation import hold
 
 
 class Sampled(NamedTuple):

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.holds import balance
-from jaxbeam.riccati import care, dare
+from jaxbeam.numerics.discretisation import balance
+from jaxbeam.numerics.riccati import care, dare
 
 Square = Float[Array, "state state"]
 Rows = Float[Array, "output state"]

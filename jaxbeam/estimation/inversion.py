@@ -20,7 +20,7 @@ from jaxbeam.estimation.observability import (
     deflections,
 )
 from jaxbeam.estimation.sampled import Transition, ticks
-from jaxbeam.holds import balance
+from jaxbeam.numerics.discretisation import balance
 
 WORST = 100.0  # conditioning beyond which there is a warning
 

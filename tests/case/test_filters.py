@@ -16,7 +16,7 @@ from jaxbeam.case.filters import (
     initial,
     sections,
 )
-from jaxbeam.holds import hold
+from jaxbeam.numerics.discretisation import hold
 from tests.differences import central
 
 ORDERS = [1, 2, 3, 5, 10]

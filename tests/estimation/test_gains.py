@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from jaxbeam.estimation import kalman_gain, placed_gain, sampled_kalman_gain
 from jaxbeam.estimation.sampled import Ticks
-from jaxbeam.holds import balance
+from jaxbeam.numerics.discretisation import balance
 from tests.differences import central
 
 FREQUENCIES = np.array([128.0, 512.0, 1153.0])

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import is_known, known
-from jaxbeam.holds import balance
-from jaxbeam.stretches import Commands, Inputs, Square, Stretch, even_units, symmetric
+from jaxbeam.numerics.discretisation import balance
+from jaxbeam.numerics.intervals import Commands, Inputs, Square, Stretch, even_units, symmetric
 
 Gain = tuple[Float[Array, "input state"], Square]
 

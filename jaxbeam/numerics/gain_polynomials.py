@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.coupled import Plant
-from jaxbeam.gain_table import from_nodes, polynomials
-from jaxbeam.small import joined, times, turned
+from jaxbeam.numerics.batched_linalg import joined, times, turned
+from jaxbeam.numerics.coupled_stages import Plant
+from jaxbeam.numerics.gain_table import from_nodes, polynomials
 
 
 def pieces(

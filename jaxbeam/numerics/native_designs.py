@@ -11,18 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbeam import flows, gain_pieces
-from jaxbeam.coupled import Answers, Coupling, Plant, flows_of_kind
-from jaxbeam.gain_table import AT_ENDS, hermite
+from jaxbeam.numerics import gain_polynomials, stages
+from jaxbeam.numerics.batched_linalg import each_lane, in_lanes, lanes_of
+from jaxbeam.numerics.coupled_stages import Answers, Coupling, Plant, flows_of_kind
+from jaxbeam.numerics.gain_table import AT_ENDS, hermite
+from jaxbeam.numerics.intervals import Commands
 from jaxbeam.runtime.native_library import Library
-from jaxbeam.small import each_lane, in_lanes, lanes_of
-from jaxbeam.stretches import Commands
 
 LIBRARY = Library(
     name="designs",
     sources=("native_carried.c", "native_flows.c", "native_pieces.c"),
     headers=("native_matrices.h", "native_lanes.h"),
-    constants=(("NODES", flows.STAGES),),
+    constants=(("NODES", stages.STAGES),),
     targets=("carried", "coupled", "pieces"),
 )
 
@@ -58,19 +58,19 @@ def coupled(
     coupling: Coupling,
     R: Commands,
     length: Float[Array, ""],
-) -> flows.Flow:
+) -> stages.Flow:
     """As `coupled.flows_of_kind`."""
-    return flows.Flow(*in_lanes(_coupled, plant, every, kind, coupling, R, length))
+    return stages.Flow(*in_lanes(_coupled, plant, every, kind, coupling, R, length))
 
 
 @jax.custom_jvp
 def _coupled(plant, every, kind, coupling, R, length):
     """The parts of flows, in lanes."""
-    effort = each_lane(flows.on_commands, R, length)
+    effort = each_lane(stages.on_commands, R, length)
     first, changing = (every.inner, every.end, every.toll), (coupling.shape, coupling.rows)
     given = *first, kind, *changing, coupling.direct, coupling.back, effort
     count, (states, inputs) = coupling.shape.shape[0], plant.B.shape[:2]
-    values = flows.STAGES * inputs
+    values = stages.STAGES * inputs
     results = (states, states), (states, values), (states + values, states + values)
     lanes = lanes_of(given)
     shapes = [(count, *result, lanes) for result in results]
@@ -88,7 +88,7 @@ def _coupled_jvp(given, changes):
 
 @jax.custom_jvp
 def carried(
-    parts: flows.Flow,
+    parts: stages.Flow,
     effort: Float[Array, "value value _"],
     terminal: Float[Array, "state state _"],
 ) -> Float[Array, "edge state state lane"]:
@@ -102,7 +102,7 @@ def carried(
 
 @carried.defjvp
 def _carried_jvp(given, changes):
-    return jax.jvp(flows.carried, given, changes)
+    return jax.jvp(stages.carried, given, changes)
 
 
 @jax.custom_jvp
@@ -127,4 +127,4 @@ def pieces(
 
 @pieces.defjvp
 def _pieces_jvp(given, changes):
-    return jax.jvp(gain_pieces.pieces, given, changes)
+    return jax.jvp(gain_polynomials.pieces, given, changes)

@@ -15,9 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.holds import balance
-from jaxbeam.small import in_lanes, lanes_of, solve_any, solve_lanes, times, turned
-from jaxbeam.stretches import Commands, Square, Stretch, symmetric, transposed
+from jaxbeam.numerics.batched_linalg import (
+    in_lanes,
+    lanes_of,
+    solve_any,
+    solve_lanes,
+    times,
+    turned,
+)
+from jaxbeam.numerics.discretisation import balance
+from jaxbeam.numerics.intervals import Commands, Square, Stretch, symmetric, transposed
 
 STAGES = 6  # Gauss nodes of a stretch; order 12
 NODES = (np.polynomial.legendre.leggauss(STAGES)[0] + 1) / 2

@@ -8,8 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
-from jaxbeam import native_designs
 from jaxbeam.control import FiniteLQR
+from jaxbeam.numerics import native_designs
 from jaxbeam.runtime import native_library
 
 SHARES = np.array([0.0, 0.123, 0.25, 0.377, 0.5, 0.61, 0.75, 0.9, 0.97, 0.9999])

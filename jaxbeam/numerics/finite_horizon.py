@@ -16,13 +16,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbeam import flows as plain_flows
-from jaxbeam import gain_pieces, native_designs
-from jaxbeam.coupled import Coupling, Plant, answers, flows_of_kind, law_solved
-from jaxbeam.flows import NODES, costs_to_go, flows, on_commands
-from jaxbeam.gain_table import GainTable
-from jaxbeam.small import each_lane, few_lanes, in_lanes, lanes_of, solve_any, turned
-from jaxbeam.stretches import Commands, Square
+from jaxbeam.numerics import gain_polynomials, native_designs
+from jaxbeam.numerics import stages as plain_flows
+from jaxbeam.numerics.batched_linalg import (
+    each_lane,
+    few_lanes,
+    in_lanes,
+    lanes_of,
+    solve_any,
+    turned,
+)
+from jaxbeam.numerics.coupled_stages import Coupling, Plant, answers, flows_of_kind, law_solved
+from jaxbeam.numerics.gain_table import GainTable
+from jaxbeam.numerics.intervals import Commands, Square
+from jaxbeam.numerics.stages import NODES, costs_to_go, flows, on_commands
 
 GROUP = 8  # stretches
 # Backward in time P hastens, right before an event, to what the plant from then on demands, and
@@ -142,7 +149,7 @@ def _backward(prepare, make, plant, events, count, Q, R, terminal, in_time):
         grouped = jnp.concatenate([first, costs[GROUP::GROUP, None]], axis=1)
         given = plant, shape, law, grouped, groups[1], Q, inverse
         axes = None, 0, 0, 0, 0, None, None
-        pieces = jax.vmap(functools.partial(in_lanes, gain_pieces.pieces), axes)(*given)
+        pieces = jax.vmap(functools.partial(in_lanes, gain_polynomials.pieces), axes)(*given)
     else:
         by_hand = in_time == "native"
         given = prepare, make, plant, groups, Q, R, inverse, terminal
@@ -165,7 +172,7 @@ def _few(by_hand, prepare, make, plant, groups, *rest):
 def _swept(by_hand, prepare, make, plant, groups, Q, R, inverse, terminal):
     """P at the starts of stretches and polynomials of the gain, of all groups, in lanes."""
     carried = native_designs.carried if by_hand else plain_flows.carried
-    fitted = native_designs.pieces if by_hand else gain_pieces.pieces
+    fitted = native_designs.pieces if by_hand else gain_polynomials.pieces
     known = each_lane(lambda prepare: prepare(), prepare)
     free = jnp.zeros((*R.shape[:2], 1))  # commands, so that lanes with other R share the flows
 

@@ -15,7 +15,7 @@ import jaxbeam as jb
 from jaxbeam.control import FiniteLQR
 from jaxbeam.control.lqr import optimal
 from jaxbeam.modes import lay_out
-from jaxbeam.native_designs import LIBRARY, lacking
+from jaxbeam.numerics.native_designs import LIBRARY, lacking
 from jaxbeam.runtime import native_library
 from tests.differences import central
 from tests.modules import ROOT
@@ -146,10 +146,10 @@ def test_slopes_in_reverse_and_forward(varied):
 NARROW = """
 import sys
 import jax, numpy as np
-from jaxbeam.native_designs import LIBRARY, lacking
+from jaxbeam.numerics.native_designs import LIBRARY, lacking
 from tests.differences import central
 from tests.modules import ROOT
-from tests.test_native_designs import CASES, VARIED, designed
+from tests.numerics.test_native_designs import CASES, VARIED, designed
 LIBRARY.build()
 varied = VARIED["nothing shared"]
 of = jax.jit(jax.vmap(designed(CASES["two commands"], varied, "native")))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.small import FEW, product, solve_any
+from jaxbeam.numerics.batched_linalg import FEW, product, solve_any
 from tests.differences import central
 
 RANDOM = np.random.default_rng(0)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-import jaxbeam.peaks
+import jaxbeam.numerics.peak_search
 from jaxbeam.exponentials import LOOKED
 
 EQUAL = tuple(float(share) for share in np.linspace(0.0, 1.0, 7))
 EITHER = pytest.mark.parametrize("points", [EQUAL, LOOKED], ids=["equal", "of a step"])
 refine, vertex = (
     jax.jit(function, static_argnames="points")
-    for function in (jaxbeam.peaks.refine, jaxbeam.peaks.vertex)
+    for function in (jaxbeam.numerics.peak_search.refine, jaxbeam.numerics.peak_search.vertex)
 )
 
 

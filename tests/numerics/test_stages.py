@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BarycentricInterpolator
 
-from jaxbeam.coupled import Coupling, Plant, answers, coupled_flows
-from jaxbeam.flows import NODES, costs_to_go, flows
+from jaxbeam.numerics.coupled_stages import Coupling, Plant, answers, coupled_flows
+from jaxbeam.numerics.stages import NODES, costs_to_go, flows
 
 STATES, INPUTS, DIRECTIONS, FORCES, HALVINGS = 4, 2, 3, 2, 3
 START, LENGTH = 0.4, 0.1

@@ -9,8 +9,8 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
-from jaxbeam.flows import NODES, costs_to_go, flows
-from jaxbeam.riccati import care, dare, dlqr, lqr, lyapunov, stein
+from jaxbeam.numerics.riccati import care, dare, dlqr, lqr, lyapunov, stein
+from jaxbeam.numerics.stages import NODES, costs_to_go, flows
 from tests.differences import central
 
 R = jnp.array([[0.1, 0.02], [0.02, 0.3]])

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.flows import NODES
-from jaxbeam.riccati import lqr
-from jaxbeam.stretches import Commands, Square
+from jaxbeam.numerics.intervals import Commands, Square
+from jaxbeam.numerics.riccati import lqr
+from jaxbeam.numerics.stages import NODES
 
 INSIDE = 1e-9  # of a stretch: how far within it its ends are looked at, step by step
 

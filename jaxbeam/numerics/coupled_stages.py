@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbeam.flows import NODES, STAGES, Flow, on_commands
-from jaxbeam.small import solve_any
-from jaxbeam.stretches import Commands, Inputs, Square, transposed
+from jaxbeam.numerics.batched_linalg import solve_any
+from jaxbeam.numerics.intervals import Commands, Inputs, Square, transposed
+from jaxbeam.numerics.stages import NODES, STAGES, Flow, on_commands
 
 TERMS = 12  # of the series for the shortest stretches
 

@@ -1,0 +1,1 @@
+"""Linear algebra, matrix equations and piecewise polynomials, without physics."""
