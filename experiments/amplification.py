@@ -22,8 +22,8 @@ from experiments.beams import (
     with_modes,
 )
 from experiments.verdicts import Experiment, Outcome, finding
+from jaxbeam.model.statics import static_peak
 from jaxbeam.simulate import ContactLossWarning
-from jaxbeam.static import static_peak
 
 MASSES = np.append(np.linspace(0.05, 0.6, 18), [0.26, 0.261, 0.5])  # kg; also those printed
 ONE_RATIOS = np.append(np.geomspace(0.05, 0.2, 9)[:-1], np.linspace(0.2, 1.2, 21))

@@ -8,10 +8,10 @@ from experiments import published
 from experiments.beams import one_span, two_spans
 from experiments.patches import DENSITY, MODULUS
 from experiments.verdicts import Experiment, Outcome, finding
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modal_model import rig
+from jaxbeam.model.modes import lay_out
+from jaxbeam.model.sine_basis import sine_basis_modes
 from jaxbeam.plot.style import colour, name, styled
-from jaxbeam.rig import rig
-from jaxbeam.sine_basis import sine_basis_modes
 
 BESIDE = {"beam.flexural_rigidity": 12.11, "beam.mass_per_length": 0.5411}  # Table 2.2
 

@@ -21,7 +21,7 @@ from experiments.shaker import data_physics_v4
 from experiments.verdicts import Experiment, Finding, Outcome, finding
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.beliefs import Beliefs
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from jaxbeam.plan import make_plan
 from jaxbeam.plot.style import colour, name, styled
 from jaxbeam.runtime.compiling import compiled

@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments import published
 from experiments.verdicts import Experiment, Outcome, finding
+from jaxbeam.model.statics import static_lift
 from jaxbeam.plot.style import colour, name, styled
-from jaxbeam.static import static_lift
 
 WIDTH, MODULUS, DENSITY = 0.1, 65e9, 2800.0  # m, Pa, kg/m^3
 HEIGHT, FITTING = 2.83e-3, 2.9e-3  # m: as printed, and the one that the printed section has

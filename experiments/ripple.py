@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments import published
 from experiments.verdicts import Finding, finding
+from jaxbeam.model.statics import static_lift
 from jaxbeam.plot.style import colour, name, styled
-from jaxbeam.static import static_lift
 
 SPEED, MASS = 0.28, 0.509  # m/s, kg
 CUTOFFS, DAMPING = (10.0, 5.0), (0.03, 0.01)  # Hz; 1, the second as in Fig. 6.10

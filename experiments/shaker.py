@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments import published
 from experiments.verdicts import Experiment, Outcome, finding
-from jaxbeam.frequency import FrequencyResponse, extremes, frequency_response
+from jaxbeam.model.channels import shaker_chain
+from jaxbeam.model.frequency_response import FrequencyResponse, extremes, frequency_response
 from jaxbeam.plot.style import colour, name, styled
-from jaxbeam.ports import shaker_chain
 
 FREQUENCIES = np.geomspace(1.0, 1000.0, 4000)  # Hz
 PARKED = ((0.3, 0.5),)  # m, kg: Fig. 2.16

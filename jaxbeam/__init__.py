@@ -42,10 +42,10 @@ from jaxbeam.control import (
 )
 from jaxbeam.control.bound import bound
 from jaxbeam.estimation import Inversion, Kalman, Observer
-from jaxbeam.modes import modes
+from jaxbeam.model.modes import modes
+from jaxbeam.model.state_space import state_space
 from jaxbeam.record import Record, read_record
 from jaxbeam.simulate import simulate
-from jaxbeam.statespace import state_space
 from jaxbeam.sweep import sweep
 
 __all__ = [

@@ -11,7 +11,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from jaxbeam.dynamics import solve_contact
+from jaxbeam.model.contact import solve_contact
 from jaxbeam.numerics.batched_linalg import FEW, product, solve_small
 from jaxbeam.tables import Tables
 

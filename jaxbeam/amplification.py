@@ -9,10 +9,10 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.integrate import march
+from jaxbeam.model.statics import static_peak
 from jaxbeam.plan import TOLERANCE, make_plan, sample_times
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import prepare
-from jaxbeam.static import static_peak
 from jaxbeam.tables import both_sides
 
 

@@ -16,10 +16,10 @@ from jaxbeam import native, programs
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.lanes import Tasks
 from jaxbeam.loop import loop_schedule
-from jaxbeam.modes import Layout, lay_out
+from jaxbeam.model.modal_model import couples
+from jaxbeam.model.modes import Layout, lay_out
 from jaxbeam.pacing import ORDER, choose_steps, drawn, rounding
 from jaxbeam.plan import Form, most_at_once, sample_times
-from jaxbeam.rig import couples
 from jaxbeam.schedule import sampled
 
 RUNS = 512  # in a block, at most, about: each is one call and one write

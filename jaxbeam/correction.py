@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.modes import Layout, lay_out
+from jaxbeam.model.modal_model import rig
+from jaxbeam.model.modes import Layout, lay_out
+from jaxbeam.model.statics import influence_line, static_lift
 from jaxbeam.record import Record
-from jaxbeam.rig import rig
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.static import influence_line, static_lift
 
 
 def residual_lift(

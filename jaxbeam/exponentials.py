@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.rig import Rig
+from jaxbeam.model.modal_model import Rig
 
 NODES = 6  # Gauss nodes a step; the integrator is of order 12
 DOUBLINGS = 7

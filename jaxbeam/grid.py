@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads import motion
-from jaxbeam.rig import Rig
+from jaxbeam.model.modal_model import Rig
 from jaxbeam.schedule import Schedule
 
 

@@ -19,10 +19,10 @@ from jaxtyping import Array, Float
 from jaxbeam.advance import KEPT, advance, contact, undriven
 from jaxbeam.case.loads import AbstractLoad, MovingMass
 from jaxbeam.driver import AbstractDriver, Moment
-from jaxbeam.dynamics import Traffic
 from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
 from jaxbeam.extremes import Extremes, fold, nothing_seen
-from jaxbeam.rig import Rig
+from jaxbeam.model.contact import Traffic
+from jaxbeam.model.modal_model import Rig
 from jaxbeam.tables import CHUNK, Path, Rigging, follow, tabulate
 
 # Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,

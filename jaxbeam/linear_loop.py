@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from jaxbeam.open_loop import ROUNDING, Clock, OpenLoop, open_loop
 from jaxbeam.runtime.compiling import compiled
 

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import known
 from jaxbeam.linear_loop import LinearLoop
+from jaxbeam.model.state_space import StateSpace
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.statespace import StateSpace
 
 POINTS = 400  # frequencies around each pole
 DEFECTIVE = 1e12  # conditioning of eigenvectors beyond which they are too few

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.dynamics import Traffic
 from jaxbeam.exponentials import DOUBLINGS, GAUSS, LOOKED, NODES, TERMS, lagrange
 from jaxbeam.extremes import NEAR, Found
 from jaxbeam.grid import Grid
 from jaxbeam.integrate import march as plain_march
+from jaxbeam.model.contact import Traffic
+from jaxbeam.model.modal_model import Rig
 from jaxbeam.numerics.peak_search import CLIMBS, ROUNDINGS, STARTS, VERTEX_ROUNDS, reach, through
-from jaxbeam.rig import Rig
 from jaxbeam.runtime.native_library import Library
 from jaxbeam.tables import CHUNK, make_rigging
 

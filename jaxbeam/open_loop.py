@@ -17,12 +17,12 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.trajectory import NEVER, AbstractMotion
-from jaxbeam.modes import Layout
-from jaxbeam.rig import rig_in_one
+from jaxbeam.model.modal_model import rig_in_one
+from jaxbeam.model.modes import Layout
+from jaxbeam.model.sensor_filters import sensed
+from jaxbeam.model.sensor_signals import design, init, read
+from jaxbeam.model.state_space import LoadedBeam, loaded_beam
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.sensed import sensed
-from jaxbeam.sensing import design, init, read
-from jaxbeam.statespace import LoadedBeam, loaded_beam
 
 ROUNDING = 1e-9  # of a period: shorter differences are none
 

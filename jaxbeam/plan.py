@@ -17,13 +17,13 @@ from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.fields import known
 from jaxbeam.case.loads import motion
 from jaxbeam.case.validation import check
-from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.extremes import Extremes
 from jaxbeam.grid import even_grid, scheduled_grid
 from jaxbeam.integrate import at_edges, longest_step, march
 from jaxbeam.loop import loop_schedule, make_loop
-from jaxbeam.modes import Layout, lay_out
-from jaxbeam.rig import couples, rig
+from jaxbeam.model.contact import Traffic, traffic
+from jaxbeam.model.modal_model import couples, rig
+from jaxbeam.model.modes import Layout, lay_out
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.schedule import Schedule
 from jaxbeam.tables import make_rigging

@@ -17,12 +17,12 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxbeam import native
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.loads import motion
-from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.grid import even_grid, scheduled_grid
 from jaxbeam.integrate import longest_step, march, trace
 from jaxbeam.loop import make_loop
+from jaxbeam.model.contact import Traffic, traffic
+from jaxbeam.model.modal_model import Rig, rig
 from jaxbeam.plan import Form
-from jaxbeam.rig import Rig, rig
 from jaxbeam.runtime.compiling import ROUGHLY, SIDE_BY_SIDE, compiled, compiled_with
 from jaxbeam.schedule import Schedule
 from jaxbeam.tables import make_rigging

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.measuring import history, measure
-from jaxbeam.modes import Modes
+from jaxbeam.model.measurement import history, measure
+from jaxbeam.model.modes import Modes
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.validation import check
-from jaxbeam.dynamics import Traffic, traffic
-from jaxbeam.rig import Rig, rig_in_one
+from jaxbeam.model.contact import Traffic, traffic
+from jaxbeam.model.modal_model import Rig, rig_in_one
 from jaxbeam.runtime.compiling import compiled
 
 BREATH = 1e-14  # of the run: motions are asked for so far from their kinks, on the leg's own side

@@ -13,7 +13,7 @@ from jaxbeam.case.loads import motion
 from jaxbeam.control import MPC
 from jaxbeam.linear_loop import LinearLoop, linear, prepared
 from jaxbeam.margins import margins
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from jaxbeam.open_loop import OpenLoop, open_loop
 
 PLACES = 13  # of the loads along a crossing, at which margins are looked for

@@ -12,16 +12,16 @@ from jaxtyping import Array, Float, Int
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import is_known, known
 from jaxbeam.driver import AbstractDriver
-from jaxbeam.dynamics import Traffic, at_instant, traffic
 from jaxbeam.exponentials import NODES, at_ends
 from jaxbeam.extremes import Found
 from jaxbeam.grid import scheduled_grid
 from jaxbeam.integrate import trace
 from jaxbeam.loop import make_loop
-from jaxbeam.measuring import measure
+from jaxbeam.model.contact import Traffic, at_instant, traffic
+from jaxbeam.model.measurement import measure
+from jaxbeam.model.modal_model import Rig, rig
 from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
 from jaxbeam.record import Record
-from jaxbeam.rig import Rig, rig
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.schedule import sampled
 from jaxbeam.tables import Rigging, make_rigging

@@ -23,7 +23,7 @@ from jaxbeam.case.fields import known
 from jaxbeam.case.loads import motion
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.linear_loop import linear, prepared
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from jaxbeam.open_loop import Clock, OpenLoop, open_loop, through
 from jaxbeam.runtime.compiling import compiled
 

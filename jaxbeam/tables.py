@@ -18,10 +18,10 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.driver import AbstractDriver
-from jaxbeam.dynamics import Traffic, contact_rows
 from jaxbeam.exponentials import GAUSS, LOOKED, Step, propagators
 from jaxbeam.grid import Grid
-from jaxbeam.rig import Rig
+from jaxbeam.model.contact import Traffic, contact_rows
+from jaxbeam.model.modal_model import Rig
 
 CHUNK = 16  # steps that are tabulated at once
 

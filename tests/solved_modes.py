@@ -6,7 +6,7 @@ import numpy as np
 from jaxbeam.case.actuators import Patch
 from jaxbeam.case.beam import ENDS, Beam, Support
 from jaxbeam.case.case import Case
-from jaxbeam.modes import Modes, lay_out, modes
+from jaxbeam.model.modes import Modes, lay_out, modes
 
 STUFF = {"flexural_rigidity": 11.68, "mass_per_length": 0.535}
 PAIRS = [f"{left}-{right}" for left in ENDS for right in ENDS]

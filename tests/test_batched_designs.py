@@ -13,7 +13,7 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.control import DiscreteLQR, ScheduledLQR
 from jaxbeam.control.lqr import optimal
 from jaxbeam.estimation import Kalman, Observer
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from tests.differences import central
 
 WEIGHTS = {"state_weight": [4e5, 1e5, 10.0, 1.0, 0.0], "command_weight": [1e-3]}

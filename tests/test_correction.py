@@ -18,9 +18,9 @@ from jaxbeam.correction import (
     residual_line,
     shear_force,
 )
-from jaxbeam.modes import lay_out
-from jaxbeam.rig import rig
-from jaxbeam.static import influence_line, static_lift
+from jaxbeam.model.modal_model import rig
+from jaxbeam.model.modes import lay_out
+from jaxbeam.model.statics import influence_line, static_lift
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import finite_elements

@@ -18,7 +18,7 @@ from jaxbeam.control import LQR, DiscreteLQR, SamplingWarning
 from jaxbeam.control.discrete import sampled_problem
 from jaxbeam.control.sampling import reach_kept
 from jaxbeam.linear_loop import linear_loop
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 
 WEIGHTS = {
     "state_weight": [1e3, 1e2, 10.0, 0.1, 0.01, 0.01, 0.0],

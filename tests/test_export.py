@@ -22,7 +22,7 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.cli import main
 from jaxbeam.control import DiscreteLQR, Feedback, FiniteLQR, ScheduledLQR
 from jaxbeam.export import Gains, export_gains, read_gains, write_gains
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 
 RANDOM = np.random.default_rng(0)
 SIGNALS = (tuple((f"q_{i}", "m kg^0.5") for i in range(4)), (("u_0", "V"), ("u_1", "N")))

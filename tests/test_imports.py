@@ -10,7 +10,7 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.document  jaxbeam.driver  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
+jaxbeam.model.__init__  jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.document  jaxbeam.driver  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
 jaxbeam.runtime.compile_cache  jaxbeam.numerics.batched_linalg
 jaxbeam.runtime.compiling
 jaxbeam.case.declared_checks  jaxbeam.numerics.piecewise  jaxbeam.numerics.intervals
@@ -18,18 +18,18 @@ jaxbeam.numerics.stages  jaxbeam.runtime.native_library
 jaxbeam.numerics.coupled_stages
 jaxbeam.case.beam  jaxbeam.case.filters  jaxbeam.case.trajectory  jaxbeam.case.actuators  jaxbeam.case.controller
 jaxbeam.case.estimator  jaxbeam.case.loads  jaxbeam.numerics.riccati  jaxbeam.schedule  jaxbeam.case.sensors
-jaxbeam.case.case  jaxbeam.numerics.gain_table  jaxbeam.sensing
+jaxbeam.case.case  jaxbeam.numerics.gain_table  jaxbeam.model.sensor_signals
 jaxbeam.numerics.gain_polynomials
 jaxbeam.numerics.native_designs
 jaxbeam.numerics.finite_horizon
 jaxbeam.case.validation
-jaxbeam.modes
-jaxbeam.measuring  jaxbeam.rig
-jaxbeam.compliance  jaxbeam.exponentials  jaxbeam.numerics.peak_search  jaxbeam.ports  jaxbeam.sine_basis
-jaxbeam.frequency  jaxbeam.grid
-jaxbeam.dynamics
-jaxbeam.reference  jaxbeam.statespace  jaxbeam.static  jaxbeam.tables
-jaxbeam.sensed
+jaxbeam.model.modes
+jaxbeam.model.measurement  jaxbeam.model.modal_model
+jaxbeam.model.flexibility  jaxbeam.exponentials  jaxbeam.numerics.peak_search  jaxbeam.model.channels  jaxbeam.model.sine_basis
+jaxbeam.model.frequency_response  jaxbeam.grid
+jaxbeam.model.contact
+jaxbeam.reference  jaxbeam.model.state_space  jaxbeam.model.statics  jaxbeam.tables
+jaxbeam.model.sensor_filters
 jaxbeam.estimation
 jaxbeam.control  jaxbeam.extremes
 jaxbeam.advance  jaxbeam.casefile

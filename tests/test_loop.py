@@ -18,8 +18,8 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.loop import loop_schedule
+from jaxbeam.model.sensor_signals import noise_samples
 from jaxbeam.plan import Plan, form
-from jaxbeam.sensing import noise_samples
 from jaxbeam.simulate import readings
 from tests.loop_as_oracle import expected, span_of
 

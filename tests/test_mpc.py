@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.loop import loop_schedule
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from jaxbeam.plan import Plan, form
 from tests.differences import central
 

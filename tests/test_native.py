@@ -21,14 +21,14 @@ import jaxbeam as jb
 from jaxbeam import native
 from jaxbeam.case.case import replace
 from jaxbeam.cli import main
-from jaxbeam.dynamics import traffic
 from jaxbeam.exponentials import LOOKED
 from jaxbeam.grid import even_grid
 from jaxbeam.integrate import march
+from jaxbeam.model.contact import traffic
+from jaxbeam.model.modal_model import rig
 from jaxbeam.numerics import native_designs, peak_search
 from jaxbeam.order import make_order
 from jaxbeam.plan import form
-from jaxbeam.rig import rig
 from jaxbeam.runtime import native_library
 from jaxbeam.sweep_store import FINGERPRINT
 from jaxbeam.tables import make_rigging
@@ -240,7 +240,7 @@ def test_what_cannot_be_loaded_is_left_alone(folder, monkeypatch, tmp_path):
 @pytest.mark.parametrize("library", [native.LIBRARY, native_designs.LIBRARY])
 def test_whatever_is_included_decides_the_name_of_a_library(library):
     """Else one would be taken that was compiled from an older header."""
-    folder = pathlib.Path(native_library.__file__).parent
+    folder = native_library.HERE
     texts = [(folder / name).read_text() for name in library.sources + library.headers]
     included = re.findall(r'#include "(native_\w+\.h)"', "".join(texts))
     assert set(included) == set(library.headers)
@@ -294,7 +294,7 @@ def test_places_of_peaks_are_as_high_as_those_found_without_it(tmp_path):
     curves[:, 1] = np.cumsum(curves[:, 1], axis=0)  # less wild
     curves = curves.reshape(len(LOOKED), -1)
     (tmp_path / "seek.c").write_text(SEEK)
-    headers = pathlib.Path(native_library.__file__).parent
+    headers = native_library.HERE
     words = [native_library.compiler(), *native.LIBRARY.flags, "-I", str(headers), "seek.c"]
     subprocess.run([*words, "-o", "seek.so"], check=True, cwd=tmp_path)
     pointer = np.ctypeslib.ndpointer(float, flags="C")

@@ -15,7 +15,7 @@ from PIL import Image, ImageSequence
 
 import jaxbeam as jb
 from jaxbeam.casefile import case_to_dict
-from jaxbeam.frequency import frequency_response
+from jaxbeam.model.frequency_response import frequency_response
 from jaxbeam.plot import (
     FitPanel,
     animate,

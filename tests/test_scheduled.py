@@ -15,9 +15,9 @@ from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control import FiniteLQR, ScheduledLQR
 from jaxbeam.control.gains import Schedule
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
+from jaxbeam.model.statics import influence_line, static_lift
 from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.static import influence_line, static_lift
 
 WEIGHTS = {
     "state_weight": [1e3, 1e2, 0.1, 0.01, 0.0],

@@ -13,11 +13,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.dynamics import traffic
 from jaxbeam.grid import even_grid
 from jaxbeam.integrate import trace
+from jaxbeam.model.contact import traffic
+from jaxbeam.model.modal_model import rig
 from jaxbeam.plan import form
-from jaxbeam.rig import rig
 from jaxbeam.simulate import ContactLossWarning
 from jaxbeam.tables import make_rigging
 from tests.oracles import modal_equations

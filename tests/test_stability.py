@@ -14,8 +14,8 @@ from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.limits import limit
 from jaxbeam.linear_loop import linear_loop
 from jaxbeam.margins import gramians, margins
+from jaxbeam.model.state_space import state_space
 from jaxbeam.stability import _followed, frozen_poles, growth, stream
-from jaxbeam.statespace import state_space
 
 REFERENCE = json.loads((Path(__file__).parent / "data/optimal_control.json").read_text())
 LENGTH, RIGIDITY, DENSITY, RATIO = 0.6, 11.68, 0.535, 0.03

@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.blocks import Work
 from jaxbeam.lanes import arrange
-from jaxbeam.static import static_peak
+from jaxbeam.model.statics import static_peak
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=[0.03, 0.02], modes=2),

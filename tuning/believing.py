@@ -7,8 +7,8 @@ import equinox as eqx
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.modes import Layout
-from jaxbeam.statespace import state_space
+from jaxbeam.model.modes import Layout
+from jaxbeam.model.state_space import state_space
 
 
 class Believing(AbstractController):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.control.bound import HELD, least_achievable
-from jaxbeam.dynamics import traffic
+from jaxbeam.model.contact import traffic
 from jaxbeam.plan import Plan, make_plan, sample_times
 from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled

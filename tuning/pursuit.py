@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
 from jaxbeam.case.loads import MovingMass
-from jaxbeam.static import influence_line
+from jaxbeam.model.statics import influence_line
 from tuning.logs import Log
 
 PLACES = 201  # along the beam, at which influence lines are tabulated

@@ -16,8 +16,8 @@ import scipy.signal
 from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.frequency import Parked, frequency_response
-from jaxbeam.modes import lay_out
+from jaxbeam.model.frequency_response import Parked, frequency_response
+from jaxbeam.model.modes import lay_out
 from tuning.belief import Belief
 from tuning.free import Free, free_numbers
 from tuning.logs import Log

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case, known_case, replace, value_at
 from jaxbeam.case.loads import motion
 from jaxbeam.linear_loop import linear, open_loop, prepared
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from tuning.believing import believing
 from tuning.bench import Bench
 from tuning.load_cases import Values, apply

@@ -33,9 +33,9 @@ from experiments.benchmarks.steps import PREDICTIVE, rig
 from experiments.benchmarks.timing import time_call
 from jaxbeam.control import SamplingWarning
 from jaxbeam.control.qp import solve_qp
+from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import ContactLossWarning
-from jaxbeam.statespace import state_space
 
 SIZES = {4: 6, 6: 8, 8: 10}  # variables, and periods ahead
 MANY, ROUNDS = 256, 20

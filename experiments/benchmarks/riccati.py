@@ -25,7 +25,7 @@ import numpy as np
 
 import jaxbeam as jb
 from jaxbeam.control.lqr import optimal
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from jaxbeam.numerics import native_designs
 from jaxbeam.numerics.riccati import lqr
 from jaxbeam.runtime import native_library

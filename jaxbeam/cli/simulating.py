@@ -258,7 +258,7 @@ def frf(
     plot
         Draw magnitude and phase to a PNG beside the output, or to CASE_frf.png in this folder.
     """
-    from jaxbeam.frequency import extremes, frequency_response
+    from jaxbeam.model.frequency_response import extremes, frequency_response
 
     check_suffix(output, ".nc", "a frequency response")
     picture = picture_path(output, case.with_stem(f"{case.stem}_frf")) if plot else None

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, count, number
-from jaxbeam.rig import assemble
-from jaxbeam.statespace import LoadedBeam, loaded_beam
+from jaxbeam.model.modal_model import assemble
+from jaxbeam.model.state_space import LoadedBeam, loaded_beam
 
 OF_ACTUATORS = ("force_per_volt", "stiffness", "damping", "correction")
 OF_LOADS = ("mass", "speed", "entry_time")

@@ -26,8 +26,8 @@ from jaxbeam.case.validation import check
 from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.reach import TOLERANCE, reach
+from jaxbeam.model.channels import takes_commands
 from jaxbeam.plan import form, run_extremes, suitable_step
-from jaxbeam.ports import takes_commands
 from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled
 

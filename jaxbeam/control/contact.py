@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.dynamics import contact_rows
+from jaxbeam.model.contact import contact_rows
+from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics.coupled_stages import Coupling, Plant
 from jaxbeam.numerics.finite_horizon import Changes
-from jaxbeam.statespace import LoadedBeam
 
 
 def coupled_beam(model: LoadedBeam, weights: bool) -> tuple[Plant, Changes]:

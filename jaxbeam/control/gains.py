@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.statespace import LoadedBeam
 
 
 class Schedule(eqx.Module):

@@ -28,11 +28,11 @@ from jaxbeam.control.contact import coupled_beam
 from jaxbeam.control.gains import Schedule, crossing
 from jaxbeam.control.sampling import warn_if_slow
 from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics import native_designs
 from jaxbeam.numerics.finite_horizon import finite_time, finite_time_coupled, layer
 from jaxbeam.numerics.gain_table import GainTable, edges_between, even, step_by_step
 from jaxbeam.numerics.riccati import lqr
-from jaxbeam.statespace import LoadedBeam
 
 TURN = 3.0  # rad by which the fastest mode may turn within a stretch of a table
 

@@ -33,8 +33,8 @@ from jaxbeam.control.prediction import (
 )
 from jaxbeam.control.qp import METHODS, solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics.riccati import dare
-from jaxbeam.statespace import LoadedBeam
 
 
 class Design(eqx.Module):

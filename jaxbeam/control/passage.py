@@ -13,7 +13,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
 from jaxbeam.case.loads import motion
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.statespace import LoadedBeam
+from jaxbeam.model.state_space import LoadedBeam
 
 
 class Passage(AbstractController):

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.driver import AbstractDriver
-from jaxbeam.dynamics import Traffic, traffic
 from jaxbeam.exponentials import NODES
 from jaxbeam.grid import scheduled_grid
 from jaxbeam.integrate import trace
+from jaxbeam.model.contact import Traffic, traffic
+from jaxbeam.model.modal_model import rig
 from jaxbeam.plan import Form, form, suitable_step
-from jaxbeam.rig import rig
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.schedule import Schedule, merged
 from jaxbeam.tables import make_rigging

@@ -18,9 +18,9 @@ from jaxbeam.control.following import Follower
 from jaxbeam.control.listening import Listener
 from jaxbeam.estimation.fixed import offsets
 from jaxbeam.estimation.observability import deflections
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
+from jaxbeam.model.state_space import LoadedBeam, state_space
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.statespace import LoadedBeam, state_space
 
 PLACES = 201  # at which influence lines are kept
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import INCREASING, POSITIVE, is_known, known, number
 from jaxbeam.case.filters import filter_step, initial, sections
-from jaxbeam.statespace import LoadedBeam
+from jaxbeam.model.state_space import LoadedBeam
 
 
 class Watch(eqx.Module):

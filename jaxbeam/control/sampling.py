@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
-from jaxbeam.statespace import StateSpace, state_space
+from jaxbeam.model.state_space import StateSpace, state_space
 
 KEPT = 0.3  # of the reach of commands: less is worth a warning, so beyond 0.93 of the limit
 UNREACHED = 1e-9  # of the largest push that a mode could get: less is none

@@ -13,8 +13,8 @@ from jaxbeam.control.gains import Schedule
 from jaxbeam.control.listening import Listener
 from jaxbeam.control.lqr import FiniteLQR, too_coarse
 from jaxbeam.control.recognition import Recognition
-from jaxbeam.dynamics import traffic
-from jaxbeam.statespace import LoadedBeam
+from jaxbeam.model.contact import traffic
+from jaxbeam.model.state_space import LoadedBeam
 
 
 class Family(eqx.Module):

@@ -14,9 +14,9 @@ from jaxbeam.case.loads import motion
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.estimation import KINDS
 from jaxbeam.estimation.flowing import Flowing
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
+from jaxbeam.model.state_space import LoadedBeam, StateSpace, loaded_beam, state_space
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.statespace import LoadedBeam, StateSpace, loaded_beam, state_space
 
 
 class AbstractStateLaw(AbstractController):

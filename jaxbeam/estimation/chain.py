@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.filters import filter_step
 from jaxbeam.estimation.sampled import ROUNDING, Ticks, Transition
-from jaxbeam.sensed import sensed
-from jaxbeam.sensing import Sections, design
-from jaxbeam.statespace import LoadedBeam, StateSpace
+from jaxbeam.model.sensor_filters import sensed
+from jaxbeam.model.sensor_signals import Sections, design
+from jaxbeam.model.state_space import LoadedBeam, StateSpace
 
 # Of the noise of its samples, what a digital filter is taken to add to its output. Without it the
 # filter would be undone exactly, and what it all but stops be taken for known.

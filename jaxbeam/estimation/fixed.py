@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import Measurement
 from jaxbeam.estimation.sampled import Transition
-from jaxbeam.statespace import LoadedBeam
+from jaxbeam.model.state_space import LoadedBeam
 
 
 class FixedGain(eqx.Module):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.estimation.chain import Sight
-from jaxbeam.statespace import StateSpace
+from jaxbeam.model.state_space import StateSpace
 
 
 class Flowing(eqx.Module):

@@ -18,10 +18,10 @@ from jaxbeam.estimation.flowing import Flowing
 from jaxbeam.estimation.gains import filter_gain, kalman_gain, sampled_kalman_gain
 from jaxbeam.estimation.observability import modes_of, unseen_fault
 from jaxbeam.estimation.sampled import ROUNDING, ticks
+from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.finite_horizon import finite_time
 from jaxbeam.numerics.intervals import symmetric
-from jaxbeam.statespace import LoadedBeam
 
 TURN = 3.0  # rad by which the fastest mode may turn within a stretch of a table
 

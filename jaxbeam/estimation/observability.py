@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import known
-from jaxbeam.statespace import StateSpace
+from jaxbeam.model.state_space import StateSpace
 
 UNSEEN = 1e-9  # of what a sensor sees of the mode it sees best: less is nothing
 

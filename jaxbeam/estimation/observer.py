@@ -11,8 +11,8 @@ from jaxbeam.estimation.flowing import Flowing
 from jaxbeam.estimation.gains import placed_gain
 from jaxbeam.estimation.observability import modes_of, unseen_fault
 from jaxbeam.estimation.sampled import Ticks, ticks
+from jaxbeam.model.state_space import StateSpace
 from jaxbeam.numerics.discretisation import balance, hold
-from jaxbeam.statespace import StateSpace
 
 
 class Observer(AbstractEstimator):

@@ -13,10 +13,10 @@ from jaxbeam.control.lqr import LQR, AbstractScheduledRegulator
 from jaxbeam.control.scheduled import Family, ScheduledLQR
 from jaxbeam.estimation import Observer
 from jaxbeam.export.gains import Gains
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
+from jaxbeam.model.sensor_signals import design
+from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.sensing import design
-from jaxbeam.statespace import state_space
 
 
 def export_gains(case: Case, points: int = 1001) -> Gains:

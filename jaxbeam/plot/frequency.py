@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, MultipleLocator, NullFormatter
 
-from jaxbeam.frequency import FrequencyResponse
+from jaxbeam.model.frequency_response import FrequencyResponse
 from jaxbeam.plot.style import FAINT, colour, name, styled
 
 

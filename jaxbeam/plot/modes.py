@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
-from jaxbeam.modes import Modes
-from jaxbeam.modes import modes as find_modes
+from jaxbeam.model.modes import Modes
+from jaxbeam.model.modes import modes as find_modes
 from jaxbeam.plot.schematic import draw_supports
 from jaxbeam.plot.style import FAINT, GREY, INK, colour, digits, name, scale, styled
 

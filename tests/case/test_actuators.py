@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case.case import addresses, replace
-from jaxbeam.modes import lay_out
-from jaxbeam.rig import rig
+from jaxbeam.model.modal_model import rig
+from jaxbeam.model.modes import lay_out
 
 # Smart Material M8557-P1 on rig B of the thesis: sections 2.4.1 and 2.4.2.
 MATERIAL = {

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 
 from jaxbeam.case.trajectory import Braking, Tabulated
-from jaxbeam.dynamics import Traffic
+from jaxbeam.model.contact import Traffic
 
 LENGTH = jnp.asarray(2.0)
 KNOTS = np.array([0.0, 0.3, 0.7, 0.8, 1.5])

@@ -15,7 +15,7 @@ from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.estimation import ConditioningWarning, Inversion, Kalman, Observer, conditioning
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from tests.differences import central
 from tests.loop_as_oracle import span_of
 

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.estimation import Kalman
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from tests.differences import central
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant, conditioned

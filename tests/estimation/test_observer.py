@@ -11,7 +11,7 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.estimation import Observer
 from jaxbeam.linear_loop import linear_loop
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant
 

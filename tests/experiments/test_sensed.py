@@ -9,7 +9,7 @@ import jaxbeam as jb
 from experiments import sensed, sensed_search, tuned
 from jaxbeam import rigs
 from jaxbeam.case.case import known_case
-from jaxbeam.modes import lay_out
+from jaxbeam.model.modes import lay_out
 from jaxbeam.stability import frozen_poles
 from tuning.believing import believing
 

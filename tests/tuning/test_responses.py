@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 import jaxbeam as jb
-from jaxbeam.frequency import frequency_response
+from jaxbeam.model.frequency_response import frequency_response
 from tests.tuning import test_commands as rigs
 from tuning.logs import Log
 from tuning.responses import Responses, identify_responses, responses_of

@@ -24,7 +24,7 @@ from jaxbeam.case.actuators import AbstractActuator, Electrodynamic
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.sensors import QUANTITIES
-from jaxbeam.rig import Rig
+from jaxbeam.model.modal_model import Rig
 
 AT_A_POINT = ("deflection", "velocity", "acceleration", "slope")  # strain also needs a fibre
 OF_ACTUATOR = ("current", "active_force", "transmitted_force")

@@ -12,7 +12,8 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.case import replace
 from jaxbeam.correction import residual_lift
-from jaxbeam.frequency import (
+from jaxbeam.model.channels import common_pairs, shaker_chain
+from jaxbeam.model.frequency_response import (
     accelerance,
     extremes,
     frequency_response,
@@ -21,9 +22,8 @@ from jaxbeam.frequency import (
     receptance,
     zeros,
 )
-from jaxbeam.modes import lay_out
-from jaxbeam.ports import common_pairs, shaker_chain
-from jaxbeam.rig import rig
+from jaxbeam.model.modal_model import rig
+from jaxbeam.model.modes import lay_out
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import finite_elements

@@ -22,9 +22,9 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import is_known, known
 from jaxbeam.case.validation import check
-from jaxbeam.modes import Layout, lay_out
-from jaxbeam.ports import Pair, check_pairs, column, common_pairs, row
-from jaxbeam.rig import Rig, rig, rig_in_one
+from jaxbeam.model.channels import Pair, check_pairs, column, common_pairs, row
+from jaxbeam.model.modal_model import Rig, rig, rig_in_one
+from jaxbeam.model.modes import Layout, lay_out
 from jaxbeam.runtime.compiling import compiled
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from jaxbeam.case.filters import analogue
-from jaxbeam.rig import Rig
-from jaxbeam.statespace import LoadedBeam
+from jaxbeam.model.modal_model import Rig
+from jaxbeam.model.state_space import LoadedBeam
 
 
 def sensed(model: LoadedBeam) -> tuple[Rig, Float[Array, "sensor state"]]:

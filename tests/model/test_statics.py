@@ -13,8 +13,8 @@ from jaxbeam.case.actuators import Patch, Shaker, SpringDamper
 from jaxbeam.case.beam import ENDS, Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.loads import MovingForce, MovingMass, motion
-from jaxbeam.modes import lay_out
-from jaxbeam.static import influence_line, static_deflection, static_peak
+from jaxbeam.model.modes import lay_out
+from jaxbeam.model.statics import influence_line, static_deflection, static_peak
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import closed_forms, finite_elements

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from jaxbeam.case.actuators import Patch
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.modes import Modes, lay_out, modes
+from jaxbeam.model.modes import Modes, lay_out, modes
 from tests.differences import central
 from tests.solved_modes import STUFF, solve
 

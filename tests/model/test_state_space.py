@@ -14,8 +14,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
-from jaxbeam.modes import lay_out
-from jaxbeam.statespace import state_space
+from jaxbeam.model.modes import lay_out
+from jaxbeam.model.state_space import state_space
 from tests.differences import central
 from tests.oracles.loads import GRAVITY, Load
 from tests.oracles.modal_equations import Span, _System

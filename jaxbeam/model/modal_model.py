@@ -15,7 +15,7 @@ from jax.scipy.linalg import block_diag, solve_triangular
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.modes import Layout, Modes, lay_out, modes
+from jaxbeam.model.modes import Layout, Modes, lay_out, modes
 from jaxbeam.runtime.compiling import compiled
 
 

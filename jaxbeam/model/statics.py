@@ -13,8 +13,8 @@ from jaxbeam.case.fields import is_known
 from jaxbeam.case.loads import motion
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check
-from jaxbeam.compliance import check_held, compliance
-from jaxbeam.modes import Layout, lay_out
+from jaxbeam.model.flexibility import check_held, compliance
+from jaxbeam.model.modes import Layout, lay_out
 from jaxbeam.numerics.peak_search import refine
 from jaxbeam.runtime.compiling import compiled
 

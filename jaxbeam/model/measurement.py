@@ -5,8 +5,8 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.sensors import QUANTITIES
-from jaxbeam.modes import Modes
-from jaxbeam.sensing import convert, needs_times, noise_samples, sense
+from jaxbeam.model.modes import Modes
+from jaxbeam.model.sensor_signals import convert, needs_times, noise_samples, sense
 
 
 def history(modes: Modes, motion, x, quantity: str, fibre_distance) -> Float[Array, "time ..."]:

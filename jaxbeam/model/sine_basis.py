@@ -10,7 +10,7 @@ import dataclasses
 import jax.numpy as jnp
 
 from jaxbeam.case.case import Case
-from jaxbeam.modes import Modes, modes, oriented
+from jaxbeam.model.modes import Modes, modes, oriented
 from jaxbeam.numerics.eigen import eigen
 
 RIGID = 3.21e10  # N/m; with it Table 2.2 of the thesis is reproduced to all printed digits

@@ -15,8 +15,8 @@ from jaxbeam.case.filters import Filter
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict
-from jaxbeam.measuring import measure
-from jaxbeam.sensing import convert, design, init, noise_samples, read, sense
+from jaxbeam.model.measurement import measure
+from jaxbeam.model.sensor_signals import convert, design, init, noise_samples, read, sense
 from tests.differences import central
 
 TIMES = jnp.arange(201) / 1000.0

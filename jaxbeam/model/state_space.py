@@ -20,11 +20,11 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import is_known, known
 from jaxbeam.case.sensors import QUANTITIES
-from jaxbeam.dynamics import Traffic, contact_rows, traffic
-from jaxbeam.modes import Layout
+from jaxbeam.model.contact import Traffic, contact_rows, traffic
+from jaxbeam.model.modal_model import Rig, rig_in_one
+from jaxbeam.model.modes import Layout
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.numerics.discretisation import hold
-from jaxbeam.rig import Rig, rig_in_one
 from jaxbeam.runtime.compiling import compiled
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.modes import Layout, assemble, section, supported
+from jaxbeam.model.modes import Layout, assemble, section, supported
 from jaxbeam.numerics.piecewise import piecewise
 from jaxbeam.runtime.compiling import compiled
 

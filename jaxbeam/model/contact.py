@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads import motion
 from jaxbeam.case.trajectory import AbstractMotion
+from jaxbeam.model.modal_model import Rig
 from jaxbeam.numerics.batched_linalg import solve_small
-from jaxbeam.rig import Rig
 
 
 class Traffic(eqx.Module):
