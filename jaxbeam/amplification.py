@@ -8,12 +8,12 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.integrate import march
+from jaxbeam.integrator.integrate import march
+from jaxbeam.integrator.step_matrices import both_sides
 from jaxbeam.model.statics import static_peak
 from jaxbeam.plan import TOLERANCE, make_plan, sample_times
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import prepare
-from jaxbeam.tables import both_sides
 
 
 class Envelope(NamedTuple):

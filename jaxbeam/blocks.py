@@ -12,15 +12,16 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam import native, programs
+from jaxbeam import programs
 from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator.events import sampled
 from jaxbeam.lanes import Tasks
 from jaxbeam.loop import loop_schedule
 from jaxbeam.model.modal_model import couples
 from jaxbeam.model.modes import Layout, lay_out
 from jaxbeam.pacing import ORDER, choose_steps, drawn, rounding
 from jaxbeam.plan import Form, most_at_once, sample_times
-from jaxbeam.schedule import sampled
 
 RUNS = 512  # in a block, at most, about: each is one call and one write
 BLOCKS = 8  # at least, if each then has more runs than are tried at once: for all cores
@@ -74,7 +75,7 @@ class Work:
         slots = len(case.loads)
         if slots > 1:
             slots = max(most_at_once(window) for window in windows())
-        self.form = Form(layout, couples(case), slots, native.serves(case) and not single)
+        self.form = Form(layout, couples(case), slots, native_peaks.serves(case) and not single)
         # C puts rigs on their steps itself.
         self.apart = case.controller is None and not self.form.by_hand
         job = self.job()

@@ -17,15 +17,15 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.fields import known
-from jaxbeam.driver import AbstractDriver, Moment
-from jaxbeam.exponentials import GAUSS, NODES
+from jaxbeam.integrator.events import Schedule, merged
+from jaxbeam.integrator.input_policy import AbstractDriver, Moment
+from jaxbeam.integrator.propagators import GAUSS, NODES
 from jaxbeam.model.contact import Traffic, at_instant
 from jaxbeam.model.modal_model import Rig
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensor_filters import sensed
 from jaxbeam.model.sensor_signals import design, init, noise_samples, read
 from jaxbeam.model.state_space import LoadedBeam, state_space
-from jaxbeam.schedule import Schedule, merged
 
 ITERATIONS = 4  # of Newton's method for a law at every instant; one would do for a linear law
 

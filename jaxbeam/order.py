@@ -13,12 +13,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam import native
 from jaxbeam.blocks import RUNS, Work
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.declared_checks import in_words
 from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.integrator import native_peaks
 from jaxbeam.lanes import LANES, MOST_RUNS, Tasks, arrange
 
 # Whether these are right depends on each other: places, and entries of a list.
@@ -95,7 +95,7 @@ class Order:
 
     def fingerprint(self) -> str:
         """A number for all that shapes the results: case, values, settings and versions."""
-        by_hand = native.serves(self.case) and not (self.histories or self.single)
+        by_hand = native_peaks.serves(self.case) and not (self.histories or self.single)
         content = self.to_dict() | {
             "blocks": [RUNS, LANES, len(jax.local_devices())],
             "versions": [_version(), jax.__version__, by_hand],

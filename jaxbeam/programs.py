@@ -14,18 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxbeam import native
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.loads import motion
-from jaxbeam.grid import even_grid, scheduled_grid
-from jaxbeam.integrate import longest_step, march, trace
+from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator.events import Schedule
+from jaxbeam.integrator.integrate import longest_step, march, trace
+from jaxbeam.integrator.step_matrices import make_rigging
+from jaxbeam.integrator.time_grid import even_grid, scheduled_grid
 from jaxbeam.loop import make_loop
 from jaxbeam.model.contact import Traffic, traffic
 from jaxbeam.model.modal_model import Rig, rig
 from jaxbeam.plan import Form
 from jaxbeam.runtime.compiling import ROUGHLY, SIDE_BY_SIDE, compiled, compiled_with
-from jaxbeam.schedule import Schedule
-from jaxbeam.tables import make_rigging
 
 
 class Job(NamedTuple):
@@ -140,7 +140,7 @@ def _by_hand(job: Job, wanted, rigs, heavy, light, pace):
         return grid, job.varied(heavy).sensor_places, job.loads(heavy, light)
 
     arounds = jax.vmap(around)(own, heavy, light, pace)
-    return native.march(job.form.slots, wanted, rigs, *arounds)._asdict()
+    return native_peaks.march(job.form.slots, wanted, rigs, *arounds)._asdict()
 
 
 def _by_xla(job: Job, wanted, riggings, heavy, light, pace):

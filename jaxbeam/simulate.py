@@ -11,11 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import is_known, known
-from jaxbeam.driver import AbstractDriver
-from jaxbeam.exponentials import NODES, at_ends
-from jaxbeam.extremes import Found
-from jaxbeam.grid import scheduled_grid
-from jaxbeam.integrate import trace
+from jaxbeam.integrator.events import sampled
+from jaxbeam.integrator.input_policy import AbstractDriver
+from jaxbeam.integrator.integrate import trace
+from jaxbeam.integrator.propagators import NODES, at_ends
+from jaxbeam.integrator.running_peaks import Found
+from jaxbeam.integrator.step_matrices import Rigging, make_rigging
+from jaxbeam.integrator.time_grid import scheduled_grid
 from jaxbeam.loop import make_loop
 from jaxbeam.model.contact import Traffic, at_instant, traffic
 from jaxbeam.model.measurement import measure
@@ -23,8 +25,6 @@ from jaxbeam.model.modal_model import Rig, rig
 from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
 from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.schedule import sampled
-from jaxbeam.tables import Rigging, make_rigging
 
 
 class ContactLossWarning(UserWarning):

@@ -10,14 +10,14 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.model.__init__  jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.document  jaxbeam.driver  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
+jaxbeam.integrator.__init__  jaxbeam.model.__init__  jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.document  jaxbeam.integrator.input_policy  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
 jaxbeam.runtime.compile_cache  jaxbeam.numerics.batched_linalg
 jaxbeam.runtime.compiling
 jaxbeam.case.declared_checks  jaxbeam.numerics.piecewise  jaxbeam.numerics.intervals
 jaxbeam.numerics.stages  jaxbeam.runtime.native_library
 jaxbeam.numerics.coupled_stages
 jaxbeam.case.beam  jaxbeam.case.filters  jaxbeam.case.trajectory  jaxbeam.case.actuators  jaxbeam.case.controller
-jaxbeam.case.estimator  jaxbeam.case.loads  jaxbeam.numerics.riccati  jaxbeam.schedule  jaxbeam.case.sensors
+jaxbeam.case.estimator  jaxbeam.case.loads  jaxbeam.numerics.riccati  jaxbeam.integrator.events  jaxbeam.case.sensors
 jaxbeam.case.case  jaxbeam.numerics.gain_table  jaxbeam.model.sensor_signals
 jaxbeam.numerics.gain_polynomials
 jaxbeam.numerics.native_designs
@@ -25,16 +25,16 @@ jaxbeam.numerics.finite_horizon
 jaxbeam.case.validation
 jaxbeam.model.modes
 jaxbeam.model.measurement  jaxbeam.model.modal_model
-jaxbeam.model.flexibility  jaxbeam.exponentials  jaxbeam.numerics.peak_search  jaxbeam.model.channels  jaxbeam.model.sine_basis
-jaxbeam.model.frequency_response  jaxbeam.grid
+jaxbeam.model.flexibility  jaxbeam.integrator.propagators  jaxbeam.numerics.peak_search  jaxbeam.model.channels  jaxbeam.model.sine_basis
+jaxbeam.model.frequency_response  jaxbeam.integrator.time_grid
 jaxbeam.model.contact
-jaxbeam.reference  jaxbeam.model.state_space  jaxbeam.model.statics  jaxbeam.tables
+jaxbeam.integrator.adaptive_reference  jaxbeam.model.state_space  jaxbeam.model.statics  jaxbeam.integrator.step_matrices
 jaxbeam.model.sensor_filters
 jaxbeam.estimation
-jaxbeam.control  jaxbeam.extremes
-jaxbeam.advance  jaxbeam.casefile
-jaxbeam.integrate
-jaxbeam.export  jaxbeam.loop  jaxbeam.native  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
+jaxbeam.control  jaxbeam.integrator.running_peaks
+jaxbeam.integrator.step  jaxbeam.casefile
+jaxbeam.integrator.integrate
+jaxbeam.export  jaxbeam.loop  jaxbeam.integrator.native_peaks  jaxbeam.open_loop  jaxbeam.record  jaxbeam.rigs
 jaxbeam.linear_loop  jaxbeam.plan
 jaxbeam.margins  jaxbeam.programs  jaxbeam.stability  jaxbeam.step_times  jaxbeam.swings
 jaxbeam.limits  jaxbeam.reserve

@@ -13,13 +13,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.grid import even_grid
-from jaxbeam.integrate import trace
+from jaxbeam.integrator.integrate import trace
+from jaxbeam.integrator.step_matrices import make_rigging
+from jaxbeam.integrator.time_grid import even_grid
 from jaxbeam.model.contact import traffic
 from jaxbeam.model.modal_model import rig
 from jaxbeam.plan import form
 from jaxbeam.simulate import ContactLossWarning
-from jaxbeam.tables import make_rigging
 from tests.oracles import modal_equations
 from tests.oracles.closed_forms import (
     cancellation_speed,

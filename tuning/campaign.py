@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.validation import check
+from jaxbeam.integrator.events import Schedule, stacked
 from jaxbeam.plan import Plan, make_plan
-from jaxbeam.schedule import Schedule, stacked
 from jaxbeam.simulate import readings
 from tuning.free import OF_LOG, insert
 from tuning.logs import Log

@@ -23,7 +23,7 @@ from experiments.benchmarks.crossing import GRAVITY, Rig
 from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, rig, sweep_peaks
 from experiments.benchmarks.timing import best_in_turn
 from jaxbeam import programs
-from jaxbeam.exponentials import GAUSS, LOOKED
+from jaxbeam.integrator.propagators import GAUSS, LOOKED
 from jaxbeam.numerics.peak_search import reach, through
 from jaxbeam.order import make_order
 

@@ -27,7 +27,7 @@ import jaxbeam as jb
 from experiments.benchmarks import baselines, by_numba
 from experiments.benchmarks.crossing import Rig
 from experiments.benchmarks.timing import Timing, best_in_turn, time_call
-from jaxbeam import native
+from jaxbeam.integrator import native_peaks
 from jaxbeam.plan import make_plan
 from jaxbeam.runtime import native_library
 from jaxbeam.runtime.compiling import compiled
@@ -94,7 +94,7 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
     else:
         with tempfile.TemporaryDirectory() as folder:
             with cached_in(folder):
-                native.build()
+                native_peaks.build()
 
             def by_hand():
                 with cached_in(folder):

@@ -15,7 +15,7 @@ def native(*, remove: bool = False, json_: Json = False) -> None:
     remove
         Remove what was compiled; sweeps do without again.
     """
-    from jaxbeam import native as compiled
+    from jaxbeam.integrator import native_peaks as compiled
     from jaxbeam.numerics import native_designs as designs
 
     path = compiled.binary()

@@ -14,16 +14,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.driver import AbstractDriver
-from jaxbeam.exponentials import NODES
-from jaxbeam.grid import scheduled_grid
-from jaxbeam.integrate import trace
+from jaxbeam.integrator.events import Schedule, merged
+from jaxbeam.integrator.input_policy import AbstractDriver
+from jaxbeam.integrator.integrate import trace
+from jaxbeam.integrator.propagators import NODES
+from jaxbeam.integrator.step_matrices import make_rigging
+from jaxbeam.integrator.time_grid import scheduled_grid
 from jaxbeam.model.contact import Traffic, traffic
 from jaxbeam.model.modal_model import rig
 from jaxbeam.plan import Form, form, suitable_step
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.schedule import Schedule, merged
-from jaxbeam.tables import make_rigging
 
 TOLERANCE = 1e-9  # relative to the largest deflection
 LANES = 256  # at once; more fall out of the cache

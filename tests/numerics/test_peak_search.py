@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import jaxbeam.numerics.peak_search
-from jaxbeam.exponentials import LOOKED
+from jaxbeam.integrator.propagators import LOOKED
 
 EQUAL = tuple(float(share) for share in np.linspace(0.0, 1.0, 7))
 EITHER = pytest.mark.parametrize("points", [EQUAL, LOOKED], ids=["equal", "of a step"])

@@ -187,7 +187,7 @@ def test_a_changed_source_is_noticed(folder, tmp_path, monkeypatch):
     before = compile_cache._surroundings()
     home = tmp_path / "jaxbeam"
     home.mkdir()
-    monkeypatch.setattr(compile_cache, "__file__", str(home / "kept_programs.py"))
+    monkeypatch.setattr(compile_cache, "__file__", str(home / "runtime" / "compile_cache.py"))
     marks = [before]
     for text in ("a = 1\n", "a = 2\n"):
         (home / "modes.py").write_text(text)

@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads import motion
+from jaxbeam.integrator.events import Schedule
 from jaxbeam.model.modal_model import Rig
-from jaxbeam.schedule import Schedule
 
 
 class Grid(eqx.Module):

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.exponentials import GAUSS, LOOKED
+from jaxbeam.integrator.propagators import GAUSS, LOOKED
+from jaxbeam.integrator.step_matrices import Path, Tables
 from jaxbeam.numerics.peak_search import highest, refine, vertex
-from jaxbeam.tables import Path, Tables
 
 NEAR = 1.1  # a peak between samples is less than this above the highest of them
 

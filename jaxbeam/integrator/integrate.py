@@ -16,14 +16,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.advance import KEPT, advance, contact, undriven
 from jaxbeam.case.loads import AbstractLoad, MovingMass
-from jaxbeam.driver import AbstractDriver, Moment
-from jaxbeam.exponentials import GAUSS, LONGEST, NODES, norm
-from jaxbeam.extremes import Extremes, fold, nothing_seen
+from jaxbeam.integrator.input_policy import AbstractDriver, Moment
+from jaxbeam.integrator.propagators import GAUSS, LONGEST, NODES, norm
+from jaxbeam.integrator.running_peaks import Extremes, fold, nothing_seen
+from jaxbeam.integrator.step import KEPT, advance, contact, undriven
+from jaxbeam.integrator.step_matrices import CHUNK, Path, Rigging, follow, tabulate
 from jaxbeam.model.contact import Traffic
 from jaxbeam.model.modal_model import Rig
-from jaxbeam.tables import CHUNK, Path, Rigging, follow, tabulate
 
 # Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
 # a polynomial in each step, misses that mode's oscillation and feeds it.

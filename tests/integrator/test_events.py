@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from jaxbeam.schedule import merged, sampled, stacked
+from jaxbeam.integrator.events import merged, sampled, stacked
 
 MILLI = 1e-3
 

@@ -17,9 +17,9 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbeam.driver import AbstractDriver
-from jaxbeam.exponentials import GAUSS, LOOKED, Step, propagators
-from jaxbeam.grid import Grid
+from jaxbeam.integrator.input_policy import AbstractDriver
+from jaxbeam.integrator.propagators import GAUSS, LOOKED, Step, propagators
+from jaxbeam.integrator.time_grid import Grid
 from jaxbeam.model.contact import Traffic, contact_rows
 from jaxbeam.model.modal_model import Rig
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.advance import advance, undriven
+from jaxbeam.integrator.step import advance, undriven
+from jaxbeam.integrator.step_matrices import Tables
 from jaxbeam.simulate import readings
-from jaxbeam.tables import Tables
 from tests.runs import plan_of
 
 STEPS, LANES = 5, 3

@@ -18,12 +18,13 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam import native
 from jaxbeam.case.case import replace
 from jaxbeam.cli import main
-from jaxbeam.exponentials import LOOKED
-from jaxbeam.grid import even_grid
-from jaxbeam.integrate import march
+from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator.integrate import march
+from jaxbeam.integrator.propagators import LOOKED
+from jaxbeam.integrator.step_matrices import make_rigging
+from jaxbeam.integrator.time_grid import even_grid
 from jaxbeam.model.contact import traffic
 from jaxbeam.model.modal_model import rig
 from jaxbeam.numerics import native_designs, peak_search
@@ -31,7 +32,6 @@ from jaxbeam.order import make_order
 from jaxbeam.plan import form
 from jaxbeam.runtime import native_library
 from jaxbeam.sweep_store import FINGERPRINT
-from jaxbeam.tables import make_rigging
 
 pytestmark = pytest.mark.skipif(native_library.compiler() is None, reason="no C compiler here")
 
@@ -90,16 +90,16 @@ def folder(tmp_path_factory):
     """The C, compiled into a cache folder of these tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        assert not native.ready()
-        assert native.build() == native.binary()
-        assert native.ready()
-        yield native.binary().parent
+        assert not native_peaks.ready()
+        assert native_peaks.build() == native_peaks.binary()
+        assert native_peaks.ready()
+        yield native_peaks.binary().parent
 
 
 def swept(case, over):
     with_it = jb.sweep(case, over, progress=False)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(native, "ready", lambda: False)
+        patch.setattr(native_peaks, "ready", lambda: False)
         return with_it, jb.sweep(case, over, progress=False)
 
 
@@ -136,7 +136,7 @@ NARROW = """
 import sys
 import jaxbeam as jb
 from jaxbeam import native, native_library
-from tests.test_native import COUPLED, GRID
+from tests.integrator.test_native_peaks import COUPLED, GRID
 native.build()
 assert native.ready()
 jb.sweep(COUPLED, GRID, progress=False).to_netcdf(sys.argv[1], engine="h5netcdf")
@@ -151,7 +151,7 @@ def test_narrower_machines_compute_the_same(without, tmp_path, monkeypatch):
     monkeypatch.setenv("CC", f"{native_library.compiler()} -mno-{without}")
     path = tmp_path / "found.nc"
     subprocess.run([sys.executable, "-c", NARROW, str(path)], check=True, cwd=ROOT)
-    monkeypatch.setattr(native, "ready", lambda: False)
+    monkeypatch.setattr(native_peaks, "ready", lambda: False)
     plain = jb.sweep(COUPLED, GRID, progress=False).peak_deflection
     with xarray.open_dataset(path, engine="h5netcdf") as found:
         assert_allclose(found.peak_deflection, plain, rtol=1e-11)
@@ -177,7 +177,7 @@ def marched(case, by_hand, longest=1e-3):
             return best.peak()[0][:, 0]
         given = jnp.ones((), bool), assembled, grid, places, loads
         of_one = jax.tree.map(lambda leaf: leaf[None], given)
-        return native.march(known.slots, *of_one).peak_deflection[0, 0]
+        return native_peaks.march(known.slots, *of_one).peak_deflection[0, 0]
 
     return jax.jit(peak_search)
 
@@ -215,7 +215,7 @@ def test_a_resumed_sweep_keeps_to_what_began_it():
     def marks(histories, precision, case=PLAIN):
         for ready in (True, False):
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(native, "ready", lambda ready=ready: ready)
+                patch.setattr(native_peaks, "ready", lambda ready=ready: ready)
                 order = make_order(case, GRID, False, histories, 1e-7, precision)
                 yield order.fingerprint()
 
@@ -232,12 +232,12 @@ def test_a_resumed_sweep_keeps_to_what_began_it():
 
 def test_what_cannot_be_loaded_is_left_alone(folder, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native.binary().parent.mkdir()
-    native.binary().write_bytes((folder / native.binary().name).read_bytes()[:1000])
-    assert not native.ready()
+    native_peaks.binary().parent.mkdir()
+    native_peaks.binary().write_bytes((folder / native_peaks.binary().name).read_bytes()[:1000])
+    assert not native_peaks.ready()
 
 
-@pytest.mark.parametrize("library", [native.LIBRARY, native_designs.LIBRARY])
+@pytest.mark.parametrize("library", [native_peaks.LIBRARY, native_designs.LIBRARY])
 def test_whatever_is_included_decides_the_name_of_a_library(library):
     """Else one would be taken that was compiled from an older header."""
     folder = native_library.HERE
@@ -250,15 +250,15 @@ def test_compilers_that_fail_are_told_of(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CC", "false")
     with pytest.raises(RuntimeError, match="the C compiler false cannot compile .*native.c"):
-        native.build()
+        native_peaks.build()
     monkeypatch.setenv("CC", "/nowhere/cc")
     with pytest.raises(RuntimeError, match="the C compiler /nowhere/cc cannot be run"):
-        native.build()
+        native_peaks.build()
     monkeypatch.delenv("CC")
     monkeypatch.setattr(shutil, "which", lambda _: None)
     with pytest.raises(RuntimeError, match="there is no C compiler here: install gcc or clang"):
-        native.build()
-    assert not native.binary().exists()
+        native_peaks.build()
+    assert not native_peaks.binary().exists()
 
 
 def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
@@ -266,12 +266,12 @@ def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["native", "--json"])
     answer = json.loads(capsys.readouterr().out)
-    assert answer == {"path": str(native.binary()), "compiled": True}
-    assert native.binary().exists() and native.ready()
+    assert answer == {"path": str(native_peaks.binary()), "compiled": True}
+    assert native_peaks.binary().exists() and native_peaks.ready()
     with pytest.raises(SystemExit, match="0"):
         main(["native", "--remove"])
     assert "sweeps do without" in capsys.readouterr().out
-    assert not native.binary().exists()
+    assert not native_peaks.binary().exists()
 
 
 SEEK = """
@@ -295,7 +295,7 @@ def test_places_of_peaks_are_as_high_as_those_found_without_it(tmp_path):
     curves = curves.reshape(len(LOOKED), -1)
     (tmp_path / "seek.c").write_text(SEEK)
     headers = native_library.HERE
-    words = [native_library.compiler(), *native.LIBRARY.flags, "-I", str(headers), "seek.c"]
+    words = [native_library.compiler(), *native_peaks.LIBRARY.flags, "-I", str(headers), "seek.c"]
     subprocess.run([*words, "-o", "seek.so"], check=True, cwd=tmp_path)
     pointer = np.ctypeslib.ndpointer(float, flags="C")
     seek = ctypes.CDLL(str(tmp_path / "seek.so")).seek

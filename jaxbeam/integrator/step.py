@@ -11,9 +11,9 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
+from jaxbeam.integrator.step_matrices import Tables
 from jaxbeam.model.contact import solve_contact
 from jaxbeam.numerics.batched_linalg import FEW, product, solve_small
-from jaxbeam.tables import Tables
 
 KEPT = "steps"  # states and forces in rows of steps, which reverse mode need not work out again
 

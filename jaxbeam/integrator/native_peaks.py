@@ -17,15 +17,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.exponentials import DOUBLINGS, GAUSS, LOOKED, NODES, TERMS, lagrange
-from jaxbeam.extremes import NEAR, Found
-from jaxbeam.grid import Grid
-from jaxbeam.integrate import march as plain_march
+from jaxbeam.integrator.integrate import march as plain_march
+from jaxbeam.integrator.propagators import DOUBLINGS, GAUSS, LOOKED, NODES, TERMS, lagrange
+from jaxbeam.integrator.running_peaks import NEAR, Found
+from jaxbeam.integrator.step_matrices import CHUNK, make_rigging
+from jaxbeam.integrator.time_grid import Grid
 from jaxbeam.model.contact import Traffic
 from jaxbeam.model.modal_model import Rig
 from jaxbeam.numerics.peak_search import CLIMBS, ROUNDINGS, STARTS, VERTEX_ROUNDS, reach, through
 from jaxbeam.runtime.native_library import Library
-from jaxbeam.tables import CHUNK, make_rigging
 
 FILL = 8  # numbers that fill whole vector registers of any machine
 CONSTANTS = {

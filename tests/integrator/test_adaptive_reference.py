@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.integrator.adaptive_reference import simulate_adaptive
 from jaxbeam.plan import make_plan
-from jaxbeam.reference import simulate_adaptive
 
 TIMES = jnp.linspace(0.0, 0.5, 101)
 BEAM = jb.Beam(1.2, 11.68, 0.535, [0.01, 0.03, 0.02], "pinned-clamped", modes=3)

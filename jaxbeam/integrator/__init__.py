@@ -1,0 +1,1 @@
+"""Exact modal propagation with collocated contact forces, step by step."""
