@@ -16,7 +16,7 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.case.fields import POSITIVE, is_known, known, number
 from jaxbeam.control.following import Follower
 from jaxbeam.control.listening import Listener
-from jaxbeam.estimation.fixed import offsets
+from jaxbeam.estimation.constant_gain import offsets
 from jaxbeam.estimation.observability import deflections
 from jaxbeam.model.modes import lay_out
 from jaxbeam.model.state_space import LoadedBeam, state_space

@@ -13,7 +13,7 @@ from jaxbeam.case.fields import choice, is_known, known, part
 from jaxbeam.case.loads import motion
 from jaxbeam.control.beliefs import Beliefs
 from jaxbeam.estimation import KINDS
-from jaxbeam.estimation.flowing import Flowing
+from jaxbeam.estimation.continuous import Flowing
 from jaxbeam.model.modes import lay_out
 from jaxbeam.model.state_space import LoadedBeam, StateSpace, loaded_beam, state_space
 from jaxbeam.runtime.compiling import compiled

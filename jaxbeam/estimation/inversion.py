@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
 from jaxbeam.case.fields import POSITIVE, known, number
-from jaxbeam.estimation.fixed import offsets
+from jaxbeam.estimation.constant_gain import offsets
 from jaxbeam.estimation.observability import (
     UNSEEN,
     ConditioningWarning,
@@ -19,7 +19,7 @@ from jaxbeam.estimation.observability import (
     deflection_rows,
     deflections,
 )
-from jaxbeam.estimation.sampled import Transition, ticks
+from jaxbeam.estimation.sampled_plant import Transition, ticks
 from jaxbeam.numerics.discretisation import balance
 
 WORST = 100.0  # conditioning beyond which there is a warning

@@ -12,12 +12,12 @@ from jaxtyping import Array, Float
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
 from jaxbeam.case.fields import POSITIVE, choice, count, is_known, known, number
-from jaxbeam.estimation.chain import Chain, Sight, chain, sight
-from jaxbeam.estimation.fixed import at_rest, offsets
-from jaxbeam.estimation.flowing import Flowing
+from jaxbeam.estimation.constant_gain import at_rest, offsets
+from jaxbeam.estimation.continuous import Flowing
 from jaxbeam.estimation.gains import filter_gain, kalman_gain, sampled_kalman_gain
 from jaxbeam.estimation.observability import modes_of, unseen_fault
-from jaxbeam.estimation.sampled import ROUNDING, ticks
+from jaxbeam.estimation.sampled_plant import ROUNDING, ticks
+from jaxbeam.estimation.sensor_chain import Chain, Sight, chain, sight
 from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.finite_horizon import finite_time

@@ -6,11 +6,11 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
 from jaxbeam.case.fields import POSITIVE, known, number
-from jaxbeam.estimation.fixed import FixedGain, at_rest, offsets
-from jaxbeam.estimation.flowing import Flowing
+from jaxbeam.estimation.constant_gain import FixedGain, at_rest, offsets
+from jaxbeam.estimation.continuous import Flowing
 from jaxbeam.estimation.gains import placed_gain
 from jaxbeam.estimation.observability import modes_of, unseen_fault
-from jaxbeam.estimation.sampled import Ticks, ticks
+from jaxbeam.estimation.sampled_plant import Ticks, ticks
 from jaxbeam.model.state_space import StateSpace
 from jaxbeam.numerics.discretisation import balance, hold
 

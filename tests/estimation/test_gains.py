@@ -10,7 +10,7 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 from jaxbeam.estimation import kalman_gain, placed_gain, sampled_kalman_gain
-from jaxbeam.estimation.sampled import Ticks
+from jaxbeam.estimation.sampled_plant import Ticks
 from jaxbeam.numerics.discretisation import balance
 from tests.differences import central
 

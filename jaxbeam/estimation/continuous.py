@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.estimator import Estimate
-from jaxbeam.estimation.chain import Sight
+from jaxbeam.estimation.sensor_chain import Sight
 from jaxbeam.model.state_space import StateSpace
 
 

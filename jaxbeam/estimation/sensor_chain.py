@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.filters import filter_step
-from jaxbeam.estimation.sampled import ROUNDING, Ticks, Transition
+from jaxbeam.estimation.sampled_plant import ROUNDING, Ticks, Transition
 from jaxbeam.model.sensor_filters import sensed
 from jaxbeam.model.sensor_signals import Sections, design
 from jaxbeam.model.state_space import LoadedBeam, StateSpace

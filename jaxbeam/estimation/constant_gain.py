@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import Measurement
-from jaxbeam.estimation.sampled import Transition
+from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.model.state_space import LoadedBeam
 
 
