@@ -20,7 +20,7 @@ from experiments.regulator_limits import Loops, draw_poles, frozen, grown, sampl
 from experiments.shaker import data_physics_v4
 from experiments.verdicts import Experiment, Finding, Outcome, finding
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.model.modes import lay_out
 from jaxbeam.plan import make_plan
 from jaxbeam.plot.style import colour, name, styled

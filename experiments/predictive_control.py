@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments import published
 from experiments.verdicts import Experiment, Finding, Outcome, finding
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.reach import reach
 from jaxbeam.loop import loop_schedule

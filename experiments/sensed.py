@@ -1,6 +1,6 @@
 """Laws on the patch rigs that know nothing but what their sensors read, beside what is possible.
 
-One table of commands over the deflection under the load (`jaxbeam.control.relief`) for all masses
+One table of commands over the deflection under the load (`jaxbeam.control.internal_model`) for all masses
 and speeds, tuned by gradients on the bench (`experiments.sensed_search`): noise of 4 um, filters
 of tenth order at 10 Hz (one span) and 20 Hz (two), a command every 10 ms in steps of 10 mV, 20 ms
 late. No gate, no mass and no speed is told. It is proven on loads, entries and noise that it was

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments.verdicts import Experiment, Outcome
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.plot.style import GREY, colour, name, styled
 
 MASS, SPEED, ENTRIES = 0.371, 1.0, np.array([0.0, 0.25, 0.5])  # kg, m/s, s

@@ -1,6 +1,6 @@
 """Tuned laws on the patch rigs, beside the hand-set ones of chapter 6 and what is possible at all.
 
-One table of commands over the way of the load (`jaxbeam.control.passage`) for all masses and
+One table of commands over the way of the load (`jaxbeam.control.feedforward`) for all masses and
 speeds, tuned by gradients (`experiments.tuned_search`), is proven on loads that it was not tuned
 on:
 

@@ -10,7 +10,7 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.integrator.__init__  jaxbeam.model.__init__  jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.document  jaxbeam.integrator.input_policy  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
+jaxbeam.control.predictive.__init__  jaxbeam.control.optimal.__init__  jaxbeam.integrator.__init__  jaxbeam.model.__init__  jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.document  jaxbeam.integrator.input_policy  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
 jaxbeam.runtime.compile_cache  jaxbeam.numerics.batched_linalg
 jaxbeam.runtime.compiling
 jaxbeam.case.declared_checks  jaxbeam.numerics.piecewise  jaxbeam.numerics.intervals

@@ -10,7 +10,7 @@ import scipy.integrate
 import scipy.linalg
 
 import jaxbeam as jb
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.limits import limit
 from jaxbeam.linear_loop import linear_loop
 from jaxbeam.margins import gramians, margins

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.control.lqr import AbstractRegulator
+from jaxbeam.control.optimal.lqr import AbstractRegulator
 from tuning.load_cases import LoadCases
 from tuning.objective import Objective
 from tuning.proof import Tuned

@@ -32,7 +32,7 @@ import jaxbeam as jb
 from experiments.benchmarks.steps import PREDICTIVE, rig
 from experiments.benchmarks.timing import time_call
 from jaxbeam.control import SamplingWarning
-from jaxbeam.control.qp import solve_qp
+from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import ContactLossWarning

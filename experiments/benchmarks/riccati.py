@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam.control.lqr import optimal
+from jaxbeam.control.optimal.lqr import optimal
 from jaxbeam.model.modes import lay_out
 from jaxbeam.numerics import native_designs
 from jaxbeam.numerics.riccati import lqr

@@ -1,16 +1,16 @@
 """Controllers, one family a file, behind the interface in `controller`."""
 
 from jaxbeam.control.compensators import PD, Lead, PositivePositionFeedback
-from jaxbeam.control.discrete import DiscreteLQR
 from jaxbeam.control.feedback import Feedback
-from jaxbeam.control.lqr import LQR, AugmentedLQR, FiniteLQR, StepLQR
-from jaxbeam.control.mpc import MPC
-from jaxbeam.control.passage import Passage
+from jaxbeam.control.feedforward import Passage
+from jaxbeam.control.internal_model import Relief
+from jaxbeam.control.load_identification import Recognised, Recognition, recognised
+from jaxbeam.control.optimal.lqr import LQR, AugmentedLQR, FiniteLQR, StepLQR
+from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
+from jaxbeam.control.optimal.sampling_loss import SamplingWarning, sampling_limit
+from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.control.predictive.mpc import MPC
 from jaxbeam.control.prescribed import Prescribed
-from jaxbeam.control.recognition import Recognised, Recognition, recognised
-from jaxbeam.control.relief import Relief
-from jaxbeam.control.sampling import SamplingWarning, sampling_limit
-from jaxbeam.control.scheduled import ScheduledLQR
 from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from jaxbeam.control.state_feedback import StateFeedback
 

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import INCREASING, choice, count, is_known, known, number, part
 from jaxbeam.control.feedback import Feedback, pairing_fault
-from jaxbeam.control.listening import Listener
-from jaxbeam.control.recognition import Recognition
+from jaxbeam.control.load_identification import Recognition
+from jaxbeam.control.load_update import Listener
 
 
 class Told(eqx.Module):

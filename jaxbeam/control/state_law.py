@@ -11,7 +11,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
 from jaxbeam.case.fields import choice, is_known, known, part
 from jaxbeam.case.loads import motion
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.estimation import KINDS
 from jaxbeam.estimation.continuous import Flowing
 from jaxbeam.model.modes import lay_out

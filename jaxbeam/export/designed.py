@@ -8,9 +8,9 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
 from jaxbeam.control import DiscreteLQR, StateFeedback
-from jaxbeam.control.gains import Schedule
-from jaxbeam.control.lqr import LQR, AbstractScheduledRegulator
-from jaxbeam.control.scheduled import Family, ScheduledLQR
+from jaxbeam.control.optimal.gain_schedules import Schedule
+from jaxbeam.control.optimal.lqr import LQR, AbstractScheduledRegulator
+from jaxbeam.control.optimal.scheduled_lqr import Family, ScheduledLQR
 from jaxbeam.estimation import Observer
 from jaxbeam.export.gains import Gains
 from jaxbeam.model.modes import lay_out

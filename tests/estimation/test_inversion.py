@@ -13,7 +13,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.estimation import ConditioningWarning, Inversion, Kalman, Observer, conditioning
 from jaxbeam.model.modes import lay_out
 from tests.differences import central

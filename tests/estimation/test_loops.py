@@ -9,7 +9,7 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.estimation import Kalman
 from jaxbeam.linear_loop import linear_loop
 from jaxbeam.loop import loop_schedule

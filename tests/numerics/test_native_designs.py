@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.control import FiniteLQR
-from jaxbeam.control.lqr import optimal
+from jaxbeam.control.optimal.lqr import optimal
 from jaxbeam.model.modes import lay_out
 from jaxbeam.numerics.native_designs import LIBRARY, lacking
 from jaxbeam.runtime import native_library

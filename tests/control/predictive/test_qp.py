@@ -8,7 +8,7 @@ import pytest
 import scipy.sparse
 from numpy.testing import assert_allclose, assert_array_equal
 
-from jaxbeam.control.qp import INFEASIBLE, SOLVED, UNFINISHED, solve_qp
+from jaxbeam.control.predictive.qp import INFEASIBLE, SOLVED, UNFINISHED, solve_qp
 from tests.differences import central
 
 METHODS = ("interior", "hildreth")  # qpax has its own tests

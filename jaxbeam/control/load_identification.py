@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.fields import POSITIVE, is_known, known, number
-from jaxbeam.control.following import Follower
-from jaxbeam.control.listening import Listener
+from jaxbeam.control.load_position import Follower
+from jaxbeam.control.load_update import Listener
 from jaxbeam.estimation.constant_gain import offsets
 from jaxbeam.estimation.observability import deflections
 from jaxbeam.model.modes import lay_out

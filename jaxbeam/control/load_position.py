@@ -8,7 +8,7 @@ over time is its way, large deflections counting most.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.control.listening import Listener
+from jaxbeam.control.load_update import Listener
 
 # A way is believed that scatters places by so much of the way listened to, after so many ticks with
 # deflections as large as the largest: at first the beam lags; its load seems to stay, or to jump.

@@ -9,11 +9,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxbeam.case.validation import check
-from jaxbeam.control import by_qpax
-from jaxbeam.control.qp import SOLVED, UNFINISHED, solve_qp
+from jaxbeam.control.predictive import by_qpax
+from jaxbeam.control.predictive.qp import SOLVED, UNFINISHED, solve_qp
+from tests.control.predictive.test_mpc import mpc, rig
+from tests.control.predictive.test_qp import FEASIBLE, problems
 from tests.differences import central
-from tests.test_mpc import mpc, rig
-from tests.test_qp import FEASIBLE, problems
 
 there = pytest.mark.skipif(not by_qpax.installed(), reason="qpax is not installed")
 
@@ -82,7 +82,7 @@ def test_derivatives():
 
 @there
 def test_predictive_control_gives_the_same_commands():
-    from tests.test_mpc_law import commands
+    from tests.control.predictive.test_mpc_law import commands
 
     states = jnp.asarray(np.random.default_rng(3).normal(size=(12, 6))) * 1e-3
     own, other = (commands(mpc(solver=solver), states) for solver in ("interior", "qpax"))

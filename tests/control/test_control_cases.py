@@ -14,8 +14,8 @@ import jaxbeam as jb
 from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.cli import main
+from tests.control.test_controllers import HELD
 from tests.loop_as_oracle import expected
-from tests.test_control import HELD
 
 ACTUATOR, LISTENER = HELD.actuators[0], HELD.sensors[0]
 SAMPLED = "needs a controller that samples: give controller.period"

@@ -16,10 +16,9 @@ import jaxbeam as jb
 from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control import AugmentedLQR, ScheduledLQR
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.loop import loop_schedule
-from tests.runs import plan_of
-from tests.test_regulators import (
+from tests.control.optimal.test_regulators import (
     ENTRIES,
     EVENTS,
     GRAVITY,
@@ -35,6 +34,7 @@ from tests.test_regulators import (
     plant,
     rig,
 )
+from tests.runs import plan_of
 
 # Both late to be noticed, the second as early as it overlaps the first; heavier, lighter.
 PREDICTED = {"masses": (0.36, 0.15), "speeds": (1.6, 1.9), "entries": (0.013, 0.095)}

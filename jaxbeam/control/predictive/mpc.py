@@ -21,8 +21,8 @@ from jaxbeam.case.fields import (
     known,
     number,
 )
-from jaxbeam.control.by_qpax import installed
-from jaxbeam.control.prediction import (
+from jaxbeam.control.predictive.by_qpax import installed
+from jaxbeam.control.predictive.prediction import (
     Prediction,
     Sampled,
     incremental,
@@ -31,7 +31,7 @@ from jaxbeam.control.prediction import (
     pulses,
     sample,
 )
-from jaxbeam.control.qp import METHODS, solve_qp
+from jaxbeam.control.predictive.qp import METHODS, solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics.riccati import dare

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import INCREASING, choice, is_known, known, number, part
-from jaxbeam.control.gains import Schedule
-from jaxbeam.control.listening import Listener
-from jaxbeam.control.lqr import FiniteLQR, too_coarse
-from jaxbeam.control.recognition import Recognition
+from jaxbeam.control.load_identification import Recognition
+from jaxbeam.control.load_update import Listener
+from jaxbeam.control.optimal.gain_schedules import Schedule
+from jaxbeam.control.optimal.lqr import FiniteLQR, too_coarse
 from jaxbeam.model.contact import traffic
 from jaxbeam.model.state_space import LoadedBeam
 

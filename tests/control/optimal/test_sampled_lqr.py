@@ -15,8 +15,8 @@ import jaxbeam as jb
 from jaxbeam.case.validation import check
 from jaxbeam.cli import main
 from jaxbeam.control import LQR, DiscreteLQR, SamplingWarning
-from jaxbeam.control.discrete import sampled_problem
-from jaxbeam.control.sampling import reach_kept
+from jaxbeam.control.optimal.sampled_lqr import sampled_problem
+from jaxbeam.control.optimal.sampling_loss import reach_kept
 from jaxbeam.linear_loop import linear_loop
 from jaxbeam.model.modes import lay_out
 

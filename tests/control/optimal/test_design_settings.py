@@ -10,7 +10,7 @@ import scipy.optimize
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.limits import limit
 from jaxbeam.stability import frozen_poles
 from tests import test_stability as oracle

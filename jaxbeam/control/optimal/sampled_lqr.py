@@ -6,7 +6,7 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, is_known, known, number
-from jaxbeam.control.lqr import AbstractRegulator
+from jaxbeam.control.optimal.lqr import AbstractRegulator
 from jaxbeam.estimation.sampled_plant import ticks, whole_and_sum
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.intervals import Commands, Inputs, Square, symmetric

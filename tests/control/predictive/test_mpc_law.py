@@ -13,9 +13,9 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.casefile import case_from_dict, case_to_dict
-from jaxbeam.control.prediction import incremental
+from jaxbeam.control.predictive.prediction import incremental
 from jaxbeam.numerics.riccati import dlqr
-from tests.test_mpc import PATCH, PERIOD, mpc, rig
+from tests.control.predictive.test_mpc import PATCH, PERIOD, mpc, rig
 
 
 def test_laguerre_moves_that_span_all_moves_change_nothing():

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.control import DiscreteLQR, ScheduledLQR
-from jaxbeam.control.lqr import optimal
+from jaxbeam.control.optimal.lqr import optimal
 from jaxbeam.estimation import Kalman, Observer
 from jaxbeam.model.modes import lay_out
 from tests.differences import central

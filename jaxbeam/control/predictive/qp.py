@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbeam.control.by_qpax import nearest
+from jaxbeam.control.predictive.by_qpax import nearest
 
 METHODS = ("interior", "hildreth", "qpax")
 SOLVED, INFEASIBLE, UNFINISHED = range(3)

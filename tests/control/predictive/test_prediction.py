@@ -5,7 +5,14 @@ import numpy as np
 import scipy.linalg
 from numpy.testing import assert_allclose, assert_array_equal
 
-from jaxbeam.control.prediction import Sampled, incremental, moves, predict, pulses, sample
+from jaxbeam.control.predictive.prediction import (
+    Sampled,
+    incremental,
+    moves,
+    predict,
+    pulses,
+    sample,
+)
 
 
 def plant(states=4, inputs=2, outputs=2, seed=0):

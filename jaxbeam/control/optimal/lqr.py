@@ -24,9 +24,9 @@ from jaxbeam.case.fields import (
     number,
 )
 from jaxbeam.case.loads import motion
-from jaxbeam.control.contact import coupled_beam
-from jaxbeam.control.gains import Schedule, crossing
-from jaxbeam.control.sampling import warn_if_slow
+from jaxbeam.control.optimal.crossing_plant import coupled_beam
+from jaxbeam.control.optimal.gain_schedules import Schedule, crossing
+from jaxbeam.control.optimal.sampling_loss import warn_if_slow
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics import native_designs

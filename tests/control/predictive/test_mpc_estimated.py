@@ -13,9 +13,9 @@ from scipy.optimize import lsq_linear
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.control.beliefs import Beliefs
+from jaxbeam.control.design_model import Beliefs
 from jaxbeam.estimation import Kalman
-from tests.test_mpc import PATCH, PERIOD, THESIS, mpc, rig
+from tests.control.predictive.test_mpc import PATCH, PERIOD, THESIS, mpc, rig
 
 INTENSITY, NOISE = 0.05, 1e-6
 TICKS, FINE = 40, 4
