@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from experiments.verdicts import IMPOSSIBLE, VERDICTS, Finding, Judged
-from jaxbeam.document import html_table, markdown_table, page
+from jaxbeam.files.report import html_table, markdown_table, page
 
 if TYPE_CHECKING:
     from experiments.reproduction import Run

@@ -18,7 +18,6 @@ from jaxbeam.case.case import Case, Run, addresses, replace
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.loads import MovingForce, MovingMass
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.casefile import load_case, save_case
 from jaxbeam.control import (
     LQR,
     MPC,
@@ -42,6 +41,7 @@ from jaxbeam.control import (
 )
 from jaxbeam.control.bound import bound
 from jaxbeam.estimation import Inversion, Kalman, Observer
+from jaxbeam.files.case_file import load_case, save_case
 from jaxbeam.model.modes import modes
 from jaxbeam.model.state_space import state_space
 from jaxbeam.record import Record, read_record

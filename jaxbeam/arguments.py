@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.casefile import load_case, load_controller, with_settings
+from jaxbeam.files.case_file import load_case, load_controller, with_settings
 from jaxbeam.lanes import MOST_RUNS
 
 

@@ -17,7 +17,7 @@ from jaxbeam.blocks import RUNS, Work
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.declared_checks import in_words
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
 from jaxbeam.lanes import LANES, MOST_RUNS, Tasks, arrange
 

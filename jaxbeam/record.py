@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
-from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.measurement import history, measure
 from jaxbeam.model.modes import Modes
 

@@ -168,7 +168,7 @@ def test_modes(run, folder):
 
 def test_simulate_prints_and_writes_the_same(run, folder):
     import jaxbeam as jb
-    from jaxbeam.casefile import load_case
+    from jaxbeam.files.case_file import load_case
 
     record = jb.simulate(load_case(folder / "case.toml"))
     found = run("simulate case.toml --json")
@@ -263,7 +263,7 @@ def test_identify_modes_of_a_decay(run, folder):
 
 def test_identify_a_case(run, folder):
     import jaxbeam as jb
-    from jaxbeam.casefile import load_case
+    from jaxbeam.files.case_file import load_case
 
     record = jb.simulate(load_case(folder / "case.toml"))
     table = np.column_stack([record.times, np.asarray(record.deflection)[:, 0]])

@@ -13,8 +13,8 @@ import tomli_w
 
 import jaxbeam as jb
 from jaxbeam import cluster
-from jaxbeam.casefile import case_to_dict
 from jaxbeam.cli import main
+from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.order import make_order, order_from_dict
 from jaxbeam.sweep_store import Disk, create
 from tests.test_sweep import CASE

@@ -11,9 +11,9 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.casefile import load_controller
 from jaxbeam.cli import main
 from jaxbeam.compare import compare
+from jaxbeam.files.case_file import load_controller
 from jaxbeam.plot import plot_comparison
 from jaxbeam.reserve import PLACES, reserve
 from jaxbeam.step_times import step_times

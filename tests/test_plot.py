@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageSequence
 
 import jaxbeam as jb
-from jaxbeam.casefile import case_to_dict
+from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.model.frequency_response import frequency_response
 from jaxbeam.plot import (
     FitPanel,

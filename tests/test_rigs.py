@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.casefile import case_from_dict
+from jaxbeam.files.case_file import case_from_dict
 from tests.oracles import crossing, finite_elements
 from tests.oracles.loads import GRAVITY, Load
 from tests.runs import assert_close, load_of, plan_of

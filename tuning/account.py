@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxbeam.document import html_table, markdown_table, page
+from jaxbeam.files.report import html_table, markdown_table, page
 from tuning.criticism import Rival, Unseen, channels
 from tuning.identify import Fit
 from tuning.posterior import Posterior

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbeam.case.case import Case
-from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tuning.belief import Belief
 from tuning.campaign import prepare
 from tuning.checkpoint import load, save

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxbeam.case.loads import KINDS, AbstractLoad
-from jaxbeam.casefile import read_part
+from jaxbeam.files.case_file import read_part
 
 _KEYS = ("loads", "columns", "time", "runs")
 _COLUMN_KEYS = {

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.casefile import case_to_dict
+from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulate import ContactLossWarning, Histories

@@ -32,7 +32,7 @@ def export(
     points
         Points of the table over the crossing; 1001 if left out.
     """
-    from jaxbeam.export import WRITERS, export_gains, write_gains
+    from jaxbeam.files.export import WRITERS, export_gains, write_gains
 
     endings = ", ".join(WRITERS)
     refuse(output.suffix not in WRITERS, f"gains are written to {endings}, not to {output}")

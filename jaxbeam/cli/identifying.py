@@ -209,7 +209,7 @@ def _judge(fit, profile, draws, sampling, validate, output, resume) -> dict:
 
 def _tell(fit, judged, report, output, picture, json_) -> None:
     """Write and print what was found; then what was kept on the way is needed no longer."""
-    from jaxbeam.casefile import save_case
+    from jaxbeam.files.case_file import save_case
     from tuning.account import write_report
     from tuning.keeping import save_fit
 

@@ -81,7 +81,7 @@ def sharpen(
         Write the case with the chosen experiment to this file, TOML.
     """
     import tuning
-    from jaxbeam.casefile import save_case
+    from jaxbeam.files.case_file import save_case
 
     check_outputs(overwrite, output)
     refuse(not free, "name what will be identified with --free ADDRESS")

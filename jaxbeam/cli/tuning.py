@@ -172,7 +172,7 @@ def tune(
 
 def _tell(found, results, files, picture, json_) -> None:
     """Write the tuned cases and the picture, and print what was found."""
-    from jaxbeam.casefile import save_case
+    from jaxbeam.files.case_file import save_case
 
     for one, file in zip(results, files, strict=False):
         save_case(one.case, file, overwrite=True)  # checked before the work

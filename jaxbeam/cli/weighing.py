@@ -39,7 +39,7 @@ def weigh(
         Write the case with the loads found to this file, TOML.
     """
     import tuning
-    from jaxbeam.casefile import save_case
+    from jaxbeam.files.case_file import save_case
 
     check_outputs(overwrite, output)
     between = range_of("--speeds", speeds, "m/s, such as 0.5:3")
@@ -84,7 +84,7 @@ def identify_responses(
         Write the fitted case to this file, TOML.
     """
     import tuning
-    from jaxbeam.casefile import save_case
+    from jaxbeam.files.case_file import save_case
 
     check_outputs(overwrite, output)
     refuse(not free, "name what to identify with --free ADDRESS")

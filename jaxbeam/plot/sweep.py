@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
-from jaxbeam.casefile import case_from_dict
+from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.plot.style import ALARM, FAINT, INK, colour, digits, margin_labels, name, scale, styled
 
 EDGE = 0.06  # of a map, where the number of a line might stick out

@@ -8,7 +8,7 @@ files may be copied and changed like any other case file.
 from importlib import resources
 
 from jaxbeam.case.case import Case
-from jaxbeam.casefile import load_case
+from jaxbeam.files.case_file import load_case
 
 NAMES = ("A", "B", "C", "D")
 

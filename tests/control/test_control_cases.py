@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.cli import main
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.control.test_controllers import HELD
 from tests.loop_as_oracle import expected
 

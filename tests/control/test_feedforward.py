@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 
 SHARES = [0.0, 0.2, 0.7, 1.0]
 VALUES = [[0.5, 6.0, 4.0, 1.0]]

@@ -8,7 +8,7 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.casefile import case_from_dict, case_to_dict
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.stability import frozen_poles
 
 LENGTH, RIGIDITY, MODES = 0.6, 13.2, 3

@@ -11,9 +11,9 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control import ScheduledFeedback
 from jaxbeam.derived_gains import BestGain, best_gains, equivalent_gains, scheduled
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.loop_as_oracle import expected, span_of
 from tests.test_compare import critical_gain
 

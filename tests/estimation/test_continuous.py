@@ -17,9 +17,9 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.estimation import Inversion, Kalman, Observer
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.linear_loop import linear_loop
 from jaxbeam.loop import loop_schedule
 from jaxbeam.plan import Plan, form

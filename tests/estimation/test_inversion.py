@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.estimation import ConditioningWarning, Inversion, Kalman, Observer, conditioning
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.modes import lay_out
 from tests.differences import central
 from tests.loop_as_oracle import span_of

@@ -14,7 +14,7 @@ import jaxbeam as jb
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict
+from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.model.measurement import measure
 from jaxbeam.model.sensor_signals import convert, design, init, noise_samples, read, sense
 from tests.differences import central

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 
 import jaxbeam as jb
-from jaxbeam.casefile import case_to_dict
+from jaxbeam.files.case_file import case_to_dict
 from tests.tuning.stand_in import (
     CASE,
     NOISE,

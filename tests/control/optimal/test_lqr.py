@@ -12,10 +12,10 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control import LQR, AugmentedLQR, FiniteLQR, StepLQR
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.control.optimal.lqr import optimal
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 
 REFERENCE = json.loads((Path(__file__).parent / "data" / "optimal_control.json").read_text())
 SHARES = np.array(REFERENCE["fractions_of_crossing"])

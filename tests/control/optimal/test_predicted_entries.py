@@ -14,9 +14,9 @@ from scipy.linalg import block_diag
 
 import jaxbeam as jb
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control import AugmentedLQR, ScheduledLQR
 from jaxbeam.control.design_model import Beliefs
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.loop import loop_schedule
 from tests.control.optimal.test_regulators import (
     ENTRIES,

@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control import FiniteLQR, ScheduledLQR
 from jaxbeam.control.optimal.gain_schedules import Schedule
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.modes import lay_out
 from jaxbeam.model.statics import influence_line, static_lift
 from jaxbeam.numerics.gain_table import GainTable

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
-from jaxbeam.casefile import case_from_dict, case_to_dict
 from jaxbeam.control.predictive.prediction import incremental
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.numerics.riccati import dlqr
 from tests.control.predictive.test_mpc import PATCH, PERIOD, mpc, rig
 

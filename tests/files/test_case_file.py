@@ -13,7 +13,13 @@ from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.loads import MovingForce, MovingMass
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.casefile import case_from_dict, case_to_dict, load_case, save_case, with_settings
+from jaxbeam.files.case_file import (
+    case_from_dict,
+    case_to_dict,
+    load_case,
+    save_case,
+    with_settings,
+)
 from tests.strategies import cases
 
 FULL = """

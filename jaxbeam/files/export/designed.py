@@ -12,7 +12,7 @@ from jaxbeam.control.optimal.gain_schedules import Schedule
 from jaxbeam.control.optimal.lqr import LQR, AbstractScheduledRegulator
 from jaxbeam.control.optimal.scheduled_lqr import Family, ScheduledLQR
 from jaxbeam.estimation import Observer
-from jaxbeam.export.gains import Gains
+from jaxbeam.files.export.gains import Gains
 from jaxbeam.model.modes import lay_out
 from jaxbeam.model.sensor_signals import design
 from jaxbeam.model.state_space import state_space

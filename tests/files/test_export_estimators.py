@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.export import export_gains, read_gains, write_gains
-from tests.test_export import COMPILER, ESTIMATED, WEIGHTS, rig
+from jaxbeam.files.export import export_gains, read_gains, write_gains
+from tests.files.test_export import COMPILER, ESTIMATED, WEIGHTS, rig
 
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")

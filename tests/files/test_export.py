@@ -21,7 +21,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.cli import main
 from jaxbeam.control import DiscreteLQR, Feedback, FiniteLQR, ScheduledLQR
-from jaxbeam.export import Gains, export_gains, read_gains, write_gains
+from jaxbeam.files.export import Gains, export_gains, read_gains, write_gains
 from jaxbeam.model.modes import lay_out
 
 RANDOM = np.random.default_rng(0)

@@ -1,7 +1,7 @@
 """Gains and filters for real controllers, as CSV, .mat, TDMS or a C header; and read back."""
 
-from jaxbeam.export.designed import export_gains
-from jaxbeam.export.files import WRITERS, read_gains, write_gains
-from jaxbeam.export.gains import Gains
+from jaxbeam.files.export.designed import export_gains
+from jaxbeam.files.export.files import WRITERS, read_gains, write_gains
+from jaxbeam.files.export.gains import Gains
 
 __all__ = ["WRITERS", "Gains", "export_gains", "read_gains", "write_gains"]

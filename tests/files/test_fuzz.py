@@ -9,10 +9,10 @@ import tomli_w
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxbeam.casefile import case_from_dict, case_to_dict, load_case
 from jaxbeam.cli import main
+from jaxbeam.files.case_file import case_from_dict, case_to_dict, load_case
 from tests import mutations
-from tests.test_casefile import FULL
+from tests.files.test_case_file import FULL
 from tests.test_cli import CASE as SMALL
 from tests.tuning import test_readers as readers
 from tuning import read_logs

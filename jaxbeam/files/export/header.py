@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbeam.export.gains import ARRAYS, Gains
+from jaxbeam.files.export.gains import ARRAYS, Gains
 
 
 def header(gains: Gains, about: dict[str, Any]) -> str:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from jaxbeam.export.gains import ARRAYS, Gains
-from jaxbeam.export.header import header
+from jaxbeam.files.export.gains import ARRAYS, Gains
+from jaxbeam.files.export.header import header
 
 FORMAT = "jaxbeam gains 3"
 COEFFICIENTS = ("b0", "b1", "b2", "a0", "a1", "a2")

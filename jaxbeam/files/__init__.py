@@ -1,0 +1,1 @@
+"""Cases as TOML, reports, gains for real controllers."""
