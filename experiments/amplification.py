@@ -23,7 +23,7 @@ from experiments.beams import (
 )
 from experiments.verdicts import Experiment, Outcome, finding
 from jaxbeam.model.statics import static_peak
-from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.simulation.simulate import ContactLossWarning
 
 MASSES = np.append(np.linspace(0.05, 0.6, 18), [0.26, 0.261, 0.5])  # kg; also those printed
 ONE_RATIOS = np.append(np.geomspace(0.05, 0.2, 9)[:-1], np.linspace(0.2, 1.2, 21))

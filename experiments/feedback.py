@@ -15,9 +15,9 @@ from experiments import published
 from experiments.ripple import gain_margin, rippled
 from experiments.scheduling import STRONGER, by_statics, derived, switched
 from experiments.verdicts import Experiment, Outcome, finding
-from jaxbeam.plan import make_plan
 from jaxbeam.plot.style import colour, name, styled
-from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.simulate import ContactLossWarning
 
 MASSES = (0.261, 0.322, 0.371, 0.509)  # kg
 GAIN, PERIOD = 2.0, 0.002  # V per mm or mm^3; s, not printed

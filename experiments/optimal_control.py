@@ -22,9 +22,9 @@ from experiments.verdicts import Experiment, Finding, Outcome, finding
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.model.modes import lay_out
-from jaxbeam.plan import make_plan
 from jaxbeam.plot.style import colour, name, styled
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.integration_plan import make_plan
 
 MASSES, SPEEDS = (0.261, 0.371, 0.509), (0.3, 0.55)
 WEIGHTS = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]  # of q, its rate, and the shaker

@@ -18,9 +18,9 @@ from experiments.verdicts import Experiment, Finding, Outcome, finding
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.reach import reach
-from jaxbeam.loop import loop_schedule
-from jaxbeam.plan import Plan, form
 from jaxbeam.plot.style import GREY, colour, name, styled
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import Plan, form
 
 PERIOD, SPEED = 0.01, 1.0  # s, m/s
 STRONG, WEAK = 1e-11, 1e-6  # r_w

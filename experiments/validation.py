@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.simulation.simulate import ContactLossWarning
 
 if TYPE_CHECKING:
     from experiments.validation_checks import Check

@@ -22,7 +22,7 @@ from jaxbeam.control.reach import reach
 from jaxbeam.estimation import kalman_gain, sampled_kalman_gain
 from jaxbeam.integrator.adaptive_reference import simulate_adaptive
 from jaxbeam.model.statics import static_peak
-from jaxbeam.plan import make_plan
+from jaxbeam.simulation.integration_plan import make_plan
 from tests import loop_as_oracle
 from tests.as_oracle import as_oracle
 from tests.differences import central

@@ -44,8 +44,8 @@ from jaxbeam.estimation import Inversion, Kalman, Observer
 from jaxbeam.files.case_file import load_case, save_case
 from jaxbeam.model.modes import modes
 from jaxbeam.model.state_space import state_space
-from jaxbeam.record import Record, read_record
-from jaxbeam.simulate import simulate
+from jaxbeam.simulation.record import Record, read_record
+from jaxbeam.simulation.simulate import simulate
 from jaxbeam.sweep import sweep
 
 __all__ = [

@@ -11,9 +11,9 @@ from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.integrator.integrate import march
 from jaxbeam.integrator.step_matrices import both_sides
 from jaxbeam.model.statics import static_peak
-from jaxbeam.plan import TOLERANCE, make_plan, sample_times
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulate import prepare
+from jaxbeam.simulation.integration_plan import TOLERANCE, make_plan, sample_times
+from jaxbeam.simulation.simulate import prepare
 
 
 class Envelope(NamedTuple):

@@ -17,9 +17,9 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.loads import motion
 from jaxbeam.control.bound import HELD, Bound, bound
-from jaxbeam.record import Record
 from jaxbeam.reserve import Reserve, reserve
-from jaxbeam.simulate import ContactLossWarning, simulate
+from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 from jaxbeam.step_times import StepTimes, step_times
 from jaxbeam.swings import Swings, swings
 

@@ -13,8 +13,8 @@ from jaxbeam.case.case import Case
 from jaxbeam.model.modal_model import rig
 from jaxbeam.model.modes import Layout, lay_out
 from jaxbeam.model.statics import influence_line, static_lift
-from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.record import Record
 
 
 def residual_lift(

@@ -17,9 +17,9 @@ from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import known
 from jaxbeam.control import Feedback, Recognition, ScheduledFeedback
 from jaxbeam.model.statics import influence_line, static_lift
-from jaxbeam.plan import make_plan
 from jaxbeam.reserve import reserve
-from jaxbeam.simulate import ContactLossWarning, simulate
+from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
 POSITIONS = 201  # of the load, at which the static deflection is looked for
 TRIED = 8  # gains from the largest one down, by equal factors

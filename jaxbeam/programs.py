@@ -21,11 +21,11 @@ from jaxbeam.integrator.events import Schedule
 from jaxbeam.integrator.integrate import longest_step, march, trace
 from jaxbeam.integrator.step_matrices import make_rigging
 from jaxbeam.integrator.time_grid import even_grid, scheduled_grid
-from jaxbeam.loop import make_loop
 from jaxbeam.model.contact import Traffic, traffic
 from jaxbeam.model.modal_model import Rig, rig
-from jaxbeam.plan import Form
 from jaxbeam.runtime.compiling import ROUGHLY, SIDE_BY_SIDE, compiled, compiled_with
+from jaxbeam.simulation.closed_loop import make_loop
+from jaxbeam.simulation.integration_plan import Form
 
 
 class Job(NamedTuple):

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 from jaxbeam.case.controller import AbstractController, Measurement
 from jaxbeam.case.fields import known
 from jaxbeam.model.state_space import state_space
-from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.record import Record
 
 TIMED = 60  # steps of a run that are timed, evenly spread over it
 WALKED = 1000  # steps of a run at most

@@ -16,8 +16,8 @@ from jaxbeam.blocks import Work
 from jaxbeam.case.case import Case
 from jaxbeam.lanes import Tasks
 from jaxbeam.order import Order, make_order
-from jaxbeam.plan import TOLERANCE, sample_times
-from jaxbeam.record import sensor_labels
+from jaxbeam.simulation.integration_plan import TOLERANCE, sample_times
+from jaxbeam.simulation.record import sensor_labels
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.record import Record
+from jaxbeam.simulation.record import Record
 
 SMALLEST = 0.2  # of the whole span of a history: what turns back after less has not turned
 MORE = 4  # swings more than without control: two whole cycles

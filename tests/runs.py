@@ -6,7 +6,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.plan import Plan, form
+from jaxbeam.simulation.integration_plan import Plan, form
 from tests.oracles.loads import Load
 
 

@@ -18,7 +18,7 @@ import jaxbeam as jb
 from jaxbeam.control.bound import bound
 from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.reach import reach
-from jaxbeam.plan import make_plan
+from jaxbeam.simulation.integration_plan import make_plan
 
 DATA = json.loads((Path(__file__).parent / "data" / "bounds.json").read_text())
 PATCH = jb.Patch(

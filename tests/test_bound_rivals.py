@@ -9,7 +9,7 @@ from hypothesis import given, settings
 
 import jaxbeam as jb
 from jaxbeam.control.bound import bound
-from jaxbeam.plan import make_plan
+from jaxbeam.simulation.integration_plan import make_plan
 
 PERIOD = 0.02
 CASE = jb.Case(

@@ -10,7 +10,7 @@ import pytest
 import xarray
 
 import jaxbeam as jb
-from jaxbeam.record import read_record
+from jaxbeam.simulation.record import read_record
 from jaxbeam.sweep_store import Disk
 from tests.modules import module_files, parse
 from tests.test_sweep import CASE

@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.plan import make_plan
 from jaxbeam.reserve import reserve
 from jaxbeam.rigs import load
+from jaxbeam.simulation.integration_plan import make_plan
 from jaxbeam.swings import counted, swings, turning_points
 
 TIMES = np.arange(2001) / 1000
@@ -62,7 +62,7 @@ def test_growth_with_a_parked_load_is_that_of_the_reference():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_too_high_a_gain_ends_in_a_limit_cycle_as_published():
     """k = 3 is unstable from 0.322 kg on, with 30 ms of delay and little damping; 0.261 kg is not.
 

@@ -14,10 +14,10 @@ from jaxtyping import Array, Float, Int
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.control.bound import HELD, least_achievable
 from jaxbeam.model.contact import traffic
-from jaxbeam.plan import Plan, make_plan, sample_times
-from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulate import Histories, histories, simulate
+from jaxbeam.simulation.integration_plan import Plan, make_plan, sample_times
+from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.simulate import Histories, histories, simulate
 from tuning.believing import believing
 from tuning.load_cases import PLANT, Values, apply
 from tuning.objective import Sharpness, run_merits

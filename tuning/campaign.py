@@ -11,8 +11,8 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.validation import check
 from jaxbeam.integrator.events import Schedule, stacked
-from jaxbeam.plan import Plan, make_plan
-from jaxbeam.simulate import readings
+from jaxbeam.simulation.integration_plan import Plan, make_plan
+from jaxbeam.simulation.simulate import readings
 from tuning.free import OF_LOG, insert
 from tuning.logs import Log
 from tuning.pairing import at_sensors, case_of_log, check_loads, check_times, made_alike

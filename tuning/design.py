@@ -16,9 +16,9 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
-from jaxbeam.plan import Plan, make_plan, sample_times
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulate import readings
+from jaxbeam.simulation.integration_plan import Plan, make_plan, sample_times
+from jaxbeam.simulation.simulate import readings
 from tuning.free import unit_at
 
 TOLERANCE = 1e-5  # of the simulation, relative to the largest deflection

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.simulate import Histories
+from jaxbeam.simulation.simulate import Histories
 
 MERITS = ("peak", "shortfall", "rms", "after_exit", "effort", "contact")
 OVER = ("mean", "worst", "cvar")

@@ -17,9 +17,9 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.files.case_file import case_to_dict
-from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulate import ContactLossWarning, Histories
+from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.simulate import ContactLossWarning, Histories
 from tuning.bench import Bench, make_bench
 from tuning.checkpoint import fingerprint
 from tuning.descent import Descent, State

@@ -35,7 +35,7 @@ from jaxbeam.control import SamplingWarning
 from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.simulation.simulate import ContactLossWarning
 
 SIZES = {4: 6, 6: 8, 8: 10}  # variables, and periods ahead
 MANY, ROUNDS = 256, 20

@@ -22,7 +22,7 @@ import numpy as np
 import jaxbeam as jb
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control import KINDS, SamplingWarning
-from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.simulation.simulate import ContactLossWarning
 from jaxbeam.step_times import StepTimes, step_times
 
 PERIOD, MODES = 0.01, 5

@@ -28,10 +28,10 @@ from experiments.benchmarks import baselines, by_numba
 from experiments.benchmarks.crossing import Rig
 from experiments.benchmarks.timing import Timing, best_in_turn, time_call
 from jaxbeam.integrator import native_peaks
-from jaxbeam.plan import make_plan
 from jaxbeam.runtime import native_library
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulate import readings
+from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.simulate import readings
 
 MASSES = np.linspace(0.1, 1.0, 64)
 SPEEDS = np.linspace(0.3, 10.0, 64)

@@ -88,7 +88,7 @@ def simulate(
         Write the run as a moving picture to this file, OUT.gif.
     """
     import jaxbeam as jb
-    from jaxbeam.simulate import ContactLossWarning
+    from jaxbeam.simulation.simulate import ContactLossWarning
 
     check_suffix(output, ".nc", "a record")
     check_suffix(animate, ".gif", "a moving picture")

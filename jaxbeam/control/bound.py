@@ -27,9 +27,9 @@ from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.reach import TOLERANCE, reach
 from jaxbeam.model.channels import takes_commands
-from jaxbeam.plan import form, run_extremes, suitable_step
-from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.integration_plan import form, run_extremes, suitable_step
+from jaxbeam.simulation.record import Record
 
 HELD = 0.01  # s: over which commands are held, where no controller says
 

@@ -22,8 +22,8 @@ from jaxbeam.integrator.step_matrices import make_rigging
 from jaxbeam.integrator.time_grid import scheduled_grid
 from jaxbeam.model.contact import Traffic, traffic
 from jaxbeam.model.modal_model import rig
-from jaxbeam.plan import Form, form, suitable_step
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.integration_plan import Form, form, suitable_step
 
 TOLERANCE = 1e-9  # relative to the largest deflection
 LANES = 256  # at once; more fall out of the cache

@@ -21,7 +21,7 @@ from jaxbeam.plot.style import (
     scale,
     styled,
 )
-from jaxbeam.record import Record
+from jaxbeam.simulation.record import Record
 
 TINTS = 96  # colours of the GIF: few, so that it stays small
 

@@ -20,7 +20,7 @@ from jaxbeam.plot.style import (
     scale,
     styled,
 )
-from jaxbeam.record import Record
+from jaxbeam.simulation.record import Record
 
 
 @styled

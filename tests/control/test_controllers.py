@@ -11,8 +11,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.loop import loop_schedule
-from jaxbeam.plan import Plan, form
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import Plan, form
 from tests.differences import central
 from tests.loop_as_oracle import expected
 

@@ -17,8 +17,8 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.linear_loop import linear_loop
-from jaxbeam.loop import loop_schedule
-from jaxbeam.plan import Plan, form
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import Plan, form
 from tests.loop_as_oracle import expected, span_of
 
 PERIOD = 2e-3

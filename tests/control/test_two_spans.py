@@ -10,8 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.loop import loop_schedule
-from jaxbeam.plan import Plan, form
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import Plan, form
 from tests.loop_as_oracle import expected, parts_of
 from tests.oracles import closed_loop
 from tests.oracles.two_spans import ProjectedSines, TwoSpans

@@ -12,8 +12,8 @@ import jaxbeam as jb
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.estimation import Kalman
 from jaxbeam.linear_loop import linear_loop
-from jaxbeam.loop import loop_schedule
-from jaxbeam.plan import Plan, form
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import Plan, form
 from tests.differences import central
 from tests.loop_as_oracle import expected, parts_of
 from tests.oracles.sampled_plant import SampledPlant

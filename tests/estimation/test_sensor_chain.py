@@ -14,9 +14,9 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.estimation import Kalman
-from jaxbeam.loop import loop_schedule
 from jaxbeam.model.modes import lay_out
-from jaxbeam.plan import Plan, form
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import Plan, form
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant
 

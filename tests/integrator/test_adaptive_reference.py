@@ -6,7 +6,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.integrator.adaptive_reference import simulate_adaptive
-from jaxbeam.plan import make_plan
+from jaxbeam.simulation.integration_plan import make_plan
 
 TIMES = jnp.linspace(0.0, 0.5, 101)
 BEAM = jb.Beam(1.2, 11.68, 0.535, [0.01, 0.03, 0.02], "pinned-clamped", modes=3)

@@ -29,8 +29,8 @@ from jaxbeam.model.contact import traffic
 from jaxbeam.model.modal_model import rig
 from jaxbeam.numerics import native_designs, peak_search
 from jaxbeam.order import make_order
-from jaxbeam.plan import form
 from jaxbeam.runtime import native_library
+from jaxbeam.simulation.integration_plan import form
 from jaxbeam.sweep_store import FINGERPRINT
 
 pytestmark = pytest.mark.skipif(native_library.compiler() is None, reason="no C compiler here")

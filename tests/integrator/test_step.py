@@ -8,7 +8,7 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.integrator.step import advance, undriven
 from jaxbeam.integrator.step_matrices import Tables
-from jaxbeam.simulate import readings
+from jaxbeam.simulation.simulate import readings
 from tests.runs import plan_of
 
 STEPS, LANES = 5, 3

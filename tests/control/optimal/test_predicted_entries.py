@@ -17,7 +17,7 @@ from jaxbeam.case.validation import check
 from jaxbeam.control import AugmentedLQR, ScheduledLQR
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.loop import loop_schedule
+from jaxbeam.simulation.closed_loop import loop_schedule
 from tests.control.optimal.test_regulators import (
     ENTRIES,
     EVENTS,

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag, solve_continuous_are
 
 import jaxbeam as jb
 from jaxbeam.control import AugmentedLQR, StepLQR
-from jaxbeam.loop import loop_schedule
+from jaxbeam.simulation.closed_loop import loop_schedule
 from tests.differences import central
 from tests.runs import plan_of
 

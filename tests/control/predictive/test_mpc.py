@@ -16,9 +16,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.loop import loop_schedule
 from jaxbeam.model.modes import lay_out
-from jaxbeam.plan import Plan, form
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import Plan, form
 from tests.differences import central
 
 REFERENCE = json.loads((Path(__file__).parent / "data" / "predictive_control.json").read_text())

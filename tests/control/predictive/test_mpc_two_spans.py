@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.plan import make_plan
+from jaxbeam.simulation.integration_plan import make_plan
 from tests.differences import central
 
 CASE = jb.Case(

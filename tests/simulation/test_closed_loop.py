@@ -17,10 +17,10 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.loop import loop_schedule
 from jaxbeam.model.sensor_signals import noise_samples
-from jaxbeam.plan import Plan, form
-from jaxbeam.simulate import readings
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.simulate import readings
 from tests.loop_as_oracle import expected, span_of
 
 TIMES = np.linspace(0.0, 0.4, 81)

@@ -18,13 +18,13 @@ from jaxbeam.integrator.propagators import NODES, at_ends
 from jaxbeam.integrator.running_peaks import Found
 from jaxbeam.integrator.step_matrices import Rigging, make_rigging
 from jaxbeam.integrator.time_grid import scheduled_grid
-from jaxbeam.loop import make_loop
 from jaxbeam.model.contact import Traffic, at_instant, traffic
 from jaxbeam.model.measurement import measure
 from jaxbeam.model.modal_model import Rig, rig
-from jaxbeam.plan import TOLERANCE, Plan, make_plan, sample_times
-from jaxbeam.record import Record
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.closed_loop import make_loop
+from jaxbeam.simulation.integration_plan import TOLERANCE, Plan, make_plan, sample_times
+from jaxbeam.simulation.record import Record
 
 
 class ContactLossWarning(UserWarning):
@@ -43,7 +43,7 @@ def simulate(
     integrated to `tolerance` (relative to the largest deflection) by exponential collocation.
     Samples are at the run's own rate or at the given ascending `times` (s); they do not depend on
     the time step. Differentiable in every number of the case, forward and in reverse. Inside
-    `jit` or `vmap`, give the `plan` made outside by `jaxbeam.plan.make_plan`.
+    `jit` or `vmap`, give the `plan` made outside by `jaxbeam.simulation.integration_plan.make_plan`.
 
     Raises ValueError for a faulty case or times, RuntimeError if no time step meets the
     tolerance; warns (ContactLossWarning) if a load would have to pull on the beam.

@@ -8,7 +8,7 @@ import jaxbeam as jb
 from experiments.benchmarks.baselines import reference_peaks
 from experiments.benchmarks.crossing import Rig
 from jaxbeam.model.statics import static_peak
-from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.simulation.simulate import ContactLossWarning
 
 MASS = 0.535 * 0.6  # of the beam, kg
 CRITICAL = np.pi / 0.6 * np.sqrt(11.68 / 0.535)  # speed at which the first mode is in step, m/s

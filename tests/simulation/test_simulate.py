@@ -18,8 +18,8 @@ from jaxbeam.integrator.step_matrices import make_rigging
 from jaxbeam.integrator.time_grid import even_grid
 from jaxbeam.model.contact import traffic
 from jaxbeam.model.modal_model import rig
-from jaxbeam.plan import form
-from jaxbeam.simulate import ContactLossWarning
+from jaxbeam.simulation.integration_plan import form
+from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations
 from tests.oracles.closed_forms import (
     cancellation_speed,

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.case.sensors import QUANTITIES
-from jaxbeam.record import record_from_xarray
+from jaxbeam.simulation.record import record_from_xarray
 
 CASE = jb.Case(
     jb.Beam(1.2, 11.68, 0.535, 0.02, modes=3),

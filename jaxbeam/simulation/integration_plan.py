@@ -22,11 +22,11 @@ from jaxbeam.integrator.integrate import at_edges, longest_step, march
 from jaxbeam.integrator.running_peaks import Extremes
 from jaxbeam.integrator.step_matrices import make_rigging
 from jaxbeam.integrator.time_grid import even_grid, scheduled_grid
-from jaxbeam.loop import loop_schedule, make_loop
 from jaxbeam.model.contact import Traffic, traffic
 from jaxbeam.model.modal_model import couples, rig
 from jaxbeam.model.modes import Layout, lay_out
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.closed_loop import loop_schedule, make_loop
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 MOST = 10**8  # samples or time steps of a run: more would fill any memory, or take days
