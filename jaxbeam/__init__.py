@@ -46,7 +46,7 @@ from jaxbeam.model.modes import modes
 from jaxbeam.model.state_space import state_space
 from jaxbeam.simulation.record import Record, read_record
 from jaxbeam.simulation.simulate import simulate
-from jaxbeam.sweep import sweep
+from jaxbeam.sweeps.sweep import sweep
 
 __all__ = [
     "LQR",

@@ -10,7 +10,7 @@ import numpy as np
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.files.case_file import load_case, load_controller, with_settings
-from jaxbeam.lanes import MOST_RUNS
+from jaxbeam.sweeps.batches import MOST_RUNS
 
 
 def read_case(path: Path, settings: Iterable[str]) -> Case:

@@ -22,10 +22,10 @@ import numpy as np
 from experiments.benchmarks.crossing import GRAVITY, Rig
 from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, rig, sweep_peaks
 from experiments.benchmarks.timing import best_in_turn
-from jaxbeam import programs
 from jaxbeam.integrator.propagators import GAUSS, LOOKED
 from jaxbeam.numerics.peak_search import reach, through
-from jaxbeam.order import make_order
+from jaxbeam.sweeps import programs
+from jaxbeam.sweeps.specification import make_order
 
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", "-lm")
 Library = Callable[..., None]

@@ -180,7 +180,7 @@ def sweep(
         double, or single: runs in half the bits, to a few parts in a million.
     """
     import jaxbeam as jb
-    from jaxbeam.cluster import connect
+    from jaxbeam.sweeps.cluster import connect
 
     values = sweep_values(over)
     refuse(resume and not output, "--resume needs the store to continue; name it with -o OUT.zarr")

@@ -28,10 +28,10 @@ from jaxbeam.integrator.time_grid import even_grid
 from jaxbeam.model.contact import traffic
 from jaxbeam.model.modal_model import rig
 from jaxbeam.numerics import native_designs, peak_search
-from jaxbeam.order import make_order
 from jaxbeam.runtime import native_library
 from jaxbeam.simulation.integration_plan import form
-from jaxbeam.sweep_store import FINGERPRINT
+from jaxbeam.sweeps.specification import make_order
+from jaxbeam.sweeps.store import FINGERPRINT
 
 pytestmark = pytest.mark.skipif(native_library.compiler() is None, reason="no C compiler here")
 

@@ -13,13 +13,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.blocks import RUNS, Work
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.declared_checks import in_words
 from jaxbeam.case.validation import check
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
-from jaxbeam.lanes import LANES, MOST_RUNS, Tasks, arrange
+from jaxbeam.sweeps.batches import LANES, MOST_RUNS, Tasks, arrange
+from jaxbeam.sweeps.blocks import RUNS, Work
 
 # Whether these are right depends on each other: places, and entries of a list.
 TOGETHER = re.compile(

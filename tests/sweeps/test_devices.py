@@ -54,7 +54,7 @@ import sys
 import jax
 import numpy as np
 import jaxbeam as jb
-from tests.test_devices import CASE, OVER
+from tests.sweeps.test_devices import CASE, OVER
 assert len(jax.local_devices()) == 3
 peaks = jb.sweep(CASE, OVER, progress=False).peak_deflection.values
 lines = jb.sweep(CASE, OVER, progress=False, histories=True).deflection.values

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxbeam.pacing import MARGIN, SURE, choose_steps, drawn, errors, spread
+from jaxbeam.sweeps.step_size import MARGIN, SURE, choose_steps, drawn, errors, spread
 
 ORDER = 12
 

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.blocks import Work
-from jaxbeam.lanes import arrange
 from jaxbeam.model.statics import static_peak
+from jaxbeam.sweeps.batches import arrange
+from jaxbeam.sweeps.blocks import Work
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=[0.03, 0.02], modes=2),
@@ -129,7 +129,7 @@ def test_a_store_holds_what_was_returned(product, tmp_path):
 
 KILLED = """
 import sys, numpy as np
-import jaxbeam as jb, tests.test_sweep as t
+import jaxbeam as jb, tests.sweeps.test_sweep as t
 over = {"loads.0.mass": np.linspace(0.1, 0.9, 256), "loads.0.speed": np.linspace(1, 4, 24)}
 jb.sweep(t.CASE, over, store=sys.argv[1], resume=True, progress=False)
 """

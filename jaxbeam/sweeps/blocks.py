@@ -12,16 +12,16 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam import programs
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.events import sampled
-from jaxbeam.lanes import Tasks
 from jaxbeam.model.modal_model import couples
 from jaxbeam.model.modes import Layout, lay_out
-from jaxbeam.pacing import ORDER, choose_steps, drawn, rounding
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Form, most_at_once, sample_times
+from jaxbeam.sweeps import programs
+from jaxbeam.sweeps.batches import Tasks
+from jaxbeam.sweeps.step_size import ORDER, choose_steps, drawn, rounding
 
 RUNS = 512  # in a block, at most, about: each is one call and one write
 BLOCKS = 8  # at least, if each then has more runs than are tried at once: for all cores

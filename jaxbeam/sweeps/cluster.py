@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxbeam import sweep_store
-from jaxbeam.blocks import Work
-from jaxbeam.order import order_from_dict
+from jaxbeam.sweeps import store
+from jaxbeam.sweeps.blocks import Work
+from jaxbeam.sweeps.specification import order_from_dict
 
 if TYPE_CHECKING:
     import distributed  # comes with the extra `cluster` only
@@ -75,11 +75,11 @@ def work_off(blocks: list[int], mark: str, path: Path) -> list[int]:
     Raises ValueError if the worker's versions differ from those that began the sweep, or if it
     does not see the store.
     """
-    if sweep_store.status(path) != ("unfinished", mark):
+    if store.status(path) != ("unfinished", mark):
         raise ValueError(
             f"a worker does not find the sweep at {path}; put the store where all machines see it"
         )
-    keeper = sweep_store.Disk(path)
+    keeper = store.Disk(path)
     work, made = _work(mark, keeper)
     if made != mark:
         raise ValueError(
@@ -97,7 +97,7 @@ _preparing = threading.Lock()
 _known: dict[str, tuple[Work, str]] = {}
 
 
-def _work(mark: str, keeper: sweep_store.Disk) -> tuple[Work, str]:
+def _work(mark: str, keeper: store.Disk) -> tuple[Work, str]:
     """The blocks of a sweep, prepared once in each process, and the fingerprint made there."""
     with _preparing:
         if mark not in _known:

@@ -12,12 +12,12 @@ import pytest
 import tomli_w
 
 import jaxbeam as jb
-from jaxbeam import cluster
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import case_to_dict
-from jaxbeam.order import make_order, order_from_dict
-from jaxbeam.sweep_store import Disk, create
-from tests.test_sweep import CASE
+from jaxbeam.sweeps import cluster
+from jaxbeam.sweeps.specification import make_order, order_from_dict
+from jaxbeam.sweeps.store import Disk, create
+from tests.sweeps.test_sweep import CASE
 
 distributed = pytest.importorskip("distributed")
 

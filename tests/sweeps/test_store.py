@@ -11,9 +11,9 @@ import xarray
 
 import jaxbeam as jb
 from jaxbeam.simulation.record import read_record
-from jaxbeam.sweep_store import Disk
+from jaxbeam.sweeps.store import Disk
 from tests.modules import module_files, parse
-from tests.test_sweep import CASE
+from tests.sweeps.test_sweep import CASE
 from tuning import read_logs
 
 OVER = {"loads.0.mass": np.linspace(0.1, 0.9, 200), "loads.0.speed": [1.5, 2.0, 4.0]}

@@ -1,0 +1,1 @@
+"""Many cases at once: batches, blocks, store, step size, cluster."""
