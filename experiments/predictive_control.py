@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments import published
 from experiments.verdicts import Experiment, Finding, Outcome, finding
+from jaxbeam.analysis.bound.input_influence import reach
+from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.control.design_model import Beliefs
-from jaxbeam.control.least_peak import least_peak
-from jaxbeam.control.reach import reach
 from jaxbeam.plot.style import GREY, colour, name, styled
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form

@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments import published
 from experiments.verdicts import Finding, finding
-from jaxbeam.limits import limit
+from jaxbeam.analysis.stability import frozen_poles, growth
+from jaxbeam.analysis.stability_limits import limit
 from jaxbeam.numerics.riccati import dlqr, stein
 from jaxbeam.plot.poles import plot_poles
-from jaxbeam.stability import frozen_poles, growth
 
 EFFORT = 9e-8  # R of the example in 5.1
 ACTIVE = 3500.0  # N/m

@@ -12,10 +12,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
+from jaxbeam.analysis.crossing_margin import reserve
+from jaxbeam.analysis.derived_gains import BestGain, best_gains, equivalent_gains, scheduled
 from jaxbeam.control import ScheduledFeedback
-from jaxbeam.derived_gains import BestGain, best_gains, equivalent_gains, scheduled
 from jaxbeam.plot.style import colour, name, styled
-from jaxbeam.reserve import reserve
 
 GAIN, STRONGER = 2.0, (3.0, 4.5)  # V/mm: of both laws, and linear ones as they may be scheduled
 MOST = 24.0  # V/mm, the largest gain that is tried

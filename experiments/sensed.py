@@ -37,9 +37,9 @@ from experiments.tuned import (
 )
 from experiments.tuned_search import MODES, PERIOD
 from experiments.verdicts import Experiment, Outcome
+from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.case import known_case
 from jaxbeam.model.modes import lay_out
-from jaxbeam.stability import frozen_poles
 from tuning.believing import believing
 from tuning.bench import make_bench
 from tuning.load_cases import apply

@@ -17,8 +17,8 @@ import scipy.sparse
 
 import jaxbeam as jb
 from jaxbeam import rigs
+from jaxbeam.analysis.bound.input_influence import reach
 from jaxbeam.case.filters import filter_history, initial, sections
-from jaxbeam.control.reach import reach
 from jaxbeam.estimation import kalman_gain, sampled_kalman_gain
 from jaxbeam.integrator.adaptive_reference import simulate_adaptive
 from jaxbeam.model.statics import static_peak

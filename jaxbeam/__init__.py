@@ -12,6 +12,7 @@ import jax
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
+from jaxbeam.analysis.bound.bound import bound
 from jaxbeam.case.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, Run, addresses, replace
@@ -39,7 +40,6 @@ from jaxbeam.control import (
     recognised,
     sampling_limit,
 )
-from jaxbeam.control.bound import bound
 from jaxbeam.estimation import Inversion, Kalman, Observer
 from jaxbeam.files.case_file import load_case, save_case
 from jaxbeam.model.modes import modes

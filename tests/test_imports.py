@@ -10,7 +10,7 @@ from tests.modules import PACKAGES, module_files, parse
 # goes into the lowest layer above all that it imports. A package named here stands for those of
 # its modules that are not named themselves, which may import each other.
 LAYERS = """
-jaxbeam.sweeps.__init__  jaxbeam.simulation.__init__  jaxbeam.files.__init__  jaxbeam.control.predictive.__init__  jaxbeam.control.optimal.__init__  jaxbeam.integrator.__init__  jaxbeam.model.__init__  jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.files.report  jaxbeam.integrator.input_policy  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
+jaxbeam.analysis.bound.__init__  jaxbeam.analysis.__init__  jaxbeam.sweeps.__init__  jaxbeam.simulation.__init__  jaxbeam.files.__init__  jaxbeam.control.predictive.__init__  jaxbeam.control.optimal.__init__  jaxbeam.integrator.__init__  jaxbeam.model.__init__  jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.files.report  jaxbeam.integrator.input_policy  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
 jaxbeam.runtime.compile_cache  jaxbeam.numerics.batched_linalg
 jaxbeam.runtime.compiling
 jaxbeam.case.declared_checks  jaxbeam.numerics.piecewise  jaxbeam.numerics.intervals
@@ -34,21 +34,21 @@ jaxbeam.estimation
 jaxbeam.control  jaxbeam.integrator.running_peaks
 jaxbeam.integrator.step  jaxbeam.files.case_file
 jaxbeam.integrator.integrate
-jaxbeam.files.export  jaxbeam.simulation.closed_loop  jaxbeam.integrator.native_peaks  jaxbeam.open_loop  jaxbeam.simulation.record  jaxbeam.rigs
-jaxbeam.linear_loop  jaxbeam.simulation.integration_plan
-jaxbeam.margins  jaxbeam.sweeps.programs  jaxbeam.stability  jaxbeam.step_times  jaxbeam.swings
-jaxbeam.limits  jaxbeam.reserve
-jaxbeam.control.reach
-jaxbeam.control.least_peak
-jaxbeam.control.bound
+jaxbeam.files.export  jaxbeam.simulation.closed_loop  jaxbeam.integrator.native_peaks  jaxbeam.analysis.frozen_loop  jaxbeam.simulation.record  jaxbeam.rigs
+jaxbeam.analysis.linearised_loop  jaxbeam.simulation.integration_plan
+jaxbeam.analysis.margins  jaxbeam.sweeps.programs  jaxbeam.analysis.stability  jaxbeam.analysis.computing_time  jaxbeam.analysis.limit_cycles
+jaxbeam.analysis.stability_limits  jaxbeam.analysis.crossing_margin
+jaxbeam.analysis.bound.input_influence
+jaxbeam.analysis.bound.linear_program
+jaxbeam.analysis.bound.bound
 jaxbeam.sweeps.batches  jaxbeam.sweeps.step_size  jaxbeam.sweeps.store
-jaxbeam.simulation.simulate  jaxbeam.correction
-jaxbeam.amplification
+jaxbeam.simulation.simulate  jaxbeam.analysis.static_correction
+jaxbeam.analysis.amplification
 jaxbeam.sweeps.blocks
 jaxbeam.sweeps.specification
 jaxbeam.sweeps.cluster
-jaxbeam.sweeps.sweep  jaxbeam.compare
-jaxbeam.derived_gains  jaxbeam.plot
+jaxbeam.sweeps.sweep  jaxbeam.analysis.compare
+jaxbeam.analysis.derived_gains  jaxbeam.plot
 jaxbeam.__init__
 tuning
 experiments

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxbeam.analysis.bound.bound import HELD, least_achievable
 from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.control.bound import HELD, least_achievable
 from jaxbeam.model.contact import traffic
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import Plan, make_plan, sample_times

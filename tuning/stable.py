@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.analysis.linearised_loop import linear, open_loop, prepared
 from jaxbeam.case.case import Case, known_case, replace, value_at
 from jaxbeam.case.loads import motion
-from jaxbeam.linear_loop import linear, open_loop, prepared
 from jaxbeam.model.modes import lay_out
 from tuning.believing import believing
 from tuning.bench import Bench

@@ -5,7 +5,7 @@
 The one-span rig with a patch and five modes, crossed by 0.509 kg at 1 m/s, five sensors read every
 10 ms. A step is all that a controller does between a measurement and a command, estimator and
 recognition of the load included; what it designs beforehand is left out. The steps are those of the
-crossing, on one core, compiled (see `jaxbeam.step_times`): the median and the worst of them, and
+crossing, on one core, compiled (see `jaxbeam.analysis.computing_time`): the median and the worst of them, and
 the time for each of 256 at once.
 """
 
@@ -20,10 +20,10 @@ import warnings
 import numpy as np
 
 import jaxbeam as jb
+from jaxbeam.analysis.computing_time import StepTimes, step_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control import KINDS, SamplingWarning
 from jaxbeam.simulation.simulate import ContactLossWarning
-from jaxbeam.step_times import StepTimes, step_times
 
 PERIOD, MODES = 0.01, 5
 WEIGHTS = {"state_weight": [1e6] * (2 * MODES), "command_weight": [1.0], "period": PERIOD}

@@ -36,10 +36,10 @@ def stability(
     plot
         Draw the poles along the crossing to CASE_poles.png in this folder.
     """
-    from jaxbeam.limits import frozen, load_limits, streaming
-    from jaxbeam.linear_loop import linear_loop
-    from jaxbeam.margins import margins
-    from jaxbeam.stability import frozen_poles, growth, stream
+    from jaxbeam.analysis.linearised_loop import linear_loop
+    from jaxbeam.analysis.margins import margins
+    from jaxbeam.analysis.stability import frozen_poles, growth, stream
+    from jaxbeam.analysis.stability_limits import frozen, load_limits, streaming
 
     picture = picture_path(None, case.with_stem(f"{case.stem}_poles")) if plot else None
     check_outputs(overwrite, picture)

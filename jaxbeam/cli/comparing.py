@@ -51,7 +51,7 @@ def compare(
         Draw deflections and commands to this file, OUT.png.
     """
     import jaxbeam as jb
-    from jaxbeam.compare import compare, standings
+    from jaxbeam.analysis.compare import compare, standings
 
     values = sweep_values(over)
     check_suffix(output, ".png", "a comparison")

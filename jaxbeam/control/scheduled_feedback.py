@@ -1,6 +1,6 @@
 """Feedback of readings with gains k(m) over the mass of the load, told or recognised: Fig. 6.7.
 
-What gains to schedule, `jaxbeam.derived_gains` works out.
+What gains to schedule, `jaxbeam.analysis.derived_gains` works out.
 """
 
 from typing import Any

@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxbeam.analysis.compare import Comparison
 from jaxbeam.case.fields import known
-from jaxbeam.compare import Comparison
 from jaxbeam.plot.record import name_loads, shade
 from jaxbeam.plot.style import GREY, INK, colour, digits, margin_labels, name, scale, styled
 

@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxbeam.analysis.stability import FrozenPoles, Growth
 from jaxbeam.plot.style import ALARM, GREY, INK, colour, name, styled
-from jaxbeam.stability import FrozenPoles, Growth
 
 SHOWN = 3.0  # times as far left as the fastest pole is high: faster decay is left out
 

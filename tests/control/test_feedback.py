@@ -14,9 +14,9 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.linearised_loop import linear_loop
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
-from jaxbeam.linear_loop import linear_loop
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form
 from tests.loop_as_oracle import expected, span_of

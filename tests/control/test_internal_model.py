@@ -8,8 +8,8 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.stability import frozen_poles
 
 LENGTH, RIGIDITY, MODES = 0.6, 13.2, 3
 START, END, MOMENT = 0.25, 0.35, 8.3e-4 * 0.3 * 200

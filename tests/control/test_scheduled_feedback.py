@@ -9,13 +9,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.derived_gains import BestGain, best_gains, equivalent_gains, scheduled
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.control import ScheduledFeedback
-from jaxbeam.derived_gains import BestGain, best_gains, equivalent_gains, scheduled
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from tests.analysis.test_compare import critical_gain
 from tests.loop_as_oracle import expected, span_of
-from tests.test_compare import critical_gain
 
 PATCH = jb.Patch(
     0.2575, 0.3425, 8.292e-4, correction=0.32, amplifier_gain=200.0, limits=[-2.5, 7.5]

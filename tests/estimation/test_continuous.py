@@ -16,11 +16,11 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
+from jaxbeam.analysis.linearised_loop import linear_loop
 from jaxbeam.case.validation import check
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.estimation import Inversion, Kalman, Observer
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.linear_loop import linear_loop
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form
 from tests.differences import central

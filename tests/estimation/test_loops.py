@@ -9,9 +9,9 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.linearised_loop import linear_loop
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.estimation import Kalman
-from jaxbeam.linear_loop import linear_loop
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form
 from tests.differences import central

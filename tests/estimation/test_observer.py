@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.linearised_loop import linear_loop
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.estimation import Observer
-from jaxbeam.linear_loop import linear_loop
 from jaxbeam.model.modes import lay_out
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant

@@ -8,9 +8,9 @@ import pytest
 import jaxbeam as jb
 from experiments import sensed, sensed_search, tuned
 from jaxbeam import rigs
+from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.case import known_case
 from jaxbeam.model.modes import lay_out
-from jaxbeam.stability import frozen_poles
 from tuning.believing import believing
 
 

@@ -10,8 +10,8 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.static_correction import residual_lift
 from jaxbeam.case.case import replace
-from jaxbeam.correction import residual_lift
 from jaxbeam.model.channels import common_pairs, shaker_chain
 from jaxbeam.model.frequency_response import (
     accelerance,

@@ -11,7 +11,7 @@ import scipy.optimize
 
 import jaxbeam as jb
 import tuning
-from jaxbeam.stability import frozen_poles
+from jaxbeam.analysis.stability import frozen_poles
 from tests.differences import central
 from tuning import descent
 from tuning.bench import make_bench

@@ -10,11 +10,11 @@ import scipy.optimize
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.stability import frozen_poles
+from jaxbeam.analysis.stability_limits import limit
 from jaxbeam.control.design_model import Beliefs
-from jaxbeam.limits import limit
-from jaxbeam.stability import frozen_poles
-from tests import test_stability as oracle
-from tests.test_stability import LENGTH, MASS, SPEED, rig, written_out
+from tests.analysis import test_stability as oracle
+from tests.analysis.test_stability import LENGTH, MASS, SPEED, rig, written_out
 
 STATES = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]
 TIMES = np.array([0.2, 0.4]) / SPEED

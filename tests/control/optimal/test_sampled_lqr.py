@@ -12,12 +12,12 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.linearised_loop import linear_loop
 from jaxbeam.case.validation import check
 from jaxbeam.cli import main
 from jaxbeam.control import LQR, DiscreteLQR, SamplingWarning
 from jaxbeam.control.optimal.sampled_lqr import sampled_problem
 from jaxbeam.control.optimal.sampling_loss import reach_kept
-from jaxbeam.linear_loop import linear_loop
 from jaxbeam.model.modes import lay_out
 
 WEIGHTS = {

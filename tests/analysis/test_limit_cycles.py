@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.reserve import reserve
+from jaxbeam.analysis.crossing_margin import reserve
+from jaxbeam.analysis.limit_cycles import counted, swings, turning_points
 from jaxbeam.rigs import load
 from jaxbeam.simulation.integration_plan import make_plan
-from jaxbeam.swings import counted, swings, turning_points
 
 TIMES = np.arange(2001) / 1000
 

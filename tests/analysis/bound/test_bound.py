@@ -15,9 +15,9 @@ from numpy.testing import assert_allclose
 from scipy.optimize import OptimizeResult, linprog
 
 import jaxbeam as jb
-from jaxbeam.control.bound import bound
-from jaxbeam.control.least_peak import least_peak
-from jaxbeam.control.reach import reach
+from jaxbeam.analysis.bound.bound import bound
+from jaxbeam.analysis.bound.input_influence import reach
+from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.simulation.integration_plan import make_plan
 
 DATA = json.loads((Path(__file__).parent / "data" / "bounds.json").read_text())

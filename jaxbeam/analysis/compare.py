@@ -13,15 +13,15 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.analysis.bound.bound import HELD, Bound, bound
+from jaxbeam.analysis.computing_time import StepTimes, step_times
+from jaxbeam.analysis.crossing_margin import Reserve, reserve
+from jaxbeam.analysis.limit_cycles import Swings, swings
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.loads import motion
-from jaxbeam.control.bound import HELD, Bound, bound
-from jaxbeam.reserve import Reserve, reserve
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
-from jaxbeam.step_times import StepTimes, step_times
-from jaxbeam.swings import Swings, swings
 
 
 class Merits(NamedTuple):

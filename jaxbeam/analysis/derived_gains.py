@@ -13,11 +13,11 @@ import scipy
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxbeam.analysis.crossing_margin import reserve
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import known
 from jaxbeam.control import Feedback, Recognition, ScheduledFeedback
 from jaxbeam.model.statics import influence_line, static_lift
-from jaxbeam.reserve import reserve
 from jaxbeam.simulation.integration_plan import make_plan
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 

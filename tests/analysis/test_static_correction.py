@@ -10,14 +10,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.case import replace
-from jaxbeam.correction import (
+from jaxbeam.analysis.static_correction import (
     bending_moment,
     corrected,
     residual_lift,
     residual_line,
     shear_force,
 )
+from jaxbeam.case.case import replace
 from jaxbeam.model.modal_model import rig
 from jaxbeam.model.modes import lay_out
 from jaxbeam.model.statics import influence_line, static_lift

@@ -12,8 +12,8 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
+from jaxbeam.analysis.linearised_loop import LinearLoop
 from jaxbeam.case.fields import known
-from jaxbeam.linear_loop import LinearLoop
 from jaxbeam.model.state_space import StateSpace
 from jaxbeam.numerics.discretisation import balance
 

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from jaxbeam.analysis.stability import frozen_poles, stream
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import known
-from jaxbeam.stability import frozen_poles, stream
 
 # What is above zero for an unstable case.
 Measure = Callable[[Case], float]

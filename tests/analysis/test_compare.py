@@ -11,12 +11,12 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.compare import compare
+from jaxbeam.analysis.computing_time import step_times
+from jaxbeam.analysis.crossing_margin import PLACES, reserve
 from jaxbeam.cli import main
-from jaxbeam.compare import compare
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.plot import plot_comparison
-from jaxbeam.reserve import PLACES, reserve
-from jaxbeam.step_times import step_times
 from tests.loop_as_oracle import span_of
 from tests.test_plot import words
 

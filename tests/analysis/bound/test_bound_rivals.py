@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 import jaxbeam as jb
-from jaxbeam.control.bound import bound
+from jaxbeam.analysis.bound.bound import bound
 from jaxbeam.simulation.integration_plan import make_plan
 
 PERIOD = 0.02

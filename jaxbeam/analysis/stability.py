@@ -18,13 +18,13 @@ import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 
+from jaxbeam.analysis.frozen_loop import Clock, OpenLoop, open_loop, through
+from jaxbeam.analysis.linearised_loop import linear, prepared
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.fields import known
 from jaxbeam.case.loads import motion
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.linear_loop import linear, prepared
 from jaxbeam.model.modes import lay_out
-from jaxbeam.open_loop import Clock, OpenLoop, open_loop, through
 from jaxbeam.runtime.compiling import compiled
 
 TURN = 0.15  # rad by which the fastest mode may turn in a step along a transition

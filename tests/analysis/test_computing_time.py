@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam.analysis.computing_time import WALKED, _changes, _ticks, timed
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.step_times import WALKED, _changes, _ticks, timed
 
 
 class Laborious(AbstractController):

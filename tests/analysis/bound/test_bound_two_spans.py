@@ -9,9 +9,9 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.control.bound import bound
-from jaxbeam.control.least_peak import least_peak
-from jaxbeam.control.reach import Reach
+from jaxbeam.analysis.bound.bound import bound
+from jaxbeam.analysis.bound.input_influence import Reach
+from jaxbeam.analysis.bound.linear_program import least_peak
 
 KNOWN = json.loads((Path(__file__).parent / "data" / "bounds.json").read_text())[
     "two spans, one mass"

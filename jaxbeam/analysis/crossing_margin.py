@@ -7,14 +7,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbeam.analysis.frozen_loop import OpenLoop, open_loop
+from jaxbeam.analysis.linearised_loop import LinearLoop, linear, prepared
+from jaxbeam.analysis.margins import margins
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.fields import known
 from jaxbeam.case.loads import motion
 from jaxbeam.control import MPC
-from jaxbeam.linear_loop import LinearLoop, linear, prepared
-from jaxbeam.margins import margins
 from jaxbeam.model.modes import lay_out
-from jaxbeam.open_loop import OpenLoop, open_loop
 
 PLACES = 13  # of the loads along a crossing, at which margins are looked for
 STILL = 1e-6  # 1/s: what moves at a smaller rate neither grows nor dies out

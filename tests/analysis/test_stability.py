@@ -10,12 +10,12 @@ import scipy.integrate
 import scipy.linalg
 
 import jaxbeam as jb
+from jaxbeam.analysis.linearised_loop import linear_loop
+from jaxbeam.analysis.margins import gramians, margins
+from jaxbeam.analysis.stability import _followed, frozen_poles, growth, stream
+from jaxbeam.analysis.stability_limits import limit
 from jaxbeam.control.design_model import Beliefs
-from jaxbeam.limits import limit
-from jaxbeam.linear_loop import linear_loop
-from jaxbeam.margins import gramians, margins
 from jaxbeam.model.state_space import state_space
-from jaxbeam.stability import _followed, frozen_poles, growth, stream
 
 REFERENCE = json.loads((Path(__file__).parent / "data/optimal_control.json").read_text())
 LENGTH, RIGIDITY, DENSITY, RATIO = 0.6, 11.68, 0.535, 0.03

@@ -9,11 +9,11 @@ import scipy.linalg
 import scipy.optimize
 
 import jaxbeam as jb
+from jaxbeam.analysis.stability import frozen_poles, growth, stream
+from jaxbeam.analysis.stability_limits import LoadLimits, load_limits, streaming
 from jaxbeam.cli import main
-from jaxbeam.limits import LoadLimits, load_limits, streaming
-from jaxbeam.stability import frozen_poles, growth, stream
-from tests import test_stability as oracle
-from tests.test_stability import LENGTH, MASS, SPEED, regulator, rig, written_out
+from tests.analysis import test_stability as oracle
+from tests.analysis.test_stability import LENGTH, MASS, SPEED, regulator, rig, written_out
 
 STATES = np.diag([1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0])
 

@@ -7,8 +7,8 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.linear_loop import linear_loop
-from jaxbeam.margins import margins
+from jaxbeam.analysis.linearised_loop import linear_loop
+from jaxbeam.analysis.margins import margins
 from tests.loop_as_oracle import span_of
 
 PERIOD, GAIN = 0.002, 200.0

@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxbeam.analysis.bound.input_influence import TOLERANCE, reach
+from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check
-from jaxbeam.control.least_peak import least_peak
 from jaxbeam.control.prescribed import Prescribed
-from jaxbeam.control.reach import TOLERANCE, reach
 from jaxbeam.model.channels import takes_commands
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import form, run_extremes, suitable_step

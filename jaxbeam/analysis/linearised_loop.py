@@ -14,11 +14,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from jaxbeam.analysis.frozen_loop import ROUNDING, Clock, OpenLoop, open_loop
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
 from jaxbeam.model.modes import lay_out
-from jaxbeam.open_loop import ROUNDING, Clock, OpenLoop, open_loop
 from jaxbeam.runtime.compiling import compiled
 
 SETTLING = 8  # steps of Newton's method towards the state about which a law is made linear

@@ -11,7 +11,7 @@ import numpy as np
 import scipy  # whose parts are loaded when used: all of them take a third of a second
 from jaxtyping import Float
 
-from jaxbeam.control.reach import Reach
+from jaxbeam.analysis.bound.input_influence import Reach
 
 EXACT = 1e-9  # of the largest deflection without commands: how exactly a program is solved
 VIOLATED = 1e-7  # of the same: rows that are violated by less are left out

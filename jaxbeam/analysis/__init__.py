@@ -1,0 +1,1 @@
+"""Stability, margins, the least achievable peak, comparison of controllers."""
