@@ -52,7 +52,7 @@ jaxbeam.analysis.derived_gains  jaxbeam.plot
 jaxbeam.__init__
 tuning
 experiments
-jaxbeam.arguments  jaxbeam.printing
+jaxbeam.cli.arguments  jaxbeam.cli.printing
 jaxbeam.cli
 jaxbeam.__main__
 """

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbeam.arguments import check_outputs, picture_path, read_case
 from jaxbeam.cli.app import Json, Overwrite, Settings, app
-from jaxbeam.printing import print_json, print_table, print_written
+from jaxbeam.cli.arguments import check_outputs, picture_path, read_case
+from jaxbeam.cli.printing import print_json, print_table, print_written
 
 
 @app.command

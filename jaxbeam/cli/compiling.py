@@ -1,7 +1,7 @@
 """The command that compiles what is written in C for this machine."""
 
 from jaxbeam.cli.app import Json, app
-from jaxbeam.printing import print_json
+from jaxbeam.cli.printing import print_json
 
 
 @app.command

@@ -5,9 +5,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.arguments import check_outputs, read_case, refuse
 from jaxbeam.cli.app import Json, Overwrite, Settings, app
-from jaxbeam.printing import print_json, print_written
+from jaxbeam.cli.arguments import check_outputs, read_case, refuse
+from jaxbeam.cli.printing import print_json, print_written
 
 
 @app.command

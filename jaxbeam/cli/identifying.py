@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from jaxbeam.arguments import (
+from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app, say
+from jaxbeam.cli.arguments import (
     assignment,
     bounds_of,
     check_outputs,
@@ -11,8 +12,7 @@ from jaxbeam.arguments import (
     refuse,
     split_files,
 )
-from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app, say
-from jaxbeam.printing import print_json, print_written
+from jaxbeam.cli.printing import print_json, print_written
 
 
 @app.command

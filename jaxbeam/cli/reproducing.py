@@ -5,9 +5,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.arguments import refuse
 from jaxbeam.cli.app import Json, Overwrite, app, say
-from jaxbeam.printing import print_json, print_table
+from jaxbeam.cli.arguments import refuse
+from jaxbeam.cli.printing import print_json, print_table
 
 TOGETHER = 2  # experiments at once, each of which takes a core and up to 2 GB
 

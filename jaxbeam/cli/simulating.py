@@ -7,7 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.arguments import (
+from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
+from jaxbeam.cli.arguments import (
     check_outputs,
     check_suffix,
     frequency_range,
@@ -18,8 +19,7 @@ from jaxbeam.arguments import (
     refuse,
     sweep_values,
 )
-from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
-from jaxbeam.printing import print_json, print_table, print_written
+from jaxbeam.cli.printing import print_json, print_table, print_written
 
 
 @app.command

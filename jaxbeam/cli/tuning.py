@@ -5,7 +5,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.arguments import (
+from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
+from jaxbeam.cli.arguments import (
     bounds_of,
     check_outputs,
     check_suffix,
@@ -13,8 +14,7 @@ from jaxbeam.arguments import (
     read_case,
     refuse,
 )
-from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
-from jaxbeam.printing import print_json, print_written
+from jaxbeam.cli.printing import print_json, print_written
 
 
 @app.command

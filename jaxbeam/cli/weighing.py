@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from jaxbeam.arguments import bounds_of, check_outputs, range_of, read_case, refuse
 from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app
-from jaxbeam.printing import print_json, print_written
+from jaxbeam.cli.arguments import bounds_of, check_outputs, range_of, read_case, refuse
+from jaxbeam.cli.printing import print_json, print_written
 
 
 @app.command

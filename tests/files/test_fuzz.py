@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import case_from_dict, case_to_dict, load_case
 from tests import mutations
+from tests.cli.test_cli import CASE as SMALL
 from tests.files.test_case_file import FULL
-from tests.test_cli import CASE as SMALL
 from tests.tuning import test_readers as readers
 from tuning import read_logs
 
