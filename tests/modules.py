@@ -4,6 +4,7 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
+DATA = ROOT / "tests" / "data"
 PACKAGES = ("jaxbeam", "tuning", "experiments")
 
 

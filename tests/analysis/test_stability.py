@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,9 @@ from jaxbeam.analysis.stability import _followed, frozen_poles, growth, stream
 from jaxbeam.analysis.stability_limits import limit
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.model.state_space import state_space
+from tests.modules import DATA
 
-REFERENCE = json.loads((Path(__file__).parent / "data/optimal_control.json").read_text())
+REFERENCE = json.loads((DATA / "optimal_control.json").read_text())
 LENGTH, RIGIDITY, DENSITY, RATIO = 0.6, 11.68, 0.535, 0.03
 SPRING, DAMPER, PLACE, LAG = 12000.0, 80.0, 0.5, 1e4
 MASS, SPEED = 0.509, 0.55

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,10 +12,11 @@ import jaxbeam as jb
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form
 from tests.loop_as_oracle import expected, parts_of
+from tests.modules import DATA
 from tests.oracles import closed_loop
 from tests.oracles.two_spans import ProjectedSines, TwoSpans
 
-REFERENCE = json.loads((Path(__file__).parent / "data" / "two_spans.json").read_text())
+REFERENCE = json.loads((DATA / "two_spans.json").read_text())
 STARTS = (0.2575, 0.8575)
 
 

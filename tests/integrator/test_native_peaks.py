@@ -35,7 +35,7 @@ from jaxbeam.sweeps.store import FINGERPRINT
 
 pytestmark = pytest.mark.skipif(native_library.compiler() is None, reason="no C compiler here")
 
-ROOT = pathlib.Path(__file__).parents[1]
+ROOT = pathlib.Path(__file__).parents[2]
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
 SENSORS = [jb.Sensor(0.15), jb.Sensor(0.3), jb.Sensor(0.41)]
 PLAIN = jb.Case(BEAM, sensors=SENSORS, loads=[jb.MovingMass(mass=0.5, speed=1.0)], run=jb.Run(1.0))

@@ -2,12 +2,12 @@
 
 import json
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from tests.modules import DATA
 from tests.oracles import crossing, modal_equations
 from tests.oracles.closed_forms import (
     cancellation_speed,
@@ -31,9 +31,7 @@ from tests.oracles.loads import Load
 from tests.oracles.modal_equations import Span
 
 NAMES = ("pinned", "clamped", "free", "guided")
-REFERENCE = json.loads(
-    (Path(__file__).parents[1] / "data" / "reference_cases.json").read_text(encoding="utf-8")
-)
+REFERENCE = json.loads((DATA / "reference_cases.json").read_text(encoding="utf-8"))
 
 
 def equal_spans(count: int, ends: str = "pinned-pinned") -> Beam:

@@ -5,7 +5,6 @@ Every test compiles a loop or two of its own, hence plans made by hand, which co
 
 import dataclasses
 import json
-from pathlib import Path
 
 import control
 import jax
@@ -22,6 +21,7 @@ from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form
 from jaxbeam.simulation.simulate import readings
 from tests.loop_as_oracle import expected, span_of
+from tests.modules import DATA
 
 TIMES = np.linspace(0.0, 0.4, 81)
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
@@ -313,7 +313,7 @@ def test_energy_is_conserved():
     assert_allclose(total(supplied) + total(work), stored + total(lost), rtol=0, atol=1e-8 * size)
 
 
-REFERENCE = json.loads((Path(__file__).parent / "data" / "reference_control.json").read_text())
+REFERENCE = json.loads((DATA / "reference_control.json").read_text())
 
 
 def of_reference(name: str) -> jb.Case:

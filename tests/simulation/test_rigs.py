@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import tomllib
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.files.case_file import case_from_dict
+from tests.modules import DATA
 from tests.oracles import crossing, finite_elements
 from tests.oracles.loads import GRAVITY, Load
 from tests.runs import assert_close, load_of, plan_of
@@ -23,7 +23,7 @@ pytestmark = [
     ),
 ]
 
-REFERENCE = json.loads((Path(__file__).parent / "data" / "reference_cases.json").read_text("utf-8"))
+REFERENCE = json.loads((DATA / "reference_cases.json").read_text("utf-8"))
 
 
 @pytest.mark.parametrize("reference", REFERENCE, ids=lambda reference: reference["title"])

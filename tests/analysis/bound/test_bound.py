@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import clarabel
 import jax
@@ -19,8 +18,9 @@ from jaxbeam.analysis.bound.bound import bound
 from jaxbeam.analysis.bound.input_influence import reach
 from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.simulation.integration_plan import make_plan
+from tests.modules import DATA as DATA_FOLDER
 
-DATA = json.loads((Path(__file__).parent / "data" / "bounds.json").read_text())
+DATA = json.loads((DATA_FOLDER / "bounds.json").read_text())
 PATCH = jb.Patch(
     0.2575,
     0.3425,

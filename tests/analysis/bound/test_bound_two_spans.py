@@ -1,7 +1,6 @@
 """The bound of two spans with two patches: the program on an oracle's motion; ours beside it."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +11,9 @@ import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import bound
 from jaxbeam.analysis.bound.input_influence import Reach
 from jaxbeam.analysis.bound.linear_program import least_peak
+from tests.modules import DATA
 
-KNOWN = json.loads((Path(__file__).parent / "data" / "bounds.json").read_text())[
-    "two spans, one mass"
-]
+KNOWN = json.loads((DATA / "bounds.json").read_text())["two spans, one mass"]
 LENGTH, RIGIDITY, DENSITY, RATIO = 1.2, 12.277, 0.7924, 0.03
 STARTS, SENSORS, GRAVITY = (0.2575, 0.8575), (0.3, 0.9), 9.81
 MOMENT = 8.292438504838157e-4 * 0.39  # N m/V that reach the beam

@@ -1,7 +1,6 @@
 """Linear-quadratic regulators: gains and closed loops computed independently, costs, optimality."""
 
 import json
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,8 +15,9 @@ from jaxbeam.control import LQR, AugmentedLQR, FiniteLQR, StepLQR
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.control.optimal.lqr import optimal
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from tests.modules import DATA
 
-REFERENCE = json.loads((Path(__file__).parent / "data" / "optimal_control.json").read_text())
+REFERENCE = json.loads((DATA / "optimal_control.json").read_text())
 SHARES = np.array(REFERENCE["fractions_of_crossing"])
 WEIGHTS = {
     "state_weight": REFERENCE["case"]["Q"],

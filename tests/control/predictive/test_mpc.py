@@ -5,7 +5,6 @@ Most loops here run on a plant frozen anew in the middle of every millisecond, w
 
 import dataclasses
 import json
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -20,8 +19,9 @@ from jaxbeam.model.modes import lay_out
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form
 from tests.differences import central
+from tests.modules import DATA
 
-REFERENCE = json.loads((Path(__file__).parent / "data" / "predictive_control.json").read_text())
+REFERENCE = json.loads((DATA / "predictive_control.json").read_text())
 PERIOD = 0.01
 PATCH = jb.Patch(
     0.2575, 0.3425, 8.292438504838157e-4, correction=0.32, amplifier_gain=200.0, limits=[-2.5, 7.5]
