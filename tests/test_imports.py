@@ -1,121 +1,138 @@
-"""Data flows one way: a module imports only what ranks below it."""
+"""Data flows one way: a package imports only those above it in ORDER, and no modules import in a circle."""
 
 import ast
+import graphlib
+import itertools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import pytest
 
 from tests.modules import PACKAGES, module_files, parse
 
-# One layer a line, lowest first; the modules of a layer do not import each other. A new module
-# goes into the lowest layer above all that it imports. A package named here stands for those of
-# its modules that are not named themselves, which may import each other.
-LAYERS = """
-jaxbeam.analysis.bound.__init__  jaxbeam.analysis.__init__  jaxbeam.sweeps.__init__  jaxbeam.simulation.__init__  jaxbeam.files.__init__  jaxbeam.control.predictive.__init__  jaxbeam.control.optimal.__init__  jaxbeam.integrator.__init__  jaxbeam.model.__init__  jaxbeam.numerics.__init__  jaxbeam.runtime.__init__  jaxbeam.case.__init__  jaxbeam.files.report  jaxbeam.integrator.input_policy  jaxbeam.numerics.eigen  jaxbeam.case.fields  jaxbeam.numerics.discretisation
-jaxbeam.runtime.compile_cache  jaxbeam.numerics.batched_linalg
-jaxbeam.runtime.compiling
-jaxbeam.case.declared_checks  jaxbeam.numerics.piecewise  jaxbeam.numerics.intervals
-jaxbeam.numerics.stages  jaxbeam.runtime.native_library
-jaxbeam.numerics.coupled_stages
-jaxbeam.case.beam  jaxbeam.case.filters  jaxbeam.case.trajectory  jaxbeam.case.actuators  jaxbeam.case.controller
-jaxbeam.case.estimator  jaxbeam.case.loads  jaxbeam.numerics.riccati  jaxbeam.integrator.events  jaxbeam.case.sensors
-jaxbeam.case.case  jaxbeam.numerics.gain_table  jaxbeam.model.sensor_signals
-jaxbeam.numerics.gain_polynomials
-jaxbeam.numerics.native_designs
-jaxbeam.numerics.finite_horizon
-jaxbeam.case.validation
-jaxbeam.model.modes
-jaxbeam.model.measurement  jaxbeam.model.modal_model
-jaxbeam.model.flexibility  jaxbeam.integrator.propagators  jaxbeam.numerics.peak_search  jaxbeam.model.channels  jaxbeam.model.sine_basis
-jaxbeam.model.frequency_response  jaxbeam.integrator.time_grid
-jaxbeam.model.contact
-jaxbeam.integrator.adaptive_reference  jaxbeam.model.state_space  jaxbeam.model.statics  jaxbeam.integrator.step_matrices
-jaxbeam.model.sensor_filters
-jaxbeam.estimation
-jaxbeam.control  jaxbeam.integrator.running_peaks
-jaxbeam.integrator.step  jaxbeam.files.case_file
-jaxbeam.integrator.integrate
-jaxbeam.files.export  jaxbeam.simulation.closed_loop  jaxbeam.integrator.native_peaks  jaxbeam.analysis.frozen_loop  jaxbeam.simulation.record  jaxbeam.rigs
-jaxbeam.analysis.linearised_loop  jaxbeam.simulation.integration_plan
-jaxbeam.analysis.margins  jaxbeam.sweeps.programs  jaxbeam.analysis.stability  jaxbeam.analysis.computing_time  jaxbeam.analysis.limit_cycles
-jaxbeam.analysis.stability_limits  jaxbeam.analysis.crossing_margin
-jaxbeam.analysis.bound.input_influence
-jaxbeam.analysis.bound.linear_program
-jaxbeam.analysis.bound.bound
-jaxbeam.sweeps.batches  jaxbeam.sweeps.step_size  jaxbeam.sweeps.store
-jaxbeam.simulation.simulate  jaxbeam.analysis.static_correction
-jaxbeam.analysis.amplification
-jaxbeam.sweeps.blocks
-jaxbeam.sweeps.specification
-jaxbeam.sweeps.cluster
-jaxbeam.sweeps.sweep  jaxbeam.analysis.compare
-jaxbeam.analysis.derived_gains  jaxbeam.plot
-jaxbeam.__init__
+# Each package may import those above it. A package named here stands for all within it that are
+# not named themselves; those of a line do not import each other.
+ORDER = """
+jaxbeam.case  jaxbeam.runtime
+jaxbeam.numerics
+jaxbeam.model
+jaxbeam.integrator  jaxbeam.estimation
+jaxbeam.control
+jaxbeam.files
+jaxbeam.rigs  jaxbeam.simulation
+jaxbeam.sweeps
+jaxbeam.analysis
+jaxbeam.plot
+jaxbeam
+tuning.checkpoint  tuning.optional
+tuning.logs
+tuning.parameters  tuning.modal
+tuning.fit
+tuning.control
 tuning
-experiments
-jaxbeam.cli.arguments  jaxbeam.cli.printing
+experiments.thesis  experiments.demo
+experiments.studies  experiments.validation
+experiments.benchmarks  experiments
 jaxbeam.cli
 jaxbeam.__main__
 """
-RANKS = {name: rank for rank, layer in enumerate(LAYERS.split("\n")) for name in layer.split()}
+
+
+def ranks(order: str) -> dict[str, int]:
+    """The level of each package that the order names, lowest first."""
+    return {name: level for level, line in enumerate(order.split("\n")) for name in line.split()}
+
+
+RANKS = ranks(ORDER)
 FILES = module_files()
 
 
-def place(module: str) -> str | None:
-    """The entry of the table under which a module falls."""
+def package(module: str) -> str:
+    """The entry of the order under which a module falls: the longest that it begins with."""
+    if module == "jaxbeam.__init__":
+        return "jaxbeam"
     parts = module.split(".")
-    names = [".".join(parts[: i + 1]) for i in range(len(parts))]
-    return next((name for name in reversed(names) if name in RANKS), None)
+    names = [".".join(parts[:end]) for end in range(len(parts), 1, -1)]
+    found = next((name for name in names if name in RANKS), None)
+    found = found or (parts[0] if parts[0] in RANKS and len(parts) <= 2 else None)
+    assert found, f"give the package of {module} a place in ORDER of tests/test_imports.py"
+    return found
 
 
-def imported(tree: ast.AST) -> set[str]:
-    """Our modules that the code in a syntax tree imports, anywhere in it."""
-    found = set()
+def imported(tree: ast.AST, files: Mapping[str, object]) -> Iterator[tuple[str, int]]:
+    """Our modules that the code in a syntax tree imports, anywhere in it, and the line."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are absolute"
             # `from package import name` may mean the module package.name
-            found |= {
-                inner if is_module(inner := f"{node.module}.{alias.name}") else str(node.module)
-                for alias in node.names
-            }
-    ours = {name for name in found if name.split(".")[0] in PACKAGES}
-    return {name if name in FILES else f"{name}.__init__" for name in ours}
+            inner = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [
+                name if name in files or f"{name}.__init__" in files else str(node.module)
+                for name in inner
+            ]
+        else:
+            continue
+        for name in names:
+            if name.split(".")[0] in PACKAGES:
+                yield name if name in files else f"{name}.__init__", node.lineno
 
 
-def is_module(name: str) -> bool:
-    """Tell whether a dotted name is a module or package of ours."""
-    return name in FILES or f"{name}.__init__" in FILES
+def violations(imports: Mapping[str, set[str]]) -> list[str]:
+    """Imports between packages that do not go upwards in ORDER, in words."""
+    found = []
+    for module, others in imports.items():
+        for other in others:
+            here, there = package(module), package(other)
+            if here != there and not RANKS[there] < RANKS[here]:
+                found.append(f"{module} imports {other}, which is not above it in ORDER")
+    return found
 
 
-def imported_at_once(tree: ast.Module) -> set[str]:
-    """Our modules that are imported as soon as the module itself is, not within a function."""
-    eager = [node for node in tree.body if not isinstance(node, ast.FunctionDef)]
-    return imported(ast.Module(eager, []))
+def circle(imports: Mapping[str, set[str]]) -> list[str]:
+    """Modules that import each other in a circle, or none."""
+    try:
+        graphlib.TopologicalSorter(imports).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
 
 
-@pytest.mark.parametrize("module", FILES)
-def test_has_a_rank(module):
-    assert place(module), f"give {module} a place in LAYERS of tests/test_imports.py"
+IMPORTS = {
+    module: {name for name, _ in imported(parse(path), FILES)} - {module}
+    for module, path in FILES.items()
+}
 
 
-@pytest.mark.parametrize("module", FILES)
-def test_imports_only_downward(module):
-    here = place(module)
-    for other in imported(parse(FILES[module])):
-        there = place(other)
-        assert here and there
-        below = RANKS[there] < RANKS[here]
-        assert below or here == there, f"{module} imports {other}, which does not rank below it"
+def test_packages_import_only_what_is_above_them():
+    assert violations(IMPORTS) == []
+
+
+def test_no_circles():
+    assert circle(IMPORTS) == []
+
+
+def test_violations_and_circles_are_found():
+    assert violations({"jaxbeam.case.beam": {"jaxbeam.model.modes"}})
+    assert violations({"jaxbeam.control.lqr": {"jaxbeam.sweeps.sweep"}})
+    assert not violations({"jaxbeam.model.modes": {"jaxbeam.case.beam"}})
+    code = "if TYPE_CHECKING:\n    from jaxbeam.model.modes import Modes\n"
+    assert {name for name, _ in imported(ast.parse(code), FILES)} == {"jaxbeam.model.modes"}
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
+
+
+@pytest.mark.parametrize("folder", sorted({path.parent for path in FILES.values()}))
+def test_no_package_has_more_than_fifteen_files(folder: Path):
+    assert len(list(folder.glob("*.py"))) <= 16, "a package of at most fifteen files and its door"
 
 
 def test_experiments_are_imported_only_when_a_command_needs_them():
     for module, path in FILES.items():
-        if place(module) == "experiments":
+        if package(module).startswith("experiments"):
             continue
         tree = parse(path)
-        wanted = [name for name in imported(tree) if name.startswith("experiments")]
-        assert not wanted or place(module) == "jaxbeam.cli", f"{module} imports {wanted}"
-        eager = [name for name in imported_at_once(tree) if name.startswith("experiments")]
-        assert not eager, f"{module} imports {eager} outside a function"
+        eager = [node for node in tree.body if not isinstance(node, ast.FunctionDef)]
+        names = itertools.chain.from_iterable(imported(node, FILES) for node in eager)
+        found = [name for name, _ in names if name.startswith("experiments")]
+        assert not found, f"{module} imports {found} outside a function"

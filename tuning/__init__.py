@@ -7,29 +7,29 @@ import os
 # was not. XLA reads this before it computes anything; a setting given stays.
 os.environ.setdefault("PJRT_NPROC", str(max(8, os.cpu_count() or 1)))
 
-from tuning.account import write_report
-from tuning.belief import Belief
-from tuning.choices import tune_choices
-from tuning.criticism import compare_fits, cross_validate, hold_out
-from tuning.design import sharpen
-from tuning.faults import find_faults, mask
-from tuning.identify import Fit, identify
-from tuning.keeping import load_fit, save_fit
-from tuning.load_cases import LoadCases, draws, grid, read_load_cases
-from tuning.logs import Log
-from tuning.modal import ModalFit, identify_modes
-from tuning.objective import Objective
-from tuning.pareto import lexicographic, pareto
-from tuning.plants import adopt, draw_plants
-from tuning.posterior import sample
-from tuning.profile import profile
-from tuning.proof import Tuned
-from tuning.reading import read_log, read_logs
-from tuning.reduced import tune_reduced
-from tuning.responses import Responses, identify_responses, responses_of
-from tuning.stable import Stable
-from tuning.tune import tune
-from tuning.weigh import weigh
+from tuning.control.integer_choices import tune_choices
+from tuning.control.load_cases import LoadCases, draws, grid, read_load_cases
+from tuning.control.objective import Objective
+from tuning.control.pareto import lexicographic, pareto
+from tuning.control.plants import adopt, draw_plants
+from tuning.control.reduced_order import tune_reduced
+from tuning.control.stability_constraint import Stable
+from tuning.control.tune import tune
+from tuning.control.tuning_result import Tuned
+from tuning.fit.experiment_design import sharpen
+from tuning.fit.frequency_responses import Responses, identify_responses, responses_of
+from tuning.fit.identify import Fit, identify
+from tuning.fit.model_validation import compare_fits, cross_validate, hold_out
+from tuning.fit.report import write_report
+from tuning.fit.storage import load_fit, save_fit
+from tuning.fit.uncertainty.posterior import sample
+from tuning.fit.uncertainty.profile import profile
+from tuning.fit.weigh import weigh
+from tuning.logs.log import Log
+from tuning.logs.quality import find_faults, mask
+from tuning.logs.reading import read_log, read_logs
+from tuning.modal.modal import ModalFit, identify_modes
+from tuning.parameters.prior import Belief
 
 __all__ = [
     "Belief",

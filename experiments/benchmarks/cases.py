@@ -23,8 +23,8 @@ import time
 import numpy as np
 
 import jaxbeam as jb
-from experiments.benchmarks import baselines
-from experiments.benchmarks.crossing import MOMENT, PATCH, SPAN, Rig
+from experiments.benchmarks.rivals import baselines
+from experiments.benchmarks.rivals.crossing import MOMENT, PATCH, SPAN, Rig
 from experiments.benchmarks.sweep import TOLERANCE
 from experiments.benchmarks.timing import peak_memory, time_call
 

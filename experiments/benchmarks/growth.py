@@ -30,7 +30,7 @@ def measure(runs: int) -> dict[str, float]:
     from experiments.benchmarks.cluster import grid
     from experiments.benchmarks.sweep import rig
     from experiments.benchmarks.timing import peak_memory
-    from jaxbeam.sweeps import sweep
+    from jaxbeam.sweeps.sweep import sweep
 
     case, took, over = rig(3), [], grid(runs)
     xarray.Dataset({"loaded": ("run", [0.0])})

@@ -15,11 +15,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import jaxbeam as jb
-from experiments.benchmarks.crossing import Rig, crossing_rate
+from experiments.benchmarks.rivals.crossing import Rig, crossing_rate
 from tuning import Log
-from tuning.campaign import prepare
-from tuning.free import free_numbers
-from tuning.search import Search
+from tuning.fit.dataset import prepare
+from tuning.fit.least_squares import Search
+from tuning.parameters.free import free_numbers
 
 TRUTH = {
     "beam.flexural_rigidity": 11.68,

@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from experiments.benchmarks.crossing import GRAVITY, Rig
+from experiments.benchmarks.rivals.crossing import GRAVITY, Rig
 from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, rig, sweep_peaks
 from experiments.benchmarks.timing import best_in_turn
 from jaxbeam.integrator.propagators import GAUSS, LOOKED

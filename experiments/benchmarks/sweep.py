@@ -24,8 +24,8 @@ import numpy as np
 import xarray
 
 import jaxbeam as jb
-from experiments.benchmarks import baselines, by_numba
-from experiments.benchmarks.crossing import Rig
+from experiments.benchmarks.rivals import baselines, by_numba
+from experiments.benchmarks.rivals.crossing import Rig
 from experiments.benchmarks.timing import Timing, best_in_turn, time_call
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library

@@ -21,12 +21,12 @@ from scipy.optimize import differential_evolution
 
 import jaxbeam as jb
 import tuning
-from experiments.tuned_search import ENTRY, GATES, LEAD, LIMITS, PERIOD, STARTS
+from experiments.studies.tuned_search import ENTRY, GATES, LEAD, LIMITS, PERIOD, STARTS
 from jaxbeam import rigs
 from jaxbeam.case.case import value_at
 from jaxbeam.runtime.compiling import compiled
-from tuning.bench import make_bench
-from tuning.methods import METHODS
+from tuning.control.optimisers import METHODS
+from tuning.control.run_set import make_bench
 
 KNOTS, STEPS, COST, MORE, SEED = 11, 80, 4, 10, 0
 LOADS = tuning.grid({"loads.0.mass": [0.261, 0.509], "loads.0.speed": [0.5, 1.0]})

@@ -162,7 +162,7 @@ def _fit(case, files, kinds, free, prior, scale, output, overwrite, settings):
 
 def _beliefs(free, prior, scale) -> dict:
     """Bounds, priors and scales by address, of the options that name them."""
-    from tuning.belief import Belief
+    from tuning.parameters.prior import Belief
 
     scales = dict(assignment("--scale", text) for text in scale)
     priors = {}
@@ -194,9 +194,9 @@ def _beliefs(free, prior, scale) -> dict:
 
 def _judge(fit, profile, draws, sampling, validate, output, resume) -> dict:
     """Profiles, posterior and cross-validation, as far as they are asked for."""
-    from tuning.criticism import cross_validate
-    from tuning.posterior import sample
-    from tuning.profile import profile as profile_of
+    from tuning.fit.model_validation import cross_validate
+    from tuning.fit.uncertainty.posterior import sample
+    from tuning.fit.uncertainty.profile import profile as profile_of
 
     judged = {"profiles": [profile_of(fit, address) for address in profile]}
     if validate:
@@ -210,8 +210,8 @@ def _judge(fit, profile, draws, sampling, validate, output, resume) -> dict:
 def _tell(fit, judged, report, output, picture, json_) -> None:
     """Write and print what was found; then what was kept on the way is needed no longer."""
     from jaxbeam.files.case_file import save_case
-    from tuning.account import write_report
-    from tuning.keeping import save_fit
+    from tuning.fit.report import write_report
+    from tuning.fit.storage import save_fit
 
     if output:
         save_case(fit.case, output, overwrite=True)  # checked before the work

@@ -34,7 +34,7 @@ def reproduce(
     output
         Folder for the report and the figures; out/reproduce if left out.
     """
-    from experiments import reproduction
+    from experiments.thesis import reproduction
 
     known = reproduction.experiments()
     if list_:

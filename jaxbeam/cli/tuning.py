@@ -144,7 +144,7 @@ def tune(
         "steps": steps, "seed": seed, "bounds": bounds, "progress": not json_,
     }  # fmt: skip
     if sweep:
-        found = tuning.pareto(*given, goal, *sweep, **common)
+        found = tuning.control.pareto(*given, goal, *sweep, **common)
         results = found.tuned
     elif rank:
         results = tuning.lexicographic(*given, rank.split(","), over=over, **common)[-1:]

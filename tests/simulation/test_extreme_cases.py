@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from experiments.benchmarks.baselines import reference_peaks
-from experiments.benchmarks.crossing import Rig
+from experiments.benchmarks.rivals.baselines import reference_peaks
+from experiments.benchmarks.rivals.crossing import Rig
 from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.simulate import ContactLossWarning
 

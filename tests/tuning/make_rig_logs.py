@@ -11,7 +11,7 @@ import numpy as np
 import scipy.signal
 
 import jaxbeam as jb
-from experiments.identification import HAND_FITTED, plant_of
+from experiments.thesis.chapter2.identification import HAND_FITTED, plant_of
 from jaxbeam import rigs
 from tests.oracles import finite_elements
 from tests.tuning.rehearsals import Plant

@@ -14,11 +14,11 @@ from jaxbeam.case.case import replace
 from tests.oracles import crossing, finite_elements
 from tests.oracles.loads import Load
 from tuning import Fit, Log
-from tuning.campaign import prepare
-from tuning.free import free_numbers
-from tuning.identify import fit_of
-from tuning.search import Search
-from tuning.uncertainty import reach
+from tuning.fit.dataset import prepare
+from tuning.fit.identify import fit_of
+from tuning.fit.least_squares import Search
+from tuning.fit.uncertainty.covariance import reach
+from tuning.parameters.free import free_numbers
 
 RATE, MEMORY = 100.0, 0.5  # Hz, correlation from sample to sample
 NOISE = {"deflection": 1e-5, "acceleration": 2e-3}  # m, m/s^2

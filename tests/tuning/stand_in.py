@@ -7,10 +7,10 @@ import numpy as np
 
 import jaxbeam as jb
 from tuning import Log
-from tuning.campaign import Campaign
-from tuning.free import free_numbers
-from tuning.identify import fit_of
-from tuning.search import Search
+from tuning.fit.dataset import Campaign
+from tuning.fit.identify import fit_of
+from tuning.fit.least_squares import Search
+from tuning.parameters.free import free_numbers
 
 TRUTH = {"beam.flexural_rigidity": 20.0, "beam.damping_ratio": 0.03, "sensors.0.offset": 0.2}
 PULLS = (1.0, 1.6, 0.7)  # how hard the beam of each log was pulled before it was let go

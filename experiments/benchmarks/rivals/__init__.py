@@ -1,0 +1,1 @@
+"""The speed benchmark's problem solved by scipy, diffrax and numba."""

@@ -1,1 +1,0 @@
-"""Numbers that the thesis prints, a file for each chapter."""

@@ -1,0 +1,80 @@
+"""What the thesis fitted by hand, by gradients: damping, suspension and patch factors.
+
+The measured logs are not available. Those in `logs` were made by finite elements with the numbers
+fitted by hand (python -m tests.tuning.make_rig_logs); the fits begin a quarter off them.
+"""
+
+import dataclasses
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+import jaxbeam as jb
+import tuning
+from experiments.thesis import published
+from experiments.thesis.verdicts import Experiment, Outcome, finding
+from jaxbeam.plot.style import colour, name, styled
+
+LOGS = Path(__file__).parents[2] / "logs"
+OFF = 1.25  # how far off the fits begin
+MODES = 12  # eight leave out half of the noise on two spans
+DAMPING = "beam.damping_ratio"
+FACTORS = "actuators.0.correction", "actuators.1.correction"
+HAND_FITTED = {
+    "A": {DAMPING: 0.03, "actuators.0.stiffness": 3500.0, "actuators.0.damping": 80.0},
+    "B": {DAMPING: 0.03, FACTORS[0]: 0.32},
+    "C": {FACTORS[0]: 0.39, FACTORS[1]: 0.68},
+}
+PRINTED = {"A": published.SHAKER_BY_HAND, "B": published.PATCH_BY_HAND, "C": published.RAIL_BY_HAND}
+
+
+def plant_of(case: jb.Case) -> jb.Case:
+    """A published rig with as many modes as its log shows."""
+    return dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=MODES))
+
+
+def fit(rig: str, load) -> tuning.Fit:
+    """The numbers of a rig that were fitted by hand, from its log."""
+    start = {address: OFF * value for address, value in HAND_FITTED[rig].items()}
+    case = jb.replace(plant_of(load(rig)), start)
+    return tuning.identify(case, tuning.read_log(LOGS / f"{rig}.csv"), list(start))
+
+
+def run(load) -> Outcome:
+    """All fits, with what they say of their numbers."""
+    fits = {rig: fit(rig, load) for rig in HAND_FITTED}
+    findings = [finding(PRINTED[rig], found.values) for rig, found in fits.items()]
+    remarks = ["The measured logs are not available: these come from finite elements."]
+    for rig, found in fits.items():
+        for address, value, (low, high) in zip(
+            found.addresses, found.values, found.intervals, strict=True
+        ):
+            remarks.append(f"rig {rig}, {address}: {value:.4g}, 95 % {low:.4g} to {high:.4g}")
+    return Outcome(tuple(findings), {"logs": _draw(fits)}, tuple(remarks))
+
+
+@styled
+def _draw(fits) -> Figure:
+    """Measured and fitted deflections, and what is left, rig by rig."""
+    figure = Figure(figsize=(7.2, 5.6))
+    columns = figure.subplots(2, len(fits), sharex="col").T
+    for (above, below), (rig, found) in zip(columns, fits.items(), strict=True):
+        times, last = found.campaign.times[0], found.fitted.shape[2] - 1
+        above.plot(times, 1e3 * found.campaign.measured[0, :, last], color="0.6", label="log")
+        above.plot(times, 1e3 * found.fitted[0, :, last], color=colour(0), lw=1, label="fitted")
+        below.plot(times, 1e6 * found.residuals[0, :, last], color=colour(1), lw=1)
+        above.set_title(f"rig {rig}")
+        below.set_xlabel("time (s)")
+    figure.axes[0].set_ylabel("deflection (mm)")
+    figure.axes[len(fits)].set_ylabel("residual (µm)")
+    figure.axes[0].legend()
+    name(figure, "What was fitted by hand, fitted by gradients")
+    return figure
+
+
+EXPERIMENT = Experiment(
+    "identification",
+    "hand fits of damping, shaker and patches: 2.1.2, 2.2.4, 2.4.2",
+    "From logs of such rigs, gradients find the numbers that the thesis fitted by hand.",
+    run,
+)

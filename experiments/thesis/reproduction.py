@@ -1,0 +1,147 @@
+"""The thesis, reproduced: all experiments by name, run and written up in one report."""
+
+import dataclasses
+import importlib
+import json
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import jax
+
+import jaxbeam as jb
+from experiments.thesis import writeup
+from experiments.thesis.verdicts import VERDICTS, Experiment, Run, judge
+from jaxbeam import rigs
+
+MODULES = (
+    "thesis.chapter2.frequencies",
+    "thesis.chapter2.patches",
+    "thesis.chapter2.amplification",
+    "thesis.chapter2.shaker",
+    "thesis.chapter2.identification",
+    "thesis.chapter5.optimal_control",
+    "studies.streams",
+    "thesis.chapter6.feedback",
+    "thesis.chapter7.predictive_control",
+    "studies.tuned",
+    "studies.sensed",
+)
+FOLDER = "out/reproduce"
+
+
+def experiments() -> dict[str, Experiment]:
+    """All experiments by name, in the order of the thesis."""
+    found = (importlib.import_module(f"experiments.{name}").EXPERIMENT for name in MODULES)
+    return {one.name: one for one in found}
+
+
+def chosen(names: Sequence[str]) -> list[Experiment]:
+    """The experiments of these names. Raises ValueError for a name that none has."""
+    known = experiments()
+    for name in names:
+        if name not in known:
+            raise ValueError(f"there is no experiment {name!r}; there are {', '.join(known)}")
+    return [known[name] for name in names]
+
+
+def perform(experiment: Experiment, load: Callable[[str], jb.Case] = rigs.load) -> Run:
+    """Run one experiment on the published rigs, or on what is loaded in their place."""
+    start = time.perf_counter()
+    outcome = experiment.run(load)
+    return Run(experiment, outcome, judge(outcome.findings), time.perf_counter() - start)
+
+
+def reproduce(
+    names: Sequence[str],
+    folder: str | Path = FOLDER,
+    overwrite: bool = False,
+    tell: Callable[[str], None] = print,
+    processes: int = 1,
+) -> list[Run]:
+    """Run experiments and write figures, numbers and one report into a folder.
+
+    So many `processes` share the experiments; each is told as text as soon as it and all before
+    it are done. Raises ValueError for an unknown name,
+    FileExistsError if the folder is not empty and may not be overwritten.
+    """
+    wanted, folder = [one.name for one in chosen(names)], Path(folder)
+    if folder.exists() and any(folder.iterdir()) and not overwrite:
+        raise FileExistsError(f"the folder {folder} is not empty; choose another, or --overwrite")
+    folder.mkdir(parents=True, exist_ok=True)
+    runs = []
+    for run in _performed(wanted, folder, processes):
+        tell(writeup.text(run))
+        runs.append(run)
+    (folder / "report.md").write_text(writeup.markdown(runs), encoding="utf-8")
+    (folder / "report.html").write_text(writeup.html(runs), encoding="utf-8")
+    (folder / "report.json").write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
+    return runs
+
+
+def _performed(names: Sequence[str], folder: Path, processes: int) -> Iterator[Run]:
+    """Runs of experiments, in their order, with their figures in the folder."""
+    if processes == 1:
+        yield from (_draw(perform(one), folder) for one in chosen(names))
+        return
+    # Each process has a Python lock of its own, under which programs are traced.
+    settings = (jax.config.jax_compilation_cache_dir,)
+    pool = ProcessPoolExecutor(processes, get_context("spawn"), _begin, settings)
+    with pool:
+        parts = pool.map(_apart, names, [folder] * len(names))
+        for one, part in zip(chosen(names), parts, strict=True):
+            yield Run(one, *part)
+
+
+def _apart(name: str, folder: Path) -> tuple:
+    """What a process brings back of an experiment: all but the experiment itself."""
+    (one,) = chosen([name])
+    _, *rest = _draw(perform(one), folder)
+    return tuple(rest)
+
+
+def _draw(run: Run, folder: Path) -> Run:
+    """Write the figures of a run; only their names are kept, for the report."""
+    for name, figure in run.outcome.figures.items():
+        figure.savefig(folder / f"{run.experiment.name}-{name}.png")
+    names = dict.fromkeys(run.outcome.figures)
+    return run._replace(outcome=dataclasses.replace(run.outcome, figures=names))
+
+
+def _begin(programs: str | None) -> None:
+    """Set a process up as the command line is: compiled programs are kept, warnings are short."""
+    jax.config.update("jax_compilation_cache_dir", programs)
+    warnings.formatwarning = lambda message, *_: f"jaxbeam: warning: {message}\n"
+
+
+def as_dict(runs: Sequence[Run]) -> dict:
+    """All numbers and verdicts as plain lists and words."""
+    return {
+        "summary": {word: writeup.count(runs, word) for word in VERDICTS},
+        "experiments": {
+            run.experiment.name: {
+                "claim": run.experiment.claim,
+                "seconds": run.seconds,
+                "remarks": list(run.outcome.remarks),
+                "findings": [
+                    {
+                        "where": one.printed.where,
+                        "what": one.printed.what,
+                        "unit": one.printed.unit,
+                        "kind": one.printed.kind,
+                        "tolerance": str(one.printed.tolerance),
+                        "labels": one.printed.names,
+                        "published": one.printed.numbers.tolist(),
+                        "readings": {k: list(map(float, v)) for k, v in one.readings.items()},
+                        "verdicts": judged.words,
+                        "obstacle": one.obstacle,
+                    }
+                    for one, judged in zip(run.outcome.findings, run.judged, strict=True)
+                ],
+            }
+            for run in runs
+        },
+    }

@@ -1,0 +1,188 @@
+"""The baselines of the speed benchmark solve the same problem, and solve it right."""
+
+import time
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from experiments.benchmarks import cases
+from experiments.benchmarks.rivals import baselines, by_numba
+from experiments.benchmarks.rivals.baselines import (
+    diffrax_peaks,
+    reference_peaks,
+    scipy_peaks,
+    scipy_time,
+)
+from experiments.benchmarks.rivals.crossing import Rig, crossing_rate, free_times, hermite_peaks
+from experiments.benchmarks.timing import Timing, time_call
+from tests.oracles.closed_loop import Actuator, Clock, Sensor, respond
+from tests.oracles.loads import Load
+from tests.oracles.modal_equations import Span
+from tests.oracles.two_spans import TwoSpans
+
+MASSES = np.array([0.1, 0.55, 1.0])
+# The heavier masses peak after the exit at 5.3 and 10 m/s, all others while they cross.
+SPEEDS = np.array([0.8, 2.2, 5.3, 10.0])
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return reference_peaks(Rig(3), MASSES, SPEEDS)
+
+
+def test_scipy_agrees_to_one_in_a_million(reference):
+    np.testing.assert_allclose(scipy_peaks(Rig(3), MASSES, SPEEDS), reference, rtol=1e-6)
+
+
+@pytest.mark.parametrize("shared_steps", [False, True])
+def test_diffrax_agrees_to_one_in_a_million(reference, shared_steps):
+    peaks = diffrax_peaks(Rig(3), MASSES, SPEEDS, shared_steps=shared_steps)
+    np.testing.assert_allclose(peaks, reference, rtol=1e-6)
+
+
+def test_reference_agrees_with_the_coupled_equations_sampled_finely():
+    """The full mass matrix, Gaussian elimination, and no closed form after the exit."""
+    mass, speed, length, modes = 0.7, 6.0, 0.6, 3
+    order = np.arange(1, modes + 1)
+    wavenumber = order * np.pi / length
+    stiffness = 11.68 * wavenumber**4
+    damping = 2 * 0.03 * np.sqrt(stiffness * 0.535)
+
+    def rate(t, state):
+        """Modal amplitudes of sines, modal mass 0.535 L / 2 each."""
+        q, velocity = np.split(state, 2)
+        inertia = 0.535 * length / 2 * np.eye(modes)
+        force = -length / 2 * (stiffness * q + damping * velocity)
+        if t < length / speed:
+            sine = np.sin(wavenumber * speed * t)
+            cosine = np.cos(wavenumber * speed * t)
+            inertia = inertia + mass * np.outer(sine, sine)
+            convected = 2 * speed * wavenumber * cosine @ velocity
+            convected -= speed**2 * (wavenumber**2 * sine) @ q
+            force = force - mass * (9.81 + convected) * sine
+        return np.concatenate([velocity, np.linalg.solve(inertia, force)])
+
+    state, largest = np.zeros(2 * modes), 0.0
+    for start, end in [(0.0, length / speed), (length / speed, length / speed + 0.5)]:
+        inside = np.nextafter(end, 0) if start == 0 else end
+        samples = np.linspace(start, inside, 200001)  # misses 2e-8 of a peak
+        run = solve_ivp(
+            rate, (start, inside), state, "DOP853", samples, rtol=1e-10, atol=1e-15, max_step=1e-2
+        )
+        sensors = np.sin(np.outer([0.15, 0.3, 0.45], wavenumber))
+        largest = np.maximum(largest, np.abs(sensors @ run.y[:modes]).max(axis=1))
+        state = run.y[:, -1]
+    expected = reference_peaks(Rig(modes), [mass], [speed])[0, 0]
+    np.testing.assert_allclose(largest, expected, rtol=1e-7)
+
+
+def test_cubic_peaks_are_exact_for_a_cubic_and_need_no_sample_at_the_peak():
+    times = np.array([0.0, 0.7, 1.1])
+    value = 2 * times**3 - 3 * times**2 + 0.9 * times - 0.5
+    rate = 6 * times**2 - 6 * times + 0.9
+    dip = (1 + np.sqrt(0.4)) / 2
+    lowest = 2 * dip**3 - 3 * dip**2 + 0.9 * dip - 0.5
+    peak = hermite_peaks(np.diff(times), value, rate)
+    np.testing.assert_allclose(peak, abs(lowest), rtol=1e-14)
+
+
+def test_free_times_cover_the_time_asked_for_and_thin_out_as_high_modes_die():
+    times = free_times(Rig(12), 0.5)
+    assert times[0] == 0.0 and times[-1] == 0.5
+    assert np.all(np.diff(times) > 0)
+    assert times[-2] - times[-3] > 5 * times[1]
+
+
+def test_time_call_keeps_compiling_apart():
+    timing = time_call(jax.jit(lambda x: x @ x), np.eye(50))
+    assert 0 < timing.run < timing.compile
+    assert np.isnan(timing.ratio)
+
+
+def test_time_call_compares_with_what_runs_beside(monkeypatch):
+    """A clock that all run slower by, and ever more so: the ratio stays."""
+    now, pace = [0.0], [1.0]
+
+    def passing(seconds):
+        now[0] += seconds * pace[0]
+        pace[0] *= 1.1
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    timing = time_call(passing, 6.0, repeat=3, beside=lambda: passing(2.0))
+    assert timing.ratio == pytest.approx(3.0, rel=0.01)
+    assert timing.run > 7.0
+    # The shortest are not of one moment: the other's first call comes just before ours.
+    assert timing.ratio_of_shortest == pytest.approx(3.0 * 1.1)
+
+
+def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
+    """Costs of the form it assumes are added up exactly."""
+    masses, speeds = np.linspace(0.1, 1, 5), np.linspace(0.3, 10, 9)
+
+    def known_cost(function, rig, masses, speeds, repeat, beside):
+        cost = 0.01 + 0.02 / speeds[0]
+        return Timing(run=cost, ratio=3 / speeds[0], shortest=cost / 2, shortest_beside=0.1)
+
+    monkeypatch.setattr(baselines, "time_call", known_cost)
+    found = scipy_time(scipy_peaks, Rig(1), masses, speeds, runs=4)
+    np.testing.assert_allclose(found.run, np.sum(0.01 + 0.02 / speeds) * len(masses))
+    np.testing.assert_allclose(found.ratio, np.sum(3 / speeds) * len(masses))
+    np.testing.assert_allclose(found.ratio_of_shortest, found.run / 2 / 0.1)
+
+
+@pytest.mark.parametrize("place", [0.1, 0.55, 0.7, 1.15])
+def test_modes_of_two_spans_are_those_of_the_oracle(place):
+    rig, oracle = Rig(6, 1.2, spans=2), TwoSpans(1.2, 11.68, 0.535, 6, 0.03)
+    np.testing.assert_allclose(rig.frequencies, oracle.frequencies, rtol=1e-12)
+    for order in (0, 1):
+        expected = oracle.shapes(place, order)
+        atol = 1e-12 * np.max(np.abs(expected))
+        np.testing.assert_allclose(rig.shapes(place, order), expected, atol=atol)
+
+
+@pytest.mark.parametrize("spans", [1, 2])
+def test_scipy_histories_under_control_are_those_of_the_oracle(spans):
+    """Through the full mass matrix, with sensors, clock and patches of its own."""
+    rig = cases.plain(spans, "sampled", 4)
+    kind = TwoSpans if spans == 2 else Span
+    beam = kind(rig.length, rig.flexural_rigidity, rig.mass_per_length, 4, rig.damping_ratio)
+    edges = [(0.6 * i + 0.2575, 0.6 * i + 0.3425) for i in range(spans)]
+    patches = [Actuator([(a, 1, 1.0), (b, 1, -1.0)], 8.292e-4 * 0.35 * 200) for a, b in edges]
+    times = np.arange(0.0, 0.5, 0.02)
+    expected = respond(
+        beam,
+        [Load(0.7, 4.0)],
+        patches,
+        [Sensor(x) for x in rig.sensors],
+        lambda readings, *_: -1e3 * readings[:spans],
+        times.tolist(),
+        Clock(0.01),
+    )
+    found = baselines.scipy_histories(rig, [0.7], [4.0], times)[0, 0]
+    size = np.max(np.abs(expected.deflection))
+    np.testing.assert_allclose(found, expected.deflection, atol=1e-6 * size)
+
+
+def test_a_rate_off_the_beam_is_that_of_a_mass_of_none():
+    rig = Rig(3)
+    state = np.random.default_rng(0).normal(size=(2, 3, 1))
+    away = crossing_rate(rig, np.ones(1), 1.0, None)(0.2, state)
+    np.testing.assert_allclose(away, crossing_rate(rig, np.zeros(1), 1.0)(0.2, state))
+
+
+@pytest.mark.parametrize("modes", [3, 6])
+def test_loops_for_numba_find_the_peaks_uncompiled_too(modes):
+    rig = Rig(modes)
+    expected = reference_peaks(rig, MASSES, SPEEDS)
+    found = by_numba.numba_peaks(by_numba.program(None), rig, MASSES, SPEEDS)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_numba_finds_what_the_same_loops_find_uncompiled():
+    package = pytest.importorskip("numba")
+    found, plain = (
+        by_numba.numba_peaks(by_numba.program(p), Rig(3), MASSES, SPEEDS) for p in (package, None)
+    )
+    np.testing.assert_allclose(found, plain, rtol=1e-9)

@@ -1,0 +1,77 @@
+"""What explains printed numbers, against the equations of the thesis written out with scipy."""
+
+import dataclasses
+
+import numpy as np
+from scipy.linalg import expm, solve_discrete_are
+
+from experiments.thesis import published
+from experiments.thesis.beams import one_span
+from experiments.thesis.chapter2 import frequencies, shaker
+from experiments.thesis.chapter5.optimal_control import WEIGHTS
+from experiments.thesis.chapter5.regulator_limits import EFFORT, active, optimal_gain, unlike
+from jaxbeam import rigs
+
+LENGTH, RIGIDITY, DENSITY, DAMPING = 0.6, 11.68, 0.535, 0.03
+MODAL = DENSITY * LENGTH / 2  # kg, of the sine modes
+
+
+def sines(modes):
+    """Wave numbers and angular frequencies of the pinned beam."""
+    waves = np.arange(1, modes + 1) * np.pi / LENGTH
+    return waves, waves**2 * np.sqrt(RIGIDITY / DENSITY)
+
+
+def test_critical_speed_of_the_denser_beam():
+    heavier = 2800 * 0.06 * 3.3e-3
+    speed = np.pi / LENGTH * np.sqrt(RIGIDITY / heavier)
+    ours = LENGTH * frequencies._heavier(one_span(rigs.load)) / np.pi
+    np.testing.assert_allclose(ours, speed, rtol=1e-9)
+    assert abs(speed - published.CRITICAL.numbers[0]) < published.CRITICAL.allowed[0]
+
+
+def mobility(s, mass):
+    """Eqs (2.29) and (2.30) at the shaker, with a mass parked at midspan."""
+    waves, omega = sines(4)
+    here, there = np.sin(0.5 * waves), np.sin(0.3 * waves)
+    plain = np.diag(MODAL * (s**2 + 2 * DAMPING * omega * s + omega**2))
+    return s * here @ np.linalg.solve(plain + mass * s**2 * np.outer(there, there), here)
+
+
+def force_per_volt(frequency, in_impedance, in_transmission):
+    """Eq. (2.34), with a parked mass (kg) in eq. (2.26) and another in (2.33)."""
+    s = 2j * np.pi * frequency
+    own = s / (0.02 * s**2 + 0.55 * s + 9700)
+    felt, beam = mobility(s, in_impedance), mobility(s, in_transmission)
+    impedance = 0.82 + 5e-5 * s + 4.2**2 * felt / (1 + felt / own)
+    return 4.2 / impedance * own / (own + beam)
+
+
+def test_the_mass_in_one_equation_only():
+    beam = dataclasses.replace(rigs.load("A").beam, modes=4)
+    found = shaker._in_impedance_alone(beam)
+    some = slice(None, None, 97)
+    theirs = [force_per_volt(f, 0.5, 0.0) for f in np.asarray(found.frequencies)[some]]
+    np.testing.assert_allclose(np.asarray(found.values)[some, 3], theirs, rtol=1e-8)
+    both = shaker._response(beam, shaker.PARKED)
+    theirs = [force_per_volt(f, 0.5, 0.5) for f in np.asarray(both.frequencies)[some]]
+    np.testing.assert_allclose(np.asarray(both.values)[some, 3], theirs, rtol=1e-8)
+
+
+def test_sampled_gain_of_the_other_shaker():
+    """3.25 N/V and 1000 1/s: all seven numbers that are printed for 5 ms."""
+    waves, omega = sines(3)
+    here = np.sin(0.5 * waves)
+    A, B = np.zeros((7, 7)), np.zeros((7, 1))
+    A[:3, 3:6] = np.eye(3)
+    A[3:6, :3] = -np.diag(omega**2) - 3500 / MODAL * np.outer(here, here)
+    A[3:6, 3:6] = -np.diag(2 * DAMPING * omega) - 80 / MODAL * np.outer(here, here)
+    A[3:6, 6], A[6, 6], B[6] = 3.25 * here / MODAL, -1000, 1000
+    held = expm(5e-3 * np.vstack([np.hstack([A, B]), np.zeros((1, 8))]))
+    A, B = held[:7, :7], held[:7, 7:]
+    cost = solve_discrete_are(A, B, np.diag(WEIGHTS), [[EFFORT]])
+    theirs = np.linalg.solve(EFFORT + B.T @ cost @ B, B.T @ cost @ A)[0]
+    ours = np.asarray(optimal_gain(unlike(active(rigs.load("A"))), 5e-3, WEIGHTS)[0])[0]
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+    printed = published.SAMPLED_GAIN
+    assert np.all(np.abs(theirs - printed.numbers) <= printed.allowed)

@@ -1,0 +1,84 @@
+"""What holds of every tuning, whatever the rig, the loads and what is free: on random cases."""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxbeam as jb
+import tuning
+from tests.tuning.small_rig import GAIN, rig
+from tuning.control.load_cases import apply
+
+CUTOFF, PLACE = "sensors.0.filter.cutoff", "sensors.0.position"
+FREE = {GAIN: (-9000.0, 9000.0), CUTOFF: (5.0, 45.0), PLACE: (0.1, 0.5)}
+
+
+PROBLEMS = {
+    "gain": st.floats(-4000.0, 8000.0),
+    "rigidity": st.floats(9.0, 16.0),
+    "damping": st.floats(0.0, 0.1),
+    "place": st.floats(0.15, 0.45),
+    "cutoff": st.floats(8.0, 40.0),
+    "masses": st.lists(st.floats(0.05, 0.6), min_size=3, max_size=3, unique=True),
+    "speeds": st.lists(st.floats(1.3, 2.5), min_size=3, max_size=3),
+}
+
+
+def small(gain, rigidity, damping, place, cutoff) -> jb.Case:
+    """A rig of two modes with one sensor behind a filter, under linear feedback."""
+    case = rig(jb.Feedback([gain], period=0.01))
+    beam = dataclasses.replace(
+        case.beam,
+        modes=2,
+        flexural_rigidity=np.asarray(rigidity),
+        damping_ratio=np.asarray(damping),
+    )
+    sensor = jb.Sensor(place, filter=jb.Filter(cutoff, order=2))
+    return dataclasses.replace(case, beam=beam, sensors=(sensor,))
+
+
+def peak(case: jb.Case, place: float) -> float:
+    """The largest deflection (m) at samples, at a place that stays where a sensor may be moved."""
+    return float(np.abs(jb.simulate(case).at([place])).max())
+
+
+def relative(case: jb.Case, place: float) -> float:
+    """The same, relative to the run without control."""
+    return peak(case, place) / peak(dataclasses.replace(case, controller=None), place)
+
+
+@pytest.mark.slow
+@settings(max_examples=4)
+@given(st.fixed_dictionaries(PROBLEMS))
+def test_it_never_gets_worse_and_says_what_the_saved_case_does(problem):
+    speeds = problem.pop("speeds")
+    runs = [
+        {"loads.0.mass": mass, "loads.0.speed": speed}
+        for mass, speed in zip(problem.pop("masses"), speeds, strict=True)
+    ]
+    cases = tuning.LoadCases(tuple(runs[:2]), tuple(runs[2:]))
+    case = small(**problem)
+    found = tuning.control.tune(case, FREE, cases, steps=4, bounds=False, progress=False)
+    training, held_out = found.outcomes
+    before, after = training.objective
+    assert after <= before
+    assert all(low <= value <= high for (low, high), value in
+               zip(FREE.values(), found.values, strict=True))  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "tuned.toml"
+        jb.save_case(found.case, file)
+        saved = jb.load_case(file)
+    # True values are those of the saved case, simulated run by run.
+    place = float(case.sensors[0].position)
+    peaks = [relative(apply(saved, run), place) for run in cases.training]
+    assert after == pytest.approx(max(peaks), rel=1e-3)
+    # The verdict on the run held out, likewise; peaks between samples may be a little larger.
+    own = apply(saved, cases.held_out[0])
+    assert 1 - 1e-3 < held_out.after[0] / peak(own, place) < 1.02
+    below = 1 - held_out.after[0] / held_out.uncontrolled[0]
+    assert f"worst held out run: peak {below:.1%} below no control" in found.verdict

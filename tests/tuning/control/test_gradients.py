@@ -1,0 +1,139 @@
+"""Derivatives of what is tuned for, through closed loops of several kinds, against differences."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+import tuning
+from jaxbeam.control import KINDS
+from tests.differences import central
+from tuning.control.run_set import make_bench
+
+RUNS = tuning.grid({"loads.0.mass": [0.3], "loads.0.speed": [1.5]})
+REGULATOR = {"state_weight": [1e4, 1.0], "command_weight": [1e-3], "period": 0.01}
+LOOPS = {
+    "feedback": (
+        jb.Feedback([3000.0], period=0.01, delay=0.004),
+        {
+            "controller.gains.0": 3000.0,
+            "sensors.0.filter.cutoff": 20.0,
+            "sensors.0.position": 0.25,
+            "actuators.0.start": 0.2575,
+            "actuators.0.end": 0.3425,
+        },
+    ),
+    "regulator": (
+        jb.LQR(
+            estimator=jb.Kalman(process_noise=0.02, measurement_noise=1e-5),
+            **REGULATOR,
+        ),
+        {
+            "controller.state_weight.0": 1e4,
+            "controller.command_weight.0": 1e-3,
+            "controller.estimator.process_noise": 0.02,
+        },
+    ),
+    "pd": (
+        jb.PD([3000.0], rate_gains=20.0, lag=0.02, period=0.01),
+        {"controller.gains.0": 3000.0, "controller.rate_gains": 20.0, "controller.lag": 0.02},
+    ),
+    "lead": (
+        jb.Lead([3000.0], zero=2.0, pole=8.0, period=0.01),
+        {"controller.gains.0": 3000.0, "controller.zero": 2.0, "controller.pole": 8.0},
+    ),
+    "ppf": (
+        jb.PositivePositionFeedback([800.0], frequency=17.0, damping_ratio=0.3, period=0.01),
+        {"controller.frequency": 17.0, "controller.damping_ratio": 0.3},
+    ),
+    "relief": (
+        jb.Relief(
+            [-4e-4, -1e-4, 1e-4], [[6.0, 2.0, -0.5]], notches=[18.0], period=0.01, delay=0.01
+        ),
+        {
+            "controller.values.0.0": 6.0,
+            "controller.values.0.1": 2.0,
+            "controller.readings.0": -4e-4,
+            "controller.compensation": 1.0,
+            "controller.notches.0": 18.0,
+            "actuators.0.correction": 0.32,
+        },
+    ),
+    "sampled regulator": (
+        jb.DiscreteLQR(**REGULATOR),
+        {"controller.state_weight.0": 1e4, "controller.command_weight.0": 1e-3},
+    ),
+    "state": (
+        jb.StateFeedback([[2000.0, 20.0]], period=0.01),
+        {"controller.gain.0.0": 2000.0, "controller.gain.0.1": 20.0},
+    ),
+    "finite": (
+        jb.FiniteLQR(**REGULATOR, points=24),
+        {"controller.state_weight.0": 1e4, "controller.command_weight.0": 1e-3},
+    ),
+    "scheduled": (
+        jb.ScheduledLQR(**REGULATOR, points=24, masses=[0.2, 0.4], speeds=[1.0, 2.0]),
+        {"controller.state_weight.0": 1e4, "controller.masses.0": 0.2},
+    ),
+    "scheduled feedback": (
+        jb.ScheduledFeedback([0.2, 0.6], [[2000.0, 4000.0]], power=1, period=0.01),
+        {
+            "controller.gains.0.0": 2000.0,
+            "controller.gains.0.1": 4000.0,
+            "controller.masses.1": 0.6,
+        },
+    ),
+    "prescribed": (
+        jb.Prescribed(offsets=[1.0], times=[0.0, 0.2, 0.5], values=[[0.0, 6.0, 0.0]], period=0.01),
+        {"controller.values.0.1": 6.0, "controller.offsets.0": 1.0},
+    ),
+    "passage": (
+        jb.Passage([-0.2, -0.1], [0.0, 0.4, 1.0], [[1.0, 6.0, 2.0]], period=0.01, lead=0.012),
+        {"controller.values.0.1": 6.0, "controller.lead": 0.012},
+    ),
+}
+
+
+def rig(controller):
+    return jb.Case(
+        jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.03, modes=1),
+        actuators=[jb.Patch(0.2575, 0.3425, 8.292e-4, correction=0.32, amplifier_gain=200.0)],
+        sensors=[jb.Sensor(0.25, filter=jb.Filter(cutoff=20.0, order=2, realisation="analogue"))],
+        loads=[jb.MovingMass(mass=0.5, speed=1.5)],
+        controller=controller,
+        run=jb.Run(duration=0.5, sample_rate=100.0),
+    )
+
+
+ELSEWHERE = {jb.MPC, jb.StepLQR, jb.AugmentedLQR}  # test_mpc, test_regulators
+
+
+def test_no_kind_of_law_is_left_out():
+    assert {type(law) for law, _ in LOOPS.values()} | ELSEWHERE == set(KINDS.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", LOOPS)
+def test_slopes_through_the_loop_are_those_of_differences(kind):
+    controller, start = LOOPS[kind]
+    case = rig(controller)
+    if kind not in ("feedback", "relief"):  # once is enough; without, it compiles sooner
+        case = dataclasses.replace(case, sensors=[jb.Sensor(0.25)])
+    bench = make_bench(case, RUNS)
+    sizes = np.array(list(start.values()))
+
+    @jax.jit
+    @jax.value_and_grad
+    def both(shares):
+        values = dict(zip(start, shares * sizes, strict=True))
+        merits = bench.merits(values, 50.0)
+        return merits["peak"][0] + 0.1 * merits["effort"][0]
+
+    ones = np.ones(sizes.size)
+    slope = both(jnp.asarray(ones))[1]
+    expected = central(lambda shares: both(shares)[0], ones, step=1e-4)
+    np.testing.assert_allclose(slope, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+    assert np.all(np.abs(expected) > 1e-7)

@@ -1,0 +1,138 @@
+"""From a fit to tuning: plants that its logs leave possible, and laws that do not know them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.stats
+
+import jaxbeam as jb
+import tuning
+from tests.tuning.small_rig import GAIN, RIGIDITY, rig
+from tests.tuning.stand_in import CASE, fit
+from tuning.control.fixed_design import believing
+from tuning.control.run_set import make_bench
+from tuning.fit.uncertainty.posterior import Posterior
+
+
+@pytest.fixture(scope="module")
+def found():
+    return fit()
+
+
+def drawn(found, count=4000, seed=0):
+    rows = tuning.draw_plants(found, count, seed)
+    return np.array([list(row.values()) for row in rows])
+
+
+def test_plants_have_the_covariance_of_the_fit(found):
+    rows = drawn(found)
+    scatter = found.errors / np.sqrt(len(rows))
+    assert np.all(np.abs(rows.mean(axis=0) - found.values) < 4 * scatter)
+    np.testing.assert_allclose(rows.std(axis=0), found.errors, rtol=0.05)
+    np.testing.assert_allclose(np.corrcoef(rows.T), found.correlation, atol=0.06)
+    np.testing.assert_array_equal(drawn(found, 3), drawn(found, 3))
+    assert not np.array_equal(drawn(found, 3), drawn(found, 3, seed=1))
+
+
+def test_few_samples_leave_long_tails(found):
+    """As many plants lie in the fit's 95 % interval as Student's law says."""
+    few = dataclasses.replace(found, freedom=3.0)
+    rows = drawn(few)[:, 2]
+    inside = np.mean((rows > few.intervals[2, 0]) & (rows < few.intervals[2, 1]))
+    assert inside == pytest.approx(0.95, abs=0.015)
+    standard = (rows - few.values[2]) / few.errors[2]
+    assert scipy.stats.kstest(standard, scipy.stats.t(3).cdf).pvalue > 1e-3
+
+
+def test_plants_keep_within_bounds(found):
+    low = float(found.values[1])
+    numbers = [dataclasses.replace(n, low=low) if i == 1 else n
+               for i, n in enumerate(found.numbers)]  # fmt: skip
+    assert drawn(dataclasses.replace(found, numbers=numbers), 300)[:, 1].min() >= low
+    numbers[1] = dataclasses.replace(numbers[1], low=low + 9 * float(found.errors[1]))
+    with pytest.raises(ValueError, match="lie within the bounds of the fit"):
+        drawn(dataclasses.replace(found, numbers=numbers), 5)
+
+
+def test_draws_of_a_posterior_are_plants():
+    draws = np.random.default_rng(0).normal(size=(2, 50, 2))
+    posterior = Posterior(["beam.length", "loads.0.mass"], draws, np.ones(2), np.ones(2), 0)
+    rows = tuning.draw_plants(posterior, 100)
+    assert sorted(row["beam.length"] for row in rows) == sorted(draws[..., 0].ravel())
+    assert set(rows[0]) == {"beam.length"}
+    with pytest.raises(ValueError, match="101 plants need as many draws; the posterior has 100"):
+        tuning.draw_plants(posterior, 101)
+
+
+def test_what_cannot_be_drawn_is_refused(found):
+    blind = dataclasses.replace(found, errors=np.array([1.0, np.inf, 1.0]))
+    with pytest.raises(ValueError, match="cannot see beam.damping_ratio, so that nothing says"):
+        tuning.draw_plants(blind, 3)
+    with pytest.raises(ValueError, match="must be 1 or more, not 0"):
+        tuning.draw_plants(found, 0)
+    loads = Posterior(["logs.0.loads.0.mass"], np.ones((1, 5, 1)), np.ones(1), np.ones(1), 0)
+    with pytest.raises(ValueError, match="nothing that was identified concerns the plant"):
+        tuning.draw_plants(loads, 3)
+
+
+def test_a_case_adopts_the_plant(found):
+    other = dataclasses.replace(CASE, loads=(jb.MovingMass(mass=0.1, speed=2.0),))
+    adopted = tuning.adopt(other, found)
+    assert float(adopted.beam.flexural_rigidity) == found.values[0]
+    assert float(adopted.sensors[0].offset) == found.values[2]
+    assert float(adopted.loads[0].mass) == 0.1
+
+
+def test_runs_are_simulated_on_every_plant():
+    cases = tuning.LoadCases(({"a": 1.0}, {"a": 2.0}), ({"a": 3.0},))
+    found = cases.across(({"b": 5.0}, {"b": 6.0}), ({"b": 7.0},))
+    assert found.training == tuple({"a": a, "b": b} for a in (1.0, 2.0) for b in (5.0, 6.0))
+    assert found.held_out == ({"a": 3.0, "b": 7.0},)
+    assert cases.across(({"b": 5.0},)).held_out == cases.held_out
+
+
+WEIGHTS = {"state_weight": [1e4, 1.0], "command_weight": [1e-3]}
+
+
+def test_a_law_is_designed_for_the_plant_it_is_told_of():
+    """On a softer beam it acts as the very gains that were designed for the stiffer one."""
+    law = jb.LQR(**WEIGHTS, period=0.01)
+    model = jb.state_space(rig(law))
+    gain = np.asarray(law.init(model)[0])
+    soft = {RIGIDITY: 10.0}
+    fixed = jb.StateFeedback(gain=gain.reshape(1, -1), period=0.01)
+    expected = jb.simulate(jb.replace(rig(fixed), soft))
+    bench = make_bench(rig(law), [soft])
+    assert float(bench.nominal[RIGIDITY]) == 13.211
+    told = bench.records({})[0]
+    np.testing.assert_allclose(told.command, expected.command, rtol=1e-6, atol=1e-9)
+    knowing = jb.simulate(jb.replace(rig(law), soft))
+    assert np.abs(np.asarray(knowing.command) - told.command).max() > 1e-3
+    case = rig(law)
+    assert believing(case, {}, bench.plan.form.layout) is case
+
+
+@pytest.mark.slow
+def test_tuned_for_the_worst_of_the_plants():
+    """From a fit straight to tuning; what is said of a plant is what simulating it gives."""
+    identified = Posterior(
+        [RIGIDITY], np.linspace(11.0, 15.0, 9).reshape(1, 9, 1), np.ones(1), np.ones(1), 0
+    )
+    loads = tuning.LoadCases(({"loads.0.mass": 0.3},), ({"loads.0.mass": 0.4},))
+    tuned = tuning.control.tune(
+        rig(), {GAIN: (500.0, 20000.0)}, loads,
+        plant=identified, plants=2, steps=8, bounds=False, progress=False,
+    )  # fmt: skip
+    training, held_out = tuned.outcomes
+    assert float(tuned.case.beam.flexural_rigidity) == pytest.approx(13.0)
+    plants = [run[RIGIDITY] for outcome in tuned.outcomes for run in outcome.runs]
+    assert len(set(plants)) == 4 and all(11.0 <= value <= 15.0 for value in plants)
+    relative = training.after / training.uncontrolled
+    assert training.objective[1] == pytest.approx(relative.max(), rel=1e-3)
+    run = held_out.runs[1]
+    record = jb.simulate(jb.replace(tuned.case, run))
+    assert held_out.after[1] == pytest.approx(float(record.peak_deflection[0]), rel=1e-4)
+    plain = jb.simulate(dataclasses.replace(record.case, controller=None))
+    peak = np.abs(plain.deflection).max()  # at samples, as what it is compared with
+    assert held_out.uncontrolled[1] == pytest.approx(peak, rel=1e-3)

@@ -1,0 +1,137 @@
+"""The command line of tunings: what it asks of the library, what it writes, and how it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+import tuning
+from jaxbeam.cli import main
+from tests.tuning.small_rig import GAIN, RIGIDITY, rig
+from tests.tuning.stand_in import campaign, fit, search
+from tuning.fit import storage
+
+LOADS = '[training]\n"loads.0.mass" = [0.3, 0.5]\n[held_out]\n"loads.0.mass" = [0.4]\n'
+TUNE = f"tune case.toml --cases loads.toml --free {GAIN}=500:7500 --no-bounds --steps 2"
+
+
+@pytest.fixture
+def call(tmp_path, monkeypatch, capsys):
+    """Run a command line in a folder with a case and loads; returns status, output and errors."""
+    jb.save_case(rig(), tmp_path / "case.toml")
+    (tmp_path / "loads.toml").write_text(LOADS)
+    monkeypatch.chdir(tmp_path)
+
+    def call(line):
+        with pytest.raises(SystemExit) as ended:
+            main(line.split())
+        printed = capsys.readouterr()
+        return ended.value.code, printed.out, printed.err
+
+    return call
+
+
+@pytest.mark.slow
+def test_from_a_fit_to_a_tuned_case(call, tmp_path, monkeypatch):
+    """The file that identify writes goes in, a case that simulates comes out."""
+    monkeypatch.setattr(storage, "prepare", lambda case, logs: campaign())
+    found = fit(search(free={RIGIDITY: None, "beam.damping_ratio": None}))
+    tuning.save_fit(found, tmp_path / "fit.npz")
+    code, out, err = call(f"{TUNE} --plant fit.toml --plants 2 --over cvar -o tuned.toml --json")
+    assert code == 0, err
+    told = json.loads(out)
+    assert len(told["runs"]["training"]["cases"]) == 4
+    assert len(told["runs"]["held out"]["cases"]) == 2
+    plants = [run[RIGIDITY] for kind in told["runs"].values() for run in kind["cases"]]
+    assert len(set(plants)) == 4
+    assert np.all(np.abs(np.array(plants) - found.values[0]) < 6 * found.errors[0])
+    tuned = jb.load_case(tmp_path / "tuned.toml")
+    assert float(tuned.beam.flexural_rigidity) == found.values[0]
+    assert float(tuned.controller.gains[0]) == told["numbers"][GAIN]["after"]
+    assert not (tmp_path / "tuned.search.npz").exists()
+    assert call("simulate tuned.toml -o run.nc")[0] == 0
+
+
+def test_what_is_asked_of_a_front(call, tmp_path, monkeypatch):
+    asked = {}
+
+    class Front:
+        tuned = ()
+
+        def __str__(self):
+            return "a front"
+
+    def pareto(*given, **options):
+        asked.update(given=given, options=options)
+        return Front()
+
+    monkeypatch.setattr(tuning, "pareto", pareto)
+    code, out, err = call(f"{TUNE} --front effort=0.1,0.2 --limit after_exit=0.5 --over mean")
+    assert code == 0 and "a front" in out, err
+    case, free, cases, objective, merit, limits = asked["given"]
+    assert free == {GAIN: (500.0, 7500.0)} and len(cases.training) == 2
+    assert (merit, limits) == ("effort", [0.1, 0.2])
+    assert objective == tuning.Objective({"peak": 1.0}, "mean", limits={"after_exit": 0.5})
+    assert asked["options"]["method"] == "lbfgs" and asked["options"]["steps"] == 2
+
+
+def test_ranks_and_choices_are_handed_on(call, monkeypatch):
+    asked = {}
+
+    class Told:
+        def to_dict(self):
+            return {"verdict": "fine"}
+
+    class Chosen:
+        best = Told()
+
+    def lexicographic(*given, **options):
+        asked["rank"] = given[3], options["over"]
+        return Told(), Told()
+
+    def tune_choices(*given, **options):
+        asked["choose"] = given[1], options["method"]
+        return Chosen()
+
+    def tune_reduced(*given, **options):
+        asked["keep"] = given[1], list(given[2]), options["starts"]
+        return Reduced()
+
+    class Reduced:
+        tuned = Told()
+
+    monkeypatch.setattr(tuning, "lexicographic", lexicographic)
+    monkeypatch.setattr(tuning, "tune_reduced", tune_reduced)
+    monkeypatch.setattr(tuning, "tune_choices", tune_choices)
+    assert json.loads(call(f"{TUNE} --rank peak,effort --json")[1]) == {"verdict": "fine"}
+    assert json.loads(call(f"{TUNE} --choose controller.power=1,3 --json")[1])
+    assert json.loads(call(f"{TUNE} --keep 1 --starts 2 --json")[1]) == {"verdict": "fine"}
+    assert asked == {
+        "keep": (1, [GAIN], 2),
+        "rank": (["peak", "effort"], "worst"),
+        "choose": ({"controller.power": [1, 3]}, "adam"),
+    }
+
+
+REFUSED = {
+    "--front effort": "--front takes MERIT=NUMBER",
+    "--front effort=0.1 --rank peak": "--rank and --front do not go together",
+    "--rank peak --objective rms=1": "--rank takes the place of --objective",
+    "--front effort=0.1 --starts 3": "are for a single search, not for --front",
+    "--choose controller.power=1 --resume": "are for a single search, not for --choose",
+    "--keep 1": "only regulators, such as kind 'lqr', have states to leave out",
+    "--choose controller.power=one": "--choose takes ADDRESS=NUMBER",
+    "--sampled": "it needs --plant",
+    "--reserve 0.01": "--reserve and --spread need --stable",
+    "--plant none.npz": "there is no such fit",
+    "--method newton": "a method is one of adam, lbfgs, bfgs",
+    "--limit effort": "a name and a number are needed",
+    "-o tuned.txt": "a tuned case is written to a .toml file",
+}
+
+
+@pytest.mark.parametrize("options", REFUSED)
+def test_what_makes_no_sense_is_refused(call, options):
+    code, _, err = call(f"{TUNE} {options}")
+    assert code != 0 and REFUSED[options] in " ".join(err.split())

@@ -1,0 +1,107 @@
+"""Intervals mean what they say: over many simulated campaigns they cover the truth."""
+
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.case.case import replace
+from tests.tuning.fit.test_identify import NOISE, simulated_log, small
+from tests.well_compiled import well_compiled
+from tuning.fit.dataset import prepare
+from tuning.fit.identify import fit_of
+from tuning.fit.least_squares import Search
+from tuning.fit.uncertainty.covariance import reach
+from tuning.parameters.free import free_numbers
+
+# One sensor, two modes, few samples: small enough for hundreds of fits.
+SMALL = {
+    "beam.flexural_rigidity": 11.68,
+    "beam.mass_per_length": 0.535,
+    "beam.damping_ratio": 0.03,
+    "sensors.0.offset": 0.0,
+    "loads.0.speed": 2.0,
+    "loads.0.entry_time": 0.05,
+}
+STARTS = {"beam.flexural_rigidity": 11.0, "beam.damping_ratio": 0.02, "loads.0.speed": 2.05}
+
+
+class Rehearsal:
+    """Many logs of one rig, fitted by one compiled search that starts beside the truth.
+
+    The mass of the load is known unless a test says otherwise.
+    """
+
+    def __init__(self):
+        self.case = small(duration=0.5, rate=250.0)
+        self.clean = np.asarray(jb.simulate(self.case).measured)
+        log = simulated_log(self.case, NOISE)
+        campaign = prepare(replace(self.case, STARTS), [log])
+        free = [*SMALL, "loads.0.mass"]
+        numbers = free_numbers(campaign.cases, dict.fromkeys(free), np.ptp(self.clean))
+        self.search = Search(campaign, numbers)
+
+    def deviations(self, noises):
+        """Errors in half widths of stated intervals (log, free), and the standard errors."""
+        free = np.arange(7) < 6
+        found = [self.search.estimate((self.clean + noise)[None], free=free) for noise in noises]
+        errors = np.array([each.uncertainty.errors[:6] for each in found])
+        values = np.array([each.values[:6] for each in found])
+        assert all(each.converged for each in found)
+        halves = errors * np.array([[reach(each.freedom)] for each in found])
+        return (values - list(SMALL.values())) / halves, errors
+
+
+@pytest.fixture(scope="module")
+def rehearsal():
+    """Its search is run six hundred times, and so worth compiling well, as for users."""
+    made = Rehearsal()
+    with well_compiled():
+        yield made
+
+
+def coloured(white, memory: float):
+    """A first-order process of the same power as the white noise (log, time, channel)."""
+    noise = np.array(white)
+    for i in range(1, noise.shape[1]):
+        noise[:, i] = memory * noise[:, i - 1] + np.sqrt(1 - memory**2) * white[:, i]
+    return noise
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth(rehearsal):
+    noises = NOISE * np.random.default_rng(5).normal(size=(500, *rehearsal.clean.shape))
+    errors, _ = rehearsal.deviations(noises)
+    covered = np.mean(np.abs(errors) < 1, axis=0)
+    assert np.all((covered >= 0.92) & (covered <= 0.97)), dict(zip(SMALL, covered, strict=True))
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 3 / 1.96 / np.sqrt(500))
+
+
+@pytest.mark.slow
+def test_coloured_residuals_widen_intervals(rehearsal):
+    white = NOISE * np.random.default_rng(6).normal(size=(100, *rehearsal.clean.shape))
+    _, narrow = rehearsal.deviations(white[:10])
+    errors, wide = rehearsal.deviations(coloured(white, 0.6))
+    widening = np.median(wide, axis=0) / np.median(narrow, axis=0)
+    np.testing.assert_allclose(widening, 2.0, rtol=0.25)  # sqrt((1 + r) / (1 - r))
+    covered = np.mean(np.abs(errors) < 1, axis=0)
+    assert np.all(covered >= 0.90), dict(zip(SMALL, covered, strict=True))
+
+
+@pytest.mark.slow
+def test_a_common_scale_is_reported_by_name(rehearsal):
+    """Rigidity, mass per length and the load's mass times anything: the same deflection."""
+    scaled = ["beam.flexural_rigidity", "beam.mass_per_length", "loads.0.mass"]
+    noise = NOISE * np.random.default_rng(0).normal(size=rehearsal.clean.shape)
+    search = rehearsal.search
+    found = search.estimate((rehearsal.clean + noise)[None])
+    fit = fit_of(rehearsal.case, search, found)
+    (direction,) = fit.unseen
+    assert set(direction) == set(scaled)
+    values = dict(zip(fit.addresses, fit.values, strict=True))
+    shares = [direction[address] / values[address] for address in scaled]
+    np.testing.assert_allclose(shares, shares[0], rtol=0.02)
+    blind = [address in scaled for address in fit.addresses]
+    assert np.isinf(fit.errors).tolist() == blind
+    assert np.isinf(fit.intervals[blind]).all()
+    assert str(fit).count("the data cannot tell") == 3
+    assert fit.to_dict()["numbers"]["loads.0.mass"]["interval_95"] is None

@@ -1,0 +1,118 @@
+"""Command lines around fits: what they ask of the library, what they print, how they refuse."""
+
+import json
+
+import numpy as np
+import pytest
+
+import tuning
+from tests.tuning import stand_in
+from tests.tuning.fit import test_frequency_responses
+from tests.tuning.fit.test_identify_command import call
+
+__all__ = ["call"]
+
+
+def test_weighing(call, tmp_path, monkeypatch):
+    fit = stand_in.fit()
+    asked = {}
+
+    class Weighed:
+        def __init__(self, *given, **settings):
+            asked.update(given=given, settings=settings)
+            self.fit = fit
+
+        def to_dict(self):
+            return {"loads": np.ones(2)}
+
+        def __str__(self):
+            return "one load found"
+
+    monkeypatch.setattr(tuning, "weigh", Weighed)
+    (tmp_path / "log.csv").write_text("t [s],a [mm]\n0,1\n1,2\n2,1\n")
+    code, out, _ = call("weigh case.toml log.csv --speeds 0.5:3 --one-way -o found.toml")
+    assert (code, out) == (0, "one load found\nwritten: found.toml\n")
+    assert asked["given"][2:] == ((0.5, 3.0), 3) and asked["settings"] == {"both_ways": False}
+    code, out, _ = call("weigh case.toml log.csv --speeds 0.5:3 --json")
+    assert json.loads(out) == {"loads": [1.0, 1.0]}
+    code, _, err = call("weigh case.toml log.csv --speeds fast")
+    assert code == 1 and "--speeds takes LOW:HIGH in m/s, such as 0.5:3, not 'fast'" in err
+
+
+def test_rivals_and_unseen_logs(call, tmp_path, monkeypatch):
+    """What is printed of rivals is what the library says; needless numbers cost."""
+    held = stand_in.search({"beam.flexural_rigidity": None})
+    fits = {"three": stand_in.fit(), "one": stand_in.fit(held)}
+    for name in fits:
+        (tmp_path / f"{name}.npz").touch()
+    monkeypatch.setattr(tuning, "load_fit", lambda path: fits[path.stem])
+    monkeypatch.setattr(
+        tuning,
+        "hold_out",
+        lambda fit, logs: [tuning.fit.model_validation.Unseen("new", np.array([1.1]))],
+    )
+    code, out, err = call("judge three.npz one.npz --unseen runs.csv")
+    assert code == 1 and "the cell is empty" in err
+    code, out, err = call("judge three.npz one.npz")
+    assert code == 0, err
+    header, first, second = out.splitlines()
+    assert header.split() == ["numbers", "log", "likelihood", "AIC", "BIC", "weight"]
+    assert first.split()[:2] == ["one", "1"] and second.split()[:2] == ["three", "3"]
+    assert float(first.split()[4]) == pytest.approx(tuning.compare_fits(fits)[0].bic, rel=1e-5)
+    (tmp_path / "new.csv").write_text("t [s],a [mm],b [mm]\n0,1,1\n1,2,2\n2,1,1\n")
+    code, out, _ = call("judge one.npz --unseen new.csv")
+    assert out == "one: new: predicted; residuals are 1.1 times the noise at most\n"
+    told = json.loads(call("judge three.npz one.npz --unseen new.csv --json")[1])
+    assert [rival["name"] for rival in told["rivals"]] == ["one", "three"]
+    assert told["unseen"]["one"] == {"new": [1.1]}
+    assert "one fit alone: give a rival" in call("judge one.npz")[2]
+
+
+def test_an_experiment_is_planned(call, monkeypatch):
+    asked = {}
+
+    def sharpen(case, free, over, **settings):
+        asked.update(free=free, over=over, settings=settings)
+        return tuning.fit.experiment_design.Design(
+            ["sensors.0.position"], ["m"], np.array([0.1]), np.array([0.3]), ["beam.length"],
+            np.array([2.0]), np.array([1.0]), np.ones((1, 1)), case,
+        )  # fmt: skip
+
+    monkeypatch.setattr(tuning, "sharpen", sharpen)
+    line = "sharpen case.toml --free beam.length --over sensors.0.position=0.1:0.5 --noise 1e-6"
+    code, out, err = call(f"{line} -o better.toml")
+    assert code == 0, err
+    assert asked["over"] == {"sensors.0.position": (0.1, 0.5)}
+    assert asked["settings"] == {"target": None, "noise": 1e-6}
+    assert "standard error of beam.length: 2 -> 1" in out and "written: better.toml" in out
+    told = json.loads(call(f"{line} --json")[1])
+    assert told["standard_errors"]["beam.length"] == {"before": 2.0, "after": 1.0}
+    assert "name what can be chosen with --over" in call("sharpen case.toml --free beam.length")[2]
+    assert "--over takes ADDRESS=VALUE" in call(f"{line} --over loads.0.speed")[2]
+
+
+def test_responses_are_fitted(call, monkeypatch):
+    fit = tuning.identify_responses(
+        test_frequency_responses.CASE,
+        test_frequency_responses.measured(),
+        ["beam.flexural_rigidity"],
+    )
+    asked = {}
+
+    def identify_responses(case, measured, free):
+        asked.update(measured=measured, free=free)
+        return fit
+
+    monkeypatch.setattr(tuning, "responses_of", lambda log, segment: (log.source, segment))
+    monkeypatch.setattr(tuning, "identify_responses", identify_responses)
+    line = "identify-responses case.toml new.csv --free beam.flexural_rigidity=5:20"
+    assert "new.csv" in call(line)[2]
+    with open("new.csv", "w") as file:
+        file.write("t [s],a [mm],b [mm]\n0,1,1\n1,2,2\n2,1,1\n")
+    code, out, err = call(f"{line} --segment 4 -o fit.toml")
+    assert code == 0, err
+    assert asked == {"measured": ("new.csv", 4.0), "free": {"beam.flexural_rigidity": (5.0, 20.0)}}
+    assert out == f"{fit}\nwritten: fit.toml\n"
+    told = json.loads(call(f"{line} --json")[1])
+    assert told["numbers"]["beam.flexural_rigidity"]["value"] == pytest.approx(fit.values[0])
+    assert "name what to identify" in call("identify-responses case.toml new.csv")[2]

@@ -1,0 +1,96 @@
+"""Fits to frequency responses that were summed mode by mode with numpy."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import jaxbeam as jb
+from jaxbeam.model.frequency_response import frequency_response
+from tests.tuning.fit import test_actuators_from_logs as rigs
+from tuning.fit.frequency_responses import Responses, identify_responses, responses_of
+from tuning.logs.log import Log
+
+LENGTH, RIGIDITY, DENSITY, DAMPING, MODES = 0.6, 11.68, 0.535, 0.02, 3
+HAMMER, PLACES = 0.2, (0.15, 0.3)
+FREQUENCIES = np.linspace(5, 300, 150)
+
+
+def sum_of_modes(frequencies, rigidity=RIGIDITY, damping=DAMPING):
+    """Receptances at the places: sum of shape(x) shape(a) / (w_i^2 - w^2 + 2 i z w_i w)."""
+    w = 2 * np.pi * frequencies[:, None]
+    total = np.zeros((frequencies.size, len(PLACES)), complex)
+    for i in range(1, MODES + 1):
+        own = (i * np.pi / LENGTH) ** 2 * np.sqrt(rigidity / DENSITY)
+        here = np.sin(i * np.pi * HAMMER / LENGTH) * 2 / (DENSITY * LENGTH)
+        shape = np.sin(i * np.pi * np.array(PLACES) / LENGTH)
+        total += here * shape / (own**2 - w**2 + 2j * damping * own * w)
+    return total
+
+
+def measured(noise=0.01, **about):
+    values = sum_of_modes(FREQUENCIES)
+    rng = np.random.default_rng(0)
+    off = noise * (rng.normal(size=values.shape) + 1j * rng.normal(size=values.shape))
+    pairs = tuple((f"force@{HAMMER}", f"sensors.{i}") for i in range(2))
+    return Responses(FREQUENCIES, values * np.exp(off), pairs, source="hammer.csv", **about)
+
+
+CASE = jb.Case(
+    jb.Beam(length=LENGTH, flexural_rigidity=12.4, mass_per_length=DENSITY, damping_ratio=0.03,
+            modes=MODES),
+    sensors=[jb.Sensor(x) for x in PLACES],
+)  # fmt: skip
+
+
+def test_rigidity_and_damping_from_a_hammer():
+    fit = identify_responses(CASE, measured(), ["beam.flexural_rigidity", "beam.damping_ratio"])
+    truth = np.array([RIGIDITY, DAMPING])
+    assert np.all(np.abs(fit.values - truth) < 3.5 * fit.errors)
+    assert np.all(fit.errors < [0.003 * RIGIDITY, 0.03 * DAMPING])
+    np.testing.assert_allclose(fit.misfit, 0.01 * np.sqrt(2), rtol=0.15)
+    np.testing.assert_allclose(fit.fitted, sum_of_modes(FREQUENCIES, *fit.values), rtol=1e-6)
+    assert fit.verdict == "converged" and "responses are off by 1.4 %" in str(fit)
+    assert float(fit.case.beam.flexural_rigidity) == fit.values[0]
+
+
+def test_a_log_of_a_shaker_gives_responses():
+    """Noise as command: what Welch's method estimates from lsim is the response of the rig."""
+    times = np.arange(60_001) / 1000.0
+    volts = scipy.signal.lfilter(*scipy.signal.butter(2, 0.2), np.random.default_rng(0).normal(
+        size=times.size))  # fmt: skip
+    readings = rigs.respond(times, volts, 0 * volts)
+    log = Log(times, np.column_stack([readings, volts]), ("a", "b", "u"),
+              ("deflection", "deflection", "voltage"), ("m", "m", "V"),
+              sensors=(0, 1, None), actuators=(None, None, 0))  # fmt: skip
+    found = responses_of(log, segment=4.0)
+    assert found.pairs == (("actuators.0", "sensors.0"), ("actuators.0", "sensors.1"))
+    kept = found.frequencies < 100
+    exact = frequency_response(rigs.case(), found.frequencies[kept], found.pairs).values
+    off = np.abs(found.values[kept] / np.asarray(exact) - 1)
+    assert np.median(off) < 0.02
+    with pytest.raises(ValueError, match="responses need one command and at least one sensor"):
+        responses_of(dataclasses.replace(log, actuators=(None, None, None)))
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"frequencies": FREQUENCIES[::-1]}, "hammer.csv: frequencies must ascend from above 0 Hz"),
+        ({"pairs": measured().pairs[:1]}, r"hammer.csv: \(150, 2\) values for 150 .* and 1 pairs"),
+        (
+            {"values": 0 * measured().values},
+            "hammer.csv: the response of sensors.0 to force@0.2 at 5 Hz is 0j; leave this",
+        ),
+    ],
+)
+def test_faulty_responses(changes, words):
+    with pytest.raises(ValueError, match=words):
+        dataclasses.replace(measured(), **changes)
+
+
+def test_pairs_that_do_not_exist():
+    pairs = (("force@0.2", "sensors.0"), ("force@0.2", "sensors.7"))
+    with pytest.raises(ValueError, match="'sensors.7' does not exist"):
+        identify_responses(CASE, dataclasses.replace(measured(), pairs=pairs), ["beam.length"])

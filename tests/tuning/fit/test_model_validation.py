@@ -1,0 +1,280 @@
+"""Criticism, profiles and posterior of fits, on readings that are a formula."""
+
+import dataclasses
+import json
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+import jaxbeam as jb
+from jaxbeam.files.case_file import case_to_dict
+from tests.tuning.stand_in import (
+    CASE,
+    NOISE,
+    PULLS,
+    TIMES,
+    TRUTH,
+    campaign,
+    clean,
+    fit,
+    formula,
+    search,
+)
+from tuning.fit import model_validation, storage
+from tuning.fit.identify import fit_of
+from tuning.fit.model_validation import (
+    channel_remarks,
+    channels,
+    compare_fits,
+    cross_validate,
+    whiteness,
+)
+from tuning.fit.uncertainty.covariance import reach
+from tuning.fit.uncertainty.posterior import _density, nuts, sample, summary
+from tuning.fit.uncertainty.profile import profile
+
+VALUES = np.array(list(TRUTH.values()))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return fit()
+
+
+def refit(plain, measured, **about):
+    """Another log, fitted by the same program."""
+    found = plain.search.estimate(measured, **about)
+    made = dataclasses.replace(plain.campaign, measured=measured)
+    return dataclasses.replace(fit_of(plain.case, plain.search, found), campaign=made)
+
+
+# Criticism.
+
+
+def test_whiteness_of_known_noise():
+    rng = np.random.default_rng(0)
+    chances = [whiteness(rng.normal(size=400)) for _ in range(300)]
+    assert np.mean(np.array(chances) < 0.1) == pytest.approx(0.1, abs=0.05)
+    walk = np.convolve(rng.normal(size=400), np.ones(3) / 3, mode="valid")
+    assert whiteness(walk) < 1e-9 and whiteness(np.ones(50)) == 1.0
+
+
+def test_a_good_fit_has_nothing_said_against_it(plain):
+    found = channels(plain)
+    assert [(c.log, c.sensor) for c in found] == [(0, 0), (1, 0), (2, 0)]
+    assert channel_remarks(found, plain.campaign.logs) == []
+    np.testing.assert_allclose([c.noise for c in found], NOISE, rtol=0.2)
+
+
+def test_a_late_channel_and_coloured_residuals_are_told(plain):
+    measured = np.array(plain.campaign.measured)
+    late = np.interp(TIMES - 0.004, TIMES, clean()[1, :, 0])
+    measured[1, :, 0] = late + measured[1, :, 0] - clean()[1, :, 0]
+    # Fitted to the others only, so that nothing else makes up for it.
+    found = refit(plain, measured, use=np.array([True, False, True]))
+    _, channel, _ = channels(found)
+    assert channel.shift == pytest.approx(0.004, abs=4 * channel.shift_error)
+    assert channel.shift_error < 0.001
+    coloured, late_ = channel_remarks([channel], found.campaign.logs)
+    assert coloured.startswith("run 1: residuals are no white noise, so the model misses something")
+    assert late_.startswith("run 1: sensor 0 seems ") and " ms late (+- " in late_
+
+
+def test_rivals(plain):
+    """Without its damping free the model is wrong; with a number too many, it is no better."""
+    held = plain.search.estimate(plain.campaign.measured, free=np.array([True, False, True]))
+    undamped = dataclasses.replace(
+        fit_of(plain.case, plain.search, held), numbers=plain.numbers[:2]
+    )
+    best, worse = compare_fits({"damped": plain, "0.02": undamped})
+    assert (best.name, worse.name) == ("damped", "0.02")
+    assert worse.bic - best.bic > 10 and best.weight > 0.99
+    # White residuals, one channel a log: the textbook formulas, but for independent samples.
+    squares = np.nansum(plain.residuals**2, axis=(1, 2)) / TIMES.size
+    counts = TIMES.size / plain.colour[:, 0]
+    likely = -np.sum(counts * (np.log(2 * np.pi * squares) + 1)) / 2
+    assert best.log_likelihood == pytest.approx(likely)
+    assert best.aic == pytest.approx(6 - 2 * likely)
+    assert best.bic == pytest.approx(3 * np.log(counts.sum()) - 2 * likely)
+    with pytest.raises(ValueError, match="at least two"):
+        compare_fits({"one": plain})
+    with pytest.raises(ValueError, match="of other samples"):
+        compare_fits({"one": plain, "other": refit(plain, plain.campaign.measured + 1.0)})
+
+
+def test_cross_validation(plain):
+    left_out = cross_validate(plain)
+    assert [found.log for found in left_out] == ["run 0", "run 1", "run 2"]
+    ratios = np.array([found.ratio[0] for found in left_out])
+    np.testing.assert_allclose(ratios, 1.0, atol=0.3)
+    assert left_out[0].verdict.startswith("run 0: predicted; residuals are ")
+    measured = np.array(plain.campaign.measured)
+    measured[2] *= 1.3  # a run of which the model does not know something
+    told = [found.verdict for found in cross_validate(refit(plain, measured))]
+    assert "run 2: not predicted" in told[2]
+    with pytest.raises(ValueError, match="at least two"):
+        cross_validate(fit(search(logs=1)))
+
+
+def test_logs_that_were_held_out(plain, monkeypatch):
+    measured = clean() + NOISE * np.random.default_rng(9).normal(size=(3, 120, 1))
+    measured[1] += 0.1
+    monkeypatch.setattr(model_validation, "prepare", lambda case, logs: campaign(measured=measured))
+    good, bad, _ = model_validation.hold_out(plain, campaign(measured=measured).logs)
+    assert good.ratio[0] == pytest.approx(1.0, abs=0.25) and ": predicted; " in good.verdict
+    assert bad.ratio[0] == pytest.approx(np.hypot(1, 0.1 / NOISE), rel=0.1)
+    assert ": not predicted; " in bad.verdict
+
+
+# Profiles.
+
+
+def test_the_profile_of_a_number_that_acts_linearly_is_a_parabola(plain):
+    found = profile(plain, "sensors.0.offset")
+    error, centre = plain.errors[2], found.values[found.rises.argmin()]
+    assert abs(centre - plain.values[2]) < 0.1 * error
+    expected = ((found.values - centre) / error) ** 2
+    np.testing.assert_allclose(found.rises, expected, rtol=0.02, atol=1e-6)
+    np.testing.assert_allclose(found.interval, plain.intervals[2], atol=0.1 * error)
+    assert found.verdict.endswith("as the linearised fit says")
+    assert found.allowed == pytest.approx(reach(plain.freedom) ** 2)
+
+
+def test_a_number_at_its_bound_has_a_profile_of_one_side():
+    """Damping far below its error: the data only say that it is below something."""
+    undamped = np.array([formula(20.0, 1e-5, 0.2, pull) for pull in PULLS])[..., None]
+    noise = NOISE * np.random.default_rng(1).normal(size=undamped.shape)
+    found = fit(search(measured=undamped + noise))
+    told = profile(found, "beam.damping_ratio")
+    assert told.interval[0] == -np.inf and 0.0 < told.interval[1] < 1.0
+    assert told.verdict.startswith("the data only say that beam.damping_ratio is below ")
+
+
+def test_the_profile_of_a_number_that_is_not_free(plain):
+    with pytest.raises(ValueError, match="beam.length is not free in this fit; free are beam"):
+        profile(plain, "beam.length")
+
+
+# Posterior.
+
+
+def test_the_sampler_draws_from_a_known_density(tmp_path):
+    """Two correlated normal variables; stopped in between, it draws the same."""
+    pytest.importorskip("blackjax")
+    covariance = np.array([[1.0, 0.6], [0.6, 1.5]])
+    inverse = jnp.linalg.inv(covariance)
+
+    def density(z):
+        return -z @ inverse @ z / 2
+
+    given = (density, 2, 400, 2, 100, 0)
+    draws, divergences = nuts(*given)
+    found = summary(["a", "b"], draws, divergences)
+    np.testing.assert_allclose(np.cov(draws.reshape(-1, 2).T), covariance, atol=0.25)
+    np.testing.assert_allclose(found.means, 0.0, atol=0.2)
+    assert found.verdict.startswith("mixed: R-hat up to ") and divergences == 0
+    file = tmp_path / "draws.npz"
+    first, _ = nuts(density, 2, 100, 2, 100, 0, file, "this")
+    np.testing.assert_array_equal(first, draws[:, :100])
+    with pytest.raises(FileExistsError, match="resume that sampling, or delete it"):
+        nuts(*given, file, "this")
+    resumed, _ = nuts(*given, file, "this", resume=True)
+    np.testing.assert_array_equal(resumed, draws)
+    with pytest.raises(ValueError, match="belongs to another search"):
+        nuts(*given, file, "that", resume=True)
+
+
+def test_chains_that_do_not_mix_are_told():
+    pytest.importorskip("blackjax")
+    apart = np.random.default_rng(0).normal(size=(2, 300, 1)) + np.array([[[0.0]], [[5.0]]])
+    assert "the chains have not mixed" in summary(["a"], apart, 0).verdict
+    few = np.random.default_rng(0).normal(size=(2, 20, 1))
+    assert "effective draws: draw more" in summary(["a"], few, 0).verdict
+    astray = np.random.default_rng(0).normal(size=(2, 300, 1))
+    assert "100 divergent steps" in summary(["a"], astray, 100).verdict
+
+
+def test_the_posterior_of_a_fit_is_as_wide_as_its_intervals(plain):
+    """The model is nearly linear within its errors, so both ways must agree."""
+    pytest.importorskip("blackjax")
+    found = sample(plain, draws=300, chains=2, warmup=100)
+    np.testing.assert_allclose(found.deviations, plain.errors, rtol=0.2)
+    assert np.all(np.abs(found.means - plain.values) < 0.3 * plain.errors)
+    assert str(found).splitlines()[1].startswith("beam.flexural_rigidity ")
+
+
+def test_unknown_noise_levels_are_integrated_out():
+    """Twelve samples: against the integral over the level, by quadrature."""
+    real = np.zeros((1, TIMES.size, 1))
+    real[0, :12] = 1.0
+    found = fit(search({"sensors.0.offset": None}, logs=1, real=real))
+    density, _, start, spread = _density(found, "estimated")
+    places = np.linspace(-4.0, 4.0, 9)
+    ours = np.array([density(jnp.array([place])) for place in places])
+    offsets = start[0] + spread[0, 0] * places
+    rest = (campaign(logs=1).measured - clean(1))[0, :12, 0] + TRUTH["sensors.0.offset"]
+    count = 12 / found.colour[0, 0]
+
+    def evidence(offset):
+        squares = np.sum((rest - offset) ** 2) / found.colour[0, 0]
+        return quad(
+            lambda s: np.exp(-(count + 1) * np.log(s / NOISE) - squares / (2 * s**2)),
+            NOISE / 10,
+            50 * NOISE,
+            limit=200,
+            points=[NOISE],
+        )[0]
+
+    theirs = np.log([evidence(offset) for offset in offsets])
+    np.testing.assert_allclose(ours - ours[4], theirs - theirs[4], atol=1e-3)
+    # Less sure than with the noise held: the tails of Student's distribution.
+    held = _density(found)[0]
+    assert ours[-1] - ours[4] > float(held(jnp.array([4.0])) - held(jnp.array([0.0])))
+
+
+def test_another_word_on_the_noise_is_refused(plain):
+    with pytest.raises(ValueError, match="noise can be 'held' or 'estimated', not 'free'"):
+        sample(plain, noise="free")
+
+
+def test_blind_directions_are_not_sampled(plain):
+    blind = dataclasses.replace(plain, unseen=[{"beam.damping_ratio": 0.1}])
+    with pytest.raises(ValueError, match="cannot see beam.damping_ratio: give a prior"):
+        sample(blind)
+
+
+# On disk.
+
+
+def test_a_fit_is_kept_to_the_last_bit(plain, tmp_path, monkeypatch):
+    # The stand-in is made anew, as the campaign of real logs would be.
+    monkeypatch.setattr(storage, "prepare", lambda case, logs: campaign())
+    storage.save_fit(plain, tmp_path / "fit.npz")
+    again = storage.load_fit(tmp_path / "fit.npz")
+    assert str(again) == str(plain)
+    for name in ("values", "errors", "correlation", "fitted", "noise", "intervals"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(plain, name))
+    np.testing.assert_allclose(
+        again.search.estimate(again.campaign.measured).values, plain.values, rtol=1e-12
+    )
+    with pytest.raises(FileExistsError, match="exists already"):
+        storage.save_fit(plain, tmp_path / "fit.npz")
+    with pytest.raises(ValueError, match="there is no such fit"):
+        storage.load_fit(tmp_path / "other.npz")
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "fit.npz").read_bytes()[:900])
+    with pytest.raises(ValueError, match="is no fit, or is damaged; name the .npz"):
+        storage.load_fit(tmp_path / "cut.npz")
+
+
+def test_logs_are_kept_with_their_loads():
+    loads = (jb.MovingMass(mass=0.5, speed=-1.0, entry_time=0.1), jb.MovingForce(force=3, speed=2))
+    log = dataclasses.replace(campaign().logs[0], loads=loads, notes=("half of it",), sensors=(0,))
+    about = json.loads(json.dumps(storage._about(log, CASE)))
+    arrays = {f"log0.{name}": getattr(log, name) for name in ("times", "values", "valid")}
+    again = storage._log(0, about, case_to_dict(CASE)["beam"], arrays)
+    assert eqx.tree_equal(again.loads, loads)
+    for name in ("names", "units", "sensors", "notes", "source"):
+        assert getattr(again, name) == getattr(log, name)

@@ -1,0 +1,83 @@
+"""Uncertainty of a fit, against normal equations and logs of known colour."""
+
+import numpy as np
+import pytest
+
+from tuning.fit.uncertainty.covariance import FAR, STEP, colour, uncertainty
+
+NAMES = ["a", "b", "c"]
+
+
+def jacobian(*spreads, seed=0):
+    """A random Jacobian of a hundred residuals whose columns have these standard errors alone."""
+    columns = np.random.default_rng(seed).normal(size=(100, len(spreads)))
+    return columns / np.linalg.norm(columns, axis=0) / spreads
+
+
+def test_covariance_is_that_of_the_normal_equations():
+    rows, sizes = jacobian(0.01, 2.0, 1e-6), np.array([1.0, 100.0, 1e-4])
+    found = uncertainty(NAMES, rows, sizes)
+    covariance = np.linalg.inv(rows.T @ rows)
+    errors = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.errors, errors, rtol=1e-9)
+    np.testing.assert_allclose(found.correlation, covariance / np.outer(errors, errors), rtol=1e-9)
+    assert found.unseen == []
+
+
+def test_a_number_without_effect_is_named():
+    rows = jacobian(0.01, 1.0, 0.02)
+    rows[:, 1] = 0.0
+    found = uncertainty(NAMES, rows, np.array([1.0, 3.0, 1.0]))
+    assert found.errors[1] == np.inf
+    assert found.unseen == [{"b": pytest.approx(3.0 * STEP)}]
+    assert np.isnan(found.correlation[1]).all() and np.isnan(found.correlation[:, 1]).all()
+    others = np.linalg.inv(rows[:, ::2].T @ rows[:, ::2])
+    np.testing.assert_allclose(found.errors[::2], np.sqrt(np.diag(others)), rtol=1e-9)
+
+
+def test_numbers_that_only_act_together_are_named_together():
+    rows = jacobian(0.01, 0.01, 0.02)
+    rows[:, 1] = -2.0 * rows[:, 0]
+    found = uncertainty(NAMES, rows, np.ones(3))
+    assert found.errors[0] == found.errors[1] == np.inf
+    assert found.errors[2] == pytest.approx(0.02, rel=0.1)
+    (direction,) = found.unseen
+    assert set(direction) == {"a", "b"}
+    assert direction["a"] == pytest.approx(STEP)
+    assert direction["b"] == pytest.approx(STEP / 2)
+
+
+def test_hardly_seen_directions_still_widen_what_hardly_takes_part():
+    """An error of 3 sizes along (1, 0.05) is an error of 0.15 in the second, which is said."""
+    along, across = np.array([1.0, 0.05]), np.array([-0.05, 1.0])
+    length = np.linalg.norm(along)
+    rows = np.stack([along / length / 3.0, across / length / 1e-3])
+    found = uncertainty(NAMES[:2], rows, np.ones(2))
+    assert found.errors[0] == np.inf
+    assert found.errors[1] == pytest.approx(3.0 * 0.05 / length, rel=1e-3)
+    assert [set(direction) for direction in found.unseen] == [{"a"}]
+
+
+def test_fewer_residuals_than_numbers():
+    found = uncertainty(NAMES, np.array([[100.0, 0.0, 0.0]]), np.ones(3))
+    assert found.errors.tolist() == [pytest.approx(0.01), np.inf, np.inf]
+    assert FAR > 1 and len(found.unseen) == 2
+
+
+def test_colour_of_white_and_constant_residuals():
+    white = np.random.default_rng(0).normal(size=(200, 300))
+    factors = [colour(series) for series in white]
+    assert np.mean(factors) == pytest.approx(1.0, abs=0.05)
+    assert min(factors) == 1.0
+    assert colour(np.full(50, 3.0)) == 1.0
+
+
+@pytest.mark.parametrize("memory", [0.3, 0.7, 0.9])
+def test_colour_of_a_first_order_process(memory):
+    """Its correlations are powers of the memory r: 1 + 2 (r + r^2 + ...) = (1 + r) / (1 - r)."""
+    white = np.random.default_rng(1).normal(size=(50, 4000))
+    series = np.zeros_like(white)
+    for i in range(1, white.shape[1]):
+        series[:, i] = memory * series[:, i - 1] + white[:, i]
+    factors = [colour(part) for part in series]
+    assert np.mean(factors) == pytest.approx((1 + memory) / (1 - memory), rel=0.1)

@@ -1,0 +1,105 @@
+"""Free numbers: looked up, mapped between their bounds, or refused with a reason."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.case.case import replace
+from tuning.parameters.free import Free, free_numbers, insert, unit_at
+
+CASE = jb.Case(
+    beam=jb.Beam(length=1.0, flexural_rigidity=20.0, mass_per_length=2.0, damping_ratio=[0.01] * 3,
+                 modes=3),
+    supports=[jb.Support(position=0.4, stiffness=1e4)],
+    sensors=[jb.Sensor(position=0.5), jb.Sensor(position=0.5, quantity="acceleration")],
+    loads=[jb.MovingMass(mass=0.5, speed=-1.0)],
+    run=jb.Run(duration=2.0),
+)  # fmt: skip
+CASES = [CASE, replace(CASE, {"loads.0.speed": -2.0})]
+
+
+def free(address, pair=None) -> Free:
+    return free_numbers(CASES, {address: pair}, reading=0.01)[0]
+
+
+RANGES = [(-1.0, 3.0), (0.5, np.inf), (-np.inf, 2.0), (-np.inf, np.inf)]
+
+
+@pytest.mark.parametrize("low, high", RANGES)
+@pytest.mark.parametrize("value", [0.6, 1.0, 1.9])
+def test_mapping_returns_and_stays_within(low, high, value):
+    number = Free("x", "m", 1.0, low, high, 1.0)
+    np.testing.assert_allclose(
+        float(number.outward(jnp.asarray(number.inward(value)))), value, rtol=1e-12
+    )
+    for y in (-30.0, -1.0, 0.0, 2.0, 30.0):
+        assert low <= number.outward(jnp.asarray(y)) <= high
+
+
+@pytest.mark.parametrize("low, high", RANGES[:3])
+def test_a_start_on_a_bound_is_moved_in(low, high):
+    number = Free("x", "m", 1.0, low, high, 1.0)
+    bound = low if np.isfinite(low) else high
+    inner = float(number.outward(jnp.asarray(number.inward(bound))))
+    assert inner == pytest.approx(bound, abs=2e-3) and inner != bound
+    assert number.at_bound(bound) and not number.at_bound(1.0)
+
+
+@pytest.mark.parametrize(
+    "address, low, high, size, unit",
+    [
+        ("beam.flexural_rigidity", 0.0, np.inf, 20.0, "N m^2"),
+        ("beam.damping_ratio.1", 0.0, np.inf, 0.01, "1"),
+        ("supports.0.stiffness", 0.0, np.inf, 1e4, "N/m"),
+        ("logs.1.loads.0.speed", -np.inf, 0.0, 2.0, "m/s"),
+        ("loads.0.entry_time", -np.inf, np.inf, 2.0, "s"),
+        ("sensors.0.offset", -np.inf, np.inf, 0.01, "m"),
+        ("logs.0.sensors.1.offset", -np.inf, np.inf, 0.01, "m/s^2"),
+    ],
+)
+def test_ranges_sizes_and_units_without_bounds(address, low, high, size, unit):
+    number = free(address)
+    assert (number.low, number.high, number.size, number.unit) == (low, high, size, unit)
+
+
+def test_bounds_give_the_size():
+    number = free("beam.mass_per_length", (1.0, 4.0))
+    assert (number.low, number.high, number.size, number.start) == (1.0, 4.0, 3.0, 2.0)
+
+
+def test_insert_takes_what_concerns_a_log():
+    values = {"loads.0.mass": 0.7, "logs.1.loads.0.speed": -3.0}
+    first, second = (insert(case, i, values) for i, case in enumerate(CASES))
+    assert (float(first.loads[0].mass), float(first.loads[0].speed)) == (0.7, -1.0)
+    assert (float(second.loads[0].mass), float(second.loads[0].speed)) == (0.7, -3.0)
+
+
+def test_units_of_all_numbers():
+    assert unit_at(CASE, "run.gravity") == "m/s^2"
+    assert unit_at(CASE, "beam.damping_ratio") == "1"
+
+
+@pytest.mark.parametrize(
+    "bounds, words",
+    [
+        ({}, "name at least one address"),
+        ({"beam.rigidty": None}, "did you mean"),
+        ({"beam.damping_ratio": None}, "is a list; free its entries, beam.damping_ratio.0"),
+        ({"beam.length": (2.0, 1.0)}, "beam.length: the lower bound 2 is not below the upper, 1"),
+        ({"beam.length": (2.0, 3.0)}, "beam.length starts at 1, outside its bounds 2 to 3: change"),
+        ({"loads.0.speed": None}, "loads.0.speed differs between the logs; say which one, as in "),
+        ({"logs.2.loads.0.speed": None}, "no such log; the last log is logs.1"),
+        ({"logs.0.loads.3.speed": None}, "did you mean 'loads.0.speed'"),
+        ({"loads.0.deceleration": None}, "starts at 0, which does not say how large it may be"),
+        (
+            {"loads.0.mass": None, "logs.1.loads.0.mass": None},
+            "logs.1.loads.0.mass is free twice, as loads.0.mass is free for all logs together",
+        ),
+    ],
+    ids=lambda value: None if isinstance(value, str) else ",".join(value) or "none",
+)
+def test_refused(bounds, words):
+    with pytest.raises(ValueError) as refused:
+        free_numbers(CASES, bounds, 0.01)
+    assert words in str(refused.value)

@@ -1,0 +1,131 @@
+"""What one figure of merit costs in another: a front of tunings, and merits in order of rank."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxbeam.case.case import Case
+from tuning.control.load_cases import LoadCases
+from tuning.control.objective import MERITS, Objective
+from tuning.control.stability_constraint import Stable
+from tuning.control.tune import Bounds, Problem, check
+from tuning.control.tuning_result import Tuned
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Front:
+    """Tunings for one objective under ever tighter limits of one merit, loosest first."""
+
+    merit: str
+    limits: tuple[float, ...]
+    tuned: tuple[Tuned, ...]
+
+    def points(self, held_out: bool = False) -> np.ndarray:
+        """For each limit the merit and the objective (limit, 2), of training or held-out runs."""
+        own = [found.outcomes[-1 if held_out else 0] for found in self.tuned]
+        return np.array([[one.merits[self.merit], one.objective[1]] for one in own])
+
+    def __str__(self) -> str:
+        heads = ("limit", self.merit, "objective", f"{self.merit} held out", "objective held out")
+        lines = ["".join(f"{head:>24}" for head in heads)]
+        rows = zip(self.limits, self.points(), self.points(held_out=True), strict=True)
+        for limit, trained, proven in rows:
+            lines.append("".join(f"{x:>24.5g}" for x in (limit, *trained, *proven)))
+        return "\n".join(lines)
+
+    def plot(self):
+        """Figure of the front, on training and on held-out runs."""
+        from jaxbeam.plot import plot_front
+
+        kinds = {found.name: found.name == "held out" for found in self.tuned[0].outcomes}
+        lines = {name: self.points(held_out) for name, held_out in kinds.items()}
+        return plot_front(lines, self.merit, title=self.tuned[0].case.title)
+
+
+def pareto(
+    case: Case,
+    free: Bounds,
+    cases: LoadCases,
+    objective: Objective,
+    merit: str,
+    limits: Sequence[float],
+    *,
+    stable: Stable | None = None,
+    places: Sequence[float] | None = None,
+    method: str = "lbfgs",
+    steps: int = 80,
+    seed: int = 0,
+    bounds: bool = True,
+    progress: bool = True,
+) -> Front:
+    """Tune for an objective under each of some limits on a merit (see `Objective`).
+
+    From the loosest limit to the tightest each search goes on from where the last one ended, and
+    all share what is compiled. Arguments are those of `tune`; a line search meets limits more
+    exactly than Adam.
+
+    Raises ValueError as `tune` does, and for an unknown merit or a limit that is not positive.
+    """
+    limits = tuple(sorted(map(float, limits), reverse=True))
+    goals = [_limited(objective, {merit: limit}) for limit in limits]
+    if not goals:
+        raise ValueError("a front needs at least one limit")
+    check(free, cases, goals[0], method, steps, bounds=bounds)
+    problem = Problem(case, free, cases, goals[0], stable, places, bounds)
+    return Front(merit, limits, tuple(_each(problem, goals, method, steps, seed, progress)))
+
+
+def lexicographic(
+    case: Case,
+    free: Bounds,
+    cases: LoadCases,
+    merits: Sequence[str],
+    *,
+    slack: float = 0.01,
+    over: str = "worst",
+    stable: Stable | None = None,
+    places: Sequence[float] | None = None,
+    method: str = "lbfgs",
+    steps: int = 80,
+    seed: int = 0,
+    bounds: bool = True,
+    progress: bool = True,
+) -> tuple[Tuned, ...]:
+    """Tune for merits in order of rank: each is lowered as far as those before it allow.
+
+    What a merit has come to, plus the share `slack` of it, is a limit for all that follow. One
+    result for each merit; the last is that for all. Other arguments are those of `tune`.
+
+    Raises ValueError as `tune` does, for an unknown merit and one that is named twice.
+    """
+    if not merits or len(set(merits)) < len(merits):
+        raise ValueError("name at least one merit, and each once, the most important first")
+    check(free, cases, Objective(dict.fromkeys(merits, 1.0)), method, steps, bounds=bounds)
+    problem = Problem(case, free, cases, Objective({merits[0]: 1.0}, over), stable, places, bounds)
+    found, limits = [], {}
+    descent, points = problem.descent(method, steps), None
+    for merit in merits:
+        goal = Objective({merit: 1.0}, over, limits=dict(limits))
+        points = descent.points(1, seed, points)
+        state = descent.run(goal.target, points, seed, progress=progress)
+        points = state.best[0]
+        found.append(problem.proven(descent, state, goal))
+        limits[merit] = (1 + slack) * found[-1].outcomes[0].merits[merit]
+    return tuple(found)
+
+
+def _each(problem: Problem, goals, method, steps, seed, progress):
+    """One result for each goal, every search begun where the one before it ended."""
+    descent, point = problem.descent(method, steps), None
+    for goal in goals:
+        state = descent.run(goal.target, descent.points(1, seed, point), seed, progress=progress)
+        point = state.best[0]
+        yield problem.proven(descent, state, goal)
+
+
+def _limited(objective: Objective, limits: dict[str, float]) -> Objective:
+    unknown = set(limits) - set(MERITS)
+    if unknown:
+        raise ValueError(f"there is no merit {min(unknown)!r}; it may be {', '.join(MERITS)}")
+    return dataclasses.replace(objective, limits=objective.limits | limits)

@@ -1,0 +1,186 @@
+"""All runs of a tuning, simulated side by side and compiled once."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxbeam.analysis.bound.bound import HELD, least_achievable
+from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.model.contact import traffic
+from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.integration_plan import Plan, make_plan, sample_times
+from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.simulate import Histories, histories, simulate
+from tuning.control.fixed_design import believing
+from tuning.control.load_cases import PLANT, Values, apply
+from tuning.control.objective import Sharpness, run_merits
+
+TOLERANCE = 1e-4  # of the largest deflection: what tuning needs; verdicts are simulated finer
+
+
+class Bench(eqx.Module):
+    """Runs of one case that differ in numbers only, and what they are without control (`free`).
+
+    `stacked` is the case with the numbers of all runs along a first axis, `error` the relative
+    error of their peaks with the `plan`. `places` (m) are where deflections count: the sensors', or
+    given ones. Laws are designed for the plant of the case: where runs have other plants, `nominal`
+    holds its numbers. What is compiled should take the bench as an argument: closed over, its
+    arrays would be constants that XLA works on for seconds.
+    """
+
+    runs: Sequence[Values]
+    stacked: Case
+    plan: Plan
+    error: Float[np.ndarray, ""]
+    times: Float[Array, " time"]
+    places: Float[Array, " place"]
+    free: dict[str, Float[np.ndarray, " run"]]
+    after: Float[np.ndarray, "run time"]
+    ranges: Float[np.ndarray, " actuator"]
+    nominal: dict[str, Float[np.ndarray, ""]]
+
+    @property
+    def cases(self) -> list[Case]:
+        """The cases of the runs, one by one."""
+        leaves, form = jax.tree.flatten(jax.tree.map(jnp.asarray, self.stacked))
+        return [jax.tree.unflatten(form, row) for row in zip(*leaves, strict=True)]
+
+    def histories(self, values: Mapping[str, Any]) -> Histories:
+        """Histories of all runs, along a first axis, with other numbers at some addresses."""
+
+        def single(case):
+            return histories(self._used(case, values), self.times, self.plan, self.places)
+
+        return jax.vmap(single)(self.stacked)
+
+    def judge(
+        self, found: Histories, sharpness: Sharpness = None
+    ) -> dict[str, Float[Array, " run"]]:
+        """Figures of merit of all runs; differentiable."""
+        weights = jax.vmap(lambda case: traffic(case).weight[:, 0])(self.stacked)
+        ranges = jnp.asarray(self.ranges)
+
+        def single(found, free, after, weights):
+            return run_merits(found, free, after, ranges, weights, sharpness)
+
+        return jax.vmap(single)(found, self.free, jnp.asarray(self.after), weights)
+
+    def merits(
+        self, values: Mapping[str, Any], sharpness: Sharpness = None
+    ) -> dict[str, Float[Array, " run"]]:
+        """Figures of merit of all runs with other numbers at some addresses."""
+        return self.judge(self.histories(values), sharpness)
+
+    def records(self, values: Mapping[str, Any]) -> list[Record]:
+        """Records of all runs, with true peaks between and at samples."""
+        plan = dataclasses.replace(self.plan, error=float(self.error))
+        return [simulate(self._used(case, values), plan=plan) for case in self.cases]
+
+    def at(self, rows: Int[Array, " some"]) -> "Bench":
+        """The bench with some of its runs only."""
+        parts = self.stacked, self.free, self.after
+        some = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rows], parts)
+        return eqx.tree_at(lambda b: (b.stacked, b.free, b.after), self, some)
+
+    def _used(self, case: Case, values: Mapping[str, Any]) -> Case:
+        return believing(replace(case, values), self.nominal, self.plan.form.layout)
+
+
+def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = False) -> Bench:
+    """Prepare the runs of a case; peaks without control are simulated once.
+
+    With `bounds` the least peak that is possible is found for each, else it is NaN.
+
+    Raises ValueError for an address that is not there, a run that is too short or faulty, and
+    without a controller or anywhere to look at the deflection.
+    """
+    if case.controller is None:
+        raise ValueError("there is no controller to tune: give the case one")
+    if places is None:
+        places = [float(sensor.position) for sensor in case.sensors]
+    places = jnp.asarray(places, float).reshape(-1)
+    if places.size == 0:
+        raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")
+    cases = [apply(case, run) for run in runs]
+    times = sample_times(case)
+    # What takes long is compiling programs that have nothing to do with each other.
+    with ThreadPoolExecutor(3) as pool:
+        planned = pool.submit(_common_plan, cases)
+        deflecting = pool.submit(_uncontrolled, cases, times, places)
+        least = pool.submit(_least_peaks, cases, places) if bounds else None
+    plan, error = planned.result()
+    deflection = deflecting.result()
+    varied = dict.fromkeys(a for run in runs for a in run if a.startswith(PLANT))
+    leaves = np.array([_last_exit(own) for own in cases])
+    limits = [actuator.command_limits() for actuator in case.actuators]
+    return Bench(
+        runs=runs,
+        stacked=stacked_cases(cases),
+        plan=plan,
+        error=np.asarray(error),
+        times=times,
+        places=places,
+        free={
+            "peak": np.abs(deflection).max(axis=(1, 2)),
+            "rms": np.sqrt((deflection**2).mean(axis=(1, 2))),
+            "least": np.full(len(runs), np.nan) if least is None else least.result(),
+        },
+        after=(np.asarray(times) > leaves[:, None]).astype(float),
+        ranges=np.array([1.0 if pair is None else np.abs(pair).max() for pair in limits]),
+        nominal={address: np.asarray(value_at(case, address)) for address in varied},
+    )
+
+
+def _uncontrolled(cases: list[Case], times, places) -> Float[np.ndarray, "run time place"]:
+    """Deflections (m) of runs without their controllers."""
+    plain = [dataclasses.replace(own, controller=None) for own in cases]
+    plan, _ = _common_plan(plain)
+    return np.asarray(_deflections(stacked_cases(plain), times, plan, places))
+
+
+def _least_peaks(cases: list[Case], places) -> Float[np.ndarray, " run"]:
+    period = cases[0].controller.period
+    held = HELD if period is None else float(period)
+    return np.array([least_achievable(own, places, held) for own in cases])
+
+
+def stacked_cases(cases: list[Case]) -> Case:
+    """One case with the numbers of several, alike in structure, along a first axis."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
+
+
+@compiled
+def _deflections(stacked: Case, times, plan: Plan, places) -> Float[Array, "run time place"]:
+    return jax.vmap(lambda own: histories(own, times, plan, places).deflection)(stacked)
+
+
+def _common_plan(cases: list[Case]) -> tuple[Plan, float]:
+    """One plan for cases alike in structure, fine enough for each, and its error apart from it.
+
+    Runs whose plans differ in nothing but the error share what is compiled.
+
+    Raises ValueError if they differ in more than numbers.
+    """
+    plans = [make_plan(own, tolerance=TOLERANCE) for own in cases]
+    if len({plan.form.layout for plan in plans}) > 1:
+        raise ValueError("the runs differ in the order of places along the beam; tune them apart")
+    slots = max(plan.form.slots for plan in plans)
+    common = dataclasses.replace(
+        plans[0],
+        form=dataclasses.replace(plans[0].form, slots=slots),
+        substeps=max(plan.substeps for plan in plans),
+        error=0.0,
+    )
+    return common, max(plan.error for plan in plans)
+
+
+def _last_exit(case: Case) -> float:
+    windows = [path.window()[1] for path in traffic(case).motions]
+    return max((float(leave) for leave in windows), default=0.0)

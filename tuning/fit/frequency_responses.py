@@ -1,0 +1,240 @@
+"""Fits to measured frequency responses: of a hammer, a shaker or commands, loads away.
+
+    measured = responses_of(log)                      # from a log of commands and readings
+    fit = identify_responses(case, measured, ["beam.flexural_rigidity", "beam.damping_ratio"])
+
+What is compared is the logarithm of the complex response, ln |H| + i arg H, because measured
+responses are off by a share of themselves, at resonances as well as beside them.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+from jaxtyping import Complex, Float
+
+from jaxbeam.case.case import Case, replace
+from jaxbeam.model.frequency_response import Parked, frequency_response
+from jaxbeam.model.modes import lay_out
+from tuning.fit.least_squares import MAX_STEPS, Search
+from tuning.fit.uncertainty.covariance import reach
+from tuning.logs.log import Log
+from tuning.parameters.free import Free, free_numbers
+from tuning.parameters.prior import Belief
+
+LEAST = 1e-3  # relative deviation of a measured response: no sensor is better calibrated
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Responses:
+    """Measured frequency responses, a column for each pair of an input and an output.
+
+    `values` are complex, in SI units of output per input; `pairs` in the words of
+    `jaxbeam.frequency_response`; `deviations` relative standard deviations of the values, one for
+    all if not known. `parked` are masses on the beam: (position in m, mass in kg) each.
+
+    Raises ValueError if shapes disagree, frequencies do not ascend from above zero, or a value is
+    zero or not finite.
+    """
+
+    frequencies: Float[np.ndarray, " frequency"]
+    values: Complex[np.ndarray, "frequency pair"]
+    pairs: tuple[tuple[str, str], ...]
+    deviations: Float[np.ndarray, "frequency pair"] | None = None
+    parked: Parked = ()
+    source: str = "responses"
+
+    def __post_init__(self):
+        if self.values.shape != (self.frequencies.size, len(self.pairs)):
+            raise ValueError(
+                f"{self.source}: {self.values.shape} values for {self.frequencies.size} "
+                f"frequencies and {len(self.pairs)} pairs"
+            )
+        if not (self.frequencies[0] > 0 and np.all(np.diff(self.frequencies) > 0)):
+            raise ValueError(f"{self.source}: frequencies must ascend from above 0 Hz")
+        bad = ~np.isfinite(self.values) | (self.values == 0)
+        if bad.any():
+            i, j = np.argwhere(bad)[0]
+            raise ValueError(
+                f"{self.source}: the response of {self.pairs[j][1]} to {self.pairs[j][0]} at "
+                f"{self.frequencies[i]:g} Hz is {self.values[i, j]}; leave this frequency out"
+            )
+
+
+def responses_of(log: Log, segment: float | None = None, least: float = 0.8) -> Responses:
+    """Estimate the responses of the sensors in a log to the one command in it.
+
+    H1 = S_uy / S_uu by Welch's method in segments of so many seconds (an eighth of the log if left
+    out); relative deviations follow from the coherence g^2 as sqrt((1 - g^2) / (2 n g^2)) (Bendat
+    and Piersol, Random Data, section 9.1). Frequencies with less than the `least` coherence at
+    some sensor are left out. Segments much shorter than the vibration rings make damping look
+    larger than it is.
+
+    Raises ValueError unless there is one command and a named sensor, for uneven sampling, and if
+    no frequency is coherent enough.
+    """
+    commands = [i for i, actuator in enumerate(log.actuators) if actuator is not None]
+    sensors = [i for i, sensor in enumerate(log.sensors) if sensor is not None]
+    if len(commands) != 1 or not sensors:
+        raise ValueError(
+            f"{log.source}: responses need one command and at least one sensor; say in the TOML "
+            "file beside it which `actuator` and `sensor` its columns are"
+        )
+    rate = log.sample_rate
+    size = int(rate * (log.duration / 8 if segment is None else segment))
+    command = log.values[:, commands[0]]
+    power = scipy.signal.welch(command, rate, nperseg=size)[1]
+    averages = 2 * log.times.size // size - 1
+    values, coherences = [], []
+    for i in sensors:
+        frequencies, cross = scipy.signal.csd(command, log.values[:, i], rate, nperseg=size)
+        values.append(cross / np.maximum(power, 1e-300))
+        coherences.append(scipy.signal.coherence(command, log.values[:, i], rate, nperseg=size)[1])
+    coherence = np.stack(coherences, axis=1)
+    kept = (frequencies > 0) & np.all(coherence >= least, axis=1)
+    if kept.sum() < 3:
+        raise ValueError(f"{log.source}: hardly any frequency has a coherence of {least:g}")
+    coherence = coherence[kept]
+    deviations = np.sqrt((1 - coherence) / (2 * averages * coherence))
+    return Responses(
+        frequencies[kept],
+        np.stack(values, axis=1)[kept],
+        tuple(
+            (f"actuators.{log.actuators[commands[0]]}", f"sensors.{log.sensors[i]}")
+            for i in sensors
+        ),
+        np.maximum(deviations, LEAST),
+        source=log.source,
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Sweep:
+    """Responses as samples for a search: one log, whose times are frequencies."""
+
+    case: Case
+    responses: Responses
+    measured: Float[np.ndarray, "1 frequency part"]
+    real: Float[np.ndarray, "1 frequency part"]
+
+    def predictor(self, addresses: list[str]):
+        """Function from values at the addresses to weighted logarithms of the responses."""
+        case, given = self.case, self.responses
+        layout, weights = lay_out(case), _weights(given)
+        frequencies, measured = jnp.asarray(given.frequencies), jnp.asarray(given.values)
+
+        def predict(values):
+            changed = replace(case, dict(zip(addresses, values, strict=True)))
+            response = frequency_response(
+                changed, frequencies, given.pairs, given.parked, layout
+            ).values
+            # Relative to what was measured, phases do not wrap.
+            off = jnp.log(response / measured)
+            parts = jnp.concatenate([off.real, off.imag], axis=1)
+            return (_logarithms(given) + parts * weights)[None]
+
+        return predict
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ResponseFit:
+    """Numbers fitted to frequency responses (SI units), as in `tuning.Fit`.
+
+    `misfit` (pair,) is the root mean square of the relative difference between measured and
+    `fitted` responses.
+    """
+
+    numbers: list[Free]
+    values: Float[np.ndarray, " free"]
+    errors: Float[np.ndarray, " free"]
+    correlation: Float[np.ndarray, "free free"]
+    unseen: list[dict[str, float]]
+    freedom: float
+    verdict: str
+    case: Case
+    fitted: Complex[np.ndarray, "frequency pair"]
+    misfit: Float[np.ndarray, " pair"]
+
+    @property
+    def addresses(self) -> list[str]:
+        """Addresses of the free numbers."""
+        return [number.address for number in self.numbers]
+
+    @property
+    def intervals(self) -> Float[np.ndarray, "free 2"]:
+        """95 % intervals; infinite where the data cannot tell."""
+        half = reach(self.freedom) * self.errors
+        return np.stack([self.values - half, self.values + half], axis=1)
+
+    def to_dict(self) -> dict:
+        """Numbers with their intervals (SI units), misfits by pair and the verdict."""
+        rows = zip(self.addresses, self.values, self.intervals, strict=True)
+        return {
+            "numbers": {name: {"value": v, "interval_95": pair} for name, v, pair in rows},
+            "misfit": self.misfit,
+            "verdict": self.verdict,
+        }
+
+    def __str__(self) -> str:
+        width = max(map(len, self.addresses))
+        lines = [
+            f"{address:{width}}  {value:11.5g}  {low:11.5g} to {high:<10.5g}"
+            for address, value, (low, high) in zip(
+                self.addresses, self.values, self.intervals, strict=True
+            )
+        ]
+        off = ", ".join(f"{100 * share:.2g} %" for share in self.misfit)
+        return "\n".join([*lines, f"responses are off by {off}", self.verdict])
+
+
+def identify_responses(
+    case: Case,
+    measured: Responses,
+    free: Mapping[str, tuple[float, float] | Belief | None] | Sequence[str],
+    *,
+    loss: str = "squares",
+) -> ResponseFit:
+    """Fit numbers of a case to measured frequency responses.
+
+    As `tuning.fit.identify` does with logs, but in the frequency domain: exact for the modes that the
+    case keeps, whatever the excitation was. Loads of the case are away.
+
+    Raises ValueError for faulty input.
+    """
+    bounds = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
+    numbers = free_numbers([case], bounds, 1.0)
+    table = _logarithms(measured)[None]
+    # A first call outside of any compiling checks case, pairs and parked masses.
+    frequency_response(case, measured.frequencies[:2], measured.pairs, measured.parked)
+    sweep = _Sweep(case, measured, table, np.ones(table.shape))
+    found = Search(sweep, numbers, loss).estimate(table)
+    values = {n.address: float(v) for n, v in zip(numbers, found.values, strict=True)}
+    off = ((found.predicted - table)[0] / _weights(measured)).T.reshape(2, len(measured.pairs), -1)
+    relative = (off[0] + 1j * off[1]).T
+    return ResponseFit(
+        numbers,
+        found.values,
+        found.uncertainty.errors,
+        found.uncertainty.correlation,
+        found.uncertainty.unseen,
+        found.freedom,
+        "converged" if found.converged else f"not converged after {MAX_STEPS} steps",
+        replace(case, values),
+        measured.values * np.exp(relative),
+        np.sqrt(np.mean(np.abs(relative) ** 2, axis=0)),
+    )
+
+
+def _weights(given: Responses) -> Float[np.ndarray, "frequency part"]:
+    """One over the relative deviations, for magnitudes and phases."""
+    if given.deviations is None:
+        return np.ones((given.frequencies.size, 2 * len(given.pairs)))
+    return np.tile(1 / given.deviations, (1, 2))
+
+
+def _logarithms(given: Responses) -> Float[np.ndarray, "frequency part"]:
+    """Weighted logarithms of magnitudes, then phases (rad)."""
+    phases = np.unwrap(np.angle(given.values), axis=0)
+    return np.hstack([np.log(np.abs(given.values)), phases]) * _weights(given)

@@ -1,0 +1,233 @@
+"""Whether a fitted model may be believed: its residuals, its rivals, and logs it has not seen."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import chi2
+
+from jaxbeam.runtime.compiling import compiled
+from tuning.fit.dataset import prepare
+from tuning.fit.uncertainty.covariance import colour
+from tuning.logs.log import Log
+
+if TYPE_CHECKING:
+    from tuning.fit.identify import Fit
+
+LAGS = 20  # of the autocorrelation that the whiteness test looks at
+DOUBTFUL = 0.01  # probability of residuals at least so coloured by chance, below which it is said
+LATE = 4.0  # standard errors that a time shift must have to be told
+FAR = 1.5  # how much larger than in the fit residuals of unseen logs may be
+
+
+def whiteness(residual: Float[np.ndarray, " time"]) -> float:
+    """Probability that white noise looks at least so coloured: the test of Ljung and Box (1978).
+
+    Q = n (n + 2) sum r_k^2 / (n - k) over the first lags k, against chi-square.
+    """
+    centred = residual - residual.mean()
+    count, power = centred.size, float(centred @ centred)
+    lags = np.arange(1, min(LAGS, count // 4) + 1)
+    if power == 0.0 or not lags.size:
+        return 1.0
+    correlations = np.array([centred[:-k] @ centred[k:] for k in lags]) / power
+    statistic = count * (count + 2) * np.sum(correlations**2 / (count - lags))
+    return float(chi2.sf(statistic, lags.size))
+
+
+@dataclasses.dataclass(frozen=True)
+class Channel:
+    """Residuals of one sensor in one log: level, whiteness, and how late the readings seem.
+
+    `noise` is in the SI unit of the sensor, `probability` that of `whiteness`, `colour` the factor
+    by which correlation raises variances, `shift` the delay (s) of the log against the model with
+    its standard error.
+    """
+
+    log: int
+    sensor: int
+    noise: float
+    probability: float
+    colour: float
+    shift: float
+    shift_error: float
+
+
+def channel_remarks(found: Sequence[Channel], logs: Sequence[Log]) -> list[str]:
+    """What is to be said of residuals, in a sentence each; nothing if all is well."""
+    said = []
+    for i, log in enumerate(logs):
+        coloured = [c for c in found if c.log == i and c.probability < DOUBTFUL]
+        if coloured:
+            places = ", ".join(f"{c.colour:.2g} at sensor {c.sensor}" for c in coloured)
+            said.append(
+                f"{log.source}: residuals are no white noise, so the model misses something and "
+                f"its intervals are unreliable: widened for it (variances times {places}), they "
+                "cannot make up for values that are put off"
+            )
+        for c in found:
+            if c.log == i and abs(c.shift) > LATE * c.shift_error:
+                what = "late" if c.shift > 0 else "early"
+                said.append(
+                    f"{log.source}: sensor {c.sensor} seems {1e3 * abs(c.shift):.3g} ms {what} "
+                    f"(+- {2e3 * c.shift_error:.2g} ms): free its delay, or check its clock"
+                )
+    return said
+
+
+def channels(fit: Fit) -> list[Channel]:
+    """Look at the residuals of each sensor in each log.
+
+    A delay d of the readings leaves d times the rate of the fitted reading, to first order; it is
+    regressed on that rate.
+    """
+    found = []
+    for i, (residuals, fitted) in enumerate(zip(fit.residuals, fit.fitted, strict=True)):
+        rates = -np.gradient(fitted, fit.campaign.times[i], axis=0)
+        for j in range(residuals.shape[1]):
+            has = np.isfinite(residuals[:, j])
+            if not has.any():
+                continue
+            residual, rate = residuals[has, j], rates[has, j]
+            strength = max(float(rate @ rate), 1e-300)
+            shift = float(residual @ rate) / strength
+            left = residual - shift * rate
+            found.append(
+                Channel(
+                    log=i,
+                    sensor=j,
+                    noise=float(fit.noise[i, j]),
+                    probability=whiteness(residual),
+                    colour=float(fit.colour[i, j]),
+                    shift=shift,
+                    shift_error=float(left.std() * np.sqrt(colour(left) / strength)),
+                )
+            )
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Rival:
+    """One of several models of the same logs: criteria in nats doubled, lower is better.
+
+    `log_likelihood` counts independent samples; `weight` is that of Akaike among the rivals.
+    """
+
+    name: str
+    numbers: int
+    log_likelihood: float
+    aic: float
+    bic: float
+    weight: float
+
+
+def compare_fits(fits: Mapping[str, Fit]) -> list[Rival]:
+    """Information criteria of fits of different models to the same logs, best (BIC) first.
+
+    AIC = 2 k - 2 ln L and BIC = k ln n - 2 ln L with ln L = -n / 2 (ln(2 pi s^2) + 1) summed over
+    channels. As residuals may be coloured, n counts independent samples: those of the fit with the
+    least residuals, the same for all.
+
+    Raises ValueError for fewer than two fits, and fits to other samples.
+    """
+    if len(fits) < 2:
+        raise ValueError("give at least two fits to compare")
+    first, *others = fits.values()
+    for other in others:
+        same = other.campaign.measured.shape == first.campaign.measured.shape
+        if not same or np.any(other.campaign.measured != first.campaign.measured):
+            raise ValueError("the fits are of other samples; criteria only compare the same")
+    counts = first.campaign.real.sum(axis=1)
+    squares = {
+        name: np.nansum(fit.residuals**2, axis=1) / np.maximum(counts, 1)
+        for name, fit in fits.items()
+    }
+    has = counts > 0
+    best = min(fits, key=lambda name: np.sum(counts[has] * np.log(squares[name][has] + 1e-300)))
+    independent = (counts / fits[best].colour)[has]
+    rows = {}
+    for name, fit in fits.items():
+        level = np.log(2 * np.pi * (squares[name][has] + 1e-300)) + 1
+        rows[name] = len(fit.numbers), float(-np.sum(independent * level) / 2)
+    aic = {name: 2 * k - 2 * likely for name, (k, likely) in rows.items()}
+    shares = np.exp(-(np.array(list(aic.values())) - min(aic.values())) / 2)
+    weights = dict(zip(aic, shares / shares.sum(), strict=True))
+    rivals = [
+        Rival(
+            name,
+            k,
+            likely,
+            aic[name],
+            k * float(np.log(independent.sum())) - 2 * likely,
+            float(weights[name]),
+        )
+        for name, (k, likely) in rows.items()
+    ]
+    return sorted(rivals, key=lambda rival: rival.bic)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Unseen:
+    """A log predicted by a fit that did not use it.
+
+    `ratio` (sensor,) is the standard deviation of what is left over that of the noise in the
+    fit: one is perfect, NaN where nothing was measured.
+    """
+
+    log: str
+    ratio: Float[np.ndarray, " sensor"]
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        worst = float(np.nanmax(self.ratio))
+        word = "predicted" if worst < FAR else "not predicted"
+        return f"{self.log}: {word}; residuals are {worst:.3g} times the noise at most"
+
+
+def cross_validate(fit: Fit) -> list[Unseen]:
+    """Leave out one log after the other, fit the rest, and predict the one left out.
+
+    Numbers of the log left out stay at their starts (its speed and entry time, say), so logs with
+    such numbers count only as well as these are known. Nothing is compiled anew.
+
+    Raises ValueError for a single log.
+    """
+    campaign = fit.campaign
+    count = len(campaign.logs)
+    if count < 2:
+        raise ValueError("to leave one log out there must be at least two")
+    found = []
+    for i, log in enumerate(campaign.logs):
+        use = np.arange(count) != i
+        left = fit.search.estimate(campaign.measured, use=use)
+        noise = np.sqrt(np.nanmean(np.where(use[:, None], fit.noise, np.nan) ** 2, axis=0))
+        parts = campaign.measured[i], left.predicted[i], campaign.real[i]
+        found.append(_unseen(log.source, *parts, noise))
+    return found
+
+
+def hold_out(fit: Fit, logs: Sequence[Log]) -> list[Unseen]:
+    """Predict logs that the fit has not seen with the fitted case, and their own loads.
+
+    Raises ValueError as `identify` does for logs that do not match the case.
+    """
+    campaign = prepare(fit.case, list(logs))
+    predict = compiled(campaign.predictor(["run.gravity"]))
+    predicted = np.asarray(predict(jnp.asarray([float(fit.case.run.gravity)])))
+    noise = np.sqrt(np.nanmean(fit.noise**2, axis=0))
+    return [
+        _unseen(log.source, campaign.measured[i], predicted[i], campaign.real[i], noise)
+        for i, log in enumerate(campaign.logs)
+    ]
+
+
+def _unseen(source, measured, predicted, real, noise) -> Unseen:
+    counts = real.sum(axis=0)
+    squares = np.sum(((measured - predicted) * real) ** 2, axis=0) / np.maximum(counts, 1)
+    return Unseen(source, np.where(counts > 0, np.sqrt(squares) / noise, np.nan))

@@ -1,0 +1,53 @@
+"""Pictures of what is known about fitted numbers: profiles and posterior."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxbeam.plot.style import COLOURS, FAINT, INK, styled
+from tuning.fit.uncertainty.posterior import Posterior
+from tuning.fit.uncertainty.profile import Profile
+
+ACROSS = 3  # panels side by side
+
+
+@styled
+def plot_profiles(profiles: Sequence[Profile]) -> Figure:
+    """For each number the rise of -2 ln L, and where it passes what 95 % confidence allows."""
+    figure, panels = _panels(len(profiles))
+    for axes, found in zip(panels, profiles, strict=False):
+        axes.plot(found.values, found.rises, "o-", color=INK, markersize=3, linewidth=1)
+        axes.axhline(found.allowed, color=COLOURS[1], linewidth=1)
+        for end in found.interval:
+            if np.isfinite(end):
+                axes.axvline(end, color=COLOURS[1], linewidth=0.8, linestyle=":")
+        if np.all(np.isfinite(found.linear)):
+            axes.axvspan(*found.linear, color=FAINT, alpha=0.6, linewidth=0)
+        axes.set(title=found.address, ylabel="rise of $-2\\,\\ln L$", ylim=(0, 2 * found.allowed))
+        axes.set_xlabel("" if found.unit == "1" else found.unit)
+    return figure
+
+
+@styled
+def plot_posterior(posterior: Posterior) -> Figure:
+    """For each number a histogram of its draws, each chain a line, and the 95 % interval."""
+    figure, panels = _panels(len(posterior.addresses))
+    for i, axes in enumerate(panels):
+        draws = posterior.draws[..., i]
+        edges = np.linspace(draws.min(), draws.max(), 31)
+        for j, chain in enumerate(draws):
+            axes.hist(chain, edges, histtype="step", density=True, color=COLOURS[j % len(COLOURS)])
+        axes.axvspan(*posterior.intervals[i], color=FAINT, alpha=0.6, linewidth=0)
+        axes.set(title=posterior.addresses[i], yticks=[])
+    return figure
+
+
+def _panels(count: int):
+    """A figure with so many panels, three side by side."""
+    rows = -(-count // ACROSS)
+    figure = Figure(figsize=(3.2 * min(count, ACROSS), 2.4 * rows))
+    grid = figure.subplots(rows, min(count, ACROSS), squeeze=False).ravel()
+    for axes in grid[count:]:
+        axes.axis("off")
+    return figure, grid[:count]

@@ -1,0 +1,171 @@
+"""A log and a case brought together: sensors, commands and loads, checked against each other."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import known
+from jaxbeam.case.loads import AbstractLoad, motion
+from jaxbeam.control import Prescribed
+from tuning.logs.log import Log
+
+LATEST = 10.0  # start of a log, in its own durations, that is still simulated from 0 on
+UNIT_OF = {"voltage": "V", "force": "N"}
+
+
+def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case:
+    """The case as it was during a log: with the loads and commands of then, until its end.
+
+    Commands are joined by straight lines from sample to sample; `times` (s) are those of the log
+    and any that fill it up, for which the last commands stay. Raises
+    ValueError, naming the log, for a command that no actuator of the case takes.
+    """
+    if log.loads is not None:
+        case = dataclasses.replace(case, loads=tuple(log.loads))
+    if any(actuator is not None for actuator in log.actuators):
+        commands = np.zeros((len(case.actuators), times.size))
+        for channel, actuator in enumerate(log.actuators):
+            if actuator is not None:
+                _check_command(case, log, channel, actuator)
+                more = times.size - log.times.size
+                commands[actuator] = np.pad(log.values[:, channel], (0, more), mode="edge")
+        controller = Prescribed(offsets=np.zeros(len(commands)), times=times, values=commands)
+        case = dataclasses.replace(case, controller=controller)
+    return replace(case, {"run.duration": float(log.times[-1])})
+
+
+def made_alike(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> list[Case]:
+    """The cases, each with what others have besides: commands of zero, loads that come too late.
+
+    So a crossing without commands and a beam at rest that is shaken are runs of one structure.
+    """
+    commanded = any(isinstance(case.controller, Prescribed) for case in cases)
+    longest = max((case.loads for case in cases), key=len)
+    made = []
+    for case, own in zip(cases, times, strict=True):
+        if commanded and case.controller is None:
+            count = len(case.actuators)
+            still = Prescribed(np.zeros(count), times=own, values=np.zeros((count, own.size)))
+            case = dataclasses.replace(case, controller=still)
+        late = tuple(_late(load, 2 * own[-1]) for load in longest[len(case.loads) :])
+        made.append(dataclasses.replace(case, loads=(*case.loads, *late)))
+    return made
+
+
+def _late(load: AbstractLoad, time: float) -> AbstractLoad:
+    """The load, entering at a time (s)."""
+    if load.times is None:
+        return dataclasses.replace(load, entry_time=time)
+    return dataclasses.replace(load, times=load.times - load.times[0] + time)
+
+
+def _check_command(case: Case, log: Log, channel: int, actuator: int) -> None:
+    if not 0 <= actuator < len(case.actuators):
+        raise ValueError(
+            f"{log.source}: {log.names[channel]} is the command to actuators.{actuator}, but the"
+            f" case has {len(case.actuators)} actuators, counted from 0"
+        )
+    if log.actuators.count(actuator) > 1:
+        raise ValueError(f"{log.source}: two of its channels are commands to actuators.{actuator}")
+    if case.controller is not None:
+        raise ValueError(
+            f"{log.source}: its commands and the controller of the case contradict each other;"
+            " leave one out"
+        )
+    device = case.actuators[actuator]
+    wanted = type(device).__dataclass_fields__["limits"].metadata["unit"]
+    if UNIT_OF.get(log.quantities[channel]) != wanted:
+        raise ValueError(
+            f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in"
+            f" {log.units[channel]}, but the command to actuators.{actuator} is in {wanted}"
+        )
+    limits = device.command_limits()
+    low, high = (-np.inf, np.inf) if limits is None else known(limits)
+    least, most = log.values[:, channel].min(), log.values[:, channel].max()
+    if least < low or most > high:
+        raise ValueError(
+            f"{log.source}: {log.names[channel]} goes from {least:g} to {most:g} {wanted}, beyond"
+            f" what actuators.{actuator} takes, {low:g} to {high:g} {wanted}: correct its limits"
+        )
+
+
+def at_sensors(
+    case: Case, log: Log
+) -> tuple[Float[np.ndarray, "time sensor"], Bool[np.ndarray, "time sensor"]]:
+    """The readings of a log in the order of the case's sensors (time, sensor), and which count.
+
+    A log that does not name its sensors has them all, in their order. Raises ValueError, naming
+    the log, if its channels do not match the sensors.
+    """
+    sensors = case.sensors
+    if not sensors:
+        raise ValueError("the case has no sensors to compare the logs with")
+    named = [(number, i) for i, number in enumerate(log.sensors) if number is not None]
+    read = [i for i, actuator in enumerate(log.actuators) if actuator is None]
+    order = dict(named) if named else dict(enumerate(read))
+    if len(named) > len(order):
+        raise ValueError(f"{log.source}: two of its channels are of the same sensor of the case")
+    if not set(order) <= set(range(len(sensors))) or (not named and len(order) < len(sensors)):
+        ours = f"{len(sensors)} sensors" if len(sensors) > 1 else "one sensor"
+        raise ValueError(
+            f"{log.source}: its channels {', '.join(log.names)} do not match the case's {ours}; "
+            "say in the TOML file beside it which `sensor` each column is, counted from 0"
+        )
+    values = np.zeros((log.times.size, len(sensors)))
+    has = np.zeros(values.shape, bool)
+    for number, channel in order.items():
+        quantity = sensors[number].quantity
+        if log.quantities[channel] != quantity:
+            raise ValueError(
+                f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in "
+                f"{log.units[channel]}, but sensors.{number} measures {quantity}"
+            )
+        values[:, number], has[:, number] = log.values[:, channel], log.valid[:, channel]
+    return values, has
+
+
+def check_times(log: Log) -> None:
+    """Check that a run can have the times of a log. Raises ValueError, naming the log, if not.
+
+    Runs start at t = 0 from rest, and simulate all that lies before the first sample.
+    """
+    first, last = float(log.times[0]), float(log.times[-1])
+    if log.times.size < 3:
+        raise ValueError(f"{log.source}: a fit needs at least 3 samples, not {log.times.size}")
+    if first < 0:
+        raise ValueError(
+            f"{log.source}: it starts at {first:.4g} s, but runs start at 0, at rest; add "
+            f"{-first:.4g} s to its times and to the loads' entry times"
+        )
+    if first > LATEST * (last - first):
+        raise ValueError(
+            f"{log.source}: it starts only at {first:.6g} s, while runs start at 0; subtract the "
+            "time at which the recording began from its times and from the loads' entry times"
+        )
+
+
+def check_loads(log: Log, case: Case) -> None:
+    """Check that a load is known, and has crossed when the log ends. Raises ValueError if not."""
+    if case.controller is not None and not case.loads:
+        return
+    if not case.loads:
+        raise ValueError(
+            f"{log.source}: no load is known, neither in the case nor in the TOML file beside the "
+            "log; without loads, only modes can be identified (leave out --free)"
+        )
+    exits = [float(motion(load, case.beam.length).window()[1]) for load in case.loads]
+    entries = [float(motion(load, case.beam.length).window()[0]) for load in case.loads]
+    end = float(log.times[-1])
+    if end < min(entries):
+        raise ValueError(
+            f"{log.source}: it ends at {end:.4g} s, before the first load enters at "
+            f"{min(entries):.4g} s"
+        )
+    crossing = [leave for leave in exits if np.isfinite(leave) and leave < 1e200]
+    if crossing and end < min(crossing):
+        raise ValueError(
+            f"{log.source}: it ends at {end:.4g} s, before the first load has crossed at "
+            f"{min(crossing):.4g} s; check the load's speed and entry time"
+        )

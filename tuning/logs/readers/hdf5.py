@@ -1,0 +1,68 @@
+"""HDF5 files, with MATLAB's since version 7.3 and netCDF-4 among them: each group is a run."""
+
+from pathlib import Path
+
+import numpy as np
+
+from tuning.logs.readers.table import Table, damaged, table_of, word
+from tuning.optional import library
+
+MAGIC = b"\x89HDF\r\n\x1a\n"
+MATLAB = b"MATLAB 7.3 MAT-file"
+_RATES = ("sample_rate", "sampling_rate", "fs")
+
+
+def read_hdf5(path: Path) -> dict[str, Table]:
+    """Read an HDF5 file: one run for each group that holds lists of numbers, by its path.
+
+    Units are the attribute `units` or `unit` of a dataset. Times are a dataset called time, or
+    follow from an attribute `sample_rate` (Hz) of the group or the file.
+
+    Raises ValueError for a damaged file, ImportError without h5py.
+    """
+    h5py = library("h5py", "hdf5")
+    groups: dict[str, dict] = {}
+    units: dict[str, dict] = {}
+    rates = {}
+    try:
+        with h5py.File(path, "r") as file:
+
+            def visit(name, item):
+                numeric = isinstance(item, h5py.Dataset) and np.issubdtype(item.dtype, np.number)
+                if not numeric or item.size < 2 or name.startswith("#"):
+                    return
+                group, _, label = name.rpartition("/")
+                groups.setdefault(group, {})[label] = _numbers(item)
+                units.setdefault(group, {})[label] = _unit(item)
+                rates[group] = _rate(item.parent) or _rate(file)
+
+            file.visititems(visit)
+    except Exception as error:  # whatever h5py meets in a file that is not as it should be
+        raise damaged(path, error) from None
+    return {
+        group: table_of(f"{path}, group {group or '/'}", arrays, units[group], _clock(rates[group]))
+        for group, arrays in groups.items()
+    }
+
+
+def _numbers(dataset) -> np.ndarray:
+    """The numbers of a dataset, NaN where it says that none was measured."""
+    values = np.asarray(dataset[()], float)
+    fill = dataset.attrs.get("_FillValue")
+    if fill is not None:
+        values = np.where(values == np.ravel(fill)[0], np.nan, values)
+    # MATLAB keeps vectors as matrices of one column.
+    return np.ravel(values) if 1 in values.shape and values.ndim == 2 else values
+
+
+def _unit(dataset) -> str | None:
+    return word(dataset.attrs.get("units", dataset.attrs.get("unit")))
+
+
+def _rate(group) -> float | None:
+    found = [group.attrs[name] for name in _RATES if name in group.attrs]
+    return float(np.ravel(found[0])[0]) if found else None
+
+
+def _clock(rate: float | None):
+    return None if rate is None else lambda count: np.arange(count) / rate

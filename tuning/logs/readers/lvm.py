@@ -1,0 +1,183 @@
+"""LabVIEW measurement files (.lvm): a file header, then segments of header, names and rows.
+
+The format is described by National Instruments, "Specification for the LabVIEW Measurement File
+(.lvm)". Rows have one column of times, one for each channel, or none; the printed Delta_X is
+often rounded, so it is used only where a file has no times.
+"""
+
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from tuning.logs.readers.table import Table, numbers, read_text
+
+MAGIC = "LabVIEW Measurement"
+_END = "***End_of_Header***"
+_SPECIAL = ("***Start_Special***", "***End_Special***")
+
+
+@dataclass
+class _Segment:
+    """One segment while it is read: its header, its column headings and its rows."""
+
+    header: dict[str, list[str]]
+    headings: list[str] = field(default_factory=list)
+    rows: list[list[str]] = field(default_factory=list)
+    lines: list[int] = field(default_factory=list)
+
+
+def read_lvm(path: Path) -> Table:
+    """Read a LabVIEW measurement file; several segments are put one after the other in time.
+
+    A segment whose times start afresh is moved by the difference of the segments' start times.
+
+    Raises ValueError, naming file and line, for headers without end, segments with different
+    channels, channels with times of their own, and cells that are no numbers.
+    """
+    lines = read_text(path).splitlines()
+    if not lines[0].startswith(MAGIC):
+        raise ValueError(f"{path}, line 1: a LabVIEW measurement file starts with {MAGIC!r}")
+    file_header, first = _file_header(path, lines)
+    segments = _segments(path, lines, first, _separator(lines), file_header)
+    comma = file_header.get("Decimal_Separator", ["."])[0] == ","
+    parts = [_columns(path, segment, comma) for segment in segments]
+    names, units = parts[0][:2]
+    for segment, (other, _, _) in zip(segments, [part[:3] for part in parts], strict=True):
+        if other != names:
+            raise ValueError(
+                f"{path}, line {segment.lines[0]}: this segment has the channels "
+                f"{', '.join(other)}, the first one {', '.join(names)}"
+            )
+    values = _joined(path, segments, [part[2] for part in parts])
+    numbered = np.concatenate([segment.lines for segment in segments])
+    return Table(("time", *names), ("s", *units), values, numbered, time="time")
+
+
+def _separator(lines) -> str:
+    """Return the separator the header names; a tab if it names none."""
+    named = next((line for line in lines if line.startswith("Separator")), "Separator\tTab")
+    return "," if "Comma" in named else "\t"
+
+
+def _file_header(path, lines):
+    """Return the file header and the index of the line after it."""
+    separator = _separator(lines)
+    header = {}
+    for i, line in enumerate(lines):
+        if line.startswith(_END):
+            return header, i + 1
+        # With a decimal comma the file is separated by tabs, so this splits no number.
+        key, *cells = line.split(separator)
+        header[key.strip()] = [cell.strip() for cell in cells]
+    raise ValueError(f"{path}: the header has no end, {_END}")
+
+
+def _segments(path, lines, first, separator, file_header) -> list[_Segment]:
+    """Split the lines after the file header into segments."""
+    segments: list[_Segment] = []
+    header: dict[str, list[str]] | None = None
+    special = False
+    for number, line in enumerate(lines[first:], first + 1):
+        cells = [cell.strip() for cell in line.split(separator)]
+        if cells[0] in _SPECIAL:
+            special = cells[0] == _SPECIAL[0]
+        elif special or not any(cells):
+            continue
+        elif cells[0] == "Channels":
+            header = {**file_header, "Channels": cells[1:]}
+        elif header is not None:
+            if cells[0] == _END:
+                segments.append(_Segment(header))
+                header = None
+            else:
+                header[cells[0]] = cells[1:]
+        elif not segments:
+            segments.append(_Segment(file_header, headings=cells))
+        elif not segments[-1].headings:
+            segments[-1].headings = cells
+        else:
+            segments[-1].rows.append(cells)
+            segments[-1].lines.append(number)
+    segments = [segment for segment in segments if segment.rows]
+    if not segments:
+        raise ValueError(f"{path}: the log is empty: there is no row after the header")
+    return segments
+
+
+def _columns(path, segment: _Segment, decimal_comma: bool):
+    """Return names, units and values of a segment, time (s) being the first column of values."""
+    headings = segment.headings
+    if "Comment" in headings:
+        headings = headings[: headings.index("Comment")]
+    while headings and not headings[-1]:
+        headings = headings[:-1]
+    clocks = [i for i, heading in enumerate(headings) if heading == "X_Value"]
+    channels = [i for i, heading in enumerate(headings) if heading != "X_Value"]
+    timeless = segment.header.get("X_Columns", ["One"])[0] == "No"
+    used = channels if timeless else clocks + channels
+    if not channels or not (timeless or clocks):
+        raise ValueError(
+            f"{path}, line {segment.lines[0] - 1}: the column headings must be X_Value and the "
+            f"channels, not {', '.join(segment.headings)}"
+        )
+    rows = [[row[i] if i < len(row) else "" for i in used] for row in segment.rows]
+    names = tuple(headings[i] for i in channels)
+    values = numbers(path, [headings[i] for i in used], rows, segment.lines, decimal_comma)
+    times = values[:, : len(used) - len(channels)]
+    if timeless:
+        times = _counted(path, segment, decimal_comma)
+    elif np.any(times != times[:, :1]):
+        row = int(np.argmax(np.any(times != times[:, :1], axis=1)))
+        raise ValueError(
+            f"{path}, line {segment.lines[row]}: the channels have different times; "
+            "resample them to common times, or save them to separate files"
+        )
+    labels = segment.header.get("Y_Unit_Label", [])
+    units = tuple((labels[i] if i < len(labels) else "") or None for i in range(len(channels)))
+    return names, units, np.hstack([times[:, :1], values[:, -len(channels) :]])
+
+
+def _counted(path, segment: _Segment, decimal_comma: bool):
+    """Times of a segment without a column of times, from X0 and Delta_X."""
+    if "Delta_X" not in segment.header:
+        raise ValueError(f"{path}: the log has neither a column of times (X_Value) nor a Delta_X")
+    cells = [segment.header.get("X0", ["0"])[0], segment.header["Delta_X"][0]]
+    line = segment.lines[0]
+    start, step = numbers(path, ["X0", "Delta_X"], [cells], [line], decimal_comma)[0]
+    return (start + step * np.arange(len(segment.rows)))[:, None]
+
+
+def _joined(path, segments, values):
+    """Put segments one after the other; one that starts afresh is moved by its start time."""
+    joined = [values[0]]
+    for before, segment, rows in zip(segments, segments[1:], values[1:], strict=False):
+        if rows[0, 0] <= joined[-1][-1, 0]:
+            moved = joined[0][0, 0] + _seconds_between(path, segments[0], segment)
+            rows = np.column_stack([rows[:, 0] - rows[0, 0] + moved, rows[:, 1:]])
+        if rows[0, 0] <= joined[-1][-1, 0]:
+            raise ValueError(
+                f"{path}, line {segment.lines[0]}: this segment starts before the one of line "
+                f"{before.lines[0]} ends; save the segments to separate files"
+            )
+        joined.append(rows)
+    return np.concatenate(joined)
+
+
+def _seconds_between(path, first: _Segment, later: _Segment) -> float:
+    """Seconds from the start of one segment to that of another, from Date and Time."""
+    starts = []
+    for segment in (first, later):
+        date, time = (segment.header.get(key, [""])[0] for key in ("Date", "Time"))
+        whole, _, fraction = time.replace(",", ".").partition(".")
+        try:
+            start = datetime.strptime(f"{date} {whole}", "%Y/%m/%d %H:%M:%S")
+            starts.append((start, float(f"0.{fraction or 0}")))
+        except ValueError:
+            raise ValueError(
+                f"{path}, line {segment.lines[0]}: the times of segments start afresh, but this "
+                f"segment's Date {date!r} and Time {time!r} do not tell when it started"
+            ) from None
+    (day, part), (later_day, later_part) = starts
+    return (later_day - day).total_seconds() + later_part - part

@@ -1,0 +1,28 @@
+"""Classic netCDF files (netCDF-3); the newer ones are HDF5."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.io import netcdf_file
+
+from tuning.logs.readers.table import Table, damaged, table_of, word
+
+MAGIC = b"CDF"
+
+
+def read_netcdf(path: Path) -> dict[str, Table]:
+    """Read a classic netCDF file: one run, of the variables that are as long as the times.
+
+    Units are the attribute `units`. Raises ValueError for a damaged file.
+    """
+    try:
+        with netcdf_file(path, "r", mmap=False) as file:
+            arrays, units = {}, {}
+            for name, variable in file.variables.items():
+                # Text is an array of characters.
+                if variable.typecode() != "c" and np.size(variable.data) > 1:
+                    arrays[name] = np.array(variable.data, float)
+                    units[name] = word(getattr(variable, "units", None))
+    except Exception as error:  # scipy raises whatever its parser stumbles over
+        raise damaged(path, error) from None
+    return {"": table_of(str(path), arrays, units)}

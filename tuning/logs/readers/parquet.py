@@ -1,0 +1,35 @@
+"""Parquet files, by pyarrow."""
+
+from pathlib import Path
+
+import numpy as np
+
+from tuning.logs.readers.table import Table, damaged, table_of, word
+from tuning.optional import library
+
+MAGIC = b"PAR1"
+
+
+def read_parquet(path: Path) -> dict[str, Table]:
+    """Read a Parquet file: one run of its columns of numbers.
+
+    Units stand in brackets after names, or in the metadata `unit` of a column. A column of dates
+    becomes seconds since its first; what is null becomes NaN, which reading a log then speaks of.
+
+    Raises ValueError for a damaged file, ImportError without pyarrow.
+    """
+    pyarrow, parquet = library("pyarrow", "parquet"), library("pyarrow.parquet", "parquet")
+    try:
+        table = parquet.read_table(path)
+    except (OSError, pyarrow.ArrowException) as error:
+        raise damaged(path, error) from None
+    arrays, units = {}, {}
+    for field in table.schema:
+        values = table[field.name].to_numpy()
+        if values.dtype.kind == "M":
+            values = (values - values[0]) / np.timedelta64(1, "s")
+            units[field.name] = "s"
+        if values.dtype.kind in "fiu":
+            arrays[field.name] = values
+            units.setdefault(field.name, word((field.metadata or {}).get(b"unit")))
+    return {"": table_of(str(path), arrays, units)}

@@ -1,0 +1,214 @@
+"""Reading logs from files, with what is known about how they were made.
+
+    log = read_log("run7.csv")                        # units in the headings: time [s], d1 [mm]
+    log = read_log("run7.csv", units={"time": "s", "d1": "mm"}, columns=["d1"])
+
+Beside a log there may be a TOML file of the same stem, which says what the log does not:
+
+    time = "t"                                        # the column of times
+    [columns]                                         # only these are read
+    t = "ms"
+    d1 = { unit = "mm", sensor = 0, position = 0.3 }  # which sensor of the case it is, and where
+    a1 = { unit = "V", sensitivity = "100 mV/g" }     # volts of a transducer
+    u = { unit = "V", actuator = 0 }                  # the command to an actuator of the case
+    [[loads]]                                         # as in a case file
+    kind = "mass"
+    mass = 0.5
+    speed = 0.55
+    [[runs.fast.loads]]                               # those of one run, where a file has several
+    kind = "mass"
+    mass = 0.5
+    speed = 2.0
+
+A file may hold several runs: groups of a TDMS or HDF5 file, structs of a MATLAB file, or rows that
+differ in a column called run. `read_logs` reads them all.
+"""
+
+import dataclasses
+import difflib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tuning.logs.description import Sidecar, read_sidecar
+from tuning.logs.log import Log, check_samples
+from tuning.logs.quality import join_over
+from tuning.logs.readers import Table, is_time, read_tables
+from tuning.logs.units import UNITS, by_sensitivity, unit
+
+
+def read_log(
+    path: str | Path,
+    *,
+    columns: Sequence[str] | None = None,
+    units: Mapping[str, str] | str | None = None,
+    time: str | None = None,
+    run: str | None = None,
+    missing: str = "refuse",
+) -> Log:
+    """Read a log: separated values, LabVIEW (.lvm, .tdms), MATLAB, HDF5, netCDF or Parquet.
+
+    `columns` names the channels to keep, in this order; `units` gives the unit of columns by name
+    (or one for all channels) and wins over the file; `time` names the column of times, by default
+    the one called time or t, or the first with a unit of time. What is not given here is taken
+    from the TOML file beside the log, then from the log itself. Sampling is that of the times.
+    `run` names the run in a file of several. Samples that are `missing` (empty cells, NaN) are
+    refused unless it is "mask": then fits leave them out, and straight lines stand in for them.
+
+    Raises ValueError, naming file and line, for an empty or damaged log, unknown columns or units,
+    columns without a unit, cells that are not finite numbers, times that do not increase, and
+    several runs of which none is named.
+    """
+    runs = read_logs(path, columns=columns, units=units, time=time, run=run, missing=missing)
+    if len(runs) > 1:
+        names = ", ".join(repr(log.source.removeprefix(f"{path}:")) for log in runs)
+        raise ValueError(f"{path}: it holds {len(runs)} runs, {names}; name one, or use read_logs")
+    return runs[0]
+
+
+def read_logs(
+    path: str | Path,
+    *,
+    columns: Sequence[str] | None = None,
+    units: Mapping[str, str] | str | None = None,
+    time: str | None = None,
+    run: str | None = None,
+    missing: str = "refuse",
+) -> list[Log]:
+    """Read all runs in a file, one log for each; the rest is as for `read_log`.
+
+    Raises ValueError as `read_log` does, and for a `run` that is not in the file.
+    """
+    if missing not in ("refuse", "mask"):
+        raise ValueError(f'missing samples can be "refuse"d or "mask"ed, not {missing!r}')
+    path = Path(path)
+    tables = {
+        part: rows
+        for name, table in read_tables(path).items()
+        for part, rows in _split(name, table).items()
+    }
+    if run is not None and run not in tables:
+        raise ValueError(f"{path}: it has no run {run!r}; it has {', '.join(map(repr, tables))}")
+    side = read_sidecar(path)
+    if unknown := [name for name in side.runs if name not in tables]:
+        raise ValueError(
+            f"{path.with_suffix('.toml')}: runs.{unknown[0]} is no run of {path.name}; it has "
+            f"{', '.join(map(repr, tables))}"
+        )
+    chosen = tables if run is None else {run: tables[run]}
+    return [
+        _log(path, name if len(tables) > 1 else "", table, side, columns, units, time, missing)
+        for name, table in chosen.items()
+    ]
+
+
+def _split(name: str, table: Table) -> dict[str, Table]:
+    """The runs of a table: rows that differ in its column called run, if it has one."""
+    if "run" not in table.names:
+        return {name: table}
+    keys = table.values[:, table.names.index("run")]
+    return {
+        f"{name}/{key:g}" if name else f"{key:g}": dataclasses.replace(
+            table,
+            values=table.values[keys == key],
+            lines=None if table.lines is None else table.lines[keys == key],
+        )
+        for key in dict.fromkeys(keys.tolist())
+    }
+
+
+def _log(path, run, table: Table, side: Sidecar, columns, units, time, missing) -> Log:
+    """Make a log of one run, in SI units."""
+    names = _named(path, table.names)
+    clock = _time_column(path, table, time or side.time)
+    channels = list(columns or side.columns or [name for name in names if name != clock])
+    channels = [name for name in channels if name not in (clock, "run")]
+    for name in (*channels, *side.columns, *(units if isinstance(units, Mapping) else ())):
+        _check_column(path, name, names)
+    if not channels:
+        raise ValueError(f"{path}: there is no column besides the time, {clock!r}")
+    declared = units if isinstance(units, Mapping) else dict.fromkeys(channels, units)
+    found = [_unit_of(path, table, name, declared, side) for name in (clock, *channels)]
+    if found[0][1].quantity != "time":
+        raise ValueError(f"{path}: the column of times, {clock!r}, has the unit {found[0][0]!r}")
+    values = table.values[:, [names.index(name) for name in (clock, *channels)]]
+    values = values * np.array([unit.factor for _, unit in found])
+    valid, notes = np.isfinite(values), list(table.notes)
+    if missing == "mask":
+        values[:, 1:] = join_over(values[:, 0], values[:, 1:], valid[:, 1:])
+        notes += [
+            f"{count} missing samples of {name} are left out"
+            for name, count in zip(channels, np.sum(~valid[:, 1:], axis=0), strict=True)
+            if count
+        ]
+    source = f"{path}:{run}" if run else str(path)
+    check_samples(source, (clock, *channels), values, table.lines)
+    return Log(
+        times=values[:, 0],
+        values=values[:, 1:],
+        names=tuple(channels),
+        quantities=tuple(unit.quantity for _, unit in found[1:]),
+        units=tuple(text for text, _ in found[1:]),
+        source=source,
+        sensors=tuple(side.sensor(name) for name in channels),
+        positions=tuple(side.position(name) for name in channels),
+        actuators=tuple(side.actuator(name) for name in channels),
+        loads=side.loads_of(run),
+        valid=valid[:, 1:],
+        notes=tuple(notes),
+    )
+
+
+def _named(path, names):
+    """Return the column names, checked to be all there and all different."""
+    for i, name in enumerate(names):
+        if not name:
+            raise ValueError(f"{path}: column {i + 1} has no name")
+        if name in names[:i]:
+            raise ValueError(f"{path}: two columns are called {name!r}; rename one of them")
+    return names
+
+
+def _check_column(path, name, names) -> None:
+    if name in names:
+        return
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(names)}"
+    raise ValueError(f"{path}: the log has no column {name!r}; {hint}")
+
+
+def _time_column(path, table: Table, wanted: str | None) -> str:
+    """Return the name of the column of times."""
+    if wanted is not None:
+        _check_column(path, wanted, table.names)
+        return wanted
+    if table.time is not None:
+        return table.time
+    for name in table.names:
+        if is_time(name):
+            return name
+    for name, text in zip(table.names, table.units, strict=True):
+        if text in UNITS and UNITS[text].quantity == "time":
+            return name
+    raise ValueError(
+        f"{path}: no column is called time or has a unit of time; say which it is, "
+        f'e.g. time={table.names[0]!r}, or time = "{table.names[0]}" in {path.stem}.toml'
+    )
+
+
+def _unit_of(path, table: Table, name: str, declared: Mapping[str, str | None], side: Sidecar):
+    """Return the unit of a column, as text and as what it means."""
+    in_file = table.units[table.names.index(name)]
+    text = declared.get(name) or side.unit(name) or in_file
+    if not text:
+        raise ValueError(
+            f"{path}, column {name!r}: no unit found; write it in the heading, {name} [mm], "
+            f'pass units={{"{name}": "mm"}}, or put {name} = "mm" under [columns] '
+            f"in {path.with_suffix('.toml').name}"
+        )
+    try:
+        logged, sensitivity = unit(text), side.sensitivity(name)
+        return text, by_sensitivity(sensitivity, logged) if sensitivity else logged
+    except ValueError as error:
+        raise ValueError(f"{path}, column {name!r}: {error}") from None
