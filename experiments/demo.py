@@ -25,13 +25,13 @@ from jaxbeam.plot import plot_sweep
 FOLDER = "out/demo"
 LOGS = ("log_1.csv", "log_2.csv", "log_3.csv")
 MASS, SPEED = "loads.0.mass", "loads.0.speed"
-MAP = {MASS: np.linspace(0.05, 0.6, 45), SPEED: np.linspace(0.5, 6.0, 45)}  # kg, m/s
-SLOWEST, AFTER = 0.5, 0.3  # m/s; s of free vibration
+SWEPT_VALUES = {MASS: np.linspace(0.05, 0.6, 45), SPEED: np.linspace(0.5, 6.0, 45)}  # kg, m/s
+SLOWEST, FREE_VIBRATION = 0.5, 0.3  # m/s; s of free vibration
 # Rate and proportional gain of a loop that an engineer would begin with, and where they may go.
 HAND_SET = jb.PD(gains=[300.0], rate_gains=[3.0], lag=[0.002], period=0.004)
-FREE = {"controller.gains.0": (0.0, 3000.0), "controller.rate_gains.0": (0.0, 20.0)}
+FREE_GAINS = {"controller.gains.0": (0.0, 3000.0), "controller.rate_gains.0": (0.0, 20.0)}
 MODES = 3  # of the model that the controller is tuned on
-CASES = tuning.LoadCases(
+LOAD_CASES = tuning.LoadCases(
     training=tuning.grid({MASS: [0.2, 0.4], SPEED: [1.5, 2.0]}),
     held_out=tuning.grid({MASS: [0.25, 0.35], SPEED: [1.6, 1.9]}),
 )
@@ -44,11 +44,11 @@ def run(folder: str | Path | None = None, json: bool = False) -> None:
     Prints what was found, or everything as JSON. Without a folder a fresh one is made below `out`.
     Raises FileExistsError if a given folder is not empty.
     """
-    target = _fresh() if folder is None else Path(folder)
+    target = _new_folder() if folder is None else Path(folder)
     if target.exists() and any(target.iterdir()):
         raise FileExistsError(f"the folder {target} is not empty; choose another one with -o")
 
-    def say(words: str) -> None:
+    def print_progress(words: str) -> None:
         if not json:
             print(words, flush=True)
 
@@ -56,73 +56,81 @@ def run(folder: str | Path | None = None, json: bool = False) -> None:
         case = jb.load_case(data / "rig.toml")
         logs = [tuning.read_log(data / name) for name in LOGS]
         truth = tomllib.loads((data / "truth.toml").read_text())
-    say(f"1. {case.title}: {len(truth)} numbers from {len(logs)} logs; about half a minute ...")
+    print_progress(
+        f"1. {case.title}: {len(truth)} numbers from {len(logs)} logs; about half a minute ..."
+    )
     fit = tuning.identify(case, logs, dict.fromkeys(truth))
-    say(f"{_table(fit, truth)}\n{fit.verdict}")
+    print_progress(f"{_fit_table(fit, truth)}\n{fit.verdict}")
     target.mkdir(parents=True, exist_ok=True)
     fit.plot().savefig(target / "fit.png")
     jb.save_case(fit.case, target / "fit.toml")
     record = jb.simulate(fit.cases[0])
     record.to_netcdf(target / "record.nc")
 
-    runs = np.prod([values.size for values in MAP.values()])
-    say(f"\n2. The identified rig under {runs} loads of other masses and speeds ...")
-    crossed = jb.sweep(loaded(fit.case, SLOWEST), MAP, progress=False)
-    plot_sweep(crossed).savefig(target / "map.png")
-    crossed.to_netcdf(target / "map.nc")
-    say(_worst(crossed))
+    runs = np.prod([values.size for values in SWEPT_VALUES.values()])
+    print_progress(f"\n2. The identified rig under {runs} loads of other masses and speeds ...")
+    sweep_results = jb.sweep(with_one_mass(fit.case, SLOWEST), SWEPT_VALUES, progress=False)
+    plot_sweep(sweep_results).savefig(target / "map.png")
+    sweep_results.to_netcdf(target / "map.nc")
+    print_progress(_worst_run_text(sweep_results))
 
-    say("\n3. A controller for it, tuned by gradients on four loads, proven on four others ...")
-    tuned = tuning.tune(controlled(fit.case), FREE, CASES, steps=STEPS, progress=False)
+    print_progress(
+        "\n3. A controller for it, tuned by gradients on four loads, proven on four others ..."
+    )
+    tuned = tuning.tune(
+        with_initial_controller(fit.case), FREE_GAINS, LOAD_CASES, steps=STEPS, progress=False
+    )
     tuned.plot().savefig(target / "tuned.png")
     jb.save_case(tuned.case, target / "tuned.toml")
-    say(str(tuned))
+    print_progress(str(tuned))
 
     summary = fit.to_dict() | {"truth": truth, "tuned": tuned.to_dict()}
     (target / "demo.json").write_text(text.dumps(summary, indent=2))
     if json:
         print(text.dumps(summary))
-    say(f"\nwritten to {target}: {', '.join(sorted(path.name for path in target.iterdir()))}")
+    print_progress(
+        f"\nwritten to {target}: {', '.join(sorted(path.name for path in target.iterdir()))}"
+    )
 
 
-def loaded(case: jb.Case, slowest: float) -> jb.Case:
+def with_one_mass(case: jb.Case, slowest: float) -> jb.Case:
     """The identified rig under one mass, long enough for a slow one (m/s)."""
-    duration = float(case.beam.length) / slowest + AFTER
+    duration = float(case.beam.length) / slowest + FREE_VIBRATION
     return dataclasses.replace(
         case, loads=(jb.MovingMass(mass=0.3, speed=slowest),), run=jb.Run(duration, 200.0)
     )
 
 
-def controlled(case: jb.Case) -> jb.Case:
+def with_initial_controller(case: jb.Case) -> jb.Case:
     """The identified rig with the hand-set loop from the sensor at midspan to the shaker."""
     left, middle, right = case.sensors
     return dataclasses.replace(
-        loaded(case, min(run[SPEED] for run in CASES.training)),
+        with_one_mass(case, min(run[SPEED] for run in LOAD_CASES.training)),
         beam=dataclasses.replace(case.beam, modes=MODES),
         sensors=(middle, left, right),
         controller=HAND_SET,
     )
 
 
-def _worst(crossed) -> str:
+def _worst_run_text(sweep_results) -> str:
     """The largest deflection of the map, in words."""
-    peaks = crossed.peak_deflection
+    peaks = sweep_results.peak_deflection
     at = peaks.isel(peaks.argmax(list(peaks.dims)))
-    lost = (crossed.contact_lost_time.notnull().any("load")).mean()
+    lift_off_share = (sweep_results.contact_lost_time.notnull().any("load")).mean()
     return (
         f"largest deflection {1e3 * float(at):.3g} mm, at {str(at.sensor.values)}, under"
         f" {float(at[MASS]):.3g} kg at {float(at[SPEED]):.3g} m/s;"
-        f" in {float(lost):.0%} of the runs the load would lift off"
+        f" in {float(lift_off_share):.0%} of the runs the load would lift off"
     )
 
 
-def _fresh() -> Path:
+def _new_folder() -> Path:
     """A folder that does not exist yet: out/demo, out/demo-2, ..."""
     names = (FOLDER if i == 1 else f"{FOLDER}-{i}" for i in itertools.count(1))
     return next(Path(name) for name in names if not Path(name).exists())
 
 
-def _table(fit: tuning.Fit, truth: dict[str, float]) -> str:
+def _fit_table(fit: tuning.Fit, truth: dict[str, float]) -> str:
     """Fitted numbers with their 95 % intervals beside the truth."""
     width, hits = max(map(len, truth)), 0
     lines = [
@@ -134,7 +142,7 @@ def _table(fit: tuning.Fit, truth: dict[str, float]) -> str:
         hits += inside
         note = "" if inside else "  outside"
         lines.append(
-            f"{address:{width}}  {fit.starts[i]:11.5g}  {fit.values[i]:11.5g}  "
+            f"{address:{width}}  {fit.start_values[i]:11.5g}  {fit.values[i]:11.5g}  "
             f"{low:11.5g} to {high:<10.5g}  {truth[address]:10.5g}{note}"
         )
     lines.append(f"{hits} of {len(truth)} intervals hold the truth (95 % should)")

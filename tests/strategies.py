@@ -145,7 +145,7 @@ def loads(draw, length: float):
 
 @st.composite
 def cases(draw) -> Case:
-    """Cases that pass `checks.check`, with up to two of everything."""
+    """Cases that pass `checks.check_arguments`, with up to two of everything."""
     beam = draw(beams())
     length = float(beam.length)
     return Case(

@@ -4,7 +4,7 @@ import importlib
 from types import ModuleType
 
 
-def library(name: str, extra: str) -> ModuleType:
+def import_extra(name: str, extra: str) -> ModuleType:
     """Import a library of one of jaxbeam's extras. Raises ImportError, saying how to install it."""
     try:
         return importlib.import_module(name)

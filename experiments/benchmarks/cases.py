@@ -24,7 +24,7 @@ import numpy as np
 
 import jaxbeam as jb
 from experiments.benchmarks.rivals import baselines
-from experiments.benchmarks.rivals.crossing import MOMENT, PATCH, SPAN, Rig
+from experiments.benchmarks.rivals.crossing import MOMENT, PATCH, SPAN, PinnedBeam
 from experiments.benchmarks.sweep import TOLERANCE
 from experiments.benchmarks.timing import peak_memory, time_call
 
@@ -32,29 +32,29 @@ LOOPS = {"open": None, "sampled": 0.01, "instant": None}  # s between two comman
 GAIN = 1e3  # V/m
 SENSORS = {1: (0.3, 0.15, 0.45), 2: (0.3, 0.9, 0.15)}  # m; each patch hears that of its number
 SLOWEST, FASTEST = 0.3, 10.0  # m/s
-RATE = 100.0  # Hz, of histories and of the record of a loop
-TIMED = 6  # runs by scipy from which its time is scaled
+SAMPLE_RATE = 100.0  # Hz, of histories and of the record of a loop
+SCIPY_RUNS = 6  # runs by scipy from which its time is scaled
 
 
-def plain(spans: int, loop: str, modes: int) -> Rig:
+def pinned_beam(spans: int, loop: str, modes: int) -> PinnedBeam:
     """The rig as the baselines take it."""
     gain = None if loop == "open" else GAIN
-    return Rig(modes, SPAN * spans, sensors=SENSORS[spans], spans=spans, gain=gain,
+    return PinnedBeam(modes, SPAN * spans, sensors=SENSORS[spans], spans=spans, gain=gain,
                period=LOOPS[loop])  # fmt: skip
 
 
-def case(rig: Rig) -> jb.Case:
+def jaxbeam_case(pinned: PinnedBeam) -> jb.Case:
     """The same rig as jaxbeam takes it, long enough for the slowest crossing."""
     beam = jb.Beam(
-        length=rig.length,
-        flexural_rigidity=rig.flexural_rigidity,
-        mass_per_length=rig.mass_per_length,
-        damping_ratio=rig.damping_ratio,
-        modes=rig.modes,
+        length=pinned.length,
+        flexural_rigidity=pinned.flexural_rigidity,
+        mass_per_length=pinned.mass_per_length,
+        damping_ratio=pinned.damping_ratio,
+        modes=pinned.modes,
     )
     parts = {}
-    if rig.gain is not None:
-        starts = SPAN * np.arange(rig.spans)
+    if pinned.gain is not None:
+        starts = SPAN * np.arange(pinned.spans)
         parts["actuators"] = [
             jb.Patch(
                 start=start + PATCH[0],
@@ -64,31 +64,33 @@ def case(rig: Rig) -> jb.Case:
             )
             for start in starts
         ]
-        parts["controller"] = jb.Feedback(gains=[rig.gain] * rig.spans, period=rig.period)
+        parts["controller"] = jb.Feedback(gains=[pinned.gain] * pinned.spans, period=pinned.period)
     return jb.Case(
         beam,
-        supports=[jb.Support(SPAN)] if rig.spans == 2 else [],
-        sensors=[jb.Sensor(x) for x in rig.sensors],
+        supports=[jb.Support(SPAN)] if pinned.spans == 2 else [],
+        sensors=[jb.Sensor(x) for x in pinned.sensors],
         loads=[jb.MovingMass(mass=0.5, speed=1.0)],
-        run=jb.Run(duration=rig.length / SLOWEST + baselines.FREE, sample_rate=RATE),
+        run=jb.Run(
+            duration=pinned.length / SLOWEST + baselines.FREE_VIBRATION, sample_rate=SAMPLE_RATE
+        ),
         **parts,
     )
 
 
-def measure(spans: int, loop: str, kept: str, modes: int, side: int) -> dict[str, float]:
+def measure(spans: int, loop: str, saved: str, modes: int, side: int) -> dict[str, float]:
     """Times (s; of others in ours), memory (MiB), errors of a kind of sweep, `side` by `side`."""
-    rig, histories = plain(spans, loop, modes), kept == "histories"
+    beam, histories = pinned_beam(spans, loop, modes), saved == "histories"
     masses, speeds = np.linspace(0.1, 1.0, side), np.linspace(SLOWEST, FASTEST, side)
-    over, whole = {"loads.0.mass": masses, "loads.0.speed": speeds}, case(rig)
+    over, base_case = {"loads.0.mass": masses, "loads.0.speed": speeds}, jaxbeam_case(beam)
 
     def ours():
         options = {"progress": False, "tolerance": TOLERANCE, "histories": histories}
-        return jb.sweep(whole, over, **options)
+        return jb.sweep(base_case, over, **options)
 
     took = time_call(ours, repeat=3)
     memory, found = peak_memory(), ours()
-    some = np.ix_(*[np.unique(np.linspace(0, side - 1, 4).astype(int))] * 2)
-    chosen = masses[some[0].ravel()], speeds[some[1].ravel()]
+    checked = np.ix_(*[np.unique(np.linspace(0, side - 1, 4).astype(int))] * 2)
+    chosen = masses[checked[0].ravel()], speeds[checked[1].ravel()]
     times = found.time.values if histories else None
 
     def solve(rig, masses, speeds, **tolerance):
@@ -97,35 +99,35 @@ def measure(spans: int, loop: str, kept: str, modes: int, side: int) -> dict[str
         return baselines.scipy_peaks(rig, masses, speeds)
 
     def worst(values):
-        return float(np.max(np.abs(values - strict) / size))
+        return float(np.max(np.abs(values - reference) / size))
 
     if histories:
-        strict = solve(rig, *chosen, tolerance=baselines.TIGHT)
-        size = np.max(np.abs(strict), axis=(2, 3), keepdims=True)
-        error = worst(found.deflection.values[some])
+        reference = solve(beam, *chosen, tolerance=baselines.REFERENCE_TOLERANCE)
+        size = np.max(np.abs(reference), axis=(2, 3), keepdims=True)
+        error = worst(found.deflection.values[checked])
     else:
-        size = strict = baselines.reference_peaks(rig, *chosen)
-        error = worst(found.peak_deflection.values[some])
-    scaled = baselines.scipy_time(solve, rig, masses, speeds, TIMED, 1, ours)
+        size = reference = baselines.reference_peaks(beam, *chosen)
+        error = worst(found.peak_deflection.values[checked])
+    scaled = baselines.scipy_time(solve, beam, masses, speeds, SCIPY_RUNS, 1, ours)
     row = {
         "run": took.run,
         "compile": took.compile,
         "memory": memory,
         "error": error,
         "scipy": scaled.ratio,
-        "scipy_error": worst(solve(rig, *chosen)),
+        "scipy_error": worst(solve(beam, *chosen)),
     }
     if loop == "open" and not histories:
 
         def others():
-            return baselines.diffrax_peaks(rig, masses, speeds, shared_steps=True)
+            return baselines.diffrax_peaks(beam, masses, speeds, shared_steps=True)
 
-        row["diffrax"] = time_call(others, repeat=1, beside=ours).ratio
-        row["diffrax_error"] = worst(np.asarray(others())[some])
+        row["diffrax"] = time_call(others, repeat=1, reference=ours).ratio
+        row["diffrax_error"] = worst(np.asarray(others())[checked])
     return row
 
 
-def apart(*kind) -> dict[str, float]:
+def measure_in_subprocess(*kind) -> dict[str, float]:
     """The same, measured in a process of its own."""
     command = [sys.executable, "-m", "experiments.benchmarks.cases", "--measure", *map(str, kind)]
     found = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
@@ -157,7 +159,7 @@ def main() -> None:
           " | scipy | diffrax |")  # fmt: skip
     print("| ---: | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     for kind in itertools.product(given.spans, given.loops, given.keep, given.modes):
-        row = apart(*kind, given.side)
+        row = measure_in_subprocess(*kind, given.side)
         rivals = [
             f"{row[name]:.3g} ({row[name + '_error']:.0e})" if name in row else ""
             for name in ("scipy", "diffrax")

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import jaxbeam as jb
-from experiments.benchmarks.sweep import rig
+from experiments.benchmarks.sweep import one_span_case
 
 
 def grid(runs: int) -> dict[str, np.ndarray]:
@@ -28,13 +28,13 @@ def grid(runs: int) -> dict[str, np.ndarray]:
     }
 
 
-def seconds(runs: int, client, store: Path) -> tuple[int, float]:
+def time_sweep(runs: int, client, store: Path) -> tuple[int, float]:
     """How many runs were swept into a store, and how long it took (s).
 
     Raises RuntimeError if one failed.
     """
     start = time.perf_counter()
-    found = jb.sweep(rig(3), grid(runs), store=store, progress=False, client=client)
+    found = jb.sweep(one_span_case(3), grid(runs), store=store, progress=False, client=client)
     took = time.perf_counter() - start
     if found.failed.any():
         raise RuntimeError(f"{int(found.failed.sum())} runs failed")
@@ -59,7 +59,7 @@ def main() -> None:
         Client(machines, set_as_default=False) as client,
     ):
         for runs in (given.runs // 10, given.runs):
-            count, took = seconds(runs, client, Path(folder) / f"{runs}.zarr")
+            count, took = time_sweep(runs, client, Path(folder) / f"{runs}.zarr")
             rate = count / took
             memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             hours = 1e9 / rate * given.workers / 3600

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 
-FIRST = 4096  # runs of the sweep by which everything is compiled
+COMPILED_RUNS = 4096  # runs of the sweep by which everything is compiled
 
 
 def measure(runs: int) -> dict[str, float]:
@@ -28,16 +28,16 @@ def measure(runs: int) -> dict[str, float]:
     import xarray
 
     from experiments.benchmarks.cluster import grid
-    from experiments.benchmarks.sweep import rig
+    from experiments.benchmarks.sweep import one_span_case
     from experiments.benchmarks.timing import peak_memory
     from jaxbeam.sweeps.sweep import sweep
 
-    case, took, over = rig(3), [], grid(runs)
+    case, took, over = one_span_case(3), [], grid(runs)
     xarray.Dataset({"loaded": ("run", [0.0])})
     # Blocks depend on how many masses there are: with all of them, some speeds compile all.
     some = over | {"loads.0.speed": over["loads.0.speed"][:: -(-len(over["loads.0.speed"]) // 16)]}
     before = 0.0
-    for given in (grid(FIRST), grid(FIRST), some, over):
+    for given in (grid(COMPILED_RUNS), grid(COMPILED_RUNS), some, over):
         before = peak_memory()
         start = time.perf_counter()
         found = sweep(case, given, progress=False)
@@ -48,7 +48,7 @@ def measure(runs: int) -> dict[str, float]:
     return {"first": took[0], "again": took[1], "run": took[3], "before": before, "peak": peak}
 
 
-def apart(runs: int, cache: str) -> dict[str, float]:
+def measure_in_subprocess(runs: int, cache: str) -> dict[str, float]:
     """The same, measured in a process of its own with a persistent cache in a folder."""
     settings = {
         "JAX_COMPILATION_CACHE_DIR": cache,
@@ -72,14 +72,17 @@ def main() -> None:
         print(json.dumps(measure(given.measure)))
         return
     with tempfile.TemporaryDirectory() as cache:
-        cold, warm = apart(FIRST, cache), apart(FIRST, cache)
+        cold, warm = (
+            measure_in_subprocess(COMPILED_RUNS, cache),
+            measure_in_subprocess(COMPILED_RUNS, cache),
+        )
         print("| compiling a sweep | seconds |\n| --- | ---: |")
         for name, found in {"cold": cold, "from the persistent cache": warm}.items():
             print(f"| {name} | {found['first'] - found['again']:.2f} |", flush=True)
         print("\n| runs | seconds | us a run | peak MiB | bytes a run above what was held before |")
         print("| ---: | ---: | ---: | ---: | ---: |")
         for runs in given.runs:
-            found, count = apart(runs, cache), round(runs**0.5) ** 2
+            found, count = measure_in_subprocess(runs, cache), round(runs**0.5) ** 2
             more = (found["peak"] - found["before"]) * 2**20 / count
             print(
                 f"| {count} | {found['run']:.2f} | {1e6 * found['run'] / count:.1f} |"

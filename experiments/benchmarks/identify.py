@@ -15,11 +15,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import jaxbeam as jb
-from experiments.benchmarks.rivals.crossing import Rig, crossing_rate
+from experiments.benchmarks.rivals.crossing import PinnedBeam, crossing_rate
 from tuning import Log
-from tuning.fit.dataset import prepare
-from tuning.fit.least_squares import Search
-from tuning.parameters.free import free_numbers
+from tuning.fit.dataset import make_dataset
+from tuning.fit.least_squares import LeastSquares
+from tuning.parameters.free import free_parameters
 
 TRUTH = {
     "beam.flexural_rigidity": 11.68,
@@ -28,28 +28,28 @@ TRUTH = {
     "sensors.0.position": 0.15,
     "sensors.1.position": 0.3,
 }
-STARTS = np.array([11.0, 0.56, 0.02, 0.14, 0.31])
+INITIAL_VALUES = np.array([11.0, 0.56, 0.02, 0.14, 0.31])
 SPEEDS = np.linspace(0.8, 4.0, 10)  # m/s, one for each log
-MASS, NOISE, RATE, MODES, FREE = 0.5, 1e-5, 500.0, 3, 0.3
+MASS, NOISE, RATE, MODES, FREE_VIBRATION = 0.5, 1e-5, 500.0, 3, 0.3
 TOLERANCE = 1e-11  # of DOP853, relative to the sizes of the states
 STEP = 1e-5  # of the differences, relative to each number
 
 
-def crossing(values: np.ndarray, speed: float, times: np.ndarray) -> np.ndarray:
+def scipy_deflections(values: np.ndarray, speed: float, times: np.ndarray) -> np.ndarray:
     """Deflections (time, sensor) in m while a mass crosses and after, by DOP853."""
-    rig = replace(
-        Rig(MODES),
+    beam = replace(
+        PinnedBeam(MODES),
         flexural_rigidity=values[0],
         mass_per_length=values[1],
         damping_ratio=values[2],
         sensors=(values[3], values[4]),
     )
-    size = (rig.state_sizes[:, :, None] * MASS).ravel()
-    exit_time = rig.length / speed
+    size = (beam.state_scales[:, :, None] * MASS).ravel()
+    exit_time = beam.length / speed
     settings = {"method": "DOP853", "rtol": 1e-13, "atol": TOLERANCE * size}
 
     def during(masses):
-        rate = crossing_rate(rig, np.array(masses), speed)
+        rate = crossing_rate(beam, np.array(masses), speed)
         return lambda t, y: rate(t, y.reshape(2, MODES, 1)).ravel()
 
     on = times < exit_time - 1e-9
@@ -61,7 +61,7 @@ def crossing(values: np.ndarray, speed: float, times: np.ndarray) -> np.ndarray:
         during([0.0]), (exit_time, later[-1]), first[:, -1], t_eval=later, **settings
     ).y
     states = np.hstack([first[:, :-1], second])
-    return (rig.sensor_shapes @ states[:MODES]).T
+    return (beam.sensor_shapes @ states[:MODES]).T
 
 
 def make_logs() -> list[Log]:
@@ -69,8 +69,8 @@ def make_logs() -> list[Log]:
     rng = np.random.default_rng(0)
     logs = []
     for i, speed in enumerate(SPEEDS):
-        times = np.arange(int((0.6 / speed + FREE) * RATE)) / RATE
-        clean = crossing(np.array(list(TRUTH.values())), speed, times)
+        times = np.arange(int((0.6 / speed + FREE_VIBRATION) * RATE)) / RATE
+        clean = scipy_deflections(np.array(list(TRUTH.values())), speed, times)
         values = clean + NOISE * rng.normal(size=clean.shape)
         load = jb.MovingMass(mass=MASS, speed=speed)
         words = ("left", "middle"), ("deflection",) * 2, ("m",) * 2, f"log {i}"
@@ -82,15 +82,15 @@ def case() -> jb.Case:
     """The rig with the starts of the search."""
     beam = jb.Beam(
         length=0.6,
-        flexural_rigidity=STARTS[0],
-        mass_per_length=STARTS[1],
-        damping_ratio=STARTS[2],
+        flexural_rigidity=INITIAL_VALUES[0],
+        mass_per_length=INITIAL_VALUES[1],
+        damping_ratio=INITIAL_VALUES[2],
         modes=MODES,
     )
-    return jb.Case(beam, sensors=[jb.Sensor(STARTS[3]), jb.Sensor(STARTS[4])])
+    return jb.Case(beam, sensors=[jb.Sensor(INITIAL_VALUES[3]), jb.Sensor(INITIAL_VALUES[4])])
 
 
-def by_scipy(logs: list[Log]) -> tuple[np.ndarray, int, float]:
+def fit_by_scipy(logs: list[Log]) -> tuple[np.ndarray, int, float]:
     """Values by scipy's least squares with differences, evaluations of all logs, and seconds."""
     calls = 0
 
@@ -98,35 +98,41 @@ def by_scipy(logs: list[Log]) -> tuple[np.ndarray, int, float]:
         nonlocal calls
         calls += 1
         parts = [
-            (log.values - crossing(values, speed, log.times)) / NOISE
+            (log.values - scipy_deflections(values, speed, log.times)) / NOISE
             for log, speed in zip(logs, SPEEDS, strict=True)
         ]
         return np.concatenate([part.ravel() for part in parts])
 
     begin = time.perf_counter()
     found = least_squares(
-        residuals, STARTS, x_scale=STARTS, diff_step=STEP, xtol=1e-9, ftol=1e-12, gtol=1e-12
+        residuals,
+        INITIAL_VALUES,
+        x_scale=INITIAL_VALUES,
+        diff_step=STEP,
+        xtol=1e-9,
+        ftol=1e-12,
+        gtol=1e-12,
     )
     return found.x, calls, time.perf_counter() - begin
 
 
-def run() -> dict[str, float]:
+def time_fits() -> dict[str, float]:
     """Time both; seconds, their ratio, and the largest relative difference of the optima."""
     logs = make_logs()
     begin = time.perf_counter()
-    campaign = prepare(case(), logs)
-    numbers = free_numbers(campaign.cases, dict.fromkeys(TRUTH), 1.0)
-    search = Search(campaign, numbers)
-    found = search.estimate(campaign.measured)
+    dataset = make_dataset(case(), logs)
+    numbers = free_parameters(dataset.cases, dict.fromkeys(TRUTH), 1.0)
+    search = LeastSquares(dataset, numbers)
+    found = search.solve(dataset.measured)
     first = time.perf_counter() - begin
     begin = time.perf_counter()
-    found = search.estimate(campaign.measured)
+    found = search.solve(dataset.measured)
     again = time.perf_counter() - begin
-    values, calls, seconds = by_scipy(logs)
+    values, calls, seconds = fit_by_scipy(logs)
     # A fit finds the noise; for the same weights as scipy's it is given.
     noise = np.full(found.noise.shape, NOISE)
-    given = search.scale(found.point, noise)[None], search.weights(noise), campaign.measured
-    points, _ = search.minimise(found.point[None], *given, np.ones(len(numbers), bool))
+    given = search.step_scale(found.unbounded, noise)[None], search.weights(noise), dataset.measured
+    points, _ = search.minimise(found.unbounded[None], *given, np.ones(len(numbers), bool))
     ours = search.values_at(points[0])
     return {
         "first_fit_s": first,
@@ -142,7 +148,7 @@ def run() -> dict[str, float]:
 
 def main() -> None:
     """Print the comparison."""
-    found = run()
+    found = time_fits()
     print(f"jaxbeam, compiled:              {found['fit_s']:8.2f} s")
     print(f"jaxbeam, compiling included:    {found['first_fit_s']:8.2f} s")
     print(f"scipy, differences and DOP853:  {found['scipy_s']:8.2f} s, "

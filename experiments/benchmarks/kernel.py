@@ -19,9 +19,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from experiments.benchmarks.rivals.crossing import GRAVITY, Rig
-from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, rig, sweep_peaks
-from experiments.benchmarks.timing import best_in_turn
+from experiments.benchmarks.rivals.crossing import GRAVITY, PinnedBeam
+from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, one_span_case, sweep_peaks
+from experiments.benchmarks.timing import interleaved_best
 from jaxbeam.integrator.propagators import GAUSS, LOOKED
 from jaxbeam.numerics.peak_search import reach, through
 from jaxbeam.sweeps import programs
@@ -44,38 +44,49 @@ def build(modes: int, folder: Path) -> Library:
     return ctypes.CDLL(str(target)).crossing
 
 
-def prepare(modes: int) -> tuple[np.ndarray, list]:
+def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     """The beam as one array, and for each speed what a crossing takes: all as kernel.c has it."""
-    case = rig(modes)
+    case = one_span_case(modes)
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
-    work = make_order(case, over, False, False, TOLERANCE, "double").work()
-    steps, _ = work.steps()
-    wanted = np.ones(SPEEDS.size, bool)
-    rigs = jax.tree.map(lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), work.rigs)
-    pace = steps, np.zeros(steps.size, int)
-    found = programs.riggings(work.job(), wanted, rigs, work.tasks.heavy, pace)
-    riggings = jax.tree.map(np.asarray, found)
-    plain = Rig(modes)
-    rates = riggings.rig.state_matrix[0, :, 1, :]
-    looked = np.array(LOOKED), through(LOOKED)[: len(LOOKED)], reach(LOOKED)
+    runner = make_order(case, over, False, False, TOLERANCE, "double").work()
+    steps, _ = runner.steps()
+    mask = np.ones(SPEEDS.size, bool)
+    models = jax.tree.map(lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), runner.rigs)
+    step_size = steps, np.zeros(steps.size, int)
+    found = programs.riggings(runner.job(), mask, models, runner.tasks.heavy, step_size)
+    discrete_models = jax.tree.map(np.asarray, found)
+    pinned_beam = PinnedBeam(modes)
+    rates = discrete_models.rig.state_matrix[0, :, 1, :]
+    peak_search_points = np.array(LOOKED), through(LOOKED)[: len(LOOKED)], reach(LOOKED)
     # Signs of modes are free: those of jaxbeam are seen in its rows for the sensors at rest.
-    seen, angles = riggings.watch[0, 0, :3, :, 0], np.outer(plain.sensors, plain.wavenumbers)
+    seen, angles = (
+        discrete_models.watch[0, 0, :3, :, 0],
+        np.outer(pinned_beam.sensors, pinned_beam.wavenumbers),
+    )
     signs = np.where(np.sum(seen * np.sin(angles), axis=0) < 0, -1.0, 1.0)
-    numbers = [plain.length, GRAVITY], plain.amplitude * signs, GAUSS, *looked, rates
-    parts = [*numbers, plain.frequencies**2, riggings.flexibility[0]]
+    numbers = (
+        [pinned_beam.length, GRAVITY],
+        pinned_beam.mode_amplitudes * signs,
+        GAUSS,
+        *peak_search_points,
+        rates,
+    )
+    parts = [*numbers, pinned_beam.frequencies**2, discrete_models.flexibility[0]]
     beam = np.concatenate([np.ravel(part) for part in parts])
     crossings = []
-    for i, speed in enumerate(work.tasks.heavy[:, 0]):
-        task = jax.tree.map(lambda leaf, i=i: leaf[i], riggings)
+    for i, speed in enumerate(runner.tasks.heavy[:, 0]):
+        task = jax.tree.map(lambda leaf, i=i: leaf[i], discrete_models)
         on, last = np.flatnonzero(task.grid.counts)  # the crossing, and what comes after it
         kinds = [int(task.grid.kind[panel]) for panel in (on, last)]
         span = float(task.grid.lengths[kinds[0]])
         counts = int(task.grid.counts[on]), int(task.grid.counts[last])
-        crossings.append((*(_answers(task, kind) for kind in kinds), float(speed), span, *counts))
+        crossings.append(
+            (*(_step_matrices(task, kind) for kind in kinds), float(speed), span, *counts)
+        )
     return beam, crossings
 
 
-def _answers(task, kind: int) -> np.ndarray:
+def _step_matrices(task, kind: int) -> np.ndarray:
     step = task.step
     parts = (
         step.drift_nodes[kind],
@@ -88,7 +99,7 @@ def _answers(task, kind: int) -> np.ndarray:
     return np.concatenate([np.ravel(part) for part in parts])
 
 
-def peaks(library: Library, beam: np.ndarray, crossings: list) -> np.ndarray:
+def kernel_peaks(library: Library, beam: np.ndarray, crossings: list) -> np.ndarray:
     """Peaks (mass, speed, sensor) by the kernel."""
 
     def at(array):
@@ -113,14 +124,14 @@ def main() -> None:
     print("| --- | ---: | ---: | ---: | ---: |")
     with tempfile.TemporaryDirectory() as folder:
         for modes in given.modes:
-            library, (beam, crossings) = build(modes, Path(folder)), prepare(modes)
-            ours, by_hand = sweep_peaks(modes), peaks(library, beam, crossings)
-            apart = np.max(np.abs(by_hand / ours - 1))
+            library, (beam, crossings) = build(modes, Path(folder)), kernel_arguments(modes)
+            ours, kernel_result = sweep_peaks(modes), kernel_peaks(library, beam, crossings)
+            apart = np.max(np.abs(kernel_result / ours - 1))
             functions = [
                 lambda _, m=modes: sweep_peaks(m),
-                lambda _, part=(library, beam, crossings): peaks(*part),
+                lambda _, part=(library, beam, crossings): kernel_peaks(*part),
             ]
-            first, second = best_in_turn(functions, None)
+            first, second = interleaved_best(functions, None)
             row = f"{first:.3f} s | {second:.3f} s | {first / second:.2f} | {apart:.0e}"
             print(f"| {modes} modes | {row} |", flush=True)
 

@@ -21,7 +21,7 @@ STAGES = (
     "native",
 )
 # What they take is told by what they call; a call that calls nothing is a kernel.
-CONTAINERS = re.compile(r"(while|cond|conditional)[.\d]*$")
+CONTROL_FLOW = re.compile(r"(while|cond|conditional)[.\d]*$")
 
 
 def stage_of(op_name: str) -> str:
@@ -30,7 +30,7 @@ def stage_of(op_name: str) -> str:
     return named[-1] if named else "the rest"
 
 
-def stages(dump: Path, module: str) -> dict[str, str]:
+def operation_stages(dump: Path, module: str) -> dict[str, str]:
     """The stage of every operation of a compiled module, from what XLA has dumped.
 
     XLA may make one kernel of a whole loop, a call, which then is of all stages of what it calls.
@@ -58,7 +58,7 @@ def stages(dump: Path, module: str) -> dict[str, str]:
     return found
 
 
-def shares(trace: Path, found: dict[str, str], module: str) -> dict[str, float]:
+def stage_shares(trace: Path, found: dict[str, str], module: str) -> dict[str, float]:
     """The share of each stage in the time of all kernels of a module."""
     (path,) = trace.rglob("*.trace.json.gz")
     with gzip.open(path) as file:
@@ -68,7 +68,7 @@ def shares(trace: Path, found: dict[str, str], module: str) -> dict[str, float]:
     for event in sorted(events, key=lambda event: (event.get("ts", 0), -event.get("dur", 0))):
         about = event.get("args", {})
         name = about.get("hlo_op", "")
-        if about.get("hlo_module") != module or CONTAINERS.match(name):
+        if about.get("hlo_module") != module or CONTROL_FLOW.match(name):
             continue
         stage, took = found.get(name, "the rest"), event.get("dur", 0.0)
         around = open_until[event["pid"], event["tid"]]
@@ -100,7 +100,9 @@ def main() -> None:
     options.python_tracer_level = 0
     with jax.profiler.trace(str(folder / "trace"), profiler_options=options):
         sweep_peaks(given.modes)
-    found = shares(folder / "trace", stages(folder / "hlo", "jit_block"), "jit_block")
+    found = stage_shares(
+        folder / "trace", operation_stages(folder / "hlo", "jit_block"), "jit_block"
+    )
     print(f"| {given.modes} modes, 4096 crossings | share of the time |\n| --- | ---: |")
     for stage, share in found.items():
         print(f"| {stage} | {share:.0%} |")

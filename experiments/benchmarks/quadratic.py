@@ -29,7 +29,7 @@ import numpy as np
 import scipy.sparse
 
 import jaxbeam as jb
-from experiments.benchmarks.steps import PREDICTIVE, rig
+from experiments.benchmarks.steps import PREDICTIVE, patch_case
 from experiments.benchmarks.timing import time_call
 from jaxbeam.control import SamplingWarning
 from jaxbeam.control.predictive.qp import solve_qp
@@ -37,14 +37,14 @@ from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.simulate import ContactLossWarning
 
-SIZES = {4: 6, 6: 8, 8: 10}  # variables, and periods ahead
-MANY, ROUNDS = 256, 20
+HORIZONS = {4: 6, 6: 8, 8: 10}  # variables, and periods ahead
+BATCH_SIZE, ROUNDS = 256, 20
 ACCURACY = 1e-7  # of OSQP's residuals, before it polishes
-AGREED = 1e-6  # share of the largest move by which solutions may differ
-MOST = 100_000  # iterations of OSQP
+SOLUTION_TOLERANCE = 1e-6  # share of the largest move by which solutions may differ
+MAX_ITERATIONS = 100_000  # iterations of OSQP
 
 
-def osqp() -> ModuleType | None:
+def import_osqp() -> ModuleType | None:
     """The package, if it is installed."""
     try:
         return importlib.import_module("osqp")
@@ -52,9 +52,9 @@ def osqp() -> ModuleType | None:
         return None
 
 
-def programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def crossing_programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """H (variable, variable), f (tick, variable), M and gamma (tick, row) of a crossing."""
-    case = rig(jb.MPC(horizon=SIZES[variables], moves=variables, **PREDICTIVE))
+    case = patch_case(jb.MPC(horizon=HORIZONS[variables], moves=variables, **PREDICTIVE))
     with warnings.catch_warnings():
         for kind in (ContactLossWarning, SamplingWarning):
             warnings.simplefilter("ignore", kind)
@@ -66,9 +66,9 @@ def programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
     @compiled
     def program(design, state, last, before):
-        explained = design.plant.A @ last + design.plant.B @ before
-        known = jnp.concatenate([state, state - explained, before, jnp.ones(1)])
-        return case.controller.program(design, design.prediction, known, before)
+        predicted_state = design.plant.A @ last + design.plant.B @ before
+        prediction_inputs = jnp.concatenate([state, state - predicted_state, before, jnp.ones(1)])
+        return case.controller.program(design, design.prediction, prediction_inputs, before)
 
     last = jnp.concatenate([jnp.zeros((1, states.shape[1])), states[:-1]])
     found = [program(design, *each) for each in zip(states, last, before, strict=True)]
@@ -76,7 +76,7 @@ def programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     return H[0], f, M[0], gamma
 
 
-def by_jaxbeam(H, f, M, gamma) -> tuple[np.ndarray, np.ndarray, float, float]:
+def solve_by_jaxbeam(H, f, M, gamma) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Solutions, whether limits are felt, and seconds of each: one by one, and of many at once.
 
     Raises RuntimeError if a program is left unsolved.
@@ -93,24 +93,24 @@ def by_jaxbeam(H, f, M, gamma) -> tuple[np.ndarray, np.ndarray, float, float]:
     found = in_turn(H, f, M, gamma)
     if not found.solved.all():
         raise RuntimeError(f"jaxbeam left {int((~found.solved).sum())} programs unsolved")
-    many = np.resize(np.arange(len(f)), MANY)
-    batch = time_call(at_once, H, f[many], M, gamma[many], repeat=ROUNDS).run / MANY
+    many = np.resize(np.arange(len(f)), BATCH_SIZE)
+    batch = time_call(at_once, H, f[many], M, gamma[many], repeat=ROUNDS).run / BATCH_SIZE
     single = time_call(in_turn, H, f, M, gamma, repeat=ROUNDS).run / len(f)
     return np.asarray(found.x), np.asarray(found.steps) > 0, single, batch
 
 
-def by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, float, float]:
+def solve_by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, float, float]:
     """Solutions, and seconds of each: by its own account, and called from Python."""
     solver = package.OSQP()
     matrices = scipy.sparse.csc_matrix(np.triu(H)), scipy.sparse.csc_matrix(M)
     free = np.full(gamma.shape[1], -np.inf)
-    settings = {"eps_abs": ACCURACY, "eps_rel": ACCURACY, "max_iter": MOST}
+    settings = {"eps_abs": ACCURACY, "eps_rel": ACCURACY, "max_iter": MAX_ITERATIONS}
     settings |= {"polishing": True, "warm_starting": True, "verbose": False}
     solver.setup(matrices[0], f[0], matrices[1], free, gamma[0], **settings)
     times = []
     for _ in range(ROUNDS):
         x, own, start = [], 0.0, time.perf_counter()
-        with _silent():
+        with _suppress_output():
             for one, top in zip(f, gamma, strict=True):
                 solver.update(q=one, u=top)
                 found = solver.solve(raise_error=True)
@@ -121,7 +121,7 @@ def by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, float, flo
 
 
 @contextlib.contextmanager
-def _silent():
+def _suppress_output():
     """Nothing is printed, by C neither: OSQP tells of its polishing whatever it is asked."""
     sys.stdout.flush()
     kept = os.dup(1)
@@ -136,23 +136,23 @@ def _silent():
 
 def main() -> None:
     """Print the table. Raises RuntimeError if the solutions differ."""
-    package = osqp()
+    package = import_osqp()
     if package is None:
         print("OSQP is not installed (uv sync --extra benchmarks): nothing to compare with")
         return
     print("| variables | limits felt | jaxbeam, one by one | 256 at once | OSQP, own account"
           " | OSQP, called from Python | largest difference |")  # fmt: skip
     print("| ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
-    for variables in SIZES:
-        H, f, M, gamma = programs(variables)
+    for variables in HORIZONS:
+        H, f, M, gamma = crossing_programs(variables)
         H, f = H / np.max(np.abs(H)), f / np.max(np.abs(H))
-        ours, felt, single, batch = by_jaxbeam(H, f, M, gamma)
-        theirs, own, called = by_osqp(package, H, f, M, gamma)
-        apart = np.max(np.abs(theirs - ours)) / np.max(np.abs(ours))
-        if apart > AGREED:
-            raise RuntimeError(f"{variables} variables: solutions differ by {apart:.0e}")
+        ours, constrained, single, batch = solve_by_jaxbeam(H, f, M, gamma)
+        theirs, own, called = solve_by_osqp(package, H, f, M, gamma)
+        difference = np.max(np.abs(theirs - ours)) / np.max(np.abs(ours))
+        if difference > SOLUTION_TOLERANCE:
+            raise RuntimeError(f"{variables} variables: solutions differ by {difference:.0e}")
         times = " | ".join(f"{1e6 * t:.1f} us" for t in (single, batch, own, called))
-        print(f"| {variables} | {np.mean(felt):.0%} of {len(f)} | {times} | {apart:.0e} |",
+        print(f"| {variables} | {np.mean(constrained):.0%} of {len(f)} | {times} | {difference:.0e} |",
               flush=True)  # fmt: skip
 
 

@@ -31,22 +31,26 @@ from jaxbeam.numerics.riccati import lqr
 from jaxbeam.runtime import native_library
 from jaxbeam.runtime.compiling import options
 
-MANY, REPEATS, BATCH = 4096, 3, 16  # BATCH also is how many values a number has in the grid
+DESIGNS, REPEATS, BATCH_SIZE = 4096, 3, 16  # BATCH also is how many values a number has in the grid
 THREADS = os.cpu_count() or 1
-TURNS = {3.0: 3e-4, 2.0: 3e-5}  # rad the fastest mode turns in a stretch: error of the gains
-SIZES = (3, 7)  # modes
-MASSES, SPEEDS, EFFORTS = (0.26, 0.51), (2.0, 3.0), (1e-4, 1e-2)  # kg, m/s, weight of the force
+PHASE_STEPS = {3.0: 3e-4, 2.0: 3e-5}  # rad the fastest mode turns in a stretch: error of the gains
+MODE_COUNTS = (3, 7)  # modes
+MASSES, SPEEDS, COMMAND_WEIGHTS = (
+    (0.26, 0.51),
+    (2.0, 3.0),
+    (1e-4, 1e-2),
+)  # kg, m/s, weight of the force
 ADDRESSES = ("loads.0.mass", "loads.0.speed", "controller.command_weight.0")
 
 
-class Times(NamedTuple):
+class DesignTimes(NamedTuple):
     """Seconds: of compiling, and of all designs."""
 
     compiling: float
     run: float
 
 
-def timed(function, batches, share: float = 1.0, threads: int = THREADS) -> Times:
+def time_designs(function, batches, share: float = 1.0, threads: int = THREADS) -> DesignTimes:
     """Time a function of batches, a part of which each thread works out; the fastest of some runs.
 
     `share` of all batches is timed, so many that each thread has the same number.
@@ -62,10 +66,10 @@ def timed(function, batches, share: float = 1.0, threads: int = THREADS) -> Time
             start = time.perf_counter()
             list(pool.map(lambda part: jax.block_until_ready(program(part)), parts))
             runs.append(time.perf_counter() - start)
-    return Times(compiled, min(runs) * len(batches) / (each * threads))
+    return DesignTimes(compiled, min(runs) * len(batches) / (each * threads))
 
 
-def rig(modes: int, points: int, in_time: str = "sequential") -> jb.Case:
+def regulator_case(modes: int, points: int, in_time: str = "sequential") -> jb.Case:
     """The rig with a regulator to be designed."""
     weights = [1e6] * modes + [10.0] * modes
     return jb.Case(
@@ -78,29 +82,35 @@ def rig(modes: int, points: int, in_time: str = "sequential") -> jb.Case:
 
 def grid() -> np.ndarray:
     """Masses, speeds and weights (pair, number, weight), a batch sharing mass and speed."""
-    axes = (np.linspace(*MASSES, BATCH), np.linspace(*SPEEDS, BATCH), np.geomspace(*EFFORTS, BATCH))
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=2).reshape(-1, 3, BATCH)
+    axes = (
+        np.linspace(*MASSES, BATCH_SIZE),
+        np.linspace(*SPEEDS, BATCH_SIZE),
+        np.geomspace(*COMMAND_WEIGHTS, BATCH_SIZE),
+    )
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=2).reshape(-1, 3, BATCH_SIZE)
 
 
-def scattered() -> np.ndarray:
+def scattered_grid() -> np.ndarray:
     """The same (batch, number, design), all numbers different."""
     values = grid()
     low, high = values.min(axis=(0, 2)), values.max(axis=(0, 2))
-    shares = np.random.default_rng(0).uniform(size=(MANY // BATCH, 3, BATCH))
+    shares = np.random.default_rng(0).uniform(size=(DESIGNS // BATCH_SIZE, 3, BATCH_SIZE))
     return low[:, None] + (high - low)[:, None] * shares
 
 
-def stretches(modes: int, turn: float) -> int:
+def interval_count(modes: int, phase_step: float) -> int:
     """Stretches in which the fastest mode turns by so many rad, at the lowest speed."""
-    beam = rig(modes, 1).beam
+    beam = regulator_case(modes, 1).beam
     length, rigidity, density = 0.6, float(beam.rigidity), float(beam.linear_density)
     fastest = (modes * math.pi / length) ** 2 * math.sqrt(rigidity / density)
-    return math.ceil(fastest * length / SPEEDS[0] / turn)
+    return math.ceil(fastest * length / SPEEDS[0] / phase_step)
 
 
-def designs(modes: int, points: int, in_time: str, shared: bool, share: float) -> Times:
+def time_finite_horizon(
+    modes: int, points: int, in_time: str, shared: bool, share: float
+) -> DesignTimes:
     """Time finite-time designs: those of the grid, which share much, or others."""
-    case = rig(modes, points, in_time)
+    case = regulator_case(modes, points, in_time)
     layout = lay_out(case)
 
     def one(mass, speed, effort):
@@ -113,12 +123,12 @@ def designs(modes: int, points: int, in_time: str, shared: bool, share: float) -
             return jax.vmap(one, (None, None, 0))(values[0, 0], values[1, 0], values[2])
         return jax.vmap(one)(*values)
 
-    return timed(batch, grid() if shared else scattered(), share)
+    return time_designs(batch, grid() if shared else scattered_grid(), share)
 
 
-def invariant(modes: int) -> Times:
+def time_invariant(modes: int) -> DesignTimes:
     """Time the time-invariant designs."""
-    case = rig(modes, 1000)
+    case = regulator_case(modes, 1000)
     plant = jb.state_space(case).unloaded
     Q = case.controller.weights(jb.state_space(case))[0]
 
@@ -126,10 +136,10 @@ def invariant(modes: int) -> Times:
         return lqr(plant.A, plant.B, Q, effort * jnp.eye(1))[0]
 
     # By one thread: several that have a library invert batches may wait for each other for ever.
-    return timed(jax.vmap(one), np.geomspace(*EFFORTS, MANY)[None], threads=1)
+    return time_designs(jax.vmap(one), np.geomspace(*COMMAND_WEIGHTS, DESIGNS)[None], threads=1)
 
 
-def row(name: str, found: Times) -> None:
+def print_row(name: str, found: DesignTimes) -> None:
     """Print a line of the table."""
     print(f"{name:64} {found.compiling:13.2f} {found.run:12.2f}", flush=True)
 
@@ -150,17 +160,19 @@ def main() -> None:
 
 
 def _print_table(ways: dict[str, str]) -> None:
-    print(f"{'':64} compiling (s)   {MANY} take (s)")
-    for modes in SIZES:
-        row(f"time-invariant, {2 * modes} states", invariant(modes))
-        for turn, error in TURNS.items():
+    print(f"{'':64} compiling (s)   {DESIGNS} take (s)")
+    for modes in MODE_COUNTS:
+        print_row(f"time-invariant, {2 * modes} states", time_invariant(modes))
+        for turn, error in PHASE_STEPS.items():
             name = f"finite-time, {2 * modes} states, to {error:.0e}"
-            points = stretches(modes, turn)
+            points = interval_count(modes, turn)
             for addition, way in ways.items():
-                row(f"{name}, grid{addition}", designs(modes, points, way, True, 1 / 4))
-                row(
+                print_row(
+                    f"{name}, grid{addition}", time_finite_horizon(modes, points, way, True, 1 / 4)
+                )
+                print_row(
                     f"{name}, all different{addition}",
-                    designs(modes, points, way, False, 1 / 16),
+                    time_finite_horizon(modes, points, way, False, 1 / 16),
                 )
 
 

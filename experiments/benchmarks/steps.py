@@ -27,12 +27,12 @@ from jaxbeam.simulation.simulate import ContactLossWarning
 
 PERIOD, MODES = 0.01, 5
 WEIGHTS = {"state_weight": [1e6] * (2 * MODES), "command_weight": [1.0], "period": PERIOD}
-TABLED = {**WEIGHTS, "points": 600}
+FINITE_HORIZON = {**WEIGHTS, "points": 600}
 PREDICTIVE = {"move_weight": 1e-11, "period": PERIOD}
-FOUR = {"horizon": 6, "moves": 4, **PREDICTIVE}
+MPC_4 = {"horizon": 6, "moves": 4, **PREDICTIVE}
 NOISE = {"process_noise": 0.02, "measurement_noise": 1e-5}
-GATES = jb.Recognition(gates=[-0.2, -0.1], until=0.3)
-LIGHT_TO_HEAVY = {"masses": [0.2, 0.4, 0.6], "speeds": [1.0, 1.5]}
+GATE_IDENTIFICATION = jb.Recognition(gates=[-0.2, -0.1], until=0.3)
+SCHEDULE_GRID = {"masses": [0.2, 0.4, 0.6], "speeds": [1.0, 1.5]}
 CONTROLLERS = {
     "prescribed": jb.Prescribed(offsets=[1.0], period=PERIOD),
     "passage": jb.Passage(
@@ -42,7 +42,7 @@ CONTROLLERS = {
     "feedback, linear": jb.Feedback(gains=[2e3], period=PERIOD),
     "feedback, cubic": jb.Feedback(gains=[2e9], power=3, period=PERIOD),
     "feedback-scheduled, recognised": jb.ScheduledFeedback(
-        masses=[0.2, 0.6], gains=[[2e3, 4e3]], recognition=GATES, period=PERIOD
+        masses=[0.2, 0.6], gains=[[2e3, 4e3]], recognition=GATE_IDENTIFICATION, period=PERIOD
     ),
     "pd": jb.PD(gains=[2e3], rate_gains=20.0, lag=0.02, period=PERIOD),
     "lead": jb.Lead(gains=[2e3], zero=2.0, pole=8.0, period=PERIOD),
@@ -61,24 +61,26 @@ CONTROLLERS = {
         **WEIGHTS, estimator=jb.Kalman(**NOISE, loads="estimated", weight_deviation=2.0)
     ),
     "dlqr": jb.DiscreteLQR(**WEIGHTS),
-    "lqr-step": jb.StepLQR(**TABLED),
-    "lqr-finite": jb.FiniteLQR(**TABLED),
-    "lqr-augmented": jb.AugmentedLQR(**TABLED),
-    "lqr-scheduled, recognised": jb.ScheduledLQR(**TABLED, **LIGHT_TO_HEAVY, recognition=GATES),
-    "mpc, unconstrained": jb.MPC(**FOUR, solver="unconstrained"),
-    "mpc, 4 variables": jb.MPC(**FOUR),
+    "lqr-step": jb.StepLQR(**FINITE_HORIZON),
+    "lqr-finite": jb.FiniteLQR(**FINITE_HORIZON),
+    "lqr-augmented": jb.AugmentedLQR(**FINITE_HORIZON),
+    "lqr-scheduled, recognised": jb.ScheduledLQR(
+        **FINITE_HORIZON, **SCHEDULE_GRID, recognition=GATE_IDENTIFICATION
+    ),
+    "mpc, unconstrained": jb.MPC(**MPC_4, solver="unconstrained"),
+    "mpc, 4 variables": jb.MPC(**MPC_4),
     "mpc, 6 variables": jb.MPC(horizon=8, moves=6, **PREDICTIVE),
     "mpc, 8 variables": jb.MPC(horizon=10, moves=8, **PREDICTIVE),
-    "mpc, 4 variables, Hildreth": jb.MPC(**FOUR, solver="hildreth"),
+    "mpc, 4 variables, Hildreth": jb.MPC(**MPC_4, solver="hildreth"),
     "mpc, 8 variables, Hildreth": jb.MPC(horizon=10, moves=8, solver="hildreth", **PREDICTIVE),
-    "mpc, 4 variables, Kalman filter": jb.MPC(**FOUR, estimator=jb.Kalman(**NOISE)),
-    "mpc, 4 variables, soft limit": jb.MPC(**FOUR, soft_limit=1e-3),
-    "mpc, 4 variables, loads known": jb.MPC(**FOUR, loads="known"),
-    "mpc, 4 variables, time-varying": jb.MPC(**FOUR, prediction="time-varying"),
+    "mpc, 4 variables, Kalman filter": jb.MPC(**MPC_4, estimator=jb.Kalman(**NOISE)),
+    "mpc, 4 variables, soft limit": jb.MPC(**MPC_4, soft_limit=1e-3),
+    "mpc, 4 variables, loads known": jb.MPC(**MPC_4, loads="known"),
+    "mpc, 4 variables, time-varying": jb.MPC(**MPC_4, prediction="time-varying"),
 }
 
 
-def rig(controller: AbstractController) -> jb.Case:
+def patch_case(controller: AbstractController) -> jb.Case:
     """The one-span rig with a patch, under a controller; the load has passed gates before it."""
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=MODES),
@@ -104,7 +106,7 @@ def measure(controller: AbstractController) -> StepTimes:
     with warnings.catch_warnings():
         for kind in (ContactLossWarning, SamplingWarning):
             warnings.simplefilter("ignore", kind)
-        return step_times(jb.simulate(rig(controller), tolerance=1e-4))
+        return step_times(jb.simulate(patch_case(controller), tolerance=1e-4))
 
 
 def main() -> None:

@@ -25,8 +25,8 @@ import xarray
 
 import jaxbeam as jb
 from experiments.benchmarks.rivals import baselines, by_numba
-from experiments.benchmarks.rivals.crossing import Rig
-from experiments.benchmarks.timing import Timing, best_in_turn, time_call
+from experiments.benchmarks.rivals.crossing import PinnedBeam
+from experiments.benchmarks.timing import Timing, interleaved_best, time_call
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library
 from jaxbeam.runtime.compiling import compiled
@@ -36,8 +36,8 @@ from jaxbeam.simulation.simulate import readings
 MASSES = np.linspace(0.1, 1.0, 64)
 SPEEDS = np.linspace(0.3, 10.0, 64)
 TOLERANCE = 9e-7  # of every peak; checked below against a reference
-SHORT = 15  # runs of which the median is taken, where they take little time
-CHECKED = slice(0, 64, 9)  # speeds at which peaks are compared with the reference
+REPEATS = 15  # runs of which the median is taken, where they take little time
+CHECKED_SPEEDS = slice(0, 64, 9)  # speeds at which peaks are compared with the reference
 FREE = (
     "beam.flexural_rigidity",
     "beam.mass_per_length",
@@ -48,7 +48,7 @@ FREE = (
 )
 
 
-def rig(modes: int) -> jb.Case:
+def one_span_case(modes: int) -> jb.Case:
     """The one-span rig with its three sensors, long enough for the slowest crossing."""
     beam = jb.Beam(
         length=0.6,
@@ -68,13 +68,16 @@ def rig(modes: int) -> jb.Case:
 def sweep_peaks(modes: int) -> np.ndarray:
     """Peaks of the grid by `jaxbeam.sweep`, choice of time steps included."""
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
-    found = jb.sweep(rig(modes), over, progress=False, tolerance=TOLERANCE)
+    found = jb.sweep(one_span_case(modes), over, progress=False, tolerance=TOLERANCE)
     return found.peak_deflection.values
 
 
 def compare(modes: int) -> list[tuple[str, Timing, float]]:
     """Name, times (and how many of jaxbeam's) and largest relative error of each solver."""
-    reference, found = baselines.reference_peaks(Rig(modes), MASSES, SPEEDS[CHECKED]), []
+    reference, found = (
+        baselines.reference_peaks(PinnedBeam(modes), MASSES, SPEEDS[CHECKED_SPEEDS]),
+        [],
+    )
 
     def plain():
         return sweep_peaks(modes)
@@ -83,53 +86,55 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
         """A row of the table; the last run is the one that is checked."""
         kept = []
         took = time_call(
-            lambda: kept.append(jax.block_until_ready(solve())), repeat=repeat, beside=plain
+            lambda: kept.append(jax.block_until_ready(solve())), repeat=repeat, reference=plain
         )
-        error = np.max(np.abs(np.asarray(kept[-1])[:, CHECKED] / reference - 1))
+        error = np.max(np.abs(np.asarray(kept[-1])[:, CHECKED_SPEEDS] / reference - 1))
         found.append((name, took, float(error)))
 
-    timed("jaxbeam", plain, SHORT)
+    timed("jaxbeam", plain, REPEATS)
     if native_library.compiler() is None:
         print("steps in C are left out: there is no C compiler here")
     else:
         with tempfile.TemporaryDirectory() as folder:
-            with cached_in(folder):
+            with with_cache_folder(folder):
                 native_peaks.build()
 
-            def by_hand():
-                with cached_in(folder):
+            def sweep_in_c():
+                with with_cache_folder(folder):
                     return sweep_peaks(modes)
 
-            timed("jaxbeam native", by_hand, SHORT)
+            timed("jaxbeam native", sweep_in_c, REPEATS)
     for name, shared in (("diffrax, vmapped", False), ("diffrax, shared steps", True)):
 
         def others(shared=shared):
-            return baselines.diffrax_peaks(Rig(modes), MASSES, SPEEDS, shared_steps=shared)
+            return baselines.diffrax_peaks(PinnedBeam(modes), MASSES, SPEEDS, shared_steps=shared)
 
         timed(name, others)
-    package = by_numba.numba()
+    package = by_numba.import_numba()
     if package is None:
         print("numba is left out: it is not installed (uv sync --extra benchmarks)")
     else:
-        fill = by_numba.program(package)
+        fill = by_numba.compile_peaks(package)
         timed(
             "numba, parallel over runs",
-            lambda: by_numba.numba_peaks(fill, Rig(modes), MASSES, SPEEDS),
+            lambda: by_numba.numba_peaks(fill, PinnedBeam(modes), MASSES, SPEEDS),
         )
-    scaled = baselines.scipy_time(baselines.scipy_peaks, Rig(modes), MASSES, SPEEDS, beside=plain)
-    some = baselines.scipy_peaks(Rig(modes), MASSES[::21], SPEEDS[CHECKED])
+    scaled = baselines.scipy_time(
+        baselines.scipy_peaks, PinnedBeam(modes), MASSES, SPEEDS, reference=plain
+    )
+    some = baselines.scipy_peaks(PinnedBeam(modes), MASSES[::21], SPEEDS[CHECKED_SPEEDS])
     error = float(np.max(np.abs(some / reference[::21] - 1)))
     return [*found, ("scipy DOP853, scaled", scaled, error)]
 
 
-def cached_in(folder: str):
+def with_cache_folder(folder: str):
     """A context in which steps in C are looked for in another folder."""
     return mock.patch.dict(os.environ, XDG_CACHE_HOME=folder)
 
 
 def derivatives() -> list[tuple[str, float]]:
     """Time of a misfit's jvp, Jacobian over six numbers and gradient in reverse, in plain runs."""
-    case = jb.replace(rig(3), {"run.duration": 1.2})
+    case = jb.replace(one_span_case(3), {"run.duration": 1.2})
     times = jnp.arange(1200) / 1000.0
     plan = make_plan(case, times)
     start = jnp.array([float(jb.addresses(case)[address]) for address in FREE])
@@ -151,13 +156,13 @@ def derivatives() -> list[tuple[str, float]]:
         "gradient in reverse mode": jax.grad(misfit),
     }
     functions = [compiled(function) for function in (misfit, *derived.values())]
-    plain, *times = best_in_turn(functions, start)
+    plain, *times = interleaved_best(functions, start)
     return [(name, took / plain) for name, took in zip(derived, times, strict=True)]
 
 
 def main() -> None:
     """Run the benchmark and print its tables."""
-    with tempfile.TemporaryDirectory() as folder, cached_in(folder):  # without steps in C
+    with tempfile.TemporaryDirectory() as folder, with_cache_folder(folder):  # without steps in C
         _compare_all()
 
 

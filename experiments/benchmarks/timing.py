@@ -20,18 +20,18 @@ class Timing(NamedTuple):
     compile: float = 0.0
     ratio: float = float("nan")
     shortest: float = float("nan")
-    shortest_beside: float = float("nan")
+    reference_shortest: float = float("nan")
 
     @property
     def ratio_of_shortest(self) -> float:
         """How many times as long as the other function it takes, both undisturbed."""
-        return self.shortest / self.shortest_beside
+        return self.shortest / self.reference_shortest
 
 
-def time_call(function, *args, repeat=5, beside=None):
+def time_call(function, *args, repeat=5, reference=None):
     """Time `function(*args)` until its results are ready: once cold, then `repeat` times warm.
 
-    With a function `beside` it is compared with that, which is called before and after each: a
+    With a function `reference` it is compared with that, which is called before and after each: a
     machine that is faster at one moment than at another is so for both.
     """
 
@@ -41,23 +41,23 @@ def time_call(function, *args, repeat=5, beside=None):
         return time.perf_counter() - start
 
     cold, times = seconds(function, *args), []
-    others = [seconds(beside or _nothing)]
+    others = [seconds(reference or _no_operation)]
     for _ in range(repeat):
         times.append(seconds(function, *args))
-        others.append(seconds(beside or _nothing))
+        others.append(seconds(reference or _no_operation))
     run = statistics.median(times)
     around = np.add(others[:-1], others[1:]) / 2
     compiling, ratio, other = max(cold - run, 0.0), float("nan"), float("nan")
-    if beside is not None:
+    if reference is not None:
         ratio, other = float(np.median(np.divide(times, around))), min(others)
     return Timing(run, compiling, ratio, min(times), other)
 
 
-def _nothing() -> None:
+def _no_operation() -> None:
     pass
 
 
-def best_in_turn(functions, *args, rounds=40):
+def interleaved_best(functions, *args, rounds=40):
     """Shortest times of several functions, called in turn: disturbances meet them all alike."""
     times = []
     for function in functions:

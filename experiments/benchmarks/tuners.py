@@ -21,18 +21,25 @@ from scipy.optimize import differential_evolution
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.tuned_search import ENTRY, GATES, LEAD, LIMITS, PERIOD, STARTS
+from experiments.studies.tuned_search import (
+    COMMAND_LIMITS,
+    ENTRY_TIME,
+    GATES,
+    INITIAL_TABLES,
+    LEAD,
+    PERIOD,
+)
 from jaxbeam import rigs
 from jaxbeam.case.case import value_at
 from jaxbeam.runtime.compiling import compiled
 from tuning.control.optimisers import METHODS
-from tuning.control.run_set import make_bench
+from tuning.control.run_set import make_run_set
 
-KNOTS, STEPS, COST, MORE, SEED = 11, 80, 4, 10, 0
+KNOTS, STEPS, GRADIENT_COST, EVALUATION_FACTOR, SEED = 11, 80, 4, 10, 0
 LOADS = tuning.grid({"loads.0.mass": [0.261, 0.509], "loads.0.speed": [0.5, 1.0]})
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """The worst peak that a search came to, what it took, and how many evaluations that were."""
 
     peak: float
@@ -43,24 +50,26 @@ class Found(NamedTuple):
         return f"{self.peak:.4f} after {self.evaluations} evaluations in {self.seconds:.1f} s"
 
 
-def problem() -> tuple[jb.Case, dict[str, tuple[float, float]]]:
+def tuning_problem() -> tuple[jb.Case, dict[str, tuple[float, float]]]:
     """The case to tune, and what is free in it."""
     shares = np.linspace(0.0, 1.0, KNOTS)
-    values = [np.interp(shares, *table) for table in STARTS["B"]]
+    values = [np.interp(shares, *table) for table in INITIAL_TABLES["B"]]
     law = jb.Passage(gates=GATES, shares=shares, values=values, period=PERIOD, lead=LEAD)
-    case = jb.replace(rigs.load("B"), {"loads.0.entry_time": ENTRY})
+    case = jb.replace(rigs.load("B"), {"loads.0.entry_time": ENTRY_TIME})
     case = dataclasses.replace(case, controller=law, run=jb.Run(duration=1.4, sample_rate=200.0))
-    free = {f"controller.values.0.{k}": LIMITS for k in range(KNOTS)}
+    free = {f"controller.values.0.{k}": COMMAND_LIMITS for k in range(KNOTS)}
     return case, free | {"controller.lead": (0.0, 0.1)}
 
 
-def evolved(case: jb.Case, free: dict, evaluations: int, seconds: float = np.inf) -> Found:
+def run_evolution(
+    case: jb.Case, free: dict, evaluations: int, seconds: float = np.inf
+) -> SearchResult:
     """The worst peak (relative to no control) that differential evolution comes to.
 
     It ends after so many evaluations, or after the generation in which the time is up; compiling
     does not count.
     """
-    bench = make_bench(case, LOADS)
+    run_set = make_run_set(case, LOADS)
 
     @compiled
     def worst(points, bench):
@@ -69,14 +78,14 @@ def evolved(case: jb.Case, free: dict, evaluations: int, seconds: float = np.inf
 
         return jax.lax.map(one, points)
 
-    def judged(points):
-        return np.nan_to_num(worst(jnp.asarray(points.T), bench), nan=1e3)
+    def objective(points):
+        return np.nan_to_num(worst(jnp.asarray(points.T), run_set), nan=1e3)
 
     population = 4 * len(free)
-    judged(np.array(list(free.values())).mean(axis=1)[:, None] * np.ones(population))
+    objective(np.array(list(free.values())).mean(axis=1)[:, None] * np.ones(population))
     began = time.perf_counter()
     found = differential_evolution(
-        judged,
+        objective,
         list(free.values()),
         maxiter=max(evaluations // population - 1, 1),
         popsize=4,
@@ -88,31 +97,31 @@ def evolved(case: jb.Case, free: dict, evaluations: int, seconds: float = np.inf
         x0=[float(value_at(case, address)) for address in free],
         callback=lambda intermediate_result: time.perf_counter() - began > seconds,
     )
-    return Found(float(found.fun), time.perf_counter() - began, int(found.nfev) * population)
+    return SearchResult(float(found.fun), time.perf_counter() - began, int(found.nfev) * population)
 
 
-def descended(case: jb.Case, free: dict, method: str) -> tuple[float, Found]:
+def run_gradients(case: jb.Case, free: dict, method: str) -> tuple[float, SearchResult]:
     """Worst peaks at the start and where gradients lead; timed when all is compiled."""
     loads = tuning.LoadCases(LOADS)
     options = {"steps": STEPS, "method": method, "bounds": False, "progress": False}
     tuning.tune(case, free, loads, **options)
     began = time.perf_counter()
     found = tuning.tune(case, free, loads, **options)
-    start, end = found.outcomes[0].objective
-    return start, Found(end, time.perf_counter() - began, COST * STEPS)
+    start, end = found.run_sets[0].objective
+    return start, SearchResult(end, time.perf_counter() - began, GRADIENT_COST * STEPS)
 
 
 def main() -> None:
     """Run all of them and print what they come to."""
-    case, free = problem()
-    found = {method: descended(case, free, method) for method in METHODS}
+    case, free = tuning_problem()
+    found = {method: run_gradients(case, free, method) for method in METHODS}
     print(f"worst peak, relative to no control: {found['adam'][0]:.4f} at the start")
     for method, (_, one) in found.items():
         print(f"{method}, {STEPS} gradients: {one}")
     taken = found["adam"][1].seconds
-    print(f"differential evolution, as long as adam: {evolved(case, free, 10**6, taken)}")
-    for times in (1, MORE):
-        print(f"differential evolution: {evolved(case, free, COST * STEPS * times)}")
+    print(f"differential evolution, as long as adam: {run_evolution(case, free, 10**6, taken)}")
+    for times in (1, EVALUATION_FACTOR):
+        print(f"differential evolution: {run_evolution(case, free, GRADIENT_COST * STEPS * times)}")
 
 
 if __name__ == "__main__":

@@ -16,39 +16,45 @@ import numpy as np
 import jaxbeam as jb
 import tuning
 from experiments.studies import sensed_search, tuned_search
-from experiments.studies.sensed_search import on_bench
-from experiments.studies.tuned import ENTRY
-from experiments.studies.tuned_search import LIMITS, MODES
+from experiments.studies.sensed_search import with_noise_and_filters
+from experiments.studies.tuned import ENTRY_TIME
+from experiments.studies.tuned_search import COMMAND_LIMITS, MODES
 from jaxbeam import rigs
 
-LOADS = tuning.grid(
-    {"loads.0.mass": [0.322, 0.42], "loads.0.speed": [0.35, 0.95], "loads.0.entry_time": [ENTRY]}
+HELD_OUT_LOADS = tuning.grid(
+    {
+        "loads.0.mass": [0.322, 0.42],
+        "loads.0.speed": [0.35, 0.95],
+        "loads.0.entry_time": [ENTRY_TIME],
+    }
 )
 RIG, STEPS = "B", 60
 
 
-def problems() -> dict[str, tuple[jb.Case, dict]]:
+def tuning_problems() -> dict[str, tuple[jb.Case, dict]]:
     """By name a rig under the law for all loads, and what is free in its table."""
     case = rigs.load(RIG)
-    slowest = float(case.beam.length) / 0.35 + ENTRY + 0.1
+    slowest = float(case.beam.length) / 0.35 + ENTRY_TIME + 0.1
     beam = dataclasses.replace(case.beam, modes=MODES)
     case = dataclasses.replace(case, beam=beam, run=jb.Run(slowest, 200.0))
-    gated = jb.load_case(tuned_search.FOLDER / f"{RIG}.toml").controller
-    sensing = jb.load_case(sensed_search.FOLDER / f"{RIG}.toml").controller
-    used = np.flatnonzero(np.asarray(sensing.readings) < 0)
+    gate_law = jb.load_case(tuned_search.FOLDER / f"{RIG}.toml").controller
+    sensor_law = jb.load_case(sensed_search.FOLDER / f"{RIG}.toml").controller
+    active_breakpoints = np.flatnonzero(np.asarray(sensor_law.readings) < 0)
     return {
         "clocked by gates": (
-            dataclasses.replace(case, controller=gated),
-            {f"controller.values.0.{k}": LIMITS for k in range(gated.values.shape[1])},
+            dataclasses.replace(case, controller=gate_law),
+            {f"controller.values.0.{k}": COMMAND_LIMITS for k in range(gate_law.values.shape[1])},
         ),
         "sensors only": (
-            dataclasses.replace(on_bench(RIG, case, 1), controller=sensing),
-            {f"controller.values.0.{k}": LIMITS for k in used},
+            dataclasses.replace(with_noise_and_filters(RIG, case, 1), controller=sensor_law),
+            {f"controller.values.0.{k}": COMMAND_LIMITS for k in active_breakpoints},
         ),
     }
 
 
-def compared(case: jb.Case, free: dict, load: dict[str, float]) -> tuple[float, float]:
+def general_and_own_shares(
+    case: jb.Case, free: dict, load: dict[str, float]
+) -> tuple[float, float]:
     """Shares of the attainable reduction: of the law for all loads, and of one for this load."""
     found = tuning.tune(
         case,
@@ -58,15 +64,17 @@ def compared(case: jb.Case, free: dict, load: dict[str, float]) -> tuple[float, 
         steps=STEPS,
         progress=False,
     )
-    outcome = found.outcomes[0]
-    return float(outcome.shares(outcome.before)[0]), float(outcome.shares(outcome.after)[0])
+    outcome = found.run_sets[0]
+    return float(outcome.attained_shares(outcome.peaks_before)[0]), float(
+        outcome.attained_shares(outcome.peaks_after)[0]
+    )
 
 
 def main() -> None:
     """Print a line for each law and load."""
-    for name, (case, free) in problems().items():
-        for load in LOADS:
-            one, own = compared(case, free, load)
+    for name, (case, free) in tuning_problems().items():
+        for load in HELD_OUT_LOADS:
+            one, own = general_and_own_shares(case, free, load)
             words = f"{load['loads.0.mass']:g} kg at {load['loads.0.speed']:g} m/s"
             print(f"{name}, {words}: {one:.1%} for all, {own:.1%} for this load", flush=True)
 

@@ -21,64 +21,79 @@ import numpy as np
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.tuned_search import LIMITS, MASSES, MODES, PERIOD, STEP
+from experiments.studies.tuned_search import (
+    COMMAND_LIMITS,
+    COMMAND_RESOLUTION,
+    MASSES,
+    MODES,
+    PERIOD,
+)
 from jaxbeam import rigs
 
 FOLDER = Path(__file__).parents[1] / "controllers" / "sensed"
 DELAY = 0.02  # s
-NOISE = 4e-6  # m: about the largest of section 5.1 of the thesis, (0.135e-10 m^2)^0.5
+NOISE_DEVIATION = 4e-6  # m: about the largest of section 5.1 of the thesis, (0.135e-10 m^2)^0.5
 CUTOFF, ORDER = {"B": 10.0, "C": 20.0}, 10  # Hz: the filters of sections 6.1 and 6.2
 # The filter of 20 Hz passes the lowest modes, between 15.5 and 18.5 Hz with a light load on the way
 # in and a beam that is 10 % off, and near 27 Hz: there the search for notches starts.
 NOTCHES = {"B": None, "C": [16.2, 18.4, 27.0]}  # Hz
-READINGS = {  # m: flat where a load has gone far enough to lower the frequencies
+READING_BREAKPOINTS = {  # m: flat where a load has gone far enough to lower the frequencies
     "B": 1e-3 * np.array([-1.2, -0.8, -0.55, -0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4]),
     "C": 1e-3 * np.array([-0.4, -0.3, -0.2, -0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.3]),
 }
 SPEEDS = np.linspace(0.3, 1.0, 8)  # m/s
 ENTRY = 0.05  # s
-START = {"B": (0.45e-3, 7.2, 0.0), "C": (0.25e-3, 7.2, -1.8)}  # m, V below, V above
+INITIAL_TABLE = {"B": (0.45e-3, 7.2, 0.0), "C": (0.25e-3, 7.2, -1.8)}  # m, V below, V above
 RIGIDITY = "beam.flexural_rigidity"
-SPREAD = 0.1  # share by which the beam may be stiffer or softer than believed
-FACTORS = (1.0, 1.0 - SPREAD, 1.0 + SPREAD)
-RINGING = (10.0, 35.0)  # Hz: where notches may go
+RIGIDITY_TOLERANCE = 0.1  # share by which the beam may be stiffer or softer than believed
+RIGIDITY_FACTORS = (1.0, 1.0 - RIGIDITY_TOLERANCE, 1.0 + RIGIDITY_TOLERANCE)
+NOTCH_BOUNDS = (10.0, 35.0)  # Hz: where notches may go
 # For poles along crossings: the largest real part (1/s), delay on top (s), speed of the loads
 # (m/s), places along each, and how far beside the bend at rest (m) a table is looked at.
-RIGHTMOST, RESERVE, SLOW, PLACES, BESIDE = -0.3, 0.01, 0.6, 10, 1e-5
+MAX_REAL_PART, EXTRA_DELAY, CROSSING_SPEED, CROSSING_POSITIONS, READING_OFFSET = (
+    -0.3,
+    0.01,
+    0.6,
+    10,
+    1e-5,
+)
 STEPS, SAMPLE_RATE = 120, {"B": 200.0, "C": 100.0}  # Hz
 
 
-def on_bench(name: str, case: jb.Case, seed: int = 0) -> jb.Case:
+def with_noise_and_filters(rig: str, case: jb.Case, seed: int = 0) -> jb.Case:
     """The rig as on the bench: noise and filters at all sensors."""
-    smooth = jb.Filter(CUTOFF[name], order=ORDER)
-    seen = [dataclasses.replace(s, filter=smooth, noise=np.asarray(NOISE)) for s in case.sensors]
+    sensor_filter = jb.Filter(CUTOFF[rig], order=ORDER)
+    filtered_sensors = [
+        dataclasses.replace(s, filter=sensor_filter, noise=np.asarray(NOISE_DEVIATION))
+        for s in case.sensors
+    ]
     run = dataclasses.replace(case.run, seed=seed)
-    return dataclasses.replace(case, sensors=tuple(seen), run=run)
+    return dataclasses.replace(case, sensors=tuple(filtered_sensors), run=run)
 
 
-def start(name: str) -> jb.Relief:
+def initial_law(rig: str) -> jb.Relief:
     """The law that the search starts from on rig B or C: steep, then flat."""
-    full, below, above = START[name]
-    readings = READINGS[name]
-    row = np.interp(readings, [-full, 0.0, full], [below, 0.0, above])
-    actuators = len(rigs.load(name).actuators)
+    saturation_reading, below, above = INITIAL_TABLE[rig]
+    readings = READING_BREAKPOINTS[rig]
+    row = np.interp(readings, [-saturation_reading, 0.0, saturation_reading], [below, 0.0, above])
+    actuators = len(rigs.load(rig).actuators)
     return jb.Relief(
         readings=readings,
         values=[row] * actuators,
-        notches=NOTCHES[name],
+        notches=NOTCHES[rig],
         period=PERIOD,
         delay=DELAY,
-        resolution=STEP,
+        resolution=COMMAND_RESOLUTION,
     )
 
 
-def training(rig: str = "B") -> tuple[dict[str, float], ...]:
+def training_loads(rig: str = "B") -> tuple[dict[str, float], ...]:
     """The lightest and the heaviest load at all speeds, entering at ticks and between them.
 
     On rig C also on beams that are stiffer or softer.
     """
     rigidity = float(rigs.load(rig).beam.flexural_rigidity)
-    plants = [{RIGIDITY: factor * rigidity} for factor in FACTORS] if rig == "C" else [{}]
+    plants = [{RIGIDITY: factor * rigidity} for factor in RIGIDITY_FACTORS] if rig == "C" else [{}]
     return tuple(
         {
             "loads.0.mass": mass,
@@ -92,33 +107,35 @@ def training(rig: str = "B") -> tuple[dict[str, float], ...]:
     )
 
 
-def margin(law: jb.Relief) -> tuning.Stable:
+def stability_constraint(law: jb.Relief) -> tuning.Stable:
     """Where poles may lie along crossings, for a table that bends where no load is: on both sides.
 
     The loads are slow: fast ones of half the beam's mass move poles to the right by themselves.
     """
-    knots = np.asarray(law.readings)
-    sides = [
-        {f"controller.readings.{k}": x + side for k, x in enumerate(knots)}
-        for side in (-BESIDE, BESIDE)
+    breakpoints = np.asarray(law.readings)
+    shifted_tables = [
+        {f"controller.readings.{k}": x + side for k, x in enumerate(breakpoints)}
+        for side in (-READING_OFFSET, READING_OFFSET)
     ]
-    loads = tuning.grid({"loads.0.mass": (*MASSES, sum(MASSES) / 2), "loads.0.speed": [SLOW]})
+    loads = tuning.grid(
+        {"loads.0.mass": (*MASSES, sum(MASSES) / 2), "loads.0.speed": [CROSSING_SPEED]}
+    )
     return tuning.Stable(
-        largest=RIGHTMOST,
-        delay=RESERVE,
-        spread={RIGIDITY: SPREAD},
-        places=PLACES,
-        crossings=tuple(load | side for load in loads for side in sides),
+        largest=MAX_REAL_PART,
+        delay=EXTRA_DELAY,
+        spread={RIGIDITY: RIGIDITY_TOLERANCE},
+        places=CROSSING_POSITIONS,
+        crossings=tuple(load | side for load in loads for side in shifted_tables),
     )
 
 
-def search(
+def tune_law(
     rig: str, file: Path | None = None, steps: int = STEPS, progress: bool = True
 ) -> tuning.Tuned:
     """Tune the table for the worst of all loads on rig B or C; a file keeps the search."""
-    case = on_bench(rig, rigs.load(rig))
+    case = with_noise_and_filters(rig, rigs.load(rig))
     slowest = float(case.beam.length) / min(SPEEDS)
-    law, robust = start(rig), rig == "C"
+    law, with_stability = initial_law(rig), rig == "C"
     case = dataclasses.replace(
         case,
         beam=dataclasses.replace(case.beam, modes=MODES),
@@ -127,15 +144,21 @@ def search(
     )
     actuators = len(case.actuators)
     # Without a load there is no command; upwards the beam of one span goes only when it rings.
-    used = [k for k, x in enumerate(READINGS[rig]) if x < 0 or (x > 0 and actuators > 1)]
-    free = {f"controller.values.{a}.{k}": LIMITS for a in range(actuators) for k in used}
-    notches = {f"controller.notches.{k}": RINGING for k in range(len(NOTCHES[rig] or ()))}
+    active_breakpoints = [
+        k for k, x in enumerate(READING_BREAKPOINTS[rig]) if x < 0 or (x > 0 and actuators > 1)
+    ]
+    free = {
+        f"controller.values.{a}.{k}": COMMAND_LIMITS
+        for a in range(actuators)
+        for k in active_breakpoints
+    }
+    notches = {f"controller.notches.{k}": NOTCH_BOUNDS for k in range(len(NOTCHES[rig] or ()))}
     return tuning.tune(
         case,
         free | notches,
-        tuning.LoadCases(training(rig)),
+        tuning.LoadCases(training_loads(rig)),
         tuning.Objective({"shortfall": 1.0}),
-        stable=margin(law) if robust else None,
+        stable=stability_constraint(law) if with_stability else None,
         steps=steps,
         checkpoint=file,
         resume=True,
@@ -147,7 +170,7 @@ if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
     for name in sys.argv[1:]:
         kept = FOLDER / f"{name}.search.npz"
-        found = search(name, kept)
+        found = tune_law(name, kept)
         print(found)
         jb.save_case(found.case, FOLDER / f"{name}.toml", overwrite=True)
         kept.unlink()

@@ -13,12 +13,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis.verdicts import Experiment, Outcome
+from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.design_model import Beliefs
-from jaxbeam.plot.style import GREY, colour, name, styled
+from jaxbeam.plot.style import GREY, colour, set_title, use_style
 
-MASS, SPEED, ENTRIES = 0.371, 1.0, np.array([0.0, 0.25, 0.5])  # kg, m/s, s
+MASS, SPEED, ENTRY_TIMES = 0.371, 1.0, np.array([0.0, 0.25, 0.5])  # kg, m/s, s
 WEIGHTS = {
     "state_weight": [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0],
     "command_weight": [9e-5],
@@ -26,74 +26,82 @@ WEIGHTS = {
     "points": 300,
     "period": 2e-3,
 }
-LATE = np.array([-0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1])  # s
-HEAVIER = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])  # share of the mass
+ENTRY_TIME_ERRORS = np.array([-0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1])  # s
+MASS_ERRORS = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])  # share of the mass
 SENSOR, TOLERANCE = 1, 1e-4
 
 
-def crossed(load) -> jb.Case:
+def three_mass_case(load_rig) -> jb.Case:
     """The one-span rig with its shaker, crossed by three masses, two or three of them at once."""
-    rig = load("A")
-    masses = tuple(jb.MovingMass(mass=MASS, speed=SPEED, entry_time=t) for t in ENTRIES)
+    rig = load_rig("A")
+    masses = tuple(jb.MovingMass(mass=MASS, speed=SPEED, entry_time=t) for t in ENTRY_TIMES)
     run = dataclasses.replace(rig.run, duration=np.asarray(1.2), sample_rate=np.asarray(400.0))
     return dataclasses.replace(rig, loads=masses, run=run)
 
 
-def predicting(late: float = 0.0, heavier: float = 0.0) -> AbstractController:
+def regulator(entry_time_error: float = 0.0, mass_error: float = 0.0) -> AbstractController:
     """The regulator that believes in a stream so late (s), and by such a share heavier."""
-    beliefs = Beliefs(mass=[MASS * (1 + heavier)] * 3, entry_time=ENTRIES + late)
-    return jb.AugmentedLQR(**WEIGHTS, design=beliefs, entries="predicted")
+    design_model = Beliefs(
+        mass=[MASS * (1 + mass_error)] * 3, entry_time=ENTRY_TIMES + entry_time_error
+    )
+    return jb.AugmentedLQR(**WEIGHTS, design=design_model, entries="predicted")
 
 
-def run(load) -> Outcome:
+def run(load_rig) -> ExperimentResult:
     """Peaks at 0.25 m under the regulator for what is predicted, over the error of that."""
-    rig = crossed(load)
+    rig = three_mass_case(load_rig)
 
     def simulated(law) -> jb.Record:
         return jb.simulate(dataclasses.replace(rig, controller=law), tolerance=TOLERANCE)
 
     free = simulated(None)
-    most = float(free.peak_deflection[SENSOR])
-    blind = simulated(jb.FiniteLQR(**WEIGHTS))
+    uncontrolled_peak = float(free.peak_deflection[SENSOR])
+    without_feedforward = simulated(jb.FiniteLQR(**WEIGHTS))
 
-    def less(record) -> float:
-        return 100 * (1 - float(record.peak_deflection[SENSOR]) / most)
+    def reduction(record) -> float:
+        return 100 * (1 - float(record.peak_deflection[SENSOR]) / uncontrolled_peak)
 
-    by_time = {late: simulated(predicting(late=late)) for late in LATE}
-    by_mass = {share: simulated(predicting(heavier=share)) for share in HEAVIER}
-    entries = [less(record) for record in by_time.values()]
-    masses = [less(record) for record in by_mass.values()]
-    told = (
+    by_time = {late: simulated(regulator(entry_time_error=late)) for late in ENTRY_TIME_ERRORS}
+    by_mass = {share: simulated(regulator(mass_error=share)) for share in MASS_ERRORS}
+    entries = [reduction(record) for record in by_time.values()]
+    masses = [reduction(record) for record in by_mass.values()]
+    remarks = (
         "Three masses of 0.371 kg at 1 m/s, 0.25 s apart; peak at 0.25 m below no control:"
-        f" {less(by_time[0.0]):.1f} % predicted rightly, {less(blind):.1f} % with weights unknown.",
-        _told("Entries predicted late", 1e3 * LATE, "ms", entries),
-        _told("Masses predicted heavier", 100 * HEAVIER, "%", masses),
+        f" {reduction(by_time[0.0]):.1f} % predicted rightly, {reduction(without_feedforward):.1f} % with weights unknown.",
+        _remark("Entries predicted late", 1e3 * ENTRY_TIME_ERRORS, "ms", entries),
+        _remark("Masses predicted heavier", 100 * MASS_ERRORS, "%", masses),
     )
-    shown = {
+    drawn_records = {
         "no control": free,
-        "loads not fed forward": blind,
+        "loads not fed forward": without_feedforward,
         "predicted rightly": by_time[0.0],
-        f"{1e3 * LATE[-1]:g} ms late": by_time[LATE[-1]],
+        f"{1e3 * ENTRY_TIME_ERRORS[-1]:g} ms late": by_time[ENTRY_TIME_ERRORS[-1]],
     }
-    return Outcome((), {"errors": _draw(entries, masses, less(blind), shown)}, told)
+    return ExperimentResult(
+        (),
+        {"errors": _draw(entries, masses, reduction(without_feedforward), drawn_records)},
+        remarks,
+    )
 
 
-def _told(what: str, errors: np.ndarray, unit: str, found: Sequence[float]) -> str:
+def _remark(label: str, errors: np.ndarray, unit: str, found: Sequence[float]) -> str:
     pairs = zip(errors, found, strict=True)
-    return f"{what} by: " + "; ".join(f"{error:+g} {unit}: {value:.1f} %" for error, value in pairs)
+    return f"{label} by: " + "; ".join(
+        f"{error:+g} {unit}: {value:.1f} %" for error, value in pairs
+    )
 
 
-@styled
-def _draw(entries, masses, blind: float, records) -> Figure:
+@use_style
+def _draw(entries, masses, without_feedforward: float, records) -> Figure:
     """Reductions over both errors above, deflections and voltages below."""
     figure = Figure(figsize=(8.0, 6.4))
     (left, right), (low, volts) = figure.subplots(2, 2)
-    left.plot(1e3 * LATE, entries, "o-", color=colour(2))
+    left.plot(1e3 * ENTRY_TIME_ERRORS, entries, "o-", color=colour(2))
     left.set(xlabel="entries predicted late by (ms)", ylabel="peak below no control (%)")
-    right.plot(100 * HEAVIER, masses, "o-", color=colour(2))
+    right.plot(100 * MASS_ERRORS, masses, "o-", color=colour(2))
     right.set(xlabel="masses predicted heavier by (%)")
     for axes in (left, right):
-        axes.axhline(blind, color=GREY, linestyle="--", label="loads not fed forward")
+        axes.axhline(without_feedforward, color=GREY, linestyle="--", label="loads not fed forward")
         axes.set_ylim(0, 100)
     left.legend(loc="lower center")
     for i, (word, record) in enumerate(records.items()):
@@ -104,7 +112,7 @@ def _draw(entries, masses, blind: float, records) -> Figure:
     low.set(xlabel="time (s)", ylabel="deflection at 0.25 m (mm)")
     volts.set(xlabel="time (s)", ylabel="voltage (V)")
     figure.legend(*low.get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    name(figure, "Three masses at once: what a wrong prediction costs")
+    set_title(figure, "Three masses at once: what a wrong prediction costs")
     return figure
 
 

@@ -24,33 +24,38 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 import tuning
 from experiments.studies.tuned_search import FOLDER
-from experiments.thesis.chapter6.feedback import ONE_CUTOFF, TWO_CUTOFF, controlled
-from experiments.thesis.verdicts import Experiment, Outcome
-from jaxbeam.plot.style import GREY, INK, colour, name, styled
-from tuning.control.load_cases import Values
-from tuning.control.run_set import Bench, make_bench
+from experiments.thesis.chapter6.feedback import ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF, with_feedback
+from experiments.thesis.verdicts import Experiment, ExperimentResult
+from jaxbeam.plot.style import GREY, INK, colour, set_title, use_style
+from tuning.control.load_cases import AddressValues
+from tuning.control.run_set import RunSet, make_run_set
 
 # Not among those tuned on:
 MASSES = (0.322, 0.42)  # kg
 SPEEDS = {"B": (0.35, 0.55, 0.95), "C": (0.45, 0.95)}  # m/s
-ENTRY = 0.054  # s: between two ticks, and late enough for commands to begin before
-DELAY, MORE_DELAY = 0.02, 0.01  # s
-STIFFER = {"10 % stiffer": 1.1, "10 % softer": 0.9}
+ENTRY_TIME = 0.054  # s: between two ticks, and late enough for commands to begin before
+DELAY, EXTRA_DELAY = 0.02, 0.01  # s
+RIGIDITY_ERRORS = {"10 % stiffer": 1.1, "10 % softer": 0.9}
 RIGIDITY = "beam.flexural_rigidity"
-CUBIC, IDEAL, BENCH, LATE = "hand-set, cubic", "tuned, ideal", "tuned, bench", "10 ms later"
-DRAWN = (CUBIC, BENCH, LATE)
-CUTOFFS = {"B": ONE_CUTOFF, "C": TWO_CUTOFF}
+CUBIC_FEEDBACK, TUNED_IDEAL, TUNED_BENCH, EXTRA_DELAY_LAW = (
+    "hand-set, cubic",
+    "tuned, ideal",
+    "tuned, bench",
+    "10 ms later",
+)
+DRAWN_LAWS = (CUBIC_FEEDBACK, TUNED_BENCH, EXTRA_DELAY_LAW)
+CUTOFFS = {"B": ONE_SPAN_CUTOFF, "C": TWO_SPAN_CUTOFF}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Study:
+class HeldOutStudy:
     """What laws do to the held-out loads of a rig: least reductions and, by law, those attained.
 
     All are shares of the peak without control (run); `records` are those of the last run.
     """
 
     title: str
-    loads: tuple[Values, ...]
+    loads: tuple[AddressValues, ...]
     attainable: np.ndarray
     reductions: dict[str, np.ndarray]
     records: dict[str, jb.Record]
@@ -60,49 +65,62 @@ class Study:
         return self.reductions[law] / self.attainable
 
 
-def run(load) -> Outcome:
+def run(load_rig) -> ExperimentResult:
     """Shares of the attainable reduction on rigs B and C, for loads held out."""
-    studies = {rig: study(rig, load(rig)) for rig in ("B", "C")}
-    remarks = tuple(line for one in studies.values() for line in told(one))
+    studies = {rig: run_study(rig, load_rig(rig)) for rig in ("B", "C")}
+    remarks = tuple(line for one in studies.values() for line in study_remarks(one))
     title = "One tuned table for all loads, proven on loads held out"
-    return Outcome((), {"shares": draw(list(studies.values()), DRAWN, title)}, remarks)
+    return ExperimentResult(
+        (), {"shares": draw(list(studies.values()), DRAWN_LAWS, title)}, remarks
+    )
 
 
-def study(rig: str, case: jb.Case) -> Study:
+def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
     """Run all laws on the held-out loads of a rig."""
-    duration = float(case.beam.length) / min(SPEEDS[rig]) + ENTRY + 0.1
+    duration = float(case.beam.length) / min(SPEEDS[rig]) + ENTRY_TIME + 0.1
     case = dataclasses.replace(case, run=jb.Run(duration=duration, sample_rate=200.0))
     loads = tuning.grid(
-        {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS[rig], "loads.0.entry_time": [ENTRY]}
+        {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS[rig], "loads.0.entry_time": [ENTRY_TIME]}
     )
     ideal = jb.load_case(FOLDER / f"{rig}.toml").controller
-    best = make_bench(dataclasses.replace(case, controller=ideal), loads, bounds=True)
-    late = make_bench(dataclasses.replace(case, controller=on_bench(ideal, MORE_DELAY)), loads)
-    real = make_bench(dataclasses.replace(case, controller=on_bench(ideal)), loads)
-    hand = make_bench(controlled(case, 3, CUTOFFS[rig]), loads)
+    ideal_runs = make_run_set(dataclasses.replace(case, controller=ideal), loads, least_peaks=True)
+    late_runs = make_run_set(
+        dataclasses.replace(case, controller=with_bench_delay(ideal, EXTRA_DELAY)), loads
+    )
+    bench_runs = make_run_set(dataclasses.replace(case, controller=with_bench_delay(ideal)), loads)
+    feedback_runs = make_run_set(with_feedback(case, 3, CUTOFFS[rig]), loads)
     records = {
         law: bench.records({})
-        for law, bench in ((CUBIC, hand), (IDEAL, best), (BENCH, real), (LATE, late))
+        for law, bench in (
+            (CUBIC_FEEDBACK, feedback_runs),
+            (TUNED_IDEAL, ideal_runs),
+            (TUNED_BENCH, bench_runs),
+            (EXTRA_DELAY_LAW, late_runs),
+        )
     }
-    reductions = {law: 1 - peaks(found) / best.free["peak"] for law, found in records.items()}
-    for word, factor in STIFFER.items():
+    reductions = {
+        law: 1 - peaks(found) / ideal_runs.uncontrolled["peak"] for law, found in records.items()
+    }
+    for word, factor in RIGIDITY_ERRORS.items():
         changed = {RIGIDITY: factor * float(case.beam.flexural_rigidity)}
-        reductions[word] = 1 - peaks(real.records(changed)) / uncontrolled(real, changed)
-    return Study(
+        reductions[word] = 1 - peaks(bench_runs.records(changed)) / uncontrolled_peaks(
+            bench_runs, changed
+        )
+    return HeldOutStudy(
         title=case.title,
         loads=loads,
-        attainable=1 - best.free["least"] / best.free["peak"],
+        attainable=1 - ideal_runs.uncontrolled["least"] / ideal_runs.uncontrolled["peak"],
         reductions=reductions,
         records={law: found[-1] for law, found in records.items()},
     )
 
 
-def on_bench(law: jb.Passage, more: float = 0.0) -> jb.Passage:
+def with_bench_delay(law: jb.Passage, extra_delay: float = 0.0) -> jb.Passage:
     """The law as it runs on the bench: it knows the delay and reads its table so much earlier.
 
-    Of `more` delay (s) it knows nothing.
+    Of `extra_delay` delay (s) it knows nothing.
     """
-    return dataclasses.replace(law, lead=law.lead + DELAY, delay=np.asarray(DELAY + more))
+    return dataclasses.replace(law, lead=law.lead + DELAY, delay=np.asarray(DELAY + extra_delay))
 
 
 def peaks(records: list[jb.Record]) -> np.ndarray:
@@ -110,43 +128,45 @@ def peaks(records: list[jb.Record]) -> np.ndarray:
     return np.array([float(np.max(record.peak_deflection)) for record in records])
 
 
-def uncontrolled(bench: Bench, changed: dict[str, float]) -> np.ndarray:
+def uncontrolled_peaks(run_set: RunSet, changed: dict[str, float]) -> np.ndarray:
     """Peaks (m) without control of the runs of a bench with other numbers."""
-    plain = [dataclasses.replace(jb.replace(c, changed), controller=None) for c in bench.cases]
+    plain = [dataclasses.replace(jb.replace(c, changed), controller=None) for c in run_set.cases]
     return peaks([jb.simulate(one, tolerance=1e-4) for one in plain])
 
 
-def told(one: Study, laws: Sequence[str] = (CUBIC, IDEAL, BENCH)) -> list[str]:
+def study_remarks(
+    held_out_study: HeldOutStudy, laws: Sequence[str] = (CUBIC_FEEDBACK, TUNED_IDEAL, TUNED_BENCH)
+) -> list[str]:
     """The result in lines: load by load for some laws, and the worst and the mean of all."""
-    lines = [one.title + ", held-out loads: peaks below no control"]
-    for i, load in enumerate(one.loads):
-        words = ", ".join(f"{law} {one.reductions[law][i]:.1%}" for law in laws)
+    lines = [held_out_study.title + ", held-out loads: peaks below no control"]
+    for i, load in enumerate(held_out_study.loads):
+        words = ", ".join(f"{law} {held_out_study.reductions[law][i]:.1%}" for law in laws)
         lines.append(
             f"{load['loads.0.mass']:g} kg at {load['loads.0.speed']:g} m/s: {words};"
-            f" at most {one.attainable[i]:.1%}"
+            f" at most {held_out_study.attainable[i]:.1%}"
         )
-    for law in one.reductions:
-        shares = one.shares(law)
+    for law in held_out_study.reductions:
+        shares = held_out_study.shares(law)
         lines.append(
             f"{law}: at least {shares.min():.1%} of the attainable, {shares.mean():.1%} in the mean"
         )
     return lines
 
 
-@styled
-def draw(studies: list[Study], laws: Sequence[str], title: str) -> Figure:
+@use_style
+def draw(studies: list[HeldOutStudy], laws: Sequence[str], title: str) -> Figure:
     """For each rig: shares of the attainable by load, and deflection and commands of one run."""
     figure = Figure(figsize=(5.2 * len(studies), 8.0))
     grid = figure.subplots(3, len(studies), squeeze=False, height_ratios=[1.2, 1, 1])
     for (top, middle, below), one in zip(grid.T, studies, strict=True):
-        _shares(top, one, laws)
-        _run(middle, below, one, laws)
+        _draw_shares(top, one, laws)
+        _draw_run(middle, below, one, laws)
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    name(figure, title)
+    set_title(figure, title)
     return figure
 
 
-def _shares(axes, one: Study, laws: Sequence[str]):
+def _draw_shares(axes, one: HeldOutStudy, laws: Sequence[str]):
     rows = np.arange(len(one.loads))
     for i, law in enumerate(laws):
         axes.plot(100 * one.shares(law), rows, "o", color=colour(i), label=law)
@@ -157,18 +177,25 @@ def _shares(axes, one: Study, laws: Sequence[str]):
     axes.set(xlabel="share of the attainable reduction (%)", xlim=(0, 105), title=one.title)
 
 
-def _run(upper, lower, one: Study, laws: Sequence[str]):
+def _draw_run(upper, lower, one: HeldOutStudy, laws: Sequence[str]):
     """The last of the runs: deflection where it is largest, and all commands."""
     free = dataclasses.replace(one.records[laws[-1]].case, controller=None)
-    plain = jb.simulate(free, tolerance=1e-4)
-    upper.plot(plain.times, 1e3 * plain.deflection[:, 0], color=GREY, label="no control")
+    uncontrolled_record = jb.simulate(free, tolerance=1e-4)
+    upper.plot(
+        uncontrolled_record.times,
+        1e3 * uncontrolled_record.deflection[:, 0],
+        color=GREY,
+        label="no control",
+    )
     for i, law in enumerate(laws):
         record = one.records[law]
         upper.plot(record.times, 1e3 * record.deflection[:, 0], color=colour(i))
-        for j, sent in enumerate(np.asarray(record.command).T):
-            lower.plot(record.times, sent, ("-", "--")[j], color=colour(i), drawstyle="steps-post")
+        for j, command in enumerate(np.asarray(record.command).T):
+            lower.plot(
+                record.times, command, ("-", "--")[j], color=colour(i), drawstyle="steps-post"
+            )
     mass, speed = one.loads[-1]["loads.0.mass"], one.loads[-1]["loads.0.speed"]
-    end = ENTRY + float(free.beam.length) / speed + 0.1
+    end = ENTRY_TIME + float(free.beam.length) / speed + 0.1
     upper.set(
         title=f"{mass:g} kg at {speed:g} m/s; no control grey",
         ylabel="deflection at first sensor (mm)",

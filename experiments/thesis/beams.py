@@ -7,14 +7,14 @@ import numpy as np
 import jaxbeam as jb
 
 
-def one_span(load) -> jb.Case:
+def one_span(load_rig) -> jb.Case:
     """Rig A without its shaker."""
-    return dataclasses.replace(load("A"), actuators=())
+    return dataclasses.replace(load_rig("A"), actuators=())
 
 
-def two_spans(load, modes: int = 8) -> jb.Case:
+def two_spans(load_rig, modes: int = 8) -> jb.Case:
     """The beam of rig A over two of its spans, of which rigidity and density "stay unchanged"."""
-    one = one_span(load)
+    one = one_span(load_rig)
     return dataclasses.replace(
         one,
         beam=dataclasses.replace(one.beam, length=2 * one.beam.length, modes=modes),
@@ -22,7 +22,7 @@ def two_spans(load, modes: int = 8) -> jb.Case:
     )
 
 
-def as_force(case: jb.Case) -> jb.Case:
+def as_moving_force(case: jb.Case) -> jb.Case:
     """The same case with loads that weigh as much and have no inertia."""
     loads = [jb.MovingForce(mass=load.mass, speed=load.speed) for load in case.loads]
     return dataclasses.replace(case, loads=tuple(loads))
@@ -38,8 +38,8 @@ def with_modes(case: jb.Case, modes: int) -> jb.Case:
     return dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=modes))
 
 
-def watched(case: jb.Case, *places: float, duration: float) -> jb.Case:
+def with_sensors(case: jb.Case, *positions: float, duration: float) -> jb.Case:
     """The same case with sensors at places (m), for a duration (s)."""
-    sensors = tuple(jb.Sensor(place) for place in places)
+    sensors = tuple(jb.Sensor(place) for place in positions)
     run = dataclasses.replace(case.run, duration=np.asarray(duration))
     return dataclasses.replace(case, sensors=sensors, run=run)

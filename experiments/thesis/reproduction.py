@@ -14,7 +14,7 @@ import jax
 
 import jaxbeam as jb
 from experiments.thesis import writeup
-from experiments.thesis.verdicts import VERDICTS, Experiment, Run, judge
+from experiments.thesis.verdicts import VERDICTS, Experiment, Run, assign_verdicts
 from jaxbeam import rigs
 
 MODULES = (
@@ -30,7 +30,7 @@ MODULES = (
     "studies.tuned",
     "studies.sensed",
 )
-FOLDER = "out/reproduce"
+OUTPUT_FOLDER = "out/reproduce"
 
 
 def experiments() -> dict[str, Experiment]:
@@ -39,7 +39,7 @@ def experiments() -> dict[str, Experiment]:
     return {one.name: one for one in found}
 
 
-def chosen(names: Sequence[str]) -> list[Experiment]:
+def select_experiments(names: Sequence[str]) -> list[Experiment]:
     """The experiments of these names. Raises ValueError for a name that none has."""
     known = experiments()
     for name in names:
@@ -48,18 +48,18 @@ def chosen(names: Sequence[str]) -> list[Experiment]:
     return [known[name] for name in names]
 
 
-def perform(experiment: Experiment, load: Callable[[str], jb.Case] = rigs.load) -> Run:
+def run_experiment(experiment: Experiment, load_rig: Callable[[str], jb.Case] = rigs.load) -> Run:
     """Run one experiment on the published rigs, or on what is loaded in their place."""
     start = time.perf_counter()
-    outcome = experiment.run(load)
-    return Run(experiment, outcome, judge(outcome.findings), time.perf_counter() - start)
+    outcome = experiment.run(load_rig)
+    return Run(experiment, outcome, assign_verdicts(outcome.findings), time.perf_counter() - start)
 
 
 def reproduce(
     names: Sequence[str],
-    folder: str | Path = FOLDER,
+    folder: str | Path = OUTPUT_FOLDER,
     overwrite: bool = False,
-    tell: Callable[[str], None] = print,
+    report_progress: Callable[[str], None] = print,
     processes: int = 1,
 ) -> list[Run]:
     """Run experiments and write figures, numbers and one report into a folder.
@@ -68,13 +68,13 @@ def reproduce(
     it are done. Raises ValueError for an unknown name,
     FileExistsError if the folder is not empty and may not be overwritten.
     """
-    wanted, folder = [one.name for one in chosen(names)], Path(folder)
+    selected, folder = [one.name for one in select_experiments(names)], Path(folder)
     if folder.exists() and any(folder.iterdir()) and not overwrite:
         raise FileExistsError(f"the folder {folder} is not empty; choose another, or --overwrite")
     folder.mkdir(parents=True, exist_ok=True)
     runs = []
-    for run in _performed(wanted, folder, processes):
-        tell(writeup.text(run))
+    for run in _run_all(selected, folder, processes):
+        report_progress(writeup.text(run))
         runs.append(run)
     (folder / "report.md").write_text(writeup.markdown(runs), encoding="utf-8")
     (folder / "report.html").write_text(writeup.html(runs), encoding="utf-8")
@@ -82,28 +82,28 @@ def reproduce(
     return runs
 
 
-def _performed(names: Sequence[str], folder: Path, processes: int) -> Iterator[Run]:
+def _run_all(names: Sequence[str], folder: Path, processes: int) -> Iterator[Run]:
     """Runs of experiments, in their order, with their figures in the folder."""
     if processes == 1:
-        yield from (_draw(perform(one), folder) for one in chosen(names))
+        yield from (_save_figures(run_experiment(one), folder) for one in select_experiments(names))
         return
     # Each process has a Python lock of its own, under which programs are traced.
     settings = (jax.config.jax_compilation_cache_dir,)
-    pool = ProcessPoolExecutor(processes, get_context("spawn"), _begin, settings)
+    pool = ProcessPoolExecutor(processes, get_context("spawn"), _initialise_process, settings)
     with pool:
-        parts = pool.map(_apart, names, [folder] * len(names))
-        for one, part in zip(chosen(names), parts, strict=True):
-            yield Run(one, *part)
+        parts = pool.map(_run_in_process, names, [folder] * len(names))
+        for experiment, part in zip(select_experiments(names), parts, strict=True):
+            yield Run(experiment, *part)
 
 
-def _apart(name: str, folder: Path) -> tuple:
+def _run_in_process(name: str, folder: Path) -> tuple:
     """What a process brings back of an experiment: all but the experiment itself."""
-    (one,) = chosen([name])
-    _, *rest = _draw(perform(one), folder)
+    (one,) = select_experiments([name])
+    _, *rest = _save_figures(run_experiment(one), folder)
     return tuple(rest)
 
 
-def _draw(run: Run, folder: Path) -> Run:
+def _save_figures(run: Run, folder: Path) -> Run:
     """Write the figures of a run; only their names are kept, for the report."""
     for name, figure in run.outcome.figures.items():
         figure.savefig(folder / f"{run.experiment.name}-{name}.png")
@@ -111,16 +111,16 @@ def _draw(run: Run, folder: Path) -> Run:
     return run._replace(outcome=dataclasses.replace(run.outcome, figures=names))
 
 
-def _begin(programs: str | None) -> None:
+def _initialise_process(cache_folder: str | None) -> None:
     """Set a process up as the command line is: compiled programs are kept, warnings are short."""
-    jax.config.update("jax_compilation_cache_dir", programs)
+    jax.config.update("jax_compilation_cache_dir", cache_folder)
     warnings.formatwarning = lambda message, *_: f"jaxbeam: warning: {message}\n"
 
 
 def as_dict(runs: Sequence[Run]) -> dict:
     """All numbers and verdicts as plain lists and words."""
     return {
-        "summary": {word: writeup.count(runs, word) for word in VERDICTS},
+        "summary": {word: writeup.count_verdicts(runs, word) for word in VERDICTS},
         "experiments": {
             run.experiment.name: {
                 "claim": run.experiment.claim,
@@ -128,16 +128,18 @@ def as_dict(runs: Sequence[Run]) -> dict:
                 "remarks": list(run.outcome.remarks),
                 "findings": [
                     {
-                        "where": one.printed.where,
-                        "what": one.printed.what,
-                        "unit": one.printed.unit,
-                        "kind": one.printed.kind,
-                        "tolerance": str(one.printed.tolerance),
-                        "labels": one.printed.names,
-                        "published": one.printed.numbers.tolist(),
-                        "readings": {k: list(map(float, v)) for k, v in one.readings.items()},
-                        "verdicts": judged.words,
-                        "obstacle": one.obstacle,
+                        "where": one.published.location,
+                        "what": one.published.quantity,
+                        "unit": one.published.unit,
+                        "kind": one.published.origin,
+                        "tolerance": str(one.published.tolerance),
+                        "labels": one.published.value_labels,
+                        "published": one.published.numbers.tolist(),
+                        "readings": {
+                            k: list(map(float, v)) for k, v in one.interpretations.items()
+                        },
+                        "verdicts": judged.verdicts,
+                        "obstacle": one.inconsistency,
                     }
                     for one, judged in zip(run.outcome.findings, run.judged, strict=True)
                 ],

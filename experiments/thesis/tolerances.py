@@ -2,17 +2,19 @@
 
 from experiments.thesis.verdicts import Tolerance
 
-EXACT = Tolerance("a table of an eigenvalue problem that is stated in full", digits=1)
+EIGENVALUE_TABLE = Tolerance("a table of an eigenvalue problem that is stated in full", digits=1)
 FORMULA = Tolerance("a formula with its numbers", relative=0.001)
 SAME_MODEL = Tolerance("computed with a model that is stated in full", relative=0.02)
-CURVE = Tolerance("read off a computed curve, and rounded in the text", relative=0.05)
+COMPUTED_CURVE = Tolerance("read off a computed curve, and rounded in the text", relative=0.05)
 GAIN = Tolerance("a computed gain, of which some digits are printed", relative=0.02, digits=0.5)
-SAMPLE = Tolerance("an instant of a sampled run, to one sample", absolute=0.01)
-POINTS = Tolerance("a computed reduction in percent, to one point", absolute=1.0)
+SAMPLE_INSTANT = Tolerance("an instant of a sampled run, to one sample", absolute=0.01)
+COMPUTED_REDUCTION = Tolerance("a computed reduction in percent, to one point", absolute=1.0)
 MEASURED = Tolerance("measured; supports alone are quoted to yield by 0.1 mm", relative=0.05)
-RUNS = Tolerance("a measured reduction, mean of few runs, to three points", absolute=3.0)
-VOLTS = Tolerance("a measured voltage", relative=0.1)
-BY_HAND = Tolerance("fitted by hand, as well as an eye can tell", relative=0.05)
-EITHER = Tolerance("yes or no", absolute=0.5)
+MEASURED_REDUCTION = Tolerance(
+    "a measured reduction, mean of few runs, to three points", absolute=3.0
+)
+MEASURED_VOLTAGE = Tolerance("a measured voltage", relative=0.1)
+HAND_FIT = Tolerance("fitted by hand, as well as an eye can tell", relative=0.05)
+YES_OR_NO = Tolerance("yes or no", absolute=0.5)
 
 HZ = "Hz"

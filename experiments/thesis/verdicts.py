@@ -17,12 +17,12 @@ import jaxbeam as jb
 class Tolerance:
     """How far ours may be from a printed number: the largest of what is given here.
 
-    `relative` is a share of the printed number, `absolute` is in its unit, `digits` in units of
-    its last digit (zeros at the end of a whole number are none); `why` says for what kind of
+    `relative` is a share of the printed number, `absolute` is in its unit, `format_number` in units of
+    its last digit (zeros at the end of a whole number are none); `basis` says for what kind of
     number it is.
     """
 
-    why: str
+    basis: str
     relative: float = 0.0
     absolute: float = 0.0
     digits: float = 0.0
@@ -35,43 +35,45 @@ class Tolerance:
 
 
 @dataclasses.dataclass(frozen=True)
-class Printed:
+class PublishedNumbers:
     """Printed numbers of one kind: what, where, and how near ours must come.
 
-    `values` are written as printed, since their digits count; `labels` name them one by one.
-    `kind` is "measured" or "computed", by the thesis; `reading` is what was chosen where it is
+    `printed_text` are written as printed, since their digits count; `labels` name them one by one.
+    `origin` is "measured" or "computed", by the thesis; `interpretation` is what was chosen where it is
     ambiguous.
     """
 
-    where: str
-    what: str
+    location: str
+    quantity: str
     unit: str
-    kind: str
+    origin: str
     tolerance: Tolerance
-    values: str
+    printed_text: str
     labels: str = ""
-    reading: str = ""
+    interpretation: str = ""
 
     @property
     def numbers(self) -> np.ndarray:
         """The values as numbers."""
-        return np.array([float(word) for word in self.values.split()])
+        return np.array([float(word) for word in self.printed_text.split()])
 
     @property
-    def allowed(self) -> np.ndarray:
+    def allowed_error(self) -> np.ndarray:
         """How far ours may be from each of the values."""
-        last = self.tolerance.digits * np.array([_last_digit(w) for w in self.values.split()])
+        last = self.tolerance.digits * np.array(
+            [_last_digit_unit(w) for w in self.printed_text.split()]
+        )
         wide = self.tolerance.relative * np.abs(self.numbers)
         return np.maximum(np.maximum(wide, last), self.tolerance.absolute)
 
     @property
-    def names(self) -> list[str]:
+    def value_labels(self) -> list[str]:
         """A label for each value."""
         labels = self.labels.split()
         return labels or [""] * self.numbers.size
 
 
-def _last_digit(word: str) -> float:
+def _last_digit_unit(word: str) -> float:
     """One unit of the last digit of a number; zeros at the end of a whole number are none."""
     if "." in word:
         return 10.0 ** -len(word.partition(".")[2])
@@ -79,64 +81,67 @@ def _last_digit(word: str) -> float:
 
 
 REPRODUCED, EXPLAINED = "reproduced", "explained"
-IMPOSSIBLE, NOT = "cannot be reproduced", "not reproduced"
-VERDICTS = (REPRODUCED, EXPLAINED, IMPOSSIBLE, NOT)
+IRREPRODUCIBLE, NOT_REPRODUCED = "cannot be reproduced", "not reproduced"
+VERDICTS = (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED)
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
     """Printed numbers beside ours, by one reading of the thesis or by several.
 
-    The first of the `readings` is what the thesis says; the others are what it may have meant,
-    each named by a reason. `obstacle` is why the numbers cannot be right for the rig that is
+    The first of the `interpretations` is what the thesis says; the others are what it may have meant,
+    each named by a reason. `inconsistency` is why the numbers cannot be right for the rig that is
     stated, if a computation has shown that, else empty.
     """
 
-    printed: Printed
-    readings: Mapping[str, np.ndarray]
-    obstacle: str = ""
+    published: PublishedNumbers
+    interpretations: Mapping[str, np.ndarray]
+    inconsistency: str = ""
 
     def __post_init__(self):
-        count = self.printed.numbers.size
-        for name, values in self.readings.items():
+        count = self.published.numbers.size
+        for name, values in self.interpretations.items():
             if np.shape(values) != (count,):
-                raise ValueError(f"{self.printed.where}, {name}: {count} numbers are printed")
+                raise ValueError(f"{self.published.location}, {name}: {count} numbers are printed")
 
-    def within(self, reading: str) -> np.ndarray:
+    def within_tolerance(self, interpretation: str) -> np.ndarray:
         """Whether each number of a reading is as near as it must be."""
         # The last bit of a difference of rounded numbers does not count.
-        far = np.abs(np.asarray(self.readings[reading]) - self.printed.numbers)
-        return far <= self.printed.allowed * (1 + 1e-9)
+        far = np.abs(np.asarray(self.interpretations[interpretation]) - self.published.numbers)
+        return far <= self.published.allowed_error * (1 + 1e-9)
 
 
-def finding(
-    printed: Printed, values, others: Mapping[str, np.ndarray] | None = None, obstacle: str = ""
+def make_finding(
+    published: PublishedNumbers,
+    values,
+    alternatives: Mapping[str, np.ndarray] | None = None,
+    inconsistency: str = "",
 ) -> Finding:
-    """A finding by the reading as printed, and by `others`, each named by what it takes instead."""
-    readings = {"as printed": values} | dict(others or {})
+    """A finding by the reading as printed, and by `alternatives`, each named by what it takes instead."""
+    readings = {"as printed": values} | dict(alternatives or {})
     return Finding(
-        printed, {k: np.atleast_1d(np.asarray(v)) for k, v in readings.items()}, obstacle
+        published, {k: np.atleast_1d(np.asarray(v)) for k, v in readings.items()}, inconsistency
     )
 
 
-def best_reading(findings: Sequence[Finding]) -> str:
+def best_interpretation(findings: Sequence[Finding]) -> str:
     """Of the other readings that findings have in common, the one that meets most numbers.
 
     One reading has to serve for all: no number gets one of its own. Empty if there is no other.
     """
-    others = list(findings[0].readings)[1:]
-    hits = {name: sum(int(one.within(name).sum()) for one in findings) for name in others}
+    others = list(findings[0].interpretations)[1:]
+    hits = {name: sum(int(one.within_tolerance(name).sum()) for one in findings) for name in others}
     return max(hits, key=lambda name: hits[name], default="")
 
 
-class Judged(NamedTuple):
+class FindingVerdicts(NamedTuple):
     """Verdicts on the numbers of a finding, and for each the reading of ours it rests on."""
 
-    words: list[str]
-    by: list[str]
+    verdicts: list[str]
+    interpretations: list[str]
 
 
-def judge(findings: Sequence[Finding]) -> list[Judged]:
+def assign_verdicts(findings: Sequence[Finding]) -> list[FindingVerdicts]:
     """The verdicts on the numbers of each finding.
 
     Reproduced: the reading as printed is within the tolerance. Explained: another reading is, the
@@ -145,19 +150,31 @@ def judge(findings: Sequence[Finding]) -> list[Judged]:
     """
     judged = []
     for one in findings:
-        alike = [other for other in findings if list(other.readings) == list(one.readings)]
-        first, second = next(iter(one.readings)), best_reading(alike)
-        explained = one.within(second) if second else np.zeros(one.printed.numbers.size, bool)
-        words = [
-            REPRODUCED if plain else EXPLAINED if other else IMPOSSIBLE if one.obstacle else NOT
-            for plain, other in zip(one.within(first), explained, strict=True)
+        alike = [
+            other for other in findings if list(other.interpretations) == list(one.interpretations)
         ]
-        judged.append(Judged(words, [second if word == EXPLAINED else first for word in words]))
+        first, second = next(iter(one.interpretations)), best_interpretation(alike)
+        explained = (
+            one.within_tolerance(second) if second else np.zeros(one.published.numbers.size, bool)
+        )
+        words = [
+            REPRODUCED
+            if plain
+            else EXPLAINED
+            if other
+            else IRREPRODUCIBLE
+            if one.inconsistency
+            else NOT_REPRODUCED
+            for plain, other in zip(one.within_tolerance(first), explained, strict=True)
+        ]
+        judged.append(
+            FindingVerdicts(words, [second if word == EXPLAINED else first for word in words])
+        )
     return judged
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
+class ExperimentResult:
     """What an experiment found: numbers beside printed ones, figures by name, remarks."""
 
     findings: tuple[Finding, ...]
@@ -175,13 +192,13 @@ class Experiment:
     name: str
     covers: str
     claim: str
-    run: Callable[[Callable[[str], jb.Case]], Outcome]
+    run: Callable[[Callable[[str], jb.Case]], ExperimentResult]
 
 
 class Run(NamedTuple):
     """An experiment, what it found, the verdicts on its numbers, and the seconds it took."""
 
     experiment: Experiment
-    outcome: Outcome
-    judged: list[Judged]
+    outcome: ExperimentResult
+    judged: list[FindingVerdicts]
     seconds: float

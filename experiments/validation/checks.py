@@ -47,29 +47,29 @@ LOAD = jb.MovingMass(mass=0.4, speed=2.0)
 class Check(NamedTuple):
     """One comparison: what, with what, and its error (relative) beside what is allowed."""
 
-    what: str
-    source: str
+    quantity: str
+    reference: str
     error: float
-    allowed: float
+    tolerance: float
 
     @property
     def passed(self) -> bool:
         """Whether the error is within what is allowed; NaN is not."""
-        return self.error <= self.allowed
+        return self.error <= self.tolerance
 
 
-def off(found, expected) -> float:
+def max_relative_error(found, expected) -> float:
     """Largest difference, relative to the largest expected value."""
     found, expected = np.asarray(found), np.asarray(expected)
     return float(np.max(np.abs(found - expected)) / np.max(np.abs(expected)))
 
 
-def each_off(found, expected) -> float:
+def max_entrywise_error(found, expected) -> float:
     """Largest difference of any entry, relative to that entry."""
     return float(np.max(np.abs(np.asarray(found) / np.asarray(expected) - 1)))
 
 
-def crossed(load=LOAD, span: Span = SPAN, duration: float = 0.6) -> jb.Case:
+def single_span_case(load=LOAD, span: Span = SPAN, duration: float = 0.6) -> jb.Case:
     """A span on two pins with three sensors, crossed by a load."""
     beam = jb.Beam(
         span.length,
@@ -91,7 +91,7 @@ def frequencies() -> Iterator[Check]:
         parameters = single_span_parameters(name, 8)
         bending = parameters > 0
         found = jb.modes(jb.Case(jb.Beam(0.6, 11.68, 0.535, ends=name, modes=8))).frequencies
-        worst = max(worst, each_off(found[bending], unit * parameters[bending] ** 2))
+        worst = max(worst, max_entrywise_error(found[bending], unit * parameters[bending] ** 2))
         worst = max(worst, float(np.max(found[~bending], initial=0.0)))
     yield Check(
         f"8 frequencies of one span, {len(ends)} pairs of ends",
@@ -103,7 +103,9 @@ def frequencies() -> Iterator[Check]:
     for ratio in (0.37, 0.45):
         case = jb.Case(jb.Beam(0.6, 11.68, 0.535, modes=8), [jb.Support(0.6 * ratio)])
         errors.append(
-            each_off(jb.modes(case).frequencies, unit * two_span_parameters(ratio, 8) ** 2)
+            max_entrywise_error(
+                jb.modes(case).frequencies, unit * two_span_parameters(ratio, 8) ** 2
+            )
         )
     yield Check(
         "8 frequencies of two unequal spans",
@@ -118,21 +120,21 @@ def frequencies() -> Iterator[Check]:
     yield Check(
         "8 frequencies of a stepped beam with an elastic and a rigid support",
         "dynamic stiffness matrix, counted by Wittrick and Williams",
-        each_off(jb.modes(case).frequencies, exact),
+        max_entrywise_error(jb.modes(case).frequencies, exact),
         1e-9,
     )
 
 
 def statics() -> Iterator[Check]:
     """Static deflection under travelling weights."""
-    case = crossed()
-    places = np.linspace(0, SPAN.length, 6001)
-    line = [influence_line(SPAN.length, 11.68, "pinned-pinned", x, places) for x in SENSORS]
+    case = single_span_case()
+    load_positions = np.linspace(0, SPAN.length, 6001)
+    line = [influence_line(SPAN.length, 11.68, "pinned-pinned", x, load_positions) for x in SENSORS]
     expected = 0.4 * GRAVITY * np.max(np.abs(line), axis=1)
     yield Check(
         "largest static deflection at three places",
         "Macaulay's method",
-        each_off(static_peak(case, SENSORS), expected),
+        max_entrywise_error(static_peak(case, SENSORS), expected),
         1e-6,  # the source looks at 6001 positions of the load
     )
 
@@ -140,7 +142,7 @@ def statics() -> Iterator[Check]:
 def runs() -> Iterator[Check]:
     """Crossings: deflection and contact force."""
     undamped = dataclasses.replace(SPAN, damping_ratio=0.0)
-    case = crossed(jb.MovingForce(force=3.0, speed=1.0), undamped)
+    case = single_span_case(jb.MovingForce(force=3.0, speed=1.0), undamped)
     errors = []
     for ratio in (0.05, 0.3, 1.0, 2.0, 3.7):
         speed = ratio * critical_speed(undamped)
@@ -148,7 +150,7 @@ def runs() -> Iterator[Check]:
         one = jb.replace(case, {"loads.0.speed": speed, "run.duration": times[-1]})
         record = jb.simulate(one, jnp.asarray(times))
         q, _ = moving_force(undamped, 3.0, speed, times)
-        errors.append(off(record.deflection, q @ undamped.shapes(SENSORS).T))
+        errors.append(max_relative_error(record.deflection, q @ undamped.shapes(SENSORS).T))
     yield Check(
         "moving force, 5 speeds from 0.05 to 3.7 of the critical one (it included)",
         "closed form",
@@ -156,18 +158,18 @@ def runs() -> Iterator[Check]:
         1e-7,
     )
     times = np.linspace(0, 0.6, 301)
-    case = crossed()
+    case = single_span_case()
     record = jb.simulate(case, jnp.asarray(times))
     solved = modal_equations.respond(SPAN, [Load(0.4, 2.0)], SENSORS, times)
     source = "modal equations with the whole mass matrix, scipy DOP853"
     for what in ("deflection", "contact_force"):
-        error = off(getattr(record, what), getattr(solved, what))
+        error = max_relative_error(getattr(record, what), getattr(solved, what))
         yield Check(f"moving mass, {what.replace('_', ' ')}", source, error, 1e-5)
     reference = simulate_adaptive(case, jnp.asarray(times))
     yield Check(
         "moving mass, deflection",
         "other equations and another integrator inside jaxbeam (diffrax Dopri8)",
-        off(record.deflection, reference.deflection),
+        max_relative_error(record.deflection, reference.deflection),
         1e-6,
     )
     beam = jb.Beam(1.2, 12.0, 0.7, ends="clamped-free", modes=4, damping_ratio=0.02)
@@ -179,15 +181,15 @@ def runs() -> Iterator[Check]:
     ]
     case = jb.Case(beam, supports, (), sensors, loads, run=jb.Run(0.8, gravity=GRAVITY))
     times = np.linspace(0, 0.8, 161)
-    same = [Load(0.3, 2.5, 0.02, 2.0), Load(0.2, -3.0, 0.1)]
+    oracle_loads = [Load(0.3, 2.5, 0.02, 2.0), Load(0.2, -3.0, 0.1)]
     elements = as_oracle(case, elements=80)
     elements = dataclasses.replace(elements, damping_ratio=0.02)
-    where = [0.2, 0.6, 1.15]
-    solved = crossing.respond(elements, same, where, times, modes=4, rtol=1e-9)
+    sensor_positions = [0.2, 0.6, 1.15]
+    solved = crossing.respond(elements, oracle_loads, sensor_positions, times, modes=4, rtol=1e-9)
     yield Check(
         "two masses at once, one braking, one from the right, over an elastic support and a tip",
         "80 Hermite elements, scipy DOP853",
-        off(jb.simulate(case, jnp.asarray(times)).deflection, solved.deflection),
+        max_relative_error(jb.simulate(case, jnp.asarray(times)).deflection, solved.deflection),
         1e-4,
     )
 
@@ -200,23 +202,23 @@ def energy() -> Iterator[Check]:
     inner = (pieces[:-1] + half)[:, None] + half[:, None] * nodes
     times = np.concatenate([[0.0], inner.ravel(), [0.3 - 1e-12]])
     quadrature = np.concatenate([[0.0], np.outer(half, weights).ravel(), [0.0]])
-    record = jb.simulate(crossed(duration=0.3), jnp.asarray(times), tolerance=1e-9)
+    record = jb.simulate(single_span_case(duration=0.3), jnp.asarray(times), tolerance=1e-9)
     q, u = np.asarray(record.coordinates), np.asarray(record.rates)
     stored = np.sum(u**2 + SPAN.frequencies**2 * q**2, axis=1)[-1] / 2
-    under = np.sum(u * record.modes.shapes(record.load_position[:, 0]), axis=1)
-    work = quadrature @ (-record.contact_force[:, 0] * under)
-    lost = quadrature @ np.sum(2 * SPAN.damping_ratio * SPAN.frequencies * u**2, axis=1)
+    contact_velocity = np.sum(u * record.modes.shapes(record.load_position[:, 0]), axis=1)
+    work = quadrature @ (-record.contact_force[:, 0] * contact_velocity)
+    dissipated = quadrature @ np.sum(2 * SPAN.damping_ratio * SPAN.frequencies * u**2, axis=1)
     yield Check(
-        f"stored and dissipated energy of a crossing (dissipated: {lost / work:.0%})",
+        f"stored and dissipated energy of a crossing (dissipated: {dissipated / work:.0%})",
         "work of the contact force, by Gauss quadrature",
-        each_off(stored + lost, work),
+        max_entrywise_error(stored + dissipated, work),
         1e-7,
     )
 
 
 def gradients() -> Iterator[Check]:
     """Derivatives of peaks by all sorts of numbers."""
-    case = crossed()
+    case = single_span_case()
     free = ("beam.flexural_rigidity", "beam.damping_ratio", "loads.0.mass", "loads.0.speed",
             "sensors.0.position")  # fmt: skip
     sizes = jnp.array([jb.addresses(case)[address] for address in free])
@@ -233,7 +235,7 @@ def gradients() -> Iterator[Check]:
         yield Check(
             f"derivatives of 3 peaks by 5 numbers, {mode} mode",
             "central differences of order 6",
-            off(jax.jit(jacobian(peaks))(one), expected),
+            max_relative_error(jax.jit(jacobian(peaks))(one), expected),
             1e-6,
         )
 
@@ -241,8 +243,8 @@ def gradients() -> Iterator[Check]:
 def loops() -> Iterator[Check]:
     """Sampled closed loops, their gains and filters."""
     case = rigs.load("B")
-    law = jb.Feedback(gains=[1e10], power=3, period=0.002, delay=0.001)
-    case = dataclasses.replace(case, controller=law)
+    feedback = jb.Feedback(gains=[1e10], power=3, period=0.002, delay=0.001)
+    case = dataclasses.replace(case, controller=feedback)
     changes = {"loads.0.speed": 1.5, "run.duration": 0.5}
     case = jb.replace(case, changes)
     times = np.linspace(0, 0.5, 126)[:-1] + 1e-4  # between the ticks
@@ -250,7 +252,7 @@ def loops() -> Iterator[Check]:
     yield Check(
         "cubic feedback, sampled, delayed, saturated: deflection",
         "event by event with scipy DOP853",
-        off(found, loop_as_oracle.expected(case, times).deflection),
+        max_relative_error(found, loop_as_oracle.expected(case, times).deflection),
         1e-5,
     )
     model = jb.state_space(dataclasses.replace(case, controller=None))
@@ -260,35 +262,37 @@ def loops() -> Iterator[Check]:
     P = scipy.linalg.solve_continuous_are(A, B, Q, R)
     gain = jb.LQR(**weights).gains(model)
     yield Check("gain of the regulator", "scipy, algebraic Riccati equation",
-                off(gain, np.linalg.solve(R, B.T @ P)), 1e-6)  # fmt: skip
+                max_relative_error(gain, np.linalg.solve(R, B.T @ P)), 1e-6)  # fmt: skip
     noise, C = np.diag([0.0] * 3 + [0.01, 0.02, 0.03]), np.eye(1, 6) * 1e3
     P = scipy.linalg.solve_continuous_are(A.T, C.T, noise, R)
     filtering = kalman_gain(*map(jnp.asarray, (A, C, noise, R)))
     yield Check("gain of the Kalman filter", "scipy, algebraic Riccati equation",
-                off(filtering[0], P @ C.T / R), 1e-6)  # fmt: skip
+                max_relative_error(filtering[0], P @ C.T / R), 1e-6)  # fmt: skip
     held = scipy.signal.cont2discrete((A, B, C, np.zeros((1, 1))), 0.002)[0]
     sampled = model.unloaded.discretize(0.002)
-    yield Check("plant sampled at 500 Hz", "scipy cont2discrete", off(sampled.A, held), 1e-9)
+    yield Check(
+        "plant sampled at 500 Hz", "scipy cont2discrete", max_relative_error(sampled.A, held), 1e-9
+    )
     P = scipy.linalg.solve_discrete_are(held.T, C.T, noise, R)
     gain = P @ C.T / (C @ P @ C.T + R)
     found = sampled_kalman_gain(*map(jnp.asarray, (held, C, noise, R)))[0]
     yield Check("gain of the sampled Kalman filter", "scipy, discrete Riccati equation",
-                off(found, gain), 1e-6)  # fmt: skip
+                max_relative_error(found, gain), 1e-6)  # fmt: skip
     signal = np.random.default_rng(7).normal(size=(2000, 1)).cumsum(axis=0)
     rows = sections(jb.Filter(40.0, 5), 1e-3)
     filtered = filter_history(rows, initial(rows, np.zeros(1)), jnp.asarray(signal))
     butter = scipy.signal.butter(5, 40.0, fs=1000.0, output="sos")
     yield Check("Butterworth filter of order 5, output", "scipy butter and sosfilt",
-                off(filtered, scipy.signal.sosfilt(butter, signal, axis=0)), 1e-9)  # fmt: skip
+                max_relative_error(filtered, scipy.signal.sosfilt(butter, signal, axis=0)), 1e-9)  # fmt: skip
 
 
 def bounds() -> Iterator[Check]:
     """The least peak that any controller leaves."""
     case = jb.replace(rigs.load("B"), {"loads.0.speed": 1.0, "run.duration": 0.8})
     best = jb.bound(case)
-    found = reach(case, best.places, best.period, best.spacing)
-    free = found.free @ found.rows[0]
-    response = np.einsum("m,tmk->tk", found.rows[0], found.response[..., 0])
+    influence = reach(case, best.places, best.period, best.spacing)
+    free = influence.free @ influence.rows[0]
+    response = np.einsum("m,tmk->tk", influence.rows[0], influence.response[..., 0])
     count, scale = response.shape[1], 1e3
     one = np.ones((free.size, 1))
     rows = np.block([[scale * response, -one], [-scale * response, -one]])
@@ -309,10 +313,10 @@ def bounds() -> Iterator[Check]:
     )
     other = solver.solve().x[-1] / scale
     yield Check("least peak of rig B", "the whole linear program, by Clarabel",
-                each_off(best.peak, other), 1e-6)  # fmt: skip
+                max_entrywise_error(best.peak, other), 1e-6)  # fmt: skip
     record = jb.simulate(dataclasses.replace(case, controller=best.controller()))
     yield Check("least peak of rig B", "a run with the commands that are said to attain it",
-                each_off(np.max(np.abs(record.deflection)), best.peak), 1e-4)  # fmt: skip
+                max_entrywise_error(np.max(np.abs(record.deflection)), best.peak), 1e-4)  # fmt: skip
 
 
 CHECKS = (frequencies, statics, runs, energy, gradients, loops, bounds)

@@ -19,8 +19,8 @@ from jaxbeam.simulation.simulate import ContactLossWarning
 if TYPE_CHECKING:
     from experiments.validation.checks import Check
 
-PAGE = Path(__file__).parents[2] / "VALIDATION.md"
-HEAD = """# Validation
+PAGE_FILE = Path(__file__).parents[2] / "VALIDATION.md"
+PAGE_HEAD = """# Validation
 
 Each row holds jaxbeam against something that shares no code with it: closed forms, finite elements,
 scipy, another solver. The errors are relative, and were computed when this page was written, by
@@ -32,7 +32,7 @@ which fails if one is above what is allowed. Nothing here is typed in. The sourc
 """
 
 
-def run() -> list[tuple[str, list["Check"]]]:
+def run_checks() -> list[tuple[str, list["Check"]]]:
     """All checks, by what they are about.
 
     Raises RuntimeError where the repository's tests cannot be found.
@@ -54,20 +54,20 @@ def run() -> list[tuple[str, list["Check"]]]:
         return found
 
 
-def page(groups: Sequence[tuple[str, Sequence["Check"]]]) -> str:
+def validation_page(groups: Sequence[tuple[str, Sequence["Check"]]]) -> str:
     """The page: a table for each group of checks."""
     checks = [check for _, group in groups for check in group]
     passed = sum(check.passed for check in checks)
     versions = ", ".join(f"{name} {metadata.version(name)}" for name in ("jaxbeam", "jax", "scipy"))
     parts = [
-        HEAD,
+        PAGE_HEAD,
         f"**{passed} of {len(checks)} checks are within what is allowed**"
         f" ({versions}, Python {platform.python_version()}).",
     ]
     for title, group in groups:
         rows = ["| what | held against | error | allowed | |", "| --- | --- | ---: | ---: | --- |"]
         rows += [
-            f"| {c.what} | {c.source} | {c.error:.1e} | {c.allowed:.0e} |"
+            f"| {c.quantity} | {c.reference} | {c.error:.1e} | {c.tolerance:.0e} |"
             f" {'within' if c.passed else '**above**'} |"
             for c in group
         ]
@@ -78,12 +78,12 @@ def page(groups: Sequence[tuple[str, Sequence["Check"]]]) -> str:
 def main() -> int:
     """Write the page; return 1 if a check failed."""
     start = time.perf_counter()
-    groups = run()
-    PAGE.write_text(page(groups), encoding="utf-8")
+    groups = run_checks()
+    PAGE_FILE.write_text(validation_page(groups), encoding="utf-8")
     failed = [check for _, group in groups for check in group if not check.passed]
     for check in failed:
-        print(f"{check.what}: error {check.error:.1e}, allowed {check.allowed:.0e}")
-    print(f"written: {PAGE.name}, in {time.perf_counter() - start:.0f} s")
+        print(f"{check.quantity}: error {check.error:.1e}, allowed {check.tolerance:.0e}")
+    print(f"written: {PAGE_FILE.name}, in {time.perf_counter() - start:.0f} s")
     return 1 if failed else 0
 
 

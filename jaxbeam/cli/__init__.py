@@ -26,7 +26,7 @@ from jaxbeam.cli import (
     tuning,
     weighing,
 )
-from jaxbeam.cli.app import app, say
+from jaxbeam.cli.app import app, print_message
 
 __all__ = [
     "checking",
@@ -48,29 +48,29 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
     A mistake of the user ends in one sentence on standard error, a warning is one as well.
     """
-    said = set()  # what is checked twice warns twice
+    warned = set()  # what is checked twice warns twice
 
     def warn(message, *_, **__):
-        if str(message) not in said:
-            said.add(str(message))
-            say(f"warning: {message}")
+        if str(message) not in warned:
+            warned.add(str(message))
+            print_message(f"warning: {message}")
 
     warnings.showwarning = warn
     if arguments is None:
-        _collect_rarely()
-        _keep_compiled()
+        _relax_garbage_collection()
+        _enable_compile_cache()
     try:
         app(arguments, exit_on_error=False, print_error=False)
     except MemoryError as error:
-        say(f"not enough memory: {error}")
+        print_message(f"not enough memory: {error}")
         sys.exit(1)
     except (ValueError, OSError, RuntimeError, ImportError, CycloptsError) as error:
-        say(" ".join(str(error).split()))
+        print_message(" ".join(str(error).split()))
         sys.exit(1)
     sys.exit(0)
 
 
-def _collect_rarely() -> None:
+def _relax_garbage_collection() -> None:
     """Look for garbage rarely, and not at the end: tracing makes very many objects, hardly any of
     them garbage, and to look through all of them again when the process ends takes a second.
     """
@@ -78,7 +78,7 @@ def _collect_rarely() -> None:
     atexit.register(gc.freeze)
 
 
-def _keep_compiled() -> None:
+def _enable_compile_cache() -> None:
     """Keep compiled programs from one command to the next, in the user's cache folder.
 
     JAX_COMPILATION_CACHE_DIR names another folder; empty, it keeps nothing.

@@ -24,6 +24,6 @@ Overwrite = Annotated[bool, Parameter("--overwrite", help="Replace output files 
 Output = Annotated[Path | None, Parameter(("-o", "--output"))]
 
 
-def say(sentence: str) -> None:
+def print_message(message: str) -> None:
     """Tell the user something that is no result, on standard error."""
-    print(f"jaxbeam: {sentence}", file=sys.stderr)
+    print(f"jaxbeam: {message}", file=sys.stderr)

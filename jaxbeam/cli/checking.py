@@ -43,36 +43,40 @@ def stability(
 
     picture = picture_path(None, case.with_stem(f"{case.stem}_poles")) if plot else None
     check_outputs(overwrite, picture)
-    described = read_case(case, set_)
+    parsed_case = read_case(case, set_)
     # Before the first load: loads off the beam leave the loop as it is.
-    alone = linear_loop(described, -1.0)
-    settled = bool(alone.poles().real.max() < 0)
-    each = [margins(alone, i) for i in range(len(described.actuators))] if settled else []
-    poles = frozen_poles(described)
-    grown = growth(described) if described.loads else None
-    passing = None if spacing is None else stream(described, spacing)
+    unloaded_loop = linear_loop(parsed_case, -1.0)
+    stable = bool(unloaded_loop.poles().real.max() < 0)
+    loop_margins = (
+        [margins(unloaded_loop, i) for i in range(len(parsed_case.actuators))] if stable else []
+    )
+    poles = frozen_poles(parsed_case)
+    deviation_growth = growth(parsed_case) if parsed_case.loads else None
+    floquet = None if spacing is None else stream(parsed_case, spacing)
     by = {"loads frozen": frozen} if limits else {}
     by |= {"a stream": streaming(spacing)} if limits and spacing is not None else {}
-    found = {word: load_limits(described, measure) for word, measure in by.items()}
+    stability_limits = {word: load_limits(parsed_case, measure) for word, measure in by.items()}
     if picture:
         from jaxbeam.plot import plot_poles
 
-        plot_poles(poles, grown, described.title).savefig(picture)
+        plot_poles(poles, deviation_growth, parsed_case.title).savefig(picture)
     worst = int(np.argmax(poles.largest))
     if json_:
         print_json(
             {
-                "stable_without_loads": settled,
-                "margins": [entry._asdict() for entry in each],
+                "stable_without_loads": stable,
+                "margins": [entry._asdict() for entry in loop_margins],
                 "largest_real_part": poles.largest[worst],
                 "at_time": poles.times[worst],
-                "largest_growth": None if grown is None else grown.factor.max(),
-                "largest_multiplier": None if passing is None else passing.largest,
-                "unstable_from": {word: each._asdict() for word, each in found.items()},
+                "largest_growth": None
+                if deviation_growth is None
+                else deviation_growth.factor.max(),
+                "largest_multiplier": None if floquet is None else floquet.largest,
+                "unstable_from": {word: each._asdict() for word, each in stability_limits.items()},
             }
         )
         return
-    print("without loads the loop is", "stable" if settled else "unstable")
+    print("without loads the loop is", "stable" if stable else "unstable")
     print_table(
         ("actuator", "gain margin", "phase margin (deg)", "delay margin (s)", "distance"),
         [
@@ -83,32 +87,32 @@ def stability(
                 f"{entry.delay:.4g}",
                 f"{entry.distance:.4g}",
             )
-            for i, entry in enumerate(each)
+            for i, entry in enumerate(loop_margins)
         ],
     )
-    if grown is not None:
+    if deviation_growth is not None:
         print(
             f"with the loads frozen where they are worst, at {poles.times[worst]:.4g} s, the"
             f" largest real part of a pole is {poles.largest[worst]:.4g} 1/s"
         )
         print(
             "over the crossing a deviation grows at most by a factor of"
-            f" {grown.factor.max():.4g}, to {grown.factor[-1]:.3g} at its end"
+            f" {deviation_growth.factor.max():.4g}, to {deviation_growth.factor[-1]:.3g} at its end"
         )
-    if passing is not None:
+    if floquet is not None:
         print(
-            f"in an endless stream, a load every {passing.period:g} s, a deviation is multiplied by"
-            f" at most {passing.largest:.4g} each time: {'' if passing.stable else 'un'}stable"
+            f"in an endless stream, a load every {floquet.period:g} s, a deviation is multiplied by"
+            f" at most {floquet.largest:.4g} each time: {'' if floquet.stable else 'un'}stable"
         )
-    for word, each in found.items():
-        pairs = (("mass", each.mass, "kg"), ("speed", each.speed, "m/s"))
+    for word, loop_margins in stability_limits.items():
+        pairs = (("mass", loop_margins.mass, "kg"), ("speed", loop_margins.speed, "m/s"))
         for name, value, unit in pairs:
             if value is not None:
-                print(f"with {word} the loop is unstable {_from(name, value, unit)}")
+                print(f"with {word} the loop is unstable {_limit_text(name, value, unit)}")
     print_written(picture)
 
 
-def _from(name: str, value: float, unit: str) -> str:
+def _limit_text(name: str, value: float, unit: str) -> str:
     """From where on a loop is unstable, in words."""
     if value == 0:
         return f"at every {name} that was tried"

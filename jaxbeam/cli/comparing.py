@@ -57,29 +57,34 @@ def compare(
     check_suffix(output, ".png", "a comparison")
     refuse(bool(output and over), "a picture shows one load case: leave out -o or --over")
     check_outputs(overwrite, output)
-    described = read_case(case, set_)
-    laws = read_controllers(case, described, controllers)
+    parsed_case = read_case(case, set_)
+    laws = read_controllers(case, parsed_case, controllers)
     runs = [dict(zip(values, row, strict=True)) for row in itertools.product(*values.values())]
-    varied = [jb.replace(described, run) for run in runs]
-    for one in varied:
+    cases_compared = [jb.replace(parsed_case, run) for run in runs]
+    for one in cases_compared:
         check(one)
-    found = [compare(one, laws, period) for one in varied]
-    table = standings(found)
+    comparisons = [compare(one, laws, period) for one in cases_compared]
+    table = standings(comparisons)
     if output:
         from jaxbeam.plot import plot_comparison
 
-        plot_comparison(found[0]).savefig(output)
+        plot_comparison(comparisons[0]).savefig(output)
     if json_:
-        cases = [{"values": run} | _content(one) for run, one in zip(runs, found, strict=True)]
+        cases = [
+            {"values": run} | _comparison_dict(one)
+            for run, one in zip(runs, comparisons, strict=True)
+        ]
         summary = {name: standing._asdict() for name, standing in table.items()}
-        print_json({"cases": cases, "over_all": summary} if over else _content(found[0]))
+        print_json(
+            {"cases": cases, "over_all": summary} if over else _comparison_dict(comparisons[0])
+        )
         return
-    for run, one in zip(runs, found, strict=True):
+    for run, one in zip(runs, comparisons, strict=True):
         if over:
             print("; ".join(f"{address} = {value:g}" for address, value in run.items()))
-        _print(one)
+        _print_comparison(one)
     if over:
-        print(f"over all {len(found)} load cases:")
+        print(f"over all {len(comparisons)} load cases:")
         print_table(
             (
                 "controller",
@@ -104,34 +109,34 @@ def compare(
     print_written(output)
 
 
-def _content(found) -> dict:
+def _comparison_dict(comparison) -> dict:
     """A comparison in words and numbers."""
-    limit = found.bound
+    bound = comparison.bound
     return {
-        "uncontrolled_peak": limit.uncontrolled,
-        "least_peak": limit.peak,
-        "held_for": limit.period,
+        "uncontrolled_peak": bound.uncontrolled,
+        "least_peak": bound.peak,
+        "held_for": bound.period,
         "controllers": {
-            name: merits._asdict()
+            name: metrics._asdict()
             | {
-                "step_times": merits.step_times._asdict(),
-                "reserve": merits.reserve._asdict()
-                | {"unstable": merits.reserve.unstable and merits.reserve.unstable._asdict()},
-                "swings": [one._asdict() for one in merits.swings],
-                "loop": found.loop(name),
-                "verdict": found.records[name].verdict,
+                "step_times": metrics.step_times._asdict(),
+                "reserve": metrics.reserve._asdict()
+                | {"unstable": metrics.reserve.unstable and metrics.reserve.unstable._asdict()},
+                "swings": [one._asdict() for one in metrics.swings],
+                "loop": comparison.loop(name),
+                "verdict": comparison.records[name].verdict,
             }
-            for name, merits in found.merits.items()
+            for name, metrics in comparison.merits.items()
         },
     }
 
 
-def _print(found) -> None:
+def _print_comparison(comparison) -> None:
     """Print a comparison for people."""
-    limit = found.bound
+    bound = comparison.bound
     print(
-        f"no control: peak {limit.uncontrolled:.6g} m; no controller that holds its commands for "
-        f"{limit.period:g} s gets below {limit.peak:.6g} m, {limit.reduction:.1%} less"
+        f"no control: peak {bound.uncontrolled:.6g} m; no controller that holds its commands for "
+        f"{bound.period:g} s gets below {bound.peak:.6g} m, {bound.reduction:.1%} less"
     )
     print_table(
         (
@@ -157,21 +162,21 @@ def _print(found) -> None:
                 f"{merits.after_exit:.4g}",
                 " ".join(f"{effort:.4g}" for effort in merits.effort),
                 " ".join(f"{share:.1%}" for share in merits.saturated),
-                *(_margin(merits.reserve, number) for number in merits.reserve[:2]),
+                *(_margin_text(merits.reserve, number) for number in merits.reserve[:2]),
                 *(f"{seconds:.2g}" for seconds in merits.step_times[:3]),
             )
-            for name, merits in found.merits.items()
+            for name, merits in comparison.merits.items()
         ],
     )
-    obstacles = {name: merits.reserve.obstacle for name, merits in found.merits.items()}
-    for obstacle in dict.fromkeys(filter(None, obstacles.values())):
-        names = [name for name, met in obstacles.items() if met == obstacle]
+    margin_errors = {name: metrics.reserve.obstacle for name, metrics in comparison.merits.items()}
+    for obstacle in dict.fromkeys(filter(None, margin_errors.values())):
+        names = [name for name, met in margin_errors.items() if met == obstacle]
         print(f"no margin of {', '.join(names)}: {obstacle}")
-    for name, record in found.records.items():
-        print(f"{name}: {'; '.join(filter(None, (found.loop(name), record.verdict)))}")
+    for name, record in comparison.records.items():
+        print(f"{name}: {'; '.join(filter(None, (comparison.loop(name), record.verdict)))}")
 
 
-def _margin(reserve, number: float) -> str:
-    if reserve.obstacle:
+def _margin_text(margin, number: float) -> str:
+    if margin.obstacle:
         return "-"
-    return "unstable" if reserve.gain == 0 else f"{number:.3g}"
+    return "unstable" if margin.gain == 0 else f"{number:.3g}"

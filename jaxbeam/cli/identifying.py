@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app, say
+from jaxbeam.cli.app import Json, Output, Overwrite, Settings, app, print_message
 from jaxbeam.cli.arguments import (
     assignment,
     bounds_of,
@@ -100,17 +100,17 @@ def identify(
     if case and free:
         refuse(resume and not output, "--resume goes on with what is kept beside the output: -o")
         picture = picture_path(output, logs[0]) if plot else None
-        check_outputs(overwrite, output, _beside(output, ".npz"), picture)
-        _check_report(report, overwrite)
+        check_outputs(overwrite, output, _with_suffix(output, ".npz"), picture)
+        _check_report_folder(report, overwrite)
         settings = {"loss": loss, "starts": starts, "seed": seed, "resume": resume}
         settings["stages"] = [text.split(",") for text in stage]
         fit = _fit(
             read_case(case, set_), logs, mask, free, prior, scale, output, overwrite, settings
         )
-        judged = _judge(
+        assessment = _assess(
             fit, profile, draws, {"seed": seed, "noise": noise}, validate, output, resume
         )
-        _tell(fit, judged, report, output, picture, json_)
+        _write_and_print(fit, assessment, report, output, picture, json_)
         return
     refuse(
         bool(output or set_),
@@ -122,45 +122,47 @@ def identify(
         "the options of fits are for fitting a case; name what is free with --free ADDRESS",
     )
     if case:
-        say(f"nothing is named with --free, so {case} is not used; modes of the free decay:")
+        print_message(
+            f"nothing is named with --free, so {case} is not used; modes of the free decay:"
+        )
     pictures = [picture_path(None, log) if plot else None for log in logs]
     check_outputs(overwrite, *pictures)
     _identify_modes(logs, pictures, json_)
 
 
-def _beside(output: Path | None, suffix: str) -> Path | None:
+def _with_suffix(output: Path | None, suffix: str) -> Path | None:
     return None if output is None else output.with_suffix(suffix)
 
 
-def _forget(output: Path | None) -> None:
+def _remove_checkpoints(output: Path | None) -> None:
     """Remove what searches and draws kept beside the output on their way."""
     for suffix in (".search.npz", ".draws.npz") if output else ():
         output.with_suffix(suffix).unlink(missing_ok=True)
 
 
-def _check_report(folder: Path | None, overwrite: bool) -> None:
+def _check_report_folder(folder: Path | None, overwrite: bool) -> None:
     if folder and folder.exists() and any(folder.iterdir()) and not overwrite:
         raise FileExistsError(
             f"the folder {folder} is not empty; choose another or add --overwrite"
         )
 
 
-def _fit(case, files, kinds, free, prior, scale, output, overwrite, settings):
+def _fit(case, files, fault_kinds, free, prior, scale, output, overwrite, settings):
     """Read the logs and fit the case to them."""
     import tuning
 
-    beliefs = _beliefs(free, prior, scale)
-    missing = "mask" if "missing" in kinds else "refuse"
+    priors = _priors_by_address(free, prior, scale)
+    missing = "mask" if "missing" in fault_kinds else "refuse"
     logs = [log for path in files for log in tuning.read_logs(path, missing=missing)]
-    others = [kind for kind in kinds if kind != "missing"]
-    logs = [tuning.mask(log, others) for log in logs] if others else logs
+    masked_kinds = [kind for kind in fault_kinds if kind != "missing"]
+    logs = [tuning.mask(log, masked_kinds) for log in logs] if masked_kinds else logs
     if overwrite and not settings["resume"]:
-        _forget(output)
-    checkpoint = _beside(output, ".search.npz") if settings["starts"] > 1 else None
-    return tuning.identify(case, logs, beliefs, checkpoint=checkpoint, **settings)
+        _remove_checkpoints(output)
+    checkpoint = _with_suffix(output, ".search.npz") if settings["starts"] > 1 else None
+    return tuning.identify(case, logs, priors, checkpoint=checkpoint, **settings)
 
 
-def _beliefs(free, prior, scale) -> dict:
+def _priors_by_address(free, prior, scale) -> dict:
     """Bounds, priors and scales by address, of the options that name them."""
     from tuning.parameters.prior import Belief
 
@@ -180,34 +182,36 @@ def _beliefs(free, prior, scale) -> dict:
     bounds = dict(bounds_of(text) for text in free)
     for address in (*scales, *priors):
         refuse(address not in bounds, f"{address} has a prior or a scale, but is not free: --free")
-    found = {}
+    priors_by_address = {}
     for address, pair in bounds.items():
         prior = priors.get(address, (None, None))
         try:
-            found[address] = Belief(
+            priors_by_address[address] = Belief(
                 *(pair or (None, None)), *prior, scale=scales.get(address, "plain")
             )
         except ValueError as error:
             raise ValueError(f"{address}: {error}") from None
-    return found
+    return priors_by_address
 
 
-def _judge(fit, profile, draws, sampling, validate, output, resume) -> dict:
+def _assess(fit, profile, draws, sampling, validate, output, resume) -> dict:
     """Profiles, posterior and cross-validation, as far as they are asked for."""
     from tuning.fit.model_validation import cross_validate
     from tuning.fit.uncertainty.posterior import sample
     from tuning.fit.uncertainty.profile import profile as profile_of
 
-    judged = {"profiles": [profile_of(fit, address) for address in profile]}
+    assessment = {"profiles": [profile_of(fit, address) for address in profile]}
     if validate:
-        judged["unseen"] = cross_validate(fit)
+        assessment["unseen"] = cross_validate(fit)
     if draws:
-        checkpoint = _beside(output, ".draws.npz")
-        judged["posterior"] = sample(fit, draws, checkpoint=checkpoint, resume=resume, **sampling)
-    return judged
+        checkpoint = _with_suffix(output, ".draws.npz")
+        assessment["posterior"] = sample(
+            fit, draws, checkpoint=checkpoint, resume=resume, **sampling
+        )
+    return assessment
 
 
-def _tell(fit, judged, report, output, picture, json_) -> None:
+def _write_and_print(fit, assessment, report, output, picture, json_) -> None:
     """Write and print what was found; then what was kept on the way is needed no longer."""
     from jaxbeam.files.case_file import save_case
     from tuning.fit.report import write_report
@@ -219,24 +223,24 @@ def _tell(fit, judged, report, output, picture, json_) -> None:
     if picture:
         fit.plot().savefig(picture)
     if report:
-        write_report(report, fit, overwrite=True, **judged)
-    _forget(output)
-    posterior = judged.get("posterior")
+        write_report(report, fit, overwrite=True, **assessment)
+    _remove_checkpoints(output)
+    posterior = assessment.get("posterior")
     if json_:
-        told = fit.to_dict()
-        told["profiles"] = {p.address: {"interval": p.interval, "verdict": p.verdict}
-                            for p in judged["profiles"]}  # fmt: skip
+        summary = fit.to_dict()
+        summary["profiles"] = {p.address: {"interval": p.interval, "verdict": p.verdict}
+                            for p in assessment["profiles"]}  # fmt: skip
         if posterior:
-            told["posterior"] = posterior.to_dict()
-        told["left_out"] = {u.log: u.ratio for u in judged.get("unseen", ())}
-        print_json(told)
+            summary["posterior"] = posterior.to_dict()
+        summary["left_out"] = {u.log: u.ratio for u in assessment.get("unseen", ())}
+        print_json(summary)
         return
     print(fit)
-    for found in (*judged["profiles"], *judged.get("unseen", ())):
+    for found in (*assessment["profiles"], *assessment.get("unseen", ())):
         print(found.verdict)
     if posterior:
         print(posterior)
-    print_written(output, _beside(output, ".npz"), picture)
+    print_written(output, _with_suffix(output, ".npz"), picture)
     print_written(report and report / "report.html")
 
 

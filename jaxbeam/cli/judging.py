@@ -28,23 +28,27 @@ def judge(
     refuse(len(fits) < 2 and not unseen, "one fit alone: give a rival, or a log with --unseen LOG")
     names = [path.stem for path in fits]
     refuse(len(set(names)) < len(names), "two fits have the same name; rename one")
-    read = dict(zip(names, map(tuning.load_fit, fits), strict=True))
+    fits_by_name = dict(zip(names, map(tuning.load_fit, fits), strict=True))
     logs = [log for path in unseen for log in tuning.read_logs(path)]
-    rivals = tuning.compare_fits(read) if len(read) > 1 else []
-    held = {name: tuning.hold_out(fit, logs) if logs else [] for name, fit in read.items()}
+    rivals = tuning.compare_fits(fits_by_name) if len(fits_by_name) > 1 else []
+    held_out = {
+        name: tuning.hold_out(fit, logs) if logs else [] for name, fit in fits_by_name.items()
+    }
     if json_:
-        told = {name: {u.log: u.ratio for u in found} for name, found in held.items()}
-        print_json({"rivals": [vars(rival) for rival in rivals], "unseen": told})
+        error_ratios = {
+            name: {u.log: u.residual_ratio for u in found} for name, found in held_out.items()
+        }
+        print_json({"rivals": [vars(rival) for rival in rivals], "unseen": error_ratios})
         return
     if rivals:
         width = max(map(len, names))
         print(f"{'':{width}}  numbers  log likelihood        AIC        BIC  weight")
     for r in rivals:
         print(
-            f"{r.name:{width}}  {r.numbers:7}  {r.log_likelihood:14.6g}  {r.aic:9.6g}  "
+            f"{r.name:{width}}  {r.parameter_count:7}  {r.log_likelihood:14.6g}  {r.aic:9.6g}  "
             f"{r.bic:9.6g}  {r.weight:6.3f}"
         )
-    for name, found in held.items():
+    for name, found in held_out.items():
         for one in found:
             print(f"{name}: {one.verdict}")
 
@@ -89,11 +93,11 @@ def sharpen(
     for text in over:
         assignment("--over", text)
     bounds = dict(bounds_of(text, "--over") for text in over)
-    found = tuning.sharpen(read_case(case, set_), free, bounds, target=target, noise=noise)
+    design = tuning.sharpen(read_case(case, set_), free, bounds, target=target, noise=noise)
     if output:
-        save_case(found.case, output, overwrite=True)  # checked before the work
+        save_case(design.case, output, overwrite=True)  # checked before the work
     if json_:
-        print_json(found.to_dict())
+        print_json(design.to_dict())
     else:
-        print(found)
+        print(design)
         print_written(output)

@@ -5,11 +5,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.cli.app import Json, Overwrite, app, say
+from jaxbeam.cli.app import Json, Overwrite, app, print_message
 from jaxbeam.cli.arguments import refuse
 from jaxbeam.cli.printing import print_json, print_table
 
-TOGETHER = 2  # experiments at once, each of which takes a core and up to 2 GB
+MAX_PROCESSES = 2  # experiments at once, each of which takes a core and up to 2 GB
 
 
 @app.command
@@ -36,25 +36,25 @@ def reproduce(
     """
     from experiments.thesis import reproduction
 
-    known = reproduction.experiments()
+    available = reproduction.experiments()
     if list_:
         if json_:
             print_json(
-                {one.name: {"covers": one.covers, "claim": one.claim} for one in known.values()}
+                {one.name: {"covers": one.covers, "claim": one.claim} for one in available.values()}
             )
         else:
-            print_table(("name", "covers"), [(one.name, one.covers) for one in known.values()])
+            print_table(("name", "covers"), [(one.name, one.covers) for one in available.values()])
         return
     refuse(not (names or all_), "name an experiment, or take --all; --list names them")
     refuse(bool(names and all_), "give names or --all, not both")
     runs = reproduction.reproduce(
-        tuple(known) if all_ else names,
+        tuple(available) if all_ else names,
         output,
         overwrite,
         (lambda text: None) if json_ else print,
-        processes=min(TOGETHER, len(known) if all_ else len(names)),
+        processes=min(MAX_PROCESSES, len(available) if all_ else len(names)),
     )
     if json_:
         print_json(reproduction.as_dict(runs))
         return
-    say(f"written to {output}: report.html, report.md, report.json and the figures")
+    print_message(f"written to {output}: report.html, report.md, report.json and the figures")

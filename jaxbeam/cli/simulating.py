@@ -45,16 +45,21 @@ def modes(
 
     picture = picture_path(None, case.with_stem(f"{case.stem}_modes")) if plot else None
     check_outputs(overwrite, picture)
-    described = read_case(case, set_)
-    found = jb.modes(described)
+    parsed_case = read_case(case, set_)
+    computed_modes = jb.modes(parsed_case)
     if picture:
         from jaxbeam.plot import plot_modes
 
-        plot_modes(described, found).savefig(picture)
+        plot_modes(parsed_case, computed_modes).savefig(picture)
     if json_:
-        print_json({"frequencies_hz": found.frequencies, "damping_ratios": found.damping_ratios})
+        print_json(
+            {
+                "frequencies_hz": computed_modes.frequencies,
+                "damping_ratios": computed_modes.damping_ratios,
+            }
+        )
         return
-    rows = zip(found.frequencies, found.damping_ratios, strict=True)
+    rows = zip(computed_modes.frequencies, computed_modes.damping_ratios, strict=True)
     print_table(
         ("mode", "frequency (Hz)", "damping ratio"),
         [(i + 1, f"{f:.6g}", f"{d:.4g}") for i, (f, d) in enumerate(rows)],
@@ -94,10 +99,10 @@ def simulate(
     check_suffix(animate, ".gif", "a moving picture")
     picture = picture_path(output, case) if plot else None
     check_outputs(overwrite, output, picture, animate)
-    described = read_case(case, set_)
+    parsed_case = read_case(case, set_)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)  # the verdict says it
-        record = jb.simulate(described)
+        record = jb.simulate(parsed_case)
     if output:
         record.to_netcdf(output, overwrite)
     if picture:
@@ -112,7 +117,7 @@ def simulate(
         names = ("peak_deflection", "lowest_contact_force", "contact_lost_time")
         summary = {name: getattr(record, name) for name in names}
         summary |= {"error_estimate": record.error_estimate, "steps": record.steps}
-        if described.controller is not None:
+        if parsed_case.controller is not None:
             summary |= {
                 "peak_command": record.peak_command,
                 "effort": record.effort,
@@ -121,7 +126,7 @@ def simulate(
         print_json(summary | {"verdict": record.verdict})
         return
     print(record.verdict)
-    peaks = zip(described.sensors, record.peak_deflection, strict=True)
+    peaks = zip(parsed_case.sensors, record.peak_deflection, strict=True)
     print_table(
         ("sensor", "position (m)", "peak deflection (m)"),
         [(i, f"{s.position:.4g}", f"{peak:.6g}") for i, (s, peak) in enumerate(peaks)],
@@ -130,7 +135,7 @@ def simulate(
         ("load", "lowest contact force (N)"),
         [(i, f"{force:.6g}") for i, force in enumerate(record.lowest_contact_force)],
     )
-    if described.controller is not None:
+    if parsed_case.controller is not None:
         rows = zip(record.peak_command, record.effort, record.saturated.mean(axis=0), strict=True)
         print_table(
             ("actuator", "largest command", "effort (command^2 s)", "saturated"),
@@ -187,10 +192,10 @@ def sweep(
     refuse(bool(scheduler) and not output, "--scheduler needs a store for the results: -o OUT.zarr")
     check_suffix(output, ".zarr", "a sweep")
     check_outputs(overwrite or resume, output)
-    described = read_case(case, set_)
+    parsed_case = read_case(case, set_)
     with connect(scheduler) if scheduler else nullcontext() as client:
         results = jb.sweep(
-            described,
+            parsed_case,
             values,
             store=output,
             resume=resume,
@@ -265,26 +270,26 @@ def frf(
     check_outputs(overwrite, output, picture)
     frequencies = frequency_range(from_, to, points)
     pairs = [pair_of(text) for text in pair] or None
-    parked = [parked_mass(text) for text in mass_at]
-    found = frequency_response(read_case(case, set_), frequencies, pairs, parked)
+    stationary_masses = [parked_mass(text) for text in mass_at]
+    response = frequency_response(read_case(case, set_), frequencies, pairs, stationary_masses)
     if output:
-        found.to_netcdf(output, overwrite)
+        response.to_netcdf(output, overwrite)
     if picture:
-        from jaxbeam.plot import plot_frequency
+        from jaxbeam.plot import plot_frequency_response
 
-        plot_frequency(found).savefig(picture)
+        plot_frequency_response(response).savefig(picture)
     if json_:
-        columns = zip(found.pairs, found.magnitude.T, found.phase.T, strict=True)
+        columns = zip(response.pairs, response.magnitude.T, response.phase.T, strict=True)
         responses = [
             {**pair._asdict(), "magnitude": magnitude, "phase_deg": phase}
             for pair, magnitude, phase in columns
         ]
-        print_json({"frequencies_hz": found.frequencies, "responses": responses})
+        print_json({"frequencies_hz": response.frequencies, "responses": responses})
         return
-    for i, pair in enumerate(found.pairs):
+    for i, pair in enumerate(response.pairs):
         print(f"{pair}, in {pair.unit}" if pair.unit != "1" else str(pair))
         print_table(
             ("", "frequency (Hz)", "magnitude"),
-            [(word, f"{f:.5g}", f"{size:.5g}") for word, f, size in extremes(found, i)],
+            [(word, f"{f:.5g}", f"{size:.5g}") for word, f, size in extremes(response, i)],
         )
     print_written(output, picture)

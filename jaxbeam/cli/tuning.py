@@ -113,91 +113,121 @@ def tune(
     """
     import tuning
 
-    weights = dict(_weight(text) for text in objective)
-    limits = dict(_weight(text) for text in limit)
-    shares = dict(_weight(text) for text in spread)
+    weights = dict(_named_number(text) for text in objective)
+    limits = dict(_named_number(text) for text in limit)
+    shares = dict(_named_number(text) for text in spread)
     refuse(stable is None and bool(reserve or shares), "--reserve and --spread need --stable")
     refuse(plant is None and sampled, "--sampled draws from a posterior: it needs --plant")
-    ways = {"--rank": rank, "--front": front, "--choose": choose, "--keep": keep is not None}
-    many = [name for name, given in ways.items() if given]
-    refuse(len(many) > 1, f"{' and '.join(many)} do not go together; give one of them")
-    refuse(bool(rank and (weights or limits)), "--rank takes the place of --objective and --limit")
-    alone = batch is not None or starts > 1 or resume
+    exclusive_options = {
+        "--rank": rank,
+        "--front": front,
+        "--choose": choose,
+        "--keep": keep is not None,
+    }
+    chosen_options = [name for name, given in exclusive_options.items() if given]
     refuse(
-        bool(many and (many[0] in ("--rank", "--front") or resume) and alone),
-        f"--batch, --starts and --resume are for a single search, not for {''.join(many)}",
+        len(chosen_options) > 1,
+        f"{' and '.join(chosen_options)} do not go together; give one of them",
+    )
+    refuse(bool(rank and (weights or limits)), "--rank takes the place of --objective and --limit")
+    single_search_options = batch is not None or starts > 1 or resume
+    refuse(
+        bool(
+            chosen_options
+            and (chosen_options[0] in ("--rank", "--front") or resume)
+            and single_search_options
+        ),
+        f"--batch, --starts and --resume are for a single search, not for {''.join(chosen_options)}",
     )
     picture = picture_path(output, case.with_suffix(".tuned")) if plot else None
     check_suffix(output, ".toml", "a tuned case")
-    sweep = _front(front) if front else None
-    files = _outputs(output, len(sweep[1]) if sweep else 0)
+    front_limits = _pareto_limits(front) if front else None
+    files = _output_files(output, len(front_limits[1]) if front_limits else 0)
     check_outputs(overwrite, *files, picture)
-    rig = read_case(case, set_)
+    parsed_case = read_case(case, set_)
     loads = tuning.read_load_cases(cases)
     if plant is not None:
-        rig, loads = _on_plant(rig, loads, plant, plants, sampled, seed)
-    goal = tuning.Objective(weights or {"peak": 1.0}, over, limits=limits)
-    given = rig, dict(bounds_of(text) for text in free), loads
-    common = {
+        parsed_case, loads = _with_identified_plant(
+            parsed_case, loads, plant, plants, sampled, seed
+        )
+    total_objective = tuning.Objective(weights or {"peak": 1.0}, over, limits=limits)
+    problem = parsed_case, dict(bounds_of(text) for text in free), loads
+    shared_options = {
         "stable": None if stable is None else tuning.Stable(stable, reserve, shares),
-        "method": method or ("lbfgs" if sweep or rank else "adam"),
+        "method": method or ("lbfgs" if front_limits or rank else "adam"),
         "steps": steps, "seed": seed, "bounds": bounds, "progress": not json_,
     }  # fmt: skip
-    if sweep:
-        found = tuning.control.pareto(*given, goal, *sweep, **common)
-        results = found.tuned
+    if front_limits:
+        tuning_result = tuning.control.pareto(
+            *problem, total_objective, *front_limits, **shared_options
+        )
+        results = tuning_result.tuned
     elif rank:
-        results = tuning.lexicographic(*given, rank.split(","), over=over, **common)[-1:]
-        found = results[0]
+        results = tuning.lexicographic(*problem, rank.split(","), over=over, **shared_options)[-1:]
+        tuning_result = results[0]
     elif choose:
-        chosen = dict(_wholes(text) for text in choose)
-        more = {"batch": batch, "starts": starts}
-        found = tuning.tune_choices(rig, chosen, *given[1:], goal, **more, **common)
-        results = (found.best,)
+        integer_choices = dict(_integer_choices(text) for text in choose)
+        search_options = {"batch": batch, "starts": starts}
+        tuning_result = tuning.tune_choices(
+            parsed_case,
+            integer_choices,
+            *problem[1:],
+            total_objective,
+            **search_options,
+            **shared_options,
+        )
+        results = (tuning_result.best,)
     elif keep is not None:
-        more = {"batch": batch, "starts": starts}
-        found = tuning.tune_reduced(rig, keep, *given[1:], goal, **more, **common)
-        results = (found.tuned,)
+        search_options = {"batch": batch, "starts": starts}
+        tuning_result = tuning.tune_reduced(
+            parsed_case, keep, *problem[1:], total_objective, **search_options, **shared_options
+        )
+        results = (tuning_result.tuned,)
     else:
         checkpoint = None if output is None else output.with_suffix(".search.npz")
         if checkpoint and checkpoint.exists() and overwrite and not resume:
             checkpoint.unlink()
-        more = {"batch": batch, "starts": starts, "checkpoint": checkpoint, "resume": resume}
-        found = tuning.tune(*given, goal, **more, **common)
-        results = (found,)
-    _tell(found, results, files, picture, json_)
+        search_options = {
+            "batch": batch,
+            "starts": starts,
+            "checkpoint": checkpoint,
+            "resume": resume,
+        }
+        tuning_result = tuning.tune(*problem, total_objective, **search_options, **shared_options)
+        results = (tuning_result,)
+    _write_and_print(tuning_result, results, files, picture, json_)
     if output:
         output.with_suffix(".search.npz").unlink(missing_ok=True)
 
 
-def _tell(found, results, files, picture, json_) -> None:
+def _write_and_print(tuning_result, results, files, picture, json_) -> None:
     """Write the tuned cases and the picture, and print what was found."""
     from jaxbeam.files.case_file import save_case
 
     for one, file in zip(results, files, strict=False):
         save_case(one.case, file, overwrite=True)  # checked before the work
     if picture:
-        drawn = found if hasattr(found, "plot") else results[0]
+        drawn = tuning_result if hasattr(tuning_result, "plot") else results[0]
         drawn.plot().savefig(picture)
     if json_:
-        told = [one.to_dict() for one in results]
-        print_json(told[0] if len(told) == 1 else {"front": told})
+        summaries = [one.to_dict() for one in results]
+        print_json(summaries[0] if len(summaries) == 1 else {"front": summaries})
     else:
-        print(found)
+        print(tuning_result)
         print_written(*files, picture)
 
 
-def _on_plant(case, loads, file: Path, count: int, sampled: bool, seed: int):
+def _with_identified_plant(case, loads, file: Path, count: int, sampled: bool, seed: int):
     """The case on the plant of a fit, and its load cases on plants that the fit leaves possible."""
     import tuning
 
     fit = tuning.load_fit(file.with_suffix(".npz"))
     source = tuning.sample(fit, seed=seed) if sampled else fit
-    drawn = tuning.draw_plants(source, 2 * count, seed)
-    return tuning.adopt(case, fit), loads.across(drawn[:count], drawn[count:])
+    plants_drawn = tuning.draw_plants(source, 2 * count, seed)
+    return tuning.adopt(case, fit), loads.across(plants_drawn[:count], plants_drawn[count:])
 
 
-def _outputs(output: Path | None, count: int) -> list[Path]:
+def _output_files(output: Path | None, count: int) -> list[Path]:
     """The files to write tuned cases to: one, or one for each limit of a front."""
     if output is None:
         return []
@@ -206,7 +236,7 @@ def _outputs(output: Path | None, count: int) -> list[Path]:
     return [output.with_stem(f"{output.stem}-{i + 1}") for i in range(count)]
 
 
-def _front(text: str) -> tuple[str, list[float]]:
+def _pareto_limits(text: str) -> tuple[str, list[float]]:
     """The merit and the limits of MERIT=NUMBER,NUMBER,...; raises ValueError otherwise."""
     merit, _, numbers = text.partition("=")
     try:
@@ -217,7 +247,7 @@ def _front(text: str) -> tuple[str, list[float]]:
         ) from None
 
 
-def _wholes(text: str) -> tuple[str, list[int]]:
+def _integer_choices(text: str) -> tuple[str, list[int]]:
     """The address and the numbers of ADDRESS=NUMBER,...; raises ValueError otherwise."""
     address, _, numbers = text.partition("=")
     try:
@@ -229,7 +259,7 @@ def _wholes(text: str) -> tuple[str, list[int]]:
         ) from None
 
 
-def _weight(text: str) -> tuple[str, float]:
+def _named_number(text: str) -> tuple[str, float]:
     """The two sides of NAME=NUMBER. Raises ValueError if the number is none."""
     merit, _, weight = text.partition("=")
     try:

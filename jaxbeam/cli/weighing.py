@@ -42,16 +42,16 @@ def weigh(
     from jaxbeam.files.case_file import save_case
 
     check_outputs(overwrite, output)
-    between = range_of("--speeds", speeds, "m/s, such as 0.5:3")
-    found = tuning.weigh(
-        read_case(case, set_), tuning.read_log(log), between, most, both_ways=not one_way
+    speed_range = range_of("--speeds", speeds, "m/s, such as 0.5:3")
+    weighing = tuning.weigh(
+        read_case(case, set_), tuning.read_log(log), speed_range, most, both_ways=not one_way
     )
     if output:
-        save_case(found.fit.case, output, overwrite=True)  # checked before the work
+        save_case(weighing.fit.case, output, overwrite=True)  # checked before the work
     if json_:
-        print_json(found.to_dict())
+        print_json(weighing.to_dict())
     else:
-        print(found)
+        print(weighing)
         print_written(output)
 
 

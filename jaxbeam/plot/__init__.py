@@ -7,8 +7,8 @@ nothing is shown, and nothing has to be closed.
 from jaxbeam.plot.animation import animate
 from jaxbeam.plot.compare import plot_comparison
 from jaxbeam.plot.fit import FitPanel, plot_fit
-from jaxbeam.plot.frequency import plot_frequency
-from jaxbeam.plot.front import plot_front
+from jaxbeam.plot.frequency import plot_frequency_response
+from jaxbeam.plot.front import plot_pareto_front
 from jaxbeam.plot.modes import plot_modes
 from jaxbeam.plot.poles import plot_poles
 from jaxbeam.plot.record import plot_record
@@ -21,8 +21,8 @@ __all__ = [
     "animate",
     "plot_comparison",
     "plot_fit",
-    "plot_frequency",
-    "plot_front",
+    "plot_frequency_response",
+    "plot_pareto_front",
     "plot_modes",
     "plot_poles",
     "plot_record",

@@ -9,24 +9,24 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxbeam.case.fields import known
-from jaxbeam.plot.record import shade
-from jaxbeam.plot.schematic import BALL, DEVICE, draw_supports
+from jaxbeam.plot.record import shade_crossings
+from jaxbeam.plot.schematic import ACTUATOR_MARKER, LOAD_MARKER, draw_supports
 from jaxbeam.plot.style import (
     COLOURS,
     GREY,
     INK,
     colour,
     load_colour,
-    name,
-    scale,
-    styled,
+    set_title,
+    unit_scale,
+    use_style,
 )
 from jaxbeam.simulation.record import Record
 
-TINTS = 96  # colours of the GIF: few, so that it stays small
+PALETTE_SIZE = 96  # colours of the GIF: few, so that it stays small
 
 
-@styled
+@use_style
 def animate(
     record: Record,
     path: str | os.PathLike,
@@ -47,32 +47,32 @@ def animate(
         raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
     if np.isfinite(float(known(record.diverged_time))):
         raise ValueError(f"there is nothing to show: {record.verdict}")
-    commanded = record.case.controller is not None
-    heights = [2.2] + [1.3] * (bool(record.case.sensors) + commanded)
+    controlled = record.case.controller is not None
+    heights = [2.2] + [1.3] * (bool(record.case.sensors) + controlled)
     figure = Figure(figsize=(6.4, 0.8 + sum(heights)), dpi=90)
     canvas = FigureCanvasAgg(figure)
     top, *below = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
-    moves = [_beam(top, record)]
+    updates = [_beam_axes(top, record)]
     if record.case.sensors:
-        moves.append(_history(below[0], record, np.asarray(record.deflection), "deflection"))
-    if commanded:
-        moves.append(_history(below[-1], record, np.asarray(record.command), "command"))
+        updates.append(_history_axes(below[0], record, np.asarray(record.deflection), "deflection"))
+    if controlled:
+        updates.append(_history_axes(below[-1], record, np.asarray(record.command), "command"))
     for axes in below[:-1]:
         axes.tick_params(labelbottom=False)
     if below:
         below[-1].set_xlabel("time (s)")
-    name(figure, record.case.title)
+    set_title(figure, record.case.title)
 
     images = []
     for frame in np.linspace(0, record.times.shape[0] - 1, frames).round().astype(int):
-        for move in moves:
-            move(frame)
+        for update in updates:
+            update(frame)
         canvas.draw()
         if not images:
             figure.set_layout_engine("none")  # found once; a moving layout would tremble
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     # One palette for all, from the fullest picture: what stays the same is stored once.
-    palette = images[-1].quantize(TINTS)
+    palette = images[-1].quantize(PALETTE_SIZE)
     first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in images)
     first.save(
         path,
@@ -84,76 +84,89 @@ def animate(
     )
 
 
-def _beam(axes, record):
+def _beam_axes(axes, record):
     """Draw the rig; return what moves it to a sample."""
     case = record.case
     length = float(known(case.beam.length))
     x = np.linspace(0, length, 201)
-    where = np.array([float(known(sensor.position)) for sensor in case.sensors])
-    loads = np.asarray(record.load_position)
+    sensor_positions = np.array([float(known(sensor.position)) for sensor in case.sensors])
+    load_positions = np.asarray(record.load_position)
     beam = np.asarray(record.at(jnp.asarray(x)))
-    factor, unit = scale(beam, "m")
+    factor, unit = unit_scale(beam, "m")
     beam = beam / factor
-    so_far = np.minimum.accumulate(beam)
-    strokes = [[float(known(p)) for p, _, _ in actuator.stroke()] for actuator in case.actuators]
-    spots = np.array([places[0] for places in strokes if len(places) == 1])
-    spans = [np.linspace(places[0], places[1], 20) for places in strokes if len(places) == 2]
+    lowest_deflection = np.minimum.accumulate(beam)
+    actuator_positions = [
+        [float(known(p)) for p, _, _ in actuator.stroke()] for actuator in case.actuators
+    ]
+    point_actuators = np.array([places[0] for places in actuator_positions if len(places) == 1])
+    patches = [
+        np.linspace(places[0], places[1], 20) for places in actuator_positions if len(places) == 2
+    ]
 
     draw_supports(axes, case)
     axes.axhline(0, color=GREY, linewidth=0.7, linestyle=":")
     (line,) = axes.plot([], [], color=INK, linewidth=3, zorder=2)
     (lowest,) = axes.plot([], [], color=COLOURS[5], linewidth=1, zorder=1.8)
-    glyph = {"marker": DEVICE, "linestyle": "", "markersize": 22, "zorder": 1.9}
+    glyph = {"marker": ACTUATOR_MARKER, "linestyle": "", "markersize": 22, "zorder": 1.9}
     look = {"markerfacecolor": "white", "markeredgecolor": GREY}
-    (devices,) = axes.plot([], [], clip_on=False, **glyph, **look)
-    bonded = [axes.plot([], [], color=COLOURS[4], linewidth=6, zorder=2.5)[0] for _ in spans]
-    tints = [colour(i) for i in range(where.size)]
-    dots = axes.scatter(where, 0 * where, color=tints, edgecolor="white", zorder=4)
-    (balls,) = axes.plot([], [], linestyle="", marker=BALL, markersize=20, color=COLOURS[5])
-    balls.set(markeredgecolor=INK, clip_on=False, zorder=3)
-    for moving in (devices, balls):
+    (actuator_markers,) = axes.plot([], [], clip_on=False, **glyph, **look)
+    patch_lines = [axes.plot([], [], color=COLOURS[4], linewidth=6, zorder=2.5)[0] for _ in patches]
+    sensor_colours = [colour(i) for i in range(sensor_positions.size)]
+    sensor_markers = axes.scatter(
+        sensor_positions, 0 * sensor_positions, color=sensor_colours, edgecolor="white", zorder=4
+    )
+    (load_markers,) = axes.plot(
+        [], [], linestyle="", marker=LOAD_MARKER, markersize=20, color=COLOURS[5]
+    )
+    load_markers.set(markeredgecolor=INK, clip_on=False, zorder=3)
+    for moving in (actuator_markers, load_markers):
         moving.set_in_layout(False)  # what is not there yet has no place
     clock = axes.text(1, 1, "", transform=axes.transAxes, ha="right", va="top", family="monospace")
     low, high = min(beam.min(), 0.0), max(beam.max(), 0.0)
-    room = (high - low) or 1.0
-    axes.set(xlim=(-0.02 * length, 1.02 * length), ylim=(low - 0.15 * room, high + 0.4 * room))
+    height_range = (high - low) or 1.0
+    axes.set(
+        xlim=(-0.02 * length, 1.02 * length),
+        ylim=(low - 0.15 * height_range, high + 0.4 * height_range),
+    )
     axes.set(xlabel="position (m)", ylabel=f"deflection ({unit})")
 
-    def move(frame):
+    def update(frame):
         def height(places):
             return np.interp(places, x, beam[frame])
 
         line.set_data(x, beam[frame])
-        lowest.set_data(x, so_far[frame])
-        devices.set_data(spots, height(spots))
-        for patch, span in zip(bonded, spans, strict=True):
+        lowest.set_data(x, lowest_deflection[frame])
+        actuator_markers.set_data(point_actuators, height(point_actuators))
+        for patch, span in zip(patch_lines, patches, strict=True):
             patch.set_data(span, height(span))
-        dots.set_offsets(np.column_stack([where, height(where)]))
-        on = loads[frame][np.isfinite(loads[frame])]
-        balls.set_data(on, height(on))
+        sensor_markers.set_offsets(np.column_stack([sensor_positions, height(sensor_positions)]))
+        on = load_positions[frame][np.isfinite(load_positions[frame])]
+        load_markers.set_data(on, height(on))
         clock.set_text(f"t = {float(record.times[frame]):.3f} s")
 
-    return move
+    return update
 
 
-def _history(axes, record, values, what):
+def _history_axes(axes, record, values, quantity):
     """Prepare axes for the columns of some values over time; return what draws them so far."""
     times = np.asarray(record.times)
-    unit, factor, tint, style = "", 1.0, load_colour, "default"
-    if what == "deflection":
-        (factor, unit), tint = scale(values, "m"), colour
+    unit, factor, line_colour, style = "", 1.0, load_colour, "default"
+    if quantity == "deflection":
+        (factor, unit), line_colour = unit_scale(values, "m"), colour
     else:
         actuator = record.case.actuators[0]
         unit = type(actuator).__dataclass_fields__["limits"].metadata["unit"]
         if record.case.controller.period is not None:
             style = "steps-post"
     values = values / factor
-    shade(axes, record)
+    shade_crossings(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.7)
-    lines = [axes.plot([], [], color=tint(i), drawstyle=style)[0] for i in range(values.shape[1])]
+    lines = [
+        axes.plot([], [], color=line_colour(i), drawstyle=style)[0] for i in range(values.shape[1])
+    ]
     low, high = np.min(values), np.max(values)
-    room = 0.08 * ((high - low) or 1.0)
-    axes.set(ylim=(low - room, high + room), ylabel=f"{what} ({unit})")
+    margin = 0.08 * ((high - low) or 1.0)
+    axes.set(ylim=(low - margin, high + margin), ylabel=f"{quantity} ({unit})")
 
     def draw(frame):
         for line, column in zip(lines, values.T, strict=True):

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from jaxbeam.plot.style import GREY, INK, colour, digits, name, scale, styled
+from jaxbeam.plot.style import GREY, INK, colour, format_number, set_title, unit_scale, use_style
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +22,7 @@ class FitPanel:
     unit: str = "m"
 
 
-@styled
+@use_style
 def plot_fit(panels: Sequence[FitPanel], title: str = "") -> Figure:
     """One column a log: measured (dots) and fitted (line), and the residual of each channel.
 
@@ -44,31 +44,31 @@ def plot_fit(panels: Sequence[FitPanel], title: str = "") -> Figure:
         _draw(column, panel)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     grid[0, 0].legend(handles[:2], labels[:2], loc="best", handlelength=1.2, markerscale=3)
-    name(figure, title)
+    set_title(figure, title)
     return figure
 
 
 def _draw(column, panel):
     """Fill one column: the channels together, then the residual of each in its colour."""
-    top, *strips = column
+    top, *residual_axes = column
     residual = panel.measured - panel.fitted
     deviation = np.std(residual, axis=0)
-    factor, unit = scale(panel.measured, panel.unit)
-    fine, fine_unit = scale(deviation, panel.unit)
-    reach = 1.15 * np.max(np.abs(residual)) / fine or 1.0
-    for i, strip in enumerate(strips):
+    factor, unit = unit_scale(panel.measured, panel.unit)
+    residual_factor, residual_unit = unit_scale(deviation, panel.unit)
+    residual_limit = 1.15 * np.max(np.abs(residual)) / residual_factor or 1.0
+    for i, strip in enumerate(residual_axes):
         if i >= len(panel.names):
             strip.axis("off")
             continue
         dots = {"markersize": 1.8, "color": colour(i), "markeredgewidth": 0}
         top.plot(panel.times, panel.measured[:, i] / factor, "o", label="measured", **dots)
         top.plot(panel.times, panel.fitted[:, i] / factor, color=INK, linewidth=0.9, label="fitted")
-        strip.plot(panel.times, residual[:, i] / fine, "o", **dots)
+        strip.plot(panel.times, residual[:, i] / residual_factor, "o", **dots)
         strip.axhline(0, color=INK, linewidth=0.7)
-        strip.set(ylim=(-reach, reach))
+        strip.set(ylim=(-residual_limit, residual_limit))
         strip.set_ylabel(panel.names[i], color=colour(i))
         strip.annotate(
-            f"residual sd {digits(deviation[i] / fine)} {fine_unit}",
+            f"residual sd {format_number(deviation[i] / residual_factor)} {residual_unit}",
             (1.0, 1.0),
             xycoords="axes fraction",
             xytext=(-2, 0),
@@ -81,5 +81,5 @@ def _draw(column, panel):
     top.set_title(panel.title)
     top.set_ylabel(f"measured and fitted ({unit})")
     top.set_xlim(panel.times[0], panel.times[-1])
-    strips[len(panel.names) - 1].set_xlabel("time (s)")
-    strips[len(panel.names) - 1].tick_params(labelbottom=True)
+    residual_axes[len(panel.names) - 1].set_xlabel("time (s)")
+    residual_axes[len(panel.names) - 1].tick_params(labelbottom=True)

@@ -5,18 +5,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, MultipleLocator, NullFormatter
 
 from jaxbeam.model.frequency_response import FrequencyResponse
-from jaxbeam.plot.style import FAINT, colour, name, styled
+from jaxbeam.plot.style import FAINT, colour, set_title, use_style
 
 
-@styled
-def plot_frequency(response: FrequencyResponse) -> Figure:
+@use_style
+def plot_frequency_response(response: FrequencyResponse) -> Figure:
     """Magnitude and phase over frequency: one column for each unit, one curve for each pair.
 
     Frequencies of zero have no place on the logarithmic axis and are left out.
     """
-    shown = np.asarray(response.frequencies) > 0
-    frequencies = np.asarray(response.frequencies)[shown]
-    magnitude, phase = (np.asarray(x)[shown] for x in (response.magnitude, response.phase))
+    positive = np.asarray(response.frequencies) > 0
+    frequencies = np.asarray(response.frequencies)[positive]
+    magnitude, phase = (np.asarray(x)[positive] for x in (response.magnitude, response.phase))
     units = list(dict.fromkeys(pair.unit for pair in response.pairs))
     figure = Figure(figsize=(max(7.0, 1.0 + 4.2 * len(units)), 5.6))
     grid = figure.subplots(2, len(units), squeeze=False, sharex=True, height_ratios=[3, 2])
@@ -30,8 +30,10 @@ def plot_frequency(response: FrequencyResponse) -> Figure:
         top.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2)
         # Within one decade the powers of ten alone would leave the axis without numbers.
         least, most = top.get_ylim()
-        few = most < 20 * least
-        top.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False) if few else NullFormatter())
+        within_a_decade = most < 20 * least
+        top.yaxis.set_minor_formatter(
+            LogFormatter(labelOnlyBase=False) if within_a_decade else NullFormatter()
+        )
         top.grid(True, which="minor", color=FAINT, linewidth=0.3)
         low, high = np.min(phase[:, chosen]), np.max(phase[:, chosen])
         bottom.set_ylim(90 * np.floor(low / 90 - 0.1), 90 * np.ceil(high / 90 + 0.1))
@@ -39,5 +41,5 @@ def plot_frequency(response: FrequencyResponse) -> Figure:
         bottom.xaxis.set_major_formatter("{x:g}")
         bottom.set(xlabel="frequency (Hz)", ylabel="phase (°)")
         bottom.set_xlim(frequencies[0], frequencies[-1])
-    name(figure, response.title)
+    set_title(figure, response.title)
     return figure

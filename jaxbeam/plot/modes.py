@@ -9,10 +9,19 @@ from jaxbeam.case.fields import known
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.modes import modes as find_modes
 from jaxbeam.plot.schematic import draw_supports
-from jaxbeam.plot.style import FAINT, GREY, INK, colour, digits, name, scale, styled
+from jaxbeam.plot.style import (
+    FAINT,
+    GREY,
+    INK,
+    colour,
+    format_number,
+    set_title,
+    unit_scale,
+    use_style,
+)
 
 
-@styled
+@use_style
 def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
     """Shapes of the modes of a case, one above the other, with frequencies and damping ratios.
 
@@ -36,7 +45,7 @@ def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
         axes.plot(x, shape, color=colour(0), linewidth=1.8)
         draw_supports(axes, case, y=-i, size=17)
         axes.annotate(
-            f"{_in_hertz(float(frequency))}\ndamping {100 * float(ratio):.3g} %",
+            f"{_frequency_text(float(frequency))}\ndamping {100 * float(ratio):.3g} %",
             (1.0, -i),
             xycoords=axes.get_yaxis_transform(),
             xytext=(12, 0),
@@ -50,10 +59,10 @@ def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
     axes.spines["left"].set_visible(False)
     axes.grid(False, axis="y")
     axes.grid(True, axis="x", color=FAINT)
-    name(figure, case.title)
+    set_title(figure, case.title)
     return figure
 
 
-def _in_hertz(frequency: float) -> str:
-    factor, unit = scale(frequency, "Hz")
-    return f"{digits(frequency / factor, 4)} {unit}"
+def _frequency_text(frequency: float) -> str:
+    factor, unit = unit_scale(frequency, "Hz")
+    return f"{format_number(frequency / factor, 4)} {unit}"

@@ -7,23 +7,23 @@ from matplotlib.figure import Figure
 
 from jaxbeam.case.fields import known
 from jaxbeam.case.loads import motion
-from jaxbeam.plot.schematic import draw_rig
+from jaxbeam.plot.schematic import draw_schematic
 from jaxbeam.plot.style import (
     ALARM,
     GREY,
     SHADE,
     colour,
-    digits,
+    format_number,
     load_colour,
     margin_labels,
-    name,
-    scale,
-    styled,
+    set_title,
+    unit_scale,
+    use_style,
 )
 from jaxbeam.simulation.record import Record
 
 
-@styled
+@use_style
 def plot_record(record: Record) -> Figure:
     """Deflection at the sensors (dots: peaks), below it contact forces, and commands if any.
 
@@ -33,13 +33,13 @@ def plot_record(record: Record) -> Figure:
     case = record.case
     panels = [
         (height, draw)
-        for height, draw, wanted in (
-            (0.7, _draw_rig, True),
+        for height, draw, shown in (
+            (0.7, _draw_schematic, True),
             (3.2, _draw_deflection, case.sensors),
             (1.7, _draw_forces, case.loads),
             (1.7, _draw_commands, case.controller is not None),
         )
-        if wanted
+        if shown
     ]
     if len(panels) == 1:
         raise ValueError("the record has nothing to draw: its case has neither sensors nor loads")
@@ -51,38 +51,40 @@ def plot_record(record: Record) -> Figure:
     rows[-1].set_xlabel("time (s)")
     for axes in rows[1:-1]:
         axes.tick_params(labelbottom=False)
-    name(figure, case.title)
+    set_title(figure, case.title)
     return figure
 
 
 def load_windows(record: Record) -> list[tuple[int, float, float]]:
     """Each load seen in the record, by number, with its entry and exit (s), cut to the record."""
     times = np.asarray(record.times)
-    paths = [motion(load, record.case.beam.length) for load in record.case.loads]
-    windows = np.array([[float(known(t)) for t in path.window()] for path in paths]).reshape(-1, 2)
+    trajectories = [motion(load, record.case.beam.length) for load in record.case.loads]
+    windows = np.array(
+        [[float(known(t)) for t in trajectory.window()] for trajectory in trajectories]
+    ).reshape(-1, 2)
     cut = np.clip(windows, times[0], times[-1]).tolist()
     return [(i, entry, leaves) for i, (entry, leaves) in enumerate(cut) if entry < leaves]
 
 
-def _draw_rig(axes, record):
-    draw_rig(axes, record.case)
+def _draw_schematic(axes, record):
+    draw_schematic(axes, record.case)
 
 
-def shade(axes, record: Record) -> None:
+def shade_crossings(axes, record: Record) -> None:
     """Shade the times at which loads are on the beam, in axes over the time of a record."""
     times = np.asarray(record.times)
     axes.set_xlim(times[0], times[-1])
-    for _, entry, leaves in load_windows(record):
-        axes.axvspan(entry, leaves, color=SHADE, zorder=0.5, linewidth=0)
-        for edge in (entry, leaves):
-            axes.axvline(edge, color=GREY, linewidth=0.7, linestyle=(0, (4, 3)), zorder=0.6)
+    for _, entry, exit_time in load_windows(record):
+        axes.axvspan(entry, exit_time, color=SHADE, zorder=0.5, linewidth=0)
+        for instant in (entry, exit_time):
+            axes.axvline(instant, color=GREY, linewidth=0.7, linestyle=(0, (4, 3)), zorder=0.6)
 
 
-def name_loads(axes, record: Record) -> None:
+def label_loads(axes, record: Record) -> None:
     """Write at its entry what a load is; several are numbered."""
     loads = record.case.loads
     for i, entry, _ in load_windows(record):
-        label = f"load {i}" if len(loads) > 1 else _described(loads[i])
+        label = f"load {i}" if len(loads) > 1 else _load_label(loads[i])
         axes.annotate(
             label,
             (entry, 1.0),
@@ -95,7 +97,7 @@ def name_loads(axes, record: Record) -> None:
         )
 
 
-def _described(load) -> str:
+def _load_label(load) -> str:
     """The numbers of a load that tell it from others, with units: "0.5 kg, 1.2 m/s"."""
     numbers = [(field, getattr(load, field.name)) for field in dataclasses.fields(load)]
     return ", ".join(
@@ -107,8 +109,8 @@ def _described(load) -> str:
 
 def _draw_deflection(axes, record):
     times, deflection = np.asarray(record.times), np.asarray(record.deflection)
-    factor, unit = scale(deflection, "m")
-    shade(axes, record)
+    factor, unit = unit_scale(deflection, "m")
+    shade_crossings(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.8)
     peaks = []
     for i, when in enumerate(np.asarray(record.peak_time)):
@@ -120,20 +122,20 @@ def _draw_deflection(axes, record):
     axes.set_ylabel(f"deflection ({unit})")
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.07 * (high - low))  # room for the names
-    name_loads(axes, record)
-    names = [f"peak {digits(peak)} {unit}" for peak in peaks]
+    label_loads(axes, record)
+    names = [f"peak {format_number(peak)} {unit}" for peak in peaks]
     margin_labels(axes, peaks, names, [colour(i) for i in range(len(peaks))])
 
 
 def _draw_forces(axes, record):
     times, force = np.asarray(record.times), np.asarray(record.contact_force)
     on = np.isfinite(np.asarray(record.load_position))
-    factor, unit = scale(force[on], "N")
-    shade(axes, record)
+    factor, unit = unit_scale(force[on], "N")
+    shade_crossings(axes, record)
     weights = {}
     for i, load in enumerate(record.case.loads):
-        pressing = np.where(on[:, i], force[:, i], np.nan) / factor
-        axes.plot(times, pressing, color=load_colour(i), linewidth=1.1)
+        contact_force = np.where(on[:, i], force[:, i], np.nan) / factor
+        axes.plot(times, contact_force, color=load_colour(i), linewidth=1.1)
         weight = float(known(load.weight(record.case.run.gravity))) / factor
         weights.setdefault(weight, load_colour(i))
     lost = np.asarray(record.contact_lost_time)
@@ -153,7 +155,7 @@ def _draw_forces(axes, record):
     axes.set_ylabel(f"contact force ({unit})")
     for weight, tint in weights.items():
         axes.axhline(weight, color=tint, linewidth=0.9, linestyle=":")
-    names = [f"weight {digits(weight)} {unit}" for weight in weights]
+    names = [f"weight {format_number(weight)} {unit}" for weight in weights]
     margin_labels(axes, list(weights), names, list(weights.values()))
 
 
@@ -161,13 +163,13 @@ def _draw_commands(axes, record):
     times, command = np.asarray(record.times), np.asarray(record.command)
     actuators = record.case.actuators
     units = {type(a).__dataclass_fields__["limits"].metadata["unit"] for a in actuators}
-    shade(axes, record)
+    shade_crossings(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.8)
-    ends, names, tints = [], [], []
+    limit_values, names, tints = [], [], []
     for i, actuator in enumerate(actuators):
         # Commands of a sampled controller are held, not joined.
-        held = record.case.controller.period is not None
-        style = "steps-post" if held else "default"
+        sampled = record.case.controller.period is not None
+        style = "steps-post" if sampled else "default"
         axes.plot(times, command[:, i], color=load_colour(i), linewidth=1.1, drawstyle=style)
         limits = actuator.command_limits()
         if limits is None or not np.any(np.asarray(record.saturated)[:, i]):
@@ -175,8 +177,8 @@ def _draw_commands(axes, record):
         for limit in np.asarray(known(limits)):
             if np.any(np.isclose(command[:, i], limit)):
                 axes.axhline(limit, color=load_colour(i), linewidth=0.9, linestyle=":")
-                ends.append(limit)
-                names.append(f"limit {digits(limit)}")
+                limit_values.append(limit)
+                names.append(f"limit {format_number(limit)}")
                 tints.append(load_colour(i))
     axes.set_ylabel(f"command ({', '.join(sorted(units))})")
-    margin_labels(axes, ends, names, tints)
+    margin_labels(axes, limit_values, names, tints)

@@ -12,7 +12,7 @@ INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, which can be told apart with any kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 ALARM = COLOURS[1]
-LOADS = (INK, "#A6611A", "#7B3294", "#7A868F")  # as far from those as from each other
+LOAD_COLOURS = (INK, "#A6611A", "#7B3294", "#7A868F")  # as far from those as from each other
 
 STYLE = {
     "figure.dpi": 150,
@@ -44,11 +44,11 @@ STYLE = {
     "legend.frameon": False,
 }
 
-styled = rc_context(STYLE)
+use_style = rc_context(STYLE)
 """Decorator: what the function draws has the style; nothing outside of it changes."""
 
 
-class Scale(NamedTuple):
+class UnitScale(NamedTuple):
     """Values divided by `factor` are in `unit`."""
 
     factor: float
@@ -58,7 +58,7 @@ class Scale(NamedTuple):
 _PREFIXES = ((1e6, 1e6, "M"), (1e3, 1e3, "k"), (0.1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"))
 
 
-def scale(values, unit: str) -> Scale:
+def unit_scale(values, unit: str) -> UnitScale:
     """The prefix with which values in an SI unit read best: 0.0014 m as 1.4 mm.
 
     A number without unit ("1") gets a power of ten instead.
@@ -68,8 +68,8 @@ def scale(values, unit: str) -> Scale:
     fitting = ((factor, prefix) for least, factor, prefix in _PREFIXES if largest >= least)
     factor, prefix = next(fitting, (1e-9, "n")) if largest else (1.0, "")
     if unit in ("", "1"):
-        return Scale(factor, "" if factor == 1 else f"$10^{{{np.log10(factor):.0f}}}$")
-    return Scale(factor, prefix + unit.replace("^2", "²"))
+        return UnitScale(factor, "" if factor == 1 else f"$10^{{{np.log10(factor):.0f}}}$")
+    return UnitScale(factor, prefix + unit.replace("^2", "²"))
 
 
 def colour(index: int) -> str:
@@ -79,37 +79,37 @@ def colour(index: int) -> str:
 
 def load_colour(index: int) -> str:
     """Colour of a load by its number; they repeat after four."""
-    return LOADS[index % len(LOADS)]
+    return LOAD_COLOURS[index % len(LOAD_COLOURS)]
 
 
-def digits(value: float, count: int = 3) -> str:
+def format_number(value: float, count: int = 3) -> str:
     """A number rounded to so many digits, zeros at its end kept, with a proper minus sign."""
     return f"{value:#.{count}g}".rstrip(".").replace("-", "\N{MINUS SIGN}")
 
 
-def name(figure, title: str) -> None:
+def set_title(figure, title: str) -> None:
     """Write a title over a figure, at the left."""
     if title:
         figure.suptitle(title, x=0.01, ha="left")
 
 
-def spread(wanted, gap: float) -> Float[np.ndarray, " label"]:
+def separate_labels(positions, gap: float) -> Float[np.ndarray, " label"]:
     """Places at least `gap` apart, in the order of those wanted and as near to them as can be."""
-    wanted = np.asarray(wanted, float)
-    order = np.argsort(wanted, kind="stable")
-    steps = gap * np.arange(wanted.size)
-    places = np.empty_like(wanted)
+    positions = np.asarray(positions, float)
+    order = np.argsort(positions, kind="stable")
+    steps = gap * np.arange(positions.size)
+    separated = np.empty_like(positions)
     # The gaps taken away, "at least a gap apart" means "not falling": a monotone regression.
-    places[order] = scipy.optimize.isotonic_regression(wanted[order] - steps).x + steps
-    return places
+    separated[order] = scipy.optimize.isotonic_regression(positions[order] - steps).x + steps
+    return separated
 
 
 def margin_labels(axes, heights, labels, colours) -> None:
     """Write labels in the right margin, each beside its height (data units) if there is room."""
     low, high = axes.get_ylim()
     inches = axes.get_figure().get_figheight() * axes.get_position().height
-    places = spread(heights, 0.17 * (high - low) / inches)
-    for place, label, tint in zip(places, labels, colours, strict=True):
+    label_heights = separate_labels(heights, 0.17 * (high - low) / inches)
+    for place, label, tint in zip(label_heights, labels, colours, strict=True):
         axes.annotate(
             label,
             (1.0, place),

@@ -11,13 +11,23 @@ from matplotlib.ticker import MaxNLocator
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.plot.style import ALARM, FAINT, INK, colour, digits, margin_labels, name, scale, styled
+from jaxbeam.plot.style import (
+    ALARM,
+    FAINT,
+    INK,
+    colour,
+    format_number,
+    margin_labels,
+    set_title,
+    unit_scale,
+    use_style,
+)
 
-EDGE = 0.06  # of a map, where the number of a line might stick out
-MARKED = 40  # runs; each is a dot on a curve of so few
+LABEL_MARGIN = 0.06  # of a map, where the number of a line might stick out
+MAX_MARKED_RUNS = 40  # runs; each is a dot on a curve of so few
 
 
-@styled
+@use_style
 def plot_sweep(dataset: xarray.Dataset) -> Figure:
     """Peak deflection over the swept addresses: curves for one, a map per sensor for two.
 
@@ -31,26 +41,26 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
     case = case_from_dict(json.loads(dataset.attrs["case"]))
     peaks = dataset["peak_deflection"]
     peaks = peaks.squeeze([d for d in peaks.dims if d != "sensor" and peaks.sizes[d] == 1])
-    over = [str(dimension) for dimension in peaks.dims if dimension != "sensor"]
-    peaks = peaks.sortby([address for address in over if address in peaks.coords])
+    swept = [str(dimension) for dimension in peaks.dims if dimension != "sensor"]
+    peaks = peaks.sortby([address for address in swept if address in peaks.coords])
     if "sensor" not in peaks.dims:
         peaks = peaks.expand_dims("sensor")
-    if not over:
+    if not swept:
         raise ValueError("the dataset holds a single run; a sweep is drawn over its addresses")
-    if len(over) > 2:
+    if len(swept) > 2:
         raise ValueError(
-            f"a sweep is drawn over one or two addresses, not {len(over)} ({', '.join(over)}); "
-            f"select a value of the others, as in dataset.isel({{{over[0]!r}: 0}})"
+            f"a sweep is drawn over one or two addresses, not {len(swept)} ({', '.join(swept)}); "
+            f"select a value of the others, as in dataset.isel({{{swept[0]!r}: 0}})"
         )
-    factor, unit = scale(peaks, "m")
-    peaks = peaks.transpose("sensor", *over) / factor
-    figure = (_curves if len(over) == 1 else _maps)(peaks, over, unit, case)
-    held = [
+    factor, unit = unit_scale(peaks, "m")
+    peaks = peaks.transpose("sensor", *swept) / factor
+    figure = (_curves if len(swept) == 1 else _maps)(peaks, swept, unit, case)
+    fixed_values = [
         f"{address} = {float(value):.4g} {_unit(case, str(address))}".rstrip()
         for address, value in peaks.coords.items()
         if value.ndim == 0 and address != "sensor"
     ]
-    name(figure, "\n".join(filter(None, [case.title, ", ".join(held)])))
+    set_title(figure, "\n".join(filter(None, [case.title, ", ".join(fixed_values)])))
     return figure
 
 
@@ -84,27 +94,29 @@ def _sensor_names(peaks, case):
     ]
 
 
-def _curves(peaks, over, unit, case):
-    (address,) = over
+def _curves(peaks, swept, unit, case):
+    (address,) = swept
     figure = Figure(figsize=(6.4, 4))
     axes = figure.subplots()
     x = peaks[address].values if address in peaks.coords else np.arange(peaks.sizes[address])
-    few = "o-" if x.size <= MARKED else "-"
-    ends = []
+    line_style = "o-" if x.size <= MAX_MARKED_RUNS else "-"
+    last_values = []
     for i, values in enumerate(peaks.values):
-        axes.plot(x, values, few, markersize=3, color=colour(i))
-        done = np.flatnonzero(np.isfinite(values))
-        ends.append(values[done[-1]] if done.size else 0.0)
-        top = done[np.argmax(values[done])] if done.size else []
+        axes.plot(x, values, line_style, markersize=3, color=colour(i))
+        finite = np.flatnonzero(np.isfinite(values))
+        last_values.append(values[finite[-1]] if finite.size else 0.0)
+        top = finite[np.argmax(values[finite])] if finite.size else []
         axes.plot(x[top], values[top], "o", markersize=7, markeredgecolor="white", color=colour(i))
     axes.set(xlabel=_axis_label(case, address), ylabel=f"peak deflection ({unit})")
     axes.set_ylim(bottom=0)
     axes.margins(x=0.01)
-    margin_labels(axes, ends, _sensor_names(peaks, case), [colour(i) for i in range(len(ends))])
+    margin_labels(
+        axes, last_values, _sensor_names(peaks, case), [colour(i) for i in range(len(last_values))]
+    )
     return figure
 
 
-def _maps(peaks, over, unit, case):
+def _maps(peaks, swept, unit, case):
     count = peaks.sizes["sensor"]
     columns = min(count, 3)
     rows = -(-count // columns)
@@ -112,34 +124,36 @@ def _maps(peaks, over, unit, case):
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes in grid.flat[count:]:
         axes.set_visible(False)
-    y, x = (peaks[address].values for address in over)
+    y, x = (peaks[address].values for address in swept)
     # One scale for all sensors, so that equal colours and lines are equal deflections.
     highest = np.max(peaks.values, initial=0.0, where=np.isfinite(peaks.values)) or 1.0
-    lines = MaxNLocator(8).tick_values(0, highest)
-    fills = np.linspace(0, lines[-1], 8 * (lines.size - 1) + 1)
+    contour_levels = MaxNLocator(8).tick_values(0, highest)
+    fill_levels = np.linspace(0, contour_levels[-1], 8 * (contour_levels.size - 1) + 1)
     names = _sensor_names(peaks, case)
     filled = None
     for axes, values, title in zip(grid.flat, peaks.values, names, strict=False):
         axes.set_facecolor(FAINT)  # seen where runs failed
-        filled = axes.contourf(x, y, values, levels=fills, cmap="YlGnBu")
-        drawn = axes.contour(x, y, values, levels=lines[1:-1], colors=INK, linewidths=0.5)
+        filled = axes.contourf(x, y, values, levels=fill_levels, cmap="YlGnBu")
+        drawn = axes.contour(x, y, values, levels=contour_levels[1:-1], colors=INK, linewidths=0.5)
         texts = axes.clabel(drawn, inline=False, fontsize=7, fmt="%.4g")
         corner, size = np.array([x[0], y[0]]), np.array([np.ptp(x), np.ptp(y)])
         for text in texts:
             # Cut off at an edge a number would be another one.
             inside = (np.array(text.get_position()) - corner) / size
-            text.set_visible(bool(np.all((inside > EDGE) & (inside < 1 - EDGE))))
+            text.set_visible(bool(np.all((inside > LABEL_MARGIN) & (inside < 1 - LABEL_MARGIN))))
             text.set_path_effects([withStroke(linewidth=3, foreground="white")])
         if np.any(np.isfinite(values)):
             row, column = np.unravel_index(np.nanargmax(values), values.shape)
             axes.plot(x[column], y[row], "o", color=ALARM, markeredgecolor="white", clip_on=False)
-            title = f"{title}, largest {digits(values[row, column])} {unit}"
+            title = f"{title}, largest {format_number(values[row, column])} {unit}"
         axes.set_title(title)
         axes.grid(False)
     for axes in grid[-1]:
-        axes.set_xlabel(_axis_label(case, over[1]))
+        axes.set_xlabel(_axis_label(case, swept[1]))
     for axes in grid[:, 0]:
-        axes.set_ylabel(_axis_label(case, over[0]))
-    bar = figure.colorbar(filled, ax=grid, ticks=lines, label=f"peak deflection ({unit})", pad=0.02)
+        axes.set_ylabel(_axis_label(case, swept[0]))
+    bar = figure.colorbar(
+        filled, ax=grid, ticks=contour_levels, label=f"peak deflection ({unit})", pad=0.02
+    )
     bar.outline.set_visible(False)
     return figure

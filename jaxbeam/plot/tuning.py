@@ -7,22 +7,22 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from jaxbeam.plot.style import GREY, INK, colour, name, styled
+from jaxbeam.plot.style import GREY, INK, colour, set_title, use_style
 
 
 @dataclasses.dataclass(frozen=True)
 class TuningPanel:
-    """Runs in a picture of a tuning, each with its label and its peaks (m); `least` may be NaN."""
+    """Runs in a picture of a tuning, each with its label and its peaks (m); `least_peak` may be NaN."""
 
     title: str
     labels: Sequence[str]
     uncontrolled: Float[np.ndarray, " run"]
     before: Float[np.ndarray, " run"]
     after: Float[np.ndarray, " run"]
-    least: Float[np.ndarray, " run"]
+    least_peak: Float[np.ndarray, " run"]
 
 
-@styled
+@use_style
 def plot_tuning(
     panels: Sequence[TuningPanel], history: Float[np.ndarray, "step start"], title: str = ""
 ) -> Figure:
@@ -33,9 +33,11 @@ def plot_tuning(
     """
     if not panels:
         raise ValueError("there is nothing to draw: give at least one panel")
-    most = max(len(panel.labels) for panel in panels)
-    figure = Figure(figsize=(max(7.0, 4.2 * len(panels)), 3.4 + 0.26 * most))
-    grid = figure.subplots(2, len(panels), squeeze=False, height_ratios=[1.2 + 0.22 * most, 1.2])
+    max_runs = max(len(panel.labels) for panel in panels)
+    figure = Figure(figsize=(max(7.0, 4.2 * len(panels)), 3.4 + 0.26 * max_runs))
+    grid = figure.subplots(
+        2, len(panels), squeeze=False, height_ratios=[1.2 + 0.22 * max_runs, 1.2]
+    )
     for axes, panel in zip(grid[0], panels, strict=True):
         _draw(axes, panel)
     handles, labels = grid[0, 0].get_legend_handles_labels()
@@ -49,23 +51,34 @@ def plot_tuning(
     below.plot(history, color=GREY, linewidth=0.7)
     below.plot(np.fmin.accumulate(np.nanmin(history, axis=1)), color=INK, linewidth=1.4)
     below.set(xlabel="step", ylabel="objective", title="search: every start, and the best so far")
-    name(figure, title)
+    set_title(figure, title)
     return figure
 
 
 def _draw(axes, panel):
     """One line a run: from before to after, with what is out of reach shaded."""
     rows = np.arange(len(panel.labels))
-    whole = 100 / panel.uncontrolled
-    axes.hlines(rows, panel.before * whole, panel.after * whole, color=GREY, linewidth=1.0)
-    axes.plot(panel.before * whole, rows, "o", color=colour(1), label="before", markersize=5)
-    axes.plot(panel.after * whole, rows, "o", color=colour(0), label="after", markersize=5)
+    percent_factor = 100 / panel.uncontrolled
+    axes.hlines(
+        rows, panel.before * percent_factor, panel.after * percent_factor, color=GREY, linewidth=1.0
+    )
+    axes.plot(
+        panel.before * percent_factor, rows, "o", color=colour(1), label="before", markersize=5
+    )
+    axes.plot(panel.after * percent_factor, rows, "o", color=colour(0), label="after", markersize=5)
     if np.isfinite(panel.least).all():
-        axes.plot(panel.least * whole, rows, "|", color=INK, label="least possible", markersize=10)
-        axes.barh(rows, panel.least * whole, height=0.9, color="#eef2f5", zorder=0)
-    lowest = np.nanmin([panel.least, panel.after, panel.before], axis=0) * whole
+        axes.plot(
+            panel.least * percent_factor,
+            rows,
+            "|",
+            color=INK,
+            label="least possible",
+            markersize=10,
+        )
+        axes.barh(rows, panel.least * percent_factor, height=0.9, color="#eef2f5", zorder=0)
+    lowest = np.nanmin([panel.least, panel.after, panel.before], axis=0) * percent_factor
     axes.set_xlim(
-        max(0.0, 0.9 * np.nanmin(lowest)), 1.02 * max(100.0, (panel.before * whole).max())
+        max(0.0, 0.9 * np.nanmin(lowest)), 1.02 * max(100.0, (panel.before * percent_factor).max())
     )
     axes.axvline(100, color=GREY, linewidth=0.8, linestyle=":")
     axes.set_yticks(rows, panel.labels)

@@ -20,12 +20,12 @@ from jaxbeam.plot import (
     FitPanel,
     animate,
     plot_fit,
-    plot_frequency,
+    plot_frequency_response,
     plot_modes,
     plot_record,
     plot_sweep,
 )
-from jaxbeam.plot.style import INK, digits, scale, spread
+from jaxbeam.plot.style import INK, format_number, separate_labels, unit_scale
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=2),
@@ -91,7 +91,7 @@ def test_record(record):
     for text in ("one ball", "deflection (mm)", "contact force (N)", "time (s)", "0.15 m",
                  "0.5 kg, 2 m/s", "weight 4.91 N"):  # fmt: skip
         assert text in said
-    assert f"peak {digits(-1e3 * float(record.peak_deflection[1]))} mm" in said
+    assert f"peak {format_number(-1e3 * float(record.peak_deflection[1]))} mm" in said
 
 
 def test_record_of_many_parts(record):
@@ -256,7 +256,7 @@ def test_fit():
     said = words(figure)
     for text in ("two logs", "first.csv", "second.csv", "d1", "d2", "measured and fitted (mm)",
                  "measured and fitted (mm/s\N{SUPERSCRIPT TWO})", "fitted",
-                 f"residual sd {digits(np.std(noise[:, 1]) * 1e6)} \N{MICRO SIGN}m"):  # fmt: skip
+                 f"residual sd {format_number(np.std(noise[:, 1]) * 1e6)} \N{MICRO SIGN}m"):  # fmt: skip
         assert text in said
     with pytest.raises(ValueError, match="at least one log"):
         plot_fit([])
@@ -272,7 +272,7 @@ def test_frequency_responses():
     """A column a unit; the curve of each pair, without a frequency of zero."""
     pairs = [("force@0.3", "sensors.0"), ("force@0.3", "velocity@0.1"), ("force@0.2", "sensors.1")]
     response = frequency_response(CASE, [0.0, 2.0, 20.0, 200.0], pairs)
-    figure = plot_frequency(response)
+    figure = plot_frequency_response(response)
     grid = np.array(figure.axes).reshape(2, 2)
     assert [len(axes.lines) for axes in grid.ravel()] == [2, 1, 2, 1]
     assert_allclose(data(grid[0, 0].lines[1])[1], response.magnitude[1:, 2])
@@ -344,10 +344,10 @@ def test_style_stays_in_the_figure():
     ],
 )
 def test_prefixes(values, unit, expected):
-    assert scale(values, unit) == expected
+    assert unit_scale(values, unit) == expected
 
 
 def test_labels_keep_apart():
-    assert_allclose(spread([3.0, 1.0, 2.0], 0.5), [3, 1, 2])
-    assert_allclose(spread([1.0, 1.0, 5.0], 0.5), [0.75, 1.25, 5.0])
-    assert spread([], 1.0).shape == (0,)
+    assert_allclose(separate_labels([3.0, 1.0, 2.0], 0.5), [3, 1, 2])
+    assert_allclose(separate_labels([1.0, 1.0, 5.0], 0.5), [0.75, 1.25, 5.0])
+    assert separate_labels([], 1.0).shape == (0,)

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.signal
 
 import jaxbeam as jb
-from experiments.thesis.chapter2.identification import HAND_FITTED, plant_of
+from experiments.thesis.chapter2.identification import HAND_FITTED, with_log_modes
 from jaxbeam import rigs
 from tests.oracles import finite_elements
 from tests.tuning.rehearsals import Plant
@@ -23,7 +23,7 @@ VOLTS, LOWEST, HIGHEST = 2.0, 1.0, 30.0  # V, Hz, Hz
 
 def plant(name: str) -> Plant:
     """A rig as finite elements."""
-    case = jb.replace(plant_of(rigs.load(name)), HAND_FITTED[name] | {"loads.0.speed": SPEED})
+    case = jb.replace(with_log_modes(rigs.load(name)), HAND_FITTED[name] | {"loads.0.speed": SPEED})
     beam = case.beam
     suspensions = [
         finite_elements.Suspension(float(a.position), float(a.stiffness), float(a.damping))

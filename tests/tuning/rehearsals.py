@@ -14,11 +14,11 @@ from jaxbeam.case.case import replace
 from tests.oracles import crossing, finite_elements
 from tests.oracles.loads import Load
 from tuning import Fit, Log
-from tuning.fit.dataset import prepare
-from tuning.fit.identify import fit_of
-from tuning.fit.least_squares import Search
-from tuning.fit.uncertainty.covariance import reach
-from tuning.parameters.free import free_numbers
+from tuning.fit.dataset import make_dataset
+from tuning.fit.identify import fit_result
+from tuning.fit.least_squares import LeastSquares
+from tuning.fit.uncertainty.covariance import t_quantile
+from tuning.parameters.free import free_parameters
 
 RATE, MEMORY = 100.0, 0.5  # Hz, correlation from sample to sample
 NOISE = {"deflection": 1e-5, "acceleration": 2e-3}  # m, m/s^2
@@ -153,26 +153,26 @@ class Rehearsal:
             actuators=(None,) * sensors + tuple(range(count)),
         )
         start = {address: 1.06 * value for address, value in made.truth.items()}
-        campaign = prepare(replace(made.case, start), [log])
+        campaign = make_dataset(replace(made.case, start), [log])
         scale = np.ptp(self.clean)
-        self.numbers = free_numbers(campaign.cases, dict.fromkeys(made.truth), scale)
-        self.search = Search(campaign, self.numbers)
-        self.known = np.array([n.inward(made.truth[n.address]) for n in self.numbers])
+        self.numbers = free_parameters(campaign.cases, dict.fromkeys(made.truth), scale)
+        self.search = LeastSquares(campaign, self.numbers)
+        self.known = np.array([n.to_unbounded(made.truth[n.address]) for n in self.numbers])
 
     def fit(self, noise, free, held=None):
         """A fit of what is free, the other numbers `held`, or known; noise of unit size."""
         measured = (self.clean + self.noise * noise)[None]
-        start = np.where(free, self.search.start, self.known if held is None else held)
-        return self.search.estimate(measured, start=start, free=free)
+        start = np.where(free, self.search.start_point, self.known if held is None else held)
+        return self.search.solve(measured, start=start, free=free)
 
     def errors(self, found, free):
         """Errors of what was free, in half widths of the stated intervals."""
-        halves = reach(found.freedom) * found.uncertainty.errors[free]
+        halves = t_quantile(found.degrees_of_freedom) * found.uncertainty.errors[free]
         return (found.values[free] - np.array(list(self.truth.values()))[free]) / halves
 
     def told(self, noise, found) -> Fit:
         """All of a fit."""
-        campaign = self.search.campaign
-        fit = fit_of(campaign.cases[0], self.search, found)
+        campaign = self.search.data
+        fit = fit_result(campaign.cases[0], self.search, found)
         noisy = dataclasses.replace(campaign, measured=(self.clean + self.noise * noise)[None])
         return dataclasses.replace(fit, campaign=noisy)

@@ -7,10 +7,10 @@ import numpy as np
 
 import jaxbeam as jb
 from tuning import Log
-from tuning.fit.dataset import Campaign
-from tuning.fit.identify import fit_of
-from tuning.fit.least_squares import Search
-from tuning.parameters.free import free_numbers
+from tuning.fit.dataset import Dataset
+from tuning.fit.identify import fit_result
+from tuning.fit.least_squares import LeastSquares
+from tuning.parameters.free import free_parameters
 
 TRUTH = {"beam.flexural_rigidity": 20.0, "beam.damping_ratio": 0.03, "sensors.0.offset": 0.2}
 PULLS = (1.0, 1.6, 0.7)  # how hard the beam of each log was pulled before it was let go
@@ -30,7 +30,7 @@ def formula(rigidity, damping, offset, pull):
 
 
 @dataclasses.dataclass(frozen=True)
-class StandIn(Campaign):
+class StandIn(Dataset):
     """Logs of one channel, each with a pull of its own; its numbers are those of `TRUTH`."""
 
     def predictor(self, addresses):
@@ -66,14 +66,14 @@ def campaign(measured=None, real=None, logs=3, seed=0) -> StandIn:
     return StandIn(CASE, [CASE] * len(made), made, None, times, measured, real)
 
 
-def search(free=None, loss="squares", **about) -> Search:
+def search(free=None, loss="squares", **about) -> LeastSquares:
     """A search for the numbers of `TRUTH`, or some of them."""
     made = campaign(**about)
     free = dict.fromkeys(TRUTH) if free is None else free
-    return Search(made, free_numbers(made.cases, free, 1.0), loss)
+    return LeastSquares(made, free_parameters(made.cases, free, 1.0), loss)
 
 
-def fit(found: Search | None = None):
+def fit(found: LeastSquares | None = None):
     """The fit of a search."""
     found = search() if found is None else found
-    return fit_of(CASE, found, found.estimate(found.campaign.measured))
+    return fit_result(CASE, found, found.solve(found.data.measured))

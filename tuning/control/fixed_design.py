@@ -11,31 +11,31 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.state_space import state_space
 
 
-class Believing(AbstractController):
-    """A `law` whose gains and estimators are designed for the `believed` case; else it is as it is.
+class FixedDesign(AbstractController):
+    """A `law` whose gains and estimators are designed for the `design_case` case; else it is as it is.
 
     Laws design themselves for the rig of their case (`AbstractController.init`). Where that rig is
     uncertain, they would otherwise know each plant that is tried.
     """
 
     law: AbstractController = eqx.field(kw_only=True)
-    believed: Case = eqx.field(kw_only=True)
+    design_case: Case = eqx.field(kw_only=True)
     layout: Layout = eqx.field(static=True, kw_only=True)
 
     @property
-    def memoryless(self) -> bool:
+    def stateless(self) -> bool:
         return self.law.memoryless
 
     @property
-    def blind(self) -> bool:
+    def open_loop(self) -> bool:
         return self.law.blind
 
     @property
-    def knows_loads(self) -> bool:
+    def design_depends_on_loads(self) -> bool:
         return self.law.knows_loads
 
-    def init(self, model):
-        return self.law.init(state_space(self.believed, layout=self.layout))
+    def init(self, plant):
+        return self.law.init(state_space(self.design_case, layout=self.layout))
 
     def step(self, memory, measurement, t):
         return self.law.step(memory, measurement, t)
@@ -49,17 +49,17 @@ class Believing(AbstractController):
     def flow(self, memory, own, measurement, t, limited):
         return self.law.flow(memory, own, measurement, t, limited)
 
-    def fault(self, case):
+    def validate(self, case):
         return self.law.fault(case)
 
     def failures(self, memory):
         return self.law.failures(memory)
 
-    def knots(self, case):
+    def breakpoints(self, case):
         return self.law.knots(case)
 
 
-def believing(case: Case, nominal: Mapping[str, Any], layout: Layout) -> Case:
+def with_fixed_design(case: Case, nominal: Mapping[str, Any], layout: Layout) -> Case:
     """The case with a controller that takes the numbers at some addresses for the `nominal` ones.
 
     `layout` is the order of places along the beam, the same for both.
@@ -67,6 +67,8 @@ def believing(case: Case, nominal: Mapping[str, Any], layout: Layout) -> Case:
     law = case.controller
     if not nominal or law is None:
         return case
-    clock = {name: getattr(law, name) for name in ("period", "delay", "resolution")}
-    wrapped = Believing(law=law, believed=replace(case, dict(nominal)), layout=layout, **clock)
+    sampling = {name: getattr(law, name) for name in ("period", "delay", "resolution")}
+    wrapped = FixedDesign(
+        law=law, design_case=replace(case, dict(nominal)), layout=layout, **sampling
+    )
     return eqx.tree_at(lambda c: c.controller, case, wrapped)

@@ -10,12 +10,12 @@ import numpy as np
 from jaxbeam.case.case import Case
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
-from tuning.control.tune import Bounds, tune
+from tuning.control.tune import ParameterBounds, tune
 from tuning.control.tuning_result import Tuned
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Chosen:
+class IntegerSearchResult:
     """What every choice of whole numbers has come to; `best` is that of the lowest objective.
 
     Training runs choose, held-out ones have no part in it.
@@ -27,16 +27,18 @@ class Chosen:
     @property
     def best(self) -> Tuned:
         """The tuning that has come furthest down on training runs."""
-        ended = [(found.violation > 0, found.outcomes[0].objective[1]) for found in self.tuned]
-        return self.tuned[min(range(len(ended)), key=ended.__getitem__)]
+        ranks = [
+            (found.stability_violation > 0, found.run_sets[0].objective[1]) for found in self.tuned
+        ]
+        return self.tuned[min(range(len(ranks)), key=ranks.__getitem__)]
 
     def __str__(self) -> str:
         names = list(self.choices[0])
-        heads = [*names, *(f"{found.name}" for found in self.tuned[0].outcomes)]
+        heads = [*names, *(f"{found.name}" for found in self.tuned[0].run_sets)]
         lines = ["objective by choice", "".join(f"{head:>24}" for head in heads)]
         for choice, found in zip(self.choices, self.tuned, strict=True):
             cells = [f"{choice[name]:d}" for name in names]
-            cells += [f"{outcome.objective[1]:.5g}" for outcome in found.outcomes]
+            cells += [f"{outcome.objective[1]:.5g}" for outcome in found.run_sets]
             mark = "  (best)" if found is self.best else ""
             lines.append("".join(f"{cell:>24}" for cell in cells) + mark)
         return "\n".join([*lines, "", str(self.best)])
@@ -45,11 +47,11 @@ class Chosen:
 def tune_choices(
     case: Case,
     choices: Mapping[str, Sequence[int]],
-    free: Bounds,
+    free: ParameterBounds,
     cases: LoadCases,
     objective: Objective | None = None,
     **options: Any,
-) -> Chosen:
+) -> IntegerSearchResult:
     """Tune a case with every combination of whole numbers at some addresses.
 
     `choices` are lists by address, such as {"controller.horizon": [4, 6, 8]}. Whole numbers decide
@@ -61,41 +63,43 @@ def tune_choices(
     rows = [dict(zip(choices, row, strict=True)) for row in itertools.product(*choices.values())]
     if not choices or not rows:
         raise ValueError("name at least one whole number, with at least one value to try")
-    chosen = [with_whole(case, row) for row in rows]
+    chosen = [with_integers(case, row) for row in rows]
     found = [tune(own, free, cases, objective, **options) for own in chosen]
-    return Chosen(tuple(rows), tuple(found))
+    return IntegerSearchResult(tuple(rows), tuple(found))
 
 
-def with_whole(case: Case, values: Mapping[str, int]) -> Case:
+def with_integers(case: Case, values: Mapping[str, int]) -> Case:
     """The case with other whole numbers at some addresses.
 
     Raises ValueError for an address at which there is no whole number.
     """
     for address, value in values.items():
-        case = _set(case, address.split("."), int(value), address)
+        case = _replace_integer(case, address.split("."), int(value), address)
     return case
 
 
-def _set(part, path: list[str], value: int, address: str):
+def _replace_integer(part, path: list[str], value: int, address: str):
     """The part of a case with a whole number replaced, a step of the path at a time."""
     step, *rest = path
     if isinstance(part, tuple):
         if not (step.isdigit() and int(step) < len(part)):
             raise ValueError(f"the case has nothing at {address}")
         entries = list(part)
-        entries[int(step)] = _set(entries[int(step)], rest, value, address)
+        entries[int(step)] = _replace_integer(entries[int(step)], rest, value, address)
         return tuple(entries)
-    names = [field.name for field in dataclasses.fields(part)] if _is_part(part) else []
+    names = (
+        [field.name for field in dataclasses.fields(part)] if _is_dataclass_instance(part) else []
+    )
     if step not in names:
         hint = f"; there it has {', '.join(names)}" if names else ""
         raise ValueError(f"the case has nothing at {address}{hint}")
     old = getattr(part, step)
     if rest:
-        return dataclasses.replace(part, **{step: _set(old, rest, value, address)})
+        return dataclasses.replace(part, **{step: _replace_integer(old, rest, value, address)})
     if isinstance(old, bool) or not isinstance(old, (int, np.integer)):
         raise ValueError(f"{address} is no whole number: tune it as a free one")
     return dataclasses.replace(part, **{step: value})
 
 
-def _is_part(part) -> bool:
+def _is_dataclass_instance(part) -> bool:
     return dataclasses.is_dataclass(part) and not isinstance(part, type)

@@ -15,49 +15,62 @@ from jaxbeam.case.fields import known
 from jaxbeam.case.loads import motion
 from jaxbeam.case.trajectory import NEVER
 
-Values = dict[str, float]  # numbers of the case by address
+AddressValues = dict[str, float]  # numbers of the case by address
 TABLES = ("training", "held_out")
-PLANT = ("beam.", "supports.", "actuators.", "sensors.")  # what addresses of the plant begin with
+PLANT_PREFIXES = (
+    "beam.",
+    "supports.",
+    "actuators.",
+    "sensors.",
+)  # what addresses of the plant begin with
 
 
 @dataclasses.dataclass(frozen=True)
 class LoadCases:
     """Numbers of the case, by address, that differ from run to run: loads, plants, anything.
 
-    `training` runs are tuned on, `held_out` ones only looked at when all is done.
+    `training_loads` runs are tuned on, `held_out` ones only looked at when all is done.
     """
 
-    training: tuple[Values, ...]
-    held_out: tuple[Values, ...] = ()
+    training: tuple[AddressValues, ...]
+    held_out: tuple[AddressValues, ...] = ()
 
     def __post_init__(self):
         if not self.training:
             raise ValueError("there is nothing to tune on: give at least one training case")
-        both = [run for run in self.held_out if run in self.training]
-        if both:
-            raise ValueError(f"held-out cases must not be trained on, but {_words(both[0])} is")
+        repeated = [run for run in self.held_out if run in self.training]
+        if repeated:
+            raise ValueError(
+                f"held-out cases must not be trained on, but {_describe(repeated[0])} is"
+            )
 
-    def across(self, plants: Sequence[Values], others: Sequence[Values] = ()) -> "LoadCases":
+    def across(
+        self, plants: Sequence[AddressValues], others: Sequence[AddressValues] = ()
+    ) -> "LoadCases":
         """Every training run on each of the plants, and every held-out run on each of the others.
 
         Plants are numbers by address, as `tuning.draw_plants` gives them; without others the
         held-out runs stay on the case's own.
         """
-        held_out = _on(self.held_out, others) if others else self.held_out
-        return LoadCases(_on(self.training, plants), held_out)
+        held_out = _all_pairs(self.held_out, others) if others else self.held_out
+        return LoadCases(_all_pairs(self.training, plants), held_out)
 
 
-def _on(runs: Sequence[Values], plants: Sequence[Values]) -> tuple[Values, ...]:
+def _all_pairs(
+    runs: Sequence[AddressValues], plants: Sequence[AddressValues]
+) -> tuple[AddressValues, ...]:
     return tuple({**run, **plant} for run in runs for plant in plants)
 
 
-def grid(values: Mapping[str, Sequence[float]]) -> tuple[Values, ...]:
+def grid(values: Mapping[str, Sequence[float]]) -> tuple[AddressValues, ...]:
     """Every combination of the values given by address."""
     rows = itertools.product(*values.values())
     return tuple(dict(zip(values, map(float, row), strict=True)) for row in rows)
 
 
-def draws(ranges: Mapping[str, Sequence[float]], count: int, seed: int = 0) -> tuple[Values, ...]:
+def draws(
+    ranges: Mapping[str, Sequence[float]], count: int, seed: int = 0
+) -> tuple[AddressValues, ...]:
     """Values drawn evenly from a range for each address, spread as a Latin hypercube.
 
     Raises ValueError for a count below 1 or a range that does not ascend.
@@ -96,7 +109,7 @@ def read_load_cases(path: str | os.PathLike) -> LoadCases:
     runs = {}
     for name in TABLES:
         table = dict(content.get(name, {}))
-        drawn = {key: table.pop(key) for key in ("draws", "seed") if key in table}
+        draw_options = {key: table.pop(key) for key in ("draws", "seed") if key in table}
         for address, entries in table.items():
             numbers = isinstance(entries, list) and entries
             if not numbers or not all(type(x) in (int, float) for x in entries):
@@ -104,19 +117,19 @@ def read_load_cases(path: str | os.PathLike) -> LoadCases:
                     f"{path}: {name}.{address} must be a list of numbers, such as"
                     f' "loads.0.mass" = [0.2, 0.5]'
                 )
-        runs[name] = _runs(table, drawn, f"{path}: {name}")
+        runs[name] = _table_runs(table, draw_options, f"{path}: {name}")
     try:
         return LoadCases(**runs)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _runs(table, drawn, where: str) -> tuple[Values, ...]:
+def _table_runs(table, draw_options, where: str) -> tuple[AddressValues, ...]:
     """Runs of a table: the grid of its lists, or draws from them."""
-    if any(type(number) is not int or number < 0 for number in drawn.values()):
+    if any(type(number) is not int or number < 0 for number in draw_options.values()):
         raise ValueError(f"{where}: draws and seed are whole numbers, such as draws = 12")
-    if "draws" not in drawn:
-        if drawn:
+    if "draws" not in draw_options:
+        if draw_options:
             raise ValueError(f"{where}.seed is for drawing: say how many with draws = 12")
         return grid(table) if table else ()
     for address, entries in table.items():
@@ -126,29 +139,29 @@ def _runs(table, drawn, where: str) -> tuple[Values, ...]:
                 f" {len(entries)} entries"
             )
     try:
-        return draws(table, drawn["draws"], drawn.get("seed", 0))
+        return draws(table, draw_options["draws"], draw_options.get("seed", 0))
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
 
-def apply(case: Case, run: Values) -> Case:
+def run_case(case: Case, run: AddressValues) -> Case:
     """The case of a run. Raises ValueError if its loads have not left when the run ends."""
-    own = replace(case, run)
-    ends = [float(motion(load, own.beam.length).window()[1]) for load in own.loads]
-    last, duration = max(ends, default=0.0), float(known(own.run.duration))
+    changed = replace(case, run)
+    ends = [float(motion(load, changed.beam.length).window()[1]) for load in changed.loads]
+    last, duration = max(ends, default=0.0), float(known(changed.run.duration))
     if last < NEVER and last > duration:
         raise ValueError(
-            f"run.duration is {duration:g} s, but with {_words(run)} the last load leaves only at"
+            f"run.duration is {duration:g} s, but with {_describe(run)} the last load leaves only at"
             f" {last:.4g} s: simulate longer"
         )
-    return own
+    return changed
 
 
-def _words(run: Values) -> str:
+def _describe(run: AddressValues) -> str:
     return ", ".join(f"{address} = {value:g}" for address, value in run.items())
 
 
-def columns(runs: Sequence[Values]) -> dict[str, np.ndarray]:
+def value_columns(runs: Sequence[AddressValues]) -> dict[str, np.ndarray]:
     """Values of some runs by address, NaN where a run leaves the case's own."""
     names = dict.fromkeys(address for run in runs for address in run)
     return {name: np.array([run.get(name, np.nan) for run in runs]) for name in names}

@@ -10,12 +10,14 @@ from jaxtyping import Array, Float
 from jaxbeam.simulation.simulate import Histories
 
 MERITS = ("peak", "shortfall", "rms", "after_exit", "effort", "contact")
-OVER = ("mean", "worst", "cvar")
-STEEP = 10.0  # of the objective, for each unit by which a limited figure exceeds its limit
+AGGREGATIONS = ("mean", "worst", "cvar")
+LIMIT_PENALTY_SLOPE = (
+    10.0  # of the objective, for each unit by which a limited figure exceeds its limit
+)
 Sharpness = Float[Array, ""] | float | None  # of smooth maxima; None for true ones
 
 
-class Target(NamedTuple):
+class WeightsAndLimits(NamedTuple):
     """Weights and limits of all figures of merit, as arrays in the order of `MERITS`."""
 
     weights: Float[Array, " merit"]
@@ -51,48 +53,51 @@ class Objective:
             raise ValueError("an objective needs merits with positive, finite weights")
         if any(not 0 < value < float("inf") for value in self.limits.values()):
             raise ValueError("limits of merits must be positive and finite")
-        if self.over not in OVER:
-            raise ValueError(f"over may be {', '.join(OVER)}, not {self.over!r}")
+        if self.over not in AGGREGATIONS:
+            raise ValueError(f"over may be {', '.join(AGGREGATIONS)}, not {self.over!r}")
         if not 0 < self.share <= 1:
             raise ValueError(f"share must be above 0 and at most 1; it is {self.share:g}")
 
     @property
-    def target(self) -> Target:
+    def target(self) -> WeightsAndLimits:
         """Weights, zero for what does not count, and limits, infinite for what has none."""
         weights = [self.weights.get(name, 0.0) for name in MERITS]
-        return Target(
+        return WeightsAndLimits(
             jnp.array(weights), jnp.array([self.limits.get(name, jnp.inf) for name in MERITS])
         )
 
-    def with_price(
-        self, merits: dict[str, Float[Array, " run"]], target: Target, sharpness: Sharpness = None
+    def penalised(
+        self,
+        merits: dict[str, Float[Array, " run"]],
+        target: WeightsAndLimits,
+        sharpness: Sharpness = None,
     ) -> Float[Array, ""]:
         """One number for all runs by the weights of a target, with a price on excess of limits.
 
         The price is so steep that the least lies at a limit, not beyond it.
         """
         rows = jnp.stack([merits[name] for name in MERITS])
-        excess = jnp.stack([self.of_runs(row, sharpness) for row in rows]) - target.limits
-        price = STEEP * jnp.sum(jnp.maximum(excess, 0.0))
-        return self.of_runs(target.weights @ rows, sharpness) + price
+        excess = jnp.stack([self.aggregate(row, sharpness) for row in rows]) - target.limits
+        penalty = LIMIT_PENALTY_SLOPE * jnp.sum(jnp.maximum(excess, 0.0))
+        return self.aggregate(target.weights @ rows, sharpness) + penalty
 
-    def of_run(self, merits: dict[str, Float[Array, "..."]]) -> Float[Array, "..."]:
+    def weighted_merits(self, merits: dict[str, Float[Array, "..."]]) -> Float[Array, "..."]:
         """The weighted sum for runs whose merits are known."""
         return sum((w * merits[name] for name, w in self.weights.items()), jnp.zeros(()))
 
-    def of_runs(
+    def aggregate(
         self, values: Float[Array, " run"], sharpness: Sharpness = None
     ) -> Float[Array, ""]:
         """One number for the values of all runs; smooth if a sharpness is given."""
         if self.over == "mean":
             return jnp.mean(values)
         if self.over == "worst":
-            return largest(values, sharpness)
+            return smooth_max(values, sharpness)
         count = max(1, round(self.share * values.shape[0]))
         return jnp.mean(jnp.sort(values)[-count:])
 
 
-def largest(values: Float[Array, "..."], sharpness: Sharpness) -> Float[Array, ""]:
+def smooth_max(values: Float[Array, "..."], sharpness: Sharpness) -> Float[Array, ""]:
     """The largest of some values, or a smooth bound from above that is log(count)/sharpness off."""
     if sharpness is None:
         return jnp.max(values)
@@ -101,27 +106,30 @@ def largest(values: Float[Array, "..."], sharpness: Sharpness) -> Float[Array, "
 
 def run_merits(
     found: Histories,
-    free: dict[str, Float[Array, ""]],
-    after: Float[Array, " time"],
-    ranges: Float[Array, " actuator"],
+    uncontrolled: dict[str, Float[Array, ""]],
+    after_exit: Float[Array, " time"],
+    command_ranges: Float[Array, " actuator"],
     weights: Float[Array, " load"],
     sharpness: Sharpness = None,
 ) -> dict[str, Float[Array, ""]]:
-    """Figures of merit of one run (see `Objective`); `free` holds those without control, in m,
+    """Figures of merit of one run (see `Objective`); `uncontrolled_peaks` holds those without control, in m,
     and the least peak possible (NaN where it is not known).
 
-    `after` is 1 at samples after the last exit and 0 before; `ranges` are the largest commands
+    `after_exit` is 1 at samples after the last exit and 0 before; `command_ranges` are the largest commands
     within limits, `weights` those of the loads (N). With a `sharpness` maxima are smooth.
     """
     size = jnp.abs(found.deflection)
     change = jnp.abs(found.contact_force - weights) * (found.contact_force != 0)
-    heavy = jnp.where(weights > 0, weights, 1.0)
-    peak, least = largest(size / free["peak"], sharpness), free["least"] / free["peak"]
+    nonzero_weights = jnp.where(weights > 0, weights, 1.0)
+    peak, least = (
+        smooth_max(size / uncontrolled["peak"], sharpness),
+        uncontrolled["least"] / uncontrolled["peak"],
+    )
     return {
         "peak": peak,
         "shortfall": (peak - least) / (1 - least),
-        "rms": jnp.sqrt(jnp.mean(found.deflection**2)) / free["rms"],
-        "after_exit": largest(size * after[:, None] / free["peak"], sharpness),
-        "effort": jnp.sqrt(jnp.mean((found.command / ranges) ** 2) + 1e-30),
-        "contact": largest(change / heavy, sharpness),
+        "rms": jnp.sqrt(jnp.mean(found.deflection**2)) / uncontrolled["rms"],
+        "after_exit": smooth_max(size * after_exit[:, None] / uncontrolled["peak"], sharpness),
+        "effort": jnp.sqrt(jnp.mean((found.command / command_ranges) ** 2) + 1e-30),
+        "contact": smooth_max(change / nonzero_weights, sharpness),
     }

@@ -9,12 +9,12 @@ from jaxbeam.case.case import Case
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import MERITS, Objective
 from tuning.control.stability_constraint import Stable
-from tuning.control.tune import Bounds, Problem, check
+from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments
 from tuning.control.tuning_result import Tuned
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Front:
+class ParetoFront:
     """Tunings for one objective under ever tighter limits of one merit, loosest first."""
 
     merit: str
@@ -23,7 +23,7 @@ class Front:
 
     def points(self, held_out: bool = False) -> np.ndarray:
         """For each limit the merit and the objective (limit, 2), of training or held-out runs."""
-        own = [found.outcomes[-1 if held_out else 0] for found in self.tuned]
+        own = [found.run_sets[-1 if held_out else 0] for found in self.tuned]
         return np.array([[one.merits[self.merit], one.objective[1]] for one in own])
 
     def __str__(self) -> str:
@@ -36,16 +36,16 @@ class Front:
 
     def plot(self):
         """Figure of the front, on training and on held-out runs."""
-        from jaxbeam.plot import plot_front
+        from jaxbeam.plot import plot_pareto_front
 
-        kinds = {found.name: found.name == "held out" for found in self.tuned[0].outcomes}
+        kinds = {found.name: found.name == "held out" for found in self.tuned[0].run_sets}
         lines = {name: self.points(held_out) for name, held_out in kinds.items()}
-        return plot_front(lines, self.merit, title=self.tuned[0].case.title)
+        return plot_pareto_front(lines, self.merit, title=self.tuned[0].case.title)
 
 
 def pareto(
     case: Case,
-    free: Bounds,
+    free: ParameterBounds,
     cases: LoadCases,
     objective: Objective,
     merit: str,
@@ -58,7 +58,7 @@ def pareto(
     seed: int = 0,
     bounds: bool = True,
     progress: bool = True,
-) -> Front:
+) -> ParetoFront:
     """Tune for an objective under each of some limits on a merit (see `Objective`).
 
     From the loosest limit to the tightest each search goes on from where the last one ended, and
@@ -68,17 +68,19 @@ def pareto(
     Raises ValueError as `tune` does, and for an unknown merit or a limit that is not positive.
     """
     limits = tuple(sorted(map(float, limits), reverse=True))
-    goals = [_limited(objective, {merit: limit}) for limit in limits]
-    if not goals:
+    objectives = [_with_limits(objective, {merit: limit}) for limit in limits]
+    if not objectives:
         raise ValueError("a front needs at least one limit")
-    check(free, cases, goals[0], method, steps, bounds=bounds)
-    problem = Problem(case, free, cases, goals[0], stable, places, bounds)
-    return Front(merit, limits, tuple(_each(problem, goals, method, steps, seed, progress)))
+    check_arguments(free, cases, objectives[0], method, steps, bounds=bounds)
+    problem = TuningProblem(case, free, cases, objectives[0], stable, places, bounds)
+    return ParetoFront(
+        merit, limits, tuple(_tune_each(problem, objectives, method, steps, seed, progress))
+    )
 
 
 def lexicographic(
     case: Case,
-    free: Bounds,
+    free: ParameterBounds,
     cases: LoadCases,
     merits: Sequence[str],
     *,
@@ -101,30 +103,36 @@ def lexicographic(
     """
     if not merits or len(set(merits)) < len(merits):
         raise ValueError("name at least one merit, and each once, the most important first")
-    check(free, cases, Objective(dict.fromkeys(merits, 1.0)), method, steps, bounds=bounds)
-    problem = Problem(case, free, cases, Objective({merits[0]: 1.0}, over), stable, places, bounds)
+    check_arguments(
+        free, cases, Objective(dict.fromkeys(merits, 1.0)), method, steps, bounds=bounds
+    )
+    problem = TuningProblem(
+        case, free, cases, Objective({merits[0]: 1.0}, over), stable, places, bounds
+    )
     found, limits = [], {}
-    descent, points = problem.descent(method, steps), None
+    optimisation, points = problem.optimisation(method, steps), None
     for merit in merits:
-        goal = Objective({merit: 1.0}, over, limits=dict(limits))
-        points = descent.points(1, seed, points)
-        state = descent.run(goal.target, points, seed, progress=progress)
+        objective = Objective({merit: 1.0}, over, limits=dict(limits))
+        points = optimisation.start_points(1, seed, points)
+        state = optimisation.run(objective.target, points, seed, progress=progress)
         points = state.best[0]
-        found.append(problem.proven(descent, state, goal))
-        limits[merit] = (1 + slack) * found[-1].outcomes[0].merits[merit]
+        found.append(problem.tuning_result(optimisation, state, objective))
+        limits[merit] = (1 + slack) * found[-1].run_sets[0].merits[merit]
     return tuple(found)
 
 
-def _each(problem: Problem, goals, method, steps, seed, progress):
+def _tune_each(problem: TuningProblem, objectives, method, steps, seed, progress):
     """One result for each goal, every search begun where the one before it ended."""
-    descent, point = problem.descent(method, steps), None
-    for goal in goals:
-        state = descent.run(goal.target, descent.points(1, seed, point), seed, progress=progress)
+    optimisation, point = problem.optimisation(method, steps), None
+    for goal in objectives:
+        state = optimisation.run(
+            goal.target, optimisation.start_points(1, seed, point), seed, progress=progress
+        )
         point = state.best[0]
-        yield problem.proven(descent, state, goal)
+        yield problem.tuning_result(optimisation, state, goal)
 
 
-def _limited(objective: Objective, limits: dict[str, float]) -> Objective:
+def _with_limits(objective: Objective, limits: dict[str, float]) -> Objective:
     unknown = set(limits) - set(MERITS)
     if unknown:
         raise ValueError(f"there is no merit {min(unknown)!r}; it may be {', '.join(MERITS)}")

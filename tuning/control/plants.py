@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxbeam.case.case import Case, replace
-from tuning.control.load_cases import PLANT, Values
+from tuning.control.load_cases import PLANT_PREFIXES, AddressValues
 
 if TYPE_CHECKING:
     from tuning.fit.identify import Fit
     from tuning.fit.uncertainty.posterior import Posterior
 
-TRIES = 100  # draws for each that has to lie within the bounds
+MAX_DRAWS_PER_PLANT = 100  # draws for each that has to lie within the bounds
 
 
 def adopt(case: Case, found: Fit | Posterior) -> Case:
@@ -23,10 +23,10 @@ def adopt(case: Case, found: Fit | Posterior) -> Case:
     lacks an address, or nothing that was identified concerns the plant.
     """
     values = found.values if hasattr(found, "values") else found.means
-    return replace(case, _plant(found.addresses, values))
+    return replace(case, _plant_values(found.addresses, values))
 
 
-def draw_plants(found: Fit | Posterior, count: int, seed: int = 0) -> tuple[Values, ...]:
+def draw_plants(found: Fit | Posterior, count: int, seed: int = 0) -> tuple[AddressValues, ...]:
     """Numbers of plants, by address, that are as likely as what was identified says.
 
     Of a fit, draws from its covariance, with Student's tails where few independent samples were
@@ -45,26 +45,28 @@ def draw_plants(found: Fit | Posterior, count: int, seed: int = 0) -> tuple[Valu
             raise ValueError(f"{count} plants need as many draws; the posterior has {len(rows)}")
         rows = rows[rng.choice(len(rows), count, replace=False)]
     else:
-        rows = _normal(found, count, rng)
-    return tuple(_plant(found.addresses, row) for row in rows)
+        rows = _covariance_draws(found, count, rng)
+    return tuple(_plant_values(found.addresses, row) for row in rows)
 
 
-def _normal(fit: Fit, count: int, rng) -> np.ndarray:
+def _covariance_draws(fit: Fit, count: int, rng) -> np.ndarray:
     """Draws (count, free) from the covariance of a fit, within its bounds."""
     if not np.all(np.isfinite(fit.errors)):
-        blind = [a for a, e in zip(fit.addresses, fit.errors, strict=True) if not np.isfinite(e)]
+        unidentifiable = [
+            a for a, e in zip(fit.addresses, fit.errors, strict=True) if not np.isfinite(e)
+        ]
         raise ValueError(
-            f"the data cannot see {', '.join(blind)}, so that nothing says how far off a plant may"
+            f"the data cannot see {', '.join(unidentifiable)}, so that nothing says how far off a plant may"
             " be: fit with a prior, or hold what is known otherwise"
         )
     covariance = fit.correlation * np.outer(fit.errors, fit.errors)
     # Correlations of nearly one leave negative eigenvalues of rounding size.
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    low, high = (np.array([getattr(n, side) for n in fit.numbers]) for side in ("low", "high"))
-    tries = TRIES * count
-    wide = np.sqrt(fit.freedom / rng.chisquare(fit.freedom, tries))
-    drawn = fit.values + wide[:, None] * (rng.normal(size=(tries, len(values))) @ root.T)
+    low, high = (np.array([getattr(n, side) for n in fit.parameters]) for side in ("low", "high"))
+    tries = MAX_DRAWS_PER_PLANT * count
+    t_scale = np.sqrt(fit.degrees_of_freedom / rng.chisquare(fit.degrees_of_freedom, tries))
+    drawn = fit.values + t_scale[:, None] * (rng.normal(size=(tries, len(values))) @ root.T)
     inside = drawn[np.all((drawn >= low) & (drawn <= high), axis=1)]
     if len(inside) < count:
         raise ValueError(
@@ -74,10 +76,10 @@ def _normal(fit: Fit, count: int, rng) -> np.ndarray:
     return inside[:count]
 
 
-def _plant(addresses: list[str], row) -> Values:
+def _plant_values(addresses: list[str], row) -> AddressValues:
     """What belongs to the plant. Raises ValueError if nothing does."""
     pairs = zip(addresses, map(float, row), strict=True)
-    found = {address: value for address, value in pairs if address.startswith(PLANT)}
+    found = {address: value for address, value in pairs if address.startswith(PLANT_PREFIXES)}
     if not found:
         raise ValueError(
             f"nothing that was identified concerns the plant; there are {', '.join(addresses)}"

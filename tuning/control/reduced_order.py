@@ -11,22 +11,22 @@ from jaxbeam.case.case import Case
 from jaxbeam.control.optimal.lqr import AbstractRegulator
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
-from tuning.control.tune import Bounds, tune
+from tuning.control.tune import ParameterBounds, tune
 from tuning.control.tuning_result import Tuned
 
-SHARE = "controller.feedback"
-STEEP = 10.0  # of the objective, for shares that together are one off
-TRIED = 3  # states that may be the last to be fed back
+FEEDBACK_ADDRESS = "controller.feedback"
+SHARE_PENALTY = 10.0  # of the objective, for shares that together are one off
+CANDIDATE_COUNT = 3  # states that may be the last to be fed back
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Reduced:
-    """States that are fed back (`kept`, from 0), by their `shares` in the relaxed search.
+class ReducedFeedback:
+    """States that are fed back (`fed_back`, from 0), by their `stage_shares` in the relaxed search.
 
     `tuned` is what the others came to once the shares were rounded; its start is the rounded law.
     """
 
-    kept: tuple[int, ...]
+    fed_back: tuple[int, ...]
     shares: Float[np.ndarray, " state"]
     relaxed: Tuned
     tuned: Tuned
@@ -34,9 +34,9 @@ class Reduced:
     def __str__(self) -> str:
         lines = [f"{'state':<8}{'share':>8}  fed back"]
         for state, share in enumerate(self.shares):
-            lines.append(f"{state:<8}{share:>8.3f}  {'yes' if state in self.kept else 'no'}")
-        rounded, tuned = self.tuned.outcomes[0].objective
-        relaxed = self.relaxed.outcomes[0].objective[1]
+            lines.append(f"{state:<8}{share:>8.3f}  {'yes' if state in self.fed_back else 'no'}")
+        rounded, tuned = self.tuned.run_sets[0].objective
+        relaxed = self.relaxed.run_sets[0].objective[1]
         lines += [
             "",
             f"objective on training: {relaxed:.5g} with these shares, {rounded:.5g} when they are"
@@ -48,11 +48,11 @@ class Reduced:
 def tune_reduced(
     case: Case,
     keep: int,
-    free: Bounds,
+    free: ParameterBounds,
     cases: LoadCases,
     objective: Objective | None = None,
     **options: Any,
-) -> Reduced:
+) -> ReducedFeedback:
     """Tune a regulator that feeds back only `keep` of its states, and find which.
 
     First the share of every state (the law's `feedback`) is a free number from 0 to 1, tuned with
@@ -70,40 +70,45 @@ def tune_reduced(
     states = int(law.state_weight.shape[0])
     if not 1 <= keep < states:
         raise ValueError(f"keep must be 1 to {states - 1} of the {states} states; it is {keep}")
-    if any(address.startswith(SHARE) for address in free) or "checkpoint" in options:
-        raise ValueError(f"leave {SHARE} out of what is free, and name no checkpoint")
-    names = [f"{SHARE}.{state}" for state in range(states)]
+    if any(address.startswith(FEEDBACK_ADDRESS) for address in free) or "checkpoint" in options:
+        raise ValueError(f"leave {FEEDBACK_ADDRESS} out of what is free, and name no checkpoint")
+    names = [f"{FEEDBACK_ADDRESS}.{state}" for state in range(states)]
     shared = dict.fromkeys(names, (0.0, 1.0))
 
-    def price(values):
+    def penalty(values):
         # Both ways: weights make up for shares that are all too small.
-        together = jnp.sum(jnp.stack([values[name] for name in names]))
-        return STEEP * (together - keep) ** 2
+        total = jnp.sum(jnp.stack([values[name] for name in names]))
+        return SHARE_PENALTY * (total - keep) ** 2
 
     relaxed = tune(
-        _feeding(case, np.full(states, keep / states)),
+        _with_feedback(case, np.full(states, keep / states)),
         dict(free) | shared,
         cases,
         objective,
-        price=price,
+        price=penalty,
         **options,
     )
-    found = {n.address: x for n, x in zip(relaxed.numbers, relaxed.values, strict=True)}
+    found = {n.address: x for n, x in zip(relaxed.parameters, relaxed.values, strict=True)}
     shares = np.array([found[name] for name in names])
     order = np.argsort(-shares, kind="stable")
     # What is best in part need not be when whole: the last places are tried out.
-    sets = [np.append(order[: keep - 1], last) for last in order[keep - 1 :][:TRIED]]
-    ends = []
-    for kept in sets:
-        rounded = _feeding(relaxed.case, np.isin(np.arange(states), kept).astype(float))
-        ends.append(tune(rounded, free, cases, objective, **options))
+    candidates = [
+        np.append(order[: keep - 1], last) for last in order[keep - 1 :][:CANDIDATE_COUNT]
+    ]
+    results = []
+    for kept in candidates:
+        rounded = _with_feedback(relaxed.case, np.isin(np.arange(states), kept).astype(float))
+        results.append(tune(rounded, free, cases, objective, **options))
     best = min(
-        range(len(sets)), key=lambda i: (ends[i].violation > 0, ends[i].outcomes[0].objective[1])
+        range(len(candidates)),
+        key=lambda i: (results[i].violation > 0, results[i].run_sets[0].objective[1]),
     )
-    return Reduced(tuple(sorted(map(int, sets[best]))), shares, relaxed, ends[best])
+    return ReducedFeedback(
+        tuple(sorted(map(int, candidates[best]))), shares, relaxed, results[best]
+    )
 
 
-def _feeding(case: Case, shares: Float[np.ndarray, " state"]) -> Case:
+def _with_feedback(case: Case, shares: Float[np.ndarray, " state"]) -> Case:
     """The case with other shares of its states fed back."""
     law = dataclasses.replace(case.controller, feedback=shares)
     return dataclasses.replace(case, controller=law)

@@ -18,137 +18,145 @@ from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import Plan, make_plan, sample_times
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import Histories, histories, simulate
-from tuning.control.fixed_design import believing
-from tuning.control.load_cases import PLANT, Values, apply
+from tuning.control.fixed_design import with_fixed_design
+from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_case
 from tuning.control.objective import Sharpness, run_merits
 
-TOLERANCE = 1e-4  # of the largest deflection: what tuning needs; verdicts are simulated finer
+PEAK_TOLERANCE = 1e-4  # of the largest deflection: what tuning needs; verdicts are simulated finer
 
 
-class Bench(eqx.Module):
-    """Runs of one case that differ in numbers only, and what they are without control (`free`).
+class RunSet(eqx.Module):
+    """Runs of one case that differ in numbers only, and what they are without control (`uncontrolled_peaks`).
 
     `stacked` is the case with the numbers of all runs along a first axis, `error` the relative
-    error of their peaks with the `plan`. `places` (m) are where deflections count: the sensors', or
+    error of their peaks with the `plan`. `positions` (m) are where deflections count: the sensors', or
     given ones. Laws are designed for the plant of the case: where runs have other plants, `nominal`
     holds its numbers. What is compiled should take the bench as an argument: closed over, its
     arrays would be constants that XLA works on for seconds.
     """
 
-    runs: Sequence[Values]
+    runs: Sequence[AddressValues]
     stacked: Case
     plan: Plan
     error: Float[np.ndarray, ""]
     times: Float[Array, " time"]
-    places: Float[Array, " place"]
-    free: dict[str, Float[np.ndarray, " run"]]
-    after: Float[np.ndarray, "run time"]
-    ranges: Float[np.ndarray, " actuator"]
+    positions: Float[Array, " place"]
+    uncontrolled: dict[str, Float[np.ndarray, " run"]]
+    after_exit: Float[np.ndarray, "run time"]
+    command_ranges: Float[np.ndarray, " actuator"]
     nominal: dict[str, Float[np.ndarray, ""]]
 
     @property
     def cases(self) -> list[Case]:
         """The cases of the runs, one by one."""
-        leaves, form = jax.tree.flatten(jax.tree.map(jnp.asarray, self.stacked))
-        return [jax.tree.unflatten(form, row) for row in zip(*leaves, strict=True)]
+        leaves, treedef = jax.tree.flatten(jax.tree.map(jnp.asarray, self.stacked))
+        return [jax.tree.unflatten(treedef, row) for row in zip(*leaves, strict=True)]
 
     def histories(self, values: Mapping[str, Any]) -> Histories:
         """Histories of all runs, along a first axis, with other numbers at some addresses."""
 
         def single(case):
-            return histories(self._used(case, values), self.times, self.plan, self.places)
+            return histories(
+                self._case_with_values(case, values), self.times, self.plan, self.positions
+            )
 
         return jax.vmap(single)(self.stacked)
 
-    def judge(
+    def merits_of(
         self, found: Histories, sharpness: Sharpness = None
     ) -> dict[str, Float[Array, " run"]]:
         """Figures of merit of all runs; differentiable."""
         weights = jax.vmap(lambda case: traffic(case).weight[:, 0])(self.stacked)
-        ranges = jnp.asarray(self.ranges)
+        ranges = jnp.asarray(self.command_ranges)
 
         def single(found, free, after, weights):
             return run_merits(found, free, after, ranges, weights, sharpness)
 
-        return jax.vmap(single)(found, self.free, jnp.asarray(self.after), weights)
+        return jax.vmap(single)(found, self.uncontrolled, jnp.asarray(self.after_exit), weights)
 
     def merits(
         self, values: Mapping[str, Any], sharpness: Sharpness = None
     ) -> dict[str, Float[Array, " run"]]:
         """Figures of merit of all runs with other numbers at some addresses."""
-        return self.judge(self.histories(values), sharpness)
+        return self.merits_of(self.histories(values), sharpness)
 
     def records(self, values: Mapping[str, Any]) -> list[Record]:
         """Records of all runs, with true peaks between and at samples."""
         plan = dataclasses.replace(self.plan, error=float(self.error))
-        return [simulate(self._used(case, values), plan=plan) for case in self.cases]
+        return [simulate(self._case_with_values(case, values), plan=plan) for case in self.cases]
 
-    def at(self, rows: Int[Array, " some"]) -> "Bench":
+    def subset(self, rows: Int[Array, " some"]) -> "RunSet":
         """The bench with some of its runs only."""
-        parts = self.stacked, self.free, self.after
+        parts = self.stacked, self.uncontrolled, self.after_exit
         some = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rows], parts)
         return eqx.tree_at(lambda b: (b.stacked, b.free, b.after), self, some)
 
-    def _used(self, case: Case, values: Mapping[str, Any]) -> Case:
-        return believing(replace(case, values), self.nominal, self.plan.form.layout)
+    def _case_with_values(self, case: Case, values: Mapping[str, Any]) -> Case:
+        return with_fixed_design(replace(case, values), self.nominal, self.plan.form.layout)
 
 
-def make_bench(case: Case, runs: Sequence[Values], places=None, bounds: bool = False) -> Bench:
+def make_run_set(
+    case: Case, runs: Sequence[AddressValues], positions=None, least_peaks: bool = False
+) -> RunSet:
     """Prepare the runs of a case; peaks without control are simulated once.
 
-    With `bounds` the least peak that is possible is found for each, else it is NaN.
+    With `least_peaks` the least peak that is possible is found for each, else it is NaN.
 
     Raises ValueError for an address that is not there, a run that is too short or faulty, and
     without a controller or anywhere to look at the deflection.
     """
     if case.controller is None:
         raise ValueError("there is no controller to tune: give the case one")
-    if places is None:
-        places = [float(sensor.position) for sensor in case.sensors]
-    places = jnp.asarray(places, float).reshape(-1)
-    if places.size == 0:
+    if positions is None:
+        positions = [float(sensor.position) for sensor in case.sensors]
+    positions = jnp.asarray(positions, float).reshape(-1)
+    if positions.size == 0:
         raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")
-    cases = [apply(case, run) for run in runs]
+    cases = [run_case(case, run) for run in runs]
     times = sample_times(case)
     # What takes long is compiling programs that have nothing to do with each other.
     with ThreadPoolExecutor(3) as pool:
-        planned = pool.submit(_common_plan, cases)
-        deflecting = pool.submit(_uncontrolled, cases, times, places)
-        least = pool.submit(_least_peaks, cases, places) if bounds else None
-    plan, error = planned.result()
-    deflection = deflecting.result()
-    varied = dict.fromkeys(a for run in runs for a in run if a.startswith(PLANT))
-    leaves = np.array([_last_exit(own) for own in cases])
-    limits = [actuator.command_limits() for actuator in case.actuators]
-    return Bench(
+        plan_future = pool.submit(_common_plan, cases)
+        deflection_future = pool.submit(_uncontrolled_deflections, cases, times, positions)
+        least_future = pool.submit(_least_peaks, cases, positions) if least_peaks else None
+    plan, error = plan_future.result()
+    deflection = deflection_future.result()
+    varied = dict.fromkeys(a for run in runs for a in run if a.startswith(PLANT_PREFIXES))
+    exit_times = np.array([_last_exit(own) for own in cases])
+    command_limits = [actuator.command_limits() for actuator in case.actuators]
+    return RunSet(
         runs=runs,
         stacked=stacked_cases(cases),
         plan=plan,
         error=np.asarray(error),
         times=times,
-        places=places,
-        free={
+        positions=positions,
+        uncontrolled={
             "peak": np.abs(deflection).max(axis=(1, 2)),
             "rms": np.sqrt((deflection**2).mean(axis=(1, 2))),
-            "least": np.full(len(runs), np.nan) if least is None else least.result(),
+            "least": np.full(len(runs), np.nan) if least_future is None else least_future.result(),
         },
-        after=(np.asarray(times) > leaves[:, None]).astype(float),
-        ranges=np.array([1.0 if pair is None else np.abs(pair).max() for pair in limits]),
+        after_exit=(np.asarray(times) > exit_times[:, None]).astype(float),
+        command_ranges=np.array(
+            [1.0 if pair is None else np.abs(pair).max() for pair in command_limits]
+        ),
         nominal={address: np.asarray(value_at(case, address)) for address in varied},
     )
 
 
-def _uncontrolled(cases: list[Case], times, places) -> Float[np.ndarray, "run time place"]:
+def _uncontrolled_deflections(
+    cases: list[Case], times, positions
+) -> Float[np.ndarray, "run time place"]:
     """Deflections (m) of runs without their controllers."""
-    plain = [dataclasses.replace(own, controller=None) for own in cases]
-    plan, _ = _common_plan(plain)
-    return np.asarray(_deflections(stacked_cases(plain), times, plan, places))
+    without_controller = [dataclasses.replace(own, controller=None) for own in cases]
+    plan, _ = _common_plan(without_controller)
+    return np.asarray(_deflections(stacked_cases(without_controller), times, plan, positions))
 
 
-def _least_peaks(cases: list[Case], places) -> Float[np.ndarray, " run"]:
+def _least_peaks(cases: list[Case], positions) -> Float[np.ndarray, " run"]:
     period = cases[0].controller.period
-    held = HELD if period is None else float(period)
-    return np.array([least_achievable(own, places, held) for own in cases])
+    hold_period = HELD if period is None else float(period)
+    return np.array([least_achievable(own, positions, hold_period) for own in cases])
 
 
 def stacked_cases(cases: list[Case]) -> Case:
@@ -157,8 +165,8 @@ def stacked_cases(cases: list[Case]) -> Case:
 
 
 @compiled
-def _deflections(stacked: Case, times, plan: Plan, places) -> Float[Array, "run time place"]:
-    return jax.vmap(lambda own: histories(own, times, plan, places).deflection)(stacked)
+def _deflections(stacked: Case, times, plan: Plan, positions) -> Float[Array, "run time place"]:
+    return jax.vmap(lambda own: histories(own, times, plan, positions).deflection)(stacked)
 
 
 def _common_plan(cases: list[Case]) -> tuple[Plan, float]:
@@ -168,13 +176,13 @@ def _common_plan(cases: list[Case]) -> tuple[Plan, float]:
 
     Raises ValueError if they differ in more than numbers.
     """
-    plans = [make_plan(own, tolerance=TOLERANCE) for own in cases]
+    plans = [make_plan(own, tolerance=PEAK_TOLERANCE) for own in cases]
     if len({plan.form.layout for plan in plans}) > 1:
         raise ValueError("the runs differ in the order of places along the beam; tune them apart")
-    slots = max(plan.form.slots for plan in plans)
+    max_loads = max(plan.form.slots for plan in plans)
     common = dataclasses.replace(
         plans[0],
-        form=dataclasses.replace(plans[0].form, slots=slots),
+        form=dataclasses.replace(plans[0].form, slots=max_loads),
         substeps=max(plan.substeps for plan in plans),
         error=0.0,
     )

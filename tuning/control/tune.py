@@ -23,24 +23,24 @@ from jaxbeam.simulation.simulate import ContactLossWarning, Histories
 from tuning.checkpoint import fingerprint
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
-from tuning.control.optimisation import Descent, State
-from tuning.control.optimisers import method_of
+from tuning.control.optimisation import Optimisation, OptimisationState
+from tuning.control.optimisers import optimiser
 from tuning.control.plants import adopt, draw_plants
-from tuning.control.run_set import Bench, make_bench
-from tuning.control.stability_constraint import STEEP, Stable
-from tuning.control.tuning_result import Minimum, Outcome, Tuned
-from tuning.parameters.free import free_numbers
+from tuning.control.run_set import RunSet, make_run_set
+from tuning.control.stability_constraint import STABILITY_PENALTY_SLOPE, Stable
+from tuning.control.tuning_result import RunSetResult, StartResult, Tuned
+from tuning.parameters.free import free_parameters
 
 if TYPE_CHECKING:
     from tuning.fit.identify import Fit
     from tuning.fit.uncertainty.posterior import Posterior
 
-Bounds = Mapping[str, tuple[float, float] | None]
+ParameterBounds = Mapping[str, tuple[float, float] | None]
 
 
 def tune(
     case: Case,
-    free: Bounds,
+    free: ParameterBounds,
     cases: LoadCases,
     objective: Objective | None = None,
     *,
@@ -90,28 +90,32 @@ def tune(
         case = adopt(case, plant)
         drawn = draw_plants(plant, 2 * plants, seed)
         cases = cases.across(drawn[:plants], drawn[plants:])
-    check(free, cases, objective, method, steps, starts=starts, batch=batch, bounds=bounds)
+    check_arguments(
+        free, cases, objective, method, steps, starts=starts, batch=batch, bounds=bounds
+    )
     file = None if checkpoint is None else Path(checkpoint)
     if file is not None and file.exists() and not resume:
         raise FileExistsError(f"{file} exists; resume the search, or name another file")
     if file is not None and price is not None:
         raise ValueError("a search with a price of its own cannot be kept: leave out checkpoint")
-    problem = Problem(case, free, cases, objective, stable, places, bounds, price)
-    descent = problem.descent(method, steps, batch)
-    mark = fingerprint(problem.about | {"settings": [method, steps, batch, starts, seed]})
-    points = descent.points(starts, seed)
+    problem = TuningProblem(case, free, cases, objective, stable, places, bounds, price)
+    optimisation = problem.optimisation(method, steps, batch)
+    digest = fingerprint(problem.description | {"settings": [method, steps, batch, starts, seed]})
+    points = optimisation.start_points(starts, seed)
     # The runs of the proof are simulated while the search compiles; what is wrong with them is
     # told before it begins.
     with ThreadPoolExecutor(1) as pool:
-        proof = pool.submit(lambda: problem.held_out if cases.held_out else None)
-        descent.compile(objective.target, points)
-        proof.result()
-    state = descent.run(objective.target, points, seed, file=file, mark=mark, progress=progress)
-    return problem.proven(descent, state, objective)
+        held_out_future = pool.submit(lambda: problem.held_out_runs if cases.held_out else None)
+        optimisation.compile(objective.target, points)
+        held_out_future.result()
+    state = optimisation.run(
+        objective.target, points, seed, file=file, digest=digest, progress=progress
+    )
+    return problem.tuning_result(optimisation, state, objective)
 
 
-def check(
-    free: Bounds,
+def check_arguments(
+    free: ParameterBounds,
     cases: LoadCases,
     objective: Objective,
     method: str,
@@ -126,7 +130,7 @@ def check(
         raise ValueError(f"steps and starts must be 1 or more; they are {steps} and {starts}")
     if "shortfall" in objective.weights | objective.limits and not bounds:
         raise ValueError("the shortfall is that behind the bounds: leave bounds on to tune for it")
-    method_of(method, steps)
+    optimiser(method, steps)
     runs = len(cases.training)
     if batch is not None and method != "adam":
         raise ValueError(f"a batch is for adam: the slopes of {method} must be those of one sum")
@@ -144,120 +148,127 @@ def check(
             )
 
 
-class Problem:
+class TuningProblem:
     """What is tuned, on what runs: prepared once for any number of searches."""
 
     def __init__(
         self,
         case: Case,
-        free: Bounds,
+        free: ParameterBounds,
         cases: LoadCases,
         objective: Objective,
         stable: Stable | None = None,
-        places: Sequence[float] | None = None,
-        bounds: bool = True,
-        price: Callable | None = None,
+        positions: Sequence[float] | None = None,
+        least_peaks: bool = True,
+        penalty: Callable | None = None,
     ):
         self.case, self.cases, self.objective = case, cases, objective
-        self.places, self.bounds, self.price = places, bounds, price
-        self.numbers = free_numbers([case], dict(free), 1.0)
-        self.bench = make_bench(case, cases.training, places, bounds)
+        self.positions, self.least_peaks, self.penalty = positions, least_peaks, penalty
+        self.parameters = free_parameters([case], dict(free), 1.0)
+        self.run_set = make_run_set(case, cases.training, positions, least_peaks)
         self.violation = None
         if stable is not None:
-            self.violation = stable.of_problem(case, self.bench)
-        self.about = {
+            self.violation = stable.violation_of_runs(case, self.run_set)
+        self.description = {
             "case": case_to_dict(case),
-            "free": {n.address: [n.low, n.high] for n in self.numbers},
+            "free": {n.address: [n.low, n.high] for n in self.parameters},
             "cases": dataclasses.asdict(cases),
             "objective": dataclasses.asdict(objective),
             "stable": None if stable is None else dataclasses.asdict(stable),
-            "places": places,
+            "places": positions,
         }
 
-    def descent(self, method: str, steps: int, batch: int | None = None) -> Descent:
+    def optimisation(self, method: str, steps: int, batch: int | None = None) -> Optimisation:
         """A search of this problem."""
-        return Descent(
-            self.bench, self.numbers, self.objective, self._price(), method, steps, batch
+        return Optimisation(
+            self.run_set, self.parameters, self.objective, self._penalty(), method, steps, batch
         )
 
-    def _price(self) -> Callable | None:
+    def _penalty(self) -> Callable | None:
         """What a search pays on top of the objective, as a function of values by address."""
-        own, violation = self.price, self.violation
+        own, violation = self.penalty, self.violation
         # So steep that what violates stability is never the best, unless everything does.
         if violation is None:
             return own
         if own is None:
-            return lambda values: STEEP * violation(values)
-        return lambda values: STEEP * violation(values) + own(values)
+            return lambda values: STABILITY_PENALTY_SLOPE * violation(values)
+        return lambda values: STABILITY_PENALTY_SLOPE * violation(values) + own(values)
 
     @functools.cached_property
-    def held_out(self) -> Bench:
+    def held_out_runs(self) -> RunSet:
         """The runs that the search does not see, prepared; there must be some."""
-        return make_bench(self.case, self.cases.held_out, self.places, self.bounds)
+        return make_run_set(self.case, self.cases.held_out, self.positions, self.least_peaks)
 
-    def proven(self, descent: Descent, state: State, objective: Objective) -> Tuned:
+    def tuning_result(
+        self, optimisation: Optimisation, state: OptimisationState, objective: Objective
+    ) -> Tuned:
         """What a search came to, on training and held-out runs."""
-        values = descent.values(state)
-        before = {number.address: number.start for number in self.numbers}
+        values = optimisation.best_values(state)
+        before = {number.address: number.start for number in self.parameters}
         after = dict(zip(before, map(float, values), strict=True))
-        outcomes = [_outcome("training", self.bench, objective, before, after)]
+        outcomes = [_run_set_result("training", self.run_set, objective, before, after)]
         if self.cases.held_out:
-            outcomes.append(_outcome("held out", self.held_out, objective, before, after))
+            outcomes.append(
+                _run_set_result("held out", self.held_out_runs, objective, before, after)
+            )
         order = np.argsort(state.best_value).tolist()
         return Tuned(
             case=replace(self.case, after),
-            numbers=self.numbers,
+            parameters=self.parameters,
             values=values,
             objective=objective,
             history=state.history,
-            rejected=int(state.rejected.sum()),
-            outcomes=outcomes,
-            violation=0.0 if self.violation is None else float(compiled(self.violation)(after)),
-            minima=tuple(
-                Minimum(float(state.best_value[i]), descent.values(state, i)) for i in order
+            rejected_steps=int(state.rejected.sum()),
+            run_sets=outcomes,
+            stability_violation=0.0
+            if self.violation is None
+            else float(compiled(self.violation)(after)),
+            start_results=tuple(
+                StartResult(float(state.best_value[i]), optimisation.best_values(state, i))
+                for i in order
             ),
         )
 
 
 @compiled
-def _merits(bench: Bench, found: Histories):
-    return bench.judge(found)
+def _merits_of(run_set: RunSet, found: Histories):
+    return run_set.merits_of(found)
 
 
-def _outcome(name, bench: Bench, objective, before, after) -> Outcome:
+def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetResult:
     """True peaks and merits of all runs, before and after, and the least peaks possible."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
-        pairs = [bench.records(values) for values in (before, after)]
-    peaks = [_peaks(bench, records) for records in pairs]
+        pairs = [run_set.records(values) for values in (before, after)]
+    peaks = [_largest_deflections(run_set, records) for records in pairs]
     # What is compiled must not depend on what the runs are called.
-    nameless = dataclasses.replace(bench, runs=())
-    merits = [_merits(nameless, _histories(records, bench.places)) for records in pairs]
-    values = [np.asarray(objective.of_run(found)) for found in merits]
-    return Outcome(
+    unnamed = dataclasses.replace(run_set, runs=())
+    merits = [_merits_of(unnamed, _histories(records, run_set.positions)) for records in pairs]
+    values = [np.asarray(objective.weighted_merits(found)) for found in merits]
+    return RunSetResult(
         name=name,
-        runs=tuple(bench.runs),
-        uncontrolled=bench.free["peak"],
-        before=peaks[0],
-        after=peaks[1],
-        least=bench.free["least"],
-        values=np.stack(values),
-        saturated=np.array([float(np.asarray(r.saturated).mean()) for r in pairs[1]]),
-        objective=[float(objective.of_runs(jnp.asarray(v))) for v in values],
-        merits={name: float(objective.of_runs(part)) for name, part in merits[1].items()},
+        runs=tuple(run_set.runs),
+        uncontrolled_peaks=run_set.uncontrolled["peak"],
+        peaks_before=peaks[0],
+        peaks_after=peaks[1],
+        least_peaks=run_set.uncontrolled["least"],
+        objective_values=np.stack(values),
+        saturated_share=np.array([float(np.asarray(r.saturated).mean()) for r in pairs[1]]),
+        objective=[float(objective.aggregate(jnp.asarray(v))) for v in values],
+        merits={name: float(objective.aggregate(part)) for name, part in merits[1].items()},
     )
 
 
-def _histories(records: list[Record], places) -> Histories:
+def _histories(records: list[Record], positions) -> Histories:
     """Histories of all runs, along a first axis, at some places (m)."""
-    parts = [(record.at(places), record.command, record.contact_force) for record in records]
+    parts = [(record.at(positions), record.command, record.contact_force) for record in records]
     return Histories(*map(np.stack, zip(*parts, strict=True)))
 
 
-def _peaks(bench: Bench, records) -> Float[np.ndarray, " run"]:
+def _largest_deflections(run_set: RunSet, records) -> Float[np.ndarray, " run"]:
     """Largest deflection of each run: between samples at sensors, at samples elsewhere."""
     # Those of the records: a tuning may have moved them away from where deflections count.
     sensors = np.array([float(sensor.position) for sensor in records[0].case.sensors])
-    if np.array_equal(sensors, np.asarray(bench.places)):
+    if np.array_equal(sensors, np.asarray(run_set.positions)):
         return np.array([float(np.max(record.peak_deflection)) for record in records])
-    return np.array([float(np.max(np.abs(record.at(bench.places)))) for record in records])
+    return np.array([float(np.max(np.abs(record.at(run_set.positions)))) for record in records])

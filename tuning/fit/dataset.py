@@ -14,41 +14,41 @@ from jaxbeam.integrator.events import Schedule, stacked
 from jaxbeam.simulation.integration_plan import Plan, make_plan
 from jaxbeam.simulation.simulate import readings
 from tuning.logs.log import Log
-from tuning.logs.pairing import at_sensors, case_of_log, check_loads, check_times, made_alike
-from tuning.parameters.free import OF_LOG, insert
+from tuning.logs.pairing import case_of_log, check_loads, check_times, pad_cases, sensor_readings
+from tuning.parameters.free import LOG_ADDRESS, with_values
 
-TOLERANCE = 1e-5  # of the largest deflection: what logs can resolve, with room to spare
-OFFSET = re.compile(r"sensors\.(\d+)\.offset")
+SIMULATION_TOLERANCE = 1e-5  # of the largest deflection: what logs can resolve, with room to spare
+OFFSET_ADDRESS = re.compile(r"sensors\.(\d+)\.offset")
 
 
 @dataclasses.dataclass(frozen=True)
-class Campaign:
+class Dataset:
     """Logs with the case of each: logs alike in structure share one compiled simulation.
 
-    Logs are padded to the longest with equally spaced times, `real` is 1 for samples
+    Logs are padded to the longest with equally spaced times, `mask` is 1 for samples
     that were measured and 0 for those that only fill up. Samples are (log, time, channel). Where
     a controller takes part, its commands from a log included, `schedule` holds its clock in each.
-    `given` is the case before any log changed it.
+    `nominal_case` is the case before any log changed it.
     """
 
-    given: Case
+    nominal_case: Case
     cases: list[Case]
     logs: list[Log]
     plan: Plan
     times: Float[np.ndarray, "log time"]
     measured: Float[np.ndarray, "log time channel"]
-    real: Float[np.ndarray, "log time channel"]
+    mask: Float[np.ndarray, "log time channel"]
     schedule: Schedule | None = None
 
-    def local(self, addresses: list[str]) -> tuple[list[str], np.ndarray]:
+    def log_addresses(self, addresses: list[str]) -> tuple[list[str], np.ndarray]:
         """Addresses as seen within a log, and which of the free numbers (log, address) each is.
 
         A number of one log is -1 in the others, which keep their own.
         """
-        inner = list(dict.fromkeys(OF_LOG.sub(r"\2", address) for address in addresses))
+        inner = list(dict.fromkeys(LOG_ADDRESS.sub(r"\2", address) for address in addresses))
         which = np.full((len(self.logs), len(inner)), -1)
         for i, address in enumerate(addresses):
-            own = OF_LOG.fullmatch(address)
+            own = LOG_ADDRESS.fullmatch(address)
             rows = slice(None) if own is None else int(own[1])
             which[rows, inner.index(own[2] if own else address)] = i
         return inner, which
@@ -59,18 +59,24 @@ class Campaign:
         Each log is differentiated by its own few numbers only, one log after the other: side by
         side they would not share what is equal in time.
         """
-        inner, which = self.local(addresses)
-        moving = [address for address in inner if not OFFSET.fullmatch(address)]
-        columns = [inner.index(address) for address in moving]
-        own = jnp.array([[value_at(case, a) for a in inner] for case in self.cases])
+        own_addresses, which = self.log_addresses(addresses)
+        simulated_addresses = [
+            address for address in own_addresses if not OFFSET_ADDRESS.fullmatch(address)
+        ]
+        columns = [own_addresses.index(address) for address in simulated_addresses]
+        own = jnp.array([[value_at(case, a) for a in own_addresses] for case in self.cases])
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self.cases)
-        steady = {a: 0.0 for a in addresses_of_offsets(self.cases[0])}
-        channels = {int(OFFSET.fullmatch(a)[1]): inner.index(a) for a in inner if a not in moving}
+        zero_offsets = {a: 0.0 for a in offset_addresses(self.cases[0])}
+        channels = {
+            int(OFFSET_ADDRESS.fullmatch(a)[1]): own_addresses.index(a)
+            for a in own_addresses
+            if a not in simulated_addresses
+        }
         constant = jnp.array([[s.offset for s in case.sensors] for case in self.cases])
 
         def simulated(run, values):
             case, times, schedule = run
-            case = replace(case, dict(zip(moving, values, strict=True)) | steady)
+            case = replace(case, dict(zip(simulated_addresses, values, strict=True)) | zero_offsets)
             return readings(case, times, dataclasses.replace(self.plan, schedule=schedule))
 
         def gather(values):
@@ -96,7 +102,7 @@ class Campaign:
         def linearised(runs, table):
             def both(part):
                 run, values = part
-                basis = jnp.eye(len(moving))
+                basis = jnp.eye(len(simulated_addresses))
 
                 def along(direction):
                     return jax.jvp(lambda v: simulated(run, v), (values,), (direction,))
@@ -116,7 +122,7 @@ class Campaign:
 
         return predict
 
-    def doubt(self, values: dict[str, float]) -> str:
+    def validity_warning(self, values: dict[str, float]) -> str:
         """Why fitted values may be wrong although the search ended; "" if there is no doubt.
 
         The plan was made for the starts; far from them loads may come in another order, or
@@ -124,7 +130,9 @@ class Campaign:
         """
         for i, (case, times) in enumerate(zip(self.cases, self.times, strict=True)):
             try:
-                plan = make_plan(insert(case, i, values), jnp.asarray(times), TOLERANCE)
+                plan = make_plan(
+                    with_values(case, i, values), jnp.asarray(times), SIMULATION_TOLERANCE
+                )
             except (ValueError, RuntimeError) as error:
                 return f", to a case that cannot be: {error}"
             changed = (
@@ -135,12 +143,12 @@ class Campaign:
         return ""
 
 
-def addresses_of_offsets(case: Case) -> list[str]:
+def offset_addresses(case: Case) -> list[str]:
     """Addresses of the offsets of all sensors."""
     return [f"sensors.{i}.offset" for i in range(len(case.sensors))]
 
 
-def prepare(case: Case, logs: list[Log]) -> Campaign:
+def make_dataset(case: Case, logs: list[Log]) -> Dataset:
     """Check logs against the case and bring them to one shape.
 
     Raises ValueError, naming the log, if its channels do not match the sensors, no load is known,
@@ -152,53 +160,56 @@ def prepare(case: Case, logs: list[Log]) -> Campaign:
     for log in logs:
         check_times(log)
     count = max(log.times.size for log in logs)
-    times = [_filled(log.times, count) for log in logs]
+    times = [_padded_times(log.times, count) for log in logs]
     cases = [case_of_log(case, log, filled) for log, filled in zip(logs, times, strict=True)]
-    ordered = [at_sensors(case, log) for log in logs]
+    ordered = [sensor_readings(case, log) for log in logs]
     for log, own in zip(logs, cases, strict=True):
         check_loads(log, own)
-    cases = made_alike(cases, times)
+    cases = pad_cases(cases, times)
     shapes = {jax.tree.structure(own) for own in cases}
     if len(shapes) > 1:
         raise ValueError(
             "the logs differ in the kinds of their loads, one after the other, or in how these "
             "move (by a speed, or by a table); give all the same kinds, or fit the logs apart"
         )
-    measured, real = [], []
-    for log, (values, has) in zip(logs, ordered, strict=True):
+    measured, mask = [], []
+    for log, (values, valid) in zip(logs, ordered, strict=True):
         measured.append(np.pad(values, ((0, count - log.times.size), (0, 0))))
-        real.append(np.pad(has, ((0, count - log.times.size), (0, 0))))
-    plans = [make_plan(own, jnp.asarray(t), TOLERANCE) for own, t in zip(cases, times, strict=True)]
+        mask.append(np.pad(valid, ((0, count - log.times.size), (0, 0))))
+    plans = [
+        make_plan(own, jnp.asarray(t), SIMULATION_TOLERANCE)
+        for own, t in zip(cases, times, strict=True)
+    ]
     if len({plan.form.layout for plan in plans}) > 1:
         raise ValueError("the logs differ in the order of places along the beam; fit them apart")
-    form = dataclasses.replace(
+    static_shapes = dataclasses.replace(
         plans[0].form,
         slots=max(plan.form.slots for plan in plans),
         coupled=any(plan.form.coupled for plan in plans),
     )
     plan = dataclasses.replace(
         plans[0],
-        form=form,
+        form=static_shapes,
         substeps=max(plan.substeps for plan in plans),
         lead=max(plan.lead for plan in plans),
         even=all(plan.even for plan in plans),
         schedule=None,
     )
-    clocks = [own.schedule for own in plans]
-    schedule = None if clocks[0] is None else stacked(clocks)
-    return Campaign(
+    schedules = [own.schedule for own in plans]
+    schedule = None if schedules[0] is None else stacked(schedules)
+    return Dataset(
         case,
         cases,
         logs,
         plan,
         np.array(times),
         np.array(measured),
-        np.array(real, float),
+        np.array(mask, float),
         schedule,
     )
 
 
-def _filled(times: Float[np.ndarray, " time"], count: int) -> Float[np.ndarray, " filled"]:
+def _padded_times(times: Float[np.ndarray, " time"], count: int) -> Float[np.ndarray, " filled"]:
     """Times followed by as many more, equally spaced, as make up a count."""
     spacing = np.diff(times).mean()
     return np.append(times, times[-1] + spacing * np.arange(1, count - times.size + 1))

@@ -21,15 +21,15 @@ from jaxbeam.simulation.integration_plan import Plan, make_plan, sample_times
 from jaxbeam.simulation.simulate import readings
 from tuning.parameters.free import unit_at
 
-TOLERANCE = 1e-5  # of the simulation, relative to the largest deflection
-STARTS = 5  # of the search, spread between the bounds: there may be several best places
+SIMULATION_TOLERANCE = 1e-5  # of the simulation, relative to the largest deflection
+START_COUNT = 5  # of the search, spread between the bounds: there may be several best places
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Design:
+class ExperimentDesign:
     """A better experiment: what to choose, and the standard errors before and after (SI units).
 
-    `slopes` (free, choice) say by which share an error changes per unit of each choice, before;
+    `error_sensitivities` (free, choice) say by which share an error changes per unit of each choice, before;
     an infinite error is of a number that the experiment cannot tell.
     """
 
@@ -40,7 +40,7 @@ class Design:
     addresses: list[str]
     errors_before: Float[np.ndarray, " free"]
     errors_after: Float[np.ndarray, " free"]
-    slopes: Float[np.ndarray, "free choice"]
+    error_sensitivities: Float[np.ndarray, "free choice"]
     case: Case
 
     def to_dict(self) -> dict:
@@ -67,7 +67,7 @@ def sharpen(
     *,
     target: str | None = None,
     noise: float = 1e-5,
-) -> Design:
+) -> ExperimentDesign:
     """Choose numbers of an experiment, within bounds, such that a fit tells the most.
 
     `free` are the addresses that will be fitted; the case has their likely values. The standard
@@ -82,11 +82,11 @@ def sharpen(
     """
     free = list(free)
     check(case)
-    _check(case, free, over, target)
+    _check_arguments(case, free, over, target)
     low, high = np.array(list(over.values()), float).T
     nominal = jnp.array([float(known(value_at(case, address))) for address in free])
     before = np.array([float(known(value_at(case, address))) for address in over])
-    levels = jnp.array([noise if s.noise is None else s.noise for s in case.sensors])
+    noise_levels = jnp.array([noise if s.noise is None else s.noise for s in case.sensors])
 
     def cramer_rao(choice, plan):
         """Log standard errors, and half the log of the volume."""
@@ -96,7 +96,7 @@ def sharpen(
         def predict(values):
             return readings(replace(chosen, dict(zip(free, values, strict=True))), times, plan)
 
-        jacobian = jax.jacfwd(predict)(nominal) / levels[:, None]
+        jacobian = jax.jacfwd(predict)(nominal) / noise_levels[:, None]
         rows = jacobian.reshape(-1, len(free)) * jnp.where(nominal == 0, 1.0, jnp.abs(nominal))
         information = rows.T @ rows
         inverse = jnp.linalg.inv(information + 1e-12 * jnp.trace(information) * jnp.eye(len(free)))
@@ -116,14 +116,14 @@ def sharpen(
         index = free.index(target)
         return float(errors[index]), np.asarray(slopes[index]) * (high - low)
 
-    plan = _plan(case)
+    plan = _integration_plan(case)
     (errors, _), (slopes, _) = look(jnp.asarray(before), plan)
-    best = _search(lambda share: least(share, plan), (before - low) / (high - low))
+    best = _minimise(lambda share: least(share, plan), (before - low) / (high - low))
     after = low + (high - low) * best
     chosen = replace(case, dict(zip(over, after, strict=True)))
     sizes = np.where(nominal == 0, 1.0, np.abs(nominal))
-    (improved, _), _ = look(jnp.asarray(after), _plan(chosen))
-    return Design(
+    (improved, _), _ = look(jnp.asarray(after), _integration_plan(chosen))
+    return ExperimentDesign(
         list(over),
         [unit_at(case, address) for address in over],
         before,
@@ -136,23 +136,23 @@ def sharpen(
     )
 
 
-def _plan(case: Case) -> Plan:
-    return make_plan(case, sample_times(case), TOLERANCE)
+def _integration_plan(case: Case) -> Plan:
+    return make_plan(case, sample_times(case), SIMULATION_TOLERANCE)
 
 
-def _search(look, start: Float[np.ndarray, " choice"]) -> Float[np.ndarray, " choice"]:
+def _minimise(objective, start: Float[np.ndarray, " choice"]) -> Float[np.ndarray, " choice"]:
     """The best of some searches, of which one begins at the start (shares of the bounds)."""
-    others = np.random.default_rng(0).random((STARTS - 1, start.size))
+    others = np.random.default_rng(0).random((START_COUNT - 1, start.size))
     if start.size == 1:
-        others = (np.arange(STARTS - 1)[:, None] + 0.5) / (STARTS - 1)
+        others = (np.arange(START_COUNT - 1)[:, None] + 0.5) / (START_COUNT - 1)
     found = [
-        scipy.optimize.minimize(look, begin, jac=True, bounds=[(0, 1)] * start.size)
+        scipy.optimize.minimize(objective, begin, jac=True, bounds=[(0, 1)] * start.size)
         for begin in (start, *others)
     ]
     return min(found, key=lambda one: one.fun).x
 
 
-def _check(case: Case, free, over, target) -> None:
+def _check_arguments(case: Case, free, over, target) -> None:
     if not over:
         raise ValueError("name at least one number that may be chosen")
     if target is not None and target not in free:

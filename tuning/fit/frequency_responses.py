@@ -18,13 +18,13 @@ from jaxtyping import Complex, Float
 from jaxbeam.case.case import Case, replace
 from jaxbeam.model.frequency_response import Parked, frequency_response
 from jaxbeam.model.modes import lay_out
-from tuning.fit.least_squares import MAX_STEPS, Search
-from tuning.fit.uncertainty.covariance import reach
+from tuning.fit.least_squares import MAX_STEPS, LeastSquares
+from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.logs.log import Log
-from tuning.parameters.free import Free, free_numbers
+from tuning.parameters.free import FreeParameter, free_parameters
 from tuning.parameters.prior import Belief
 
-LEAST = 1e-3  # relative deviation of a measured response: no sensor is better calibrated
+MIN_RELATIVE_SD = 1e-3  # relative deviation of a measured response: no sensor is better calibrated
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -105,19 +105,19 @@ def responses_of(log: Log, segment: float | None = None, least: float = 0.8) -> 
             (f"actuators.{log.actuators[commands[0]]}", f"sensors.{log.sensors[i]}")
             for i in sensors
         ),
-        np.maximum(deviations, LEAST),
+        np.maximum(deviations, MIN_RELATIVE_SD),
         source=log.source,
     )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Sweep:
+class _ResponseData:
     """Responses as samples for a search: one log, whose times are frequencies."""
 
     case: Case
     responses: Responses
     measured: Float[np.ndarray, "1 frequency part"]
-    real: Float[np.ndarray, "1 frequency part"]
+    mask: Float[np.ndarray, "1 frequency part"]
 
     def predictor(self, addresses: list[str]):
         """Function from values at the addresses to weighted logarithms of the responses."""
@@ -131,9 +131,9 @@ class _Sweep:
                 changed, frequencies, given.pairs, given.parked, layout
             ).values
             # Relative to what was measured, phases do not wrap.
-            off = jnp.log(response / measured)
-            parts = jnp.concatenate([off.real, off.imag], axis=1)
-            return (_logarithms(given) + parts * weights)[None]
+            log_ratio = jnp.log(response / measured)
+            parts = jnp.concatenate([log_ratio.real, log_ratio.imag], axis=1)
+            return (_weighted_logarithms(given) + parts * weights)[None]
 
         return predict
 
@@ -142,30 +142,30 @@ class _Sweep:
 class ResponseFit:
     """Numbers fitted to frequency responses (SI units), as in `tuning.Fit`.
 
-    `misfit` (pair,) is the root mean square of the relative difference between measured and
+    `relative_misfit` (pair,) is the root mean square of the relative difference between measured and
     `fitted` responses.
     """
 
-    numbers: list[Free]
+    parameters: list[FreeParameter]
     values: Float[np.ndarray, " free"]
     errors: Float[np.ndarray, " free"]
     correlation: Float[np.ndarray, "free free"]
-    unseen: list[dict[str, float]]
-    freedom: float
+    unidentifiable: list[dict[str, float]]
+    degrees_of_freedom: float
     verdict: str
     case: Case
     fitted: Complex[np.ndarray, "frequency pair"]
-    misfit: Float[np.ndarray, " pair"]
+    relative_misfit: Float[np.ndarray, " pair"]
 
     @property
     def addresses(self) -> list[str]:
         """Addresses of the free numbers."""
-        return [number.address for number in self.numbers]
+        return [number.address for number in self.parameters]
 
     @property
     def intervals(self) -> Float[np.ndarray, "free 2"]:
         """95 % intervals; infinite where the data cannot tell."""
-        half = reach(self.freedom) * self.errors
+        half = t_quantile(self.degrees_of_freedom) * self.errors
         return np.stack([self.values - half, self.values + half], axis=1)
 
     def to_dict(self) -> dict:
@@ -173,7 +173,7 @@ class ResponseFit:
         rows = zip(self.addresses, self.values, self.intervals, strict=True)
         return {
             "numbers": {name: {"value": v, "interval_95": pair} for name, v, pair in rows},
-            "misfit": self.misfit,
+            "misfit": self.relative_misfit,
             "verdict": self.verdict,
         }
 
@@ -185,7 +185,7 @@ class ResponseFit:
                 self.addresses, self.values, self.intervals, strict=True
             )
         ]
-        off = ", ".join(f"{100 * share:.2g} %" for share in self.misfit)
+        off = ", ".join(f"{100 * share:.2g} %" for share in self.relative_misfit)
         return "\n".join([*lines, f"responses are off by {off}", self.verdict])
 
 
@@ -204,22 +204,24 @@ def identify_responses(
     Raises ValueError for faulty input.
     """
     bounds = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
-    numbers = free_numbers([case], bounds, 1.0)
-    table = _logarithms(measured)[None]
+    parameters = free_parameters([case], bounds, 1.0)
+    measured_logarithms = _weighted_logarithms(measured)[None]
     # A first call outside of any compiling checks case, pairs and parked masses.
     frequency_response(case, measured.frequencies[:2], measured.pairs, measured.parked)
-    sweep = _Sweep(case, measured, table, np.ones(table.shape))
-    found = Search(sweep, numbers, loss).estimate(table)
-    values = {n.address: float(v) for n, v in zip(numbers, found.values, strict=True)}
-    off = ((found.predicted - table)[0] / _weights(measured)).T.reshape(2, len(measured.pairs), -1)
-    relative = (off[0] + 1j * off[1]).T
+    data = _ResponseData(case, measured, measured_logarithms, np.ones(measured_logarithms.shape))
+    found = LeastSquares(data, parameters, loss).solve(measured_logarithms)
+    values = {n.address: float(v) for n, v in zip(parameters, found.values, strict=True)}
+    log_difference = ((found.predicted - measured_logarithms)[0] / _weights(measured)).T.reshape(
+        2, len(measured.pairs), -1
+    )
+    relative = (log_difference[0] + 1j * log_difference[1]).T
     return ResponseFit(
-        numbers,
+        parameters,
         found.values,
         found.uncertainty.errors,
         found.uncertainty.correlation,
-        found.uncertainty.unseen,
-        found.freedom,
+        found.uncertainty.unidentifiable,
+        found.degrees_of_freedom,
         "converged" if found.converged else f"not converged after {MAX_STEPS} steps",
         replace(case, values),
         measured.values * np.exp(relative),
@@ -227,14 +229,14 @@ def identify_responses(
     )
 
 
-def _weights(given: Responses) -> Float[np.ndarray, "frequency part"]:
+def _weights(responses: Responses) -> Float[np.ndarray, "frequency part"]:
     """One over the relative deviations, for magnitudes and phases."""
-    if given.deviations is None:
-        return np.ones((given.frequencies.size, 2 * len(given.pairs)))
-    return np.tile(1 / given.deviations, (1, 2))
+    if responses.deviations is None:
+        return np.ones((responses.frequencies.size, 2 * len(responses.pairs)))
+    return np.tile(1 / responses.deviations, (1, 2))
 
 
-def _logarithms(given: Responses) -> Float[np.ndarray, "frequency part"]:
+def _weighted_logarithms(responses: Responses) -> Float[np.ndarray, "frequency part"]:
     """Weighted logarithms of magnitudes, then phases (rad)."""
-    phases = np.unwrap(np.angle(given.values), axis=0)
-    return np.hstack([np.log(np.abs(given.values)), phases]) * _weights(given)
+    phases = np.unwrap(np.angle(responses.values), axis=0)
+    return np.hstack([np.log(np.abs(responses.values)), phases]) * _weights(responses)

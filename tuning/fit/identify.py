@@ -13,81 +13,83 @@ from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import known
 from jaxbeam.case.sensors import QUANTITIES
 from tuning.checkpoint import fingerprint
-from tuning.fit.dataset import Campaign, prepare
-from tuning.fit.least_squares import MAX_STEPS, Estimate, Search
+from tuning.fit.dataset import Dataset, make_dataset
+from tuning.fit.least_squares import MAX_STEPS, LeastSquares, LeastSquaresSolution
 from tuning.fit.loss import check_loss
-from tuning.fit.multi_start import Minimum, scout
+from tuning.fit.multi_start import LocalMinimum, coarse_search
 from tuning.fit.summary import fit_table
-from tuning.fit.uncertainty.covariance import reach
+from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.logs.log import Log
-from tuning.parameters.free import OF_LOG, Free, free_numbers, insert
+from tuning.parameters.free import LOG_ADDRESS, FreeParameter, free_parameters, with_values
 from tuning.parameters.prior import Belief
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of an identification, in SI units and the order of `numbers`.
+    """Result of an identification, in SI units and the order of `parameters`.
 
-    An error (standard error) is infinite where the data cannot tell; `unseen` says by name why:
+    An error (standard error) is infinite where the data cannot tell; `unidentifiable` says by name why:
     each entry holds changes that, made together, leave the readings as good as they are. `noise`
-    is the standard deviation of the residuals, NaN for a sensor that a log lacks. `case` has the
+    is the standard deviation of the residuals, NaN for a sensor that a log lacks. `jaxbeam_case` has the
     fitted numbers; with several logs, those of one log (`logs.1.loads.0.speed`) have no place in
-    it, but in `cases`, one for each log. `colour` is the factor by which the residuals'
-    autocorrelation raises variances, and has widened the intervals, and `freedom` the number
+    it, but in `cases`, one for each log. `autocorrelation_factor` is the factor by which the residuals'
+    autocorrelation raises variances, and has widened the intervals, and `degrees_of_freedom` the number
     of independent samples left; `minima` are those found
     where there were several starts, lowest first.
     """
 
-    numbers: list[Free]
+    parameters: list[FreeParameter]
     values: Float[np.ndarray, " free"]
     errors: Float[np.ndarray, " free"]
     correlation: Float[np.ndarray, "free free"]
-    unseen: list[dict[str, float]]
+    unidentifiable: list[dict[str, float]]
     noise: Float[np.ndarray, "log channel"]
     verdict: str
     case: Case
-    campaign: Campaign
+    dataset: Dataset
     fitted: Float[np.ndarray, "log time channel"]
-    colour: Float[np.ndarray, "log channel"]
-    freedom: float
-    search: Search
-    minima: tuple[Minimum, ...] = ()
+    autocorrelation_factor: Float[np.ndarray, "log channel"]
+    degrees_of_freedom: float
+    least_squares: LeastSquares
+    minima: tuple[LocalMinimum, ...] = ()
 
     @property
     def residuals(self) -> Float[np.ndarray, "log time channel"]:
         """Measured minus fitted, NaN where nothing was measured."""
-        campaign = self.campaign
-        return np.where(campaign.real > 0, campaign.measured - self.fitted, np.nan)
+        dataset = self.dataset
+        return np.where(dataset.mask > 0, dataset.measured - self.fitted, np.nan)
 
     @property
     def addresses(self) -> list[str]:
         """Addresses of the free numbers."""
-        return [number.address for number in self.numbers]
+        return [number.address for number in self.parameters]
 
     @property
-    def starts(self) -> Float[np.ndarray, " free"]:
+    def start_values(self) -> Float[np.ndarray, " free"]:
         """The values from which the search began."""
-        return np.array([number.start for number in self.numbers])
+        return np.array([number.start for number in self.parameters])
 
     @property
     def cases(self) -> list[Case]:
         """The fitted case of each log, with the loads that crossed, until the log's end."""
         values = dict(zip(self.addresses, map(float, self.values), strict=True))
-        return [insert(case, i, values) for i, case in enumerate(self.campaign.cases)]
+        return [with_values(case, i, values) for i, case in enumerate(self.dataset.cases)]
 
     @property
     def intervals(self) -> Float[np.ndarray, "free 2"]:
         """95 % intervals within the bounds; infinite where the data cannot tell."""
-        half = reach(self.freedom) * self.errors
-        low = np.maximum(self.values - half, [number.low for number in self.numbers])
-        high = np.minimum(self.values + half, [number.high for number in self.numbers])
-        told = np.isfinite(self.errors)
-        return np.stack([np.where(told, low, -np.inf), np.where(told, high, np.inf)], axis=1)
+        half = t_quantile(self.degrees_of_freedom) * self.errors
+        low = np.maximum(self.values - half, [number.low for number in self.parameters])
+        high = np.minimum(self.values + half, [number.high for number in self.parameters])
+        identifiable = np.isfinite(self.errors)
+        return np.stack(
+            [np.where(identifiable, low, -np.inf), np.where(identifiable, high, np.inf)], axis=1
+        )
 
     @property
     def at_bound(self) -> list[str]:
         """Addresses of the numbers that ended at one of their bounds."""
-        pairs = zip(self.numbers, self.values, strict=True)
+        pairs = zip(self.parameters, self.values, strict=True)
         return [number.address for number, value in pairs if number.at_bound(value)]
 
     def __str__(self) -> str:
@@ -95,23 +97,23 @@ class Fit:
 
     def to_dict(self) -> dict:
         """The fit as plain numbers and words, for JSON; what the data cannot tell is None."""
-        numbers = {}
-        rows = zip(self.numbers, self.values, self.errors, self.intervals, strict=True)
+        parameters = {}
+        rows = zip(self.parameters, self.values, self.errors, self.intervals, strict=True)
         for number, value, error, interval in rows:
-            told = bool(np.isfinite(error))
-            numbers[number.address] = {
+            identifiable = bool(np.isfinite(error))
+            parameters[number.address] = {
                 "value": float(value),
                 "unit": number.unit,
-                "standard_error": float(error) if told else None,
-                "interval_95": interval.tolist() if told else None,
+                "standard_error": float(error) if identifiable else None,
+                "interval_95": interval.tolist() if identifiable else None,
                 "start": number.start,
                 "at_bound": number.at_bound(value),
             }
         return {
-            "numbers": numbers,
-            "correlation": _without_nan(self.correlation),
-            "unseen": self.unseen,
-            "noise": _without_nan(self.noise),
+            "numbers": parameters,
+            "correlation": _nan_to_none(self.correlation),
+            "unseen": self.unidentifiable,
+            "noise": _nan_to_none(self.noise),
             "verdict": self.verdict,
         }
 
@@ -121,10 +123,10 @@ class Fit:
 
         measured = [sensor.quantity for sensor in self.case.sensors]
         panels = []
-        for i, log in enumerate(self.campaign.logs):
+        for i, log in enumerate(self.dataset.logs):
             count = log.times.size
             for quantity in dict.fromkeys(measured):
-                has = self.campaign.real[i].any(axis=0)
+                has = self.dataset.mask[i].any(axis=0)
                 channels = [n for n, other in enumerate(measured) if other == quantity and has[n]]
                 if not channels:
                     continue
@@ -132,7 +134,7 @@ class Fit:
                     FitPanel(
                         title=log.source.rsplit("/", 1)[-1],
                         times=log.times,
-                        measured=self.campaign.measured[i, :count, channels].T,
+                        measured=self.dataset.measured[i, :count, channels].T,
                         fitted=self.fitted[i, :count, channels].T,
                         names=[f"sensor {n}" for n in channels],
                         unit=QUANTITIES[quantity],
@@ -163,7 +165,7 @@ def identify(
     channels are estimated from the residuals. Standard errors follow from the Jacobian, widened
     where residuals are correlated in time; directions the data cannot see are reported by name.
 
-    `loss` "soft-l1" or "huber" lets outliers count less. `stages` are lists of addresses that are
+    `loss` "soft-l1" or "huber" lets outliers count less. `operation_stages` are lists of addresses that are
     fitted first, one list after the other, the rest held. From more than one of the `starts`
     (others are drawn by the `seed`) the lowest minimum is taken; with a `checkpoint` file that
     search can be stopped at any time and taken up with `resume`: the result is the same.
@@ -180,82 +182,93 @@ def identify(
     file = None if checkpoint is None else Path(checkpoint)
     if file is not None and file.exists() and not resume:
         raise FileExistsError(f"{file} exists: resume that search, or delete it")
-    campaign = prepare(case, logs)
-    reading = float(np.max(np.abs(campaign.measured)))
-    numbers = free_numbers(campaign.cases, bounds, reading)
-    masks = [_stage(numbers, stage) for stage in stages]
-    search = Search(campaign, numbers, loss)
+    dataset = make_dataset(case, logs)
+    largest_reading = float(np.max(np.abs(dataset.measured)))
+    parameters = free_parameters(dataset.cases, bounds, largest_reading)
+    stage_masks = [_stage_mask(parameters, stage) for stage in stages]
+    least_squares = LeastSquares(dataset, parameters, loss)
     minima, start = (), None
     if starts > 1:
-        mark = _mark(campaign, numbers, loss, starts, seed)
-        minima = tuple(scout(search, campaign.measured, starts, seed, file, mark))
-        start = minima[0].point
-    for mask in masks:
-        start = search.estimate(campaign.measured, start=start, free=mask).point
-    return fit_of(case, search, search.estimate(campaign.measured, start=start), minima)
+        digest = _search_digest(dataset, parameters, loss, starts, seed)
+        minima = tuple(coarse_search(least_squares, dataset.measured, starts, seed, file, digest))
+        start = minima[0].unbounded
+    for mask in stage_masks:
+        start = least_squares.solve(dataset.measured, start=start, free=mask).unbounded
+    return fit_result(
+        case, least_squares, least_squares.solve(dataset.measured, start=start), minima
+    )
 
 
-def fit_of(case: Case, search: Search, found: Estimate, minima: tuple[Minimum, ...] = ()) -> Fit:
-    """The result of a search: `case` is the one that was to be fitted."""
-    campaign, numbers = search.campaign, search.numbers
-    pairs = zip(numbers, found.values, strict=True)
+def fit_result(
+    case: Case,
+    least_squares: LeastSquares,
+    solution: LeastSquaresSolution,
+    minima: tuple[LocalMinimum, ...] = (),
+) -> Fit:
+    """The result of a search: `jaxbeam_case` is the one that was to be fitted."""
+    dataset, parameters = least_squares.data, least_squares.parameters
+    pairs = zip(parameters, solution.values, strict=True)
     values = {number.address: float(value) for number, value in pairs}
     verdict = (
-        "converged" if found.converged else f"not converged after {MAX_STEPS} steps: start closer"
+        "converged"
+        if solution.converged
+        else f"not converged after {MAX_STEPS} steps: start closer"
     )
     return Fit(
-        numbers=numbers,
-        values=found.values,
-        errors=found.uncertainty.errors,
-        correlation=found.uncertainty.correlation,
-        unseen=found.uncertainty.unseen,
-        noise=np.where(campaign.real.any(axis=1), found.noise, np.nan),
-        verdict=verdict + campaign.doubt(values),
-        case=_fitted_case(case, campaign, values),
-        campaign=campaign,
-        fitted=found.predicted,
-        colour=found.colour,
-        freedom=found.freedom,
-        search=search,
+        parameters=parameters,
+        values=solution.values,
+        errors=solution.uncertainty.errors,
+        correlation=solution.uncertainty.correlation,
+        unidentifiable=solution.uncertainty.unidentifiable,
+        noise=np.where(dataset.mask.any(axis=1), solution.noise, np.nan),
+        verdict=verdict + dataset.doubt(values),
+        case=_fitted_case(case, dataset, values),
+        dataset=dataset,
+        fitted=solution.predicted,
+        autocorrelation_factor=solution.autocorrelation_factor,
+        degrees_of_freedom=solution.degrees_of_freedom,
+        least_squares=least_squares,
         minima=minima,
     )
 
 
-def _stage(numbers: list[Free], stage: Sequence[str]):
+def _stage_mask(parameters: list[FreeParameter], stage: Sequence[str]):
     """Which numbers move in a stage; `logs.*` in front means those of every log."""
-    names = [number.address for number in numbers]
-    inner = [OF_LOG.sub(r"logs.*.\2", name) for name in names]
+    names = [number.address for number in parameters]
+    inner = [LOG_ADDRESS.sub(r"logs.*.\2", name) for name in names]
     for address in stage:
         if address not in (*names, *inner):
             raise ValueError(f"a stage fits {address}, which is not free; free are {names}")
     return np.array([a in stage or b in stage for a, b in zip(names, inner, strict=True)])
 
 
-def _mark(campaign: Campaign, numbers: list[Free], loss: str, starts: int, seed: int) -> str:
+def _search_digest(
+    dataset: Dataset, parameters: list[FreeParameter], loss: str, starts: int, seed: int
+) -> str:
     """What tells one search from another."""
     return fingerprint(
         {
-            "cases": [jax.tree.map(lambda leaf: known(leaf).tolist(), c) for c in campaign.cases],
-            "measured": [campaign.measured.tobytes().hex(), campaign.real.tobytes().hex()],
-            "times": campaign.times.tobytes().hex(),
-            "numbers": [dataclasses.asdict(number) for number in numbers],
+            "cases": [jax.tree.map(lambda leaf: known(leaf).tolist(), c) for c in dataset.cases],
+            "measured": [dataset.measured.tobytes().hex(), dataset.mask.tobytes().hex()],
+            "times": dataset.times.tobytes().hex(),
+            "numbers": [dataclasses.asdict(number) for number in parameters],
             "settings": [loss, starts, seed],
         }
     )
 
 
-def _without_nan(table: Float[np.ndarray, "row column"]) -> list[list[float | None]]:
+def _nan_to_none(table: Float[np.ndarray, "row column"]) -> list[list[float | None]]:
     return [[None if np.isnan(entry) else entry for entry in row] for row in table.tolist()]
 
 
-def _fitted_case(case: Case, campaign: Campaign, values: dict[str, float]) -> Case:
+def _fitted_case(case: Case, dataset: Dataset, values: dict[str, float]) -> Case:
     """The case with what was fitted; the loads of a single log become its own."""
-    if len(campaign.logs) == 1:
-        fitted = insert(campaign.cases[0], 0, values)
+    if len(dataset.logs) == 1:
+        fitted = with_values(dataset.cases[0], 0, values)
         # Commands that were logged belong to the log.
         fitted = dataclasses.replace(fitted, controller=case.controller)
         return replace(fitted, {"run.duration": case.run.duration})
-    shared = {address: v for address, v in values.items() if not OF_LOG.fullmatch(address)}
-    if any(log.loads is not None for log in campaign.logs):
+    shared = {address: v for address, v in values.items() if not LOG_ADDRESS.fullmatch(address)}
+    if any(log.loads is not None for log in dataset.logs):
         shared = {address: v for address, v in shared.items() if not address.startswith("loads.")}
     return replace(case, shared)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 LOSSES = ("squares", "soft-l1", "huber")
-EDGE = 1.345  # of Huber's loss: 95 % as efficient as squares where noise is normal
+HUBER_THRESHOLD = 1.345  # of Huber's loss: 95 % as efficient as squares where noise is normal
 
 
 def check_loss(loss: str) -> None:
@@ -18,7 +18,7 @@ def check_loss(loss: str) -> None:
         raise ValueError(f"a loss is one of {', '.join(LOSSES)}, not {loss!r}")
 
 
-def shaped(loss: str, residual: Float[Array, "*any"]) -> Float[Array, "*any"]:
+def robust_residual(loss: str, residual: Float[Array, "*any"]) -> Float[Array, "*any"]:
     """The residual f for which f^2 / 2 is the loss: that of squares, soft-l1 or Huber.
 
     soft-l1: f^2 / 2 = sqrt(1 + r^2) - 1; Huber: f^2 / 2 = k |r| - k^2 / 2 beyond k.
@@ -26,16 +26,16 @@ def shaped(loss: str, residual: Float[Array, "*any"]) -> Float[Array, "*any"]:
     if loss == "soft-l1":
         return residual * jnp.sqrt(2 / (1 + jnp.sqrt(1 + residual**2)))
     if loss == "huber":
-        far = jnp.maximum(jnp.abs(residual), EDGE)
+        clipped = jnp.maximum(jnp.abs(residual), HUBER_THRESHOLD)
         return jnp.where(
-            jnp.abs(residual) <= EDGE,
+            jnp.abs(residual) <= HUBER_THRESHOLD,
             residual,
-            jnp.sign(residual) * jnp.sqrt(2 * EDGE * far - EDGE**2),
+            jnp.sign(residual) * jnp.sqrt(2 * HUBER_THRESHOLD * clipped - HUBER_THRESHOLD**2),
         )
     return residual
 
 
-def widening(loss: str, residuals: Float[np.ndarray, " sample"]) -> float:
+def variance_factor(loss: str, residuals: Float[np.ndarray, " sample"]) -> float:
     """Factor by which variances of a robust fit exceed those of the linearised least squares.
 
     E[psi^2] / E[psi']^2 with psi the derivative of the loss (Huber, Robust Statistics, section
@@ -43,10 +43,10 @@ def widening(loss: str, residuals: Float[np.ndarray, " sample"]) -> float:
     """
     if loss == "soft-l1":
         root = np.sqrt(1 + residuals**2)
-        pull, stiffness = residuals / root, 1 / root**3
+        influence, stiffness = residuals / root, 1 / root**3
     elif loss == "huber":
-        pull = np.clip(residuals, -EDGE, EDGE)
-        stiffness = np.abs(residuals) <= EDGE
+        influence = np.clip(residuals, -HUBER_THRESHOLD, HUBER_THRESHOLD)
+        stiffness = np.abs(residuals) <= HUBER_THRESHOLD
     else:
         return 1.0
-    return float(np.mean(pull**2) / np.mean(stiffness) ** 2)
+    return float(np.mean(influence**2) / np.mean(stiffness) ** 2)

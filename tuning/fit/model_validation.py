@@ -12,27 +12,29 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 from jaxbeam.runtime.compiling import compiled
-from tuning.fit.dataset import prepare
-from tuning.fit.uncertainty.covariance import colour
+from tuning.fit.dataset import make_dataset
+from tuning.fit.uncertainty.covariance import autocorrelation_factor
 from tuning.logs.log import Log
 
 if TYPE_CHECKING:
     from tuning.fit.identify import Fit
 
-LAGS = 20  # of the autocorrelation that the whiteness test looks at
-DOUBTFUL = 0.01  # probability of residuals at least so coloured by chance, below which it is said
-LATE = 4.0  # standard errors that a time shift must have to be told
-FAR = 1.5  # how much larger than in the fit residuals of unseen logs may be
+LJUNG_BOX_LAGS = 20  # of the autocorrelation that the whiteness test looks at
+WHITENESS_SIGNIFICANCE = (
+    0.01  # probability of residuals at least so coloured by chance, below which it is said
+)
+MIN_TIME_SHIFT_SD = 4.0  # standard errors that a time shift must have to be told
+MAX_RESIDUAL_RATIO = 1.5  # how much larger than in the fit residuals of unseen logs may be
 
 
-def whiteness(residual: Float[np.ndarray, " time"]) -> float:
+def whiteness_p_value(residual: Float[np.ndarray, " time"]) -> float:
     """Probability that white noise looks at least so coloured: the test of Ljung and Box (1978).
 
     Q = n (n + 2) sum r_k^2 / (n - k) over the first lags k, against chi-square.
     """
     centred = residual - residual.mean()
     count, power = centred.size, float(centred @ centred)
-    lags = np.arange(1, min(LAGS, count // 4) + 1)
+    lags = np.arange(1, min(LJUNG_BOX_LAGS, count // 4) + 1)
     if power == 0.0 or not lags.size:
         return 1.0
     correlations = np.array([centred[:-k] @ centred[k:] for k in lags]) / power
@@ -41,46 +43,48 @@ def whiteness(residual: Float[np.ndarray, " time"]) -> float:
 
 
 @dataclasses.dataclass(frozen=True)
-class Channel:
+class ChannelResiduals:
     """Residuals of one sensor in one log: level, whiteness, and how late the readings seem.
 
-    `noise` is in the SI unit of the sensor, `probability` that of `whiteness`, `colour` the factor
-    by which correlation raises variances, `shift` the delay (s) of the log against the model with
+    `noise` is in the SI unit of the sensor, `p_value` that of `whiteness_p_value`, `autocorrelation_factor` the factor
+    by which correlation raises variances, `time_shift` the delay (s) of the log against the model with
     its standard error.
     """
 
     log: int
     sensor: int
     noise: float
-    probability: float
-    colour: float
-    shift: float
-    shift_error: float
+    p_value: float
+    autocorrelation_factor: float
+    time_shift: float
+    time_shift_sd: float
 
 
-def channel_remarks(found: Sequence[Channel], logs: Sequence[Log]) -> list[str]:
+def residual_remarks(found: Sequence[ChannelResiduals], logs: Sequence[Log]) -> list[str]:
     """What is to be said of residuals, in a sentence each; nothing if all is well."""
-    said = []
+    remarks = []
     for i, log in enumerate(logs):
-        coloured = [c for c in found if c.log == i and c.probability < DOUBTFUL]
+        coloured = [c for c in found if c.log == i and c.p_value < WHITENESS_SIGNIFICANCE]
         if coloured:
-            places = ", ".join(f"{c.colour:.2g} at sensor {c.sensor}" for c in coloured)
-            said.append(
+            factors = ", ".join(
+                f"{c.autocorrelation_factor:.2g} at sensor {c.sensor}" for c in coloured
+            )
+            remarks.append(
                 f"{log.source}: residuals are no white noise, so the model misses something and "
-                f"its intervals are unreliable: widened for it (variances times {places}), they "
+                f"its intervals are unreliable: widened for it (variances times {factors}), they "
                 "cannot make up for values that are put off"
             )
         for c in found:
-            if c.log == i and abs(c.shift) > LATE * c.shift_error:
-                what = "late" if c.shift > 0 else "early"
-                said.append(
-                    f"{log.source}: sensor {c.sensor} seems {1e3 * abs(c.shift):.3g} ms {what} "
-                    f"(+- {2e3 * c.shift_error:.2g} ms): free its delay, or check its clock"
+            if c.log == i and abs(c.time_shift) > MIN_TIME_SHIFT_SD * c.time_shift_sd:
+                what = "late" if c.time_shift > 0 else "early"
+                remarks.append(
+                    f"{log.source}: sensor {c.sensor} seems {1e3 * abs(c.time_shift):.3g} ms {what} "
+                    f"(+- {2e3 * c.time_shift_sd:.2g} ms): free its delay, or check its clock"
                 )
-    return said
+    return remarks
 
 
-def channels(fit: Fit) -> list[Channel]:
+def channel_residuals(fit: Fit) -> list[ChannelResiduals]:
     """Look at the residuals of each sensor in each log.
 
     A delay d of the readings leaves d times the rate of the fitted reading, to first order; it is
@@ -88,7 +92,7 @@ def channels(fit: Fit) -> list[Channel]:
     """
     found = []
     for i, (residuals, fitted) in enumerate(zip(fit.residuals, fit.fitted, strict=True)):
-        rates = -np.gradient(fitted, fit.campaign.times[i], axis=0)
+        rates = -np.gradient(fitted, fit.dataset.times[i], axis=0)
         for j in range(residuals.shape[1]):
             has = np.isfinite(residuals[:, j])
             if not has.any():
@@ -96,37 +100,39 @@ def channels(fit: Fit) -> list[Channel]:
             residual, rate = residuals[has, j], rates[has, j]
             strength = max(float(rate @ rate), 1e-300)
             shift = float(residual @ rate) / strength
-            left = residual - shift * rate
+            remaining = residual - shift * rate
             found.append(
-                Channel(
+                ChannelResiduals(
                     log=i,
                     sensor=j,
                     noise=float(fit.noise[i, j]),
-                    probability=whiteness(residual),
-                    colour=float(fit.colour[i, j]),
-                    shift=shift,
-                    shift_error=float(left.std() * np.sqrt(colour(left) / strength)),
+                    p_value=whiteness_p_value(residual),
+                    autocorrelation_factor=float(fit.autocorrelation_factor[i, j]),
+                    time_shift=shift,
+                    time_shift_sd=float(
+                        remaining.std() * np.sqrt(autocorrelation_factor(remaining) / strength)
+                    ),
                 )
             )
     return found
 
 
 @dataclasses.dataclass(frozen=True)
-class Rival:
+class ModelCriteria:
     """One of several models of the same logs: criteria in nats doubled, lower is better.
 
     `log_likelihood` counts independent samples; `weight` is that of Akaike among the rivals.
     """
 
     name: str
-    numbers: int
+    parameter_count: int
     log_likelihood: float
     aic: float
     bic: float
     weight: float
 
 
-def compare_fits(fits: Mapping[str, Fit]) -> list[Rival]:
+def compare_fits(fits: Mapping[str, Fit]) -> list[ModelCriteria]:
     """Information criteria of fits of different models to the same logs, best (BIC) first.
 
     AIC = 2 k - 2 ln L and BIC = k ln n - 2 ln L with ln L = -n / 2 (ln(2 pi s^2) + 1) summed over
@@ -139,26 +145,26 @@ def compare_fits(fits: Mapping[str, Fit]) -> list[Rival]:
         raise ValueError("give at least two fits to compare")
     first, *others = fits.values()
     for other in others:
-        same = other.campaign.measured.shape == first.campaign.measured.shape
-        if not same or np.any(other.campaign.measured != first.campaign.measured):
+        same = other.dataset.measured.shape == first.dataset.measured.shape
+        if not same or np.any(other.dataset.measured != first.dataset.measured):
             raise ValueError("the fits are of other samples; criteria only compare the same")
-    counts = first.campaign.real.sum(axis=1)
+    counts = first.dataset.mask.sum(axis=1)
     squares = {
         name: np.nansum(fit.residuals**2, axis=1) / np.maximum(counts, 1)
         for name, fit in fits.items()
     }
     has = counts > 0
     best = min(fits, key=lambda name: np.sum(counts[has] * np.log(squares[name][has] + 1e-300)))
-    independent = (counts / fits[best].colour)[has]
+    independent = (counts / fits[best].autocorrelation_factor)[has]
     rows = {}
     for name, fit in fits.items():
         level = np.log(2 * np.pi * (squares[name][has] + 1e-300)) + 1
-        rows[name] = len(fit.numbers), float(-np.sum(independent * level) / 2)
+        rows[name] = len(fit.parameters), float(-np.sum(independent * level) / 2)
     aic = {name: 2 * k - 2 * likely for name, (k, likely) in rows.items()}
-    shares = np.exp(-(np.array(list(aic.values())) - min(aic.values())) / 2)
-    weights = dict(zip(aic, shares / shares.sum(), strict=True))
-    rivals = [
-        Rival(
+    relative_likelihoods = np.exp(-(np.array(list(aic.values())) - min(aic.values())) / 2)
+    weights = dict(zip(aic, relative_likelihoods / relative_likelihoods.sum(), strict=True))
+    criteria = [
+        ModelCriteria(
             name,
             k,
             likely,
@@ -168,29 +174,29 @@ def compare_fits(fits: Mapping[str, Fit]) -> list[Rival]:
         )
         for name, (k, likely) in rows.items()
     ]
-    return sorted(rivals, key=lambda rival: rival.bic)
+    return sorted(criteria, key=lambda rival: rival.bic)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Unseen:
+class HeldOutPrediction:
     """A log predicted by a fit that did not use it.
 
-    `ratio` (sensor,) is the standard deviation of what is left over that of the noise in the
+    `residual_ratio` (sensor,) is the standard deviation of what is left over that of the noise in the
     fit: one is perfect, NaN where nothing was measured.
     """
 
     log: str
-    ratio: Float[np.ndarray, " sensor"]
+    residual_ratio: Float[np.ndarray, " sensor"]
 
     @property
     def verdict(self) -> str:
         """One sentence."""
-        worst = float(np.nanmax(self.ratio))
-        word = "predicted" if worst < FAR else "not predicted"
+        worst = float(np.nanmax(self.residual_ratio))
+        word = "predicted" if worst < MAX_RESIDUAL_RATIO else "not predicted"
         return f"{self.log}: {word}; residuals are {worst:.3g} times the noise at most"
 
 
-def cross_validate(fit: Fit) -> list[Unseen]:
+def cross_validate(fit: Fit) -> list[HeldOutPrediction]:
     """Leave out one log after the other, fit the rest, and predict the one left out.
 
     Numbers of the log left out stay at their starts (its speed and entry time, say), so logs with
@@ -198,36 +204,36 @@ def cross_validate(fit: Fit) -> list[Unseen]:
 
     Raises ValueError for a single log.
     """
-    campaign = fit.campaign
-    count = len(campaign.logs)
+    dataset = fit.dataset
+    count = len(dataset.logs)
     if count < 2:
         raise ValueError("to leave one log out there must be at least two")
     found = []
-    for i, log in enumerate(campaign.logs):
+    for i, log in enumerate(dataset.logs):
         use = np.arange(count) != i
-        left = fit.search.estimate(campaign.measured, use=use)
+        solution = fit.least_squares.solve(dataset.measured, included_logs=use)
         noise = np.sqrt(np.nanmean(np.where(use[:, None], fit.noise, np.nan) ** 2, axis=0))
-        parts = campaign.measured[i], left.predicted[i], campaign.real[i]
-        found.append(_unseen(log.source, *parts, noise))
+        parts = dataset.measured[i], solution.predicted[i], dataset.mask[i]
+        found.append(_held_out_prediction(log.source, *parts, noise))
     return found
 
 
-def hold_out(fit: Fit, logs: Sequence[Log]) -> list[Unseen]:
+def hold_out(fit: Fit, logs: Sequence[Log]) -> list[HeldOutPrediction]:
     """Predict logs that the fit has not seen with the fitted case, and their own loads.
 
     Raises ValueError as `identify` does for logs that do not match the case.
     """
-    campaign = prepare(fit.case, list(logs))
-    predict = compiled(campaign.predictor(["run.gravity"]))
+    dataset = make_dataset(fit.case, list(logs))
+    predict = compiled(dataset.predictor(["run.gravity"]))
     predicted = np.asarray(predict(jnp.asarray([float(fit.case.run.gravity)])))
     noise = np.sqrt(np.nanmean(fit.noise**2, axis=0))
     return [
-        _unseen(log.source, campaign.measured[i], predicted[i], campaign.real[i], noise)
-        for i, log in enumerate(campaign.logs)
+        _held_out_prediction(log.source, dataset.measured[i], predicted[i], dataset.mask[i], noise)
+        for i, log in enumerate(dataset.logs)
     ]
 
 
-def _unseen(source, measured, predicted, real, noise) -> Unseen:
-    counts = real.sum(axis=0)
-    squares = np.sum(((measured - predicted) * real) ** 2, axis=0) / np.maximum(counts, 1)
-    return Unseen(source, np.where(counts > 0, np.sqrt(squares) / noise, np.nan))
+def _held_out_prediction(source, measured, predicted, mask, noise) -> HeldOutPrediction:
+    counts = mask.sum(axis=0)
+    squares = np.sum(((measured - predicted) * mask) ** 2, axis=0) / np.maximum(counts, 1)
+    return HeldOutPrediction(source, np.where(counts > 0, np.sqrt(squares) / noise, np.nan))

@@ -11,24 +11,33 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
 from jaxbeam.case.loads import AbstractLoad, MovingMass
 from tuning.fit.identify import Fit, identify
-from tuning.fit.matching_pursuit import Pursuit
-from tuning.fit.model_validation import DOUBTFUL, Rival, channels, compare_fits
+from tuning.fit.matching_pursuit import MatchingPursuit
+from tuning.fit.model_validation import (
+    WHITENESS_SIGNIFICANCE,
+    ModelCriteria,
+    channel_residuals,
+    compare_fits,
+)
 from tuning.logs.log import Log
 
-_PARTS = ("mass", "speed", "entry_time")
-_FALL = 0.7  # what another load must make of the static misfit to be looked for at first
-_SHOWN = 0.65  # of the readings' deviation: one load must leave less to be there at all
+_LOAD_PARAMETERS = ("mass", "speed", "entry_time")
+_MAX_MISFIT_RATIO = (
+    0.7  # what another load must make of the static misfit to be looked for at first
+)
+_MAX_RESIDUAL_SHARE = (
+    0.65  # of the readings' deviation: one load must leave less to be there at all
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Weighing:
     """Loads found in a log: the fit of the best count, and all counts tried, best first.
 
-    `counts` is empty where the first count tried left nothing but white noise.
+    `load_counts` is empty where the first count tried left nothing but white noise.
     """
 
     fit: Fit
-    counts: list[Rival]
+    load_counts: list[ModelCriteria]
 
     @property
     def loads(self) -> tuple[AbstractLoad, ...]:
@@ -39,15 +48,15 @@ class Weighing:
         """Loads with standard errors and intervals (SI units), counts tried, and the verdict."""
         told = self.fit.to_dict()
         loads = [
-            {part: told["numbers"][f"loads.{i}.{part}"] for part in _PARTS}
+            {part: told["numbers"][f"loads.{i}.{part}"] for part in _LOAD_PARAMETERS}
             for i in range(len(self.loads))
         ]
-        counts = {rival.name: rival.bic for rival in self.counts}
+        counts = {rival.name: rival.bic for rival in self.load_counts}
         return {"loads": loads, "bic": counts, "verdict": self.fit.verdict}
 
     def __str__(self) -> str:
-        lines = [f"{_words(len(self.loads))} found"]
-        lines += [f"BIC with {rival.name}: {rival.bic:.1f}" for rival in self.counts]
+        lines = [f"{_count_text(len(self.loads))} found"]
+        lines += [f"BIC with {rival.name}: {rival.bic:.1f}" for rival in self.load_counts]
         return "\n".join([*lines, str(self.fit)])
 
 
@@ -70,29 +79,32 @@ def weigh(
     if others or not case.sensors:
         what = f"sensors.{others[0]} does not measure" if others else "no sensor measures"
         raise ValueError(f"weighing needs deflections; {what} them")
-    pursuit = Pursuit(case, log, (low, high), both_ways)
+    pursuit = MatchingPursuit(case, log, (low, high), both_ways)
     first = pursuit.find(1)
-    if first.left > _SHOWN * pursuit.deviation:
+    if first.residual_rms > _MAX_RESIDUAL_SHARE * pursuit.readings_rms:
         raise ValueError(f"{log.source}: no load shows in it at these speeds")
     found = first
-    while len(found.loads) < most and (more := pursuit.find(len(found.loads) + 1)).left < (
-        _FALL * found.left
+    while len(found.loads) < most and (more := pursuit.find(len(found.loads) + 1)).residual_rms < (
+        _MAX_MISFIT_RATIO * found.residual_rms
     ):
         found = more
     fits: dict[str, Fit] = {}
     while True:
         count = len(found.loads)
-        fit = fits[_words(count)] = _fit(case, log, found.loads)
-        if min(channel.probability for channel in channels(fit)) > DOUBTFUL or count >= most:
+        fit = fits[_count_text(count)] = _fit_loads(case, log, found.loads)
+        if (
+            min(channel.p_value for channel in channel_residuals(fit)) > WHITENESS_SIGNIFICANCE
+            or count >= most
+        ):
             break
-        if len(fits) > 1 and compare_fits(fits)[0].name != _words(count):
+        if len(fits) > 1 and compare_fits(fits)[0].name != _count_text(count):
             break
         found = pursuit.find(count + 1)
-    rivals = compare_fits(fits) if len(fits) > 1 else []
-    return Weighing(fits[rivals[0].name] if rivals else fit, rivals)
+    criteria = compare_fits(fits) if len(fits) > 1 else []
+    return Weighing(fits[criteria[0].name] if criteria else fit, criteria)
 
 
-def _fit(case: Case, log: Log, loads: list[MovingMass]) -> Fit:
+def _fit_loads(case: Case, log: Log, loads: list[MovingMass]) -> Fit:
     """Fit all loads together, and the offsets of the sensors."""
     length, end = float(known(case.beam.length)), float(log.times[-1])
     free: dict[str, tuple[float, float] | None] = {}
@@ -106,5 +118,5 @@ def _fit(case: Case, log: Log, loads: list[MovingMass]) -> Fit:
     return identify(case, dataclasses.replace(log, loads=tuple(loads)), free)
 
 
-def _words(count: int) -> str:
+def _count_text(count: int) -> str:
     return f"{count} load{'s' if count > 1 else ''}"

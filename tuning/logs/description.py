@@ -97,9 +97,9 @@ def _check_keys(path, prefix, data, known) -> None:
 
 def _check_types(path, prefix, entry) -> None:
     for key, value in entry.items():
-        kind, words = _COLUMN_KEYS[key]
+        kind, description = _COLUMN_KEYS[key]
         if not isinstance(value, kind) or isinstance(value, bool):
-            raise ValueError(f"{path}, {prefix}{key}: must be {words}, not {value!r}")
+            raise ValueError(f"{path}, {prefix}{key}: must be {description}, not {value!r}")
 
 
 def _loads(path, prefix, table) -> tuple[AbstractLoad, ...]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from jaxbeam.case.loads import AbstractLoad
 
 # Times may stray from an even grid by this share of a step: printed times are rounded.
-EVEN = 0.25
+MAX_GRID_DEVIATION_STEPS = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +70,13 @@ class Log:
 
         Raises ValueError, saying where, if times stray from an even grid by more than rounding.
         """
-        even = np.linspace(self.times[0], self.times[-1], self.times.size)
-        step = even[1] - even[0]
-        stray = np.abs(self.times - even) / step
-        if stray.max() > EVEN:
+        even_grid = np.linspace(self.times[0], self.times[-1], self.times.size)
+        step = even_grid[1] - even_grid[0]
+        deviation = np.abs(self.times - even_grid) / step
+        if deviation.max() > MAX_GRID_DEVIATION_STEPS:
             raise ValueError(
                 f"{self.source}: the log is not sampled evenly (at t = "
-                f"{self.times[np.argmax(stray)]:.6g} s it is {stray.max():.2g} steps off an even "
+                f"{self.times[np.argmax(deviation)]:.6g} s it is {deviation.max():.2g} steps off an even "
                 f"grid of {step:.4g} s); resample it to equal steps first"
             )
         return float(1 / step)
@@ -93,7 +93,7 @@ def check_samples(
     Raises ValueError naming the line (or, without `lines`, the sample) and the column.
     """
 
-    def place(row):
+    def where(row):
         return f"{source}, line {lines[row]}" if lines is not None else f"{source}, sample {row}"
 
     bad = np.argwhere(~np.isfinite(values))
@@ -102,7 +102,7 @@ def check_samples(
         value = values[row, column]
         what = "the cell is empty, or says nan" if np.isnan(value) else f"{value} is not finite"
         raise ValueError(
-            f"{place(row)}, column {names[column]!r}: {what}; fill in what was measured, cut the "
+            f"{where(row)}, column {names[column]!r}: {what}; fill in what was measured, cut the "
             'log there, or read it with missing="mask", which leaves such samples out'
         )
     if len(values) < 2:
@@ -113,4 +113,4 @@ def check_samples(
         what = "is repeated (are times printed with too few digits?)"
         if steps[row - 1] < 0:
             what = f"comes after {values[row - 1, 0]:.9g} s"
-        raise ValueError(f"{place(row)}: time {values[row, 0]:.9g} s {what}; times must increase")
+        raise ValueError(f"{where(row)}: time {values[row, 0]:.9g} s {what}; times must increase")

@@ -11,8 +11,10 @@ from jaxbeam.case.loads import AbstractLoad, motion
 from jaxbeam.control import Prescribed
 from tuning.logs.log import Log
 
-LATEST = 10.0  # start of a log, in its own durations, that is still simulated from 0 on
-UNIT_OF = {"voltage": "V", "force": "N"}
+MAX_START_DURATIONS = (
+    10.0  # start of a log, in its own durations, that is still simulated from 0 on
+)
+COMMAND_UNITS = {"voltage": "V", "force": "N"}
 
 
 def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case:
@@ -36,7 +38,7 @@ def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case
     return replace(case, {"run.duration": float(log.times[-1])})
 
 
-def made_alike(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> list[Case]:
+def pad_cases(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> list[Case]:
     """The cases, each with what others have besides: commands of zero, loads that come too late.
 
     So a crossing without commands and a beam at rest that is shaken are runs of one structure.
@@ -47,14 +49,16 @@ def made_alike(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> li
     for case, own in zip(cases, times, strict=True):
         if commanded and case.controller is None:
             count = len(case.actuators)
-            still = Prescribed(np.zeros(count), times=own, values=np.zeros((count, own.size)))
-            case = dataclasses.replace(case, controller=still)
-        late = tuple(_late(load, 2 * own[-1]) for load in longest[len(case.loads) :])
-        made.append(dataclasses.replace(case, loads=(*case.loads, *late)))
+            zero_commands = Prescribed(
+                np.zeros(count), times=own, values=np.zeros((count, own.size))
+            )
+            case = dataclasses.replace(case, controller=zero_commands)
+        absent_loads = tuple(_entering_at(load, 2 * own[-1]) for load in longest[len(case.loads) :])
+        made.append(dataclasses.replace(case, loads=(*case.loads, *absent_loads)))
     return made
 
 
-def _late(load: AbstractLoad, time: float) -> AbstractLoad:
+def _entering_at(load: AbstractLoad, time: float) -> AbstractLoad:
     """The load, entering at a time (s)."""
     if load.times is None:
         return dataclasses.replace(load, entry_time=time)
@@ -75,23 +79,23 @@ def _check_command(case: Case, log: Log, channel: int, actuator: int) -> None:
             " leave one out"
         )
     device = case.actuators[actuator]
-    wanted = type(device).__dataclass_fields__["limits"].metadata["unit"]
-    if UNIT_OF.get(log.quantities[channel]) != wanted:
+    unit = type(device).__dataclass_fields__["limits"].metadata["unit"]
+    if COMMAND_UNITS.get(log.quantities[channel]) != unit:
         raise ValueError(
             f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in"
-            f" {log.units[channel]}, but the command to actuators.{actuator} is in {wanted}"
+            f" {log.units[channel]}, but the command to actuators.{actuator} is in {unit}"
         )
     limits = device.command_limits()
     low, high = (-np.inf, np.inf) if limits is None else known(limits)
     least, most = log.values[:, channel].min(), log.values[:, channel].max()
     if least < low or most > high:
         raise ValueError(
-            f"{log.source}: {log.names[channel]} goes from {least:g} to {most:g} {wanted}, beyond"
-            f" what actuators.{actuator} takes, {low:g} to {high:g} {wanted}: correct its limits"
+            f"{log.source}: {log.names[channel]} goes from {least:g} to {most:g} {unit}, beyond"
+            f" what actuators.{actuator} takes, {low:g} to {high:g} {unit}: correct its limits"
         )
 
 
-def at_sensors(
+def sensor_readings(
     case: Case, log: Log
 ) -> tuple[Float[np.ndarray, "time sensor"], Bool[np.ndarray, "time sensor"]]:
     """The readings of a log in the order of the case's sensors (time, sensor), and which count.
@@ -108,13 +112,13 @@ def at_sensors(
     if len(named) > len(order):
         raise ValueError(f"{log.source}: two of its channels are of the same sensor of the case")
     if not set(order) <= set(range(len(sensors))) or (not named and len(order) < len(sensors)):
-        ours = f"{len(sensors)} sensors" if len(sensors) > 1 else "one sensor"
+        listed = f"{len(sensors)} sensors" if len(sensors) > 1 else "one sensor"
         raise ValueError(
-            f"{log.source}: its channels {', '.join(log.names)} do not match the case's {ours}; "
+            f"{log.source}: its channels {', '.join(log.names)} do not match the case's {listed}; "
             "say in the TOML file beside it which `sensor` each column is, counted from 0"
         )
     values = np.zeros((log.times.size, len(sensors)))
-    has = np.zeros(values.shape, bool)
+    valid = np.zeros(values.shape, bool)
     for number, channel in order.items():
         quantity = sensors[number].quantity
         if log.quantities[channel] != quantity:
@@ -122,8 +126,8 @@ def at_sensors(
                 f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in "
                 f"{log.units[channel]}, but sensors.{number} measures {quantity}"
             )
-        values[:, number], has[:, number] = log.values[:, channel], log.valid[:, channel]
-    return values, has
+        values[:, number], valid[:, number] = log.values[:, channel], log.valid[:, channel]
+    return values, valid
 
 
 def check_times(log: Log) -> None:
@@ -139,7 +143,7 @@ def check_times(log: Log) -> None:
             f"{log.source}: it starts at {first:.4g} s, but runs start at 0, at rest; add "
             f"{-first:.4g} s to its times and to the loads' entry times"
         )
-    if first > LATEST * (last - first):
+    if first > MAX_START_DURATIONS * (last - first):
         raise ValueError(
             f"{log.source}: it starts only at {first:.6g} s, while runs start at 0; subtract the "
             "time at which the recording began from its times and from the loads' entry times"

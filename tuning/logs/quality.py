@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from tuning.logs.log import Log
 
 MASKABLE = ("spikes", "saturation", "stuck")
-GAP = 1.5  # steps between two samples, beyond which some are missing
-SPIKE = 12.0  # robust standard deviations off the smooth course of the neighbours
-AROUND = 31  # samples within which what is usual is told
-LEAST_SPIKE = 0.02  # of a channel's range
-FLAT = 4  # samples at an extreme value, and no fewer, that look clipped
-STUCK = 12  # samples of one value in a channel that otherwise never repeats itself
-DRIFT = 0.5  # steps by which times bend away from an even grid
+GAP_STEPS = 1.5  # steps between two samples, beyond which some are missing
+SPIKE_SD = 12.0  # robust standard deviations off the smooth course of the neighbours
+SPIKE_WINDOW_SAMPLES = 31  # samples within which what is usual is told
+MIN_SPIKE_RANGE_SHARE = 0.02  # of a channel's range
+MIN_CLIPPED_SAMPLES = 4  # samples at an extreme value, and no fewer, that look clipped
+MIN_STUCK_SAMPLES = 12  # samples of one value in a channel that otherwise never repeats itself
+MAX_CLOCK_DRIFT_STEPS = 0.5  # steps by which times bend away from an even grid
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,21 +35,21 @@ class Fault:
     kind: str
     channel: str | None
     samples: Bool[np.ndarray, " time"]
-    words: str
+    message: str
 
     def __str__(self) -> str:
-        return self.words
+        return self.message
 
 
 def find_faults(log: Log) -> list[Fault]:
     """Look for gaps, drifting clocks, spikes, clipped and stuck channels in a log."""
-    found = [*_gaps(log), *_drift(log)]
+    found = [*_gaps(log), *_clock_drift(log)]
     finders = {"spikes": _spikes, "saturation": _clipped, "stuck": _stuck}
     for i, name in enumerate(log.names):
         for kind, find in finders.items():
             samples = find(log.values[:, i]) & log.valid[:, i]
             if samples.any():
-                found.append(Fault(kind, name, samples, _words(log, kind, name, samples)))
+                found.append(Fault(kind, name, samples, _message(log, kind, name, samples)))
     return found
 
 
@@ -72,43 +72,43 @@ def mask(log: Log, kinds: Sequence[str]) -> Log:
     return dataclasses.replace(log, valid=valid, notes=tuple(notes))
 
 
-def join_over(
+def interpolate_invalid(
     times: Float[np.ndarray, " time"],
     values: Float[np.ndarray, "time channel"],
     valid: Bool[np.ndarray, "time channel"],
 ) -> Float[np.ndarray, "time channel"]:
     """Straight lines over the samples that are not valid, so that there is a value at all."""
-    joined = np.array(values)
-    for column, good in zip(joined.T, valid.T, strict=True):
+    filled = np.array(values)
+    for column, good in zip(filled.T, valid.T, strict=True):
         if good.any():
             column[~good] = np.interp(times[~good], times[good], column[good])
-    return joined
+    return filled
 
 
 def _gaps(log: Log):
     steps = np.diff(log.times)
     usual = np.median(steps)
-    for i in np.flatnonzero(steps > GAP * usual):
+    for i in np.flatnonzero(steps > GAP_STEPS * usual):
         samples = np.zeros(log.times.size, bool)
         samples[i : i + 2] = True
         lost = round(steps[i] / usual) - 1
-        words = f"{log.source}: about {lost} samples are missing after t = {log.times[i]:.6g} s"
-        yield Fault("gaps", None, samples, words)
+        message = f"{log.source}: about {lost} samples are missing after t = {log.times[i]:.6g} s"
+        yield Fault("gaps", None, samples, message)
 
 
-def _drift(log: Log):
+def _clock_drift(log: Log):
     """Times that bend: a clock whose rate changes (a rate that is merely wrong leaves no trace)."""
     count = np.linspace(-1, 1, log.times.size)
-    if log.times.size < 4 or np.any(np.diff(log.times) > GAP * np.median(np.diff(log.times))):
+    if log.times.size < 4 or np.any(np.diff(log.times) > GAP_STEPS * np.median(np.diff(log.times))):
         return
-    bend = np.polynomial.legendre.legfit(count, log.times, 2)[2] * 1.5
+    curvature = np.polynomial.legendre.legfit(count, log.times, 2)[2] * 1.5
     step = log.duration / (log.times.size - 1)
-    if abs(bend) > DRIFT * step:
+    if abs(curvature) > MAX_CLOCK_DRIFT_STEPS * step:
         yield Fault(
             "drift",
             None,
             np.ones(log.times.size, bool),
-            f"{log.source}: the clock drifts: midway the times are {abs(bend) / step:.2g} steps "
+            f"{log.source}: the clock drifts: midway the times are {abs(curvature) / step:.2g} steps "
             "off an even grid",
         )
 
@@ -119,34 +119,36 @@ def _spikes(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
     if values.size < 9:
         return spikes
     left2, left, here, right, right2 = (values[i : values.size - 4 + i] for i in range(5))
-    stray = np.abs(here - (4 * (left + right) - left2 - right2) / 6)
+    deviation = np.abs(here - (4 * (left + right) - left2 - right2) / 6)
     # As much as is usual around: an impact rings too fast for cubics, but not for one sample.
-    around = median_filter(stray, AROUND, mode="nearest")
-    usual = 1.4826 * np.maximum(around, np.median(stray))
+    local_median = median_filter(deviation, SPIKE_WINDOW_SAMPLES, mode="nearest")
+    noise_level = 1.4826 * np.maximum(local_median, np.median(deviation))
     # A spike stands out to both sides; a jump, or a neighbour of a spike, does not.
     rise, fall = here - left, here - right
-    outstanding = np.minimum(np.abs(rise), np.abs(fall)) * (rise * fall > 0)
-    least = np.maximum(SPIKE * usual, LEAST_SPIKE * np.ptp(np.sort(values)[1:-1]))
-    spikes[2:-2] = (outstanding > stray / 2) & (stray > least)
+    prominence = np.minimum(np.abs(rise), np.abs(fall)) * (rise * fall > 0)
+    least = np.maximum(
+        SPIKE_SD * noise_level, MIN_SPIKE_RANGE_SHARE * np.ptp(np.sort(values)[1:-1])
+    )
+    spikes[2:-2] = (prominence > deviation / 2) & (deviation > least)
     return spikes
 
 
-def _runs(values: Float[np.ndarray, " time"], least: int):
+def _constant_runs(values: Float[np.ndarray, " time"], min_length: int):
     """Stretches (start, stop) of at least so many equal samples."""
-    edges = np.flatnonzero(np.diff(values) != 0) + 1
-    edges = np.concatenate([[0], edges, [values.size]])
-    return [(a, b) for a, b in zip(edges, edges[1:], strict=False) if b - a >= least]
+    run_starts = np.flatnonzero(np.diff(values) != 0) + 1
+    run_starts = np.concatenate([[0], run_starts, [values.size]])
+    return [(a, b) for a, b in zip(run_starts, run_starts[1:], strict=False) if b - a >= min_length]
 
 
 def _clipped(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
     """Stretches at the largest or smallest value that the signal enters and leaves steeply."""
     clipped = np.zeros(values.size, bool)
     steps = np.abs(np.diff(values))
-    fine = np.min(steps[steps > 0], initial=np.inf)
-    for start, stop in _runs(values, FLAT):
+    resolution = np.min(steps[steps > 0], initial=np.inf)
+    for start, stop in _constant_runs(values, MIN_CLIPPED_SAMPLES):
         inside = start > 0 and stop < values.size
         extreme = values[start] in (values.max(), values.min())
-        steep = inside and min(steps[start - 1], steps[stop - 1]) > 3 * fine
+        steep = inside and min(steps[start - 1], steps[stop - 1]) > 3 * resolution
         clipped[start:stop] |= extreme and steep
     return clipped
 
@@ -154,15 +156,17 @@ def _clipped(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
 def _stuck(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
     """Long stretches of one value in a channel whose samples otherwise differ."""
     stuck = np.zeros(values.size, bool)
-    if values.size < 2 * STUCK or np.median(np.abs(np.diff(values))) == 0.0:
+    if values.size < 2 * MIN_STUCK_SAMPLES or np.median(np.abs(np.diff(values))) == 0.0:
         return stuck
-    rare = len(_runs(values, STUCK // 2)) <= 3  # a coarse resolution makes many such stretches
-    for start, stop in _runs(values, STUCK):
+    rare = (
+        len(_constant_runs(values, MIN_STUCK_SAMPLES // 2)) <= 3
+    )  # a coarse resolution makes many such stretches
+    for start, stop in _constant_runs(values, MIN_STUCK_SAMPLES):
         stuck[start:stop] = rare
     return stuck & ~_clipped(values)
 
 
-def _words(log: Log, kind: str, name: str, samples) -> str:
+def _message(log: Log, kind: str, name: str, samples) -> str:
     first, count = log.times[np.argmax(samples)], int(samples.sum())
     number = f"{count} samples" if count > 1 else "one sample"
     what = {

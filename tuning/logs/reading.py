@@ -33,9 +33,9 @@ import numpy as np
 
 from tuning.logs.description import Sidecar, read_sidecar
 from tuning.logs.log import Log, check_samples
-from tuning.logs.quality import join_over
-from tuning.logs.readers import Table, is_time, read_tables
-from tuning.logs.units import UNITS, by_sensitivity, unit
+from tuning.logs.quality import interpolate_invalid
+from tuning.logs.readers import LogTable, is_time_name, read_tables
+from tuning.logs.units import UNITS, transducer_unit, unit
 
 
 def read_log(
@@ -49,7 +49,7 @@ def read_log(
 ) -> Log:
     """Read a log: separated values, LabVIEW (.lvm, .tdms), MATLAB, HDF5, netCDF or Parquet.
 
-    `columns` names the channels to keep, in this order; `units` gives the unit of columns by name
+    `value_columns` names the channels to keep, in this order; `units` gives the unit of columns by name
     (or one for all channels) and wins over the file; `time` names the column of times, by default
     the one called time or t, or the first with a unit of time. What is not given here is taken
     from the TOML file beside the log, then from the log itself. Sampling is that of the times.
@@ -86,24 +86,26 @@ def read_logs(
     tables = {
         part: rows
         for name, table in read_tables(path).items()
-        for part, rows in _split(name, table).items()
+        for part, rows in _split_runs(name, table).items()
     }
     if run is not None and run not in tables:
         raise ValueError(f"{path}: it has no run {run!r}; it has {', '.join(map(repr, tables))}")
-    side = read_sidecar(path)
-    if unknown := [name for name in side.runs if name not in tables]:
+    sidecar = read_sidecar(path)
+    if unknown := [name for name in sidecar.runs if name not in tables]:
         raise ValueError(
             f"{path.with_suffix('.toml')}: runs.{unknown[0]} is no run of {path.name}; it has "
             f"{', '.join(map(repr, tables))}"
         )
     chosen = tables if run is None else {run: tables[run]}
     return [
-        _log(path, name if len(tables) > 1 else "", table, side, columns, units, time, missing)
+        _make_log(
+            path, name if len(tables) > 1 else "", table, sidecar, columns, units, time, missing
+        )
         for name, table in chosen.items()
     ]
 
 
-def _split(name: str, table: Table) -> dict[str, Table]:
+def _split_runs(name: str, table: LogTable) -> dict[str, LogTable]:
     """The runs of a table: rows that differ in its column called run, if it has one."""
     if "run" not in table.names:
         return {name: table}
@@ -118,49 +120,53 @@ def _split(name: str, table: Table) -> dict[str, Table]:
     }
 
 
-def _log(path, run, table: Table, side: Sidecar, columns, units, time, missing) -> Log:
+def _make_log(path, run, table: LogTable, sidecar: Sidecar, columns, units, time, missing) -> Log:
     """Make a log of one run, in SI units."""
-    names = _named(path, table.names)
-    clock = _time_column(path, table, time or side.time)
-    channels = list(columns or side.columns or [name for name in names if name != clock])
-    channels = [name for name in channels if name not in (clock, "run")]
-    for name in (*channels, *side.columns, *(units if isinstance(units, Mapping) else ())):
+    names = _check_names(path, table.names)
+    time_column = _time_column(path, table, time or sidecar.time)
+    channels = list(columns or sidecar.columns or [name for name in names if name != time_column])
+    channels = [name for name in channels if name not in (time_column, "run")]
+    for name in (*channels, *sidecar.columns, *(units if isinstance(units, Mapping) else ())):
         _check_column(path, name, names)
     if not channels:
-        raise ValueError(f"{path}: there is no column besides the time, {clock!r}")
+        raise ValueError(f"{path}: there is no column besides the time, {time_column!r}")
     declared = units if isinstance(units, Mapping) else dict.fromkeys(channels, units)
-    found = [_unit_of(path, table, name, declared, side) for name in (clock, *channels)]
-    if found[0][1].quantity != "time":
-        raise ValueError(f"{path}: the column of times, {clock!r}, has the unit {found[0][0]!r}")
-    values = table.values[:, [names.index(name) for name in (clock, *channels)]]
-    values = values * np.array([unit.factor for _, unit in found])
+    column_units = [
+        _unit_of(path, table, name, declared, sidecar) for name in (time_column, *channels)
+    ]
+    if column_units[0][1].quantity != "time":
+        raise ValueError(
+            f"{path}: the column of times, {time_column!r}, has the unit {column_units[0][0]!r}"
+        )
+    values = table.values[:, [names.index(name) for name in (time_column, *channels)]]
+    values = values * np.array([unit.factor for _, unit in column_units])
     valid, notes = np.isfinite(values), list(table.notes)
     if missing == "mask":
-        values[:, 1:] = join_over(values[:, 0], values[:, 1:], valid[:, 1:])
+        values[:, 1:] = interpolate_invalid(values[:, 0], values[:, 1:], valid[:, 1:])
         notes += [
             f"{count} missing samples of {name} are left out"
             for name, count in zip(channels, np.sum(~valid[:, 1:], axis=0), strict=True)
             if count
         ]
     source = f"{path}:{run}" if run else str(path)
-    check_samples(source, (clock, *channels), values, table.lines)
+    check_samples(source, (time_column, *channels), values, table.lines)
     return Log(
         times=values[:, 0],
         values=values[:, 1:],
         names=tuple(channels),
-        quantities=tuple(unit.quantity for _, unit in found[1:]),
-        units=tuple(text for text, _ in found[1:]),
+        quantities=tuple(unit.quantity for _, unit in column_units[1:]),
+        units=tuple(text for text, _ in column_units[1:]),
         source=source,
-        sensors=tuple(side.sensor(name) for name in channels),
-        positions=tuple(side.position(name) for name in channels),
-        actuators=tuple(side.actuator(name) for name in channels),
-        loads=side.loads_of(run),
+        sensors=tuple(sidecar.sensor(name) for name in channels),
+        positions=tuple(sidecar.position(name) for name in channels),
+        actuators=tuple(sidecar.actuator(name) for name in channels),
+        loads=sidecar.loads_of(run),
         valid=valid[:, 1:],
         notes=tuple(notes),
     )
 
 
-def _named(path, names):
+def _check_names(path, names):
     """Return the column names, checked to be all there and all different."""
     for i, name in enumerate(names):
         if not name:
@@ -178,15 +184,15 @@ def _check_column(path, name, names) -> None:
     raise ValueError(f"{path}: the log has no column {name!r}; {hint}")
 
 
-def _time_column(path, table: Table, wanted: str | None) -> str:
+def _time_column(path, table: LogTable, requested: str | None) -> str:
     """Return the name of the column of times."""
-    if wanted is not None:
-        _check_column(path, wanted, table.names)
-        return wanted
+    if requested is not None:
+        _check_column(path, requested, table.names)
+        return requested
     if table.time is not None:
         return table.time
     for name in table.names:
-        if is_time(name):
+        if is_time_name(name):
             return name
     for name, text in zip(table.names, table.units, strict=True):
         if text in UNITS and UNITS[text].quantity == "time":
@@ -197,10 +203,12 @@ def _time_column(path, table: Table, wanted: str | None) -> str:
     )
 
 
-def _unit_of(path, table: Table, name: str, declared: Mapping[str, str | None], side: Sidecar):
+def _unit_of(
+    path, table: LogTable, name: str, declared: Mapping[str, str | None], sidecar: Sidecar
+):
     """Return the unit of a column, as text and as what it means."""
     in_file = table.units[table.names.index(name)]
-    text = declared.get(name) or side.unit(name) or in_file
+    text = declared.get(name) or sidecar.unit(name) or in_file
     if not text:
         raise ValueError(
             f"{path}, column {name!r}: no unit found; write it in the heading, {name} [mm], "
@@ -208,7 +216,7 @@ def _unit_of(path, table: Table, name: str, declared: Mapping[str, str | None], 
             f"in {path.with_suffix('.toml').name}"
         )
     try:
-        logged, sensitivity = unit(text), side.sensitivity(name)
-        return text, by_sensitivity(sensitivity, logged) if sensitivity else logged
+        logged, sensitivity = unit(text), sidecar.sensitivity(name)
+        return text, transducer_unit(sensitivity, logged) if sensitivity else logged
     except ValueError as error:
         raise ValueError(f"{path}, column {name!r}: {error}") from None

@@ -86,10 +86,10 @@ _SENSITIVITY = re.compile(
 )
 
 
-def by_sensitivity(text: str, logged: Unit) -> Unit:
+def transducer_unit(text: str, output_unit: Unit) -> Unit:
     """The unit of what a transducer measures, given its sensitivity, such as `100 mV/g`.
 
-    `logged` is the unit of the column, that of the transducer's output (volts, say).
+    `output_unit` is the unit of the column, that of the transducer's output (volts, say).
 
     Raises ValueError if the text is no sensitivity, is zero, or is in another kind of unit.
     """
@@ -97,9 +97,9 @@ def by_sensitivity(text: str, logged: Unit) -> Unit:
     if found is None or float(found["size"]) == 0.0:
         raise ValueError(f"the sensitivity {text!r} should be like '100 mV/g': number, unit/unit")
     out, measured = unit(found["out"]), unit(found["of"].strip().strip("()"))
-    if out.quantity != logged.quantity:
+    if out.quantity != output_unit.quantity:
         raise ValueError(
-            f"the sensitivity {text!r} is for {out.quantity}, but the column is {logged.quantity}"
+            f"the sensitivity {text!r} is for {out.quantity}, but the column is {output_unit.quantity}"
         )
     per_unit = float(found["size"]) * out.factor / measured.factor
-    return Unit(measured.si, logged.factor / per_unit, measured.quantity)
+    return Unit(measured.si, output_unit.factor / per_unit, measured.quantity)

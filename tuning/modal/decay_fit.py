@@ -3,23 +3,23 @@
 import numpy as np
 from scipy.stats import t as student
 
-from tuning.modal.decay_poles import Poles, Spectrum, find_poles, refine, transform
-from tuning.modal.result import Findings, Mode, reason_against
-from tuning.modal.window import in_band
+from tuning.modal.decay_poles import PoleFit, Spectrum, band_spectrum, find_poles, refine
+from tuning.modal.result import IdentifiedMode, ModeCandidates, rejection_reason
+from tuning.modal.window import band_pass
 
-LEAST_BINS = 8
-PARTS = 16  # of a window; the first is cut while the rest does not predict it
-LATE = 0.3
-UNPREDICTED = 0.5  # share of the energy
-STRONGEST = 6  # modes that predict
+MIN_BINS = 8
+TRIM_PARTS = 16  # of a window; the first is cut while the rest does not predict it
+LATE_START_SHARE = 0.3
+MAX_UNPREDICTED_ENERGY = 0.5  # share of the energy
+MAX_PREDICTING_MODES = 6  # modes that predict
 # A true mode is found again, within this many standard deviations, in parts of the window.
-LASTING = 4.0
-SHORTER = 0.2
-WEAK = 0.2  # share of the strongest mode's energy
-LOST = "not the same in parts of the window"
+MAX_POLE_SHIFT_SD = 4.0
+SHORTER_WINDOW_CUT = 0.2
+WEAK_ENERGY_SHARE = 0.2  # share of the strongest mode's energy
+NOT_REPRODUCED = "not the same in parts of the window"
 
 
-def fit_decay(values, rate: float, start: int, stop: int, band) -> Findings | None:
+def fit_decay(values, rate: float, start: int, stop: int, band) -> ModeCandidates | None:
     """Identify modes from the free decay between two samples of a log (values: time, channel).
 
     A mode must be found again in the window without its first and without its last fifth; how
@@ -27,68 +27,80 @@ def fit_decay(values, rate: float, start: int, stop: int, band) -> Findings | No
     frequency and damping depend a little on amplitude). None where the band has too few
     frequencies.
     """
-    spectrum = transform(values[start:stop], rate, band)
-    if spectrum.bins.size < LEAST_BINS:
+    spectrum = band_spectrum(values[start:stop], rate, band)
+    if spectrum.bins.size < MIN_BINS:
         return None
     found = find_poles(spectrum)
-    cut = int(SHORTER * (stop - start))
-    shorter = [
-        transform(values[first:last], rate, band)
+    cut = int(SHORTER_WINDOW_CUT * (stop - start))
+    shorter_spectra = [
+        band_spectrum(values[first:last], rate, band)
         for first, last in ((start + cut, stop), (start, stop - cut))
     ]
-    others = [_again(found, spectrum, other) for other in shorter]
-    modes = _modes(found, _scatter(found, others), spectrum)
-    reasons = [reason_against(mode, spectrum.duration, band) for mode in modes]
-    lost = _lost(found, others, spectrum)
-    return Findings(
+    shorter_fits = [_refit(found, spectrum, other) for other in shorter_spectra]
+    modes = _identified_modes(found, _nonstationary_variance(found, shorter_fits), spectrum)
+    reasons = [rejection_reason(mode, spectrum.duration, band) for mode in modes]
+    not_reproduced = _not_reproduced(found, shorter_fits, spectrum)
+    return ModeCandidates(
         modes=modes,
-        reasons=tuple(
-            why or (LOST if gone else "") for gone, why in zip(lost, reasons, strict=True)
+        rejection_reasons=tuple(
+            why or (NOT_REPRODUCED if gone else "")
+            for gone, why in zip(not_reproduced, reasons, strict=True)
         ),
         start=start,
         stop=stop,
-        quantile=float(student.ppf(0.975, max(found.freedom, 3.0))),
-        measured=in_time(found.model + found.residual, spectrum),
-        fitted=in_time(found.model, spectrum),
+        quantile=float(student.ppf(0.975, max(found.degrees_of_freedom, 3.0))),
+        measured=inverse_transform(found.model + found.residual, spectrum),
+        fitted=inverse_transform(found.model, spectrum),
     )
 
 
-def free_part(values, rate: float, start: int, stop: int, band) -> tuple[int, int]:
+def trim_to_free_decay(values, rate: float, start: int, stop: int, band) -> tuple[int, int]:
     """The samples around a decay, roughly known, in which its modes predict what is measured.
 
     The beginning is cut, in coarse steps and then in fine ones, while the modes of the later part
     do not predict it backwards: there something still excites the structure. The end is moved on
     while they predict what follows.
     """
-    for part in (max((stop - start) // PARTS, 1), max((stop - start) // (4 * PARTS), 1)):
-        while stop - start > PARTS // 2 * part:
-            late = start + int(LATE * (stop - start))
-            if _unpredicted(values, rate, (late, stop), (start, start + part), band) < UNPREDICTED:
+    for part in (max((stop - start) // TRIM_PARTS, 1), max((stop - start) // (4 * TRIM_PARTS), 1)):
+        while stop - start > TRIM_PARTS // 2 * part:
+            late = start + int(LATE_START_SHARE * (stop - start))
+            if (
+                _unpredicted_energy(values, rate, (late, stop), (start, start + part), band)
+                < MAX_UNPREDICTED_ENERGY
+            ):
                 break
             start += part
-    part = max((stop - start) // PARTS, 1)
+    part = max((stop - start) // TRIM_PARTS, 1)
     while stop + part <= len(values):
-        if _unpredicted(values, rate, (start, stop), (stop, stop + part), band) > UNPREDICTED:
+        if (
+            _unpredicted_energy(values, rate, (start, stop), (stop, stop + part), band)
+            > MAX_UNPREDICTED_ENERGY
+        ):
             break
         stop += part
     return start, stop
 
 
-def _unpredicted(values, rate, known, wanted, band) -> float:
-    """Share of the energy of the samples `wanted` that modes of the samples `known` do not make."""
-    spectrum = transform(values[known[0] : known[1]], rate, band)
-    if spectrum.bins.size < LEAST_BINS:
+def _unpredicted_energy(values, rate, fitted_range, predicted_range, band) -> float:
+    """Share of the energy of the samples `predicted_range` that modes of the samples `fitted_range` do not make."""
+    spectrum = band_spectrum(values[fitted_range[0] : fitted_range[1]], rate, band)
+    if spectrum.bins.size < MIN_BINS:
         return 0.0
-    found = find_poles(spectrum, most=STRONGEST)
-    times = (np.arange(*wanted) - known[0]) / rate
+    found = find_poles(spectrum, max_modes=MAX_PREDICTING_MODES)
+    times = (np.arange(*predicted_range) - fitted_range[0]) / rate
     predicted = (np.exp(np.multiply.outer(times, found.poles)) @ found.amplitudes).real
     # Filtered with what follows, if anything does, for a filter is unsure at the ends.
-    first, last = min(known[0], wanted[0]), max(known[1], 2 * wanted[1] - wanted[0])
-    measured = in_band(values[first:last], rate, band)[wanted[0] - first : wanted[1] - first]
+    first, last = (
+        min(fitted_range[0], predicted_range[0]),
+        max(fitted_range[1], 2 * predicted_range[1] - predicted_range[0]),
+    )
+    measured = band_pass(values[first:last], rate, band)[
+        predicted_range[0] - first : predicted_range[1] - first
+    ]
     return float(np.sum((measured - predicted) ** 2) / np.sum(measured**2))
 
 
-def in_time(values, spectrum: Spectrum):
+def inverse_transform(values, spectrum: Spectrum):
     """Samples (sample, channel) of the bins of a spectrum."""
     whole = np.zeros((spectrum.samples // 2 + 1, values.shape[1]), complex)
     first = round(spectrum.bins[0] * spectrum.duration)
@@ -96,7 +108,7 @@ def in_time(values, spectrum: Spectrum):
     return np.fft.irfft(whole, spectrum.samples, axis=0)
 
 
-def _lost(found: Poles, others, spectrum: Spectrum):
+def _not_reproduced(found: PoleFit, others, spectrum: Spectrum):
     """Tell which poles are not the same in shorter windows; the strongest are in any case.
 
     A weak pole beside a strong one often makes up for what is not linear in the strong one: it
@@ -105,25 +117,25 @@ def _lost(found: Poles, others, spectrum: Spectrum):
     moved = np.zeros(found.poles.size)
     for other in others:
         deviation = np.sqrt(np.diag(found.covariance) + np.diag(other.covariance))
-        change = np.abs(_pairs(other.poles) - _pairs(found.poles)) / deviation
+        change = np.abs(_pole_parameters(other.poles) - _pole_parameters(found.poles)) / deviation
         moved = np.maximum(moved, np.max(change.reshape(-1, 2), axis=1))
         moved[other.poles.real > 0] = np.inf
-    share = _shares(found, spectrum)
-    return (moved > LASTING) & (share < WEAK * np.max(share, initial=0.0))
+    share = _energy_shares(found, spectrum)
+    return (moved > MAX_POLE_SHIFT_SD) & (share < WEAK_ENERGY_SHARE * np.max(share, initial=0.0))
 
 
-def _again(found: Poles, spectrum: Spectrum, other: Spectrum) -> Poles:
+def _refit(found: PoleFit, spectrum: Spectrum, other: Spectrum) -> PoleFit:
     """The same poles refined on another window, with the noise level of the first."""
     levels = [np.interp(other.bins, spectrum.bins, level) for level in found.noise.T]
     return refine(found.poles, other, np.stack(levels, 1) * other.samples / spectrum.samples)
 
 
-def _pairs(poles):
+def _pole_parameters(poles):
     """(s, w) of each pole, in the order of its covariance."""
     return np.stack([-poles.real, poles.imag], axis=1).ravel()
 
 
-def _scatter(found: Poles, others):
+def _nonstationary_variance(found: PoleFit, others):
     """Variance of each of (s, w, ...) over the window, beyond what noise explains.
 
     As if they were spread evenly over the range seen: a third of the square of half the range.
@@ -131,36 +143,40 @@ def _scatter(found: Poles, others):
     extra = np.zeros(2 * found.poles.size)
     for other in others:
         expected = np.maximum(np.diag(other.covariance) - np.diag(found.covariance), 0)
-        change = (_pairs(other.poles) - _pairs(found.poles)) ** 2
+        change = (_pole_parameters(other.poles) - _pole_parameters(found.poles)) ** 2
         extra += np.where(change > 4 * expected, change - expected, 0) / 3 / len(others)
     return extra
 
 
-def _shares(found: Poles, spectrum: Spectrum):
+def _energy_shares(found: PoleFit, spectrum: Spectrum):
     """Share of each mode in the energy of the samples, the channels' energies added."""
     rates = 2 * -found.poles.real * spectrum.duration
-    lasting = np.where(np.abs(rates) < 1e-6, 1.0, -np.expm1(-rates) / np.where(rates, rates, 1))
-    energies = 0.5 * np.sum(np.abs(found.amplitudes) ** 2, axis=1) * lasting
+    decay_factor = np.where(
+        np.abs(rates) < 1e-6, 1.0, -np.expm1(-rates) / np.where(rates, rates, 1)
+    )
+    energies = 0.5 * np.sum(np.abs(found.amplitudes) ** 2, axis=1) * decay_factor
     total = 2 * np.sum(np.abs(found.model + found.residual) ** 2) / spectrum.samples**2
     return energies / total
 
 
-def _modes(found: Poles, scatter, spectrum: Spectrum) -> tuple[Mode, ...]:
+def _identified_modes(found: PoleFit, scatter, spectrum: Spectrum) -> tuple[IdentifiedMode, ...]:
     """Frequency and damping of each pole, |p| / 2 pi and s / |p|, with standard deviations."""
     modes = []
-    for k, (pole, share) in enumerate(zip(found.poles, _shares(found, spectrum), strict=True)):
+    for k, (pole, share) in enumerate(
+        zip(found.poles, _energy_shares(found, spectrum), strict=True)
+    ):
         covariance = found.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
         covariance = covariance + np.diag(scatter[2 * k : 2 * k + 2])
-        rate, turn, size = -pole.real, pole.imag, abs(pole)
-        by_frequency = np.array([rate, turn]) / size / (2 * np.pi)
-        by_damping = np.array([turn**2, -rate * turn]) / size**3
+        rate, angular_frequency, size = -pole.real, pole.imag, abs(pole)
+        by_frequency = np.array([rate, angular_frequency]) / size / (2 * np.pi)
+        by_damping = np.array([angular_frequency**2, -rate * angular_frequency]) / size**3
         modes.append(
-            Mode(
+            IdentifiedMode(
                 frequency=float(size / (2 * np.pi)),
                 frequency_sd=float(np.sqrt(by_frequency @ covariance @ by_frequency)),
                 damping_ratio=float(rate / size),
                 damping_sd=float(np.sqrt(by_damping @ covariance @ by_damping)),
-                share=float(share),
+                energy_share=float(share),
             )
         )
     return tuple(modes)

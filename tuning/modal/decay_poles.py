@@ -20,18 +20,18 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import least_squares
 
-SMOOTHING = 12  # bins on either side over which the level of the noise is averaged
-MOST_MODES = 24
+NOISE_SMOOTHING_BINS = 12  # bins on either side over which the level of the noise is averaged
+MAX_MODES = 24
 # A mode of C channels has 2 C + 2 numbers; chance must not find one in hundreds of logs, though
 # it may look for it at every bin.
-CHANCE = 1e-4
+FALSE_ALARM_PROBABILITY = 1e-4
 # No real structure is linear to the last digit, so that beside a strong mode its own misfit looks
 # like weak ones: what is below this share of the amplitudes nearby is not taken for a mode.
-MISFIT = 0.1
-NEARBY = 2  # bins
-ROUGHLY = 1e-3  # accuracy while modes are counted
-REACH = 1.5  # bins that a pole may move in one refinement
-TREND_ORDER = 3
+NONLINEARITY_SHARE = 0.1
+NEARBY_BINS = 2  # bins
+COARSE_TOLERANCE = 1e-3  # accuracy while modes are counted
+MAX_POLE_SHIFT_BINS = 1.5  # bins that a pole may move in one refinement
+DRIFT_ORDER = 3
 LEAKAGE_ORDER = 2
 
 
@@ -49,13 +49,13 @@ class Spectrum(NamedTuple):
         return self.samples * self.step
 
 
-class Poles(NamedTuple):
+class PoleFit(NamedTuple):
     """Poles found in a spectrum, with what is left when they are fitted.
 
     `poles` (mode,) in 1/s, upper half plane, ascending; `covariance` is that of all -real and
     imaginary parts, (s_1, w_1, s_2, w_2, ...); `amplitudes` (mode, channel) at the start of the
     window; `model` is the modes' part of the spectrum and `residual` what nothing explains;
-    `freedom` the degrees of freedom of the noise level, for intervals.
+    `degrees_of_freedom` the degrees of freedom of the noise level, for intervals.
     """
 
     poles: Complex[np.ndarray, " mode"]
@@ -64,10 +64,10 @@ class Poles(NamedTuple):
     model: Complex[np.ndarray, "bin channel"]
     residual: Complex[np.ndarray, "bin channel"]
     noise: Float[np.ndarray, "bin channel"]
-    freedom: float
+    degrees_of_freedom: float
 
 
-def transform(
+def band_spectrum(
     values: Float[np.ndarray, "time channel"], rate: float, band: tuple[float, float]
 ) -> Spectrum:
     """Transform samples taken at `rate` (Hz); keep the bins of a band (Hz), zero excluded."""
@@ -78,40 +78,55 @@ def transform(
     return Spectrum(bins[keep], np.fft.rfft(values, axis=0)[keep], count, 1 / rate)
 
 
-def find_poles(spectrum: Spectrum, most: int = MOST_MODES) -> Poles:
-    """Find the poles, `most` at most, that a free decay's spectrum shows beyond chance."""
+def find_poles(spectrum: Spectrum, max_modes: int = MAX_MODES) -> PoleFit:
+    """Find the poles, `max_modes` at most, that a free decay's spectrum shows beyond chance."""
     channels = spectrum.values.shape[1]
     # Chi-square tail: half the drop in weighted squares is what the likelihood gains.
-    tries = 4 * spectrum.bins.size
-    worth = channels + 1 + np.log(tries / CHANCE) + np.sqrt(2 * (channels + 1) * np.log(tries))
-    best = _fit(np.zeros(0, complex), spectrum, _robust_level(spectrum.values))
-    floor = MISFIT**2 * _smooth(np.abs(spectrum.values) ** 2, NEARBY) / (2 * NEARBY + 1)
-    while best.poles.size < min(most, spectrum.bins.size // 4):
-        level = _robust_level(best.residual) + floor
-        guess = _guess(spectrum, best.residual, level)
-        trial = refine(np.append(best.poles, guess), spectrum, level, ROUGHLY)
-        if _misfit(best.residual, level) - _misfit(trial.residual, level) < worth:
+    trials = 4 * spectrum.bins.size
+    min_gain = (
+        channels
+        + 1
+        + np.log(trials / FALSE_ALARM_PROBABILITY)
+        + np.sqrt(2 * (channels + 1) * np.log(trials))
+    )
+    best = _fit_amplitudes(np.zeros(0, complex), spectrum, _robust_level(spectrum.values))
+    misfit_level = (
+        NONLINEARITY_SHARE**2
+        * _smooth(np.abs(spectrum.values) ** 2, NEARBY_BINS)
+        / (2 * NEARBY_BINS + 1)
+    )
+    while best.poles.size < min(max_modes, spectrum.bins.size // 4):
+        level = _robust_level(best.residual) + misfit_level
+        guess = _initial_pole(spectrum, best.residual, level)
+        trial = refine(np.append(best.poles, guess), spectrum, level, COARSE_TOLERANCE)
+        if (
+            _weighted_squares(best.residual, level) - _weighted_squares(trial.residual, level)
+            < min_gain
+        ):
             break
         best = trial
-    best = _without_needless(best, spectrum, floor, worth)
+    best = _prune_poles(best, spectrum, misfit_level, min_gain)
     for _ in range(2):
         best = refine(best.poles, spectrum, best.noise)
     return best
 
 
-def _without_needless(best: Poles, spectrum: Spectrum, floor, worth: float) -> Poles:
+def _prune_poles(best: PoleFit, spectrum: Spectrum, misfit_level, min_gain: float) -> PoleFit:
     """Take out again, weakest first, the poles that the others have made needless."""
-    level = _robust_level(best.residual) + floor
+    level = _robust_level(best.residual) + misfit_level
     best = refine(best.poles, spectrum, level)
     for pole in best.poles[np.argsort(np.sum(np.abs(best.amplitudes), axis=1))]:
         nearest = int(np.argmin(np.abs(best.poles - pole)))
-        trial = refine(np.delete(best.poles, nearest), spectrum, level, ROUGHLY)
-        if _misfit(trial.residual, level) - _misfit(best.residual, level) < worth:
+        trial = refine(np.delete(best.poles, nearest), spectrum, level, COARSE_TOLERANCE)
+        if (
+            _weighted_squares(trial.residual, level) - _weighted_squares(best.residual, level)
+            < min_gain
+        ):
             best = trial
     return best
 
 
-def _misfit(residual, level) -> float:
+def _weighted_squares(residual, level) -> float:
     return float(np.sum(np.abs(residual) ** 2 / level))
 
 
@@ -125,45 +140,48 @@ def _smooth(power, width):
 def _robust_level(residual):
     """Level of the noise at each bin, from medians so that a mode not yet found stands out."""
     power = np.abs(residual) ** 2
-    width = min(2 * SMOOTHING, len(power) // 2)
+    width = min(2 * NOISE_SMOOTHING_BINS, len(power) // 2)
     padded = np.pad(power, ((width, width), (0, 0)), mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * width + 1, axis=0)
     return np.median(windows, axis=-1) / np.log(2) + 1e-30 * power.max()
 
 
-def _guess(spectrum: Spectrum, residual, level) -> complex:
+def _initial_pole(spectrum: Spectrum, residual, level) -> complex:
     """The pole that alone explains most of a residual, of a few at and beside its highest peaks."""
     ratio = np.sum(np.abs(residual) ** 2 / level, axis=1, keepdims=True)
     shares = [_smooth(ratio, width)[:, 0] / np.sqrt(2 * width + 1) for width in (0, 2, 8)]
     peaks = spectrum.bins[[int(np.argmax(share)) for share in shares]]
     spacing = 1 / spectrum.duration
-    places = np.add.outer(peaks, spacing * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])).ravel()
+    frequencies = np.add.outer(peaks, spacing * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])).ravel()
     rates = spacing * np.array([0.1, 0.5, 1.5, 4.0, 10.0, 30.0])
-    poles = np.subtract.outer(2j * np.pi * places[places > 0], rates).ravel()
-    columns, _ = _series(poles, spectrum)
+    poles = np.subtract.outer(2j * np.pi * frequencies[frequencies > 0], rates).ravel()
+    columns, _ = _pole_transform(poles, spectrum)
     match = np.abs(columns.conj().T @ (residual / level)) ** 2
     gain = np.sum(match / ((np.abs(columns) ** 2).T @ (1 / level)), axis=1)
     return poles[int(np.argmax(gain))]
 
 
-def _series(poles, spectrum: Spectrum):
+def _pole_transform(poles, spectrum: Spectrum):
     """The closed-form transform of exp(p t) at every bin, and its derivative by p."""
-    turn = (poles - 2j * np.pi * spectrum.bins[:, None]) * spectrum.step
+    exponents = (poles - 2j * np.pi * spectrum.bins[:, None]) * spectrum.step
     # exp(-i w N h) is 1 at every bin. A pole on a bin, undamped, would divide zero by zero.
-    turn = np.where(np.abs(turn) < 1e-12, 1e-12, turn)
-    top, bottom = np.expm1(spectrum.samples * turn), np.expm1(turn)
-    slope = spectrum.samples * (top + 1) / bottom - top * (bottom + 1) / bottom**2
-    return top / bottom, spectrum.step * slope
+    exponents = np.where(np.abs(exponents) < 1e-12, 1e-12, exponents)
+    numerator, denominator = np.expm1(spectrum.samples * exponents), np.expm1(exponents)
+    slope = (
+        spectrum.samples * (numerator + 1) / denominator
+        - numerator * (denominator + 1) / denominator**2
+    )
+    return numerator / denominator, spectrum.step * slope
 
 
-def _nuisance(spectrum: Spectrum):
+def _nuisance_columns(spectrum: Spectrum):
     """What is no mode: a drift over the window, and leakage from modes outside the band."""
     time = np.linspace(-1, 1, spectrum.samples)
-    every = np.fft.rfftfreq(spectrum.samples, spectrum.step)
-    first = int(np.argmin(np.abs(every - spectrum.bins[0])))
+    all_bins = np.fft.rfftfreq(spectrum.samples, spectrum.step)
+    first = int(np.argmin(np.abs(all_bins - spectrum.bins[0])))
     drifts = [
         np.fft.rfft(np.polynomial.Legendre.basis(order)(time))[first : first + spectrum.bins.size]
-        for order in range(1, TREND_ORDER + 1)
+        for order in range(1, DRIFT_ORDER + 1)
     ]
     across = np.linspace(-1, 1, spectrum.bins.size)
     leakage = [across**order * unit for order in range(LEAKAGE_ORDER + 1) for unit in (1, 1j)]
@@ -173,20 +191,22 @@ def _nuisance(spectrum: Spectrum):
 
 def _modal_columns(poles, spectrum: Spectrum):
     """Columns of the real and imaginary part of each amplitude, and their slopes by s and w."""
-    above, slope_above = _series(poles, spectrum)
-    below, slope_below = _series(poles.conj(), spectrum)
+    above, slope_above = _pole_transform(poles, spectrum)
+    below, slope_below = _pole_transform(poles.conj(), spectrum)
     columns = np.stack([above + below, 1j * (above - below)], axis=-1) / 2
     by_rate = -np.stack([slope_above + slope_below, 1j * (slope_above - slope_below)], axis=-1) / 2
-    by_turn = np.stack([1j * (slope_above - slope_below), -(slope_above + slope_below)], -1) / 2
-    return columns, np.stack([by_rate, by_turn], axis=2)
+    by_frequency = (
+        np.stack([1j * (slope_above - slope_below), -(slope_above + slope_below)], -1) / 2
+    )
+    return columns, np.stack([by_rate, by_frequency], axis=2)
 
 
-def _stack(columns):
+def _real_over_imag(columns):
     """Real and imaginary parts under each other."""
     return np.concatenate([columns.real, columns.imag])
 
 
-def _project(poles, spectrum: Spectrum, weights, nuisance):
+def _project_amplitudes(poles, spectrum: Spectrum, weights, nuisance):
     """Weighted residual with the best amplitudes, its Jacobian, amplitudes, and leverages."""
     columns, slopes = _modal_columns(poles, spectrum)
     bins, count = columns.shape[0], poles.size
@@ -194,28 +214,28 @@ def _project(poles, spectrum: Spectrum, weights, nuisance):
     size = np.linalg.norm(design, axis=0)
     residuals, jacobians, solutions, leverages = [], [], [], []
     for values, weight in zip(spectrum.values.T, weights.T, strict=True):
-        basis, triangle = np.linalg.qr(_stack(design / size * weight[:, None]))
-        data = _stack(values * weight)
+        basis, r_factor = np.linalg.qr(_real_over_imag(design / size * weight[:, None]))
+        data = _real_over_imag(values * weight)
         fitted = basis.T @ data
-        solution = np.linalg.lstsq(triangle, fitted, rcond=1e-12)[0] / size
-        bent = np.einsum("jkpr,kr->jkp", slopes, solution[: 2 * count].reshape(count, 2))
-        bent = _stack(bent.reshape(bins, 2 * count) * weight[:, None])
+        solution = np.linalg.lstsq(r_factor, fitted, rcond=1e-12)[0] / size
+        slope_columns = np.einsum("jkpr,kr->jkp", slopes, solution[: 2 * count].reshape(count, 2))
+        slope_columns = _real_over_imag(slope_columns.reshape(bins, 2 * count) * weight[:, None])
         residuals.append(data - basis @ fitted)
-        jacobians.append(basis @ (basis.T @ bent) - bent)
+        jacobians.append(basis @ (basis.T @ slope_columns) - slope_columns)
         solutions.append(solution)
         leverages.append(np.sum(basis**2, axis=1).reshape(2, bins).sum(axis=0))
     model = columns.reshape(bins, 2 * count) @ np.array(solutions).T[: 2 * count]
     return np.array(residuals), np.array(jacobians), np.array(solutions), model, leverages
 
 
-def _parameters(poles, duration):
+def _pole_parameters(poles, duration):
     """(s, w) of each pole times the duration: numbers of order one change a spectrum."""
     return np.stack([-poles.real, poles.imag], axis=1).ravel() * duration
 
 
-def _poles(parameters, duration):
-    rate, turn = parameters.reshape(-1, 2).T / duration
-    return -rate + 1j * turn
+def _poles_from_parameters(parameters, duration):
+    rate, angular_frequency = parameters.reshape(-1, 2).T / duration
+    return -rate + 1j * angular_frequency
 
 
 def refine(
@@ -223,70 +243,72 @@ def refine(
     spectrum: Spectrum,
     level: Float[np.ndarray, "bin channel"],
     accuracy: float = 1e-8,
-) -> Poles:
+) -> PoleFit:
     """Refine all poles together by least squares weighted by a level of the noise.
 
     It ends when a step gains less than the share `accuracy` of the squares left.
     """
     if poles.size:
-        duration, nuisance, weights = spectrum.duration, _nuisance(spectrum), level**-0.5
+        duration, nuisance, weights = spectrum.duration, _nuisance_columns(spectrum), level**-0.5
 
-        start = _parameters(poles, duration)
+        start = _pole_parameters(poles, duration)
 
         @functools.lru_cache(maxsize=1)
         def projected(key):
             moved = start + np.frombuffer(key)
-            return _project(_poles(moved, duration), spectrum, weights, nuisance)
+            return _project_amplitudes(
+                _poles_from_parameters(moved, duration), spectrum, weights, nuisance
+            )
 
         # A pole stays near where it was seen: joint fits of many weak ones would wander. Moves,
         # not parameters, are the unknowns, as the solver's trust region goes by their size.
-        reach = np.tile([np.inf, 2 * np.pi * REACH], poles.size)
-        least = np.tile([-1.0, 0.0], poles.size) - start
+        max_shift = np.tile([np.inf, 2 * np.pi * MAX_POLE_SHIFT_BINS], poles.size)
+        lower_bounds = np.tile([-1.0, 0.0], poles.size) - start
         solved = least_squares(
             lambda moves: projected(moves.tobytes())[0].ravel(),
-            np.maximum(np.zeros_like(start), least + 1e-9),
+            np.maximum(np.zeros_like(start), lower_bounds + 1e-9),
             lambda moves: projected(moves.tobytes())[1].reshape(-1, moves.size) / duration,
-            (np.maximum(-reach, least), reach),
+            (np.maximum(-max_shift, lower_bounds), max_shift),
             ftol=accuracy,
             xtol=1e-8,
             max_nfev=40,
         )
-        poles = _poles(start + solved.x, duration)
+        poles = _poles_from_parameters(start + solved.x, duration)
         poles = np.where(poles.imag < 0, poles.conj(), poles)
         poles = poles[np.argsort(poles.imag)]
-    return _fit(poles, spectrum, level)
+    return _fit_amplitudes(poles, spectrum, level)
 
 
-def _fit(poles, spectrum: Spectrum, level) -> Poles:
+def _fit_amplitudes(poles, spectrum: Spectrum, level) -> PoleFit:
     """Amplitudes, noise level and covariance at given poles."""
     bins, channels = spectrum.values.shape
-    stacked, slopes, solutions, model, leverages = _project(
-        poles, spectrum, level**-0.5, _nuisance(spectrum)
+    stacked, slopes, solutions, model, leverages = _project_amplitudes(
+        poles, spectrum, level**-0.5, _nuisance_columns(spectrum)
     )
     weighted = (stacked[:, :bins] + 1j * stacked[:, bins:]).T  # bin, channel
     slopes = slopes[:, :bins] + 1j * slopes[:, bins:]  # channel, bin, parameter
     normal = np.einsum("cjp,cjq->pq", slopes.conj(), slopes).real
     inverse = np.linalg.pinv(normal, hermitian=True) if poles.size else normal
-    taken = np.array(leverages).T  # of the two real numbers of each bin and channel
-    taken = taken + np.einsum("cjp,pq,cjq->jc", slopes.conj(), inverse, slopes).real
-    left = np.maximum(2 - taken, 0.02) / 2
-    count = _smooth(left, SMOOTHING)
+    leverage = np.array(leverages).T  # of the two real numbers of each bin and channel
+    leverage = leverage + np.einsum("cjp,pq,cjq->jc", slopes.conj(), inverse, slopes).real
+    residual_share = np.maximum(2 - leverage, 0.02) / 2
+    count = _smooth(residual_share, NOISE_SMOOTHING_BINS)
     # Not the weighted residual is averaged: that would keep the shape of the level assumed.
     # Channels share disturbances, so their noise is correlated: score covariance from the local
     # cross-spectra of the residual, then the sandwich.
     residual = weighted * np.sqrt(level)
-    cross = _smooth(np.einsum("jc,jd->jcd", residual, residual.conj()), SMOOTHING)
+    cross = _smooth(np.einsum("jc,jd->jcd", residual, residual.conj()), NOISE_SMOOTHING_BINS)
     cross = cross / np.sqrt(count[:, :, None] * count[:, None, :])
     noise = np.einsum("jcc->jc", cross).real + 1e-30 * np.max(np.abs(spectrum.values)) ** 2
     cross = cross / np.sqrt(level[:, :, None] * level[:, None, :])
     score = np.einsum("cjp,jcd,djq->pq", slopes.conj(), cross, slopes).real / 2
     pairs = solutions[:, : 2 * poles.size].reshape(channels, poles.size, 2)
-    return Poles(
+    return PoleFit(
         poles=poles,
         covariance=inverse @ score @ inverse,
         amplitudes=(pairs[..., 0] + 1j * pairs[..., 1]).T,
         model=model,
         residual=residual,
         noise=noise,
-        freedom=float(2 * np.median(count)),
+        degrees_of_freedom=float(2 * np.median(count)),
     )

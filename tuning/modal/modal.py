@@ -16,14 +16,14 @@ from jaxtyping import Float
 
 from tuning.logs.log import Log
 from tuning.modal.ambient import fit_ambient
-from tuning.modal.decay_fit import fit_decay, free_part
-from tuning.modal.result import Findings, Mode
-from tuning.modal.window import MOST, energy_band, find_decay
+from tuning.modal.decay_fit import fit_decay, trim_to_free_decay
+from tuning.modal.result import IdentifiedMode, ModeCandidates
+from tuning.modal.window import DECAY_ENERGY_SHARE, energy_band, find_decay
 
-LEAST_SAMPLES = 64
+MIN_SAMPLES = 64
 # What the log is taken for: in steady random vibration, too, a few cycles look like a decay.
-DECAY_CYCLES = 10.0
-UNEXPLAINED = 0.25  # of the energy
+MIN_DECAY_CYCLES = 10.0
+MAX_RESIDUAL_ENERGY = 0.25  # of the energy
 KINDS = ("free decay", "ambient")
 
 
@@ -38,8 +38,8 @@ class ModalFit:
     and, for a free decay, what the modes make of it.
     """
 
-    modes: tuple[Mode, ...]
-    rejected: tuple[tuple[Mode, str], ...]
+    modes: tuple[IdentifiedMode, ...]
+    rejected: tuple[tuple[IdentifiedMode, str], ...]
     kind: str
     window: tuple[float, float]
     band: tuple[float, float]
@@ -86,7 +86,7 @@ class ModalFit:
             lines.append(
                 f"  {mode.frequency:14.4f}  {self.quantile * mode.frequency_sd:7.4f}    "
                 f"{mode.damping_ratio:13.5f}  {self.quantile * mode.damping_sd:7.5f}    "
-                f"{100 * mode.share:5.1f} %"
+                f"{100 * mode.energy_share:5.1f} %"
             )
         if self.rejected:
             lines.append("  not well identified:")
@@ -111,7 +111,7 @@ class ModalFit:
                     "damping_ratio": mode.damping_ratio,
                     "damping_sd": mode.damping_sd,
                     "damping_95": damping.tolist(),
-                    "energy_share": mode.share,
+                    "energy_share": mode.energy_share,
                 }
                 for mode, frequency, damping in intervals
             ],
@@ -139,42 +139,46 @@ def identify_modes(
     """Identify modes from a log of unknown excitation.
 
     `window` (s) is the part of the log to use, found where left out; `band` (Hz) the range of
-    frequencies, by default the one with the kinetic energy; `count` keeps so many modes, those
+    frequencies, by default the one with the kinetic energy; `count_verdicts` keeps so many modes, those
     with most energy; `kind` is "free decay" or "ambient", by default whichever the log shows.
 
     Raises ValueError for a log that is not sampled evenly or is too short, a window outside the
     log, a band above half the sampling rate, a count below one and an unknown kind.
     """
     rate = log.sample_rate
-    start, stop = _samples(log, window)
-    _check(log, rate, band, count, kind, stop - start)
+    start, stop = _sample_range(log, window)
+    _check_arguments(log, rate, band, count, kind, stop - start)
     found = None
     if kind != "ambient":
-        found, limits = _decay(log, rate, start, stop, window, band)
+        found, used_band = _fit_free_decay(log, rate, start, stop, window, band)
         if (
             found is not None
             and kind is None
-            and not _explains(found, rate, DECAY_CYCLES if window is None else 0.0)
+            and not _is_free_decay(found, rate, MIN_DECAY_CYCLES if window is None else 0.0)
         ):
             found = None
-    decays = found is not None
-    if kind == "free decay" and not decays:
+    is_decay = found is not None
+    if kind == "free decay" and not is_decay:
         raise ValueError(f"{log.source}: no free decay found; give its window, or kind='ambient'")
-    if not decays:
-        limits = band or energy_band(log.values[start:stop], rate, log.quantities)
-        found = fit_ambient(log.values, rate, start, stop, limits, log.quantities)
-    modes = [mode for mode, why in zip(found.modes, found.reasons, strict=True) if not why]
-    against = [(mode, why) for mode, why in zip(found.modes, found.reasons, strict=True) if why]
-    modes.sort(key=lambda mode: -mode.share)
+    if not is_decay:
+        used_band = band or energy_band(log.values[start:stop], rate, log.quantities)
+        found = fit_ambient(log.values, rate, start, stop, used_band, log.quantities)
+    modes = [
+        mode for mode, why in zip(found.modes, found.rejection_reasons, strict=True) if not why
+    ]
+    rejected = [
+        (mode, why) for mode, why in zip(found.modes, found.rejection_reasons, strict=True) if why
+    ]
+    modes.sort(key=lambda mode: -mode.energy_share)
     if count is not None:
-        against += [(mode, f"not among the {count} of most energy") for mode in modes[count:]]
+        rejected += [(mode, f"not among the {count} of most energy") for mode in modes[count:]]
         modes = modes[:count]
     return ModalFit(
         modes=tuple(sorted(modes)),
-        rejected=tuple(sorted(against)),
-        kind="free decay" if decays else "ambient",
+        rejected=tuple(sorted(rejected)),
+        kind="free decay" if is_decay else "ambient",
         window=(float(log.times[found.start]), float(log.times[found.stop - 1])),
-        band=limits,
+        band=used_band,
         quantile=found.quantile,
         log=log,
         times=log.times[found.start : found.stop],
@@ -183,7 +187,9 @@ def identify_modes(
     )
 
 
-def _decay(log, rate, start, stop, window, band) -> tuple[Findings | None, tuple[float, float]]:
+def _fit_free_decay(
+    log, rate, start, stop, window, band
+) -> tuple[ModeCandidates | None, tuple[float, float]]:
     """Fit the free decay in the given window, or in the one found; and the band used."""
     limits = band or (0.0, rate / 2)
     if window is None:
@@ -191,22 +197,22 @@ def _decay(log, rate, start, stop, window, band) -> tuple[Findings | None, tuple
         if found is None:
             return None, limits
         start, stop = found
-        lasting = energy_band(log.values[start:stop], rate, log.quantities, MOST)
-        start, stop = free_part(log.values, rate, start, stop, band or lasting)
+        decay_band = energy_band(log.values[start:stop], rate, log.quantities, DECAY_ENERGY_SHARE)
+        start, stop = trim_to_free_decay(log.values, rate, start, stop, band or decay_band)
     limits = band or energy_band(log.values[start:stop], rate, log.quantities)
     return fit_decay(log.values, rate, start, stop, limits), limits
 
 
-def _explains(found: Findings, rate: float, least_cycles: float) -> bool:
+def _is_free_decay(found: ModeCandidates, rate: float, least_cycles: float) -> bool:
     """Tell whether modes make most of what was measured, over many cycles, as in a free decay."""
     duration = (found.stop - found.start) / rate
-    left = np.sum((found.measured - found.fitted) ** 2) / np.sum(found.measured**2)
-    good = [mode for mode, why in zip(found.modes, found.reasons, strict=True) if not why]
-    cycles = max(good, key=lambda mode: mode.share).frequency * duration if good else 0.0
-    return bool(cycles > least_cycles and left < UNEXPLAINED)
+    residual_energy = np.sum((found.measured - found.fitted) ** 2) / np.sum(found.measured**2)
+    good = [mode for mode, why in zip(found.modes, found.rejection_reasons, strict=True) if not why]
+    cycles = max(good, key=lambda mode: mode.energy_share).frequency * duration if good else 0.0
+    return bool(cycles > least_cycles and residual_energy < MAX_RESIDUAL_ENERGY)
 
 
-def _samples(log: Log, window) -> tuple[int, int]:
+def _sample_range(log: Log, window) -> tuple[int, int]:
     """First and last (exclusive) sample of a window in s."""
     if window is None:
         return 0, log.times.size
@@ -219,11 +225,11 @@ def _samples(log: Log, window) -> tuple[int, int]:
     return int(start), int(stop)
 
 
-def _check(log: Log, rate, band, count, kind, samples) -> None:
-    if samples < LEAST_SAMPLES:
+def _check_arguments(log: Log, rate, band, count, kind, samples) -> None:
+    if samples < MIN_SAMPLES:
         raise ValueError(
             f"{log.source}: {samples} samples are too few to identify modes from; "
-            f"at least {LEAST_SAMPLES} are needed"
+            f"at least {MIN_SAMPLES} are needed"
         )
     if band is not None and not 0 <= band[0] < band[1] <= rate / 2:
         raise ValueError(

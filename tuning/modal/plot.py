@@ -8,7 +8,7 @@ import numpy as np
 from jaxbeam.case.sensors import QUANTITIES
 
 INK, MODE, FIT, FAINT = "#333333", "#c0392b", "#1f6f8b", "#9aa5ab"
-MOST_POINTS = 4000  # a longer log is drawn as the range of each of so many pieces
+MAX_POINTS = 4000  # a longer log is drawn as the range of each of so many pieces
 
 
 def plot_modes(fit, path: str | Path | None = None):
@@ -26,20 +26,20 @@ def plot_modes(fit, path: str | Path | None = None):
         _draw_fit(rows[2], rows[3], fit, strongest, unit)
     for row in rows:
         row.spines[["top", "right"]].set_visible(False)
-    figure.suptitle(f"{Path(fit.log.source).name}: modes from {_kind(fit)}", color=INK)
+    figure.suptitle(f"{Path(fit.log.source).name}: modes from {_kind_text(fit)}", color=INK)
     if path is not None:
         figure.savefig(path, dpi=150)
     return figure
 
 
-def _kind(fit) -> str:
+def _kind_text(fit) -> str:
     return "a free decay" if fit.fitted is not None else "ambient vibration"
 
 
 def _draw_log(axes, fit, channel, unit):
     """The whole log of one channel, the window marked."""
     times, values = fit.log.times, fit.log.values[:, channel]
-    size = max(times.size // MOST_POINTS, 1)
+    size = max(times.size // MAX_POINTS, 1)
     pieces = values[: times.size // size * size].reshape(-1, size)
     axes.fill_between(
         times[::size][: len(pieces)], pieces.min(axis=1), pieces.max(axis=1),
@@ -76,18 +76,18 @@ def _draw_spectrum(axes, fit, channel, unit):
     axes.set(xlabel="frequency (Hz)", ylabel=f"amplitude ({unit})", xlim=fit.band)
 
 
-def _draw_fit(axes, below, fit, channel, unit):
+def _draw_fit(axes, residual_axes, fit, channel, unit):
     """Measured and fitted decay in the band, and the residual on the same scale."""
     measured, fitted = fit.measured[:, channel], fit.fitted[:, channel]
     axes.plot(fit.times, measured, color=FAINT, linewidth=2.2, label="measured, in the band")
     axes.plot(fit.times, fitted, color=FIT, linewidth=0.9, label="fitted modes")
     axes.legend(frameon=False, loc="upper right", ncols=2)
-    below.plot(fit.times, measured - fitted, color=INK, linewidth=0.8)
+    residual_axes.plot(fit.times, measured - fitted, color=INK, linewidth=0.8)
     left = np.sum((measured - fitted) ** 2) / max(np.sum(measured**2), 1e-300)
-    below.text(
+    residual_axes.text(
         0.995, 0.97, f"residual, {100 * left:.2g} % of the energy", color=INK, va="top",
-        ha="right", transform=below.transAxes,
+        ha="right", transform=residual_axes.transAxes,
     )  # fmt: skip
-    below.set_ylim(np.array(axes.get_ylim()) / 2)
+    residual_axes.set_ylim(np.array(axes.get_ylim()) / 2)
     axes.set(ylabel=f"{fit.log.names[channel]} ({unit})", xlim=fit.window)
-    below.set(xlabel="time (s)", ylabel="residual", xlim=fit.window)
+    residual_axes.set(xlabel="time (s)", ylabel="residual", xlim=fit.window)

@@ -6,36 +6,36 @@ import numpy as np
 from jaxtyping import Float
 
 # A damping ratio whose standard deviation is a larger share of it is not well identified.
-LEAST_CERTAIN = 0.3
-LARGEST_DAMPING = 0.2
-LEAST_CYCLES = 4.0
-LEAST_SHARE = 0.002
-EDGE = 0.98  # a mode nearer to the end of the band may be the flank of one beyond
+MAX_RELATIVE_DAMPING_SD = 0.3
+MAX_DAMPING_RATIO = 0.2
+MIN_CYCLES = 4.0
+MIN_ENERGY_SHARE = 0.002
+MAX_BAND_SHARE = 0.98  # a mode nearer to the end of the band may be the flank of one beyond
 
 
-class Mode(NamedTuple):
+class IdentifiedMode(NamedTuple):
     """A mode, or what looked like one: frequency in Hz, damping ratio, their standard deviations.
 
-    `frequency` is the undamped natural one; `share` is that of the energy of the log in the band.
+    `frequency` is the undamped natural one; `energy_share` is that of the energy of the log in the band.
     """
 
     frequency: float
     frequency_sd: float
     damping_ratio: float
     damping_sd: float
-    share: float
+    energy_share: float
 
 
-class Findings(NamedTuple):
+class ModeCandidates(NamedTuple):
     """Candidate modes with the reason against each (empty: none), and what they were found in.
 
-    `start` and `stop` are the samples used; `quantile` times a standard deviation is half a 95 %
+    `initial_law` and `stop` are the samples used; `quantile` times a standard deviation is half a 95 %
     interval; `measured` and `fitted` (sample, channel) the band's part of the log and of the fit
     (None where there is no fit in time).
     """
 
-    modes: tuple[Mode, ...]
-    reasons: tuple[str, ...]
+    modes: tuple[IdentifiedMode, ...]
+    rejection_reasons: tuple[str, ...]
     start: int
     stop: int
     quantile: float
@@ -43,18 +43,18 @@ class Findings(NamedTuple):
     fitted: Float[np.ndarray, "sample channel"] | None
 
 
-def reason_against(mode: Mode, duration: float, band: tuple[float, float]) -> str:
+def rejection_reason(mode: IdentifiedMode, duration: float, band: tuple[float, float]) -> str:
     """Say why a mode found in `duration` seconds is not well identified; empty if it is."""
-    if not band[0] <= mode.frequency <= EDGE * band[1]:
+    if not band[0] <= mode.frequency <= MAX_BAND_SHARE * band[1]:
         return "at the edge of the band"
     if mode.damping_ratio < 2 * mode.damping_sd:
         return "damping not distinguishable from none: hum, or a mode too weak or too short"
-    if mode.damping_ratio > LARGEST_DAMPING:
+    if mode.damping_ratio > MAX_DAMPING_RATIO:
         return "damped so strongly that it may be no mode"
-    if mode.frequency * duration < LEAST_CYCLES:
+    if mode.frequency * duration < MIN_CYCLES:
         return "too few cycles in the window"
-    if mode.damping_sd > LEAST_CERTAIN * mode.damping_ratio:
+    if mode.damping_sd > MAX_RELATIVE_DAMPING_SD * mode.damping_ratio:
         return f"damping uncertain by {100 * mode.damping_sd / mode.damping_ratio:.0f} %"
-    if mode.share < LEAST_SHARE:
-        return f"{100 * mode.share:.2f} % of the energy"
+    if mode.energy_share < MIN_ENERGY_SHARE:
+        return f"{100 * mode.energy_share:.2f} % of the energy"
     return ""

@@ -7,15 +7,15 @@ from jaxtyping import Float
 
 # Energy must fall by this many nepers to be called a decay: random vibration under steady
 # excitation swells and fades as well, but hardly by so much along a straight line.
-LEAST_FALL = 3.5
-BLOCKS = 150
-PASSES = 4
-MOST = 0.95  # of the energy, to look for the decay in
-LEAST_BLOCKS = 10
+MIN_FALL_NEPERS = 3.5
+ENERGY_BLOCKS = 150
+BAND_ITERATIONS = 4
+DECAY_ENERGY_SHARE = 0.95  # of the energy, to look for the decay in
+MIN_BLOCKS = 10
 # The logarithm of a decay's energy strays by about this much from a line, because modes beat.
-UNEVEN = 0.25
+BEAT_SCATTER_NEPERS = 0.25
 # Powers of angular frequency that turn a quantity's spectrum into one of velocity.
-_TO_VELOCITY = {"acceleration": -1, "velocity": 0}
+_VELOCITY_EXPONENT = {"acceleration": -1, "velocity": 0}
 
 
 def energy_band(
@@ -40,7 +40,7 @@ def energy_band(
     lowest = 4 * rate / count
     excess = np.where(power > 6 * noise, power - noise, 0.0)[bins >= lowest]
     bins = bins[bins >= lowest]
-    powers = np.array([2 * _TO_VELOCITY.get(quantity, 1) for quantity in quantities])
+    powers = np.array([2 * _VELOCITY_EXPONENT.get(quantity, 1) for quantity in quantities])
     kinetic = excess * (2 * np.pi * bins[:, None]) ** powers
     if not np.any(kinetic > 0):
         return lowest, 0.5 * rate
@@ -48,12 +48,12 @@ def energy_band(
     kinds = np.array(quantities)
     totals = np.array([np.sum(kinetic[:, kinds == kind]) for kind in quantities])
     kinetic = np.sum(kinetic / np.where(totals > 0, totals, 1.0), axis=1)
-    reach = np.cumsum(kinetic) / np.sum(kinetic)
-    highest = 1.5 * bins[min(int(np.searchsorted(reach, share)), bins.size - 1)]
+    cumulative_energy = np.cumsum(kinetic) / np.sum(kinetic)
+    highest = 1.5 * bins[min(int(np.searchsorted(cumulative_energy, share)), bins.size - 1)]
     return lowest, float(min(max(highest, 8 * lowest), 0.5 * rate))
 
 
-def in_band(
+def band_pass(
     values: Float[np.ndarray, "time channel"],
     rate: float,
     band: tuple[float, float],
@@ -73,14 +73,14 @@ def in_band(
 
 
 @functools.cache
-def _bases(count: int):
+def _line_and_parabola(count: int):
     """Orthonormal line and parabola over so many points."""
     across = np.linspace(-1, 1, count)
     basis, triangle = np.linalg.qr(np.stack([np.ones(count), across, across**2], axis=1))
     return (basis * np.sign(np.diag(triangle)))[:, 1:].T
 
 
-def free_decay(
+def find_decay_in_band(
     values: Float[np.ndarray, "time channel"],
     rate: float,
     band: tuple[float, float],
@@ -93,22 +93,22 @@ def free_decay(
     of excitation bends the other way). Accelerations are looked at, because in them the slow path
     of a load over the beam hardly shows. None if in no window the energy falls far enough.
     """
-    powers = np.array([1.0 + _TO_VELOCITY.get(quantity, 1) for quantity in quantities])
-    signal = in_band(values, rate, band, powers)
+    powers = np.array([1.0 + _VELOCITY_EXPONENT.get(quantity, 1) for quantity in quantities])
+    signal = band_pass(values, rate, band, powers)
     energy = np.sum(signal**2 / (np.mean(signal**2, axis=0) + 1e-300), axis=1)
-    size = max(len(energy) // BLOCKS, 1)
+    size = max(len(energy) // ENERGY_BLOCKS, 1)
     blocks = len(energy) // size
     level = np.log(energy[: blocks * size].reshape(blocks, size).mean(axis=1) + 1e-30)
     best, found = 0.0, None
-    for length in range(LEAST_BLOCKS, blocks + 1):
-        pieces = np.lib.stride_tricks.sliding_window_view(level, length)[: blocks - LEAST_BLOCKS]
-        line, bend = _bases(length)
+    for length in range(MIN_BLOCKS, blocks + 1):
+        pieces = np.lib.stride_tricks.sliding_window_view(level, length)[: blocks - MIN_BLOCKS]
+        line, bend = _line_and_parabola(length)
         centred = pieces - pieces.mean(axis=1, keepdims=True)
         slopes, curvatures = centred @ line, np.maximum(centred @ bend, 0.0)
         fitted = slopes[:, None] * line + curvatures[:, None] * bend
         fall = fitted[:, 0] - fitted[:, -1]
-        score = fall / (1 + np.mean((centred - fitted) ** 2, axis=1) / UNEVEN**2)
-        for start in np.flatnonzero((fall > LEAST_FALL) & (score > best)):
+        score = fall / (1 + np.mean((centred - fitted) ** 2, axis=1) / BEAT_SCATTER_NEPERS**2)
+        for start in np.flatnonzero((fall > MIN_FALL_NEPERS) & (score > best)):
             # Under steady excitation what fades soon swells again.
             after = level[start + length : start + 2 * length]
             if score[start] > best and np.all(after < pieces[start].max() - fall[start] / 2):
@@ -128,11 +128,14 @@ def find_decay(
     The whole log, with its excitation, reaches higher in frequency than the decay that follows:
     unless it is given, the band is taken again from what was found, until that is the decay.
     """
-    limits = band or energy_band(values, rate, quantities, MOST)
-    found = free_decay(values, rate, limits, quantities)
-    for _ in range(0 if band or found is None else PASSES):
+    limits = band or energy_band(values, rate, quantities, DECAY_ENERGY_SHARE)
+    found = find_decay_in_band(values, rate, limits, quantities)
+    for _ in range(0 if band or found is None else BAND_ITERATIONS):
         # What lasts longest tells: the second half of what was found so far.
         late = values[(found[0] + found[1]) // 2 : found[1]]
-        limits = (limits[0], min(limits[1], energy_band(late, rate, quantities, MOST)[1]))
-        found = free_decay(values, rate, limits, quantities) or found
+        limits = (
+            limits[0],
+            min(limits[1], energy_band(late, rate, quantities, DECAY_ENERGY_SHARE)[1]),
+        )
+        found = find_decay_in_band(values, rate, limits, quantities) or found
     return found

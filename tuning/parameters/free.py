@@ -12,19 +12,19 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.fields import known
 from jaxbeam.case.sensors import QUANTITIES, Sensor
-from tuning.parameters.prior import Belief, as_belief
+from tuning.parameters.prior import Belief, as_prior
 
-OF_LOG = re.compile(r"logs\.(\d+)\.(.+)")
-INSIDE = 1e-3  # of the distance between bounds: a start on a bound is moved in by so much
+LOG_ADDRESS = re.compile(r"logs\.(\d+)\.(.+)")
+BOUND_MARGIN = 1e-3  # of the distance between bounds: a start on a bound is moved in by so much
 
 
 @dataclasses.dataclass(frozen=True)
-class Free:
+class FreeParameter:
     """A free number: its address, unit, start, bounds (either may be infinite), and typical size.
 
     With two bounds the number is low + (high - low) (1 + sin y) / 2 in the search variable y,
     which can reach both; with one it is the bound plus or minus an exponential; else y itself.
-    The scales "log" and "logit" of a `belief` change the first of these.
+    The scales "log" and "logit" of a `prior` change the first of these.
     """
 
     address: str
@@ -32,103 +32,111 @@ class Free:
     start: float
     low: float
     high: float
-    size: float
-    belief: Belief = Belief()
+    typical_size: float
+    prior: Belief = Belief()
 
-    def inward(self, value: float) -> float:
+    def to_unbounded(self, value: float) -> float:
         """Search variable of a value; one on a bound is moved in a little."""
-        least = INSIDE * self.size
+        least = BOUND_MARGIN * self.typical_size
         if np.isfinite(self.high - self.low):
-            if self.belief.scale == "log":
-                least = min(least, INSIDE * self.low)
-            inner = np.clip(value, self.low + least, self.high - least)
-            return float(self.at_share(np.asarray(self._share(inner))))
+            if self.prior.scale == "log":
+                least = min(least, BOUND_MARGIN * self.low)
+            inside = np.clip(value, self.low + least, self.high - least)
+            return float(self.unbounded_at_share(np.asarray(self._share_between_bounds(inside))))
         if np.isfinite(self.low):
             return float(np.log(max(value - self.low, least)))
         if np.isfinite(self.high):
             return float(-np.log(max(self.high - value, least)))
         return value
 
-    def at_share(self, share: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+    def unbounded_at_share(self, share: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
         """Search variable at a share (0 to 1) of the way between two bounds, on the scale."""
-        if self.belief.scale == "logit":
+        if self.prior.scale == "logit":
             return np.asarray(np.log(share / (1 - share)))
         return np.asarray(np.arcsin(2 * share - 1))
 
-    def _share(self, value: float) -> float:
+    def _share_between_bounds(self, value: float) -> float:
         """How far between its two bounds a value is; on the log scale, its logarithm."""
-        if self.belief.scale == "log":
+        if self.prior.scale == "log":
             return np.log(value / self.low) / np.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)
 
     def at_bound(self, value: float) -> bool:
         """Whether a value lies on a bound, as good as."""
-        return bool(min(value - self.low, self.high - value) <= INSIDE * self.size)
+        return bool(min(value - self.low, self.high - value) <= BOUND_MARGIN * self.typical_size)
 
     @property
-    def search_size(self) -> float:
+    def unbounded_size(self) -> float:
         """A large change of the search variable: one, or the typical size where it is the value."""
-        return self.size if np.isinf(self.low) and np.isinf(self.high) else 1.0
+        return self.typical_size if np.isinf(self.low) and np.isinf(self.high) else 1.0
 
-    def size_at(self, value: float) -> float:
+    def typical_size_at(self, value: float) -> float:
         """Typical size once a value is fitted: one that came close to zero is itself small."""
         one_sided = np.isfinite(self.low) != np.isfinite(self.high)
         distance = min(value - self.low, self.high - value)
-        return float(np.clip(distance, 1e-9 * self.size, self.size)) if one_sided else self.size
+        return (
+            float(np.clip(distance, 1e-9 * self.typical_size, self.typical_size))
+            if one_sided
+            else self.typical_size
+        )
 
-    def outward(self, y: Float[Array, ""]) -> Float[Array, ""]:
+    def from_unbounded(self, unbounded: Float[Array, ""]) -> Float[Array, ""]:
         """Value of a search variable."""
         if np.isfinite(self.high - self.low):
-            share = (1 + jnp.sin(y)) / 2
-            if self.belief.scale == "log":
+            share = (1 + jnp.sin(unbounded)) / 2
+            if self.prior.scale == "log":
                 return self.low * (self.high / self.low) ** share
-            if self.belief.scale == "logit":
-                share = jax.nn.sigmoid(y)
+            if self.prior.scale == "logit":
+                share = jax.nn.sigmoid(unbounded)
             return self.low + (self.high - self.low) * share
         if np.isfinite(self.low):
-            return self.low + jnp.exp(y)
+            return self.low + jnp.exp(unbounded)
         if np.isfinite(self.high):
-            return self.high - jnp.exp(-y)
-        return y
+            return self.high - jnp.exp(-unbounded)
+        return unbounded
 
 
-def free_numbers(
-    cases: list[Case], bounds: dict[str, tuple[float, float] | Belief | None], reading: float
-) -> list[Free]:
+def free_parameters(
+    cases: list[Case],
+    bounds: dict[str, tuple[float, float] | Belief | None],
+    largest_reading: float,
+) -> list[FreeParameter]:
     """Look up the free numbers in the cases of the logs.
 
     An address is that of the case, shared by all logs, or `logs.1.loads.0.speed` for a number of
     one log, or `logs.*.loads.0.speed` for one of each log. Each has bounds, None or a `Belief`.
     Without bounds a number stays on its side of zero, but for offsets and entry times.
     The typical size of a number is the distance of its bounds, or else itself; that of an offset
-    is the largest `reading`, that of an entry time the duration.
+    is the largest `largest_reading`, that of an entry time the duration.
 
     Raises ValueError for an unknown address, a list, a number that is free twice, bounds that do
     not hold the start, or a start of zero that says nothing about the size.
     """
     if not bounds:
         raise ValueError("name at least one address as free")
-    bounds = _each_log(bounds, len(cases))
-    _check_once(list(bounds))
-    return [_free_number(cases, address, pair, reading) for address, pair in bounds.items()]
+    bounds = _expand_log_addresses(bounds, len(cases))
+    _check_unique(list(bounds))
+    return [
+        _free_parameter(cases, address, pair, largest_reading) for address, pair in bounds.items()
+    ]
 
 
-def _each_log(bounds: dict[str, Any], logs: int) -> dict[str, Any]:
+def _expand_log_addresses(bounds: dict[str, Any], logs: int) -> dict[str, Any]:
     """Addresses with `logs.*` in front, written out for each log."""
-    spread = {}
+    expanded = {}
     for address, pair in bounds.items():
         rest = address.removeprefix("logs.*.")
         for own in [address] if rest == address else [f"logs.{i}.{rest}" for i in range(logs)]:
-            if own in spread:
+            if own in expanded:
                 raise ValueError(f"{own} is free twice; name it once")
-            spread[own] = pair
-    return spread
+            expanded[own] = pair
+    return expanded
 
 
-def _check_once(addresses: list[str]) -> None:
+def _check_unique(addresses: list[str]) -> None:
     """A number cannot be shared by all logs and be that of one log as well."""
     for address in addresses:
-        own = OF_LOG.fullmatch(address)
+        own = LOG_ADDRESS.fullmatch(address)
         if own and own[2] in addresses:
             raise ValueError(
                 f"{address} is free twice, as {own[2]} is free for all logs together; "
@@ -136,20 +144,22 @@ def _check_once(addresses: list[str]) -> None:
             )
 
 
-def _free_number(cases: list[Case], address: str, pair, reading: float) -> Free:
-    case, rest = _place(cases, address)
-    value = known(value_at(case, rest))
+def _free_parameter(
+    cases: list[Case], address: str, bounds, largest_reading: float
+) -> FreeParameter:
+    case, local_address = _locate(cases, address)
+    value = known(value_at(case, local_address))
     if value.ndim:
         raise ValueError(f"{address} is a list; free its entries, {address}.0 and so on")
     start = float(value)
     try:
-        belief = as_belief(pair)
+        prior = as_prior(bounds)
     except ValueError as error:
         raise ValueError(f"{address}: {error}") from None
-    pair = belief.bounds
-    low, high = (-np.inf, np.inf) if pair is None else pair
-    signed = rest.endswith((".offset", ".entry_time"))
-    if pair is None and not signed:
+    bounds = prior.bounds
+    low, high = (-np.inf, np.inf) if bounds is None else bounds
+    any_sign = local_address.endswith((".offset", ".entry_time"))
+    if bounds is None and not any_sign:
         low, high = (0.0, np.inf) if start > 0 else (-np.inf, 0.0)
     if not low < high:
         raise ValueError(f"{address}: the lower bound {low:g} is not below the upper, {high:g}")
@@ -160,9 +170,9 @@ def _free_number(cases: list[Case], address: str, pair, reading: float) -> Free:
         )
     if np.isfinite(high - low):
         size = high - low
-    elif rest.endswith(".offset"):
-        size = reading
-    elif rest.endswith(".entry_time"):
+    elif local_address.endswith(".offset"):
+        size = largest_reading
+    elif local_address.endswith(".entry_time"):
         size = float(known(case.run.duration))
     else:
         size = abs(start)
@@ -171,18 +181,18 @@ def _free_number(cases: list[Case], address: str, pair, reading: float) -> Free:
             f"{address} starts at 0, which does not say how large it may be: give it bounds, such "
             f"as {address}=0:1, or another start"
         )
-    return Free(address, unit_at(case, rest), start, low, high, size, belief)
+    return FreeParameter(address, unit_at(case, local_address), start, low, high, size, prior)
 
 
-def _place(cases: list[Case], address: str) -> tuple[Case, str]:
+def _locate(cases: list[Case], address: str) -> tuple[Case, str]:
     """The case of the log that an address is about, and the address within it."""
-    own = OF_LOG.fullmatch(address)
-    if own:
-        if int(own[1]) >= len(cases):
+    match = LOG_ADDRESS.fullmatch(address)
+    if match:
+        if int(match[1]) >= len(cases):
             last = len(cases) - 1
-            known_ones = "the only log is logs.0" if last == 0 else f"the last log is logs.{last}"
-            raise ValueError(f"{address}: there is no such log; {known_ones}")
-        return cases[int(own[1])], own[2]
+            existing = "the only log is logs.0" if last == 0 else f"the last log is logs.{last}"
+            raise ValueError(f"{address}: there is no such log; {existing}")
+        return cases[int(match[1])], match[2]
     values = [known(value_at(case, address)) for case in cases]
     if any(np.any(value != values[0]) for value in values):
         raise ValueError(
@@ -194,24 +204,24 @@ def _place(cases: list[Case], address: str) -> tuple[Case, str]:
 def unit_at(case: Case, address: str) -> str:
     """The SI unit of the number at an address; "" or "1" if it has none."""
     unit, part = "", case
-    for step in address.split("."):
+    for name in address.split("."):
         if isinstance(part, tuple):
-            part = part[int(step)]
+            part = part[int(name)]
         elif dataclasses.is_dataclass(part):
-            unit = type(part).__dataclass_fields__[step].metadata.get("unit", "")
+            unit = type(part).__dataclass_fields__[name].metadata.get("unit", "")
             if isinstance(part, Sensor) and unit == "unit of quantity":
                 unit = QUANTITIES[part.quantity]
-            part = getattr(part, step)
+            part = getattr(part, name)
     return unit
 
 
-def insert(case: Case, number: int, values: dict[str, Any]) -> Case:
+def with_values(case: Case, log_index: int, values: dict[str, Any]) -> Case:
     """The case of one log with values at the addresses that concern it."""
     own = {}
     for address, value in values.items():
-        match = OF_LOG.fullmatch(address)
+        match = LOG_ADDRESS.fullmatch(address)
         if match is None:
             own[address] = value
-        elif int(match[1]) == number:
+        elif int(match[1]) == log_index:
             own[match[2]] = value
     return replace(case, own)

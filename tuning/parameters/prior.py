@@ -50,7 +50,7 @@ class Belief:
         low = -np.inf if self.low is None else float(self.low)
         return low, (np.inf if self.high is None else float(self.high))
 
-    def pull(self, value: Float[Array, ""]) -> Float[Array, ""]:
+    def prior_residual(self, value: Float[Array, ""]) -> Float[Array, ""]:
         """Distance of a value from the mean of the prior, in its deviations; 0 without a prior."""
         if self.mean is None:
             return jnp.zeros_like(value)
@@ -59,8 +59,8 @@ class Belief:
         return (value - self.mean) / self.deviation
 
 
-def as_belief(given: Any) -> Belief:
+def as_prior(bounds: Any) -> Belief:
     """A belief as it is, or what bounds (low, high) or None mean."""
-    if isinstance(given, Belief):
-        return given
-    return Belief() if given is None else Belief(*(float(bound) for bound in given))
+    if isinstance(bounds, Belief):
+        return bounds
+    return Belief() if bounds is None else Belief(*(float(bound) for bound in bounds))

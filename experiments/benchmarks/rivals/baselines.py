@@ -25,70 +25,75 @@ from experiments.benchmarks.rivals.crossing import (
 )
 from experiments.benchmarks.timing import Timing, time_call
 
-FREE = 0.5  # s of vibration after the exit
-TIGHT = 1e-12  # tolerance of references
-LOOSE = 5e-8  # with which no peak was worse than 5e-7; twice as loose, some passed 1e-6
+FREE_VIBRATION = 0.5  # s of vibration after the exit
+REFERENCE_TOLERANCE = 1e-12  # tolerance of references
+SCIPY_TOLERANCE = 5e-8  # with which no peak was worse than 5e-7; twice as loose, some passed 1e-6
 
 
-def reference_peaks(rig, masses, speeds, free=FREE):
+def reference_peaks(beam, masses, speeds, free=FREE_VIBRATION):
     """Peaks to about 1e-10, (mass, speed, sensor) in m, for checking the others.
 
     As `scipy_peaks`, at the limit of double precision, with all masses of one speed integrated
     as one system, which shares their steps and Python's overhead.
     """
-    masses, times = np.asarray(masses), free_times(rig, free, tolerance=1e-10)
-    runs = [_scipy_runs(rig, masses, v, times, tolerance=TIGHT, samples=8) for v in speeds]
+    masses, times = np.asarray(masses), free_times(beam, free, tolerance=1e-10)
+    runs = [
+        _scipy_runs(beam, masses, v, times, tolerance=REFERENCE_TOLERANCE, samples=8)
+        for v in speeds
+    ]
     return np.stack(runs, axis=1)
 
 
-def scipy_peaks(rig, masses, speeds, free=FREE):
+def scipy_peaks(beam, masses, speeds, free=FREE_VIBRATION):
     """Peaks by DOP853 in a loop, run by run, (mass, speed, sensor) in m.
 
     Masses in kg, speeds in m/s, `free` in s.
     """
-    times = free_times(rig, free)
+    times = free_times(beam, free)
 
     def run(mass, speed):
-        return _scipy_runs(rig, np.array([mass]), speed, times, tolerance=LOOSE, samples=4)[0]
+        return _scipy_runs(
+            beam, np.array([mass]), speed, times, tolerance=SCIPY_TOLERANCE, samples=4
+        )[0]
 
     return np.array([[run(mass, speed) for speed in speeds] for mass in masses])
 
 
-def scipy_histories(rig, masses, speeds, times, tolerance=LOOSE):
+def scipy_histories(beam, masses, speeds, times, tolerance=SCIPY_TOLERANCE):
     """Deflections at increasing times (s) by DOP853, run by run, (mass, speed, time, sensor)."""
 
     def run(mass, speed):
-        return _scipy_samples(rig, np.array([mass]), speed, np.asarray(times), tolerance)
+        return _scipy_samples(beam, np.array([mass]), speed, np.asarray(times), tolerance)
 
     return np.array([[run(mass, speed) for speed in speeds] for mass in masses])
 
 
-def scipy_time(solve, rig, masses, speeds, runs=12, repeat=3, beside=None):
-    """What `solve(rig, masses, speeds)` would take for all of these, from a sample of `runs`.
+def scipy_time(solve, beam, masses, speeds, runs=12, repeat=3, reference=None):
+    """What `solve(rig, masses, speeds)` would take for all of these, from a sample of `simulate_changes`.
 
     The cost of a run is a constant plus a share that grows with its duration, L / v; both are
     fitted to runs spread over the speeds, each with another mass, each timed `repeat` times; and,
-    if asked for, compared with the function `beside`.
+    if asked for, compared with the function `reference`.
     """
     chosen = np.linspace(0, len(speeds) - 1, runs).round().astype(int)
     mixed = np.resize(np.asarray(masses)[:: max(len(masses) // runs, 1)], runs)
     pairs = zip(mixed, np.asarray(speeds)[chosen], strict=True)
-    found = [time_call(solve, rig, [m], [v], repeat=repeat, beside=beside) for m, v in pairs]
+    found = [time_call(solve, beam, [m], [v], repeat=repeat, reference=reference) for m, v in pairs]
 
-    def whole(costs):
+    def total_cost(costs):
         growing, constant = np.polyfit(1 / np.asarray(speeds)[chosen], costs, 1)
         return float(len(masses) * np.sum(constant + growing / np.asarray(speeds)))
 
     return Timing(
-        whole([t.run for t in found]),
-        ratio=whole([t.ratio for t in found]),
-        shortest=whole([t.shortest for t in found]),
-        shortest_beside=min(t.shortest_beside for t in found),
+        total_cost([t.run for t in found]),
+        ratio=total_cost([t.ratio for t in found]),
+        shortest=total_cost([t.shortest for t in found]),
+        reference_shortest=min(t.reference_shortest for t in found),
     )
 
 
 @partial(jax.jit, static_argnames=("rig", "free", "shared_steps"))
-def diffrax_peaks(rig, masses, speeds, free=FREE, shared_steps=False):
+def diffrax_peaks(rig, masses, speeds, free=FREE_VIBRATION, shared_steps=False):
     """Peaks by diffrax, mapped over speeds and batched over masses, (mass, speed, sensor) in m.
 
     Masses in kg, speeds in m/s, `free` in s. Every run has its own adaptive steps (`vmap`), or
@@ -106,25 +111,27 @@ def diffrax_peaks(rig, masses, speeds, free=FREE, shared_steps=False):
     return jax.lax.map(at_speed, speeds).swapaxes(0, 1)
 
 
-def _scipy_steps(rig, masses, speed, end, tolerance):
+def _scipy_steps(beam, masses, speed, end, tolerance):
     """Every step of DOP853 from rest to a time (s), for all `masses` as one system.
 
     Each as its start, its length, and the function that takes times in it to states (2, mode, run,
     time). Steps end where a load passes a support and where the controller acts.
     """
-    size = rig.state_sizes[:, :, None] * masses
-    passed = rig.length / speed * np.arange(1, rig.spans + 1) / rig.spans
-    ticks = np.zeros(1) if rig.period is None else rig.period * np.arange(int(end / rig.period) + 1)
-    stops = np.unique(np.concatenate([ticks, passed, [end]]).round(13))
-    state, push = np.zeros_like(size), None
-    if rig.gain is not None and rig.period is None:
-        push = partial(np.matmul, rig.patch_shapes @ rig.answer(np.eye(rig.modes)))
+    size = beam.state_scales[:, :, None] * masses
+    passed = beam.length / speed * np.arange(1, beam.spans + 1) / beam.spans
+    sampling_instants = (
+        np.zeros(1) if beam.period is None else beam.period * np.arange(int(end / beam.period) + 1)
+    )
+    stops = np.unique(np.concatenate([sampling_instants, passed, [end]]).round(13))
+    state, modal_forces = np.zeros_like(size), None
+    if beam.gain is not None and beam.period is None:
+        modal_forces = partial(np.matmul, beam.patch_shapes @ beam.answer(np.eye(beam.modes)))
     for start, stop in pairwise(stops[stops <= end + 1e-12]):
         span = int(np.sum(passed < start + 1e-12))
-        if rig.period is not None and np.min(np.abs(ticks - start)) < 1e-12:
-            held = rig.patch_shapes @ rig.answer(state[0])
-            push = lambda q, held=held: held  # noqa: E731
-        rate = crossing_rate(rig, masses, speed, span if span < rig.spans else None, push)
+        if beam.period is not None and np.min(np.abs(sampling_instants - start)) < 1e-12:
+            held = beam.patch_shapes @ beam.answer(state[0])
+            modal_forces = lambda q, held=held: held  # noqa: E731
+        rate = crossing_rate(beam, masses, speed, span if span < beam.spans else None, modal_forces)
         solver = DOP853(
             lambda t, y, rate=rate: rate(t, y.reshape(size.shape)).ravel(),
             start,
@@ -146,70 +153,70 @@ def _states(dense, shape, times):
     return dense(times).reshape(*shape, -1)
 
 
-def _scipy_runs(rig, masses, speed, times, tolerance, samples):
+def _scipy_runs(beam, masses, speed, times, tolerance, samples):
     """Peaks of all `masses` at one speed, integrated as one system, (run, sensor) in m.
 
     `times` (s) are those of `free_times`.
     """
     fractions = np.linspace(0, 1, samples + 1)
-    peaks = np.zeros((len(rig.sensors), len(masses)))
-    exit_time = rig.length / speed
-    end = exit_time if rig.gain is None else exit_time + times[-1]
+    peaks = np.zeros((len(beam.sensors), len(masses)))
+    exit_time = beam.length / speed
+    end = exit_time if beam.gain is None else exit_time + times[-1]
     states = np.zeros(1)
-    for start, length, dense in _scipy_steps(rig, masses, speed, end, tolerance):
+    for start, length, dense in _scipy_steps(beam, masses, speed, end, tolerance):
         states = dense(start + fractions * length).transpose(3, 0, 1, 2)
         q, velocity = states.swapaxes(0, 1)
         interval = np.full(samples, length / samples)
-        value, slope = rig.sensor_shapes @ q, rig.sensor_shapes @ velocity
+        value, slope = beam.sensor_shapes @ q, beam.sensor_shapes @ velocity
         np.maximum(peaks, hermite_peaks(interval, value, slope), out=peaks)
-    if rig.gain is None:
-        np.maximum(peaks, free_peaks(rig, times, *states[-1]), out=peaks)
+    if beam.gain is None:
+        np.maximum(peaks, free_peaks(beam, times, *states[-1]), out=peaks)
     return peaks.T
 
 
-def _scipy_samples(rig, masses, speed, times, tolerance):
+def _scipy_samples(beam, masses, speed, times, tolerance):
     """Deflections of one mass at increasing times, (time, sensor) in m."""
-    found = np.zeros((len(times), len(rig.sensors)))
-    exit_time = rig.length / speed
-    end = min(exit_time, times[-1]) if rig.gain is None else times[-1]
+    found = np.zeros((len(times), len(beam.sensors)))
+    exit_time = beam.length / speed
+    end = min(exit_time, times[-1]) if beam.gain is None else times[-1]
     state = np.zeros(1)
-    for start, length, dense in _scipy_steps(rig, masses, speed, end, tolerance):
+    for start, length, dense in _scipy_steps(beam, masses, speed, end, tolerance):
         inside = (times > start) & (times <= start + length)
-        moments = np.append(times[inside], start + length)
-        states = dense(moments)
-        found[inside] = (rig.sensor_shapes @ states[0, :, 0, :-1]).T
+        sample_times = np.append(times[inside], start + length)
+        states = dense(sample_times)
+        found[inside] = (beam.sensor_shapes @ states[0, :, 0, :-1]).T
         state = states[..., -1]
     later = times > exit_time
-    if rig.gain is None and later.any():
-        found[later] = free_vibration(rig, times[later] - exit_time, *state)[0][:, :, 0]
+    if beam.gain is None and later.any():
+        found[later] = free_vibration(beam, times[later] - exit_time, *state)[0][:, :, 0]
     return found
 
 
-def _diffrax_runs(rig, masses, speed, times):
+def _diffrax_runs(beam, masses, speed, times):
     """Peaks of all `masses` at one speed, integrated as one system, (run, sensor) in m."""
-    size = rig.state_sizes[:, :, None] * masses
-    state, peaks = jnp.zeros_like(size), jnp.zeros((len(rig.sensors), len(masses)))
-    sound = True
-    crossing_time = rig.length / speed / rig.spans  # of one span
+    size = beam.state_scales[:, :, None] * masses
+    state, peaks = jnp.zeros_like(size), jnp.zeros((len(beam.sensors), len(masses)))
+    successful = True
+    crossing_time = beam.length / speed / beam.spans  # of one span
 
     def worst_run(error):
         return jnp.sqrt(jnp.max(jnp.mean((error / size) ** 2, axis=(0, 1))))
 
-    for span in range(rig.spans):
-        rate = crossing_rate(rig, masses, speed, span)
+    for span in range(beam.spans):
+        rate = crossing_rate(beam, masses, speed, span)
         start, stop = span * crossing_time, (span + 1) * crossing_time
-        samples = jnp.linspace(start, stop, 200 + 50 * rig.modes)
+        samples = jnp.linspace(start, stop, 200 + 50 * beam.modes)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, state, args, rate=rate: rate(t, state)),
             diffrax.Dopri8(),
             t0=start,
             t1=stop,
-            dt0=0.1 / rig.frequencies[-1],
+            dt0=0.1 / beam.frequencies[-1],
             y0=state,
             saveat=diffrax.SaveAt(
                 subs=[
                     diffrax.SubSaveAt(
-                        ts=samples, fn=lambda t, state, args: rig.sensor_shapes @ state
+                        ts=samples, fn=lambda t, state, args: beam.sensor_shapes @ state
                     ),
                     diffrax.SubSaveAt(t1=True),
                 ]
@@ -222,6 +229,6 @@ def _diffrax_runs(rig, masses, speed, times):
         deflection, end = jax.tree.leaves(solution.ys)
         seen = hermite_peaks(jnp.diff(samples), deflection[:, 0], deflection[:, 1])
         state, peaks = end[0], jnp.maximum(peaks, seen)
-        sound &= solution.result == diffrax.RESULTS.successful
-    peaks = jnp.maximum(peaks, free_peaks(rig, times, *state)).T
-    return jnp.where(sound, peaks, jnp.nan)
+        successful &= solution.result == diffrax.RESULTS.successful
+    peaks = jnp.maximum(peaks, free_peaks(beam, times, *state)).T
+    return jnp.where(successful, peaks, jnp.nan)

@@ -13,16 +13,16 @@ from types import ModuleType
 import diffrax
 import numpy as np
 
-from experiments.benchmarks.rivals.baselines import FREE
+from experiments.benchmarks.rivals.baselines import FREE_VIBRATION
 from experiments.benchmarks.rivals.crossing import GRAVITY, free_times
 
 TOLERANCE = 1e-8  # with which no peak of the benchmark's grid is worse than 1e-6
 SOLVER, ORDER = diffrax.Dopri5, 5  # faster here than Tsit5 and Dopri8, with 3 modes and with 12
-MOST = 10**6  # steps of a run
-PARTS = 4  # of each step, between which a cubic finds the peak
+MAX_STEPS = 10**6  # steps of a run
+PEAK_INTERVALS = 4  # of each step, between which a cubic finds the peak
 
 
-def numba() -> ModuleType | None:
+def import_numba() -> ModuleType | None:
     """The package, if it is installed."""
     try:
         return importlib.import_module("numba")
@@ -30,7 +30,7 @@ def numba() -> ModuleType | None:
         return None
 
 
-def program(package: ModuleType | None):
+def compile_peaks(package: ModuleType | None):
     """The function that fills in the peaks of all runs, compiled by numba, or plain without it."""
     if package is None:
         jit, share, every = (lambda function: function), range, (lambda function: function)
@@ -86,11 +86,11 @@ def program(package: ModuleType | None):
         fourth = -15 * rise + 7 * turn - bend
         fifth = 6 * rise - 3 * turn + bend / 2
         peak, value, slope = 0.0, w, v
-        for part in range(1, PARTS + 1):
-            s = part / PARTS
+        for part in range(1, PEAK_INTERVALS + 1):
+            s = part / PEAK_INTERVALS
             now = w + s * (v + s * (a / 2 + s * (third + s * (fourth + s * fifth))))
             now_slope = v + s * (a + s * (3 * third + s * (4 * fourth + s * 5 * fifth)))
-            peak = max(peak, cubic(1 / PARTS, value, slope, now, now_slope))
+            peak = max(peak, cubic(1 / PEAK_INTERVALS, value, slope, now, now_slope))
             value, slope = now, now_slope
         return peak
 
@@ -106,7 +106,7 @@ def program(package: ModuleType | None):
         constants = numbers, squares, damping, amplitude
         t, end, step = 0.0, length / speed, 0.1 / math.sqrt(squares[modes - 1])
         accelerate(t, state, rates[0], shape, mass, speed, *constants)
-        for _ in range(MOST):
+        for _ in range(MAX_STEPS):
             step = min(step, end - t)
             for i in range(1, stages):
                 for n in range(2 * modes):
@@ -172,8 +172,8 @@ def program(package: ModuleType | None):
     return fill
 
 
-def numba_peaks(fill, rig, masses, speeds, free=FREE):
-    """Peaks (mass, speed, sensor) in m by what `program` has made; masses in kg, speeds in m/s.
+def numba_peaks(peak_function, beam, masses, speeds, free=FREE_VIBRATION):
+    """Peaks (mass, speed, sensor) in m by what `compile_peaks` has made; masses in kg, speeds in m/s.
 
     For rigs of one span without control.
     """
@@ -183,13 +183,19 @@ def numba_peaks(fill, rig, masses, speeds, free=FREE):
     for i, row in enumerate(tableau.a_lower, 1):
         weights[i, :i] = row
     pair = weights, np.asarray(tableau.b_sol), np.asarray(tableau.b_error), nodes
-    damping = 2 * rig.damping_ratio * rig.frequencies
-    sizes = np.ravel(rig.state_sizes)
-    plain = rig.length, rig.wavenumbers, rig.frequencies**2, damping, float(rig.amplitude[0])
-    times = free_times(rig, free)
-    decays = np.exp(np.outer(times, rig.exponents))
-    found = np.zeros((len(masses), len(speeds), len(rig.sensors)))
+    damping = 2 * beam.damping_ratio * beam.frequencies
+    sizes = np.ravel(beam.state_scales)
+    plain = (
+        beam.length,
+        beam.wavenumbers,
+        beam.frequencies**2,
+        damping,
+        float(beam.mode_amplitudes[0]),
+    )
+    times = free_times(beam, free)
+    decays = np.exp(np.outer(times, beam.poles))
+    found = np.zeros((len(masses), len(speeds), len(beam.sensors)))
     given = np.asarray(masses, float), np.asarray(speeds, float)
-    whole = *plain, np.ascontiguousarray(rig.sensor_shapes), sizes
-    fill(*given, whole, pair, TOLERANCE, times, decays, rig.exponents, found)
+    whole = *plain, np.ascontiguousarray(beam.sensor_shapes), sizes
+    peak_function(*given, whole, pair, TOLERANCE, times, decays, beam.poles, found)
     return found

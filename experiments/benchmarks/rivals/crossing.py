@@ -24,7 +24,7 @@ MOMENT = 8.292e-4 * 0.35 * 200.0  # N m of a patch per volt of command
 
 
 @dataclass(frozen=True)
-class Rig:
+class PinnedBeam:
     """The pinned rig of the benchmark, in SI units, with `modes` modes; its spans are equal.
 
     With a `gain` (V/m) a patch on each span answers the sensor of its number, u = -gain y: every
@@ -59,7 +59,7 @@ class Rig:
         return 2 / self.length * np.transpose([turns, np.array(held)]).ravel()[: self.modes]
 
     @cached_property
-    def held(self):
+    def sinh_share(self):
         """The share h (mode,) of sinh k s in modes of two spans that are clamped in the middle."""
         if self.spans == 1:
             return np.zeros(self.modes)
@@ -72,20 +72,22 @@ class Rig:
         return self.wavenumbers**2 * np.sqrt(self.flexural_rigidity / self.mass_per_length)
 
     @cached_property
-    def amplitude(self):
+    def mode_amplitudes(self):
         """What makes the modal masses one, (mode,) in 1/sqrt(kg)."""
-        return np.sqrt(2 / (self.mass_per_length * self.length * (1 - self.held**2)))
+        return np.sqrt(2 / (self.mass_per_length * self.length * (1 - self.sinh_share**2)))
 
-    def shapes(self, place, derivative=0):
+    def shapes(self, position, derivative=0):
         """Mode shapes or slopes at a place (m) of the beam, (mode,) in 1/sqrt(kg), or by 1/m."""
-        right = self.spans == 2 and place > self.length / 2
-        s, k = (self.length - place if right else place), self.wavenumbers
+        right = self.spans == 2 and position > self.length / 2
+        s, k = (self.length - position if right else position), self.wavenumbers
         wave, grown = (np.sin, np.sinh) if derivative == 0 else (np.cos, np.cosh)
-        shape = k**derivative * self.amplitude * (wave(k * s) - self.held * grown(k * s))
-        return self.mirrored * (-1) ** derivative * shape if right else shape
+        shape = (
+            k**derivative * self.mode_amplitudes * (wave(k * s) - self.sinh_share * grown(k * s))
+        )
+        return self.symmetry_signs * (-1) ** derivative * shape if right else shape
 
     @cached_property
-    def mirrored(self):
+    def symmetry_signs(self):
         """The sign of each mode at the mirrored place, (mode,)."""
         return np.where(np.arange(self.modes) % 2 == 0, -1.0, 1.0)
 
@@ -102,44 +104,44 @@ class Rig:
         return MOMENT * np.array([left - right for left, right in edges]).T
 
     @cached_property
-    def exponents(self):
+    def poles(self):
         """-zeta w + i w_d of the free vibration of every mode, (mode,) in 1/s."""
         zeta = self.damping_ratio
         return self.frequencies * (-zeta + 1j * np.sqrt(1 - zeta**2))
 
     @cached_property
-    def state_sizes(self):
+    def state_scales(self):
         """Scale of [q, q'] per kg of load, (2, mode): the first mode under it at rest.
 
         Errors are measured against it in every mode, since all add to the deflection alike.
         """
-        size = GRAVITY * self.amplitude[0] / self.frequencies[0] ** 2
+        size = GRAVITY * self.mode_amplitudes[0] / self.frequencies[0] ** 2
         return size * np.stack([np.ones(self.modes), self.frequencies])
 
-    def answer(self, q):
+    def feedback_commands(self, q):
         """Commands (patch, run) to coordinates (mode, run)."""
         return -self.gain * (self.sensor_shapes[: self.spans] @ q)
 
 
-def crossing_rate(rig, masses, speed, span: int | None = 0, push=None):
+def crossing_rate(beam, masses, speed, span: int | None = 0, modal_forces=None):
     """The function (t, [q, q']) -> [q', q''] of all `masses` at one speed; (2, mode, run) each.
 
-    It holds while they are on the span of that number, or with None on no span. `push` gives the
+    It holds while they are on the span of that number, or with None on no span. `modal_forces` gives the
     modal forces (mode, run) that coordinates meet with, if there are any.
     """
-    damping = (2 * rig.damping_ratio * rig.frequencies)[:, None]
-    stiffness = (rig.frequencies**2)[:, None]
-    away, span = span is None, span or 0
-    k = rig.wavenumbers
-    tall = rig.amplitude * (rig.mirrored if span else 1.0)
-    slant = 2 * speed * (-1) ** span * tall * k
-    bend = -((speed * k) ** 2)
-    bent = np.any(rig.held != 0)
+    damping = (2 * beam.damping_ratio * beam.frequencies)[:, None]
+    stiffness = (beam.frequencies**2)[:, None]
+    off_beam, span = span is None, span or 0
+    k = beam.wavenumbers
+    signed_amplitude = beam.mode_amplitudes * (beam.mirrored if span else 1.0)
+    slope_factor = 2 * speed * (-1) ** span * signed_amplitude * k
+    curvature_factor = -((speed * k) ** 2)
+    has_sinh = np.any(beam.held != 0)
 
     def accelerations(q, velocity):
         """Those without a mass, (mode, run)."""
         free = -damping * velocity - stiffness * q
-        return free if push is None else free + push(q)
+        return free if modal_forces is None else free + modal_forces(q)
 
     def unloaded(t, state):
         xp = state.__array_namespace__()
@@ -148,19 +150,19 @@ def crossing_rate(rig, masses, speed, span: int | None = 0, push=None):
     def rate(t, state):
         xp = state.__array_namespace__()
         q, velocity = state
-        angle = k * (rig.length - speed * t) if span else k * speed * t
-        phi, two_speed_slope = tall * xp.sin(angle), slant * xp.cos(angle)
-        curvature = bend * phi  # times speed^2
-        if bent:
-            grown = tall * rig.held * xp.sinh(angle)
-            phi, curvature = phi - grown, curvature + bend * grown
-            two_speed_slope = two_speed_slope - slant * rig.held * xp.cosh(angle)
+        angle = k * (beam.length - speed * t) if span else k * speed * t
+        phi, two_speed_slope = signed_amplitude * xp.sin(angle), slope_factor * xp.cos(angle)
+        curvature = curvature_factor * phi  # times speed^2
+        if has_sinh:
+            grown = signed_amplitude * beam.held * xp.sinh(angle)
+            phi, curvature = phi - grown, curvature + curvature_factor * grown
+            two_speed_slope = two_speed_slope - slope_factor * beam.held * xp.cosh(angle)
         free = accelerations(q, velocity)
         convected = phi @ free + curvature @ q + two_speed_slope @ velocity
         force = masses * (GRAVITY + convected) / (1 + masses * (phi @ phi))
         return xp.concatenate((velocity, free - phi[:, None] * force)).reshape(state.shape)
 
-    return unloaded if away else rate
+    return unloaded if off_beam else rate
 
 
 def hermite_peaks(interval, value, rate):
@@ -181,38 +183,38 @@ def hermite_peaks(interval, value, rate):
     return xp.maximum(abs(value).max(0), abs(inside).max(0))
 
 
-def free_times(rig, free, tolerance=1e-7):
+def free_times(beam, free, tolerance=1e-7):
     """Times at which cubics through the free vibration are right to `tolerance`, (time,) in s.
 
     A cubic errs by h^4 w'''' / 384. Mode j is taken to start with w_1 / w_j of the peak, which
     grants every mode the same largest bending moment; as high modes die out, h grows.
     """
-    ratio = rig.frequencies / rig.frequencies[0]
+    ratio = beam.frequencies / beam.frequencies[0]
     times = [0.0]
     while times[-1] < free:
-        alive = np.exp(-rig.damping_ratio * rig.frequencies * times[-1]) / ratio
-        times.append(times[-1] + (384 * tolerance / (alive @ rig.frequencies**4)) ** 0.25)
+        alive = np.exp(-beam.damping_ratio * beam.frequencies * times[-1]) / ratio
+        times.append(times[-1] + (384 * tolerance / (alive @ beam.frequencies**4)) ** 0.25)
     return np.array([*times[:-1], free])
 
 
-def free_vibration(rig, times, q, velocity):
+def free_vibration(beam, times, q, velocity):
     """Deflections and their rates (time, sensor, run) in free vibration, in m and m/s.
 
     q_j = Re(a_j exp(p_j t)) with p_j = -zeta w_j + i w_d, from `q` and `velocity`, (mode, run),
     at time zero.
     """
     xp = q.__array_namespace__()
-    exponents = rig.exponents[:, None]
+    exponents = beam.poles[:, None]
     start = q - 1j * (velocity - exponents.real * q) / exponents.imag
-    start = rig.sensor_shapes[:, :, None] * start  # (sensor, mode, run)
-    decay = np.exp(np.outer(times, rig.exponents))
+    start = beam.sensor_shapes[:, :, None] * start  # (sensor, mode, run)
+    decay = np.exp(np.outer(times, beam.poles))
     return tuple(
         xp.einsum("tm,smr->tsr", table.real, start.real)
         - xp.einsum("tm,smr->tsr", table.imag, start.imag)
-        for table in (decay, decay * rig.exponents)
+        for table in (decay, decay * beam.poles)
     )
 
 
-def free_peaks(rig, times, q, velocity):
+def free_peaks(beam, times, q, velocity):
     """Largest absolute deflection in free vibration, (sensor, run) in m, times by `free_times`."""
-    return hermite_peaks(np.diff(times), *free_vibration(rig, times, q, velocity))
+    return hermite_peaks(np.diff(times), *free_vibration(beam, times, q, velocity))

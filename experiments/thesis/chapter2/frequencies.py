@@ -7,89 +7,108 @@ import jaxbeam as jb
 from experiments.thesis import published
 from experiments.thesis.beams import one_span, two_spans
 from experiments.thesis.chapter2.patches import DENSITY, MODULUS
-from experiments.thesis.verdicts import Experiment, Outcome, finding
+from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.model.modal_model import rig
 from jaxbeam.model.modes import lay_out
 from jaxbeam.model.sine_basis import sine_basis_modes
-from jaxbeam.plot.style import colour, name, styled
+from jaxbeam.plot.style import colour, set_title, use_style
 
-BESIDE = {"beam.flexural_rigidity": 12.11, "beam.mass_per_length": 0.5411}  # Table 2.2
+TABLE_2_2_BEAM = {"beam.flexural_rigidity": 12.11, "beam.mass_per_length": 0.5411}  # Table 2.2
 
 
-def run(load) -> Outcome:
+def run(load_rig) -> ExperimentResult:
     """Frequencies of two spans, exactly and in sine modes, and the speeds that follow."""
-    one, two = one_span(load), two_spans(load)
-    beside = jb.replace(two, BESIDE)
-    exact, printed_exact = (np.asarray(jb.modes(case).frequencies) for case in (two, beside))
+    one, two = one_span(load_rig), two_spans(load_rig)
+    table_2_2_case = jb.replace(two, TABLE_2_2_BEAM)
+    exact, printed_exact = (
+        np.asarray(jb.modes(case).frequencies) for case in (two, table_2_2_case)
+    )
     scale = (two.beam.rigidity / two.beam.linear_density) ** 0.25 / one.beam.length
     lambdas = np.sqrt(2 * np.pi * exact) / scale
 
-    stiff = 1e5 * float(beside.beam.rigidity) / float(one.beam.length)
-    springs = sine_basis_modes(beside, stiff).frequencies
+    stiff = 1e5 * float(table_2_2_case.beam.rigidity) / float(one.beam.length)
+    spring_frequencies = sine_basis_modes(table_2_2_case, stiff).frequencies
     approximate = np.asarray(sine_basis_modes(two).frequencies)
     errors = 100 * (approximate / exact - 1)
 
     span = float(one.beam.length)
     first = 2 * np.pi * float(jb.modes(one).frequencies[0])
     angular = 2 * np.pi * exact[:2]
-    speeds = _speeds(span, first, angular)
-    active = jb.replace(load("A"), {"actuators.0.stiffness": 3500.0, "actuators.0.damping": 0.0})
-    with_shaker = {k: _suspended(active, k) for k in (3500.0, 12000.0)}
+    speeds = _critical_speeds(span, first, angular)
+    active = jb.replace(
+        load_rig("A"), {"actuators.0.stiffness": 3500.0, "actuators.0.damping": 0.0}
+    )
+    with_shaker = {k: _frequencies_on_suspension(active, k) for k in (3500.0, 12000.0)}
     bare = np.asarray(jb.modes(one).frequencies)
-    low = published.SHAKER_MODES.numbers[1:] < bare[1:]
-    own = 100 * (published.APPROXIMATE.numbers / published.ANALYTICAL.numbers - 1)[[1, 3, 5, 7]]
-    slipped = abs(published.ERRORS.numbers[-1] / own[-1] - 10) < 0.1
+    below_bare_beam = published.SHAKER_MODES.numbers[1:] < bare[1:]
+    printed_errors = (
+        100
+        * (
+            published.APPROXIMATE_FREQUENCIES.numbers / published.ANALYTICAL_FREQUENCIES.numbers - 1
+        )[[1, 3, 5, 7]]
+    )
+    misplaced_decimal = abs(published.FREQUENCY_ERRORS.numbers[-1] / printed_errors[-1] - 10) < 0.1
     mass = float(one.beam.linear_density) * span
-    as_in_table = published.LAMBDAS.numbers**2 * scale**2 / (2 * np.pi)
+    as_in_table = published.FREQUENCY_PARAMETERS.numbers**2 * scale**2 / (2 * np.pi)
     findings = (
-        finding(published.LAMBDAS, lambdas),
-        finding(
-            published.ANALYTICAL,
+        make_finding(published.FREQUENCY_PARAMETERS, lambdas),
+        make_finding(
+            published.ANALYTICAL_FREQUENCIES,
             printed_exact,
             {
                 "numbers of rig A": exact,
                 "numbers of rig A, parameters rounded as in Table 2.1": as_in_table,
             },
         ),
-        finding(
-            published.APPROXIMATE,
-            springs,
+        make_finding(
+            published.APPROXIMATE_FREQUENCIES,
+            spring_frequencies,
             {"numbers of rig A, support of 3.21e10 N/m": approximate},
         ),
-        finding(
-            published.ERRORS,
+        make_finding(
+            published.FREQUENCY_ERRORS,
             errors[[1, 3, 5, 7]],
-            obstacle=f"the two rows above it give {own[-1]:.0f} %, a tenth" if slipped else "",
+            inconsistency=f"the two rows above it give {printed_errors[-1]:.0f} %, a tenth"
+            if misplaced_decimal
+            else "",
         ),
-        finding(
-            published.CRITICAL,
+        make_finding(
+            published.CRITICAL_SPEEDS,
             speeds,
-            {"one span of 2800 kg/m^3, as the patch rigs": _speeds(span, _heavier(one), angular)},
+            {
+                "one span of 2800 kg/m^3, as the patch rigs": _critical_speeds(
+                    span, _frequency_at_patch_density(one), angular
+                )
+            },
         ),
-        finding(published.SPEED_RATIOS, np.array([0.9, 1.5, 3.0]) / speeds[[0, 2, 2]]),
-        finding(published.ANGULAR, angular),
-        finding(published.MASS_RATIO, np.array([0.26, 0.5]) / mass),
-        finding(
+        make_finding(published.SPEED_RATIOS, np.array([0.9, 1.5, 3.0]) / speeds[[0, 2, 2]]),
+        make_finding(published.ANGULAR_FREQUENCIES, angular),
+        make_finding(published.MASS_RATIO, np.array([0.26, 0.5]) / mass),
+        make_finding(
             published.SHAKER_MODES,
             with_shaker[3500.0],
             {"stiffness 12000 N/m": with_shaker[12000.0]},
             f"a spring raises frequencies, and those of the bare beam are {bare[1]:.1f} and"
             f" {bare[2]:.1f} Hz"
-            if low.all()
+            if below_bare_beam.all()
             else "",
         ),
     )
-    return Outcome(findings, {"modes": _draw(two)})
+    return ExperimentResult(findings, {"modes": _draw(two)})
 
 
-def _speeds(span, first, angular):
+def _critical_speeds(span, one_span_frequency, two_span_frequencies):
     """Critical speeds: of one span, and of two by their first and second mode."""
     return np.array(
-        [span * first / np.pi, 2 * span * angular[0] / np.pi, 2 * span * angular[1] / (2 * np.pi)]
+        [
+            span * one_span_frequency / np.pi,
+            2 * span * two_span_frequencies[0] / np.pi,
+            2 * span * two_span_frequencies[1] / (2 * np.pi),
+        ]
     )
 
 
-def _heavier(one):
+def _frequency_at_patch_density(one):
     """The first angular frequency (rad/s) of rig A with the density of the patch rigs.
 
     3.3 mm of 65 GPa have the 11.68 N m^2 printed for rig A; its 0.535 kg/m are those of
@@ -102,31 +121,33 @@ def _heavier(one):
     return 2 * np.pi * float(jb.modes(heavier).frequencies[0])
 
 
-def _suspended(case, stiffness):
+def _frequencies_on_suspension(case, stiffness):
     """Natural frequencies (Hz) of the beam on the suspension of its shaker."""
     case = jb.replace(case, {"actuators.0.stiffness": stiffness})
     return np.sqrt(np.linalg.eigvalsh(np.asarray(rig(case, lay_out(case)).stiffness()))) / 2 / np.pi
 
 
-@styled
+@use_style
 def _draw(two: jb.Case) -> Figure:
     """Fig. 2.4: eight modes, exact and in eight sine modes on a stiff spring."""
     x = np.linspace(0, float(two.beam.length), 400)
     figure = Figure(figsize=(7.2, 6.4))
     panels = figure.subplots(4, 2, sharex=True)
     found = [model.shapes(x, 0) for model in (jb.modes(two), sine_basis_modes(two))]
-    words = "exact", "8 sine modes"
+    line_labels = "exact", "8 sine modes"
     for i, axes in enumerate(panels.flat):
         # The exact ones dashed on top.
         for j, dashes in ((1, "-"), (0, "--")):
             shape = np.asarray(found[j])[:, i]
-            axes.plot(x, shape / np.abs(shape).max(), dashes, color=colour(1 - j), label=words[j])
+            axes.plot(
+                x, shape / np.abs(shape).max(), dashes, color=colour(1 - j), label=line_labels[j]
+            )
         axes.plot([0, x[-1] / 2, x[-1]], [0, 0, 0], "^", color="k", markersize=4, clip_on=False)
         axes.set(title=f"mode {i + 1}", ylim=(-1.15, 1.15), yticks=(-1, 0, 1), xlim=(0, x[-1]))
     for axes in panels[-1]:
         axes.set_xlabel("x (m)")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    name(figure, "Modes of two equal spans, largest value one (Fig. 2.4)")
+    set_title(figure, "Modes of two equal spans, largest value one (Fig. 2.4)")
     return figure
 
 

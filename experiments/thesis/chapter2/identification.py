@@ -12,48 +12,52 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 import tuning
 from experiments.thesis import published
-from experiments.thesis.verdicts import Experiment, Outcome, finding
-from jaxbeam.plot.style import colour, name, styled
+from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
+from jaxbeam.plot.style import colour, set_title, use_style
 
 LOGS = Path(__file__).parents[2] / "logs"
-OFF = 1.25  # how far off the fits begin
+START_FACTOR = 1.25  # how far off the fits begin
 MODES = 12  # eight leave out half of the noise on two spans
 DAMPING = "beam.damping_ratio"
-FACTORS = "actuators.0.correction", "actuators.1.correction"
+PATCH_FACTORS = "actuators.0.correction", "actuators.1.correction"
 HAND_FITTED = {
     "A": {DAMPING: 0.03, "actuators.0.stiffness": 3500.0, "actuators.0.damping": 80.0},
-    "B": {DAMPING: 0.03, FACTORS[0]: 0.32},
-    "C": {FACTORS[0]: 0.39, FACTORS[1]: 0.68},
+    "B": {DAMPING: 0.03, PATCH_FACTORS[0]: 0.32},
+    "C": {PATCH_FACTORS[0]: 0.39, PATCH_FACTORS[1]: 0.68},
 }
-PRINTED = {"A": published.SHAKER_BY_HAND, "B": published.PATCH_BY_HAND, "C": published.RAIL_BY_HAND}
+PUBLISHED = {
+    "A": published.SHAKER_HAND_FIT,
+    "B": published.PATCH_HAND_FIT,
+    "C": published.RAIL_HAND_FIT,
+}
 
 
-def plant_of(case: jb.Case) -> jb.Case:
+def with_log_modes(case: jb.Case) -> jb.Case:
     """A published rig with as many modes as its log shows."""
     return dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=MODES))
 
 
-def fit(rig: str, load) -> tuning.Fit:
+def fit_rig(rig: str, load_rig) -> tuning.Fit:
     """The numbers of a rig that were fitted by hand, from its log."""
-    start = {address: OFF * value for address, value in HAND_FITTED[rig].items()}
-    case = jb.replace(plant_of(load(rig)), start)
+    start = {address: START_FACTOR * value for address, value in HAND_FITTED[rig].items()}
+    case = jb.replace(with_log_modes(load_rig(rig)), start)
     return tuning.identify(case, tuning.read_log(LOGS / f"{rig}.csv"), list(start))
 
 
-def run(load) -> Outcome:
+def run(load_rig) -> ExperimentResult:
     """All fits, with what they say of their numbers."""
-    fits = {rig: fit(rig, load) for rig in HAND_FITTED}
-    findings = [finding(PRINTED[rig], found.values) for rig, found in fits.items()]
+    fits = {rig: fit_rig(rig, load_rig) for rig in HAND_FITTED}
+    findings = [make_finding(PUBLISHED[rig], found.values) for rig, found in fits.items()]
     remarks = ["The measured logs are not available: these come from finite elements."]
     for rig, found in fits.items():
         for address, value, (low, high) in zip(
             found.addresses, found.values, found.intervals, strict=True
         ):
             remarks.append(f"rig {rig}, {address}: {value:.4g}, 95 % {low:.4g} to {high:.4g}")
-    return Outcome(tuple(findings), {"logs": _draw(fits)}, tuple(remarks))
+    return ExperimentResult(tuple(findings), {"logs": _draw(fits)}, tuple(remarks))
 
 
-@styled
+@use_style
 def _draw(fits) -> Figure:
     """Measured and fitted deflections, and what is left, rig by rig."""
     figure = Figure(figsize=(7.2, 5.6))
@@ -68,7 +72,7 @@ def _draw(fits) -> Figure:
     figure.axes[0].set_ylabel("deflection (mm)")
     figure.axes[len(fits)].set_ylabel("residual (µm)")
     figure.axes[0].legend()
-    name(figure, "What was fitted by hand, fitted by gradients")
+    set_title(figure, "What was fitted by hand, fitted by gradients")
     return figure
 
 

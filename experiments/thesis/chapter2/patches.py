@@ -5,18 +5,18 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments.thesis import published
-from experiments.thesis.verdicts import Experiment, Outcome, finding
+from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.model.statics import static_lift
-from jaxbeam.plot.style import colour, name, styled
+from jaxbeam.plot.style import colour, set_title, use_style
 
 WIDTH, MODULUS, DENSITY = 0.1, 65e9, 2800.0  # m, Pa, kg/m^3
-HEIGHT, FITTING = 2.83e-3, 2.9e-3  # m: as printed, and the one that the printed section has
-VOLTS = 1500.0  # at the patch
+HEIGHT, REFITTED_HEIGHT = 2.83e-3, 2.9e-3  # m: as printed, and the one that the printed section has
+PATCH_VOLTAGE = 1500.0  # at the patch
 
 
-def run(load) -> Outcome:
+def run(load_rig) -> ExperimentResult:
     """Constants of patch, section and shaker from what the thesis makes them of."""
-    made = jb.Patch(
+    patch = jb.Patch(
         0.2575,
         0.3425,
         d33=460e-12,
@@ -27,34 +27,40 @@ def run(load) -> Outcome:
         patch_width=57e-3,
     )
     findings = (
-        finding(published.MOMENT, made.moment),
-        finding(published.SECTION, _section(HEIGHT), {"h = 2.9 mm": _section(FITTING)}),
-        finding(published.CUTOFF, load("A").actuators[0].bandwidth / (2 * np.pi)),
+        make_finding(published.PATCH_MOMENT, patch.moment),
+        make_finding(
+            published.PATCH_SECTION,
+            _section_constants(HEIGHT),
+            {"h = 2.9 mm": _section_constants(REFITTED_HEIGHT)},
+        ),
+        make_finding(published.SHAKER_CUTOFF, load_rig("A").actuators[0].bandwidth / (2 * np.pi)),
     )
-    return Outcome(findings, {"lift": _draw(load)})
+    return ExperimentResult(findings, {"lift": _draw(load_rig)})
 
 
-def _section(height):
+def _section_constants(height):
     beam = jb.Beam(0.6, width=WIDTH, height=height, youngs_modulus=MODULUS, density=DENSITY)
     return [beam.rigidity, beam.linear_density]
 
 
-@styled
-def _draw(load) -> Figure:
+@use_style
+def _draw(load_rig) -> Figure:
     """How far each patch lifts the beams of rigs B and C, statically."""
     figure = Figure(figsize=(7.2, 2.8))
     for axes, rig in zip(figure.subplots(1, 2, sharey=True), "BC", strict=True):
-        case = load(rig)
+        case = load_rig(rig)
         x = np.linspace(0, float(case.beam.length), 241)
-        lifted = np.asarray(static_lift(case, x))
+        static_deflection = np.asarray(static_lift(case, x))
         for i, actuator in enumerate(case.actuators):
-            volts = VOLTS / float(actuator.amplifier_gain)
-            axes.plot(x, 1e3 * volts * lifted[i], color=colour(i), label=f"patch {i + 1}")
+            volts = PATCH_VOLTAGE / float(actuator.amplifier_gain)
+            axes.plot(
+                x, 1e3 * volts * static_deflection[i], color=colour(i), label=f"patch {i + 1}"
+            )
             axes.axvspan(actuator.start, actuator.end, color=colour(i), alpha=0.15, linewidth=0)
         axes.set(title=f"rig {rig}", xlabel="x (m)", xlim=(0, x[-1]))
         axes.legend()
     figure.axes[0].set_ylabel("deflection (mm)")
-    name(figure, f"Static lift by {VOLTS:.0f} V at a patch")
+    set_title(figure, f"Static lift by {PATCH_VOLTAGE:.0f} V at a patch")
     return figure
 
 

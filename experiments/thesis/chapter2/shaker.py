@@ -8,17 +8,17 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments.thesis import published
-from experiments.thesis.verdicts import Experiment, Outcome, finding
+from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.model.channels import shaker_chain
 from jaxbeam.model.frequency_response import FrequencyResponse, extremes, frequency_response
-from jaxbeam.plot.style import colour, name, styled
+from jaxbeam.plot.style import colour, set_title, use_style
 
 FREQUENCIES = np.geomspace(1.0, 1000.0, 4000)  # Hz
-PARKED = ((0.3, 0.5),)  # m, kg: Fig. 2.16
+STATIONARY_MASS = ((0.3, 0.5),)  # m, kg: Fig. 2.16
 ALUMINIUM = {"width": 0.06, "height": 3.3e-3, "youngs_modulus": 70e9, "density": 2700.0}
 RIGID = {"flexural_rigidity": 1.022e5, "mass_per_length": 11.016}  # Fig. 2.20
 
-HALF = "the mass in eq. (2.26), but not in (2.33)"
+MASS_IN_IMPEDANCE = "the mass in eq. (2.26), but not in (2.33)"
 
 
 def data_physics_v4() -> jb.Electrodynamic:
@@ -28,52 +28,56 @@ def data_physics_v4() -> jb.Electrodynamic:
     )
 
 
-def run(load) -> Outcome:
+def run(load_rig) -> ExperimentResult:
     """Force drops and peaks of the force per voltage, the beam free or with 0.5 kg on it."""
-    rig = dataclasses.replace(load("A").beam, modes=4)
-    plain = jb.Beam(rig.length, damping_ratio=rig.damping_ratio, modes=4, **ALUMINIUM)
-    undamped = dataclasses.replace(plain, damping_ratio=0.0)
+    rig = dataclasses.replace(load_rig("A").beam, modes=4)
+    aluminium_beam = jb.Beam(rig.length, damping_ratio=rig.damping_ratio, modes=4, **ALUMINIUM)
+    undamped = dataclasses.replace(aluminium_beam, damping_ratio=0.0)
     beams = {
         "as printed": rig,
-        "aluminium of 70 GPa, 2700 kg/m^3, 3.3 mm high": plain,
+        "aluminium of 70 GPa, 2700 kg/m^3, 3.3 mm high": aluminium_beam,
         "the same without damping": undamped,
     }
-    free = {word: _seen(_response(beam)) for word, beam in beams.items()}
-    parked = {word: _seen(_response(beam, PARKED)) for word, beam in beams.items()}
-    parked[HALF] = _seen(_in_impedance_alone(rig))
-    parked[f"{HALF}, beam of aluminium"] = _seen(_in_impedance_alone(plain))
+    free = {word: _features(_response(beam)) for word, beam in beams.items()}
+    with_mass = {word: _features(_response(beam, STATIONARY_MASS)) for word, beam in beams.items()}
+    with_mass[MASS_IN_IMPEDANCE] = _features(_mass_in_impedance_only(rig))
+    with_mass[f"{MASS_IN_IMPEDANCE}, beam of aluminium"] = _features(
+        _mass_in_impedance_only(aluminium_beam)
+    )
     transmitted = max(_peaks(_response(rig), 2), key=lambda pair: pair[1])
 
-    def told(printed, found, what):
+    def make_findings(printed, found, what):
         values = {word: what(one) for word, one in found.items()}
-        return finding(printed, values.pop("as printed"), values)
+        return make_finding(printed, values.pop("as printed"), values)
 
     findings = (
-        told(published.DROPS, free, lambda one: one["drops"][:4]),
-        told(published.SHAKER_GAIN, free, lambda one: [one["low"], one["peak"][1]]),
-        told(published.SHAKER_PEAK, free, lambda one: one["peak"][0]),
-        finding(published.TRANSMITTED_PEAK, transmitted[0]),
-        told(published.PARKED_DROP, parked, lambda one: one["drops"][0]),
-        told(published.PARKED_PLACE, parked, lambda one: one["peak"][0]),
-        told(published.PARKED_PEAK, parked, lambda one: one["peak"][1]),
+        make_findings(published.FORCE_DROPS, free, lambda one: one["drops"][:4]),
+        make_findings(published.SHAKER_GAIN, free, lambda one: [one["low"], one["peak"][1]]),
+        make_findings(published.SHAKER_PEAK_FREQUENCY, free, lambda one: one["peak"][0]),
+        make_finding(published.TRANSMITTED_PEAK_FREQUENCY, transmitted[0]),
+        make_findings(published.STATIONARY_MASS_DROP, with_mass, lambda one: one["drops"][0]),
+        make_findings(
+            published.STATIONARY_MASS_PEAK_FREQUENCY, with_mass, lambda one: one["peak"][0]
+        ),
+        make_findings(published.STATIONARY_MASS_PEAK, with_mass, lambda one: one["peak"][1]),
     )
     stiff = dataclasses.replace(rig, **{key: np.asarray(value) for key, value in RIGID.items()})
-    return Outcome(findings, {"responses": _draw(rig, stiff)})
+    return ExperimentResult(findings, {"responses": _draw(rig, stiff)})
 
 
-def _response(beam: jb.Beam, parked=()) -> FrequencyResponse:
+def _response(beam: jb.Beam, stationary_masses=()) -> FrequencyResponse:
     case = jb.Case(beam, actuators=[data_physics_v4()])
-    return frequency_response(case, FREQUENCIES, shaker_chain(0), parked)
+    return frequency_response(case, FREQUENCIES, shaker_chain(0), stationary_masses)
 
 
-def _in_impedance_alone(beam: jb.Beam) -> FrequencyResponse:
+def _mass_in_impedance_only(beam: jb.Beam) -> FrequencyResponse:
     """With the parked mass in the coil's impedance, eq. (2.26), but not in eq. (2.33).
 
     Both have the accelerance of the beam in them, and (2.30) with the mass is written for one.
     """
-    bare, laden = _response(beam).values, _response(beam, PARKED)
-    force = laden.values[:, 3] / laden.values[:, 2] * bare[:, 2]
-    return eqx.tree_at(lambda found: found.values, laden, laden.values.at[:, 3].set(force))
+    bare, with_mass = _response(beam).values, _response(beam, STATIONARY_MASS)
+    force = with_mass.values[:, 3] / with_mass.values[:, 2] * bare[:, 2]
+    return eqx.tree_at(lambda found: found.values, with_mass, with_mass.values.at[:, 3].set(force))
 
 
 def _peaks(response: FrequencyResponse, pair: int) -> list[tuple[float, float]]:
@@ -81,7 +85,7 @@ def _peaks(response: FrequencyResponse, pair: int) -> list[tuple[float, float]]:
     return [(place, height) for word, place, height in extremes(response, pair) if word == "peak"]
 
 
-def _seen(response: FrequencyResponse) -> dict:
+def _features(response: FrequencyResponse) -> dict:
     """Of the force per voltage: its start (N/V), drops (Hz) and largest peak (Hz, N/V)."""
     found = extremes(response, 3)
     drops = [place for word, place, height in found if word == "dip" and height < found[0][2]]
@@ -92,21 +96,21 @@ def _seen(response: FrequencyResponse) -> dict:
     }
 
 
-@styled
+@use_style
 def _draw(beam, stiff) -> Figure:
     """Magnitudes along the chain of the shaker, with the axes of Figs 2.15 to 2.18 and 2.20."""
     figure = Figure(figsize=(7.2, 5.6))
     panels = figure.subplots(2, 2, sharex=True)
-    free, parked, rigid = _response(beam), _response(beam, PARKED), _response(stiff)
+    free, with_mass, rigid = _response(beam), _response(beam, STATIONARY_MASS), _response(stiff)
     lines = (
-        ("force per voltage (N/V), Figs 2.15, 2.16", 3, np.abs, (free, parked)),
+        ("force per voltage (N/V), Figs 2.15, 2.16", 3, np.abs, (free, with_mass)),
         (
             "impedance (\N{GREEK CAPITAL LETTER OMEGA}), Fig. 2.17",
             0,
             lambda h: 1 / np.abs(h),
-            (free, parked),
+            (free, with_mass),
         ),
-        ("force on the beam per coil force, Fig. 2.18", 2, np.abs, (free, parked)),
+        ("force on the beam per coil force, Fig. 2.18", 2, np.abs, (free, with_mass)),
         ("force per voltage (N/V), rigid beam, Fig. 2.20", 3, np.abs, (rigid,)),
     )
     for axes, (title, pair, size, found) in zip(panels.flat, lines, strict=True):
@@ -124,7 +128,7 @@ def _draw(beam, stiff) -> Figure:
     panels[0, 0].legend(["free beam", "0.5 kg at 0.3 m"], loc="lower left")
     for axes in panels[-1]:
         axes.set_xlabel("frequency (Hz)")
-    name(figure, "Electrodynamic shaker on the beam of rig A")
+    set_title(figure, "Electrodynamic shaker on the beam of rig A")
     return figure
 
 

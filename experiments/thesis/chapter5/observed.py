@@ -12,48 +12,48 @@ import numpy as np
 
 import jaxbeam as jb
 from experiments.thesis import published
-from experiments.thesis.beams import as_force
+from experiments.thesis.beams import as_moving_force
 from experiments.thesis.chapter5.regulator_limits import (
-    EFFORT,
-    UNLIKE,
-    active,
+    COMMAND_WEIGHT,
+    OTHER_SHAKER,
     optimal_gain,
-    unlike,
+    with_active_shaker,
+    with_other_shaker,
 )
-from experiments.thesis.verdicts import Finding, finding
+from experiments.thesis.verdicts import Finding, make_finding
 
 PERIOD, MASS, SPEED = 2e-4, 0.501, 0.5  # s, kg, m/s, of Fig. 5.4
 SENSOR, TOLERANCE = 1, 1e-4
 
 
-def observed(rig: jb.Case, weights, effort: float, obstacle: str) -> Finding:
+def observed_regulator(rig: jb.Case, weights, effort: float, obstacle: str) -> Finding:
     """How far the observed regulator reduces the peak; `effort` is another R that is printed."""
-    rig = jb.replace(active(rig), {"loads.0.mass": MASS, "loads.0.speed": SPEED})
-    others = {
-        f"R = {effort:g}, as in the experiments": _less(rig, weights, effort),
-        UNLIKE: _less(unlike(rig), weights, EFFORT),
+    rig = jb.replace(with_active_shaker(rig), {"loads.0.mass": MASS, "loads.0.speed": SPEED})
+    interpretations = {
+        f"R = {effort:g}, as in the experiments": _reduction(rig, weights, effort),
+        OTHER_SHAKER: _reduction(with_other_shaker(rig), weights, COMMAND_WEIGHT),
     }
-    return finding(
-        published.OBSERVED,
-        _less(rig, weights, EFFORT),
-        {word: np.atleast_1d(value) for word, value in others.items()},
+    return make_finding(
+        published.OBSERVED_REGULATOR,
+        _reduction(rig, weights, COMMAND_WEIGHT),
+        {word: np.atleast_1d(value) for word, value in interpretations.items()},
         obstacle,
     )
 
 
-def _less(rig: jb.Case, weights, effort: float) -> float:
+def _reduction(rig: jb.Case, weights, effort: float) -> float:
     """By how much (%) the peak at 0.25 m is below that without control."""
     duration = float(rig.beam.length / rig.loads[0].speed)
     run = dataclasses.replace(rig.run, duration=np.asarray(duration))
     rig = dataclasses.replace(rig, run=run)
     gain = optimal_gain(rig, PERIOD, weights, effort)[0]
     law = jb.StateFeedback(gain=gain, coordinates="sine", period=PERIOD)
-    ticks = np.arange(round(duration / PERIOD)) * PERIOD
-    model = dataclasses.replace(as_force(rig), controller=law)
-    commands = np.asarray(jb.simulate(model, ticks, tolerance=TOLERANCE).command)
-    sent = jb.Prescribed(offsets=[0.0], times=ticks, values=commands.T)
-    free, controlled = (
+    sampling_instants = np.arange(round(duration / PERIOD)) * PERIOD
+    model = dataclasses.replace(as_moving_force(rig), controller=law)
+    commands = np.asarray(jb.simulate(model, sampling_instants, tolerance=TOLERANCE).command)
+    prescribed = jb.Prescribed(offsets=[0.0], times=sampling_instants, values=commands.T)
+    uncontrolled, controlled = (
         float(jb.simulate(one, tolerance=TOLERANCE).peak_deflection[SENSOR])
-        for one in (rig, dataclasses.replace(rig, controller=sent))
+        for one in (rig, dataclasses.replace(rig, controller=prescribed))
     )
-    return 100 * (1 - controlled / free)
+    return 100 * (1 - controlled / uncontrolled)

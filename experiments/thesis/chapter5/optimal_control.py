@@ -15,55 +15,63 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments.thesis import published
 from experiments.thesis.chapter2.shaker import data_physics_v4
-from experiments.thesis.chapter5.moving_point import deepest_place, modes_kept
-from experiments.thesis.chapter5.observed import observed
-from experiments.thesis.chapter5.regulator_limits import Loops, draw_poles, frozen, grown, sampled
-from experiments.thesis.verdicts import Experiment, Finding, Outcome, finding
+from experiments.thesis.chapter5.moving_point import deepest_position, mode_truncation
+from experiments.thesis.chapter5.observed import observed_regulator
+from experiments.thesis.chapter5.regulator_limits import (
+    TimeVaryingLoops,
+    draw_poles,
+    frozen_pole_findings,
+    growth_remark,
+    sampling_findings,
+)
+from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, make_finding
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.design_model import Beliefs
 from jaxbeam.model.modes import lay_out
-from jaxbeam.plot.style import colour, name, styled
+from jaxbeam.plot.style import colour, set_title, use_style
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import make_plan
 
 MASSES, SPEEDS = (0.261, 0.371, 0.509), (0.3, 0.55)
 WEIGHTS = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]  # of q, its rate, and the shaker
-FED_BACK = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+FEEDBACK_SHARES = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 EFFORT = 9e-5  # R
 TOLERANCE, RATE = 1e-4, 200.0  # of peaks; samples per second
-FREE, ONE = "no control", (0.55, 0.261)
+NO_CONTROL, LIGHT_FAST = "no control", (0.55, 0.261)
 SENSOR = 1  # at 0.25 m
-SCATTER = 5.0  # times what the model says of two speeds: more than that is not the model's
+SCATTER_RATIO = 5.0  # times what the model says of two speeds: more than that is not the model's
 LAWS = {"time-invariant": jb.LQR, "time-varying": jb.FiniteLQR, "augmented": jb.AugmentedLQR}
-ALL, ALONE = [1.0] * 7, [1.0, 0, 0, 0, 0, 0, 0]
-READINGS = {  # N/V that the plant has, R, N/m of the suspension, shares fed back
-    "as printed": (4.6, EFFORT, 12000.0, FED_BACK),
-    "2.5 N/V reach the beam": (2.5, EFFORT, 12000.0, FED_BACK),
-    "R = 5e-4, 3500 N/m, all states": (4.6, 5e-4, 3500.0, ALL),
+ALL_STATES, FIRST_MODE = [1.0] * 7, [1.0, 0, 0, 0, 0, 0, 0]
+INTERPRETATIONS = {  # N/V that the plant has, R, N/m of the suspension, shares fed back
+    "as printed": (4.6, EFFORT, 12000.0, FEEDBACK_SHARES),
+    "2.5 N/V reach the beam": (2.5, EFFORT, 12000.0, FEEDBACK_SHARES),
+    "R = 5e-4, 3500 N/m, all states": (4.6, 5e-4, 3500.0, ALL_STATES),
 }
-FULL = "full model of the shaker, Table 2.3"
-UNDAMPED = "R = 3e-4, 2.5 N/V, 80 N s/m in the plant only"  # for stability alone
-REFITTED = "full model, 12000 N/m and 80 N s/m with its back-EMF"
+FULL_SHAKER = "full model of the shaker, Table 2.3"
+UNDAMPED_DESIGN = "R = 3e-4, 2.5 N/V, 80 N s/m in the plant only"  # for stability alone
+REFITTED_SHAKER = "full model, 12000 N/m and 80 N s/m with its back-EMF"
 
 
-class Prepared(AbstractController):
+class PredesignedController(AbstractController):
     """A law whose memory was made beforehand, for another plant than it is used on."""
 
     law: AbstractController = eqx.field(kw_only=True)
     memory: Any = eqx.field(kw_only=True)
 
     @property
-    def memoryless(self):
+    def stateless(self):
         return self.law.memoryless
 
-    def init(self, model):
+    def init(self, plant):
         return self.memory
 
     def step(self, memory, measurement, t):
         return self.law.step(memory, measurement, t)
 
 
-def law(kind: str, effort: float, shares, damping: float | None = None) -> AbstractController:
+def regulator(
+    kind: str, effort: float, feedback_shares, damping: float | None = None
+) -> AbstractController:
     """One of the regulators of chapter 5, designed for 4.6 N/V whatever the plant has.
 
     And for another `damping` (N s/m) of the suspension, if that is given.
@@ -71,36 +79,37 @@ def law(kind: str, effort: float, shares, damping: float | None = None) -> Abstr
     return LAWS[kind](
         state_weight=WEIGHTS,
         command_weight=[effort],
-        feedback=shares,
+        feedback=feedback_shares,
         coordinates="sine",
         design=Beliefs(force_per_volt=4.6, damping=damping),
     )
 
 
-def run(load) -> Outcome:
+def run(load_rig) -> ExperimentResult:
     """Peaks under the three regulators in percent of no control, by every reading."""
-    rig = load("A")
+    rig = load_rig("A")
     longest = np.asarray(float(rig.beam.length) / min(SPEEDS) + 0.3)
     short = dataclasses.replace(rig.run, duration=longest, sample_rate=np.asarray(RATE))
     rig = dataclasses.replace(rig, run=short)
-    simple = {
+    interpreted_rigs = {
         name: jb.replace(
             rig, {"actuators.0.force_per_volt": volts, "actuators.0.stiffness": stiffness}
         )
-        for name, (volts, _, stiffness, _) in READINGS.items()
+        for name, (volts, _, stiffness, _) in INTERPRETATIONS.items()
     }
-    plants = {name: (case, case.actuators[0]) for name, case in simple.items()}
+    plants = {name: (case, case.actuators[0]) for name, case in interpreted_rigs.items()}
     plants |= {name: (rig, shaker) for name, shaker in _full_shakers(rig).items()}
-    runs = _Runs(rig)
+    runs = _RunCache(rig)
     peaks = {
         name: {
             kind: np.array([[runs.peak(name, *plant, kind, v, m) for m in MASSES] for v in SPEEDS])
-            for kind in (FREE, *LAWS)
+            for kind in (NO_CONTROL, *LAWS)
         }
         for name, plant in plants.items()
     }
     ratios = {
-        kind: {name: 100 * one[kind] / one[FREE] for name, one in peaks.items()} for kind in LAWS
+        kind: {name: 100 * one[kind] / one[NO_CONTROL] for name, one in peaks.items()}
+        for kind in LAWS
     }
     tables = (
         ("time-invariant", (published.INVARIANT_SLOW, published.INVARIANT_FAST)),
@@ -108,76 +117,95 @@ def run(load) -> Outcome:
         ("augmented", (published.AUGMENTED_SLOW, published.AUGMENTED_FAST)),
     )
     findings = [
-        _finding(printed, {name: values[i] for name, values in ratios[kind].items()}, obstacle)
+        _make_finding(printed, {name: values[i] for name, values in ratios[kind].items()}, obstacle)
         for kind, both in tables
-        for obstacle in [_scatter(both, [ratios[kind][name] for name in READINGS])]
+        for obstacle in [_scatter_text(both, [ratios[kind][name] for name in INTERPRETATIONS])]
         for i, printed in enumerate(both)
     ]
     laws = "time-varying", "augmented"
-    less = {name: [100 - ratios[kind][name][-1, -1] for kind in laws] for name in plants}
-    findings.append(_finding(published.SUMMARY_OPTIMAL, less))
-    fewer = {
+    reductions = {name: [100 - ratios[kind][name][-1, -1] for kind in laws] for name in plants}
+    findings.append(_make_finding(published.SUMMARY_OPTIMAL, reductions))
+    few_state_reductions = {
         name: [
-            100 - 100 * runs.peak(name, *plants[name], kind, *ONE, ALONE) / peaks[name][FREE][1, 0]
+            100
+            - 100
+            * runs.peak(name, *plants[name], kind, *LIGHT_FAST, FIRST_MODE)
+            / peaks[name][NO_CONTROL][1, 0]
             for kind in ("time-invariant", "time-varying")
         ]
-        for name in list(READINGS)[:2]
+        for name in list(INTERPRETATIONS)[:2]
     }
-    for reading, values in fewer.items():
+    for reading, values in few_state_reductions.items():
         values.append(100 - float(ratios["time-varying"][reading][-1, 0]))
-    findings.append(_finding(published.FEWER_STATES, fewer))
-    findings.append(_scheduled(runs, simple))
-    slow = {kind: runs.records["as printed", kind, SPEEDS[0], MASSES[-1]] for kind in (FREE, *LAWS)}
-    findings += [deepest_place(slow), modes_kept(load)]
-    gains = sampled(rig, WEIGHTS)
-    findings += [*gains, observed(rig, WEIGHTS, EFFORT, gains[-1].obstacle)]
-    loops = {name: _loops(simple[name], READINGS[name][1]) for name in simple}
-    other = _loops(simple["2.5 N/V reach the beam"], 3e-4, damping=0.0)
-    loops |= {UNDAMPED: other, f"{UNDAMPED}, but for the last tenth": other._replace(share=0.9)}
-    findings += frozen(loops)
-    shown = {kind: runs.records[REFITTED, kind, SPEEDS[1], MASSES[-1]] for kind in (FREE, *LAWS)}
-    figures = {
-        "deflections": _draw(shown),
-        "readings": _draw_readings(tables, ratios),
-        "poles": draw_poles(other.few, UNDAMPED),
+    findings.append(_make_finding(published.PARTIAL_FEEDBACK, few_state_reductions))
+    findings.append(_gain_scheduling_finding(runs, interpreted_rigs))
+    slow = {
+        kind: runs.records["as printed", kind, SPEEDS[0], MASSES[-1]]
+        for kind in (NO_CONTROL, *LAWS)
     }
-    return Outcome(tuple(findings), figures, (_misses(findings[:6], plants), grown(loops)))
+    findings += [deepest_position(slow), mode_truncation(load_rig)]
+    gains = sampling_findings(rig, WEIGHTS)
+    findings += [*gains, observed_regulator(rig, WEIGHTS, EFFORT, gains[-1].inconsistency)]
+    loops = {
+        name: _time_varying_loops(interpreted_rigs[name], INTERPRETATIONS[name][1])
+        for name in interpreted_rigs
+    }
+    other = _time_varying_loops(interpreted_rigs["2.5 N/V reach the beam"], 3e-4, damping=0.0)
+    loops |= {
+        UNDAMPED_DESIGN: other,
+        f"{UNDAMPED_DESIGN}, but for the last tenth": other._replace(share=0.9),
+    }
+    findings += frozen_pole_findings(loops)
+    drawn_records = {
+        kind: runs.records[REFITTED_SHAKER, kind, SPEEDS[1], MASSES[-1]]
+        for kind in (NO_CONTROL, *LAWS)
+    }
+    figures = {
+        "deflections": _draw(drawn_records),
+        "readings": _draw_interpretations(tables, ratios),
+        "poles": draw_poles(other.partial_feedback, UNDAMPED_DESIGN),
+    }
+    return ExperimentResult(
+        tuple(findings),
+        figures,
+        (_rms_difference_remark(findings[:6], plants), growth_remark(loops)),
+    )
 
 
-def _scheduled(runs: "_Runs", plants) -> Finding:
+def _gain_scheduling_finding(runs: "_RunCache", plants) -> Finding:
     """By how much (points) its own gain holds the heaviest mass better than the lightest's."""
-    kind, slow, (light, *_, heavy) = "time-varying", SPEEDS[0], MASSES
+    kind, slow, (lightest, *_, heaviest) = "time-varying", SPEEDS[0], MASSES
     found, alike = {}, []
     for reading, case in plants.items():
 
         def share(mass, gain_for, reading=reading, case=case):
             run = reading, case, case.actuators[0]
-            under = runs.peak(*run, kind, slow, mass, gain_for=gain_for)
-            return 100 * under / runs.peak(*run, FREE, slow, mass)
+            under = runs.peak(*run, kind, slow, mass, design_mass=gain_for)
+            return 100 * under / runs.peak(*run, NO_CONTROL, slow, mass)
 
-        found[reading] = [share(heavy, light) - share(heavy, heavy)]
-        alike.append(abs(share(heavy, light) - share(light, light)))
-    printed, own = published.SCHEDULED, published.VARYING_SLOW.numbers
+        found[reading] = [share(heaviest, lightest) - share(heaviest, heaviest)]
+        alike.append(abs(share(heaviest, lightest) - share(lightest, lightest)))
+    printed, own = published.GAIN_SCHEDULING, published.VARYING_SLOW.numbers
     most = own[0] - own[-1] + max(alike)
     obstacle = (
         f"one gain takes the same share off either mass, by every reading to {max(alike):.1f}"
         f" points, so that Table 5.1, each mass with its own, leaves no more than {most:.1f}"
     )
-    possible = most + printed.allowed[0] >= printed.numbers[0]
-    return _finding(printed, found, "" if possible else obstacle)
+    possible = most + printed.allowed_error[0] >= printed.numbers[0]
+    return _make_finding(printed, found, "" if possible else obstacle)
 
 
-def _finding(printed, values, obstacle=""):
+def _make_finding(printed, values, obstacle=""):
     first = values["as printed"]
     others = {k: v for k, v in values.items() if k != "as printed"}
-    return finding(printed, first, others, obstacle)
+    return make_finding(printed, first, others, obstacle)
 
 
-def _scatter(both, ratios) -> str:
+def _scatter_text(both, ratios) -> str:
     """Why numbers printed for two speeds cannot both be met, where the model hardly knows these."""
     printed = float(np.max(np.abs(both[0].numbers - both[1].numbers)))
     ours = max(float(np.max(np.abs(slow - fast))) for slow, fast in ratios)
-    if printed < SCATTER * ours or printed < both[0].tolerance.absolute:
+    if printed < SCATTER_RATIO * ours or printed < both[0].tolerance.absolute:
         return ""
     return (
         f"measured at {SPEEDS[0]:g} and {SPEEDS[1]:g} m/s it differs by up to {printed:.1f} points;"
@@ -185,10 +213,15 @@ def _scatter(both, ratios) -> str:
     )
 
 
-def _loops(case: jb.Case, effort: float, damping: float | None = None) -> Loops:
+def _time_varying_loops(
+    case: jb.Case, effort: float, damping: float | None = None
+) -> TimeVaryingLoops:
     """The time-varying loop with some states fed back, and with all."""
-    laws = (law("time-varying", effort, shares, damping) for shares in (FED_BACK, ALL))
-    return Loops(*(dataclasses.replace(case, controller=one) for one in laws))
+    laws = (
+        regulator("time-varying", effort, shares, damping)
+        for shares in (FEEDBACK_SHARES, ALL_STATES)
+    )
+    return TimeVaryingLoops(*(dataclasses.replace(case, controller=one) for one in laws))
 
 
 def _full_shakers(rig: jb.Case) -> dict[str, jb.Electrodynamic]:
@@ -197,56 +230,64 @@ def _full_shakers(rig: jb.Case) -> dict[str, jb.Electrodynamic]:
     braking = shaker.force_constant * shaker.back_emf / shaker.resistance  # N s/m
     damping = passive.damping - braking
     refitted = dataclasses.replace(shaker, stiffness=passive.stiffness, damping=damping)
-    return {FULL: shaker, REFITTED: refitted}
+    return {FULL_SHAKER: shaker, REFITTED_SHAKER: refitted}
 
 
-class _Runs:
+class _RunCache:
     """Runs of the plants, with a time step chosen once for each kind of law and of shaker."""
 
     def __init__(self, rig: jb.Case):
         self.layout, self.plans, self.records = lay_out(rig), {}, {}
 
-    def peak(self, name, design, actuator, kind, speed, mass, shares=None, gain_for=None) -> float:
+    def peak(
+        self, name, design, actuator, kind, speed, mass, feedback_shares=None, design_mass=None
+    ) -> float:
         """Largest deflection (m) under a law designed for one case, on another shaker.
 
-        Of its gain some `shares` are used; it is the one `gain_for` another mass, if that is given.
+        Of its gain some `feedback_shares` are used; it is the one `design_mass` another mass, if that is given.
         """
         loads = {"loads.0.mass": mass, "loads.0.speed": speed}
         design = jb.replace(design, loads)
         plant = dataclasses.replace(design, actuators=(actuator,))
         if kind in LAWS:
-            _, effort, _, own = READINGS.get(name, READINGS["as printed"])
-            law_here = law(kind, effort, own if shares is None else shares)
-            lighter = {} if gain_for is None else {"loads.0.mass": gain_for}
-            memory = _designed(law_here, jb.replace(design, lighter), self.layout)
-            plant = dataclasses.replace(plant, controller=Prepared(law=law_here, memory=memory))
+            _, effort, _, own = INTERPRETATIONS.get(name, INTERPRETATIONS["as printed"])
+            own_regulator = regulator(
+                kind, effort, own if feedback_shares is None else feedback_shares
+            )
+            lighter = {} if design_mass is None else {"loads.0.mass": design_mass}
+            memory = _initial_memory(own_regulator, jb.replace(design, lighter), self.layout)
+            plant = dataclasses.replace(
+                plant, controller=PredesignedController(law=own_regulator, memory=memory)
+            )
         key = kind, type(actuator)
         if key not in self.plans:
             self.plans[key] = make_plan(plant, None, TOLERANCE)
         record = jb.simulate(plant, plan=self.plans[key])
-        if shares is None and gain_for is None:
+        if feedback_shares is None and design_mass is None:
             self.records[name, kind, speed, mass] = record
         return float(record.peak_deflection[SENSOR])
 
 
 @compiled
-def _designed(law: AbstractController, case: jb.Case, layout):
+def _initial_memory(law: AbstractController, case: jb.Case, layout):
     """The memory of a law for a case."""
     return law.init(jb.state_space(case, layout=layout))
 
 
-def _misses(findings, names) -> str:
+def _rms_difference_remark(findings, interpretations) -> str:
     """How far each reading is from all eighteen numbers of Tables 5.1 to 5.4."""
     sizes = []
-    for reading in names:
-        far = np.concatenate([one.readings[reading] - one.printed.numbers for one in findings])
-        sizes.append(f"{reading}: {np.sqrt(np.mean(far**2)):.1f}")
+    for reading in interpretations:
+        differences = np.concatenate(
+            [one.readings[reading] - one.published.numbers for one in findings]
+        )
+        sizes.append(f"{reading}: {np.sqrt(np.mean(differences**2)):.1f}")
     return "Root mean square of the differences over Tables 5.1 to 5.4, in points: " + "; ".join(
         sizes
     )
 
 
-@styled
+@use_style
 def _draw(records) -> Figure:
     """Figs 5.19 to 5.28: deflection and voltage under each law."""
     figure = Figure(figsize=(7.2, 4.6))
@@ -261,27 +302,29 @@ def _draw(records) -> Figure:
     above.set(ylabel="deflection at 0.25 m (mm)")
     below.set(xlabel="time (s)", ylabel="voltage (V)", xlim=(0, times[-1]))
     above.legend(loc="lower right", ncols=2)
-    name(figure, "0.509 kg at 0.55 m/s, full model of the shaker refitted (Fig. 5.28)")
+    set_title(figure, "0.509 kg at 0.55 m/s, full model of the shaker refitted (Fig. 5.28)")
     return figure
 
 
-@styled
-def _draw_readings(tables, ratios) -> Figure:
+@use_style
+def _draw_interpretations(tables, ratios) -> Figure:
     """Printed peaks beside those of every reading."""
     figure = Figure(figsize=(7.2, 3.6))
     panels = figure.subplots(1, len(tables), sharey=True)
     for axes, (kind, printed) in zip(panels, tables, strict=True):
         published_ones = np.concatenate([one.numbers for one in printed])
-        places = np.arange(published_ones.size)
+        bar_positions = np.arange(published_ones.size)
         for i, (word, values) in enumerate(ratios[kind].items()):
-            axes.plot(places, np.ravel(values), "o", markersize=4, color=colour(i), label=word)
-        axes.plot(places, published_ones, "_", color="k", markersize=14, label="printed")
-        axes.set_xticks(places, [f"{mass:g}" for mass in 2 * MASSES], rotation=90)
+            axes.plot(
+                bar_positions, np.ravel(values), "o", markersize=4, color=colour(i), label=word
+            )
+        axes.plot(bar_positions, published_ones, "_", color="k", markersize=14, label="printed")
+        axes.set_xticks(bar_positions, [f"{mass:g}" for mass in 2 * MASSES], rotation=90)
         axes.set(title=kind, xlabel="mass (kg), at 0.3 and 0.55 m/s")
     # One reading's loop grows without bound in a run; its peak is in the table, not in the picture.
     panels[0].set(ylabel="peak in percent of no control", ylim=(0, 110))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    name(figure, "Optimal control in several readings (Tables 5.1 to 5.4)")
+    set_title(figure, "Optimal control in several readings (Tables 5.1 to 5.4)")
     return figure
 
 

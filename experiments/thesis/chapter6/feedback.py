@@ -12,23 +12,35 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments.thesis import published
-from experiments.thesis.chapter6.ripple import gain_margin, rippled
-from experiments.thesis.chapter6.scheduling import STRONGER, by_statics, derived, switched
-from experiments.thesis.verdicts import Experiment, Outcome, finding
-from jaxbeam.plot.style import colour, name, styled
+from experiments.thesis.chapter6.ripple import gain_margin_finding, oscillation_findings
+from experiments.thesis.chapter6.scheduling import (
+    HIGHER_GAINS,
+    derived_schedules,
+    static_schedule_remark,
+    switching_masses,
+)
+from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
+from jaxbeam.plot.style import colour, set_title, use_style
 from jaxbeam.simulation.integration_plan import make_plan
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 MASSES = (0.261, 0.322, 0.371, 0.509)  # kg
 GAIN, PERIOD = 2.0, 0.002  # V per mm or mm^3; s, not printed
-ONE_CUTOFF, TWO_CUTOFF = 10.0, 20.0  # Hz
-CORRECTIONS = (0.32, 0.39, 0.5)  # c_p of 2.4.2, that of two spans, and one that fits Fig. 6.7
-GAPS = (0.3, 0.6, 0.9, 1.2, 1.5)  # s between two masses
-LATER, LESS_DAMPING = 0.03, 0.01  # s and 1: what section 6.2 does not print, and would explain it
+ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF = 10.0, 20.0  # Hz
+CORRECTION_FACTORS = (
+    0.32,
+    0.39,
+    0.5,
+)  # c_p of 2.4.2, that of two spans, and one that fits Fig. 6.7
+HEADWAYS = (0.3, 0.6, 0.9, 1.2, 1.5)  # s between two masses
+EXTRA_DELAY, LOW_DAMPING_RATIO = (
+    0.03,
+    0.01,
+)  # s and 1: what section 6.2 does not print, and would explain it
 TOLERANCE = 1e-4
 
 
-def controlled(
+def with_feedback(
     case: jb.Case, power: int, cutoff: float, gain: float = GAIN, delay: float | None = None
 ) -> jb.Case:
     """A patch rig under the law of this power; without one for power 0."""
@@ -41,7 +53,7 @@ def controlled(
     return dataclasses.replace(case, sensors=sensors, controller=law)
 
 
-def runs(case: jb.Case, changes) -> list[jb.Record]:
+def simulate_changes(case: jb.Case, changes) -> list[jb.Record]:
     """A case with several changes of its numbers, compiled once."""
     cases = [jb.replace(case, change) for change in changes]
     plan = make_plan(cases[-1], None, TOLERANCE)
@@ -51,20 +63,23 @@ def runs(case: jb.Case, changes) -> list[jb.Record]:
         return [jb.simulate(one, plan=plan) for one in cases]
 
 
-def run(load) -> Outcome:
+def run(load_rig) -> ExperimentResult:
     """Peaks without control and under both laws, on rigs B and C."""
-    one, one_figures, remarks = _one_span(load("B"))
-    two, two_figures = _two_spans(load("C"))
-    return Outcome((*two, *one), two_figures | one_figures, remarks)
+    one, one_figures, remarks = _one_span(load_rig("B"))
+    two, two_figures = _two_spans(load_rig("C"))
+    return ExperimentResult((*two, *one), two_figures | one_figures, remarks)
 
 
-def _less(free, other):
-    return 100 * (1 - np.asarray(other) / np.asarray(free))
+def _reduction(uncontrolled, controlled):
+    return 100 * (1 - np.asarray(controlled) / np.asarray(uncontrolled))
 
 
 def _two_spans(case: jb.Case):
     changes = [{"loads.0.mass": mass} for mass in MASSES]
-    found = [runs(controlled(case, power, TWO_CUTOFF), changes) for power in (0, 1, 3)]
+    found = [
+        simulate_changes(with_feedback(case, power, TWO_SPAN_CUTOFF), changes)
+        for power in (0, 1, 3)
+    ]
     down, up = (
         np.array(
             [[1e3 * np.max(sign * np.asarray(r.deflection), axis=0) for r in row] for row in found]
@@ -74,46 +89,49 @@ def _two_spans(case: jb.Case):
     (free, linear, cubic), rise = np.moveaxis(down, 2, 1), up[..., 1]
     amplifier = float(case.actuators[0].amplifier_gain)
     volts = [amplifier * float(found[2][i].command[:, j].max()) for i, j in ((0, 0), (3, 1))]
-    reductions = _two_masses(case)
-    lowest, highest = min(reductions), max(reductions)
+    two_mass_reductions = _two_masses(case)
+    lowest, highest = min(two_mass_reductions), max(two_mass_reductions)
     inside = lowest <= published.TWO_MASSES.numbers[0] <= highest
     table = (
         (published.FREE_S1, free[0]),
         (published.CUBIC_S1, cubic[0]),
-        (published.CUBIC_LESS_S1, _less(free, cubic)[0]),
+        (published.CUBIC_REDUCTION_S1, _reduction(free, cubic)[0]),
         (published.LINEAR_S1, linear[0]),
-        (published.LINEAR_LESS_S1, _less(free, linear)[0]),
+        (published.LINEAR_REDUCTION_S1, _reduction(free, linear)[0]),
         (published.FREE_S3, free[1]),
         (published.FREE_S3_COMPUTED, free[1]),
         (published.CUBIC_S3, cubic[1]),
-        (published.CUBIC_LESS_S3, _less(free, cubic)[1]),
+        (published.CUBIC_REDUCTION_S3, _reduction(free, cubic)[1]),
         (published.LINEAR_S3, linear[1]),
-        (published.LINEAR_LESS_S3, _less(free, linear)[1]),
+        (published.LINEAR_REDUCTION_S3, _reduction(free, linear)[1]),
         (published.FREE_UP, rise[0]),
         (published.CUBIC_UP, rise[2]),
-        (published.CUBIC_LESS_UP, _less(rise[0], rise[2])),
-        (published.FEEDBACK_VOLTS, volts),
-        (published.SUMMARY_TWO, [_less(free, law)[0, -1] for law in (linear, cubic)]),
+        (published.CUBIC_REDUCTION_UP, _reduction(rise[0], rise[2])),
+        (published.FEEDBACK_VOLTAGE, volts),
+        (published.SUMMARY_TWO, [_reduction(free, law)[0, -1] for law in (linear, cubic)]),
     )
-    findings = [finding(printed, ours) for printed, ours in table]
+    findings = [make_finding(printed, ours) for printed, ours in table]
     findings.append(
-        finding(
+        make_finding(
             published.TWO_MASSES,
             np.nan,
-            obstacle=f"the gap between the masses is not printed; gaps of {GAPS[0]:g} to"
-            f" {GAPS[-1]:g} s give {lowest:.1f} to {highest:.1f} %"
+            inconsistency=f"the gap between the masses is not printed; gaps of {HEADWAYS[0]:g} to"
+            f" {HEADWAYS[-1]:g} s give {lowest:.1f} to {highest:.1f} %"
             if inside
             else "",
         )
     )
-    named = {
+    variants = {
         f"{damped} {late}".strip(): (delay, damping)
-        for late, delay in (("", None), (f"{1e3 * LATER:g} ms later", LATER))
-        for damped, damping in (("zeta 0.03", 0.03), (f"zeta {LESS_DAMPING:g}", LESS_DAMPING))
+        for late, delay in (("", None), (f"{1e3 * EXTRA_DELAY:g} ms later", EXTRA_DELAY))
+        for damped, damping in (
+            ("zeta 0.03", 0.03),
+            (f"zeta {LOW_DAMPING_RATIO:g}", LOW_DAMPING_RATIO),
+        )
     }
-    lightest = {word: _lightest_unstable(case, *numbers) for word, numbers in named.items()}
+    lightest = {word: _lightest_unstable(case, *numbers) for word, numbers in variants.items()}
     printed, *others = lightest.items()
-    findings.append(finding(published.UNSTABLE_MASS, printed[1], dict(others)))
+    findings.append(make_finding(published.UNSTABLE_MASS, printed[1], dict(others)))
     heaviest = {word: row[-1] for word, row in zip(LAWS, found, strict=True)}
     return findings, {"two-spans": _draw(heaviest, "Two spans, 0.509 kg (Figs 6.8, 6.9)")}
 
@@ -127,7 +145,7 @@ def _lightest_unstable(case: jb.Case, delay: float | None, damping: float) -> fl
     Unstable is a loop whose commands grow until the actuators' limits hold them.
     """
     changes = [{"loads.0.mass": mass, "beam.damping_ratio": damping} for mass in MASSES]
-    records = runs(controlled(case, 3, TWO_CUTOFF, 3.0, delay), changes)
+    records = simulate_changes(with_feedback(case, 3, TWO_SPAN_CUTOFF, 3.0, delay), changes)
     saturated = [bool(np.any(record.saturated)) for record in records]
     return MASSES[saturated.index(True)] if any(saturated) else np.nan
 
@@ -139,40 +157,49 @@ def _two_masses(case: jb.Case) -> list[float]:
         dataclasses.replace(first, mass=np.asarray(mass), entry_time=np.asarray(0.0))
         for mass in MASSES[2:]
     ]
-    longer = dataclasses.replace(case.run, duration=case.run.duration + GAPS[-1])
+    longer = dataclasses.replace(case.run, duration=case.run.duration + HEADWAYS[-1])
     both = dataclasses.replace(case, loads=tuple(loads), run=longer)
-    changes = [{"loads.1.entry_time": gap} for gap in GAPS]
+    changes = [{"loads.1.entry_time": gap} for gap in HEADWAYS]
     free, cubic = (
         [
             -np.min(run.deflection[:, 1])
-            for run in runs(controlled(both, power, TWO_CUTOFF), changes)
+            for run in simulate_changes(with_feedback(both, power, TWO_SPAN_CUTOFF), changes)
         ]
         for power in (0, 3)
     )
-    return list(_less(free, cubic))
+    return list(_reduction(free, cubic))
 
 
 def _one_span(case: jb.Case):
     changes = [
         {"loads.0.mass": mass, "actuators.0.correction": share}
-        for share in CORRECTIONS
+        for share in CORRECTION_FACTORS
         for mass in MASSES
     ]
-    found = [runs(controlled(case, power, ONE_CUTOFF), changes) for power in (0, 1, 3)]
+    found = [
+        simulate_changes(with_feedback(case, power, ONE_SPAN_CUTOFF), changes)
+        for power in (0, 1, 3)
+    ]
     peaks = [[float(r.peak_deflection[0]) for r in row] for row in found]
-    shape = len(CORRECTIONS), len(MASSES)
-    linear, cubic = (_less(peaks[0], row).reshape(shape) for row in peaks[1:])
-    stronger = []
-    for gain in STRONGER:
+    shape = len(CORRECTION_FACTORS), len(MASSES)
+    linear, cubic = (_reduction(peaks[0], row).reshape(shape) for row in peaks[1:])
+    higher_gain_peaks = []
+    for gain in HIGHER_GAINS:
         higher = [change | {"controller.gains.0": gain * 1e3} for change in changes]
-        records = runs(controlled(case, 1, ONE_CUTOFF), higher)
-        stronger.append(np.reshape([float(r.peak_deflection[0]) for r in records], shape))
-    switches, last = switched(MASSES, np.reshape(peaks, (3, *shape)), np.array(stronger))
-    schedule, remark = derived(controlled(case, 1, ONE_CUTOFF), MASSES, runs)
-    words = [f"c_p {share:g}" for share in CORRECTIONS]
+        records = simulate_changes(with_feedback(case, 1, ONE_SPAN_CUTOFF), higher)
+        higher_gain_peaks.append(np.reshape([float(r.peak_deflection[0]) for r in records], shape))
+    switches, last = switching_masses(
+        MASSES, np.reshape(peaks, (3, *shape)), np.array(higher_gain_peaks)
+    )
+    schedule, remark = derived_schedules(
+        with_feedback(case, 1, ONE_SPAN_CUTOFF), MASSES, simulate_changes
+    )
+    correction_labels = [f"c_p {share:g}" for share in CORRECTION_FACTORS]
 
     def by_correction(printed, values):
-        return finding(printed, values[0], dict(zip(words[1:], values[1:], strict=True)))
+        return make_finding(
+            printed, values[0], dict(zip(correction_labels[1:], values[1:], strict=True))
+        )
 
     findings = [
         by_correction(published.ONE_SPAN_LINEAR, [[v.min(), v.max()] for v in linear]),
@@ -180,15 +207,18 @@ def _one_span(case: jb.Case):
         by_correction(
             published.SUMMARY_ONE, [[a[-1], b[-1]] for a, b in zip(linear, cubic, strict=True)]
         ),
-        by_correction(published.SWITCHED_MASSES, switches),
-        by_correction(published.LAST_GAIN, last),
+        by_correction(published.SWITCHING_MASSES, switches),
+        by_correction(published.EQUIVALENT_LINEAR_GAIN, last),
         by_correction(
-            published.LIGHTEST_ONE, [[a[0], b[0]] for a, b in zip(linear, cubic, strict=True)]
+            published.LIGHTEST_MASS_REDUCTION,
+            [[a[0], b[0]] for a, b in zip(linear, cubic, strict=True)],
         ),
-        finding(published.AFTER_EXIT, jb.modes(case).frequencies[0]),
-        gain_margin(case, CORRECTIONS),
+        make_finding(published.FREE_VIBRATION_FREQUENCY, jb.modes(case).frequencies[0]),
+        gain_margin_finding(case, CORRECTION_FACTORS),
     ]
-    oscillating, oscillation = rippled(controlled(case, 3, ONE_CUTOFF), runs)
+    oscillating, oscillation = oscillation_findings(
+        with_feedback(case, 3, ONE_SPAN_CUTOFF), simulate_changes
+    )
     findings += oscillating
     heaviest = {word: row[len(MASSES) - 1] for word, row in zip(LAWS, found, strict=True)}
     return (
@@ -199,11 +229,11 @@ def _one_span(case: jb.Case):
             "reductions": _draw_reductions(linear[0], cubic[0]),
             "schedule": schedule,
         },
-        (by_statics(case, MASSES[-1]), remark),
+        (static_schedule_remark(case, MASSES[-1]), remark),
     )
 
 
-@styled
+@use_style
 def _draw(records: dict[str, jb.Record], title: str) -> Figure:
     """Deflections at the sensors, and voltages at the patches, under each law."""
     case = records["cubic"].case
@@ -215,8 +245,8 @@ def _draw(records: dict[str, jb.Record], title: str) -> Figure:
         for axes, history in zip(panels, np.asarray(record.deflection).T, strict=False):
             axes.plot(times, 1e3 * history, color=colour(i), label=word)
         if record.case.controller is not None:
-            for j, sent in enumerate(np.asarray(record.command).T):
-                volts = float(case.actuators[j].amplifier_gain) * sent
+            for j, command in enumerate(np.asarray(record.command).T):
+                volts = float(case.actuators[j].amplifier_gain) * command
                 panels[-1].plot(times, volts, ("-", "--")[j], color=colour(i))
     for axes, sensor in zip(panels, case.sensors, strict=False):
         axes.set(title=f"at {float(sensor.position):g} m", ylabel="deflection (mm)")
@@ -228,23 +258,23 @@ def _draw(records: dict[str, jb.Record], title: str) -> Figure:
         xlim=(0, times[-1]),
     )
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    name(figure, title)
+    set_title(figure, title)
     return figure
 
 
-@styled
+@use_style
 def _draw_reductions(linear, cubic) -> Figure:
     """Fig. 6.6: reductions over the mass."""
     figure = Figure(figsize=(4.6, 3.0))
     axes = figure.subplots()
-    places = np.arange(len(MASSES))
+    bar_positions = np.arange(len(MASSES))
     for i, (values, word) in enumerate(((linear, "linear"), (cubic, "cubic"))):
-        axes.bar(places + 0.36 * (i - 0.5), values, 0.34, color=colour(i), label=word)
-    axes.set_xticks(places, [f"{mass:g}" for mass in MASSES])
+        axes.bar(bar_positions + 0.36 * (i - 0.5), values, 0.34, color=colour(i), label=word)
+    axes.set_xticks(bar_positions, [f"{mass:g}" for mass in MASSES])
     axes.grid(False, axis="x")
     axes.set(xlabel="mass (kg)", ylabel="reduction of the peak (%)")
     axes.legend(loc="upper left")
-    name(figure, "One span, c_p 0.32 (Fig. 6.6)")
+    set_title(figure, "One span, c_p 0.32 (Fig. 6.6)")
     return figure
 
 

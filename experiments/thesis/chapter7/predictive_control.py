@@ -14,38 +14,48 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments.thesis import published
-from experiments.thesis.verdicts import Experiment, Finding, Outcome, finding
+from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, make_finding
 from jaxbeam.analysis.bound.input_influence import reach
 from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.control.design_model import Beliefs
-from jaxbeam.plot.style import GREY, colour, name, styled
+from jaxbeam.plot.style import GREY, colour, set_title, use_style
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form
 
 PERIOD, SPEED = 0.01, 1.0  # s, m/s
-STRONG, WEAK = 1e-11, 1e-6  # r_w
+LOW_MOVE_WEIGHT, HIGH_MOVE_WEIGHT = 1e-11, 1e-6  # r_w
 TOLERANCE = 1e-4
-LINE = 0.02  # of a limit: as near as that, a curve seems to have reached it
-SECTIONS = ((12.277, 0.7924), (13.211, 0.812), (12.11, 0.5411))  # printed for beams with patches
-DAMPING = (0.01, 0.03)
+CURVE_RESOLUTION = 0.02  # of a limit: as near as that, a curve seems to have reached it
+PRINTED_SECTIONS = (
+    (12.277, 0.7924),
+    (13.211, 0.812),
+    (12.11, 0.5411),
+)  # printed for beams with patches
+DAMPING_RATIOS = (0.01, 0.03)
 
 
-def crossing(case: jb.Case) -> jb.Case:
+def with_crossing(case: jb.Case) -> jb.Case:
     """A patch rig crossed at 1 m/s, with 0.2 s of what follows."""
     duration = np.asarray(float(case.beam.length) / SPEED + 0.2)
     case = dataclasses.replace(case, run=dataclasses.replace(case.run, duration=duration))
     return jb.replace(case, {"loads.0.speed": SPEED})
 
 
-def controlled(
-    case: jb.Case, horizon: int, moves: int, weight: float = STRONG, modes: int | None = None
+def simulate_mpc(
+    case: jb.Case,
+    horizon: int,
+    control_horizon: int,
+    weight: float = LOW_MOVE_WEIGHT,
+    modes: int | None = None,
 ) -> jb.Record:
     """A run under predictive control of the deflections at the sensors, sampled at its ticks.
 
     The controller's model has fewer `modes` than the case, if that is given.
     """
     design = None if modes is None else Beliefs(modes=modes)
-    law = jb.MPC(horizon=horizon, moves=moves, move_weight=weight, period=PERIOD, design=design)
+    law = jb.MPC(
+        horizon=horizon, moves=control_horizon, move_weight=weight, period=PERIOD, design=design
+    )
     case = dataclasses.replace(case, controller=law)
     times = np.arange(round(float(case.run.duration) / PERIOD) + 1) * PERIOD
     # Enough steps for the fastest mode to turn by a radian or two in each.
@@ -53,73 +63,89 @@ def controlled(
     return jb.simulate(case, jnp.asarray(times), plan)
 
 
-def run(load) -> Outcome:
+def run(load_rig) -> ExperimentResult:
     """Reductions and instants of saturation on rigs B and C, beside what is possible."""
-    one, one_records = _one_span(crossing(load("B")))
-    two, two_records = _two_spans(crossing(load("C")))
+    one, one_records = _one_span(with_crossing(load_rig("B")))
+    two, two_records = _two_spans(with_crossing(load_rig("C")))
     figures = {
         "one-span": _draw(one_records, "One span, 0.509 kg at 1 m/s (Figs 7.1, 7.2)"),
         "two-spans": _draw(two_records, "Two spans, 0.509 kg at 1 m/s (Figs 7.5 to 7.7)"),
     }
-    return Outcome((*one, *two), figures)
+    return ExperimentResult((*one, *two), figures)
 
 
 def _one_span(case):
     eight = dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=8))
-    less, records = [], {}
+    reductions, records = [], {}
     for one in (case, eight):
-        free, strong = jb.simulate(one, tolerance=TOLERANCE), controlled(one, 6, 4)
-        less.append(100 * (1 - float(strong.peak_deflection[0] / free.peak_deflection[0])))
+        free, strong = jb.simulate(one, tolerance=TOLERANCE), simulate_mpc(one, 6, 4)
+        reductions.append(100 * (1 - float(strong.peak_deflection[0] / free.peak_deflection[0])))
         if one is case:
-            weak = controlled(one, 6, 4, WEAK)
+            weak = simulate_mpc(one, 6, 4, HIGH_MOVE_WEIGHT)
             records = {"no control": free, "r_w 1e-11": strong, "r_w 1e-6": weak}
     both = [records[f"r_w {weight}"] for weight in ("1e-11", "1e-6")]
-    exact, seen = ([_first_at(one, 0, 7.5, near) for one in both] for near in (1e-6, LINE))
-    hasty = controlled(case, 6, 1)
+    exact, from_curve = (
+        [_saturation_time(one, 0, 7.5, near) for one in both] for near in (1e-6, CURVE_RESOLUTION)
+    )
+    one_move = simulate_mpc(case, 6, 1)
     findings = (
-        finding(published.ONE_MOVE_PEAKS, _peak_times(hasty)),
-        finding(published.PREDICTIVE_ONE, less[0], {"8 modes": less[1]}),
-        finding(published.SATURATED_ONE, exact, {f"as a curve shows it, to {LINE:.0%}": seen}),
+        make_finding(published.ONE_MOVE_PEAKS, _peak_times(one_move)),
+        make_finding(published.ONE_SPAN_REDUCTION, reductions[0], {"8 modes": reductions[1]}),
+        make_finding(
+            published.ONE_SPAN_SATURATION,
+            exact,
+            {f"as a curve shows it, to {CURVE_RESOLUTION:.0%}": from_curve},
+        ),
     )
     return findings, records
 
 
 def _two_spans(case):
     free = jb.simulate(case, tolerance=TOLERANCE)
-    short, long = controlled(case, 4, 3), controlled(case, 6, 4)
-    less = {
-        word: 100 * (1 - _halves(run) / _halves(free)) for word, run in (("s", short), ("l", long))
+    short, long = simulate_mpc(case, 4, 3), simulate_mpc(case, 6, 4)
+    reductions = {
+        word: 100 * (1 - _peaks_by_half(run) / _peaks_by_half(free))
+        for word, run in (("s", short), ("l", long))
     }
-    possible = _most_in_second_half(case)
-    far = published.PREDICTIVE_FAR.numbers.min()
+    attainable = _attainable_in_second_half(case)
+    printed_reduction = published.SECOND_HALF_REDUCTION.numbers.min()
     findings = (
-        finding(
-            published.PREDICTIVE_TWO, less["s"][[0, 0, 1], [0, 1, 1]], obstacle=_out_of_range(case)
+        make_finding(
+            published.TWO_SPAN_REDUCTION,
+            reductions["s"][[0, 0, 1], [0, 1, 1]],
+            inconsistency=_irreproducible_reductions(case),
         ),
-        finding(
-            published.PREDICTIVE_FAR,
-            [less["s"][1, 0], less["l"][1, 0]],
-            obstacle=f"no commands within the limits of the patches, whatever the controller, take"
-            f" more than {possible:.1f} % off there"
-            if possible < far
+        make_finding(
+            published.SECOND_HALF_REDUCTION,
+            [reductions["s"][1, 0], reductions["l"][1, 0]],
+            inconsistency=f"no commands within the limits of the patches, whatever the controller, take"
+            f" more than {attainable:.1f} % off there"
+            if attainable < printed_reduction
             else "",
         ),
-        _few_modes(case),
-        finding(published.SATURATED_TWO, [_first_at(short, 0, 7.5), _first_at(short, 1, -2.5)]),
+        _reduced_model_finding(case),
+        make_finding(
+            published.TWO_SPAN_SATURATION,
+            [_saturation_time(short, 0, 7.5), _saturation_time(short, 1, -2.5)],
+        ),
     )
     return findings, {"no control": free, "Np 4, Nc 3": short, "Np 6, Nc 4": long}
 
 
-def _few_modes(case: jb.Case) -> Finding:
+def _reduced_model_finding(case: jb.Case) -> Finding:
     """A controller that knows 3 modes, on a beam that has 12."""
     twelve = dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=12))
-    free, few = jb.simulate(twelve, tolerance=TOLERANCE), controlled(twelve, 2, 1, modes=3)
+    free, reduced_model = (
+        jb.simulate(twelve, tolerance=TOLERANCE),
+        simulate_mpc(twelve, 2, 1, modes=3),
+    )
     less = [
-        100 * (1 - b / a) for a, b in zip(free.peak_deflection, few.peak_deflection, strict=True)
+        100 * (1 - b / a)
+        for a, b in zip(free.peak_deflection, reduced_model.peak_deflection, strict=True)
     ]
-    told = f"less by {less[0]:.1f} and {less[1]:.1f} %"
+    label = f"less by {less[0]:.1f} and {less[1]:.1f} %"
     works = np.array([float(value > 0) for value in less])
-    return finding(published.FEW_MODES, works, {told: works})
+    return make_finding(published.REDUCED_MODEL, works, {label: works})
 
 
 def _peak_times(record: jb.Record) -> np.ndarray:
@@ -131,33 +157,35 @@ def _peak_times(record: jb.Record) -> np.ndarray:
     return times[times < float(record.case.beam.length) / SPEED][[0, -1]]
 
 
-def _out_of_range(case: jb.Case) -> str:
+def _irreproducible_reductions(case: jb.Case) -> str:
     """Which of the reductions no beam gives that is printed somewhere, if so."""
     found = []
-    for (rigidity, density), ratio in itertools.product(SECTIONS, DAMPING):
+    for (rigidity, density), ratio in itertools.product(PRINTED_SECTIONS, DAMPING_RATIOS):
         beam = {"beam.flexural_rigidity": rigidity, "beam.mass_per_length": density}
         one = jb.replace(case, beam | {"beam.damping_ratio": ratio})
-        free, less = jb.simulate(one, tolerance=TOLERANCE), controlled(one, 4, 3)
-        found.append(100 * (1 - _halves(less) / _halves(free))[[0, 0, 1], [0, 1, 1]])
+        free, less = jb.simulate(one, tolerance=TOLERANCE), simulate_mpc(one, 4, 3)
+        found.append(100 * (1 - _peaks_by_half(less) / _peaks_by_half(free))[[0, 0, 1], [0, 1, 1]])
     low, high = np.min(found, axis=0), np.max(found, axis=0)
-    printed = published.PREDICTIVE_TWO
-    out = (printed.numbers < low - printed.allowed) | (printed.numbers > high + printed.allowed)
+    printed = published.TWO_SPAN_REDUCTION
+    out = (printed.numbers < low - printed.allowed_error) | (
+        printed.numbers > high + printed.allowed_error
+    )
     ranges = [
         f"{label} {a:.1f} to {b:.1f} %"
-        for label, a, b, far in zip(printed.names, low, high, out, strict=True)
+        for label, a, b, far in zip(printed.value_labels, low, high, out, strict=True)
         if far
     ]
-    told = f"with any rigidity, mass and damping that is printed: {'; '.join(ranges)}"
-    return told if ranges else ""
+    message = f"with any rigidity, mass and damping that is printed: {'; '.join(ranges)}"
+    return message if ranges else ""
 
 
-def _first_at(record: jb.Record, actuator: int, limit: float, near: float = 1e-6) -> float:
+def _saturation_time(record: jb.Record, actuator: int, limit: float, near: float = 1e-6) -> float:
     """When a command is first at a limit (V), to a share of that, in s; NaN if never."""
     there = np.abs(np.asarray(record.command)[:, actuator] - limit) < near * abs(limit)
     return float(record.times[np.argmax(there)]) if there.any() else np.nan
 
 
-def _halves(record: jb.Record) -> np.ndarray:
+def _peaks_by_half(record: jb.Record) -> np.ndarray:
     """Largest deflections (m) in the first and second half of the crossing (half, sensor)."""
     middle = float(record.case.beam.length) / SPEED / 2
     times = np.asarray(record.times)
@@ -166,24 +194,24 @@ def _halves(record: jb.Record) -> np.ndarray:
     return np.array([sizes[times < middle].max(axis=0), sizes[second].max(axis=0)])
 
 
-def _most_in_second_half(case: jb.Case) -> float:
+def _attainable_in_second_half(case: jb.Case) -> float:
     """The largest reduction (%) at the first sensor in the second half that is possible at all."""
-    place = np.array([float(case.sensors[0].position)])
-    found = reach(case, place, PERIOD, PERIOD / 2)
+    position = np.array([float(case.sensors[0].position)])
+    influence = reach(case, position, PERIOD, PERIOD / 2)
     crossing = float(case.beam.length) / SPEED
-    second = (found.instants >= crossing / 2) & (found.instants <= crossing)
-    found = eqx.tree_at(
+    second = (influence.instants >= crossing / 2) & (influence.instants <= crossing)
+    influence = eqx.tree_at(
         lambda r: (r.instants, r.free, r.response),
-        found,
-        (found.instants[second], found.free[second], found.response[second]),
+        influence,
+        (influence.instants[second], influence.free[second], influence.response[second]),
     )
     low, high = np.array([actuator.command_limits() for actuator in case.actuators]).T
-    peak, _, _ = least_peak(found, low, high, np.full(low.shape, np.inf))
-    free = np.abs(found.free @ found.rows.T).max()
+    peak, _, _ = least_peak(influence, low, high, np.full(low.shape, np.inf))
+    free = np.abs(influence.free @ influence.rows.T).max()
     return 100 * (1 - peak / free)
 
 
-@styled
+@use_style
 def _draw(records: dict[str, jb.Record], title: str) -> Figure:
     """Deflections at the sensors and voltages at the amplifier's input."""
     case = next(iter(records.values())).case
@@ -205,7 +233,7 @@ def _draw(records: dict[str, jb.Record], title: str) -> Figure:
             axes.axhline(limit, color=GREY, linewidth=0.8, linestyle=":")
     panels[-1].set(xlabel="time (s)", xlim=(0, times[-1]))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    name(figure, title)
+    set_title(figure, title)
     return figure
 
 

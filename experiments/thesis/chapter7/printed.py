@@ -1,64 +1,69 @@
 """Chapter 7: model predictive control of one and two spans with patches."""
 
-from experiments.thesis.tolerances import EITHER, POINTS, SAMPLE
-from experiments.thesis.verdicts import Printed
+from experiments.thesis.tolerances import COMPUTED_REDUCTION, SAMPLE_INSTANT, YES_OR_NO
+from experiments.thesis.verdicts import PublishedNumbers
 
 # Model predictive control, 0.509 kg at 1 m/s.
-PREDICTIVE_ONE = Printed(
-    "Fig. 7.1, Table 8.1", "one span, less by predictive control", "%", "computed", POINTS, "22"
+ONE_SPAN_REDUCTION = PublishedNumbers(
+    "Fig. 7.1, Table 8.1",
+    "one span, less by predictive control",
+    "%",
+    "computed",
+    COMPUTED_REDUCTION,
+    "22",
 )
-SATURATED_ONE = Printed(
+ONE_SPAN_SATURATION = PublishedNumbers(
     "Figs 7.1, 7.2",
     "one span, first at 7.5 V",
     "s",
     "computed",
-    SAMPLE,
+    SAMPLE_INSTANT,
     "0.04 0.32",
     "r_w=1e-11 r_w=1e-6",
 )
-PREDICTIVE_TWO = Printed(
+TWO_SPAN_REDUCTION = PublishedNumbers(
     "Fig. 7.5, Table 8.1",
     "two spans, less by predictive control",
     "%",
     "computed",
-    POINTS,
+    COMPUTED_REDUCTION,
     "29 46 19",
     "s1,1st-half s2,1st-half s2,2nd-half",
     "r_w as for one span",
 )
-FEW_MODES = Printed(
+REDUCED_MODEL = PublishedNumbers(
     "Fig. 7.9",
     "two spans, controller with 3 modes on 12, reduces the peaks: 1, or not: 0",
     "1",
     "computed",
-    EITHER,
+    YES_OR_NO,
     "1 1",
     "s1 s2",
 )
-ONE_MOVE_PEAKS = Printed(
+ONE_MOVE_PEAKS = PublishedNumbers(
     "Fig. 7.3",
     "one span, Nc = 1, peaks of the deflection at",
     "s",
     "computed",
-    SAMPLE,
+    SAMPLE_INSTANT,
     "0.06 0.58",
     "first last",
 )
-PREDICTIVE_FAR = Printed(
+SECOND_HALF_REDUCTION = PublishedNumbers(
     "Figs 7.5, 7.7",
     "two spans, s1, less in the second half",
     "%",
     "computed",
-    POINTS,
+    COMPUTED_REDUCTION,
     "64 54",
     "Np=4,Nc=3 Np=6,Nc=4",
 )
-SATURATED_TWO = Printed(
+TWO_SPAN_SATURATION = PublishedNumbers(
     "Fig. 7.6",
     "two spans, first at a limit",
     "s",
     "computed",
-    SAMPLE,
+    SAMPLE_INSTANT,
     "0.08 0.09",
     "u1,7.5V u2,-2.5V",
 )

@@ -197,7 +197,7 @@ class AbstractForesighted(AbstractScheduledRegulator):
     modes gains were right everywhere to 3e-4 of the largest nearby where the fastest mode turned by
     3 rad in a stretch of the table, to 3e-5 with 2 rad, 2e-6 with 1, and 1e-7 with 0.5; while P
     rings, before an event, the table has finer stretches. Where an actuator lags, they were right
-    to 1e-6 if a stretch lasted nine of its time constants, to 1e-8 with four. `in_time`
+    to 1e-6 if a stretch lasted nine of its time constants, to 1e-8 with four. `inverse_transform`
     makes no difference to the gains: "parallel" is for devices with many cores, see
     `flows.costs_to_go`, and "native" takes what `jaxbeam native` has compiled from C, in about half
     the time.

@@ -15,7 +15,12 @@ from experiments.benchmarks.rivals.baselines import (
     scipy_peaks,
     scipy_time,
 )
-from experiments.benchmarks.rivals.crossing import Rig, crossing_rate, free_times, hermite_peaks
+from experiments.benchmarks.rivals.crossing import (
+    PinnedBeam,
+    crossing_rate,
+    free_times,
+    hermite_peaks,
+)
 from experiments.benchmarks.timing import Timing, time_call
 from tests.oracles.closed_loop import Actuator, Clock, Sensor, respond
 from tests.oracles.loads import Load
@@ -29,16 +34,16 @@ SPEEDS = np.array([0.8, 2.2, 5.3, 10.0])
 
 @pytest.fixture(scope="module")
 def reference():
-    return reference_peaks(Rig(3), MASSES, SPEEDS)
+    return reference_peaks(PinnedBeam(3), MASSES, SPEEDS)
 
 
 def test_scipy_agrees_to_one_in_a_million(reference):
-    np.testing.assert_allclose(scipy_peaks(Rig(3), MASSES, SPEEDS), reference, rtol=1e-6)
+    np.testing.assert_allclose(scipy_peaks(PinnedBeam(3), MASSES, SPEEDS), reference, rtol=1e-6)
 
 
 @pytest.mark.parametrize("shared_steps", [False, True])
 def test_diffrax_agrees_to_one_in_a_million(reference, shared_steps):
-    peaks = diffrax_peaks(Rig(3), MASSES, SPEEDS, shared_steps=shared_steps)
+    peaks = diffrax_peaks(PinnedBeam(3), MASSES, SPEEDS, shared_steps=shared_steps)
     np.testing.assert_allclose(peaks, reference, rtol=1e-6)
 
 
@@ -74,7 +79,7 @@ def test_reference_agrees_with_the_coupled_equations_sampled_finely():
         sensors = np.sin(np.outer([0.15, 0.3, 0.45], wavenumber))
         largest = np.maximum(largest, np.abs(sensors @ run.y[:modes]).max(axis=1))
         state = run.y[:, -1]
-    expected = reference_peaks(Rig(modes), [mass], [speed])[0, 0]
+    expected = reference_peaks(PinnedBeam(modes), [mass], [speed])[0, 0]
     np.testing.assert_allclose(largest, expected, rtol=1e-7)
 
 
@@ -89,7 +94,7 @@ def test_cubic_peaks_are_exact_for_a_cubic_and_need_no_sample_at_the_peak():
 
 
 def test_free_times_cover_the_time_asked_for_and_thin_out_as_high_modes_die():
-    times = free_times(Rig(12), 0.5)
+    times = free_times(PinnedBeam(12), 0.5)
     assert times[0] == 0.0 and times[-1] == 0.5
     assert np.all(np.diff(times) > 0)
     assert times[-2] - times[-3] > 5 * times[1]
@@ -110,7 +115,7 @@ def test_time_call_compares_with_what_runs_beside(monkeypatch):
         pace[0] *= 1.1
 
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    timing = time_call(passing, 6.0, repeat=3, beside=lambda: passing(2.0))
+    timing = time_call(passing, 6.0, repeat=3, reference=lambda: passing(2.0))
     assert timing.ratio == pytest.approx(3.0, rel=0.01)
     assert timing.run > 7.0
     # The shortest are not of one moment: the other's first call comes just before ours.
@@ -123,10 +128,10 @@ def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
 
     def known_cost(function, rig, masses, speeds, repeat, beside):
         cost = 0.01 + 0.02 / speeds[0]
-        return Timing(run=cost, ratio=3 / speeds[0], shortest=cost / 2, shortest_beside=0.1)
+        return Timing(run=cost, ratio=3 / speeds[0], shortest=cost / 2, reference_shortest=0.1)
 
     monkeypatch.setattr(baselines, "time_call", known_cost)
-    found = scipy_time(scipy_peaks, Rig(1), masses, speeds, runs=4)
+    found = scipy_time(scipy_peaks, PinnedBeam(1), masses, speeds, runs=4)
     np.testing.assert_allclose(found.run, np.sum(0.01 + 0.02 / speeds) * len(masses))
     np.testing.assert_allclose(found.ratio, np.sum(3 / speeds) * len(masses))
     np.testing.assert_allclose(found.ratio_of_shortest, found.run / 2 / 0.1)
@@ -134,7 +139,7 @@ def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
 
 @pytest.mark.parametrize("place", [0.1, 0.55, 0.7, 1.15])
 def test_modes_of_two_spans_are_those_of_the_oracle(place):
-    rig, oracle = Rig(6, 1.2, spans=2), TwoSpans(1.2, 11.68, 0.535, 6, 0.03)
+    rig, oracle = PinnedBeam(6, 1.2, spans=2), TwoSpans(1.2, 11.68, 0.535, 6, 0.03)
     np.testing.assert_allclose(rig.frequencies, oracle.frequencies, rtol=1e-12)
     for order in (0, 1):
         expected = oracle.shapes(place, order)
@@ -166,7 +171,7 @@ def test_scipy_histories_under_control_are_those_of_the_oracle(spans):
 
 
 def test_a_rate_off_the_beam_is_that_of_a_mass_of_none():
-    rig = Rig(3)
+    rig = PinnedBeam(3)
     state = np.random.default_rng(0).normal(size=(2, 3, 1))
     away = crossing_rate(rig, np.ones(1), 1.0, None)(0.2, state)
     np.testing.assert_allclose(away, crossing_rate(rig, np.zeros(1), 1.0)(0.2, state))
@@ -174,15 +179,16 @@ def test_a_rate_off_the_beam_is_that_of_a_mass_of_none():
 
 @pytest.mark.parametrize("modes", [3, 6])
 def test_loops_for_numba_find_the_peaks_uncompiled_too(modes):
-    rig = Rig(modes)
+    rig = PinnedBeam(modes)
     expected = reference_peaks(rig, MASSES, SPEEDS)
-    found = by_numba.numba_peaks(by_numba.program(None), rig, MASSES, SPEEDS)
+    found = by_numba.numba_peaks(by_numba.compile_peaks(None), rig, MASSES, SPEEDS)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_numba_finds_what_the_same_loops_find_uncompiled():
     package = pytest.importorskip("numba")
     found, plain = (
-        by_numba.numba_peaks(by_numba.program(p), Rig(3), MASSES, SPEEDS) for p in (package, None)
+        by_numba.numba_peaks(by_numba.compile_peaks(p), PinnedBeam(3), MASSES, SPEEDS)
+        for p in (package, None)
     )
     np.testing.assert_allclose(found, plain, rtol=1e-9)

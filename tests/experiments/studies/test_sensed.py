@@ -11,7 +11,7 @@ from jaxbeam import rigs
 from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.case import known_case
 from jaxbeam.model.modes import lay_out
-from tuning.control.fixed_design import believing
+from tuning.control.fixed_design import with_fixed_design
 
 
 @pytest.mark.parametrize("rig", ["B", "C"])
@@ -60,7 +60,7 @@ def off(rig, side, factor, more=0.01, run=None):
     case = jb.replace(dataclasses.replace(real, controller=law), run or {})
     believed = {tuned.RIGIDITY: float(case.beam.flexural_rigidity)}
     changed = jb.replace(case, {tuned.RIGIDITY: factor * believed[tuned.RIGIDITY]})
-    return believing(changed, believed, lay_out(known_case(changed)))
+    return with_fixed_design(changed, believed, lay_out(known_case(changed)))
 
 
 @pytest.mark.parametrize("rig", ["B", "C"])

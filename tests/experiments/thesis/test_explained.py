@@ -9,7 +9,12 @@ from experiments.thesis import published
 from experiments.thesis.beams import one_span
 from experiments.thesis.chapter2 import frequencies, shaker
 from experiments.thesis.chapter5.optimal_control import WEIGHTS
-from experiments.thesis.chapter5.regulator_limits import EFFORT, active, optimal_gain, unlike
+from experiments.thesis.chapter5.regulator_limits import (
+    COMMAND_WEIGHT,
+    optimal_gain,
+    with_active_shaker,
+    with_other_shaker,
+)
 from jaxbeam import rigs
 
 LENGTH, RIGIDITY, DENSITY, DAMPING = 0.6, 11.68, 0.535, 0.03
@@ -25,7 +30,7 @@ def sines(modes):
 def test_critical_speed_of_the_denser_beam():
     heavier = 2800 * 0.06 * 3.3e-3
     speed = np.pi / LENGTH * np.sqrt(RIGIDITY / heavier)
-    ours = LENGTH * frequencies._heavier(one_span(rigs.load)) / np.pi
+    ours = LENGTH * frequencies._frequency_at_patch_density(one_span(rigs.load)) / np.pi
     np.testing.assert_allclose(ours, speed, rtol=1e-9)
     assert abs(speed - published.CRITICAL.numbers[0]) < published.CRITICAL.allowed[0]
 
@@ -49,11 +54,11 @@ def force_per_volt(frequency, in_impedance, in_transmission):
 
 def test_the_mass_in_one_equation_only():
     beam = dataclasses.replace(rigs.load("A").beam, modes=4)
-    found = shaker._in_impedance_alone(beam)
+    found = shaker._mass_in_impedance_only(beam)
     some = slice(None, None, 97)
     theirs = [force_per_volt(f, 0.5, 0.0) for f in np.asarray(found.frequencies)[some]]
     np.testing.assert_allclose(np.asarray(found.values)[some, 3], theirs, rtol=1e-8)
-    both = shaker._response(beam, shaker.PARKED)
+    both = shaker._response(beam, shaker.STATIONARY_MASS)
     theirs = [force_per_volt(f, 0.5, 0.5) for f in np.asarray(both.frequencies)[some]]
     np.testing.assert_allclose(np.asarray(both.values)[some, 3], theirs, rtol=1e-8)
 
@@ -69,9 +74,11 @@ def test_sampled_gain_of_the_other_shaker():
     A[3:6, 6], A[6, 6], B[6] = 3.25 * here / MODAL, -1000, 1000
     held = expm(5e-3 * np.vstack([np.hstack([A, B]), np.zeros((1, 8))]))
     A, B = held[:7, :7], held[:7, 7:]
-    cost = solve_discrete_are(A, B, np.diag(WEIGHTS), [[EFFORT]])
-    theirs = np.linalg.solve(EFFORT + B.T @ cost @ B, B.T @ cost @ A)[0]
-    ours = np.asarray(optimal_gain(unlike(active(rigs.load("A"))), 5e-3, WEIGHTS)[0])[0]
+    cost = solve_discrete_are(A, B, np.diag(WEIGHTS), [[COMMAND_WEIGHT]])
+    theirs = np.linalg.solve(COMMAND_WEIGHT + B.T @ cost @ B, B.T @ cost @ A)[0]
+    ours = np.asarray(
+        optimal_gain(with_other_shaker(with_active_shaker(rigs.load("A"))), 5e-3, WEIGHTS)[0]
+    )[0]
     np.testing.assert_allclose(ours, theirs, rtol=1e-6)
     printed = published.SAMPLED_GAIN
     assert np.all(np.abs(theirs - printed.numbers) <= printed.allowed)

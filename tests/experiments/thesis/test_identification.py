@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.thesis.chapter2.identification import HAND_FITTED, LOGS, fit
+from experiments.thesis.chapter2.identification import HAND_FITTED, LOGS, fit_rig
 from jaxbeam import rigs
 from tests.tuning import make_rig_logs
 
@@ -14,7 +14,7 @@ def test_one_patch():
     kept = np.loadtxt(LOGS / "B.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(kept, make_rig_logs.make("B"), atol=2e-5)
     assert (LOGS / "B.toml").read_text(encoding="utf-8") == make_rig_logs.beside("B")
-    found = fit("B", rigs.load)
+    found = fit_rig("B", rigs.load)
     low, high = found.intervals.T
     truth = np.array(list(HAND_FITTED["B"].values()))
     assert np.all((low < truth) & (truth < high)), str(found)

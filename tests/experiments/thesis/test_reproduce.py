@@ -11,39 +11,41 @@ import jaxbeam as jb
 from experiments.thesis import published, reproduction, writeup
 from experiments.thesis.verdicts import (
     EXPLAINED,
-    IMPOSSIBLE,
-    NOT,
+    IRREPRODUCIBLE,
+    NOT_REPRODUCED,
     REPRODUCED,
-    Printed,
+    PublishedNumbers,
     Tolerance,
-    finding,
-    judge,
+    assign_verdicts,
+    make_finding,
 )
 from jaxbeam import rigs
 from jaxbeam.cli import main
 
 RELATIVE = Tolerance("for a test", relative=0.1)
-TWO = Printed("here", "two numbers", "m", "computed", RELATIVE, "1.0 20", "a b")
+TWO = PublishedNumbers("here", "two numbers", "m", "computed", RELATIVE, "1.0 20", "a b")
 
 
 def words(*findings):
-    return [judged.words for judged in judge(findings)]
+    return [judged.verdicts for judged in assign_verdicts(findings)]
 
 
 def test_verdicts():
-    assert words(finding(TWO, [1.1, 22.1])) == [[REPRODUCED, NOT]]
-    assert words(finding(TWO, [1.1, 22.1], obstacle="of that")) == [[REPRODUCED, IMPOSSIBLE]]
-    assert words(finding(TWO, [1.1, 0.0], {"else": [0.0, 20.0]})) == [[REPRODUCED, EXPLAINED]]
-    assert words(finding(TWO, [np.nan, np.inf])) == [[NOT, NOT]]
+    assert words(make_finding(TWO, [1.1, 22.1])) == [[REPRODUCED, NOT_REPRODUCED]]
+    assert words(make_finding(TWO, [1.1, 22.1], inconsistency="of that")) == [
+        [REPRODUCED, IRREPRODUCIBLE]
+    ]
+    assert words(make_finding(TWO, [1.1, 0.0], {"else": [0.0, 20.0]})) == [[REPRODUCED, EXPLAINED]]
+    assert words(make_finding(TWO, [np.nan, np.inf])) == [[NOT_REPRODUCED, NOT_REPRODUCED]]
     with pytest.raises(ValueError, match="2 numbers are printed"):
-        finding(TWO, [1.0])
+        make_finding(TWO, [1.0])
 
 
 def test_one_reading_serves_all():
     """Two readings that each fit another number: the one that fits most is taken for all."""
-    first = finding(TWO, [0, 0], {"p": [1.0, 20.0], "q": [0.0, 0.0]})
-    second = finding(TWO, [0, 0], {"p": [0.0, 0.0], "q": [1.0, 0.0]})
-    assert words(first, second) == [[EXPLAINED, EXPLAINED], [NOT, NOT]]
+    first = make_finding(TWO, [0, 0], {"p": [1.0, 20.0], "q": [0.0, 0.0]})
+    second = make_finding(TWO, [0, 0], {"p": [0.0, 0.0], "q": [1.0, 0.0]})
+    assert words(first, second) == [[EXPLAINED, EXPLAINED], [NOT_REPRODUCED, NOT_REPRODUCED]]
 
 
 @pytest.mark.parametrize(
@@ -55,22 +57,22 @@ def test_one_reading_serves_all():
     ],
 )
 def test_tolerances(tolerance, values, allowed):
-    printed = Printed("", "", "", "", tolerance, values)
-    np.testing.assert_allclose(printed.allowed, allowed)
+    printed = PublishedNumbers("", "", "", "", tolerance, values)
+    np.testing.assert_allclose(printed.allowed_error, allowed)
 
 
 def test_published_numbers_are_complete():
-    found = [one for one in vars(published).values() if isinstance(one, Printed)]
+    found = [one for one in vars(published).values() if isinstance(one, PublishedNumbers)]
     assert len(found) > 20
     for one in found:
-        assert one.kind in ("measured", "computed"), one
-        assert len(one.names) == one.numbers.size and np.all(one.allowed > 0), one
+        assert one.origin in ("measured", "computed"), one
+        assert len(one.value_labels) == one.numbers.size and np.all(one.allowed_error > 0), one
 
 
 def test_every_published_number_is_judged_in_an_experiment():
     sources = Path(published.__file__).parents[1].rglob("*.py")
     used = set(re.findall(r"published\.([A-Z]\w+)", "".join(map(Path.read_text, sources))))
-    listed = {name for name, one in vars(published).items() if isinstance(one, Printed)}
+    listed = {name for name, one in vars(published).items() if isinstance(one, PublishedNumbers)}
     assert listed == used & listed
 
 
@@ -89,7 +91,10 @@ def test_unknown_names_are_refused():
 
 def tally(name, load=rigs.load):
     run = reproduction.perform(reproduction.chosen([name])[0], load)
-    return {word: writeup.count([run], word) for word in (REPRODUCED, EXPLAINED, IMPOSSIBLE, NOT)}
+    return {
+        word: writeup.count([run], word)
+        for word in (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED)
+    }
 
 
 def test_a_wrong_model_gets_a_bad_verdict():
@@ -104,7 +109,7 @@ def test_a_wrong_model_gets_a_bad_verdict():
     # What does not depend on the rigidity stays: parameters, errors in percent, mass ratios, and
     # the spurious frequency, which is that of a spring.
     assert bad[REPRODUCED] + bad[EXPLAINED] <= 8 + 3 + 2 + 1
-    assert bad[NOT] >= right[NOT] + 15
+    assert bad[NOT_REPRODUCED] >= right[NOT_REPRODUCED] + 15
 
 
 def test_report(tmp_path, capsys):

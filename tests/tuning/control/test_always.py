@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import jaxbeam as jb
 import tuning
 from tests.tuning.small_rig import GAIN, rig
-from tuning.control.load_cases import apply
+from tuning.control.load_cases import run_case
 
 CUTOFF, PLACE = "sensors.0.filter.cutoff", "sensors.0.position"
 FREE = {GAIN: (-9000.0, 9000.0), CUTOFF: (5.0, 45.0), PLACE: (0.1, 0.5)}
@@ -64,7 +64,7 @@ def test_it_never_gets_worse_and_says_what_the_saved_case_does(problem):
     cases = tuning.LoadCases(tuple(runs[:2]), tuple(runs[2:]))
     case = small(**problem)
     found = tuning.control.tune(case, FREE, cases, steps=4, bounds=False, progress=False)
-    training, held_out = found.outcomes
+    training, held_out = found.run_sets
     before, after = training.objective
     assert after <= before
     assert all(low <= value <= high for (low, high), value in
@@ -75,10 +75,10 @@ def test_it_never_gets_worse_and_says_what_the_saved_case_does(problem):
         saved = jb.load_case(file)
     # True values are those of the saved case, simulated run by run.
     place = float(case.sensors[0].position)
-    peaks = [relative(apply(saved, run), place) for run in cases.training]
+    peaks = [relative(run_case(saved, run), place) for run in cases.training]
     assert after == pytest.approx(max(peaks), rel=1e-3)
     # The verdict on the run held out, likewise; peaks between samples may be a little larger.
-    own = apply(saved, cases.held_out[0])
+    own = run_case(saved, cases.held_out[0])
     assert 1 - 1e-3 < held_out.after[0] / peak(own, place) < 1.02
     below = 1 - held_out.after[0] / held_out.uncontrolled[0]
     assert f"worst held out run: peak {below:.1%} below no control" in found.verdict

@@ -11,7 +11,7 @@ import jaxbeam as jb
 import tuning
 from jaxbeam.control import KINDS
 from tests.differences import central
-from tuning.control.run_set import make_bench
+from tuning.control.run_set import make_run_set
 
 RUNS = tuning.grid({"loads.0.mass": [0.3], "loads.0.speed": [1.5]})
 REGULATOR = {"state_weight": [1e4, 1.0], "command_weight": [1e-3], "period": 0.01}
@@ -122,7 +122,7 @@ def test_slopes_through_the_loop_are_those_of_differences(kind):
     case = rig(controller)
     if kind not in ("feedback", "relief"):  # once is enough; without, it compiles sooner
         case = dataclasses.replace(case, sensors=[jb.Sensor(0.25)])
-    bench = make_bench(case, RUNS)
+    bench = make_run_set(case, RUNS)
     sizes = np.array(list(start.values()))
 
     @jax.jit

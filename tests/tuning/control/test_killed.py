@@ -11,7 +11,7 @@ import pytest
 import tuning
 from tests.tuning.small_rig import GAIN, rig
 from tests.tuning.stand_in import fit, search
-from tuning.fit.multi_start import scout
+from tuning.fit.multi_start import coarse_search
 from tuning.fit.uncertainty.posterior import sample
 
 # What a process does until, having written its first state, it is killed.
@@ -63,9 +63,9 @@ def test_a_tuning(tmp_path):
 def test_a_search_from_many_starts(tmp_path):
     killed(SCOUT, tmp_path / "search.npz")
     found = search()
-    given = found, found.campaign.measured, 12, 1
-    resumed = scout(*given, tmp_path / "search.npz", "it")
-    for one, other in zip(resumed, scout(*given), strict=True):
+    given = found, found.data.measured, 12, 1
+    resumed = coarse_search(*given, tmp_path / "search.npz", "it")
+    for one, other in zip(resumed, coarse_search(*given), strict=True):
         assert one.cost == other.cost and one.starts == other.starts
         np.testing.assert_array_equal(one.values, other.values)
 

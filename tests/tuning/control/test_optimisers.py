@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from tuning.control.optimisers import METHODS, method_of
+from tuning.control.optimisers import METHODS, optimiser
 
 STARTS = jnp.array([[-1.2, 1.0], [0.5, -0.5], [1.3, 1.9]])
 
@@ -23,9 +23,9 @@ def bowl(point):
 
 def descend(name, function, steps, stages=1):
     """Least values that searches from all starts have met, and how many points were unsound."""
-    method = method_of(name, steps)
+    method = optimiser(name, steps)
     ask = jax.jit(jax.vmap(jax.value_and_grad(function)))
-    onward = jax.jit(jax.vmap(method.next, (0, 0, 0, 0, None)))
+    onward = jax.jit(jax.vmap(method.step, (0, 0, 0, 0, None)))
     points, memory = STARTS, jax.vmap(method.init)(STARTS)
     best, unsound = np.full(len(STARTS), np.inf), 0
     for step in range(steps):
@@ -56,15 +56,15 @@ def test_curvatures_lead_through_a_valley_and_back_from_where_nothing_is_defined
 
 
 def test_adam_steps_back_and_goes_slower():
-    method = method_of("adam", 10)
+    method = optimiser("adam", 10)
     start = jnp.zeros(1)
-    first, memory = method.next(method.init(start), start, jnp.ones(()), -jnp.ones(1), True)
-    back, memory = method.next(memory, first, jnp.inf * jnp.ones(()), jnp.zeros(1), False)
+    first, memory = method.step(method.init(start), start, jnp.ones(()), -jnp.ones(1), True)
+    back, memory = method.step(memory, first, jnp.inf * jnp.ones(()), jnp.zeros(1), False)
     assert first[0] > 0 and back[0] == 0.0 and memory.scale == 0.5
-    again, _ = method.next(memory, back, jnp.ones(()), -jnp.ones(1), False)
+    again, _ = method.step(memory, back, jnp.ones(()), -jnp.ones(1), False)
     assert 0 < again[0] < first[0]
 
 
 def test_unknown_methods_are_refused():
     with pytest.raises(ValueError, match="one of adam, lbfgs, bfgs, not 'newton'"):
-        method_of("newton", 10)
+        optimiser("newton", 10)

@@ -10,10 +10,10 @@ import pytest
 import jaxbeam as jb
 import tuning
 from tests.tuning.small_rig import GAIN, rig
-from tuning.control.integer_choices import with_whole
+from tuning.control.integer_choices import with_integers
 from tuning.control.objective import MERITS
-from tuning.control.run_set import make_bench
-from tuning.control.tuning_result import Outcome
+from tuning.control.run_set import make_run_set
+from tuning.control.tuning_result import RunSetResult
 
 FREE = {GAIN: (500.0, 7500.0)}  # from 12000 on the loop is unstable, with minima of its own
 RUNS = tuning.grid({"loads.0.mass": [0.2, 0.3, 0.4, 0.5]})
@@ -24,7 +24,7 @@ OPTIONS = {"steps": 40, "bounds": False, "progress": False}
 @pytest.fixture(scope="module")
 def swept():
     """Merits of the worst run at many gains: what searches must not beat, and come close to."""
-    bench = make_bench(rig(), RUNS)
+    bench = make_run_set(rig(), RUNS)
     merits = jax.jit(lambda gain: bench.merits({GAIN: gain}))
     gains = np.geomspace(500.0, 7500.0, 90)
     rows = [merits(jnp.asarray(gain)) for gain in gains]
@@ -35,11 +35,11 @@ def swept():
 @pytest.mark.parametrize("method", ["adam", "lbfgs", "bfgs"])
 def test_every_method_finds_what_a_sweep_finds(swept, method):
     found = tuning.control.tune(rig(), FREE, CASES, method=method, starts=2, seed=3, **OPTIONS)
-    assert found.outcomes[0].objective[1] <= swept["peak"].min() * 1.002
+    assert found.run_sets[0].objective[1] <= swept["peak"].min() * 1.002
     assert found.history.shape == (40, 2) and np.isfinite(found.history).all()
     values = [minimum.value for minimum in found.minima]
     assert values == sorted(values) and len(values) == 2
-    assert values[0] == pytest.approx(found.outcomes[0].objective[1], rel=1e-6)
+    assert values[0] == pytest.approx(found.run_sets[0].objective[1], rel=1e-6)
     assert "minima by start:" in str(found)
 
 
@@ -64,12 +64,12 @@ def test_ranks(swept):
     first, second = tuning.lexicographic(
         rig(), FREE, CASES, ["peak", "effort"], slack=0.03, **OPTIONS
     )
-    best, allowed = first.outcomes[0].merits["peak"], second.objective.limits["peak"]
+    best, allowed = first.run_sets[0].merits["peak"], second.objective.limits["peak"]
     assert allowed == pytest.approx(1.03 * best)
-    assert second.outcomes[0].merits["peak"] <= allowed * 1.01
-    assert second.outcomes[0].merits["effort"] < first.outcomes[0].merits["effort"]
+    assert second.run_sets[0].merits["peak"] <= allowed * 1.01
+    assert second.run_sets[0].merits["effort"] < first.run_sets[0].merits["effort"]
     most, least = (swept["effort"][swept["peak"] <= share * allowed].min() for share in (1.0, 1.01))
-    assert 0.99 * least <= second.outcomes[0].merits["effort"] <= 1.02 * most
+    assert 0.99 * least <= second.run_sets[0].merits["effort"] <= 1.02 * most
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_mini_batches(swept):
     """Steps on two of four runs come to the same, and the same again by the same seed."""
     options = OPTIONS | {"batch": 2}
     found, again = (tuning.control.tune(rig(), FREE, CASES, seed=1, **options) for _ in range(2))
-    assert found.outcomes[0].objective[1] <= swept["peak"].min() * 1.01
+    assert found.run_sets[0].objective[1] <= swept["peak"].min() * 1.01
     np.testing.assert_array_equal(found.history, again.history)
     other = tuning.control.tune(rig(), FREE, CASES, seed=2, **options)
     assert not np.array_equal(found.history, other.history)
@@ -85,7 +85,7 @@ def test_mini_batches(swept):
 
 def test_limits_that_held_out_runs_exceed_are_told():
     merits = {"peak": 1.0, "effort": 0.3}
-    outcome = Outcome(
+    outcome = RunSetResult(
         "held out", ({},), *(np.full(1, x) for x in (1.0, 0.9, 0.8, 0.7)), np.ones((2, 1)),
         np.zeros(1), [1.0, 0.8], merits,
     )  # fmt: skip
@@ -93,12 +93,12 @@ def test_limits_that_held_out_runs_exceed_are_told():
         rig(), [], np.zeros(0), tuning.Objective(limits={"effort": 0.2, "peak": 1.0}),
         np.zeros((1, 1)), 0, [outcome, outcome],
     )  # fmt: skip
-    assert found.excess == {"effort": pytest.approx(0.1)}
+    assert found.limit_excess == {"effort": pytest.approx(0.1)}
     assert "effort exceeds its limit of 0.2 by 0.1" in found.verdict
 
 
 def test_whole_numbers():
-    case = with_whole(rig(jb.Feedback([1.0], period=0.01)), {"controller.power": 3})
+    case = with_integers(rig(jb.Feedback([1.0], period=0.01)), {"controller.power": 3})
     assert case.controller.power == 3
     for address, message in {
         "controller.horizon": "nothing at controller.horizon; there it has",
@@ -106,7 +106,7 @@ def test_whole_numbers():
         "beam.length": "beam.length is no whole number",
     }.items():
         with pytest.raises(ValueError, match=message):
-            with_whole(rig(), {address: 2})
+            with_integers(rig(), {address: 2})
     with pytest.raises(ValueError, match="at least one whole number"):
         tuning.tune_choices(rig(), {}, FREE, CASES)
 
@@ -117,7 +117,7 @@ def test_the_best_of_whole_numbers_is_taken():
     found = tuning.tune_choices(
         rig(), {"controller.power": [1, 3]}, FREE, CASES, **(OPTIONS | {"steps": 3})
     )
-    ends = [each.outcomes[0].objective[1] for each in found.tuned]
+    ends = [each.run_sets[0].objective[1] for each in found.tuned]
     assert [each["controller.power"] for each in found.choices] == [1, 3] and ends[0] < ends[1]
     assert found.best is found.tuned[0] and found.best.case.controller.power == 1
     assert "(best)" in str(found)
@@ -168,5 +168,5 @@ def test_draws_of_load_cases(tmp_path):
 
 def test_cvar_is_the_mean_of_the_worst():
     values = jnp.array([3.0, 9.0, 1.0, 7.0])
-    assert float(tuning.Objective(over="cvar", share=0.5).of_runs(values)) == 8.0
-    assert dataclasses.replace(tuning.Objective(), over="mean").of_runs(values) == 5.0
+    assert float(tuning.Objective(over="cvar", share=0.5).aggregate(values)) == 8.0
+    assert dataclasses.replace(tuning.Objective(), over="mean").aggregate(values) == 5.0

@@ -10,8 +10,8 @@ import jaxbeam as jb
 import tuning
 from tests.tuning.small_rig import GAIN, RIGIDITY, rig
 from tests.tuning.stand_in import CASE, fit
-from tuning.control.fixed_design import believing
-from tuning.control.run_set import make_bench
+from tuning.control.fixed_design import with_fixed_design
+from tuning.control.run_set import make_run_set
 from tuning.fit.uncertainty.posterior import Posterior
 
 
@@ -37,7 +37,7 @@ def test_plants_have_the_covariance_of_the_fit(found):
 
 def test_few_samples_leave_long_tails(found):
     """As many plants lie in the fit's 95 % interval as Student's law says."""
-    few = dataclasses.replace(found, freedom=3.0)
+    few = dataclasses.replace(found, degrees_of_freedom=3.0)
     rows = drawn(few)[:, 2]
     inside = np.mean((rows > few.intervals[2, 0]) & (rows < few.intervals[2, 1]))
     assert inside == pytest.approx(0.95, abs=0.015)
@@ -103,14 +103,14 @@ def test_a_law_is_designed_for_the_plant_it_is_told_of():
     soft = {RIGIDITY: 10.0}
     fixed = jb.StateFeedback(gain=gain.reshape(1, -1), period=0.01)
     expected = jb.simulate(jb.replace(rig(fixed), soft))
-    bench = make_bench(rig(law), [soft])
+    bench = make_run_set(rig(law), [soft])
     assert float(bench.nominal[RIGIDITY]) == 13.211
     told = bench.records({})[0]
     np.testing.assert_allclose(told.command, expected.command, rtol=1e-6, atol=1e-9)
     knowing = jb.simulate(jb.replace(rig(law), soft))
     assert np.abs(np.asarray(knowing.command) - told.command).max() > 1e-3
     case = rig(law)
-    assert believing(case, {}, bench.plan.form.layout) is case
+    assert with_fixed_design(case, {}, bench.plan.form.layout) is case
 
 
 @pytest.mark.slow
@@ -124,9 +124,9 @@ def test_tuned_for_the_worst_of_the_plants():
         rig(), {GAIN: (500.0, 20000.0)}, loads,
         plant=identified, plants=2, steps=8, bounds=False, progress=False,
     )  # fmt: skip
-    training, held_out = tuned.outcomes
+    training, held_out = tuned.run_sets
     assert float(tuned.case.beam.flexural_rigidity) == pytest.approx(13.0)
-    plants = [run[RIGIDITY] for outcome in tuned.outcomes for run in outcome.runs]
+    plants = [run[RIGIDITY] for outcome in tuned.run_sets for run in outcome.runs]
     assert len(set(plants)) == 4 and all(11.0 <= value <= 15.0 for value in plants)
     relative = training.after / training.uncontrolled
     assert training.objective[1] == pytest.approx(relative.max(), rel=1e-3)

@@ -34,9 +34,9 @@ def test_the_states_are_those_that_trying_every_choice_finds(regulated):
         one = tuning.control.tune(
             dataclasses.replace(regulated, controller=law), FREE, CASES, **OPTIONS
         )
-        ends[kept] = one.outcomes[0].objective[1]
+        ends[kept] = one.run_sets[0].objective[1]
     assert found.kept == min(ends, key=ends.get)
-    rounded, end = found.tuned.outcomes[0].objective
+    rounded, end = found.tuned.run_sets[0].objective
     assert end <= rounded and end < 1.002 * ends[found.kept]
     # The choice matters, and the shares kept to their budget.
     assert max(ends.values()) > 1.05 * end

@@ -15,11 +15,11 @@ from jaxbeam.analysis.stability import frozen_poles
 from tests.differences import central
 from tuning.checkpoint import load, save
 from tuning.control import optimisation
-from tuning.control.load_cases import apply
+from tuning.control.load_cases import run_case
 from tuning.control.objective import Objective
-from tuning.control.optimisation import Descent
-from tuning.control.run_set import make_bench
-from tuning.parameters.free import free_numbers
+from tuning.control.optimisation import Optimisation
+from tuning.control.run_set import make_run_set
+from tuning.parameters.free import free_parameters
 
 GAIN = "controller.gains.0"
 RUNS = tuning.grid({"loads.0.mass": [0.3, 0.5], "loads.0.speed": [1.5]})
@@ -47,7 +47,7 @@ def rig(gain=2000.0, **options):
 
 @pytest.fixture(scope="module")
 def bench():
-    return make_bench(rig(), RUNS, bounds=True)
+    return make_run_set(rig(), RUNS, least_peaks=True)
 
 
 @pytest.fixture(scope="module")
@@ -61,15 +61,15 @@ def merits(bench):
 def test_merits_are_those_of_the_simulated_runs(merits):
     merits = merits(5000.0)
     for i, run in enumerate(RUNS):
-        record = jb.simulate(jb.replace(apply(rig(), run), {GAIN: 5000.0}))
-        plain = jb.simulate(apply(jb.Case(rig().beam, sensors=rig().sensors, loads=rig().loads,
+        record = jb.simulate(jb.replace(run_case(rig(), run), {GAIN: 5000.0}))
+        plain = jb.simulate(run_case(jb.Case(rig().beam, sensors=rig().sensors, loads=rig().loads,
                                           run=rig().run), run))  # fmt: skip
         bent, free = np.abs(record.deflection), np.abs(plain.deflection)
         assert merits["peak"][i] == pytest.approx(bent.max() / free.max(), rel=1e-4)
         assert merits["rms"][i] == pytest.approx(
             np.sqrt(np.mean(bent**2) / np.mean(free**2)), rel=1e-4
         )
-        limit = jb.bound(apply(rig(), run)).peak
+        limit = jb.bound(run_case(rig(), run)).peak
         missed = (bent.max() - limit) / (free.max() - limit)
         assert merits["shortfall"][i] == pytest.approx(missed, rel=1e-3)
         late = np.asarray(record.times) > 0.4
@@ -91,7 +91,7 @@ def test_gradients_of_the_objectives(bench):
     @jax.jit
     def value(gain):
         merits = bench.merits({GAIN: gain}, 80.0)
-        parts = [each.of_runs(each.of_run(merits), 80.0) for each in objectives]
+        parts = [each.aggregate(each.weighted_merits(merits), 80.0) for each in objectives]
         return parts[0] + 0.7 * parts[1] + 0.4 * parts[2]
 
     expected = central(lambda point: value(point[0]), [4000.0], step=1.0)[0]
@@ -101,13 +101,15 @@ def test_gradients_of_the_objectives(bench):
 def test_slopes_of_few_and_of_many_numbers_are_the_same(bench, monkeypatch):
     """The one found forward, the other in reverse; and those of differences."""
     target = Objective().target
-    numbers = free_numbers([rig()], dict(FREE), 1.0)
-    search = Descent(bench, numbers, Objective())
-    points = jnp.asarray(search.points(2, 1))
+    numbers = free_parameters([rig()], dict(FREE), 1.0)
+    search = Optimisation(bench, numbers, Objective())
+    points = jnp.asarray(search.start_points(2, 1))
     sharpness, rows = jnp.asarray(40.0), jnp.arange(len(RUNS))
 
     def found(points):
-        return optimisation._slope.__wrapped__(*search._given, points, sharpness, rows, target)
+        return optimisation._slope.__wrapped__(
+            *search._program_arguments, points, sharpness, rows, target
+        )
 
     (smooth, true), forward = jax.jit(found)(points)
     monkeypatch.setattr(optimisation, "FEW", 0)
@@ -143,19 +145,19 @@ def test_finds_what_a_search_without_gradients_finds(merits, tuned):
     values = [peak(gain) for gain in gains]
     low, high = gains[max(np.argmin(values) - 1, 0)], gains[min(np.argmin(values) + 1, 59)]
     best = scipy.optimize.minimize_scalar(peak, bounds=(low, high), method="bounded")
-    assert tuned.outcomes[0].objective[1] <= best.fun * 1.002
-    assert tuned.outcomes[0].objective[1] < tuned.outcomes[0].objective[0]
+    assert tuned.run_sets[0].objective[1] <= best.fun * 1.002
+    assert tuned.run_sets[0].objective[1] < tuned.run_sets[0].objective[0]
 
 
 def test_the_proof(tuned):
-    training, held_out = tuned.outcomes
-    for outcome in tuned.outcomes:
+    training, held_out = tuned.run_sets
+    for outcome in tuned.run_sets:
         # Nobody beats the bound: it holds at instants, peaks in between are a little larger.
         assert np.all(outcome.after >= outcome.least * (1 - 1e-3))
         assert np.all(outcome.shares(outcome.uncontrolled) == 0)
         assert np.all(outcome.shares(outcome.least) == 1)
     run = held_out.runs[0]
-    record = jb.simulate(apply(tuned.case, run))
+    record = jb.simulate(run_case(tuned.case, run))
     assert held_out.after[0] == pytest.approx(float(record.peak_deflection[0]), rel=1e-4)
     assert tuned.verdict.startswith("objective on training ")
     assert "worst held out run: peak" in tuned.verdict
@@ -169,7 +171,7 @@ def test_the_proof(tuned):
 def test_another_seed_comes_to_the_same(tuned):
     cases = tuning.LoadCases(RUNS)
     again = tuning.control.tune(rig(9000.0), FREE, cases, seed=5, bounds=False, **OPTIONS)
-    assert again.outcomes[0].objective[1] == pytest.approx(tuned.outcomes[0].objective[1], rel=2e-3)
+    assert again.run_sets[0].objective[1] == pytest.approx(tuned.run_sets[0].objective[1], rel=2e-3)
     assert "nothing was held out" in again.verdict
 
 
@@ -202,7 +204,7 @@ def test_the_start_is_kept_where_nothing_better_is_met():
     worse = tuning.Objective({"effort": 1.0})
     options = OPTIONS | {"steps": 2, "bounds": False}
     found = tuning.control.tune(rig(1999.0), free, cases, worse, **options)
-    assert found.outcomes[0].objective[1] <= found.outcomes[0].objective[0] * (1 + 1e-6)
+    assert found.run_sets[0].objective[1] <= found.run_sets[0].objective[0] * (1 + 1e-6)
 
 
 PLAIN = jb.Case(rig().beam, loads=rig().loads, sensors=rig().sensors)
@@ -221,13 +223,15 @@ def test_a_loop_that_is_to_stay_stable():
     # Held against eigenvalues, with the delay and each change in the case itself.
     late = jb.Feedback(found.case.controller.gains, period=0.01, delay=0.005)
     for factor in (0.9, 1.0, 1.1):
-        case = dataclasses.replace(apply(found.case, light), controller=late)
+        case = dataclasses.replace(run_case(found.case, light), controller=late)
         case = jb.replace(case, {"beam.flexural_rigidity": 13.211 * factor})
         assert frozen_poles(case, np.linspace(0.0, 0.4, 30)).largest.max() <= -0.5 + 0.1
 
 
 def test_slope_of_the_violation():
-    violation = jax.jit(tuning.Stable(largest=-50.0, places=2).violation([apply(rig(), RUNS[0])]))
+    violation = jax.jit(
+        tuning.Stable(largest=-50.0, places=2).violation([run_case(rig(), RUNS[0])])
+    )
     slope = jax.grad(lambda gain: violation({GAIN: gain}))(3000.0)
     expected = central(lambda point: violation({GAIN: point[0]}), [3000.0], step=3.0)[0]
     assert slope == pytest.approx(expected, rel=1e-4)

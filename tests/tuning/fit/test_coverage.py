@@ -7,11 +7,11 @@ import jaxbeam as jb
 from jaxbeam.case.case import replace
 from tests.tuning.fit.test_identify import NOISE, simulated_log, small
 from tests.well_compiled import well_compiled
-from tuning.fit.dataset import prepare
-from tuning.fit.identify import fit_of
-from tuning.fit.least_squares import Search
-from tuning.fit.uncertainty.covariance import reach
-from tuning.parameters.free import free_numbers
+from tuning.fit.dataset import make_dataset
+from tuning.fit.identify import fit_result
+from tuning.fit.least_squares import LeastSquares
+from tuning.fit.uncertainty.covariance import t_quantile
+from tuning.parameters.free import free_parameters
 
 # One sensor, two modes, few samples: small enough for hundreds of fits.
 SMALL = {
@@ -35,19 +35,19 @@ class Rehearsal:
         self.case = small(duration=0.5, rate=250.0)
         self.clean = np.asarray(jb.simulate(self.case).measured)
         log = simulated_log(self.case, NOISE)
-        campaign = prepare(replace(self.case, STARTS), [log])
+        campaign = make_dataset(replace(self.case, STARTS), [log])
         free = [*SMALL, "loads.0.mass"]
-        numbers = free_numbers(campaign.cases, dict.fromkeys(free), np.ptp(self.clean))
-        self.search = Search(campaign, numbers)
+        numbers = free_parameters(campaign.cases, dict.fromkeys(free), np.ptp(self.clean))
+        self.search = LeastSquares(campaign, numbers)
 
     def deviations(self, noises):
         """Errors in half widths of stated intervals (log, free), and the standard errors."""
         free = np.arange(7) < 6
-        found = [self.search.estimate((self.clean + noise)[None], free=free) for noise in noises]
+        found = [self.search.solve((self.clean + noise)[None], free=free) for noise in noises]
         errors = np.array([each.uncertainty.errors[:6] for each in found])
         values = np.array([each.values[:6] for each in found])
         assert all(each.converged for each in found)
-        halves = errors * np.array([[reach(each.freedom)] for each in found])
+        halves = errors * np.array([[t_quantile(each.degrees_of_freedom)] for each in found])
         return (values - list(SMALL.values())) / halves, errors
 
 
@@ -94,8 +94,8 @@ def test_a_common_scale_is_reported_by_name(rehearsal):
     noise = NOISE * np.random.default_rng(0).normal(size=rehearsal.clean.shape)
     search = rehearsal.search
     found = search.estimate((rehearsal.clean + noise)[None])
-    fit = fit_of(rehearsal.case, search, found)
-    (direction,) = fit.unseen
+    fit = fit_result(rehearsal.case, search, found)
+    (direction,) = fit.unidentifiable
     assert set(direction) == set(scaled)
     values = dict(zip(fit.addresses, fit.values, strict=True))
     shares = [direction[address] / values[address] for address in scaled]

@@ -53,7 +53,9 @@ def test_where_a_sensor_tells_mass_best():
     assert found.errors_after[1] == pytest.approx(grid[best, 1], rel=2e-3)
     assert found.errors_after[1] < found.errors_before[1]
     near = errors_by_differences(np.array([0.1195, 0.1205]), 2e-5)[:, 1]
-    assert found.slopes[1, 0] == pytest.approx(np.diff(np.log(near))[0] / 1e-3, rel=0.02)
+    assert found.error_sensitivities[1, 0] == pytest.approx(
+        np.diff(np.log(near))[0] / 1e-3, rel=0.02
+    )
     assert str(found).startswith("sensors.0.position: 0.12 -> ")
     assert float(found.case.sensors[0].position) == found.after[0]
 

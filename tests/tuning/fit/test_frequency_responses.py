@@ -49,7 +49,7 @@ def test_rigidity_and_damping_from_a_hammer():
     truth = np.array([RIGIDITY, DAMPING])
     assert np.all(np.abs(fit.values - truth) < 3.5 * fit.errors)
     assert np.all(fit.errors < [0.003 * RIGIDITY, 0.03 * DAMPING])
-    np.testing.assert_allclose(fit.misfit, 0.01 * np.sqrt(2), rtol=0.15)
+    np.testing.assert_allclose(fit.relative_misfit, 0.01 * np.sqrt(2), rtol=0.15)
     np.testing.assert_allclose(fit.fitted, sum_of_modes(FREQUENCIES, *fit.values), rtol=1e-6)
     assert fit.verdict == "converged" and "responses are off by 1.4 %" in str(fit)
     assert float(fit.case.beam.flexural_rigidity) == fit.values[0]

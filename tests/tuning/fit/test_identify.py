@@ -114,7 +114,7 @@ def test_planted_values_come_back(two_logs):
     assert errors["beam.flexural_rigidity"] < 0.01 * 11.68
     assert errors["beam.damping_ratio"] < 0.1 * 0.03
     assert two_logs.verdict == "converged"
-    assert not two_logs.at_bound and not two_logs.unseen
+    assert not two_logs.at_bound and not two_logs.unidentifiable
 
 
 @pytest.mark.slow
@@ -163,7 +163,7 @@ def test_a_log_that_ends_at_the_exit_hardly_shows_mass_and_damping():
     assert fit.errors[0] < 0.005 * 11.68
     assert fit.errors[1] > 0.05 * 0.535
     assert fit.errors[2] == np.inf
-    assert fit.unseen == [{"beam.damping_ratio": pytest.approx(0.003)}]
+    assert fit.unidentifiable == [{"beam.damping_ratio": pytest.approx(0.003)}]
     assert "the data cannot see beam.damping_ratio: give it a value known otherwise" in str(fit)
 
 

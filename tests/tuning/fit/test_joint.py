@@ -10,7 +10,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import replace
 from tests.tuning.rehearsals import NOISE, RATE, Plant, patch, plant
 from tuning import Log, identify
-from tuning.logs.pairing import made_alike
+from tuning.logs.pairing import pad_cases
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_what_a_log_lacks_is_there_without_effect(made):
     both = dataclasses.replace(made.case, loads=(*made.case.loads, table))
     driven = jb.Prescribed(np.zeros(1), times=times, values=np.ones((1, 6)))
     empty = dataclasses.replace(made.case, loads=(), controller=driven)
-    watched, shaken = made_alike([both, empty], [times, times])
+    watched, shaken = pad_cases([both, empty], [times, times])
     assert watched.loads == both.loads and not np.any(watched.controller.values)
     assert np.all(shaken.controller.values == 1.0)
     first, second = shaken.loads

@@ -8,10 +8,10 @@ import pytest
 import scipy.optimize
 
 from tests.tuning.stand_in import CASE, NOISE, PULLS, TRUTH, campaign, clean, fit, formula, search
-from tuning.fit.identify import _stage, identify
-from tuning.fit.loss import EDGE, check_loss, shaped, widening
-from tuning.fit.multi_start import draw_starts, scout
-from tuning.parameters.free import Free, free_numbers
+from tuning.fit.identify import _stage_mask, identify
+from tuning.fit.loss import HUBER_THRESHOLD, check_loss, robust_residual, variance_factor
+from tuning.fit.multi_start import coarse_search, draw_start_points
+from tuning.parameters.free import FreeParameter, free_parameters
 from tuning.parameters.prior import Belief
 
 ADDRESSES = list(TRUTH)
@@ -28,10 +28,10 @@ def test_the_optimum_is_that_of_scipy():
     plain = fit(search(logs=1))
 
     def residuals(values):
-        residuals = plain.campaign.measured[0, :, 0] - formula(*values, PULLS[0])
+        residuals = plain.dataset.measured[0, :, 0] - formula(*values, PULLS[0])
         return np.asarray(residuals) / plain.noise[0, 0]
 
-    found = scipy.optimize.least_squares(residuals, plain.starts, x_scale=[20, 0.03, 0.2],
+    found = scipy.optimize.least_squares(residuals, plain.start_values, x_scale=[20, 0.03, 0.2],
                                          xtol=1e-12, ftol=1e-14, gtol=1e-12)  # fmt: skip
     np.testing.assert_allclose(plain.values, found.x, rtol=1e-6)
     errors = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
@@ -42,7 +42,9 @@ def test_the_optimum_is_that_of_scipy():
 RHO = {
     "squares": lambda z: z,
     "soft-l1": lambda z: 2 * (np.sqrt(1 + z) - 1),
-    "huber": lambda z: np.where(z <= EDGE**2, z, 2 * EDGE * np.sqrt(z) - EDGE**2),
+    "huber": lambda z: np.where(
+        z <= HUBER_THRESHOLD**2, z, 2 * HUBER_THRESHOLD * np.sqrt(z) - HUBER_THRESHOLD**2
+    ),
 }
 
 
@@ -50,13 +52,13 @@ RHO = {
 def test_losses(loss):
     residuals = np.linspace(-9, 9, 101)
     np.testing.assert_allclose(
-        np.asarray(shaped(loss, jnp.asarray(residuals))) ** 2, RHO[loss](residuals**2), rtol=1e-12,
+        np.asarray(robust_residual(loss, jnp.asarray(residuals))) ** 2, RHO[loss](residuals**2), rtol=1e-12,
         atol=1e-14,
     )  # fmt: skip
     normal = np.random.default_rng(0).normal(size=100_000)
     # Huber's constant is made for an efficiency of 95 %.
     expected = {"squares": 1.0, "huber": 1 / 0.95, "soft-l1": None}[loss]
-    assert expected is None or widening(loss, normal) == pytest.approx(expected, rel=0.01)
+    assert expected is None or variance_factor(loss, normal) == pytest.approx(expected, rel=0.01)
 
 
 def test_unknown_losses_are_refused():
@@ -100,18 +102,20 @@ def test_a_prior_tells_what_the_data_cannot():
     known = {"beam.mass_per_length": Belief(mean=2.0, deviation=0.1)}
     made = campaign()
     blind = search(free=dict.fromkeys(TRUTH))
-    assert made.measured.shape == blind.campaign.measured.shape
-    number = free_numbers([CASE], known, 1.0)[0]
-    assert number.low == 0.0 and number.belief.pull(jnp.asarray(2.2)) == pytest.approx(2.0)
+    assert made.measured.shape == blind.data.measured.shape
+    number = free_parameters([CASE], known, 1.0)[0]
+    assert number.low == 0.0 and number.prior.prior_residual(jnp.asarray(2.2)) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("scale", ["log", "logit"])
 def test_scales(scale):
-    number = Free("x", "m", 0.1, 0.01, 100.0, 99.99, Belief(0.01, 100.0, scale=scale))
+    number = FreeParameter("x", "m", 0.1, 0.01, 100.0, 99.99, Belief(0.01, 100.0, scale=scale))
     for value in (0.15, 1.0, 3.0, 99.0):
-        assert float(number.outward(jnp.asarray(number.inward(value)))) == pytest.approx(value)
-    shares = number.at_share(np.array([0.25, 0.5, 0.75]))
-    values = np.array([float(number.outward(jnp.asarray(y))) for y in shares])
+        assert float(
+            number.from_unbounded(jnp.asarray(number.to_unbounded(value)))
+        ) == pytest.approx(value)
+    shares = number.unbounded_at_share(np.array([0.25, 0.5, 0.75]))
+    values = np.array([float(number.from_unbounded(jnp.asarray(y))) for y in shares])
     expected = [0.1, 1.0, 10.0] if scale == "log" else [25.0075, 50.005, 75.0025]
     np.testing.assert_allclose(values, expected, rtol=1e-9)
 
@@ -132,21 +136,21 @@ def test_faulty_beliefs(given, words):
 
 
 def test_numbers_of_every_log():
-    found = free_numbers([CASE, CASE], {"logs.*.loads.0.speed": (0.5, 2.0)}, 1.0)
+    found = free_parameters([CASE, CASE], {"logs.*.loads.0.speed": (0.5, 2.0)}, 1.0)
     assert [number.address for number in found] == [f"logs.{i}.loads.0.speed" for i in (0, 1)]
     with pytest.raises(ValueError, match=r"logs.0.loads.0.speed is free twice; name it once"):
         twice = {"logs.*.loads.0.speed": None, "logs.0.loads.0.speed": None}
-        free_numbers([CASE, CASE], twice, 1.0)
+        free_parameters([CASE, CASE], twice, 1.0)
 
 
 def test_stages_move_only_what_they_name(plain):
-    mask = _stage(plain.numbers, ["beam.damping_ratio", "sensors.0.offset"])
+    mask = _stage_mask(plain.numbers, ["beam.damping_ratio", "sensors.0.offset"])
     assert mask.tolist() == [False, True, True]
     moved = plain.search.estimate(plain.campaign.measured, free=mask)
     assert moved.values[0] == pytest.approx(19.0) and moved.values[2] != pytest.approx(0.0)
     assert moved.uncertainty.errors[0] == 0.0 < moved.uncertainty.errors[1]
     with pytest.raises(ValueError, match="a stage fits beam.length, which is not free; free are"):
-        _stage(plain.numbers, ["beam.length"])
+        _stage_mask(plain.numbers, ["beam.length"])
 
 
 BOUNDS = {
@@ -163,7 +167,7 @@ def wide():
 
 def test_many_starts_find_several_minima(wide):
     """An oscillation fitted to one of another frequency: between them the misfit has hills."""
-    minima = scout(wide, wide.campaign.measured, 12, seed=1)
+    minima = coarse_search(wide, wide.campaign.measured, 12, seed=1)
     assert len(minima) > 1 and sum(found.starts for found in minima) == 12
     costs = [found.cost for found in minima]
     assert costs == sorted(costs) and costs[1] > 2 * costs[0]
@@ -171,19 +175,19 @@ def test_many_starts_find_several_minima(wide):
 
 
 def test_starts_fill_the_bounds(wide):
-    points = draw_starts(wide.numbers, 9, seed=0)
+    points = draw_start_points(wide.numbers, 9, seed=0)
     values = np.array([wide.values_at(point) for point in points])
     np.testing.assert_allclose(values[0], [19.0, 0.02, 0.0], atol=1e-9)
     eighths = np.floor((values[1:, 0] - 4) / 7).astype(int)  # a Latin hypercube: one in each
     assert sorted(eighths) == list(range(8))
     logs = np.floor(8 * np.log(values[1:, 1] / 0.001) / np.log(200)).astype(int)
     assert sorted(logs) == list(range(8))
-    assert len(draw_starts(wide.numbers, 1, seed=0)) == 1
+    assert len(draw_start_points(wide.numbers, 1, seed=0)) == 1
 
 
 def test_a_search_that_was_killed_goes_on_to_the_same_end(wide, tmp_path, monkeypatch):
     file = tmp_path / "search.npz"
-    whole = scout(wide, wide.campaign.measured, 12, seed=1)
+    whole = coarse_search(wide, wide.campaign.measured, 12, seed=1)
 
     class Killed(Exception):
         pass
@@ -196,13 +200,15 @@ def test_a_search_that_was_killed_goes_on_to_the_same_end(wide, tmp_path, monkey
     minimise = wide.minimise
     monkeypatch.setattr(wide, "minimise", killing)
     with pytest.raises(Killed):
-        scout(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, mark="this")
+        coarse_search(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="this")
     monkeypatch.undo()
-    resumed = scout(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, mark="this")
+    resumed = coarse_search(
+        wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="this"
+    )
     assert [found.cost for found in resumed] == [found.cost for found in whole]
     np.testing.assert_array_equal(resumed[0].values, whole[0].values)
     with pytest.raises(ValueError, match="belongs to another search"):
-        scout(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, mark="that")
+        coarse_search(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="that")
 
 
 def test_identify_takes_the_lowest_minimum_and_goes_on(tmp_path, monkeypatch):

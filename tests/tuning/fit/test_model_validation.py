@@ -24,16 +24,16 @@ from tests.tuning.stand_in import (
     search,
 )
 from tuning.fit import model_validation, storage
-from tuning.fit.identify import fit_of
+from tuning.fit.identify import fit_result
 from tuning.fit.model_validation import (
-    channel_remarks,
-    channels,
+    channel_residuals,
     compare_fits,
     cross_validate,
-    whiteness,
+    residual_remarks,
+    whiteness_p_value,
 )
-from tuning.fit.uncertainty.covariance import reach
-from tuning.fit.uncertainty.posterior import _density, nuts, sample, summary
+from tuning.fit.uncertainty.covariance import t_quantile
+from tuning.fit.uncertainty.posterior import _log_density, sample, sample_nuts, with_diagnostics
 from tuning.fit.uncertainty.profile import profile
 
 VALUES = np.array(list(TRUTH.values()))
@@ -48,7 +48,7 @@ def refit(plain, measured, **about):
     """Another log, fitted by the same program."""
     found = plain.search.estimate(measured, **about)
     made = dataclasses.replace(plain.campaign, measured=measured)
-    return dataclasses.replace(fit_of(plain.case, plain.search, found), campaign=made)
+    return dataclasses.replace(fit_result(plain.case, plain.search, found), campaign=made)
 
 
 # Criticism.
@@ -56,16 +56,16 @@ def refit(plain, measured, **about):
 
 def test_whiteness_of_known_noise():
     rng = np.random.default_rng(0)
-    chances = [whiteness(rng.normal(size=400)) for _ in range(300)]
+    chances = [whiteness_p_value(rng.normal(size=400)) for _ in range(300)]
     assert np.mean(np.array(chances) < 0.1) == pytest.approx(0.1, abs=0.05)
     walk = np.convolve(rng.normal(size=400), np.ones(3) / 3, mode="valid")
-    assert whiteness(walk) < 1e-9 and whiteness(np.ones(50)) == 1.0
+    assert whiteness_p_value(walk) < 1e-9 and whiteness_p_value(np.ones(50)) == 1.0
 
 
 def test_a_good_fit_has_nothing_said_against_it(plain):
-    found = channels(plain)
+    found = channel_residuals(plain)
     assert [(c.log, c.sensor) for c in found] == [(0, 0), (1, 0), (2, 0)]
-    assert channel_remarks(found, plain.campaign.logs) == []
+    assert residual_remarks(found, plain.campaign.logs) == []
     np.testing.assert_allclose([c.noise for c in found], NOISE, rtol=0.2)
 
 
@@ -75,10 +75,10 @@ def test_a_late_channel_and_coloured_residuals_are_told(plain):
     measured[1, :, 0] = late + measured[1, :, 0] - clean()[1, :, 0]
     # Fitted to the others only, so that nothing else makes up for it.
     found = refit(plain, measured, use=np.array([True, False, True]))
-    _, channel, _ = channels(found)
-    assert channel.shift == pytest.approx(0.004, abs=4 * channel.shift_error)
-    assert channel.shift_error < 0.001
-    coloured, late_ = channel_remarks([channel], found.campaign.logs)
+    _, channel, _ = channel_residuals(found)
+    assert channel.time_shift == pytest.approx(0.004, abs=4 * channel.time_shift_sd)
+    assert channel.time_shift_sd < 0.001
+    coloured, late_ = residual_remarks([channel], found.dataset.logs)
     assert coloured.startswith("run 1: residuals are no white noise, so the model misses something")
     assert late_.startswith("run 1: sensor 0 seems ") and " ms late (+- " in late_
 
@@ -87,7 +87,7 @@ def test_rivals(plain):
     """Without its damping free the model is wrong; with a number too many, it is no better."""
     held = plain.search.estimate(plain.campaign.measured, free=np.array([True, False, True]))
     undamped = dataclasses.replace(
-        fit_of(plain.case, plain.search, held), numbers=plain.numbers[:2]
+        fit_result(plain.case, plain.search, held), numbers=plain.numbers[:2]
     )
     best, worse = compare_fits({"damped": plain, "0.02": undamped})
     assert (best.name, worse.name) == ("damped", "0.02")
@@ -108,7 +108,7 @@ def test_rivals(plain):
 def test_cross_validation(plain):
     left_out = cross_validate(plain)
     assert [found.log for found in left_out] == ["run 0", "run 1", "run 2"]
-    ratios = np.array([found.ratio[0] for found in left_out])
+    ratios = np.array([found.residual_ratio[0] for found in left_out])
     np.testing.assert_allclose(ratios, 1.0, atol=0.3)
     assert left_out[0].verdict.startswith("run 0: predicted; residuals are ")
     measured = np.array(plain.campaign.measured)
@@ -134,13 +134,13 @@ def test_logs_that_were_held_out(plain, monkeypatch):
 
 def test_the_profile_of_a_number_that_acts_linearly_is_a_parabola(plain):
     found = profile(plain, "sensors.0.offset")
-    error, centre = plain.errors[2], found.values[found.rises.argmin()]
+    error, centre = plain.errors[2], found.values[found.deviance.argmin()]
     assert abs(centre - plain.values[2]) < 0.1 * error
     expected = ((found.values - centre) / error) ** 2
-    np.testing.assert_allclose(found.rises, expected, rtol=0.02, atol=1e-6)
+    np.testing.assert_allclose(found.deviance, expected, rtol=0.02, atol=1e-6)
     np.testing.assert_allclose(found.interval, plain.intervals[2], atol=0.1 * error)
     assert found.verdict.endswith("as the linearised fit says")
-    assert found.allowed == pytest.approx(reach(plain.freedom) ** 2)
+    assert found.critical_deviance == pytest.approx(t_quantile(plain.degrees_of_freedom) ** 2)
 
 
 def test_a_number_at_its_bound_has_a_profile_of_one_side():
@@ -171,30 +171,30 @@ def test_the_sampler_draws_from_a_known_density(tmp_path):
         return -z @ inverse @ z / 2
 
     given = (density, 2, 400, 2, 100, 0)
-    draws, divergences = nuts(*given)
-    found = summary(["a", "b"], draws, divergences)
+    draws, divergences = sample_nuts(*given)
+    found = with_diagnostics(["a", "b"], draws, divergences)
     np.testing.assert_allclose(np.cov(draws.reshape(-1, 2).T), covariance, atol=0.25)
     np.testing.assert_allclose(found.means, 0.0, atol=0.2)
     assert found.verdict.startswith("mixed: R-hat up to ") and divergences == 0
     file = tmp_path / "draws.npz"
-    first, _ = nuts(density, 2, 100, 2, 100, 0, file, "this")
+    first, _ = sample_nuts(density, 2, 100, 2, 100, 0, file, "this")
     np.testing.assert_array_equal(first, draws[:, :100])
     with pytest.raises(FileExistsError, match="resume that sampling, or delete it"):
-        nuts(*given, file, "this")
-    resumed, _ = nuts(*given, file, "this", resume=True)
+        sample_nuts(*given, file, "this")
+    resumed, _ = sample_nuts(*given, file, "this", resume=True)
     np.testing.assert_array_equal(resumed, draws)
     with pytest.raises(ValueError, match="belongs to another search"):
-        nuts(*given, file, "that", resume=True)
+        sample_nuts(*given, file, "that", resume=True)
 
 
 def test_chains_that_do_not_mix_are_told():
     pytest.importorskip("blackjax")
     apart = np.random.default_rng(0).normal(size=(2, 300, 1)) + np.array([[[0.0]], [[5.0]]])
-    assert "the chains have not mixed" in summary(["a"], apart, 0).verdict
+    assert "the chains have not mixed" in with_diagnostics(["a"], apart, 0).verdict
     few = np.random.default_rng(0).normal(size=(2, 20, 1))
-    assert "effective draws: draw more" in summary(["a"], few, 0).verdict
+    assert "effective draws: draw more" in with_diagnostics(["a"], few, 0).verdict
     astray = np.random.default_rng(0).normal(size=(2, 300, 1))
-    assert "100 divergent steps" in summary(["a"], astray, 100).verdict
+    assert "100 divergent steps" in with_diagnostics(["a"], astray, 100).verdict
 
 
 def test_the_posterior_of_a_fit_is_as_wide_as_its_intervals(plain):
@@ -211,15 +211,15 @@ def test_unknown_noise_levels_are_integrated_out():
     real = np.zeros((1, TIMES.size, 1))
     real[0, :12] = 1.0
     found = fit(search({"sensors.0.offset": None}, logs=1, real=real))
-    density, _, start, spread = _density(found, "estimated")
+    density, _, start, spread = _log_density(found, "estimated")
     places = np.linspace(-4.0, 4.0, 9)
     ours = np.array([density(jnp.array([place])) for place in places])
     offsets = start[0] + spread[0, 0] * places
     rest = (campaign(logs=1).measured - clean(1))[0, :12, 0] + TRUTH["sensors.0.offset"]
-    count = 12 / found.colour[0, 0]
+    count = 12 / found.autocorrelation_factor[0, 0]
 
     def evidence(offset):
-        squares = np.sum((rest - offset) ** 2) / found.colour[0, 0]
+        squares = np.sum((rest - offset) ** 2) / found.autocorrelation_factor[0, 0]
         return quad(
             lambda s: np.exp(-(count + 1) * np.log(s / NOISE) - squares / (2 * s**2)),
             NOISE / 10,
@@ -231,7 +231,7 @@ def test_unknown_noise_levels_are_integrated_out():
     theirs = np.log([evidence(offset) for offset in offsets])
     np.testing.assert_allclose(ours - ours[4], theirs - theirs[4], atol=1e-3)
     # Less sure than with the noise held: the tails of Student's distribution.
-    held = _density(found)[0]
+    held = _log_density(found)[0]
     assert ours[-1] - ours[4] > float(held(jnp.array([4.0])) - held(jnp.array([0.0])))
 
 
@@ -241,7 +241,7 @@ def test_another_word_on_the_noise_is_refused(plain):
 
 
 def test_blind_directions_are_not_sampled(plain):
-    blind = dataclasses.replace(plain, unseen=[{"beam.damping_ratio": 0.1}])
+    blind = dataclasses.replace(plain, unidentifiable=[{"beam.damping_ratio": 0.1}])
     with pytest.raises(ValueError, match="cannot see beam.damping_ratio: give a prior"):
         sample(blind)
 

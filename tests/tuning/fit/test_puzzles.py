@@ -43,7 +43,7 @@ def test_the_log_tells_sagging_supports_and_late_actuators(rehearsal):
     noise = np.random.default_rng(0).normal(size=rehearsal.clean.shape)
     names = list(rehearsal.truth)
     held = rehearsal.truth | {SUPPORT: STIFF, BANDWIDTH: PROMPT}
-    point = [n.inward(held[n.address]) for n in rehearsal.numbers]
+    point = [n.to_unbounded(held[n.address]) for n in rehearsal.numbers]
     rivals = {
         "neither": [names[0]],
         "sags": [names[0], SUPPORT],

@@ -98,7 +98,9 @@ def test_intervals_of_a_wrong_model_are_called_unreliable(rehearsal):
     assert np.all(np.abs(rehearsal.errors(right, free)) < WIDE)
     assert right.converged and "unreliable" not in str(rehearsal.told(noise, right))
     known = np.array(list(rehearsal.truth.values()))
-    stiffer = [n.inward(1.1 * value) for n, value in zip(rehearsal.numbers, known, strict=True)]
+    stiffer = [
+        n.to_unbounded(1.1 * value) for n, value in zip(rehearsal.numbers, known, strict=True)
+    ]
     wrong = rehearsal.fit(noise, free, np.array(stiffer))
     assert np.any(np.abs(rehearsal.errors(wrong, free)) > WIDE)
     assert "unreliable" in str(rehearsal.told(noise, wrong))

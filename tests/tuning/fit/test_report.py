@@ -8,10 +8,10 @@ import pytest
 
 from tests.tuning.stand_in import NOISE, TRUTH, clean, fit, search
 from tuning.fit.model_validation import compare_fits, cross_validate
-from tuning.fit.multi_start import Minimum
+from tuning.fit.multi_start import LocalMinimum
 from tuning.fit.report import write_report
 from tuning.fit.summary import remarks
-from tuning.fit.uncertainty.posterior import summary
+from tuning.fit.uncertainty.posterior import with_diagnostics
 from tuning.fit.uncertainty.profile import Profile
 from tuning.parameters.prior import Belief
 
@@ -22,7 +22,7 @@ def plain():
 
 
 def test_the_whole_account(plain, tmp_path):
-    minima = tuple(Minimum(cost, plain.values, plain.values, 3, True) for cost in (1.5, 40.0))
+    minima = tuple(LocalMinimum(cost, plain.values, plain.values, 3, True) for cost in (1.5, 40.0))
     told = dataclasses.replace(plain, minima=minima)
     values = np.linspace(0.19, 0.21, 5)
     offset = Profile("sensors.0.offset", "m", values, (values - 0.2) ** 2 * 1e5, 4.0,
@@ -34,7 +34,7 @@ def test_the_whole_account(plain, tmp_path):
         tmp_path / "report",
         told,
         profiles=[offset],
-        posterior=summary(plain.addresses, draws, 0),
+        posterior=with_diagnostics(plain.addresses, draws, 0),
         unseen=cross_validate(plain),
         rivals=compare_fits({"free": plain, "held & <fast>": worse}),
     )

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from tuning.fit.uncertainty.covariance import FAR, STEP, colour, uncertainty
+from tuning.fit.uncertainty.covariance import (
+    REPORTED_CHANGE,
+    UNBOUNDED_SD,
+    autocorrelation_factor,
+    uncertainty,
+)
 
 NAMES = ["a", "b", "c"]
 
@@ -21,7 +26,7 @@ def test_covariance_is_that_of_the_normal_equations():
     errors = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(found.errors, errors, rtol=1e-9)
     np.testing.assert_allclose(found.correlation, covariance / np.outer(errors, errors), rtol=1e-9)
-    assert found.unseen == []
+    assert found.unidentifiable == []
 
 
 def test_a_number_without_effect_is_named():
@@ -29,7 +34,7 @@ def test_a_number_without_effect_is_named():
     rows[:, 1] = 0.0
     found = uncertainty(NAMES, rows, np.array([1.0, 3.0, 1.0]))
     assert found.errors[1] == np.inf
-    assert found.unseen == [{"b": pytest.approx(3.0 * STEP)}]
+    assert found.unidentifiable == [{"b": pytest.approx(3.0 * REPORTED_CHANGE)}]
     assert np.isnan(found.correlation[1]).all() and np.isnan(found.correlation[:, 1]).all()
     others = np.linalg.inv(rows[:, ::2].T @ rows[:, ::2])
     np.testing.assert_allclose(found.errors[::2], np.sqrt(np.diag(others)), rtol=1e-9)
@@ -41,10 +46,10 @@ def test_numbers_that_only_act_together_are_named_together():
     found = uncertainty(NAMES, rows, np.ones(3))
     assert found.errors[0] == found.errors[1] == np.inf
     assert found.errors[2] == pytest.approx(0.02, rel=0.1)
-    (direction,) = found.unseen
+    (direction,) = found.unidentifiable
     assert set(direction) == {"a", "b"}
-    assert direction["a"] == pytest.approx(STEP)
-    assert direction["b"] == pytest.approx(STEP / 2)
+    assert direction["a"] == pytest.approx(REPORTED_CHANGE)
+    assert direction["b"] == pytest.approx(REPORTED_CHANGE / 2)
 
 
 def test_hardly_seen_directions_still_widen_what_hardly_takes_part():
@@ -55,21 +60,21 @@ def test_hardly_seen_directions_still_widen_what_hardly_takes_part():
     found = uncertainty(NAMES[:2], rows, np.ones(2))
     assert found.errors[0] == np.inf
     assert found.errors[1] == pytest.approx(3.0 * 0.05 / length, rel=1e-3)
-    assert [set(direction) for direction in found.unseen] == [{"a"}]
+    assert [set(direction) for direction in found.unidentifiable] == [{"a"}]
 
 
 def test_fewer_residuals_than_numbers():
     found = uncertainty(NAMES, np.array([[100.0, 0.0, 0.0]]), np.ones(3))
     assert found.errors.tolist() == [pytest.approx(0.01), np.inf, np.inf]
-    assert FAR > 1 and len(found.unseen) == 2
+    assert UNBOUNDED_SD > 1 and len(found.unidentifiable) == 2
 
 
 def test_colour_of_white_and_constant_residuals():
     white = np.random.default_rng(0).normal(size=(200, 300))
-    factors = [colour(series) for series in white]
+    factors = [autocorrelation_factor(series) for series in white]
     assert np.mean(factors) == pytest.approx(1.0, abs=0.05)
     assert min(factors) == 1.0
-    assert colour(np.full(50, 3.0)) == 1.0
+    assert autocorrelation_factor(np.full(50, 3.0)) == 1.0
 
 
 @pytest.mark.parametrize("memory", [0.3, 0.7, 0.9])
@@ -79,5 +84,5 @@ def test_colour_of_a_first_order_process(memory):
     series = np.zeros_like(white)
     for i in range(1, white.shape[1]):
         series[:, i] = memory * series[:, i - 1] + white[:, i]
-    factors = [colour(part) for part in series]
+    factors = [autocorrelation_factor(part) for part in series]
     assert np.mean(factors) == pytest.approx((1 + memory) / (1 - memory), rel=0.1)

@@ -8,7 +8,7 @@ import pytest
 from tests.oracles import modal_equations
 from tests.oracles.loads import Load
 from tests.tuning.fit.test_identify import deviations, log_of, one_span
-from tuning.fit.matching_pursuit import Pursuit
+from tuning.fit.matching_pursuit import MatchingPursuit
 from tuning.fit.weigh import weigh
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)
@@ -25,11 +25,11 @@ TWO = [Load(0.5, 1.2, 0.1), Load(0.3, -1.6, 0.5)]
 
 
 def test_pursuit_comes_near_without_any_dynamics():
-    pursuit = Pursuit(CASE, crossing(TWO), (0.8, 2.5), both_ways=True)
+    pursuit = MatchingPursuit(CASE, crossing(TWO), (0.8, 2.5), both_ways=True)
     found = pursuit.find(2)
     numbers = sorted([float(n.mass), float(n.speed), float(n.entry_time)] for n in found.loads)
     np.testing.assert_allclose(numbers, [[0.3, -1.6, 0.5], [0.5, 1.2, 0.1]], atol=0.05)
-    assert found.left < 0.2 * pursuit.deviation < 0.5 * pursuit.find(1).left
+    assert found.residual_rms < 0.2 * pursuit.readings_rms < 0.5 * pursuit.find(1).residual_rms
 
 
 @pytest.mark.slow
@@ -41,7 +41,7 @@ def test_two_loads_that_meet_on_the_beam():
         "sensors.0.offset": 0.0, "sensors.1.offset": 0.0,
     }  # fmt: skip
     assert len(found.loads) == 2
-    assert found.counts == []  # nothing but white noise is left
+    assert found.load_counts == []  # nothing but white noise is left
     assert np.all(np.abs(deviations(found.fit, truth)) < 3.5)
     assert found.fit.errors[0] < 0.01 and found.fit.errors[3] < 0.01  # kg
     assert str(found).startswith("2 loads found\nnumber ")

@@ -6,7 +6,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace
-from tuning.parameters.free import Free, free_numbers, insert, unit_at
+from tuning.parameters.free import FreeParameter, free_parameters, unit_at, with_values
 
 CASE = jb.Case(
     beam=jb.Beam(length=1.0, flexural_rigidity=20.0, mass_per_length=2.0, damping_ratio=[0.01] * 3,
@@ -19,8 +19,8 @@ CASE = jb.Case(
 CASES = [CASE, replace(CASE, {"loads.0.speed": -2.0})]
 
 
-def free(address, pair=None) -> Free:
-    return free_numbers(CASES, {address: pair}, reading=0.01)[0]
+def free(address, pair=None) -> FreeParameter:
+    return free_parameters(CASES, {address: pair}, largest_reading=0.01)[0]
 
 
 RANGES = [(-1.0, 3.0), (0.5, np.inf), (-np.inf, 2.0), (-np.inf, np.inf)]
@@ -29,19 +29,19 @@ RANGES = [(-1.0, 3.0), (0.5, np.inf), (-np.inf, 2.0), (-np.inf, np.inf)]
 @pytest.mark.parametrize("low, high", RANGES)
 @pytest.mark.parametrize("value", [0.6, 1.0, 1.9])
 def test_mapping_returns_and_stays_within(low, high, value):
-    number = Free("x", "m", 1.0, low, high, 1.0)
+    number = FreeParameter("x", "m", 1.0, low, high, 1.0)
     np.testing.assert_allclose(
-        float(number.outward(jnp.asarray(number.inward(value)))), value, rtol=1e-12
+        float(number.from_unbounded(jnp.asarray(number.to_unbounded(value)))), value, rtol=1e-12
     )
     for y in (-30.0, -1.0, 0.0, 2.0, 30.0):
-        assert low <= number.outward(jnp.asarray(y)) <= high
+        assert low <= number.from_unbounded(jnp.asarray(y)) <= high
 
 
 @pytest.mark.parametrize("low, high", RANGES[:3])
 def test_a_start_on_a_bound_is_moved_in(low, high):
-    number = Free("x", "m", 1.0, low, high, 1.0)
+    number = FreeParameter("x", "m", 1.0, low, high, 1.0)
     bound = low if np.isfinite(low) else high
-    inner = float(number.outward(jnp.asarray(number.inward(bound))))
+    inner = float(number.from_unbounded(jnp.asarray(number.to_unbounded(bound))))
     assert inner == pytest.approx(bound, abs=2e-3) and inner != bound
     assert number.at_bound(bound) and not number.at_bound(1.0)
 
@@ -60,17 +60,17 @@ def test_a_start_on_a_bound_is_moved_in(low, high):
 )
 def test_ranges_sizes_and_units_without_bounds(address, low, high, size, unit):
     number = free(address)
-    assert (number.low, number.high, number.size, number.unit) == (low, high, size, unit)
+    assert (number.low, number.high, number.typical_size, number.unit) == (low, high, size, unit)
 
 
 def test_bounds_give_the_size():
     number = free("beam.mass_per_length", (1.0, 4.0))
-    assert (number.low, number.high, number.size, number.start) == (1.0, 4.0, 3.0, 2.0)
+    assert (number.low, number.high, number.typical_size, number.start) == (1.0, 4.0, 3.0, 2.0)
 
 
 def test_insert_takes_what_concerns_a_log():
     values = {"loads.0.mass": 0.7, "logs.1.loads.0.speed": -3.0}
-    first, second = (insert(case, i, values) for i, case in enumerate(CASES))
+    first, second = (with_values(case, i, values) for i, case in enumerate(CASES))
     assert (float(first.loads[0].mass), float(first.loads[0].speed)) == (0.7, -1.0)
     assert (float(second.loads[0].mass), float(second.loads[0].speed)) == (0.7, -3.0)
 
@@ -101,5 +101,5 @@ def test_units_of_all_numbers():
 )
 def test_refused(bounds, words):
     with pytest.raises(ValueError) as refused:
-        free_numbers(CASES, bounds, 0.01)
+        free_parameters(CASES, bounds, 0.01)
     assert words in str(refused.value)

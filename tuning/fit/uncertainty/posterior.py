@@ -15,26 +15,26 @@ from jaxtyping import Array, Float
 
 from tuning.checkpoint import fingerprint, load, save
 from tuning.fit.identify import Fit
-from tuning.optional import library
+from tuning.optional import import_extra
 
-NOISES = ("held", "estimated")
-BLOCK = 100  # draws between two states on disk
-WORST = 1.05  # R-hat beyond which chains have not mixed
-FEWEST = 100  # effective draws below which intervals are not to be trusted
+NOISE_MODELS = ("held", "estimated")
+DRAWS_PER_BLOCK = 100  # draws between two states on disk
+MAX_R_HAT = 1.05  # R-hat beyond which chains have not mixed
+MIN_EFFECTIVE_DRAWS = 100  # effective draws below which intervals are not to be trusted
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Posterior:
     """Draws (chain, draw, free) of the free numbers in SI units, and how well they mixed.
 
-    `r_hat` compares the spread between and within chains (1 is perfect), `effective` is the number
+    `r_hat` compares the spread between and within chains (1 is perfect), `effective_draws` is the number
     of independent draws that these are worth; `divergences` counts steps that went astray.
     """
 
     addresses: list[str]
     draws: Float[np.ndarray, "chain draw free"]
     r_hat: Float[np.ndarray, " free"]
-    effective: Float[np.ndarray, " free"]
+    effective_draws: Float[np.ndarray, " free"]
     divergences: int
 
     @property
@@ -55,20 +55,18 @@ class Posterior:
     @property
     def verdict(self) -> str:
         """Whether the draws may be trusted."""
-        if not np.all(self.r_hat < WORST):
+        if not np.all(self.r_hat < MAX_R_HAT):
             return f"the chains have not mixed (R-hat up to {self.r_hat.max():.3f}): draw more"
-        if not np.all(self.effective > FEWEST):
-            return f"only {self.effective.min():.0f} effective draws: draw more"
+        if not np.all(self.effective_draws > MIN_EFFECTIVE_DRAWS):
+            return f"only {self.effective_draws.min():.0f} effective draws: draw more"
         if self.divergences > 0.01 * self.draws[..., 0].size:
             return f"{self.divergences} divergent steps: the corners of the posterior are missed"
-        return (
-            f"mixed: R-hat up to {self.r_hat.max():.3f}, {self.effective.min():.0f} effective draws"
-        )
+        return f"mixed: R-hat up to {self.r_hat.max():.3f}, {self.effective_draws.min():.0f} effective draws"
 
     def to_dict(self) -> dict:
         """Means, deviations, intervals, R-hat and effective draws by address, and the verdict."""
         rows = zip(
-            self.addresses, self.means, self.deviations, self.intervals, self.r_hat, self.effective,
+            self.addresses, self.means, self.deviations, self.intervals, self.r_hat, self.effective_draws,
             strict=True,
         )  # fmt: skip
         numbers = {
@@ -91,7 +89,7 @@ class Posterior:
         for i, (address, mean, deviation, (low, high)) in enumerate(rows):
             lines.append(
                 f"{address:{width}}  {mean:11.5g}  {deviation:10.3g}  {low:11.5g} to {high:<10.5g}"
-                f"  {self.r_hat[i]:6.3f}  {self.effective[i]:6.0f}"
+                f"  {self.r_hat[i]:6.3f}  {self.effective_draws[i]:6.0f}"
             )
         return "\n".join([*lines, self.verdict])
 
@@ -121,36 +119,40 @@ def sample(
     the noise, and for a damaged or foreign checkpoint, FileExistsError if it exists and `resume`
     is not set, ImportError without blackjax.
     """
-    if fit.unseen:
+    if fit.unidentifiable:
         raise ValueError(
-            f"the data cannot see {', '.join(fit.unseen[0])}: give a prior, or a value known "
+            f"the data cannot see {', '.join(fit.unidentifiable[0])}: give a prior, or a value known "
             "otherwise, before sampling"
         )
-    if noise not in NOISES:
-        raise ValueError(f"noise can be {' or '.join(map(repr, NOISES))}, not {noise!r}")
-    density, outward, start, spread = _density(fit, noise)
-    mark = fingerprint(
+    if noise not in NOISE_MODELS:
+        raise ValueError(f"noise can be {' or '.join(map(repr, NOISE_MODELS))}, not {noise!r}")
+    density, from_unbounded, start, whitening = _log_density(fit, noise)
+    digest = fingerprint(
         {
             "values": fit.values.tobytes().hex(),
-            "measured": fit.campaign.measured.tobytes().hex(),
+            "measured": fit.dataset.measured.tobytes().hex(),
             "addresses": fit.addresses,
             "settings": [chains, warmup, seed, noise],
         }
     )
     file = None if checkpoint is None else Path(checkpoint)
-    found, divergences = nuts(density, start.size, draws, chains, warmup, seed, file, mark, resume)
-    values = np.asarray(jax.vmap(jax.vmap(outward))(jnp.asarray(start + found @ spread.T)))
-    return summary(fit.addresses, values, divergences)
+    found, divergences = sample_nuts(
+        density, start.size, draws, chains, warmup, seed, file, digest, resume
+    )
+    values = np.asarray(
+        jax.vmap(jax.vmap(from_unbounded))(jnp.asarray(start + found @ whitening.T))
+    )
+    return with_diagnostics(fit.addresses, values, divergences)
 
 
-def summary(
+def with_diagnostics(
     addresses: list[str], draws: Float[np.ndarray, "chain draw free"], divergences: int
 ) -> Posterior:
     """Draws with R-hat and effective number (Gelman and others, Bayesian Data Analysis, 11.4).
 
     Raises ImportError without blackjax.
     """
-    diagnostics = library("blackjax.diagnostics", "bayes")
+    diagnostics = import_extra("blackjax.diagnostics", "bayes")
     columns = jnp.asarray(draws)
     return Posterior(
         addresses,
@@ -161,44 +163,46 @@ def summary(
     )
 
 
-def _density(fit: Fit, levels: str = "held"):
+def _log_density(fit: Fit, noise_model: str = "held"):
     """Log density over whitened search variables, their map to values, centre and directions."""
-    search, campaign = fit.search, fit.campaign
-    noise = np.where(np.isnan(fit.noise), 1.0, fit.noise * np.sqrt(fit.colour))
-    weights, measured = jnp.asarray(search.weights(noise)), jnp.asarray(campaign.measured)
-    predict = campaign.predictor(fit.addresses)
-    numbers = fit.numbers
-    pairs = zip(numbers, fit.values, strict=True)
-    start = np.array([number.inward(float(value)) for number, value in pairs])
-    slopes = np.diag(jax.jacfwd(search.outward)(jnp.asarray(start)))
-    _, jacobian = search.linearised(fit.values)
+    least_squares, dataset = fit.least_squares, fit.dataset
+    noise = np.where(np.isnan(fit.noise), 1.0, fit.noise * np.sqrt(fit.autocorrelation_factor))
+    weights, measured = jnp.asarray(least_squares.weights(noise)), jnp.asarray(dataset.measured)
+    predict = dataset.predictor(fit.addresses)
+    parameters = fit.parameters
+    pairs = zip(parameters, fit.values, strict=True)
+    start = np.array([number.to_unbounded(float(value)) for number, value in pairs])
+    slopes = np.diag(jax.jacfwd(least_squares.from_unbounded)(jnp.asarray(start)))
+    _, jacobian = least_squares.linearised(fit.values)
     rows = (jacobian * np.asarray(weights)[..., None]).reshape(-1, start.size) * slopes
-    pulls = np.asarray(jax.jacfwd(search.pulls)(jnp.asarray(fit.values))) * slopes
-    information = rows.T @ rows + pulls.T @ pulls
+    prior_jacobian = (
+        np.asarray(jax.jacfwd(least_squares.prior_residuals)(jnp.asarray(fit.values))) * slopes
+    )
+    information = rows.T @ rows + prior_jacobian.T @ prior_jacobian
     # A number at a bound has no slope there: its search variable wanders over order one.
-    floor = 1 / np.array([number.search_size for number in numbers]) ** 2
-    spread = np.linalg.cholesky(np.linalg.inv(information + np.diag(floor)))
+    floor = 1 / np.array([number.unbounded_size for number in parameters]) ** 2
+    whitening = np.linalg.cholesky(np.linalg.inv(information + np.diag(floor)))
 
-    independent = campaign.real.sum(axis=1) / fit.colour
+    independent = dataset.mask.sum(axis=1) / fit.autocorrelation_factor
 
     def misfit(residuals):
         squares = jnp.sum(residuals**2, axis=1)
-        if levels == "held":
+        if noise_model == "held":
             return jnp.sum(squares)
         # The integral of level^-(n + 1) exp(-squares / (2 level^2)) is squares^(-n / 2).
         return jnp.sum(independent * jnp.log(jnp.where(independent > 0, squares, 1.0)))
 
     def density(z):
-        y = start + spread @ z
-        values, stretch = jax.jvp(search.outward, (y,), (jnp.ones_like(y),))
+        y = start + whitening @ z
+        values, stretch = jax.jvp(least_squares.from_unbounded, (y,), (jnp.ones_like(y),))
         residuals = (measured - predict(values)) * weights
-        total = misfit(residuals) + jnp.sum(search.pulls(values) ** 2)
+        total = misfit(residuals) + jnp.sum(least_squares.prior_residuals(values) ** 2)
         return -total / 2 + jnp.sum(jnp.log(jnp.abs(stretch) + 1e-300))
 
-    return density, search.outward, start, spread
+    return density, least_squares.from_unbounded, start, whitening
 
 
-def nuts(
+def sample_nuts(
     density: Callable[[Float[Array, " size"]], Float[Array, ""]],
     size: int,
     draws: int,
@@ -206,7 +210,7 @@ def nuts(
     warmup: int,
     seed: int,
     file: Path | None = None,
-    mark: str = "",
+    digest: str = "",
     resume: bool = False,
 ) -> tuple[Float[np.ndarray, "chain draw size"], int]:
     """Draws from a log density near a standard normal one, and how many steps diverged.
@@ -215,7 +219,7 @@ def nuts(
     own, and kept in the file. Raises ValueError for a damaged or foreign file, FileExistsError if
     it exists and `resume` is not set, ImportError without blackjax.
     """
-    blackjax = library("blackjax", "bayes")
+    blackjax = import_extra("blackjax", "bayes")
     if file is not None and file.exists() and not resume:
         raise FileExistsError(f"{file} exists: resume that sampling, or delete it")
     keys = jax.random.split(jax.random.key(seed), chains)
@@ -234,12 +238,12 @@ def nuts(
             return state, (state.position, info.is_divergent)
 
         _, (positions, divergent) = jax.lax.scan(
-            one, kernel.init(position), jax.random.split(key, BLOCK)
+            one, kernel.init(position), jax.random.split(key, DRAWS_PER_BLOCK)
         )
         return positions, divergent
 
     if file is not None and file.exists():
-        state = load(file, mark)
+        state = load(file, digest)
     else:
         # Chain after chain: side by side each would wait for the longest path of all.
         position, step, mass = map(np.asarray, jax.jit(lambda k: jax.lax.map(adapt, k))(keys))
@@ -249,7 +253,7 @@ def nuts(
         }  # fmt: skip
     run = jax.jit(lambda *given: jax.lax.map(lambda each: block(*each), given))
     while state["draws"].shape[1] < draws:
-        number = state["draws"].shape[1] // BLOCK
+        number = state["draws"].shape[1] // DRAWS_PER_BLOCK
         own = jnp.stack([jax.random.fold_in(key, number + 1) for key in keys])
         positions, divergent = map(
             np.asarray, run(own, state["position"], state["step"], state["mass"])
@@ -260,5 +264,5 @@ def nuts(
             "divergent": state["divergent"] + divergent.sum(),
         }
         if file is not None:
-            save(file, mark, state)
+            save(file, digest, state)
     return state["draws"][:, :draws], int(state["divergent"])

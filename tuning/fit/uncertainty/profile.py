@@ -6,27 +6,27 @@ import numpy as np
 from jaxtyping import Float
 
 from tuning.fit.identify import Fit
-from tuning.fit.uncertainty.covariance import reach
+from tuning.fit.uncertainty.covariance import t_quantile
 
-STRAIGHT = 0.25  # share by which profile and linear interval may differ to be called alike
-MOST = 12  # steps to either side, each at most twice as long as the one before
+LINEAR_AGREEMENT = 0.25  # share by which profile and linear interval may differ to be called alike
+MAX_STEPS_PER_SIDE = 12  # steps to either side, each at most twice as long as the one before
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Profile:
-    """A profile: `values` in SI, and how much -2 ln L `rises` above its least there.
+    """A profile: `values` in SI, and how much -2 ln L `deviance` above its least there.
 
     `interval` is where it stays below what 95 % confidence allows; infinite on a side on which it
-    was not seen to rise so far. `linear` is the interval of the linearised fit.
+    was not seen to rise so far. `linear_interval` is the interval of the linearised fit.
     """
 
     address: str
     unit: str
     values: Float[np.ndarray, " point"]
-    rises: Float[np.ndarray, " point"]
-    allowed: float
+    deviance: Float[np.ndarray, " point"]
+    critical_deviance: float
     interval: tuple[float, float]
-    linear: tuple[float, float]
+    linear_interval: tuple[float, float]
 
     @property
     def verdict(self) -> str:
@@ -39,13 +39,13 @@ class Profile:
             return f"the data only say that {self.address} is above {low:.5g}{unit}"
         if np.isinf(low):
             return f"the data only say that {self.address} is below {high:.5g}{unit}"
-        told = f"{self.address} is between {low:.5g} and {high:.5g}{unit}"
-        ends = np.abs(np.array(self.interval) - self.linear)
-        if not np.all(np.isfinite(self.linear)):
-            return f"{told}, though the linearised fit could not tell"
-        if np.all(ends < STRAIGHT * (high - low) / 2):
-            return f"{told}, as the linearised fit says"
-        return f"{told}; the linearised interval is misleading, use this one"
+        statement = f"{self.address} is between {low:.5g} and {high:.5g}{unit}"
+        ends = np.abs(np.array(self.interval) - self.linear_interval)
+        if not np.all(np.isfinite(self.linear_interval)):
+            return f"{statement}, though the linearised fit could not tell"
+        if np.all(ends < LINEAR_AGREEMENT * (high - low) / 2):
+            return f"{statement}, as the linearised fit says"
+        return f"{statement}; the linearised interval is misleading, use this one"
 
 
 def profile(fit: Fit, address: str, points: int = 4) -> Profile:
@@ -60,45 +60,49 @@ def profile(fit: Fit, address: str, points: int = 4) -> Profile:
     if address not in fit.addresses:
         raise ValueError(f"{address} is not free in this fit; free are {', '.join(fit.addresses)}")
     index = fit.addresses.index(address)
-    allowed = reach(fit.freedom) ** 2
-    noise = np.where(np.isnan(fit.noise), 1.0, fit.noise * np.sqrt(fit.colour))
+    critical_deviance = t_quantile(fit.degrees_of_freedom) ** 2
+    noise = np.where(np.isnan(fit.noise), 1.0, fit.noise * np.sqrt(fit.autocorrelation_factor))
     # With weights widened channel by channel the least is not quite where the fit is.
-    centre = _refit(fit, _point(fit), noise)
-    least = fit.search.values_at(centre)
-    number, value = fit.numbers[index], float(least[index])
-    best = fit.search.cost(least, noise, fit.campaign.measured)
+    centre = _refit(fit, _unbounded_point(fit), noise)
+    least = fit.least_squares.values_at(centre)
+    number, value = fit.parameters[index], float(least[index])
+    best = fit.least_squares.cost(least, noise, fit.dataset.measured)
     error = fit.errors[index]
-    size = number.size_at(value)
-    step = min(error, size / 2) * np.sqrt(allowed) / points
-    values, rises = [value], [0.0]
+    size = number.typical_size_at(value)
+    step = min(error, size / 2) * np.sqrt(critical_deviance) / points
+    values, deviance = [value], [0.0]
     for side in (-1.0, 1.0):
-        at, stride, rise, point = value, side * step, 0.0, centre
-        for _ in range(MOST):
-            if not number.low < at + stride < number.high:
+        moved_value, stride, rise, point = value, side * step, 0.0, centre
+        for _ in range(MAX_STEPS_PER_SIDE):
+            if not number.low < moved_value + stride < number.high:
                 break
-            at += stride
+            moved_value += stride
             point, before = np.array(point), rise
-            point[index] = number.inward(at)
+            point[index] = number.to_unbounded(moved_value)
             point = _refit(fit, point, noise, index)
-            cost = fit.search.cost(fit.search.values_at(point), noise, fit.campaign.measured)
+            cost = fit.least_squares.cost(
+                fit.least_squares.values_at(point), noise, fit.dataset.measured
+            )
             rise = 2 * (cost - best)
-            values.append(at)
-            rises.append(rise)
-            if rise > 1.3 * allowed or not np.isfinite(rise):
+            values.append(moved_value)
+            deviance.append(rise)
+            if rise > 1.3 * critical_deviance or not np.isfinite(rise):
                 break
-            if rise - before < allowed / points**2:
+            if rise - before < critical_deviance / points**2:
                 stride *= 2
     order = np.argsort(values)
-    values, rises = np.array(values)[order], np.array(rises)[order]
-    interval = tuple(_crossing(values, rises, value, allowed, side) for side in (-1, 1))
+    values, deviance = np.array(values)[order], np.array(deviance)[order]
+    interval = tuple(
+        _interval_end(values, deviance, value, critical_deviance, side) for side in (-1, 1)
+    )
     linear = tuple(map(float, fit.intervals[index]))
-    return Profile(address, number.unit, values, rises, allowed, interval, linear)
+    return Profile(address, number.unit, values, deviance, critical_deviance, interval, linear)
 
 
-def _point(fit: Fit) -> Float[np.ndarray, " free"]:
+def _unbounded_point(fit: Fit) -> Float[np.ndarray, " free"]:
     """The search point of the fitted values."""
-    pairs = zip(fit.numbers, fit.values, strict=True)
-    return np.array([number.inward(float(value)) for number, value in pairs])
+    pairs = zip(fit.parameters, fit.values, strict=True)
+    return np.array([number.to_unbounded(float(value)) for number, value in pairs])
 
 
 def _refit(fit: Fit, point, noise, held: int | None = None) -> Float[np.ndarray, " free"]:
@@ -106,20 +110,20 @@ def _refit(fit: Fit, point, noise, held: int | None = None) -> Float[np.ndarray,
     free = np.arange(point.size) != (-1 if held is None else held)
     if not free.any():
         return point
-    search = fit.search
-    scale = search.scale(point, noise)
+    search = fit.least_squares
+    scale = search.step_scale(point, noise)
     found, _ = search.minimise(
-        point[None], scale[None], search.weights(noise), fit.campaign.measured, free
+        point[None], scale[None], search.weights(noise), fit.dataset.measured, free
     )
     return found[0]
 
 
-def _crossing(values, rises, best: float, allowed: float, side: int) -> float:
+def _interval_end(values, deviance, best: float, critical_deviance: float, side: int) -> float:
     """Where the root of the rise, which is nearly straight, passes what is allowed."""
-    mine = side * (values - best) >= 0
-    places = values[mine][::side]
-    roots = np.maximum.accumulate(np.sqrt(np.maximum(rises[mine][::side], 0.0)))
+    on_side = side * (values - best) >= 0
+    side_values = values[on_side][::side]
+    roots = np.maximum.accumulate(np.sqrt(np.maximum(deviance[on_side][::side], 0.0)))
     finite = np.isfinite(roots)
-    if not np.any(roots[finite] > np.sqrt(allowed)):
+    if not np.any(roots[finite] > np.sqrt(critical_deviance)):
         return side * np.inf
-    return float(np.interp(np.sqrt(allowed), roots[finite], places[finite]))
+    return float(np.interp(np.sqrt(critical_deviance), roots[finite], side_values[finite]))

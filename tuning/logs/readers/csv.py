@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import Table, heading, numbers, read_text
+from tuning.logs.readers.table import LogTable, parse_heading, parse_numbers, read_text
 
 
-def read_csv(path: Path) -> Table:
+def read_csv(path: Path) -> LogTable:
     """Read a file of values separated by tabs, semicolons or commas.
 
     The separator is the first of these three that occurs in the line of names. Unless it is the
@@ -25,20 +25,22 @@ def read_csv(path: Path) -> Table:
     and a cell that is no number.
     """
     text = read_text(path)
-    top = 0
-    kept = text.splitlines(keepends=True)
-    while top < len(kept) and (not kept[top].strip() or kept[top].startswith("#")):
-        top += 1
-    if top == len(kept):
+    header_index = 0
+    text_lines = text.splitlines(keepends=True)
+    while header_index < len(text_lines) and (
+        not text_lines[header_index].strip() or text_lines[header_index].startswith("#")
+    ):
+        header_index += 1
+    if header_index == len(text_lines):
         raise ValueError(f"{path}: the log is empty: it has comments only")
-    separator = next((mark for mark in "\t;" if mark in kept[top]), ",")
-    rows, lines = _cells(path, kept, top, separator)
+    separator = next((mark for mark in "\t;" if mark in text_lines[header_index]), ",")
+    rows, lines = _nonempty_rows(path, text_lines, header_index, separator)
     if not rows:
         raise ValueError(f"{path}: the log is empty: no cell has anything in it")
     headings = [cell.strip() for cell in rows[0]]
     if _all_numbers(headings):
         raise ValueError(
-            f"{path}, line {top + 1}: the first line must name the columns, "
+            f"{path}, line {header_index + 1}: the first line must name the columns, "
             f"e.g. time [s]{separator}d1 [mm]"
         )
     if not headings[-1]:
@@ -47,13 +49,13 @@ def read_csv(path: Path) -> Table:
     trailing = len(headings) + 1
     rows = [row[:-1] if len(row) == trailing and not row[-1].strip() else row for row in rows[1:]]
     lines = lines[1:]
-    names, units = zip(*map(heading, headings), strict=True)
+    names, units = zip(*map(parse_heading, headings), strict=True)
     decimal_comma = separator != "," and _has_decimal_comma(path, rows, lines)
-    values = numbers(path, names, rows, lines, decimal_comma)
-    return Table(names, units, values, np.array(lines))
+    values = parse_numbers(path, names, rows, lines, decimal_comma)
+    return LogTable(names, units, values, np.array(lines))
 
 
-def _cells(path, kept, top, separator):
+def _nonempty_rows(path, kept, top, separator):
     """The cells of the rows that have any, from the line of names on, and their line numbers."""
     reader = csv.reader(io.StringIO("".join(kept[top:])), delimiter=separator)
     rows, lines = [], []

@@ -4,15 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import Table, damaged, table_of, word
-from tuning.optional import library
+from tuning.logs.readers.table import LogTable, damaged_file_error, table_of, text_attribute
+from tuning.optional import import_extra
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
-MATLAB = b"MATLAB 7.3 MAT-file"
+MATLAB_MAGIC = b"MATLAB 7.3 MAT-file"
 _RATES = ("sample_rate", "sampling_rate", "fs")
 
 
-def read_hdf5(path: Path) -> dict[str, Table]:
+def read_hdf5(path: Path) -> dict[str, LogTable]:
     """Read an HDF5 file: one run for each group that holds lists of numbers, by its path.
 
     Units are the attribute `units` or `unit` of a dataset. Times are a dataset called time, or
@@ -20,7 +20,7 @@ def read_hdf5(path: Path) -> dict[str, Table]:
 
     Raises ValueError for a damaged file, ImportError without h5py.
     """
-    h5py = library("h5py", "hdf5")
+    h5py = import_extra("h5py", "hdf5")
     groups: dict[str, dict] = {}
     units: dict[str, dict] = {}
     rates = {}
@@ -34,13 +34,15 @@ def read_hdf5(path: Path) -> dict[str, Table]:
                 group, _, label = name.rpartition("/")
                 groups.setdefault(group, {})[label] = _numbers(item)
                 units.setdefault(group, {})[label] = _unit(item)
-                rates[group] = _rate(item.parent) or _rate(file)
+                rates[group] = _sample_rate(item.parent) or _sample_rate(file)
 
             file.visititems(visit)
     except Exception as error:  # whatever h5py meets in a file that is not as it should be
-        raise damaged(path, error) from None
+        raise damaged_file_error(path, error) from None
     return {
-        group: table_of(f"{path}, group {group or '/'}", arrays, units[group], _clock(rates[group]))
+        group: table_of(
+            f"{path}, group {group or '/'}", arrays, units[group], _times_function(rates[group])
+        )
         for group, arrays in groups.items()
     }
 
@@ -56,13 +58,13 @@ def _numbers(dataset) -> np.ndarray:
 
 
 def _unit(dataset) -> str | None:
-    return word(dataset.attrs.get("units", dataset.attrs.get("unit")))
+    return text_attribute(dataset.attrs.get("units", dataset.attrs.get("unit")))
 
 
-def _rate(group) -> float | None:
+def _sample_rate(group) -> float | None:
     found = [group.attrs[name] for name in _RATES if name in group.attrs]
     return float(np.ravel(found[0])[0]) if found else None
 
 
-def _clock(rate: float | None):
+def _times_function(rate: float | None):
     return None if rate is None else lambda count: np.arange(count) / rate

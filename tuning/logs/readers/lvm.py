@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import Table, numbers, read_text
+from tuning.logs.readers.table import LogTable, parse_numbers, read_text
 
 MAGIC = "LabVIEW Measurement"
 _END = "***End_of_Header***"
@@ -28,7 +28,7 @@ class _Segment:
     lines: list[int] = field(default_factory=list)
 
 
-def read_lvm(path: Path) -> Table:
+def read_lvm(path: Path) -> LogTable:
     """Read a LabVIEW measurement file; several segments are put one after the other in time.
 
     A segment whose times start afresh is moved by the difference of the segments' start times.
@@ -50,9 +50,9 @@ def read_lvm(path: Path) -> Table:
                 f"{path}, line {segment.lines[0]}: this segment has the channels "
                 f"{', '.join(other)}, the first one {', '.join(names)}"
             )
-    values = _joined(path, segments, [part[2] for part in parts])
+    values = _join_segments(path, segments, [part[2] for part in parts])
     numbered = np.concatenate([segment.lines for segment in segments])
-    return Table(("time", *names), ("s", *units), values, numbered, time="time")
+    return LogTable(("time", *names), ("s", *units), values, numbered, time="time")
 
 
 def _separator(lines) -> str:
@@ -113,21 +113,21 @@ def _columns(path, segment: _Segment, decimal_comma: bool):
         headings = headings[: headings.index("Comment")]
     while headings and not headings[-1]:
         headings = headings[:-1]
-    clocks = [i for i, heading in enumerate(headings) if heading == "X_Value"]
+    time_columns = [i for i, heading in enumerate(headings) if heading == "X_Value"]
     channels = [i for i, heading in enumerate(headings) if heading != "X_Value"]
-    timeless = segment.header.get("X_Columns", ["One"])[0] == "No"
-    used = channels if timeless else clocks + channels
-    if not channels or not (timeless or clocks):
+    without_times = segment.header.get("X_Columns", ["One"])[0] == "No"
+    used = channels if without_times else time_columns + channels
+    if not channels or not (without_times or time_columns):
         raise ValueError(
             f"{path}, line {segment.lines[0] - 1}: the column headings must be X_Value and the "
             f"channels, not {', '.join(segment.headings)}"
         )
     rows = [[row[i] if i < len(row) else "" for i in used] for row in segment.rows]
     names = tuple(headings[i] for i in channels)
-    values = numbers(path, [headings[i] for i in used], rows, segment.lines, decimal_comma)
+    values = parse_numbers(path, [headings[i] for i in used], rows, segment.lines, decimal_comma)
     times = values[:, : len(used) - len(channels)]
-    if timeless:
-        times = _counted(path, segment, decimal_comma)
+    if without_times:
+        times = _implicit_times(path, segment, decimal_comma)
     elif np.any(times != times[:, :1]):
         row = int(np.argmax(np.any(times != times[:, :1], axis=1)))
         raise ValueError(
@@ -139,17 +139,17 @@ def _columns(path, segment: _Segment, decimal_comma: bool):
     return names, units, np.hstack([times[:, :1], values[:, -len(channels) :]])
 
 
-def _counted(path, segment: _Segment, decimal_comma: bool):
+def _implicit_times(path, segment: _Segment, decimal_comma: bool):
     """Times of a segment without a column of times, from X0 and Delta_X."""
     if "Delta_X" not in segment.header:
         raise ValueError(f"{path}: the log has neither a column of times (X_Value) nor a Delta_X")
     cells = [segment.header.get("X0", ["0"])[0], segment.header["Delta_X"][0]]
     line = segment.lines[0]
-    start, step = numbers(path, ["X0", "Delta_X"], [cells], [line], decimal_comma)[0]
+    start, step = parse_numbers(path, ["X0", "Delta_X"], [cells], [line], decimal_comma)[0]
     return (start + step * np.arange(len(segment.rows)))[:, None]
 
 
-def _joined(path, segments, values):
+def _join_segments(path, segments, values):
     """Put segments one after the other; one that starts afresh is moved by its start time."""
     joined = [values[0]]
     for before, segment, rows in zip(segments, segments[1:], values[1:], strict=False):

@@ -6,12 +6,12 @@ import numpy as np
 from scipy.io import loadmat, matlab
 
 from tuning.logs.readers.mat_elements import check_elements
-from tuning.logs.readers.table import Table, damaged, table_of
+from tuning.logs.readers.table import LogTable, damaged_file_error, table_of
 
 MAGIC = b"MATLAB 5.0 MAT-file"
 
 
-def read_mat(path: Path) -> dict[str, Table]:
+def read_mat(path: Path) -> dict[str, LogTable]:
     """Read a MATLAB file: one run of its variables, and one for each struct of vectors.
 
     A struct `units` within a run names the units of its variables. The entries of an array of
@@ -23,7 +23,7 @@ def read_mat(path: Path) -> dict[str, Table]:
         check_elements(path.read_bytes())
         content = loadmat(path, squeeze_me=True, struct_as_record=False)
     except Exception as error:  # scipy raises whatever its parser stumbles over
-        raise damaged(path, error) from None
+        raise damaged_file_error(path, error) from None
     content = {name: value for name, value in content.items() if not name.startswith("__")}
     runs = {"": content}
     for name, value in content.items():
@@ -34,7 +34,7 @@ def read_mat(path: Path) -> dict[str, Table]:
             runs |= {f"{name}.{i}": _fields(entry) for i, entry in enumerate(structs)}
     tables = {}
     for name, fields in runs.items():
-        arrays = {a: v for a, v in fields.items() if _is_list_of_numbers(v)}
+        arrays = {a: v for a, v in fields.items() if _is_numeric_array(v)}
         if arrays:
             units = _fields(fields["units"]) if "units" in fields else {}
             tables[name] = table_of(f"{path}, {name}" if name else str(path), arrays, units)
@@ -51,5 +51,5 @@ def _fields(struct) -> dict:
     return {name: getattr(struct, name) for name in struct._fieldnames} if named else {}
 
 
-def _is_list_of_numbers(value) -> bool:
+def _is_numeric_array(value) -> bool:
     return isinstance(value, np.ndarray) and value.size > 1 and value.dtype.kind in "fiub"

@@ -15,7 +15,7 @@ import numpy as np
 HEADER = 128  # bytes
 MATRIX, COMPRESSED = 14, 15  # types of elements
 # Bytes of one number, by the type of the element.
-NUMBERS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
+NUMBER_SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
 CELL, STRUCT, OBJECT, TEXT, SPARSE = 1, 2, 3, 4, 5  # classes of arrays, others are numeric
 NUMERIC = range(6, 16)
 FUNCTION, OPAQUE = 16, 17
@@ -44,17 +44,17 @@ def check_elements(content: bytes) -> None:
 
 
 def _elements(data: bytes, order: str) -> list[Element]:
-    found, place = [], 0
-    while place + 8 <= len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, place)
-        start = place + 8
+    found, offset = [], 0
+    while offset + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, offset)
+        start = offset + 8
         if kind >> 16:  # up to four bytes of data, within the tag
-            kind, size, start = kind & 0xFFFF, kind >> 16, place + 4
-        if start + size > len(data) or kind not in (MATRIX, COMPRESSED, *NUMBERS):
+            kind, size, start = kind & 0xFFFF, kind >> 16, offset + 4
+        if start + size > len(data) or kind not in (MATRIX, COMPRESSED, *NUMBER_SIZES):
             raise ValueError(f"no element can be of type {kind} and {size} bytes long")
         found.append(Element(kind, data[start : start + size]))
         # Elements begin at multiples of eight bytes, except after those that are compressed.
-        place = start + size + (0 if kind == COMPRESSED else -(start + size) % 8)
+        offset = start + size + (0 if kind == COMPRESSED else -(start + size) % 8)
     return found
 
 
@@ -90,8 +90,8 @@ def _check_array(data: bytes, order: str) -> None:
     if kind not in (TEXT, SPARSE, *NUMERIC) or len(rest) != parts:
         raise ValueError(f"no array of class {kind} has {len(rest)} parts")
     for element in rest:
-        if element.kind not in NUMBERS:
+        if element.kind not in NUMBER_SIZES:
             raise ValueError(f"there are no numbers in an element of type {element.kind}")
-        fits = len(element.data) == count * NUMBERS[element.kind]
+        fits = len(element.data) == count * NUMBER_SIZES[element.kind]
         if kind in NUMERIC and not fits:
             raise ValueError(f"{len(element.data)} bytes are no array of shape {sizes}")

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 from scipy.io import netcdf_file
 
-from tuning.logs.readers.table import Table, damaged, table_of, word
+from tuning.logs.readers.table import LogTable, damaged_file_error, table_of, text_attribute
 
 MAGIC = b"CDF"
 
 
-def read_netcdf(path: Path) -> dict[str, Table]:
+def read_netcdf(path: Path) -> dict[str, LogTable]:
     """Read a classic netCDF file: one run, of the variables that are as long as the times.
 
     Units are the attribute `units`. Raises ValueError for a damaged file.
@@ -22,7 +22,7 @@ def read_netcdf(path: Path) -> dict[str, Table]:
                 # Text is an array of characters.
                 if variable.typecode() != "c" and np.size(variable.data) > 1:
                     arrays[name] = np.array(variable.data, float)
-                    units[name] = word(getattr(variable, "units", None))
+                    units[name] = text_attribute(getattr(variable, "units", None))
     except Exception as error:  # scipy raises whatever its parser stumbles over
-        raise damaged(path, error) from None
+        raise damaged_file_error(path, error) from None
     return {"": table_of(str(path), arrays, units)}

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import Table, damaged, table_of, word
-from tuning.optional import library
+from tuning.logs.readers.table import LogTable, damaged_file_error, table_of, text_attribute
+from tuning.optional import import_extra
 
 MAGIC = b"PAR1"
 
 
-def read_parquet(path: Path) -> dict[str, Table]:
+def read_parquet(path: Path) -> dict[str, LogTable]:
     """Read a Parquet file: one run of its columns of numbers.
 
     Units stand in brackets after names, or in the metadata `unit` of a column. A column of dates
@@ -18,11 +18,14 @@ def read_parquet(path: Path) -> dict[str, Table]:
 
     Raises ValueError for a damaged file, ImportError without pyarrow.
     """
-    pyarrow, parquet = library("pyarrow", "parquet"), library("pyarrow.parquet", "parquet")
+    pyarrow, parquet = (
+        import_extra("pyarrow", "parquet"),
+        import_extra("pyarrow.parquet", "parquet"),
+    )
     try:
         table = parquet.read_table(path)
     except (OSError, pyarrow.ArrowException) as error:
-        raise damaged(path, error) from None
+        raise damaged_file_error(path, error) from None
     arrays, units = {}, {}
     for field in table.schema:
         values = table[field.name].to_numpy()
@@ -31,5 +34,5 @@ def read_parquet(path: Path) -> dict[str, Table]:
             units[field.name] = "s"
         if values.dtype.kind in "fiu":
             arrays[field.name] = values
-            units.setdefault(field.name, word((field.metadata or {}).get(b"unit")))
+            units.setdefault(field.name, text_attribute((field.metadata or {}).get(b"unit")))
     return {"": table_of(str(path), arrays, units)}

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
-TIMES = ("time", "t", "zeit", "temps", "x_value")
+TIME_NAMES = ("time", "t", "zeit", "temps", "x_value")
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class LogTable:
     """Columns of one run in a log file, in the units of the file.
 
     `units` holds the unit of each column as the file names it, or None; `lines` the line number
@@ -31,23 +31,23 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-def heading(text: str) -> tuple[str, str | None]:
+def parse_heading(text: str) -> tuple[str, str | None]:
     """The name and unit in the heading of a column, such as `d1 [mm]`; None without a unit."""
     found = _HEADING.match(text.strip())
     return (found["name"], found["unit"]) if found else (text.strip(), None)
 
 
 def table_of(
-    place: str,
+    source: str,
     arrays: Mapping[str, Any],
     units: Mapping[str, str | None],
-    clock: Callable[[int], np.ndarray] | None = None,
+    times_function: Callable[[int], np.ndarray] | None = None,
     notes: Sequence[str] = (),
-) -> Table:
+) -> LogTable:
     """A table of the arrays of one run, by name; a name may be a heading with a unit.
 
     An array of several columns becomes `name.0`, `name.1`, ... What is not as long as the times
-    (else as most of the arrays) is left out, which a note says. `clock` gives the times (s) of so
+    (else as most of the arrays) is left out, which a note says. `times_function` gives the times (s) of so
     many samples, for a run that has no column of them.
 
     Raises ValueError if there are no numbers.
@@ -55,13 +55,13 @@ def table_of(
     arrays = {name: np.asarray(array, float) for name, array in arrays.items()}
     length = _length(arrays)
     if length < 2:
-        raise ValueError(f"{place}: there is no list of numbers in it")
+        raise ValueError(f"{source}: there is no list of numbers in it")
     names, found, columns, left_out = [], [], [], []
     for label, array in arrays.items():
         if length not in array.shape or array.ndim > 2:
             left_out.append(label)
             continue
-        name, unit = heading(label)
+        name, unit = parse_heading(label)
         flat = array.reshape(length, -1) if array.shape[0] == length else array.T
         single = flat.shape[1] == 1
         names += [name] if single else [f"{name}.{i}" for i in range(flat.shape[1])]
@@ -70,22 +70,22 @@ def table_of(
     if left_out:
         notes = [*notes, f"left out, not being {length} samples long: {', '.join(left_out)}"]
     values, time = np.hstack(columns), None
-    if clock is not None and not any(is_time(name) for name in names):
+    if times_function is not None and not any(is_time_name(name) for name in names):
         time = "time"
         names, found = [time, *names], ["s", *found]
-        values = np.column_stack([clock(length), values])
-    return Table(tuple(names), tuple(found), values, time=time, notes=tuple(notes))
+        values = np.column_stack([times_function(length), values])
+    return LogTable(tuple(names), tuple(found), values, time=time, notes=tuple(notes))
 
 
-def is_time(name: str) -> bool:
+def is_time_name(name: str) -> bool:
     """Tell whether a column is called as columns of times are."""
-    return name.lower() in TIMES
+    return name.lower() in TIME_NAMES
 
 
 def _length(arrays: Mapping[str, np.ndarray]) -> int:
     """Number of samples: that of the times, or else the one that most arrays have."""
     for label, array in arrays.items():
-        if is_time(heading(label)[0]):
+        if is_time_name(parse_heading(label)[0]):
             return max(array.shape, default=0)
     sizes = [max(array.shape) for array in arrays.values() if array.ndim and array.size > 1]
     return max(sizes, key=lambda size: (sizes.count(size), size), default=0)
@@ -122,21 +122,21 @@ def read_text(path: Path) -> str:
     return text
 
 
-def word(attribute: Any) -> str | None:
+def text_attribute(attribute: Any) -> str | None:
     """The text of an attribute of a file, None if it holds none."""
     if isinstance(attribute, bytes):
         attribute = attribute.decode(errors="replace")
     return attribute if isinstance(attribute, str) and attribute else None
 
 
-def damaged(path: Path, error: Exception) -> ValueError:
+def damaged_file_error(path: Path, error: Exception) -> ValueError:
     """The error for a file that the library which reads it stumbles over, in one line."""
     words = "".join(letter if letter.isprintable() else " " for letter in str(error))
     why = textwrap.shorten(words, 150, placeholder=" ...") or type(error).__name__
     return ValueError(f"{path}: the file is damaged or cut off: {why}")
 
 
-def numbers(
+def parse_numbers(
     path: Path,
     names: Sequence[str],
     rows: Sequence[Sequence[str]],

@@ -7,13 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import Table, damaged, is_time, table_of, word
-from tuning.optional import library
+from tuning.logs.readers.table import (
+    LogTable,
+    damaged_file_error,
+    is_time_name,
+    table_of,
+    text_attribute,
+)
+from tuning.optional import import_extra
 
 MAGIC = b"TDSm"
 
 
-def read_tdms(path: Path) -> dict[str, Table]:
+def read_tdms(path: Path) -> dict[str, LogTable]:
     """Read a .tdms file: one run for each group that holds numbers, by the group's name.
 
     Times are a channel called time, or follow from the waveform properties `wf_increment` and
@@ -22,28 +28,28 @@ def read_tdms(path: Path) -> dict[str, Table]:
     Raises ValueError for a damaged file and for channels of a group that differ in their times,
     ImportError without npTDMS.
     """
-    nptdms = library("nptdms", "tdms")
+    nptdms = import_extra("nptdms", "tdms")
     try:
-        with _silent(nptdms):
+        with _silenced(nptdms):
             file = nptdms.TdmsFile.read(path)
             groups = {group.name: _channels(group) for group in file.groups()}
     except Exception as error:  # whatever npTDMS meets in a file that is not as it should be
-        raise damaged(path, error) from None
-    notes = ["the recording breaks off within a segment"] if _broken_off(file) else []
+        raise damaged_file_error(path, error) from None
+    notes = ["the recording breaks off within a segment"] if _is_truncated(file) else []
     runs = {}
     for name, channels in groups.items():
         numeric = {label: channel[:] for label, channel in channels.items()}
         numeric = {a: b for a, b in numeric.items() if np.issubdtype(b.dtype, np.number)}
         if numeric:
-            place = f"{path}, group {name!r}"
-            units = {a: word(channels[a].properties.get("unit_string")) for a in numeric}
-            clock = _clock(place, {a: channels[a] for a in numeric})
-            runs[name] = table_of(place, numeric, units, clock, notes)
+            source = f"{path}, group {name!r}"
+            units = {a: text_attribute(channels[a].properties.get("unit_string")) for a in numeric}
+            clock = _times_function(source, {a: channels[a] for a in numeric})
+            runs[name] = table_of(source, numeric, units, clock, notes)
     return runs
 
 
 @contextlib.contextmanager
-def _silent(nptdms):
+def _silenced(nptdms):
     """Keep npTDMS from printing what it thinks of a file: it is said here."""
     manager = nptdms.log.log_manager
     level = manager.log_level
@@ -60,20 +66,20 @@ def _channels(group):
     return {channel.name: channel for channel in group.channels()}
 
 
-def _broken_off(file) -> bool:
+def _is_truncated(file) -> bool:
     return bool(file.file_status.incomplete_final_segment)
 
 
-def _clock(place, channels):
+def _times_function(source, channels):
     """Times by number of samples, from the waveform properties; None if no channel has them."""
     grids = {
         (p["wf_increment"], p.get("wf_start_offset", 0.0))
         for name, channel in channels.items()
-        if not is_time(name) and "wf_increment" in (p := channel.properties)
+        if not is_time_name(name) and "wf_increment" in (p := channel.properties)
     }
     if len(grids) > 1:
         raise ValueError(
-            f"{place}: the channels have different times; resample them to common times, or save "
+            f"{source}: the channels have different times; resample them to common times, or save "
             "them to separate groups"
         )
     if not grids:
