@@ -24,7 +24,7 @@ import numpy as np
 
 import jaxbeam as jb
 from experiments.benchmarks.rivals import baselines
-from experiments.benchmarks.rivals.crossing import MOMENT, PATCH, SPAN, PinnedBeam
+from experiments.benchmarks.rivals.pinned_beam import MOMENT, PATCH, SPAN, PinnedBeam
 from experiments.benchmarks.sweep import TOLERANCE
 from experiments.benchmarks.timing import peak_memory, time_call
 

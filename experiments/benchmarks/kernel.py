@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from experiments.benchmarks.rivals.crossing import GRAVITY, PinnedBeam
+from experiments.benchmarks.rivals.pinned_beam import GRAVITY, PinnedBeam
 from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, one_span_case, sweep_peaks
 from experiments.benchmarks.timing import interleaved_best
 from jaxbeam.integrator.propagators import GAUSS, LOOKED

@@ -24,8 +24,8 @@ import numpy as np
 import xarray
 
 import jaxbeam as jb
-from experiments.benchmarks.rivals import baselines, by_numba
-from experiments.benchmarks.rivals.crossing import PinnedBeam
+from experiments.benchmarks.rivals import baselines, numba_peaks
+from experiments.benchmarks.rivals.pinned_beam import PinnedBeam
 from experiments.benchmarks.timing import Timing, interleaved_best, time_call
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library
@@ -110,14 +110,14 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
             return baselines.diffrax_peaks(PinnedBeam(modes), MASSES, SPEEDS, shared_steps=shared)
 
         timed(name, others)
-    package = by_numba.import_numba()
+    package = numba_peaks.import_numba()
     if package is None:
         print("numba is left out: it is not installed (uv sync --extra benchmarks)")
     else:
-        fill = by_numba.compile_peaks(package)
+        fill = numba_peaks.compile_peaks(package)
         timed(
             "numba, parallel over runs",
-            lambda: by_numba.numba_peaks(fill, PinnedBeam(modes), MASSES, SPEEDS),
+            lambda: numba_peaks.numba_peaks(fill, PinnedBeam(modes), MASSES, SPEEDS),
         )
     scaled = baselines.scipy_time(
         baselines.scipy_peaks, PinnedBeam(modes), MASSES, SPEEDS, reference=plain

@@ -12,7 +12,7 @@ The thesis: "Active structural control of single and multi-span beam structures 
 transient loads", Liverpool John Moores University. Its measured curves are not available.
 """
 
-from experiments.thesis.chapter2.printed import *  # noqa: F403
-from experiments.thesis.chapter5.printed import *  # noqa: F403
-from experiments.thesis.chapter6.printed import *  # noqa: F403
-from experiments.thesis.chapter7.printed import *  # noqa: F403
+from experiments.thesis.chapter2.published import *  # noqa: F403
+from experiments.thesis.chapter5.published import *  # noqa: F403
+from experiments.thesis.chapter6.published import *  # noqa: F403
+from experiments.thesis.chapter7.published import *  # noqa: F403

@@ -13,9 +13,10 @@ from pathlib import Path
 import jax
 
 import jaxbeam as jb
-from experiments.thesis import writeup
+from experiments.thesis import report
 from experiments.thesis.verdicts import VERDICTS, Experiment, Run, assign_verdicts
 from jaxbeam import rigs
+from jaxbeam.files.report import check_report_folder, write_report
 
 MODULES = (
     "thesis.chapter2.frequencies",
@@ -69,15 +70,16 @@ def reproduce(
     FileExistsError if the folder is not empty and may not be overwritten.
     """
     selected, folder = [one.name for one in select_experiments(names)], Path(folder)
-    if folder.exists() and any(folder.iterdir()) and not overwrite:
-        raise FileExistsError(f"the folder {folder} is not empty; choose another, or --overwrite")
+    check_report_folder(folder, overwrite)
     folder.mkdir(parents=True, exist_ok=True)
     runs = []
     for run in _run_all(selected, folder, processes):
-        report_progress(writeup.text(run))
+        report_progress(report.text(run))
         runs.append(run)
-    (folder / "report.md").write_text(writeup.markdown(runs), encoding="utf-8")
-    (folder / "report.html").write_text(writeup.html(runs), encoding="utf-8")
+    sections = report.report_sections(runs)
+    write_report(
+        folder, report.REPORT_TITLE, sections, style=report.VERDICT_STYLE, overwrite=True
+    )
     (folder / "report.json").write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
     return runs
 
@@ -120,7 +122,7 @@ def _initialise_process(cache_folder: str | None) -> None:
 def as_dict(runs: Sequence[Run]) -> dict:
     """All numbers and verdicts as plain lists and words."""
     return {
-        "summary": {word: writeup.count_verdicts(runs, word) for word in VERDICTS},
+        "summary": {word: report.count_verdicts(runs, word) for word in VERDICTS},
         "experiments": {
             run.experiment.name: {
                 "claim": run.experiment.claim,

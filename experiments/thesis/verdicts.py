@@ -17,7 +17,7 @@ import jaxbeam as jb
 class Tolerance:
     """How far ours may be from a printed number: the largest of what is given here.
 
-    `relative` is a share of the printed number, `absolute` is in its unit, `format_number` in units of
+    `relative` is a share of the printed number, `absolute` is in its unit, `digits` in units of
     its last digit (zeros at the end of a whole number are none); `basis` says for what kind of
     number it is.
     """

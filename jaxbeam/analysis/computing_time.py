@@ -128,7 +128,7 @@ def _moved(memory, moved, changes):
 def _repeated(
     controller: AbstractController, memory, seen, t, nothing, count, changes: tuple[bool, ...]
 ):
-    """The command and what the memory becomes by a step that is made `count_verdicts` times over."""
+    """The command and what the memory becomes by a step that is made `count` times over."""
 
     def once(_, before):
         # Each takes part in the next, by a share that only the caller knows to be zero.

@@ -21,7 +21,7 @@ STILL = 1e-6  # 1/s: what moves at a smaller rate neither grows nor dies out
 
 
 class Unstable(NamedTuple):
-    """Where a loop is unstable with its loads parked: at their places from `initial_law` to `end` (s).
+    """Where a loop is unstable with its loads parked: at their places from `start` to `end` (s).
 
     `rate` (1/s) is the fastest growth of small deviations, at a `frequency` (Hz).
     """

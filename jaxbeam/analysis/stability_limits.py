@@ -46,7 +46,7 @@ def limit(
     """The least value of a number of the case between two at which the loop turns unstable.
 
     For the margin in mass or speed give `loads.0.mass` or `loads.0.speed`. `measure` is above
-    zero for an unstable case: `frozen_pole_findings`, `streaming(spacing)`, or any other, such as
+    zero for an unstable case: `frozen`, `streaming(spacing)`, or any other, such as
     `lambda case: growth(case).factor.max() - 10` (by choice). Values at `points` steps are tried,
     then the first change is bracketed to 1e-6. The bounds have the sign of the number, the larger
     size last. None if there is no such value. Raises ValueError for an address that is not there,

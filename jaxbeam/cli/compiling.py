@@ -8,7 +8,7 @@ from jaxbeam.cli.printing import print_json
 def native(*, remove: bool = False, json_: Json = False) -> None:
     """Compile what is written in C for this machine: needs a C compiler, once.
 
-    Steps of sweeps, which use it from then on, and designs that ask for it (in_time = "native").
+    Sweeps of peaks use it from then on.
 
     Parameters
     ----------
@@ -16,15 +16,12 @@ def native(*, remove: bool = False, json_: Json = False) -> None:
         Remove what was compiled; sweeps do without again.
     """
     from jaxbeam.integrator import native_peaks as compiled
-    from jaxbeam.numerics import native_designs as designs
 
     path = compiled.binary()
     if remove:
         compiled.remove()
-        designs.LIBRARY.remove()
     else:
         compiled.build()
-        designs.LIBRARY.build()
     if json_:
         print_json({"path": str(path), "compiled": not remove})
     elif remove:

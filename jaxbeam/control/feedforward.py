@@ -19,7 +19,7 @@ from jaxbeam.model.state_space import LoadedBeam
 class Passage(AbstractController):
     """Commands tabulated over the share of the way of a load that two gates have announced.
 
-    The commands at the `stage_shares` (0 at the end where the load enters, 1 at the other) are joined by
+    The commands at the `shares` (0 at the end where the load enters, 1 at the other) are joined by
     straight lines and zero outside; those of several loads are added. Gates may be before the beam
     (a negative position if loads enter at the left). A load is taken to keep the speed that it
     has between them, and commands begin when it has passed the second. The table is read `lead`

@@ -19,7 +19,7 @@ from jaxbeam.model.state_space import StateSpace
 class Flowing(eqx.Module):
     """Memory of an estimator at every instant: its model and its gain, neither of which changes.
 
-    The estimate starts at `initial_law`; its first `own` states are those of the plant. Either a `still`
+    The estimate starts at `start`; its first `own` states are those of the plant. Either a `still`
     model without loads has a constant `gain`. Or the loads are followed in a `view`, and the gain
     is a `table` (`GainTable`) along the run, transposed and backward, over `duration` (s): then
     states of analogue filters follow those of the plant, and the weights of the loads, which are

@@ -38,7 +38,7 @@ class Kalman(AbstractEstimator):
     deviation `weight_deviation`. When and how fast they cross, and their inertia, are known.
 
     Filters of the sensors and their delays are part of the model, so that its surprises are white;
-    delays may `t_quantile` over so many periods. Noise is that of the samples: behind a digital filter
+    delays may `reach` over so many periods. Noise is that of the samples: behind a digital filter
     it is coloured. The beam is at rest one period before the first tick. Not modelled are clocks
     of the sensors' own, nor what the white forces do to an accelerometer at once.
 
@@ -220,7 +220,7 @@ class Crossing(eqx.Module):
     """Memory of a filter along a crossing.
 
     The first `own` states are those of the plant; those of analogue filters follow, the weights of
-    the loads, and what else the sensors add (see `chain`). `unit_scale` is the size of the states of the
+    the loads, and what else the sensors add (see `chain`). `scale` is the size of the states of the
     plant with filters and weights, `intensity` that of the white noise in their rates.
     """
 

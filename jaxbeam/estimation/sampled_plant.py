@@ -68,7 +68,7 @@ class Ticks(eqx.Module):
         """From the tick before t (s) to that at t, white noise of this intensity acting on x'.
 
         Exact for a plant that stays as it is; else by Magnus' method of order 4, with
-        one exponential between any two changes of the command. In states over their `unit_scale`, from
+        one exponential between any two changes of the command. In states over their `scale`, from
         `holds.balance`, numbers should be of like size.
         """
         parts, _, _ = self.parts(plant, intensity, scale, t)

@@ -56,7 +56,7 @@ class Chain(eqx.Module):
     """Which states the sensors add to `plant` of the plant, and how they go on.
 
     `sections` are those of digital filters, `lags` (s) the delays of the sensors, None where there
-    is none; `variance` is that of the noise of their samples. A delay may reach back over `t_quantile`
+    is none; `variance` is that of the noise of their samples. A delay may reach back over `reach`
     periods.
     """
 

@@ -38,7 +38,7 @@ def load_case(path: str | os.PathLike) -> Case:
     """Read a case from a TOML file and check it.
 
     Raises ValueError, naming the file and the address or line, for invalid TOML, unknown keys or
-    kinds, wrong types and whatever `check_arguments` refuses; OSError if the file cannot be read.
+    kinds, wrong types and whatever `check` refuses; OSError if the file cannot be read.
     """
     content = _read_toml(path)
     try:
@@ -102,7 +102,7 @@ def case_from_dict(content: dict[str, Any]) -> Case:
     """Build a case from the tables of a case file: numbers in SI units, lists and words.
 
     Raises ValueError, naming the address, for keys and kinds that are unknown or missing and for
-    values of the wrong type or shape. The values themselves are the business of `check_arguments`.
+    values of the wrong type or shape. The values themselves are the business of `check`.
     """
     known_keys = [field.name for field in dataclasses.fields(Case)]
     parts = {}
@@ -150,7 +150,7 @@ def with_settings(case: Case, settings: dict[str, Any]) -> Case:
 
     Unlike `case.replace` this also sets words, counts and numbers that were left out, and it
     checks the result; it takes plain values (SI units), not traced ones. Raises ValueError for
-    an address that no case file could have, and for whatever `check_arguments` refuses.
+    an address that no case file could have, and for whatever `check` refuses.
     """
     content = case_to_dict(case)
     for address, value in settings.items():

@@ -1,7 +1,13 @@
-"""Tables and pages of reports, in Markdown and HTML."""
+"""Reports: sections of sentences, tables and figures, written as Markdown and HTML.
 
-import html as escaping
+write_report(folder, "Crossing", [ReportSection("Peaks", ["Largest deflections.", table])])
+"""
+
+import html as html_library
+import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 Row = Sequence[str]
 
@@ -15,31 +21,132 @@ img { max-width: 100% }
 """
 
 
-def markdown_table(header: Row, rows: Sequence[Row]) -> list[str]:
-    """Lines of a table in Markdown, and an empty one after it."""
-    lines = [header, ["---"] * len(header), *rows]
+class ReportTable(NamedTuple):
+    """Table of a report; `cell_class` returns the CSS class of a cell's text, or None."""
+
+    header: Row
+    rows: Sequence[Row]
+    cell_class: Callable[[str], str | None] = lambda cell: None
+
+
+class ReportFigure(NamedTuple):
+    """Figure of a report, in the file NAME.png beside it.
+
+    `figure` (matplotlib) is saved with the report; None if the file is written elsewhere.
+    """
+
+    name: str
+    figure: Any = None
+
+
+class ReportSection(NamedTuple):
+    """Heading of some level (2 to 6) and the paragraphs, tables and figures below it.
+
+    Without a title the section has no heading.
+    """
+
+    title: str
+    parts: Sequence[str | ReportTable | ReportFigure]
+    level: int = 2
+
+
+def check_report_folder(folder: str | os.PathLike, overwrite: bool) -> None:
+    """Raise FileExistsError if the folder is not empty and `overwrite` is not set."""
+    folder = Path(folder)
+    if folder.exists() and any(folder.iterdir()) and not overwrite:
+        raise FileExistsError(f"the folder {folder} is not empty; choose another, or overwrite it")
+
+
+def write_report(
+    folder: str | os.PathLike,
+    title: str,
+    sections: Sequence[ReportSection],
+    *,
+    style: str = "",
+    overwrite: bool = False,
+) -> None:
+    """Write report.md, report.html and the figures to a folder, which is made if need be.
+
+    `style` (CSS) is added to `STYLE`. Raises FileExistsError if the folder is not empty and
+    `overwrite` is not set.
+    """
+    check_report_folder(folder, overwrite)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for section in sections:
+        for part in section.parts:
+            if isinstance(part, ReportFigure) and part.figure is not None:
+                part.figure.savefig(folder / f"{part.name}.png")
+    (folder / "report.md").write_text(markdown(title, sections), encoding="utf-8")
+    (folder / "report.html").write_text(html(title, sections, style), encoding="utf-8")
+
+
+def markdown(title: str, sections: Sequence[ReportSection]) -> str:
+    """Text of a report in Markdown."""
+    lines = [f"# {title}", ""]
+    for section in sections:
+        if section.title:
+            lines += [f"{'#' * section.level} {section.title}", ""]
+        for part in section.parts:
+            if isinstance(part, ReportTable):
+                lines += _markdown_table(part)
+            elif isinstance(part, ReportFigure):
+                lines += [f"![{part.name}]({part.name}.png)", ""]
+            else:
+                lines += [part, ""]
+    return "\n".join(lines)
+
+
+def html(title: str, sections: Sequence[ReportSection], style: str = "") -> str:
+    """Text of a report as an HTML page; all words are escaped."""
+    safe = html_library.escape
+    body = [f"<h1>{safe(title)}</h1>"]
+    for section in sections:
+        if section.title:
+            body.append(f"<h{section.level}>{safe(section.title)}</h{section.level}>")
+        for part in section.parts:
+            if isinstance(part, ReportTable):
+                body.append(_html_table(part))
+            elif isinstance(part, ReportFigure):
+                body.append(f'<img src="{safe(part.name)}.png" alt="{safe(part.name)}">')
+            else:
+                body.append(f"<p>{safe(part)}</p>")
+    head = f'<meta charset="utf-8"><title>{safe(title)}</title><style>{STYLE}{style}</style>'
+    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>'
+
+
+def text_table(header: Row, rows: Sequence[Row], alignment: str = "") -> list[str]:
+    """Lines of a table for the terminal, columns two spaces apart.
+
+    `alignment` has a letter for each column, "<" for flush left and ">" for flush right, as in
+    format strings; all are flush left if it is left out.
+    """
+    table = [header, *rows]
+    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
+    marks = alignment or "<" * len(header)
+    return [
+        "  ".join(
+            f"{cell:{mark}{width}}" for cell, mark, width in zip(row, marks, widths, strict=True)
+        ).rstrip()
+        for row in table
+    ]
+
+
+def _markdown_table(table: ReportTable) -> list[str]:
+    lines = [table.header, ["---"] * len(table.header), *table.rows]
     return [f"| {' | '.join(line)} |" for line in lines] + [""]
 
 
-def html_table(
-    header: Row, rows: Sequence[Row], style_of: Callable[[str], str | None] = lambda cell: None
-) -> str:
-    """A table in HTML; `style_of` may give cells of the rows a class of the page's style."""
-
-    def line(tag: str, cells: Row, chosen: Callable[[str], str | None]) -> str:
+def _html_table(table: ReportTable) -> str:
+    def line(tag: str, cells: Row, class_of: Callable[[str], str | None]) -> str:
         inner = []
         for cell in cells:
-            name = chosen(cell)
+            name = class_of(cell)
             start = f"<{tag}>" if name is None else f'<{tag} class="{name}">'
-            inner.append(f"{start}{escaping.escape(cell)}</{tag}>")
+            inner.append(f"{start}{html_library.escape(cell)}</{tag}>")
         return f"<tr>{''.join(inner)}</tr>"
 
-    body = "".join(line("td", row, style_of) for row in rows)
-    return f"<table>{line('th', header, lambda cell: None)}{body}</table>"
-
-
-def page(title: str, body: Sequence[str], style: str = "") -> str:
-    """A page of HTML; `style` is added to that of all reports."""
-    safe = escaping.escape(title)
-    head = f'<meta charset="utf-8"><title>{safe}</title><style>{STYLE}{style}</style>'
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>'
+    header = line("th", table.header, lambda cell: None)
+    return (
+        f"<table>{header}{''.join(line('td', row, table.cell_class) for row in table.rows)}</table>"
+    )

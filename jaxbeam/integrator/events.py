@@ -22,7 +22,7 @@ class Schedule(eqx.Module):
     `gaps` says which of the `lengths` (s) each gap has; `samples` are the edges at which the run
     is sampled. For a run with a controller: `tick` numbers the edges at which it acts, `reads`
     those at which each sensor is read, -1 elsewhere. `age` counts the readings of a sensor made
-    since the one that has arrived by a tick, `run_case` the commands made since the one that begins
+    since the one that has arrived by a tick, `apply` the commands made since the one that begins
     to act at an edge, -1 where none does. `newest` and `waiting` are their largest values.
     """
 

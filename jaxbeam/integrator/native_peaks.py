@@ -95,7 +95,7 @@ def march(
     """What is found of tasks that C integrates one after the other, if it is `ready`.
 
     All have tasks as the first axis; a single rig is that of all. Grids are those of `even_grid`,
-    `with_sensors` the places (m) at which peaks are looked for, on both sides of the beam; `slots` is
+    `watched` the places (m) at which peaks are looked for, on both sides of the beam; `slots` is
     how many loads may be on the beam at once. No driver, double precision. Tasks that are not
     wanted come out as at rest.
     """

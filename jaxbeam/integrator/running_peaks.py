@@ -33,7 +33,7 @@ class Extremes(eqx.Module):
     """What is kept of a run.
 
     `samples` are the deflections at the points looked at in the step with the largest `size` of
-    deflection of each watched place, `initial_law` (s) and `span` (s) that step. Contact forces are those
+    deflection of each watched place, `start` (s) and `span` (s) that step. Contact forces are those
     with which a load presses on the beam; `lost` (s) is the first time it would have to pull.
     """
 

@@ -14,9 +14,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import is_known, known
-from jaxbeam.case.filters import Filter, analogue, analogue_initial, filter_history, filter_step
-from jaxbeam.case.filters import initial as filter_initial
-from jaxbeam.case.filters import sections as filter_sections
+from jaxbeam.case.filters import (
+    Filter,
+    analogue,
+    analogue_initial,
+    filter_history,
+    filter_step,
+    initial as filter_initial,
+    sections as filter_sections,
+)
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.numerics.discretisation import cubics, evaluate, hold
 

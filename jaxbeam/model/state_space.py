@@ -105,7 +105,7 @@ class StateSpace(eqx.Module):
 class LoadedBeam(eqx.Module):
     """State space of a rig crossed by loads, at any time t (s).
 
-    `unit_scale` times the rig's coordinates are the coordinates q of the states (see `state_space`).
+    `scale` times the rig's coordinates are the coordinates q of the states (see `state_space`).
     Outputs are what the sensors would read if they were ideal.
     """
 

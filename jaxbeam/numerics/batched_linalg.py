@@ -180,39 +180,6 @@ def each_lane(function: Callable, *args: Any) -> Any:
     return jax.vmap(alone, axes, -1)(*bare)
 
 
-def few_lanes(function: Callable, count: int, *args: Any) -> Any:
-    """What a function of trees of arrays (..., lane) returns, called with so many lanes at a time.
-
-    Those that are missing in the end are filled up with the last.
-    """
-    arrays, rest = eqx.partition(args, eqx.is_array)
-    leaves, structure = jax.tree.flatten(arrays)
-    lanes = lanes_of(leaves)
-    if lanes <= count:
-        return function(*args)
-    own = [leaf.shape[-1] > 1 for leaf in leaves]
-
-    def cut(leaf):
-        filled = jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 1) + [(0, -lanes % count)], mode="edge")
-        return jnp.moveaxis(filled.reshape(*leaf.shape[:-1], -1, count), -2, 0)
-
-    def some(part):
-        pairs = zip(part, leaves, own, strict=True)
-        whole = jax.tree.unflatten(
-            structure, [mine if is_own else all for mine, all, is_own in pairs]
-        )
-        return function(*eqx.combine(whole, rest))
-
-    cuts = [cut(leaf) if is_own else None for leaf, is_own in zip(leaves, own, strict=True)]
-    found = jax.lax.map(some, cuts)
-
-    def joined(part):
-        part = jnp.moveaxis(part, 0, -2)
-        return part.reshape(*part.shape[:-2], -1)[..., :lanes]
-
-    return jax.tree.map(joined, found)
-
-
 def in_lanes(function: Callable, *args: Any) -> Any:
     """Call a function of trees of arrays (..., lane) with arrays that have no lanes.
 

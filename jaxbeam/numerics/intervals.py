@@ -4,7 +4,7 @@ Over a stretch the optimal state x and costate l = P x obey
 
     x(end) = drift x(start) - reach l(end),     l(start) = toll x(start) + drift' l(end),
 
-with `t_quantile` and `toll` symmetric and not negative. Two stretches joined are a stretch again:
+with `reach` and `toll` symmetric and not negative. Two stretches joined are a stretch again:
 joining is associative, and nothing in it grows, however stiff the plant. So they may be joined one
 by one, or in parallel as a tree (Sarkka and Garcia-Fernandez, IEEE Trans. Automatic Control 68,
 2023), or to themselves (see `riccati`).

@@ -18,13 +18,12 @@ from jaxtyping import Array, Float
 from jaxbeam.numerics.batched_linalg import (
     in_lanes,
     lanes_of,
-    solve_any,
     solve_lanes,
     times,
     turned,
 )
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.intervals import Commands, Square, Stretch, symmetric, transposed
+from jaxbeam.numerics.intervals import Commands, Square, symmetric, transposed
 
 STAGES = 6  # Gauss nodes of a stretch; order 12
 NODES = (np.polynomial.legendre.leggauss(STAGES)[0] + 1) / 2
@@ -36,19 +35,6 @@ class Flow(eqx.Module):
     drift: Float[Array, "*batch state state"]
     push: Float[Array, "*batch state value"]
     toll: Float[Array, "*batch both both"]
-
-    def best(self) -> Stretch:
-        """What it does to optimal state and costate."""
-        states, across = self.drift.shape[-1], transposed(self.push)
-        mixed, spent = self.toll[..., states:, :states], self.toll[..., states:, states:]
-        right = jnp.concatenate([mixed, across], axis=-1)
-        answers = jnp.vectorize(solve_any, signature="(i,i),(i,j)->(i,j)")(spent, right)
-        to_state, to_costate = answers[..., :states], answers[..., states:]
-        return Stretch(
-            drift=self.drift - self.push @ to_state,
-            reach=symmetric(self.push @ to_costate),
-            toll=symmetric(self.toll[..., :states, :states] - transposed(mixed) @ to_state),
-        )
 
 
 def flows(
@@ -80,29 +66,8 @@ def flows(
     )
 
 
-def costs_to_go(
-    parts: Flow, terminal: Square, parallel: bool = False
-) -> Float[Array, "edge state state"]:
-    """P at the start of each of successive stretches and, last, at the end, where it is given.
-
-    One after the other; or `parallel` in time, in twice the logarithm of their number of steps
-    and about ten times the work. It compiles some ten times as long, and can pay only where many
-    more cores than designs are idle. Its batches are solved by a library, whose threads may wait
-    for each other for ever where several programs run at once on few cores.
-    """
-    if parallel:
-
-        def join(later, earlier):
-            return earlier.then(later)
-
-        # Joining inverts matrices that the balanced states leave well conditioned.
-        scale = balance(parts.drift[0])
-        outer = scale * scale[:, None]
-        best = parts.best()
-        even = Stretch(best.drift * scale / scale[:, None], best.reach / outer, best.toll * outer)
-        onward = jax.lax.associative_scan(join, even, reverse=True)
-        costs = jax.vmap(lambda part: part.before(terminal * outer))(onward) / outer
-        return jnp.concatenate([costs, terminal[None]])
+def costs_to_go(parts: Flow, terminal: Square) -> Float[Array, "edge state state"]:
+    """P at the start of each of successive stretches and, last, at the end, where it is given."""
     return in_lanes(carried, parts, jnp.zeros((1, 1)), terminal)
 
 

@@ -6,8 +6,7 @@ from matplotlib.figure import Figure
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
-from jaxbeam.model.modes import Modes
-from jaxbeam.model.modes import modes as find_modes
+from jaxbeam.model.modes import Modes, modes as find_modes
 from jaxbeam.plot.schematic import draw_supports
 from jaxbeam.plot.style import (
     FAINT,

@@ -142,7 +142,7 @@ def histories(
 class Prepared(NamedTuple):
     """All that an integration needs: a rig on its grid, its loads, and what drives it, if any.
 
-    `edges` are the steps with which the samples begin, `count_verdicts` is how many steps there are.
+    `edges` are the steps with which the samples begin, `count` is how many steps there are.
     """
 
     rigging: Rigging

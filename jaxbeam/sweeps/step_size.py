@@ -27,7 +27,7 @@ Measure = Callable[[Int[np.ndarray, " task"], Float[np.ndarray, " task"], int], 
 
 
 def spread(paces: Float[np.ndarray, " task"], count: int) -> Int[np.ndarray, " chosen"]:
-    """`count_verdicts` tasks (some maybe twice) from slow ones to the fastest, evenly in log pace.
+    """`count` tasks (some maybe twice) from slow ones to the fastest, evenly in log pace.
 
     The slowest of all are left out: they take longest, and their errors tell least of the others.
     """
@@ -57,7 +57,7 @@ def rounding(exact: Float[np.ndarray, "task lane sensor"], rounded: np.ndarray) 
 
 
 def drawn(paces: Float[np.ndarray, " task"], count: int) -> Int[np.ndarray, " chosen"]:
-    """`count_verdicts` tasks (some maybe twice), one from each of as many equal parts of all, by pace.
+    """`count` tasks (some maybe twice), one from each of as many equal parts of all, by pace.
 
     At random within these parts, and the same each time.
     """
@@ -102,7 +102,7 @@ def choose_steps(
 ) -> tuple[Float[np.ndarray, " task"], float]:
     """Longest steps (s) of all tasks for a tolerance, and the error seen on a random few.
 
-    `measure` takes tasks, a multiple of `count_verdicts`, their steps and how many more between events, and
+    `measure` takes tasks, a multiple of `count`, their steps and how many more between events, and
     returns their peaks; `each` calls it several times, as `map` does. `paces` (1/s) order the
     tasks, `guesses` start the search, `limits` (s) cap it. Raises RuntimeError if no step meets the
     tolerance.

@@ -14,7 +14,8 @@ from tqdm import tqdm
 from jaxbeam.case.case import Case
 from jaxbeam.simulation.integration_plan import TOLERANCE, sample_times
 from jaxbeam.simulation.record import sensor_labels
-from jaxbeam.sweeps import cluster, store
+from jaxbeam.sweeps import cluster
+from jaxbeam.sweeps import store as sweep_store
 from jaxbeam.sweeps.batches import Tasks
 from jaxbeam.sweeps.blocks import Work
 from jaxbeam.sweeps.specification import Order, make_order
@@ -70,22 +71,22 @@ def sweep(
     order = make_order(case, over, paired, histories, tolerance, precision)
     path = None if store is None else Path(store).absolute()
     mark = order.fingerprint()
-    state = "new" if path is None else store.prepare(path, mark, resume, overwrite)
+    state = "new" if path is None else sweep_store.prepare(path, mark, resume, overwrite)
     if path is not None and state == "complete":
-        return store.read(path)
+        return sweep_store.read(path)
 
     work = order.work()
     if path is not None and state == "resume":
-        keeper = store.Disk(path)
+        keeper = sweep_store.Disk(path)
         steps, error = keeper.steps[:-1], float(keeper.steps[-1])
     else:
         steps, error = work.steps()
         if path is None:
-            keeper = store.Memory(work.blocks)
+            keeper = sweep_store.Memory(work.blocks)
         else:
             kept = np.append(steps, error)
             content = order.to_dict()
-            keeper = store.create(path, mark, content, work.blocks, kept, overwrite)
+            keeper = sweep_store.create(path, mark, content, work.blocks, kept, overwrite)
     todo = keeper.missing()
     # The first block is always computed here: the arrays of the store are made for it.
     here = todo if client is None else todo[:1]
@@ -96,7 +97,7 @@ def sweep(
             for block in cluster.compute(client, mark, path, todo[1:]):
                 bar.update(work.runs(block))
     dataset = _label(order, work.tasks, keeper.collect())
-    dataset.attrs |= {"error_estimate": error, store.FINGERPRINT: mark}
+    dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT: mark}
     keeper.finish(dataset)
     return dataset
 
@@ -108,7 +109,7 @@ def _progress(work: Work, todo: list[int], shown: bool) -> tqdm:
     return tqdm(total=count, initial=count - left, unit="run", disable=not shown, file=sys.stderr)
 
 
-def _compute(work: Work, blocks: list[int], steps, keeper: store.Keeper) -> Iterator[int]:
+def _compute(work: Work, blocks: list[int], steps, keeper: sweep_store.Keeper) -> Iterator[int]:
     """Compute blocks on all cores and keep them, giving the number of each that is done."""
     results = work.pool.map(lambda block: (block, work.block(block, steps)), blocks)
     # Closed early, by an error or the keyboard, blocks not yet begun are called off.

@@ -104,7 +104,7 @@ class WrittenOut:
         return np.concatenate([A @ x + B @ u, F @ X + G @ u + listen @ (C @ x - H @ X), change])
 
     def solved(self):
-        """Deflections at the sensors and commands at `TIME_NAMES`."""
+        """Deflections at the sensors and commands at `TIMES`."""
         start = np.zeros(self.truth.size)
         start[-1] = 9.81 * MASS
         y = np.concatenate([start, self.guess, self.first.ravel() if self.moving else []])

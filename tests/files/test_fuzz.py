@@ -6,8 +6,7 @@ import tomllib
 
 import pytest
 import tomli_w
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import case_from_dict, case_to_dict, load_case

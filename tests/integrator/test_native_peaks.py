@@ -27,7 +27,7 @@ from jaxbeam.integrator.step_matrices import make_rigging
 from jaxbeam.integrator.time_grid import even_grid
 from jaxbeam.model.contact import traffic
 from jaxbeam.model.modal_model import rig
-from jaxbeam.numerics import native_designs, peak_search
+from jaxbeam.numerics import peak_search
 from jaxbeam.runtime import native_library
 from jaxbeam.simulation.integration_plan import form
 from jaxbeam.sweeps.specification import make_order
@@ -179,7 +179,7 @@ def marched(case, by_hand, longest=1e-3):
         of_one = jax.tree.map(lambda leaf: leaf[None], given)
         return native_peaks.march(known.slots, *of_one).peak_deflection[0, 0]
 
-    return jax.jit(peak_search)
+    return jax.jit(peaks)
 
 
 @pytest.mark.parametrize("case", [PLAIN, COUPLED], ids=["plain", "coupled"])
@@ -237,10 +237,9 @@ def test_what_cannot_be_loaded_is_left_alone(folder, monkeypatch, tmp_path):
     assert not native_peaks.ready()
 
 
-@pytest.mark.parametrize("library", [native_peaks.LIBRARY, native_designs.LIBRARY])
-def test_whatever_is_included_decides_the_name_of_a_library(library):
+def test_whatever_is_included_decides_the_name_of_a_library():
     """Else one would be taken that was compiled from an older header."""
-    folder = native_library.HERE
+    folder, library = native_library.HERE, native_peaks.LIBRARY
     texts = [(folder / name).read_text() for name in library.sources + library.headers]
     included = re.findall(r'#include "(native_\w+\.h)"', "".join(texts))
     assert set(included) == set(library.headers)

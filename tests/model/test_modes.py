@@ -6,8 +6,7 @@ Accuracy reached (relative): 1e-14 for the first dozen modes, 1e-13 for 50.
 import hypothesis
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 
 from jaxbeam.case.actuators import Patch

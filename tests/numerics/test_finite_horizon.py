@@ -9,8 +9,6 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.control import FiniteLQR
-from jaxbeam.numerics import native_designs
-from jaxbeam.runtime import native_library
 
 SHARES = np.array([0.0, 0.123, 0.25, 0.377, 0.5, 0.61, 0.75, 0.9, 0.97, 0.9999])
 
@@ -131,33 +129,15 @@ def seven_modes():
     return np.array(gains)[::-1]
 
 
-@pytest.fixture
-def compiled(tmp_path, monkeypatch):
-    """What is written in C, compiled for this test."""
-    if native_library.compiler() is None:
-        pytest.skip("no C compiler here")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native_designs.LIBRARY.build()
-
-
 @pytest.mark.parametrize(("turn", "error"), [(3.0, 3e-4), (1.0, 2e-6), (0.5, 1e-7)])
 def test_gains_are_right_between_edges_too(seven_modes, turn, error):
-    check_between_edges(seven_modes, turn, error, "sequential")
-
-
-def test_gains_in_c_are_right_between_edges_too(seven_modes, compiled):
-    check_between_edges(seven_modes, 3.0, 3e-4, "native")
-    check_between_edges(seven_modes, 0.5, 1e-7, "native")
-
-
-def check_between_edges(seven_modes, turn, error, in_time):
     """Compared with the largest gain within a hundredth of the crossing."""
     points = int(np.ceil(FASTEST * 0.6 / SPEED / turn))
     case = jb.Case(
         jb.Beam(0.6, RIGIDITY, DENSITY, 0.03, modes=7),
         actuators=[jb.PointForce(0.25)],
         loads=[jb.MovingMass(mass=MASS, speed=SPEED)],
-        controller=FiniteLQR(WEIGHTS, [EFFORT], points=points, in_time=in_time),
+        controller=FiniteLQR(WEIGHTS, [EFFORT], points=points),
     )
     found = jax.jit(lambda: jax.vmap(case.controller.gains(jb.state_space(case)))(CROSSED))()
     sizes = np.max(np.abs(seven_modes), axis=1)

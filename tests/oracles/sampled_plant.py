@@ -104,7 +104,7 @@ def conditioned(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of the last state, given all readings.
 
-    `initial_law` is mean and covariance one step before the first tick; `rows` are C and D at the ticks;
+    `start` is mean and covariance one step before the first tick; `rows` are C and D at the ticks;
     `commands` (tick, input) acted until the ticks, none before the first.
     """
     mean, covariance = start

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from experiments.benchmarks.rivals.baselines import reference_peaks
-from experiments.benchmarks.rivals.crossing import PinnedBeam
+from experiments.benchmarks.rivals.pinned_beam import PinnedBeam
 from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.simulate import ContactLossWarning
 

@@ -29,7 +29,7 @@ PLANT_PREFIXES = (
 class LoadCases:
     """Numbers of the case, by address, that differ from run to run: loads, plants, anything.
 
-    `training_loads` runs are tuned on, `held_out` ones only looked at when all is done.
+    `training` runs are tuned on, `held_out` ones only looked at when all is done.
     """
 
     training: tuple[AddressValues, ...]

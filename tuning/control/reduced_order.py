@@ -21,7 +21,7 @@ CANDIDATE_COUNT = 3  # states that may be the last to be fed back
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReducedFeedback:
-    """States that are fed back (`fed_back`, from 0), by their `stage_shares` in the relaxed search.
+    """States that are fed back (`fed_back`, from 0), by their `shares` in the relaxed search.
 
     `tuned` is what the others came to once the shares were rounded; its start is the rounded law.
     """

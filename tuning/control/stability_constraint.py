@@ -25,7 +25,7 @@ class Stable:
     """Frozen poles of all training runs are to have real parts of at most `largest` (1/s).
 
     They are looked at without loads and at `places` instants along each crossing; also with each
-    of the numbers in `separate_labels` changed by its share up and down, and, for a controller that
+    of the numbers in `spread` changed by its share up and down, and, for a controller that
     samples, with a `delay` (s) on top of its own. Poles cost more than runs: `crossings`, numbers
     by address like those of load cases, may take the place of all training runs.
     """

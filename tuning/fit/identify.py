@@ -30,7 +30,7 @@ class Fit:
 
     An error (standard error) is infinite where the data cannot tell; `unidentifiable` says by name why:
     each entry holds changes that, made together, leave the readings as good as they are. `noise`
-    is the standard deviation of the residuals, NaN for a sensor that a log lacks. `jaxbeam_case` has the
+    is the standard deviation of the residuals, NaN for a sensor that a log lacks. `case` has the
     fitted numbers; with several logs, those of one log (`logs.1.loads.0.speed`) have no place in
     it, but in `cases`, one for each log. `autocorrelation_factor` is the factor by which the residuals'
     autocorrelation raises variances, and has widened the intervals, and `degrees_of_freedom` the number
@@ -165,7 +165,7 @@ def identify(
     channels are estimated from the residuals. Standard errors follow from the Jacobian, widened
     where residuals are correlated in time; directions the data cannot see are reported by name.
 
-    `loss` "soft-l1" or "huber" lets outliers count less. `operation_stages` are lists of addresses that are
+    `loss` "soft-l1" or "huber" lets outliers count less. `stages` are lists of addresses that are
     fitted first, one list after the other, the rest held. From more than one of the `starts`
     (others are drawn by the `seed`) the lowest minimum is taken; with a `checkpoint` file that
     search can be stopped at any time and taken up with `resume`: the result is the same.
@@ -205,7 +205,7 @@ def fit_result(
     solution: LeastSquaresSolution,
     minima: tuple[LocalMinimum, ...] = (),
 ) -> Fit:
-    """The result of a search: `jaxbeam_case` is the one that was to be fitted."""
+    """The result of a search: `case` is the one that was to be fitted."""
     dataset, parameters = least_squares.data, least_squares.parameters
     pairs = zip(parameters, solution.values, strict=True)
     values = {number.address: float(value) for number, value in pairs}

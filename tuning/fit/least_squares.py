@@ -155,7 +155,7 @@ class LeastSquares:
     ) -> LeastSquaresSolution:
         """Fit the numbers to samples like those of the campaign, from their starts on.
 
-        `initial_law` are other starts (search variables), `included_logs` says which logs count, `free` which
+        `start` are other starts (search variables), `included_logs` says which logs count, `free` which
         numbers move. The noise of each channel is guessed first, then found from the residuals.
         Standard errors are those of the linearised fit (0 for what does not move), widened where
         residuals are correlated in time.

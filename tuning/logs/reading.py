@@ -49,7 +49,7 @@ def read_log(
 ) -> Log:
     """Read a log: separated values, LabVIEW (.lvm, .tdms), MATLAB, HDF5, netCDF or Parquet.
 
-    `value_columns` names the channels to keep, in this order; `units` gives the unit of columns by name
+    `columns` names the channels to keep, in this order; `units` gives the unit of columns by name
     (or one for all channels) and wins over the file; `time` names the column of times, by default
     the one called time or t, or the first with a unit of time. What is not given here is taken
     from the TOML file beside the log, then from the log itself. Sampling is that of the times.

@@ -26,7 +26,7 @@ SMOOTHING_WIDTHS_BINS = (0, 1, 4, 12)
 
 
 def fit_ambient(values, rate: float, start: int, stop: int, band, quantities) -> ModeCandidates:
-    """Identify modes from the samples `initial_law` to `stop` of a log (values: time, channel)."""
+    """Identify modes from the samples `start` to `stop` of a log (values: time, channel)."""
     spectrum = band_spectrum(values[start:stop], rate, band)
     modes, reasons = (), ()
     if spectrum.bins.size >= MIN_BINS:

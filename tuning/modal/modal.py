@@ -139,7 +139,7 @@ def identify_modes(
     """Identify modes from a log of unknown excitation.
 
     `window` (s) is the part of the log to use, found where left out; `band` (Hz) the range of
-    frequencies, by default the one with the kinetic energy; `count_verdicts` keeps so many modes, those
+    frequencies, by default the one with the kinetic energy; `count` keeps so many modes, those
     with most energy; `kind` is "free decay" or "ambient", by default whichever the log shows.
 
     Raises ValueError for a log that is not sampled evenly or is too short, a window outside the

@@ -29,7 +29,7 @@ class IdentifiedMode(NamedTuple):
 class ModeCandidates(NamedTuple):
     """Candidate modes with the reason against each (empty: none), and what they were found in.
 
-    `initial_law` and `stop` are the samples used; `quantile` times a standard deviation is half a 95 %
+    `start` and `stop` are the samples used; `quantile` times a standard deviation is half a 95 %
     interval; `measured` and `fitted` (sample, channel) the band's part of the log and of the fit
     (None where there is no fit in time).
     """

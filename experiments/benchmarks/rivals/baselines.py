@@ -16,7 +16,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 import jaxbeam  # noqa: F401 - switches JAX to double precision
-from experiments.benchmarks.rivals.crossing import (
+from experiments.benchmarks.rivals.pinned_beam import (
     crossing_rate,
     free_peaks,
     free_times,
@@ -69,7 +69,7 @@ def scipy_histories(beam, masses, speeds, times, tolerance=SCIPY_TOLERANCE):
 
 
 def scipy_time(solve, beam, masses, speeds, runs=12, repeat=3, reference=None):
-    """What `solve(rig, masses, speeds)` would take for all of these, from a sample of `simulate_changes`.
+    """What `solve(rig, masses, speeds)` would take for all of these, from a sample of `runs`.
 
     The cost of a run is a constant plus a share that grows with its duration, L / v; both are
     fitted to runs spread over the speeds, each with another mass, each timed `repeat` times; and,

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxbeam as jb
-from experiments.thesis import published
-from experiments.thesis.beams import (
+from experiments.thesis.chapter2 import published
+from experiments.thesis.cases import (
     as_moving_force,
     critical_speed,
     one_span,
@@ -20,7 +20,7 @@ from experiments.thesis.beams import (
     with_modes,
     with_sensors,
 )
-from experiments.thesis.chapter2.amplification_plot import draw_curves, draw_histories, draw_map
+from experiments.thesis.chapter2.amplification_figures import draw_curves, draw_histories, draw_map
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.simulate import ContactLossWarning

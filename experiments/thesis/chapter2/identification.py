@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 import tuning
-from experiments.thesis import published
+from experiments.thesis.chapter2 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.plot.style import colour, set_title, use_style
 

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis import published
+from experiments.thesis.chapter2 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.model.statics import static_lift
 from jaxbeam.plot.style import colour, set_title, use_style

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis import published
+from experiments.thesis.chapter2 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.model.channels import shaker_chain
 from jaxbeam.model.frequency_response import FrequencyResponse, extremes, frequency_response

@@ -13,10 +13,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis import published
+from experiments.thesis.chapter5 import published
 from experiments.thesis.chapter2.shaker import data_physics_v4
-from experiments.thesis.chapter5.moving_point import deepest_position, mode_truncation
-from experiments.thesis.chapter5.observed import observed_regulator
+from experiments.thesis.chapter5.deflection_under_load import deepest_position, mode_truncation
+from experiments.thesis.chapter5.observer import observed_regulator
 from experiments.thesis.chapter5.regulator_limits import (
     TimeVaryingLoops,
     draw_poles,

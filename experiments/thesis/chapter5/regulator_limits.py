@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis import published
+from experiments.thesis.chapter5 import published
 from experiments.thesis.verdicts import Finding, make_finding
 from jaxbeam.analysis.stability import frozen_poles, growth
 from jaxbeam.analysis.stability_limits import limit

@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis import published
-from experiments.thesis.chapter6.ripple import gain_margin_finding, oscillation_findings
-from experiments.thesis.chapter6.scheduling import (
+from experiments.thesis.chapter6 import published
+from experiments.thesis.chapter6.filter_oscillation import gain_margin_finding, oscillation_findings
+from experiments.thesis.chapter6.gain_scheduling import (
     HIGHER_GAINS,
     derived_schedules,
     static_schedule_remark,

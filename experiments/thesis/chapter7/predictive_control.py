@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis import published
+from experiments.thesis.chapter7 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, make_finding
 from jaxbeam.analysis.bound.input_influence import reach
 from jaxbeam.analysis.bound.linear_program import least_peak

@@ -1,6 +1,6 @@
 """The limit nobody can beat: the least peak deflection that commands within limits leave.
 
-For known loads the deflection is linear in the commands (`t_quantile`), so the least peak over all
+For known loads the deflection is linear in the commands (`reach`), so the least peak over all
 histories of commands is a linear program,
 
     minimise p   subject to   |free(x, t) + sum_k response_k(x, t) u_k| <= p,
@@ -53,7 +53,7 @@ class Bound(eqx.Module):
     """The least achievable peak deflection of a case, and commands that attain it.
 
     `peak` (m) is the largest absolute deflection at the `places` (m), at instants at most `spacing`
-    (s) apart; that in between may be a little larger. `uncontrolled_peaks` (m) is the peak without
+    (s) apart; that in between may be a little larger. `uncontrolled` (m) is the peak without
     commands. `commands` start at `times` (s) and are held over `period` (s); of the many that
     attain the peak (to 1e-5) they are calm ones.
     """

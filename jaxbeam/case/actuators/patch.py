@@ -12,7 +12,7 @@ MATERIAL = ("d33", "modulus", "electrode_spacing", "beam_height", "patch_height"
 
 
 class Patch(AbstractActuator):
-    """Piezoelectric patch from `initial_law` to `end`: a pair of opposite moments at its edges.
+    """Piezoelectric patch from `start` to `end`: a pair of opposite moments at its edges.
 
     The moment is `moment_per_volt` x `correction` x patch voltage, and the patch voltage is
     `amplifier_gain` x command, eqs (2.43) and (2.46) of the thesis. Positive voltage lifts the

@@ -10,7 +10,7 @@ from jaxbeam.numerics.gain_table import GainTable
 
 
 class Schedule(eqx.Module):
-    """Gains over a crossing from `initial_law` to `end` (s), and the gain from then on.
+    """Gains over a crossing from `start` to `end` (s), and the gain from then on.
 
     That dies away with a time constant `fade` (s), or does not if that is None. `known` are the
     weights of the loads (N), which have columns of their own behind the states.

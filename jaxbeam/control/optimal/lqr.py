@@ -29,7 +29,6 @@ from jaxbeam.control.optimal.gain_schedules import Schedule, crossing
 from jaxbeam.control.optimal.sampling_loss import warn_if_slow
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import LoadedBeam
-from jaxbeam.numerics import native_designs
 from jaxbeam.numerics.finite_horizon import finite_time, finite_time_coupled, layer
 from jaxbeam.numerics.gain_table import GainTable, edges_between, even, step_by_step
 from jaxbeam.numerics.riccati import lqr
@@ -197,26 +196,15 @@ class AbstractForesighted(AbstractScheduledRegulator):
     modes gains were right everywhere to 3e-4 of the largest nearby where the fastest mode turned by
     3 rad in a stretch of the table, to 3e-5 with 2 rad, 2e-6 with 1, and 1e-7 with 0.5; while P
     rings, before an event, the table has finer stretches. Where an actuator lags, they were right
-    to 1e-6 if a stretch lasted nine of its time constants, to 1e-8 with four. `inverse_transform`
-    makes no difference to the gains: "parallel" is for devices with many cores, see
-    `flows.costs_to_go`, and "native" takes what `jaxbeam native` has compiled from C, in about half
-    the time.
+    to 1e-6 if a stretch lasted nine of its time constants, to 1e-8 with four.
     """
 
     terminal_weight: Float[Array, " state"] | None = number(
         "s/unit of the state^2", "weight of each state at the end", NOT_NEGATIVE, default=None
     )
-    in_time: str = choice(
-        "how P is carried backward",
-        "sequential",
-        "parallel",
-        "native",
-        default="sequential",
-    )
 
     def fault(self, case):
-        lacking = native_designs.lacking() if self.in_time == "native" else None
-        return super().fault(case) or lacking or too_coarse(self, case)
+        return super().fault(case) or too_coarse(self, case)
 
     def gains(self, model):
         return optimal(self, model)[0]
@@ -268,7 +256,7 @@ def optimal(
     loads = len(model.case.loads) if regulator.feeds_loads_forward else 0
 
     Q, F = (jnp.pad(weight, (0, loads)) for weight in (Q, F))
-    rest = crossing(model), regulator.points, Q, R, F, regulator.in_time
+    rest = crossing(model), regulator.points, Q, R, F
     if model.rig.states == 2 * model.scale.shape[0]:
         return finite_time_coupled(*coupled_beam(model, loads > 0), *rest)
 

@@ -20,7 +20,7 @@ from jaxbeam.model.state_space import LoadedBeam
 class Family(eqx.Module):
     """Schedules for each mass and speed, and what is known of the load.
 
-    `study_remarks` are its mass (kg), speed (m/s) and time of entry (s) if they are given beforehand;
+    `told` are its mass (kg), speed (m/s) and time of entry (s) if they are given beforehand;
     `gravity` (m/s^2) makes a weight of the mass.
     """
 

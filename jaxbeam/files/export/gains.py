@@ -17,20 +17,20 @@ class Gains:
     """Gain tables as a controller runs them: u = -K(mass, speed, share) z.
 
     `table` (mass, speed, share, actuator, column) has K at the `masses` (kg), `speeds` (m/s) and
-    `stage_shares` of the crossing, from the entry of the first load to the exit of the last; `rest`
+    `shares` of the crossing, from the entry of the first load to the exit of the last; `rest`
     (mass, speed, actuator, column) is from the exit on, and dies away with the time constant `fade`
     (s) if that is finite. K is linear between the shares, and `between` masses and speeds either
     "interpolated", too, or that of the "nearest"; beyond the grid it is held. A table for one load
     has one mass and one speed, zero, which nobody asks for; a constant gain has one share as well.
 
     `crossing` (s) is that of the load designed for, zero for a constant gain; a crossing of another
-    length stretches the table. `value_columns` and `commands` are (name, unit). Rows of `filters` are the
+    length stretches the table. `columns` and `commands` are (name, unit). Rows of `filters` are the
     index of a sensor and its section b0, b1, b2, a0, a1, a2.
 
     The `estimator`, empty if there is none, is [[A, B, B', L], [C, 0, D, o]]: from tick to tick its
     states x become A x + B u + B' u', u being the commands that acted until the tick before and u'
     those until this, and then, with so many `readings` y, by L (y - C x - D u' - o) more (o is the
-    first column of its block). The first of them are the first `value_columns`.
+    first column of its block). The first of them are the first `columns`.
     """
 
     masses: np.ndarray
@@ -56,7 +56,7 @@ class Gains:
         mass: float = 0.0,
         speed: float = 0.0,
     ) -> np.ndarray:
-        """Commands for a state, in the order of `value_columns`, at a share of the crossing.
+        """Commands for a state, in the order of `columns`, at a share of the crossing.
 
         From the exit on, which was `since_exit` s ago, the share is 1 or more. `mass` (kg) and
         `speed` (m/s, its size) are those of the load. Zero before the entry. Products are added one

@@ -24,7 +24,6 @@ LAWS = {
     "lqr-step": jb.StepLQR(**WEIGHTS, points=4),
     "lqr-finite": jb.FiniteLQR(**WEIGHTS, points=60),
     "lqr-augmented": jb.AugmentedLQR(**WEIGHTS, points=60),
-    "parallel": jb.AugmentedLQR(**WEIGHTS, points=60, in_time="parallel"),
     "lqr-scheduled": ScheduledLQR(**WEIGHTS, **GRID, points=60),
 }
 # A mass, a speed, a weight of a state, one of the command, and a number of the plant.
@@ -120,11 +119,6 @@ def test_what_designs_share_makes_no_difference(actuator, varied):
     plain = jax.jit(size)
     expected = [central(lambda x: plain(x[0]), [share], step=1e-3)[0] for share in shares]
     assert_allclose(slopes, expected, rtol=1e-6)
-
-
-def test_in_parallel_the_gains_are_the_same():
-    one, other = (jax.jit(answers(name))(np.ones(5)) for name in ("lqr-augmented", "parallel"))
-    assert_allclose(one, other, rtol=1e-10)
 
 
 NOISY = {

@@ -82,7 +82,7 @@ def test_gains_over_the_crossing(model, kind, points, name):
 def test_closed_loops(controller, name):
     """What follows the exit hangs on a layer of 0.1 ms in the gain, which the table must resolve.
 
-    The reference did not there: it is replaced by `FREE_VIBRATION_FREQUENCY`, and left out where that has none.
+    The reference did not there: it is replaced by `AFTER_EXIT`, and left out where that has none.
     """
     expected = REFERENCE[f"continuous_closed_loop_{name}"]
     record = jb.simulate(rig(controller, 2.5), times=jnp.array([0.0, *expected["time_s"]]))

@@ -83,7 +83,7 @@ def optimal_gain(masses, speeds, entries):
 
 
 def deflections(predicted):
-    """Deflections (m) at `TIME_NAMES` of what comes, under the regulator of what is predicted."""
+    """Deflections (m) at `TIMES` of what comes, under the regulator of what is predicted."""
     gain = optimal_gain(**predicted)
     weights = GRAVITY * np.array(predicted["masses"])
 
@@ -98,7 +98,7 @@ def deflections(predicted):
 
 
 def simulated(predicted):
-    """The run on `CHECKPOINT_STEPS` under the law for what is predicted, in single steps between them."""
+    """The run on `EVERY` under the law for what is predicted, in single steps between them."""
     numbers = {"mass": "masses", "speed": "speeds", "entry_time": "entries"}
     beliefs = Beliefs(**{name: predicted[key] for name, key in numbers.items()})
     case = rig(dataclasses.replace(LAW, design=beliefs))

@@ -71,7 +71,7 @@ def plant(time, masses=MASSES, speeds=SPEEDS, entries=ENTRIES):
 
 
 def by_pieces(rate, start, tolerance, backward=False, events=EVENTS):
-    """States at `TIME_NAMES` from an ODE that changes at the events, forward or backward."""
+    """States at `TIMES` from an ODE that changes at the events, forward or backward."""
     found, state = {}, start
     stops = np.unique([*TIMES, *events])
     legs = list(zip(stops[:-1], stops[1:], strict=True))
@@ -85,7 +85,7 @@ def by_pieces(rate, start, tolerance, backward=False, events=EVENTS):
 
 @pytest.fixture(scope="module")
 def optimum():
-    """Optimal gains at `TIME_NAMES` of states and weights, by the Riccati equation backward in time."""
+    """Optimal gains at `TIMES` of states and weights, by the Riccati equation backward in time."""
     size = 2 * MODES + len(MASSES)
     Q_all = block_diag(Q, np.zeros((len(MASSES),) * 2))
 

@@ -8,14 +8,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from experiments.benchmarks import cases
-from experiments.benchmarks.rivals import baselines, by_numba
+from experiments.benchmarks.rivals import baselines, numba_peaks
 from experiments.benchmarks.rivals.baselines import (
     diffrax_peaks,
     reference_peaks,
     scipy_peaks,
     scipy_time,
 )
-from experiments.benchmarks.rivals.crossing import (
+from experiments.benchmarks.rivals.pinned_beam import (
     PinnedBeam,
     crossing_rate,
     free_times,
@@ -181,14 +181,14 @@ def test_a_rate_off_the_beam_is_that_of_a_mass_of_none():
 def test_loops_for_numba_find_the_peaks_uncompiled_too(modes):
     rig = PinnedBeam(modes)
     expected = reference_peaks(rig, MASSES, SPEEDS)
-    found = by_numba.numba_peaks(by_numba.compile_peaks(None), rig, MASSES, SPEEDS)
+    found = numba_peaks.numba_peaks(numba_peaks.compile_peaks(None), rig, MASSES, SPEEDS)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_numba_finds_what_the_same_loops_find_uncompiled():
     package = pytest.importorskip("numba")
     found, plain = (
-        by_numba.numba_peaks(by_numba.compile_peaks(p), PinnedBeam(3), MASSES, SPEEDS)
+        numba_peaks.numba_peaks(numba_peaks.compile_peaks(p), PinnedBeam(3), MASSES, SPEEDS)
         for p in (package, None)
     )
     np.testing.assert_allclose(found, plain, rtol=1e-9)

@@ -14,11 +14,11 @@ from experiments.benchmarks import (
     __main__,
     cases,
     growth,
-    identify,
-    quadratic,
-    riccati,
-    steps,
-    tuners,
+    identification,
+    quadratic_programs,
+    regulator_designs,
+    controller_steps,
+    tuning_methods,
 )
 
 
@@ -61,13 +61,13 @@ def test_sweeps_of_the_table_are_right_and_all_is_told(kind):
 
 @pytest.fixture(scope="module")
 def programs():
-    return quadratic.programs(4)
+    return quadratic_programs.programs(4)
 
 
 def test_programs_are_those_whose_first_moves_the_crossing_saw(programs):
     H, f, M, gamma = programs
-    x, felt, single, batch = quadratic.by_jaxbeam(H, f, M, gamma)
-    case = steps.rig(jb.MPC(horizon=6, moves=4, **steps.PREDICTIVE))
+    x, felt, single, batch = quadratic_programs.by_jaxbeam(H, f, M, gamma)
+    case = controller_steps.rig(jb.MPC(horizon=6, moves=4, **controller_steps.PREDICTIVE))
     command = np.asarray(jb.simulate(case, tolerance=1e-4).command)[:, 0]
     moves = np.diff(command, prepend=0.0)
     np.testing.assert_allclose(x[:, 0], moves, atol=1e-6 * np.max(np.abs(moves)))
@@ -79,9 +79,9 @@ def test_osqp_solves_the_same_programs(programs):
     package = pytest.importorskip("osqp")
     H, f, M, gamma = programs
     scale = np.max(np.abs(H))
-    x, own, called = quadratic.by_osqp(package, H / scale, f / scale, M, gamma)
-    ours = quadratic.by_jaxbeam(H, f, M, gamma)[0]
-    np.testing.assert_allclose(x, ours, atol=quadratic.AGREED * np.max(np.abs(ours)))
+    x, own, called = quadratic_programs.by_osqp(package, H / scale, f / scale, M, gamma)
+    ours = quadratic_programs.by_jaxbeam(H, f, M, gamma)[0]
+    np.testing.assert_allclose(x, ours, atol=quadratic_programs.AGREED * np.max(np.abs(ours)))
     assert 0 < own < called
 
 
@@ -92,27 +92,27 @@ def test_growth_tells_times_and_memory():
 
 
 def test_steps_of_a_law_are_timed():
-    found = steps.measure(steps.CONTROLLERS["feedback, linear"])
+    found = controller_steps.measure(controller_steps.CONTROLLERS["feedback, linear"])
     assert 0 < found.median <= found.worst < 1e-3
 
 
 def test_designs_are_timed():
-    for times in (riccati.invariant(2), riccati.designs(2, 8, "sequential", True, 1 / 256)):
+    for times in (regulator_designs.time_invariant(2), regulator_designs.time_finite_horizon(2, 8, True, 1 / 256)):
         assert times.compiling > 0 and times.run > 0
 
 
 @pytest.mark.slow
 def test_identification_by_scipy_comes_to_the_same_optimum(monkeypatch):
-    monkeypatch.setattr(identify, "SPEEDS", np.array([2.0, 4.0]))
-    found = identify.run()
+    monkeypatch.setattr(identification, "SPEEDS", np.array([2.0, 4.0]))
+    found = identification.run()
     assert found["difference"] < 1e-5 < found["largest_error"]
     assert found["ratio"] > 1
 
 
 @pytest.mark.slow
 def test_evolution_never_does_worse_than_where_it_starts():
-    case, free = tuners.problem()
-    start = tuners.evolved(case, free, evaluations=1)
+    case, free = tuning_methods.problem()
+    start = tuning_methods.evolved(case, free, evaluations=1)
     assert jnp.isfinite(start.peak) and 0 < start.peak <= 0.83
     assert start.evaluations == 2 * 4 * len(free)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from experiments.thesis import published, reproduction, writeup
+from experiments.thesis import published, reproduction, report
 from experiments.thesis.verdicts import (
     EXPLAINED,
     IRREPRODUCIBLE,
@@ -92,7 +92,7 @@ def test_unknown_names_are_refused():
 def tally(name, load=rigs.load):
     run = reproduction.perform(reproduction.chosen([name])[0], load)
     return {
-        word: writeup.count([run], word)
+        word: report.count([run], word)
         for word in (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED)
     }
 

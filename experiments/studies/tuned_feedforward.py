@@ -1,7 +1,7 @@
 """Tuned laws on the patch rigs, beside the hand-set ones of chapter 6 and what is possible at all.
 
 One table of commands over the way of the load (`jaxbeam.control.feedforward`) for all masses and
-speeds, tuned by gradients (`experiments.studies.tuned_search`), is proven on loads that it was not tuned
+speeds, tuned by gradients (`experiments.studies.tune_feedforward`), is proven on loads that it was not tuned
 on:
 
 - ideal: no delay;
@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.tuned_search import FOLDER
+from experiments.studies.tune_feedforward import FOLDER
 from experiments.thesis.chapter6.feedback import ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF, with_feedback
 from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.plot.style import GREY, INK, colour, set_title, use_style

@@ -1,6 +1,6 @@
-"""How the laws of `experiments.studies.sensed` are found, which know nothing but what their sensors read.
+"""How the laws of `experiments.studies.sensor_feedback` are found, which know nothing but what their sensors read.
 
-    python -m experiments.studies.sensed_search B      # or C; writes experiments/controllers/sensed/B.toml
+    python -m experiments.studies.tune_sensor_feedback B      # or C; writes experiments/studies/controllers/sensor_feedback/B.toml
 
 On each patch rig one table of commands over the deflection under the load (kind "relief") serves
 all masses and speeds. All of the bench is in the loop that is differentiated: noise, a filter of
@@ -21,7 +21,7 @@ import numpy as np
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.tuned_search import (
+from experiments.studies.tune_feedforward import (
     COMMAND_LIMITS,
     COMMAND_RESOLUTION,
     MASSES,

@@ -1,6 +1,6 @@
-"""How the tuned laws of `experiments.studies.tuned` are found: the gradient through the closed loop.
+"""How the tuned laws of `experiments.studies.tuned_feedforward` are found: the gradient through the closed loop.
 
-    python -m experiments.studies.tuned_search B        # or C; writes experiments/controllers/tuned/B.toml
+    python -m experiments.studies.tune_feedforward B        # or C; writes experiments/studies/controllers/feedforward/B.toml
 
 On each patch rig one table of commands over the way of the load serves all masses and speeds. It
 starts as a trapezium within the limits of the patches, and its knots follow the gradient of the

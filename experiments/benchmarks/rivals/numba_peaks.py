@@ -14,7 +14,7 @@ import diffrax
 import numpy as np
 
 from experiments.benchmarks.rivals.baselines import FREE_VIBRATION
-from experiments.benchmarks.rivals.crossing import GRAVITY, free_times
+from experiments.benchmarks.rivals.pinned_beam import GRAVITY, free_times
 
 TOLERANCE = 1e-8  # with which no peak of the benchmark's grid is worse than 1e-6
 SOLVER, ORDER = diffrax.Dopri5, 5  # faster here than Tsit5 and Dopri8, with 3 modes and with 12

@@ -28,7 +28,7 @@ def switching_masses(
 ) -> tuple[list[list[float]], list[list[float]]]:
     """Where the cubic law beats linear gains, and which of these is as good in the end; by c_p.
 
-    `kernel_peaks` (m) are those without control, of the linear and of the cubic law, (law, c_p, mass), and
+    `peaks` (m) are those without control, of the linear and of the cubic law, (law, c_p, mass), and
     `higher_gain_peaks` those with the stronger linear gains (gain, c_p, mass).
     """
     peak_differences = (

@@ -1,12 +1,11 @@
-"""Runs of experiments as text, Markdown and HTML: one account, three dresses."""
+"""Reports on runs of thesis experiments: text for the terminal, sections for Markdown and HTML."""
 
-import html as escaping
 from collections.abc import Sequence
 
 import numpy as np
 
 from experiments.thesis.verdicts import IRREPRODUCIBLE, VERDICTS, Finding, FindingVerdicts, Run
-from jaxbeam.files.report import html_table, markdown_table, page
+from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable, text_table
 
 COLUMNS = ("number", "published", "ours", "difference", "tolerance", "verdict")
 PREFACE = (
@@ -16,6 +15,7 @@ PREFACE = (
     " Table 5.3 and printed sampled gains are judged, set after a first look; verdicts are computed"
     " from them."
 )
+REPORT_TITLE = "The thesis, reproduced"
 VERDICT_STYLE = (
     ".reproduced { color: #00694c } .explained { color: #0072b2 } .not, .cannot { color: #b34700 }"
 )
@@ -31,9 +31,7 @@ def text(run: Run) -> str:
     lines = [f"{run.experiment.name}: {run.experiment.covers}", f"  {run.experiment.claim}"]
     for one, judged in zip(run.outcome.findings, run.judged, strict=True):
         lines += ["", f"  {_finding_title(one)}"]
-        rows = [COLUMNS, *_finding_rows(one, judged)]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
-        lines += ["    " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        lines += [f"    {line}" for line in text_table(COLUMNS, _finding_rows(one, judged))]
         lines += [f"    {sentence}" for sentence in _finding_notes(one, judged.verdicts)]
     lines += [f"  {remark}" for remark in run.outcome.remarks]
     tally = ", ".join(f"{number} {word}" for word, number in _verdict_counts([run]) if number)
@@ -41,46 +39,19 @@ def text(run: Run) -> str:
     return "\n".join([*lines, "", f"  {tally}; {run.seconds:.0f} s", ""])
 
 
-def markdown(runs: Sequence[Run]) -> str:
-    """The report in Markdown, figures beside it."""
-    lines = ["# The thesis, reproduced", "", PREFACE, ""]
-    lines += markdown_table(*_summary(runs))
+def report_sections(runs: Sequence[Run]) -> list[ReportSection]:
+    """Sections of the report: a summary of all verdicts, then the experiments one by one."""
+    sections = [ReportSection("", [PREFACE, _summary(runs)])]
     for run in runs:
-        lines += [f"## {run.experiment.name}: {run.experiment.covers}", "", run.experiment.claim]
+        title = f"{run.experiment.name}: {run.experiment.covers}"
+        sections.append(ReportSection(title, [run.experiment.claim]))
         for one, judged in zip(run.outcome.findings, run.judged, strict=True):
-            lines += [
-                "",
-                f"**{_finding_title(one)}**",
-                "",
-                *markdown_table(COLUMNS, _finding_rows(one, judged)),
-            ]
-            lines += [f"{sentence}\n" for sentence in _finding_notes(one, judged.verdicts)]
-        lines += ["", *(f"{remark}\n" for remark in run.outcome.remarks)]
-        lines += [f"![{name}]({_figure_file(run, name)})\n" for name in run.outcome.figures]
-    return "\n".join(lines)
-
-
-def html(runs: Sequence[Run]) -> str:
-    """The report as a page, figures beside it."""
-    safe = escaping.escape
-    parts = [
-        f"<h1>The thesis, reproduced</h1><p>{PREFACE}</p>",
-        html_table(*_summary(runs), _verdict_class),
-    ]
-    for run in runs:
-        title = safe(f"{run.experiment.name}: {run.experiment.covers}")
-        parts.append(f"<h2>{title}</h2><p>{safe(run.experiment.claim)}</p>")
-        for one, judged in zip(run.outcome.findings, run.judged, strict=True):
-            parts.append(f"<h4>{safe(_finding_title(one))}</h4>")
-            parts.append(html_table(COLUMNS, _finding_rows(one, judged), _verdict_class))
-            parts += [
-                f"<p>{safe(sentence)}</p>" for sentence in _finding_notes(one, judged.verdicts)
-            ]
-        parts += [f"<p>{safe(remark)}</p>" for remark in run.outcome.remarks]
-        parts += [
-            f'<img src="{_figure_file(run, n)}" alt="{safe(n)}">' for n in run.outcome.figures
-        ]
-    return page("The thesis, reproduced", parts, VERDICT_STYLE)
+            table = ReportTable(COLUMNS, _finding_rows(one, judged), _verdict_class)
+            notes = _finding_notes(one, judged.verdicts)
+            sections.append(ReportSection(_finding_title(one), [table, *notes], level=4))
+        figures = [ReportFigure(f"{run.experiment.name}-{name}") for name in run.outcome.figures]
+        sections.append(ReportSection("", [*run.outcome.remarks, *figures]))
+    return sections
 
 
 def _finding_title(one: Finding) -> str:
@@ -127,20 +98,17 @@ def _verdict_counts(runs: Sequence[Run]) -> list[tuple[str, int]]:
     return [(word, count_verdicts(runs, word)) for word in VERDICTS]
 
 
-def _summary(runs: Sequence[Run]):
-    """Header and rows of the table that says how many numbers got which verdict."""
+def _summary(runs: Sequence[Run]) -> ReportTable:
+    """Table of how many numbers got which verdict."""
     header = ("experiment", "numbers", *VERDICTS, "seconds")
     rows = [_summary_row(run.experiment.name, [run], run.seconds) for run in runs]
-    return header, [*rows, _summary_row("all", runs, sum(run.seconds for run in runs))]
+    total = _summary_row("all", runs, sum(run.seconds for run in runs))
+    return ReportTable(header, [*rows, total], _verdict_class)
 
 
 def _summary_row(name, runs, seconds) -> tuple[str, ...]:
     numbers = [number for _, number in _verdict_counts(runs)]
     return (name, str(sum(numbers)), *map(str, numbers), f"{seconds:.0f}")
-
-
-def _figure_file(run: Run, name: str) -> str:
-    return f"{run.experiment.name}-{name}.png"
 
 
 def _verdict_class(cell: str) -> str | None:

@@ -1,23 +1,20 @@
 """Time of designing optimal regulators, many at once: finite-time ones, and time-invariant ones.
 
-    python -m experiments.benchmarks.riccati
+    python -m experiments.benchmarks.regulator_designs
 
 The one-span rig with a point force, crossed by a mass. A design is the table of gains along the
 whole crossing; how right it is, between the edges of the table too, was found for 7 modes by
 scipy's DOP853 (`tests/numerics/test_finite_horizon.py`). Designs are those of a grid, as many masses as speeds
 as weights of the force, so that they share what depends on the speed or the mass alone; or all
 numbers of each are its own. They are worked out in batches, by a thread for each core. Some are
-timed, and scaled to 4096; compiling is told apart. Where there is a C compiler, finite-time designs
-are timed again with what `jaxbeam native` compiles.
+timed, and scaled to 4096; compiling is told apart.
 """
 
 import math
 import os
-import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
-from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +23,7 @@ import numpy as np
 import jaxbeam as jb
 from jaxbeam.control.optimal.lqr import optimal
 from jaxbeam.model.modes import lay_out
-from jaxbeam.numerics import native_designs
 from jaxbeam.numerics.riccati import lqr
-from jaxbeam.runtime import native_library
 from jaxbeam.runtime.compiling import options
 
 DESIGNS, REPEATS, BATCH_SIZE = 4096, 3, 16  # BATCH also is how many values a number has in the grid
@@ -69,14 +64,14 @@ def time_designs(function, batches, share: float = 1.0, threads: int = THREADS) 
     return DesignTimes(compiled, min(runs) * len(batches) / (each * threads))
 
 
-def regulator_case(modes: int, points: int, in_time: str = "sequential") -> jb.Case:
+def regulator_case(modes: int, points: int) -> jb.Case:
     """The rig with a regulator to be designed."""
     weights = [1e6] * modes + [10.0] * modes
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=modes),
         actuators=[jb.PointForce(0.25)],
         loads=[jb.MovingMass(mass=0.4, speed=SPEEDS[0])],
-        controller=jb.FiniteLQR(weights, [1e-3], points=points, in_time=in_time),
+        controller=jb.FiniteLQR(weights, [1e-3], points=points),
     )
 
 
@@ -106,11 +101,9 @@ def interval_count(modes: int, phase_step: float) -> int:
     return math.ceil(fastest * length / SPEEDS[0] / phase_step)
 
 
-def time_finite_horizon(
-    modes: int, points: int, in_time: str, shared: bool, share: float
-) -> DesignTimes:
+def time_finite_horizon(modes: int, points: int, shared: bool, share: float) -> DesignTimes:
     """Time finite-time designs: those of the grid, which share much, or others."""
-    case = regulator_case(modes, points, in_time)
+    case = regulator_case(modes, points)
     layout = lay_out(case)
 
     def one(mass, speed, effort):
@@ -146,34 +139,14 @@ def print_row(name: str, found: DesignTimes) -> None:
 
 def main() -> None:
     """Print the table."""
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        mock.patch.dict(os.environ, XDG_CACHE_HOME=folder),
-    ):
-        ways = {"": "sequential"}
-        if native_library.compiler() is None:
-            print("designs in C are left out: there is no C compiler here")
-        else:
-            native_designs.LIBRARY.build()
-            ways[", in C"] = "native"
-        _print_table(ways)
-
-
-def _print_table(ways: dict[str, str]) -> None:
     print(f"{'':64} compiling (s)   {DESIGNS} take (s)")
     for modes in MODE_COUNTS:
         print_row(f"time-invariant, {2 * modes} states", time_invariant(modes))
         for turn, error in PHASE_STEPS.items():
             name = f"finite-time, {2 * modes} states, to {error:.0e}"
             points = interval_count(modes, turn)
-            for addition, way in ways.items():
-                print_row(
-                    f"{name}, grid{addition}", time_finite_horizon(modes, points, way, True, 1 / 4)
-                )
-                print_row(
-                    f"{name}, all different{addition}",
-                    time_finite_horizon(modes, points, way, False, 1 / 16),
-                )
+            print_row(f"{name}, grid", time_finite_horizon(modes, points, True, 1 / 4))
+            print_row(f"{name}, all different", time_finite_horizon(modes, points, False, 1 / 16))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
 from experiments.thesis import published
-from experiments.thesis.beams import one_span
+from experiments.thesis.cases import one_span
 from experiments.thesis.chapter2 import frequencies, shaker
 from experiments.thesis.chapter5.optimal_control import WEIGHTS
 from experiments.thesis.chapter5.regulator_limits import (

@@ -1,6 +1,6 @@
 """Time per step of every kind of controller: one by one, typical and worst, and 256 at once.
 
-    python -m experiments.benchmarks.steps [--only TEXT]
+    python -m experiments.benchmarks.controller_steps [--only TEXT]
 
 The one-span rig with a patch and five modes, crossed by 0.509 kg at 1 m/s, five sensors read every
 10 ms. A step is all that a controller does between a measurement and a command, estimator and

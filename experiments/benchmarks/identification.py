@@ -1,6 +1,6 @@
 """Speed of an identification against scipy: five numbers of a rig from ten logged crossings.
 
-    python -m experiments.benchmarks.identify
+    python -m experiments.benchmarks.identification
 
 scipy's least squares takes differences over crossings integrated by DOP853; jaxbeam takes exact
 derivatives. Both start at the same wrong values and minimise the same weighted squares. DOP853 is
@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import jaxbeam as jb
-from experiments.benchmarks.rivals.crossing import PinnedBeam, crossing_rate
+from experiments.benchmarks.rivals.pinned_beam import PinnedBeam, crossing_rate
 from tuning import Log
 from tuning.fit.dataset import make_dataset
 from tuning.fit.least_squares import LeastSquares

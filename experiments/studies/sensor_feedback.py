@@ -1,7 +1,7 @@
 """Laws on the patch rigs that know nothing but what their sensors read, beside what is possible.
 
 One table of commands over the deflection under the load (`jaxbeam.control.internal_model`) for all masses
-and speeds, tuned by gradients on the bench (`experiments.studies.sensed_search`): noise of 4 um, filters
+and speeds, tuned by gradients on the bench (`experiments.studies.tune_sensor_feedback`): noise of 4 um, filters
 of tenth order at 10 Hz (one span) and 20 Hz (two), a command every 10 ms in steps of 10 mV, 20 ms
 late. No gate, no mass and no speed is told. It is proven on loads, entries and noise that it was
 not tuned on; then also 10 ms later, on a beam that is 10 % stiffer or softer than it believes, and
@@ -18,14 +18,14 @@ import numpy as np
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.sensed_search import (
+from experiments.studies.tune_sensor_feedback import (
     CUTOFF,
     DELAY,
     FOLDER,
     READING_OFFSET,
     with_noise_and_filters,
 )
-from experiments.studies.tuned import (
+from experiments.studies.tuned_feedforward import (
     CUBIC_FEEDBACK,
     CUTOFFS,
     ENTRY_TIME,
@@ -40,7 +40,7 @@ from experiments.studies.tuned import (
     peaks,
     study_remarks,
 )
-from experiments.studies.tuned_search import MODES, PERIOD
+from experiments.studies.tune_feedforward import MODES, PERIOD
 from experiments.thesis.chapter6.feedback import with_feedback
 from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.analysis.stability import frozen_poles

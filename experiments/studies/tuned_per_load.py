@@ -1,9 +1,9 @@
 """One controller for all loads beside one that is tuned for each: what not knowing the load costs.
 
-    python -m experiments.studies.per_load
+    python -m experiments.studies.tuned_per_load
 
-On rig B, for loads on which the laws of `experiments.studies.tuned` (clocked by gates, no delay) and
-`experiments.studies.sensed` (sensors only, as on the bench) were not tuned, each is tuned on for that load
+On rig B, for loads on which the laws of `experiments.studies.tuned_feedforward` (clocked by gates, no delay) and
+`experiments.studies.sensor_feedback` (sensors only, as on the bench) were not tuned, each is tuned on for that load
 alone, by the same gradients from the same tables. Shares of the attainable reduction, one table for
 all loads and then its own: 97.7 to 99.7 % and 99.8 to 100 % by gates, 94.8 to 97.8 % and 99.8 to
 100 % from sensors alone. So not knowing the load costs 2 % of what is possible, or 5 %.
@@ -15,10 +15,10 @@ import numpy as np
 
 import jaxbeam as jb
 import tuning
-from experiments.studies import sensed_search, tuned_search
-from experiments.studies.sensed_search import with_noise_and_filters
-from experiments.studies.tuned import ENTRY_TIME
-from experiments.studies.tuned_search import COMMAND_LIMITS, MODES
+from experiments.studies import tune_sensor_feedback, tune_feedforward
+from experiments.studies.tune_sensor_feedback import with_noise_and_filters
+from experiments.studies.tuned_feedforward import ENTRY_TIME
+from experiments.studies.tune_feedforward import COMMAND_LIMITS, MODES
 from jaxbeam import rigs
 
 HELD_OUT_LOADS = tuning.grid(
@@ -37,8 +37,8 @@ def tuning_problems() -> dict[str, tuple[jb.Case, dict]]:
     slowest = float(case.beam.length) / 0.35 + ENTRY_TIME + 0.1
     beam = dataclasses.replace(case.beam, modes=MODES)
     case = dataclasses.replace(case, beam=beam, run=jb.Run(slowest, 200.0))
-    gate_law = jb.load_case(tuned_search.FOLDER / f"{RIG}.toml").controller
-    sensor_law = jb.load_case(sensed_search.FOLDER / f"{RIG}.toml").controller
+    gate_law = jb.load_case(tune_feedforward.FOLDER / f"{RIG}.toml").controller
+    sensor_law = jb.load_case(tune_sensor_feedback.FOLDER / f"{RIG}.toml").controller
     active_breakpoints = np.flatnonzero(np.asarray(sensor_law.readings) < 0)
     return {
         "clocked by gates": (

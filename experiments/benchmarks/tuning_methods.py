@@ -1,6 +1,6 @@
 """Tuning by gradients beside differential evolution: the same loop, at equal cost.
 
-    python -m experiments.benchmarks.tuners
+    python -m experiments.benchmarks.tuning_methods
 
 A table of commands (11 knots and the lead) on rig B is tuned for the worst peak of four loads. All
 start from the same trapezium and search within the same limits. Differential evolution (scipy's) is
@@ -21,7 +21,7 @@ from scipy.optimize import differential_evolution
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.tuned_search import (
+from experiments.studies.tune_feedforward import (
     COMMAND_LIMITS,
     ENTRY_TIME,
     GATES,

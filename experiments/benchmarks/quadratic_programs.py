@@ -1,6 +1,6 @@
 """Quadratic programs of predictive control against OSQP: those of a crossing, to one accuracy.
 
-    python -m experiments.benchmarks.quadratic
+    python -m experiments.benchmarks.quadratic_programs
 
 The rig of `steps` under predictive control of 4 to 8 variables with limits; the programs are those
 of the ticks of its crossing, scaled so that the largest entry of H is one. OSQP is set up once and
@@ -29,7 +29,7 @@ import numpy as np
 import scipy.sparse
 
 import jaxbeam as jb
-from experiments.benchmarks.steps import PREDICTIVE, patch_case
+from experiments.benchmarks.controller_steps import PREDICTIVE, patch_case
 from experiments.benchmarks.timing import time_call
 from jaxbeam.control import SamplingWarning
 from jaxbeam.control.predictive.qp import solve_qp
