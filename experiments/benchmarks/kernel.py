@@ -23,7 +23,7 @@ from experiments.benchmarks.rivals.pinned_beam import GRAVITY, PinnedBeam
 from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, one_span_case, sweep_peaks
 from experiments.benchmarks.timing import interleaved_best
 from jaxbeam.integrator.propagators import GAUSS, LOOKED
-from jaxbeam.numerics.peak_search import reach, through
+from jaxbeam.numerics.peak_search import interpolation_matrix, newton_step_limit
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.specification import make_order
 
@@ -57,7 +57,7 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     discrete_models = jax.tree.map(np.asarray, found)
     pinned_beam = PinnedBeam(modes)
     rates = discrete_models.rig.state_matrix[0, :, 1, :]
-    peak_search_points = np.array(LOOKED), through(LOOKED)[: len(LOOKED)], reach(LOOKED)
+    peak_search_points = np.array(LOOKED), interpolation_matrix(LOOKED)[: len(LOOKED)], newton_step_limit(LOOKED)
     # Signs of modes are free: those of jaxbeam are seen in its rows for the sensors at rest.
     seen, angles = (
         discrete_models.watch[0, 0, :3, :, 0],

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam.control.optimal.lqr import optimal
+from jaxbeam.control.optimal.lqr import finite_horizon_gains
 from jaxbeam.model.modes import lay_out
 from jaxbeam.numerics.riccati import lqr
-from jaxbeam.runtime.compiling import options
+from jaxbeam.runtime.compiling import xla_options
 
 DESIGNS, REPEATS, BATCH_SIZE = 4096, 3, 16  # BATCH also is how many values a number has in the grid
 THREADS = os.cpu_count() or 1
@@ -51,7 +51,7 @@ def time_designs(function, batches, share: float = 1.0, threads: int = THREADS) 
     `share` of all batches is timed, so many that each thread has the same number.
     """
     each = max(1, round(len(batches) * share / threads))
-    program = jax.jit(lambda some: jax.lax.map(function, some), compiler_options=options())
+    program = jax.jit(lambda some: jax.lax.map(function, some), compiler_options=xla_options())
     start = time.perf_counter()
     parts = [jnp.asarray(batches[i * each : (i + 1) * each]) for i in range(threads)]
     program = program.lower(parts[0]).compile()
@@ -108,8 +108,8 @@ def time_finite_horizon(modes: int, points: int, shared: bool, share: float) -> 
 
     def one(mass, speed, effort):
         changed = jb.replace(case, dict(zip(ADDRESSES, (mass, speed, effort), strict=True)))
-        table = optimal(changed.controller, jb.state_space(changed, layout=layout))[0]
-        return jnp.sum(table.pieces)  # all of each design is needed, but not kept
+        table = finite_horizon_gains(changed.controller, jb.state_space(changed, layout=layout))[0]
+        return jnp.sum(table.coefficients)  # all of each design is needed, but not kept
 
     def batch(values):
         if shared:

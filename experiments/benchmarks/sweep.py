@@ -92,7 +92,7 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
         found.append((name, took, float(error)))
 
     timed("jaxbeam", plain, REPEATS)
-    if native_library.compiler() is None:
+    if native_library.find_compiler() is None:
         print("steps in C are left out: there is no C compiler here")
     else:
         with tempfile.TemporaryDirectory() as folder:

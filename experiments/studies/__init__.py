@@ -1,1 +1,1 @@
-"""Studies."""
+"""Studies beyond the thesis: streams of loads, and controllers tuned by gradients."""

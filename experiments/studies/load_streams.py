@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.plot.style import GREY, colour, set_title, use_style
 
 MASS, SPEED, ENTRY_TIMES = 0.371, 1.0, np.array([0.0, 0.25, 0.5])  # kg, m/s, s
@@ -41,7 +41,7 @@ def three_mass_case(load_rig) -> jb.Case:
 
 def regulator(entry_time_error: float = 0.0, mass_error: float = 0.0) -> AbstractController:
     """The regulator that believes in a stream so late (s), and by such a share heavier."""
-    design_model = Beliefs(
+    design_model = DesignModel(
         mass=[MASS * (1 + mass_error)] * 3, entry_time=ENTRY_TIMES + entry_time_error
     )
     return jb.AugmentedLQR(**WEIGHTS, design=design_model, entries="predicted")

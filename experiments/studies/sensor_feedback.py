@@ -18,6 +18,7 @@ import numpy as np
 
 import jaxbeam as jb
 import tuning
+from experiments.studies.tune_feedforward import MODES, PERIOD
 from experiments.studies.tune_sensor_feedback import (
     CUTOFF,
     DELAY,
@@ -40,7 +41,6 @@ from experiments.studies.tuned_feedforward import (
     peaks,
     study_remarks,
 )
-from experiments.studies.tune_feedforward import MODES, PERIOD
 from experiments.thesis.chapter6.feedback import with_feedback
 from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.analysis.stability import frozen_poles

@@ -17,7 +17,7 @@ import jaxbeam as jb
 import tuning
 from jaxbeam import rigs
 
-FOLDER = Path(__file__).parents[1] / "controllers" / "tuned"
+FOLDER = Path(__file__).parent / "controllers" / "feedforward"
 PERIOD, LEAD = 0.01, 0.005  # s: of sampling, and half of it to make up for the hold
 GATES = (-0.2, -0.1)  # m: on the ramp before the beam, as the induction sensors of the thesis
 COMMAND_LIMITS, COMMAND_RESOLUTION = (-2.5, 7.5), 0.01  # V

@@ -30,7 +30,7 @@ from experiments.studies.tune_feedforward import (
 )
 from jaxbeam import rigs
 
-FOLDER = Path(__file__).parents[1] / "controllers" / "sensed"
+FOLDER = Path(__file__).parent / "controllers" / "sensor_feedback"
 DELAY = 0.02  # s
 NOISE_DEVIATION = 4e-6  # m: about the largest of section 5.1 of the thesis, (0.135e-10 m^2)^0.5
 CUTOFF, ORDER = {"B": 10.0, "C": 20.0}, 10  # Hz: the filters of sections 6.1 and 6.2

@@ -15,10 +15,10 @@ import numpy as np
 
 import jaxbeam as jb
 import tuning
-from experiments.studies import tune_sensor_feedback, tune_feedforward
+from experiments.studies import tune_feedforward, tune_sensor_feedback
+from experiments.studies.tune_feedforward import COMMAND_LIMITS, MODES
 from experiments.studies.tune_sensor_feedback import with_noise_and_filters
 from experiments.studies.tuned_feedforward import ENTRY_TIME
-from experiments.studies.tune_feedforward import COMMAND_LIMITS, MODES
 from jaxbeam import rigs
 
 HELD_OUT_LOADS = tuning.grid(

@@ -25,11 +25,11 @@ MODULES = (
     "thesis.chapter2.shaker",
     "thesis.chapter2.identification",
     "thesis.chapter5.optimal_control",
-    "studies.streams",
+    "studies.load_streams",
     "thesis.chapter6.feedback",
     "thesis.chapter7.predictive_control",
-    "studies.tuned",
-    "studies.sensed",
+    "studies.tuned_feedforward",
+    "studies.sensor_feedback",
 )
 OUTPUT_FOLDER = "out/reproduce"
 

@@ -16,7 +16,7 @@ from jaxbeam import rigs
 from tests.oracles import finite_elements
 from tests.tuning.rehearsals import Plant
 
-FOLDER = Path(__file__).parents[2] / "experiments" / "logs"
+FOLDER = Path(__file__).parents[2] / "experiments" / "thesis" / "chapter2" / "logs"
 RATE, NOISE, SEED, SPEED = 100.0, 1e-5, 3, 1.0  # Hz, m, -, m/s
 VOLTS, LOWEST, HIGHEST = 2.0, 1.0, 30.0  # V, Hz, Hz
 

@@ -156,7 +156,7 @@ def _states(dense, shape, times):
 def _scipy_runs(beam, masses, speed, times, tolerance, samples):
     """Peaks of all `masses` at one speed, integrated as one system, (run, sensor) in m.
 
-    `times` (s) are those of `free_times`.
+    `matmul` (s) are those of `free_times`.
     """
     fractions = np.linspace(0, 1, samples + 1)
     peaks = np.zeros((len(beam.sensors), len(masses)))

@@ -1,1 +1,1 @@
-"""Chapter2."""
+"""Chapter 2: modes, moving force and moving mass, shaker, patches, identification."""

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxbeam as jb
-from experiments.thesis.chapter2 import published
 from experiments.thesis.cases import (
     as_moving_force,
     critical_speed,
@@ -20,6 +19,7 @@ from experiments.thesis.cases import (
     with_modes,
     with_sensors,
 )
+from experiments.thesis.chapter2 import published
 from experiments.thesis.chapter2.amplification_figures import draw_curves, draw_histories, draw_map
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.model.statics import static_peak

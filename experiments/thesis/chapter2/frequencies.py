@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis.chapter2 import published
 from experiments.thesis.cases import one_span, two_spans
+from experiments.thesis.chapter2 import published
 from experiments.thesis.chapter2.patches import DENSITY, MODULUS
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.model.modal_model import rig

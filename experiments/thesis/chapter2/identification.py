@@ -15,7 +15,7 @@ from experiments.thesis.chapter2 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.plot.style import colour, set_title, use_style
 
-LOGS = Path(__file__).parents[2] / "logs"
+LOGS = Path(__file__).parent / "logs"
 START_FACTOR = 1.25  # how far off the fits begin
 MODES = 12  # eight leave out half of the noise on two spans
 DAMPING = "beam.damping_ratio"

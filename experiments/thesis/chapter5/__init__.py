@@ -1,1 +1,1 @@
-"""Chapter5."""
+"""Chapter 5: optimal control of one span with a shaker."""

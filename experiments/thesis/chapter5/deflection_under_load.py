@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 
 import jaxbeam as jb
-from experiments.thesis.chapter5 import published
 from experiments.thesis.cases import one_span, with_modes
+from experiments.thesis.chapter5 import published
 from experiments.thesis.verdicts import Finding, make_finding
 
 MODE_COUNTS = (1, 2, 3, 6)  # modes

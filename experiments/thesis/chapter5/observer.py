@@ -11,8 +11,8 @@ import dataclasses
 import numpy as np
 
 import jaxbeam as jb
-from experiments.thesis.chapter5 import published
 from experiments.thesis.cases import as_moving_force
+from experiments.thesis.chapter5 import published
 from experiments.thesis.chapter5.regulator_limits import (
     COMMAND_WEIGHT,
     OTHER_SHAKER,

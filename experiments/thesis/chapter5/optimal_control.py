@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis.chapter5 import published
 from experiments.thesis.chapter2.shaker import data_physics_v4
+from experiments.thesis.chapter5 import published
 from experiments.thesis.chapter5.deflection_under_load import deepest_position, mode_truncation
 from experiments.thesis.chapter5.observer import observed_regulator
 from experiments.thesis.chapter5.regulator_limits import (
@@ -26,7 +26,7 @@ from experiments.thesis.chapter5.regulator_limits import (
 )
 from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, make_finding
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.model.modes import lay_out
 from jaxbeam.plot.style import colour, set_title, use_style
 from jaxbeam.runtime.compiling import compiled
@@ -81,7 +81,7 @@ def regulator(
         command_weight=[effort],
         feedback=feedback_shares,
         coordinates="sine",
-        design=Beliefs(force_per_volt=4.6, damping=damping),
+        design=DesignModel(force_per_volt=4.6, damping=damping),
     )
 
 

@@ -1,1 +1,1 @@
-"""Chapter6."""
+"""Chapter 6: displacement feedback of one and two spans with patches."""

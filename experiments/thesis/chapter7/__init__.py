@@ -1,1 +1,1 @@
-"""Chapter7."""
+"""Chapter 7: model predictive control of one and two spans with patches."""

@@ -17,7 +17,7 @@ from experiments.thesis.chapter7 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, make_finding
 from jaxbeam.analysis.bound.input_influence import reach
 from jaxbeam.analysis.bound.linear_program import least_peak
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.plot.style import GREY, colour, set_title, use_style
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form
@@ -52,7 +52,7 @@ def simulate_mpc(
 
     The controller's model has fewer `modes` than the case, if that is given.
     """
-    design = None if modes is None else Beliefs(modes=modes)
+    design = None if modes is None else DesignModel(modes=modes)
     law = jb.MPC(
         horizon=horizon, moves=control_horizon, move_weight=weight, period=PERIOD, design=design
     )

@@ -13,11 +13,11 @@ from experiments import benchmarks
 from experiments.benchmarks import (
     __main__,
     cases,
+    controller_steps,
     growth,
     identification,
     quadratic_programs,
     regulator_designs,
-    controller_steps,
     tuning_methods,
 )
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from experiments.studies import tuned_feedforward, tune_feedforward
+from experiments.studies import tune_feedforward, tuned_feedforward
 from jaxbeam import rigs
 
 

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from experiments.thesis import published
 from experiments.thesis.cases import one_span
-from experiments.thesis.chapter2 import frequencies, shaker
+from experiments.thesis.chapter2 import frequencies, published, shaker
+from experiments.thesis.chapter5 import published as published_regulators
 from experiments.thesis.chapter5.optimal_control import WEIGHTS
 from experiments.thesis.chapter5.regulator_limits import (
     COMMAND_WEIGHT,
@@ -32,7 +32,7 @@ def test_critical_speed_of_the_denser_beam():
     speed = np.pi / LENGTH * np.sqrt(RIGIDITY / heavier)
     ours = LENGTH * frequencies._frequency_at_patch_density(one_span(rigs.load)) / np.pi
     np.testing.assert_allclose(ours, speed, rtol=1e-9)
-    assert abs(speed - published.CRITICAL.numbers[0]) < published.CRITICAL.allowed[0]
+    assert abs(speed - published.CRITICAL_SPEEDS.numbers[0]) < published.CRITICAL_SPEEDS.allowed_error[0]
 
 
 def mobility(s, mass):
@@ -80,5 +80,5 @@ def test_sampled_gain_of_the_other_shaker():
         optimal_gain(with_other_shaker(with_active_shaker(rigs.load("A"))), 5e-3, WEIGHTS)[0]
     )[0]
     np.testing.assert_allclose(ours, theirs, rtol=1e-6)
-    printed = published.SAMPLED_GAIN
-    assert np.all(np.abs(theirs - printed.numbers) <= printed.allowed)
+    printed = published_regulators.SAMPLED_GAIN
+    assert np.all(np.abs(theirs - printed.numbers) <= printed.allowed_error)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from experiments.thesis import published, reproduction, report
+from experiments.thesis import published, report, reproduction
 from experiments.thesis.verdicts import (
     EXPLAINED,
     IRREPRODUCIBLE,
