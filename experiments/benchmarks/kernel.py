@@ -57,7 +57,11 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     discrete_models = jax.tree.map(np.asarray, found)
     pinned_beam = PinnedBeam(modes)
     rates = discrete_models.rig.state_matrix[0, :, 1, :]
-    peak_search_points = np.array(LOOKED), interpolation_matrix(LOOKED)[: len(LOOKED)], newton_step_limit(LOOKED)
+    peak_search_points = (
+        np.array(LOOKED),
+        interpolation_matrix(LOOKED)[: len(LOOKED)],
+        newton_step_limit(LOOKED),
+    )
     # Signs of modes are free: those of jaxbeam are seen in its rows for the sensors at rest.
     seen, angles = (
         discrete_models.watch[0, 0, :3, :, 0],

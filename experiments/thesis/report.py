@@ -1,116 +1,119 @@
-"""Reports on runs of thesis experiments: text for the terminal, sections for Markdown and HTML."""
+"""Report of experiments: published numbers beside computed ones, as text and as sections."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.thesis.verdicts import IRREPRODUCIBLE, VERDICTS, Finding, FindingVerdicts, Run
+from experiments.thesis.verdicts import (
+    IRREPRODUCIBLE,
+    VERDICTS,
+    ExperimentRun,
+    Finding,
+    FindingVerdicts,
+)
 from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable, text_table
 
+TITLE = "The thesis, reproduced"
 COLUMNS = ("number", "published", "ours", "difference", "tolerance", "verdict")
-PREFACE = (
+METHOD = (
     "The thesis's figures and measured curves are not available: comparisons are with printed"
-    " numbers, and figures have the thesis's axes. Tolerances were chosen by the kind of number"
-    " before the experiments were run, but for those by which numbers of Figs 6.4, 7.1 and 7.2, of"
-    " Table 5.3 and printed sampled gains are judged, set after a first look; verdicts are computed"
-    " from them."
+    " numbers, and figures have the thesis's axes. Tolerances depend on the kind of number and were"
+    " fixed before the runs, except those of Figs 6.4, 7.1, 7.2, Table 5.3 and the sampled gains,"
+    " set after a first look. Verdicts are computed from them."
 )
-REPORT_TITLE = "The thesis, reproduced"
 VERDICT_STYLE = (
     ".reproduced { color: #00694c } .explained { color: #0072b2 } .not, .cannot { color: #b34700 }"
 )
 
 
-def count_verdicts(runs: Sequence[Run], verdict: str) -> int:
-    """How many numbers got a verdict."""
-    return sum(one.verdicts.count(verdict) for run in runs for one in run.judged)
-
-
-def text(run: Run) -> str:
+def as_text(run: ExperimentRun) -> str:
     """One experiment for the terminal."""
     lines = [f"{run.experiment.name}: {run.experiment.covers}", f"  {run.experiment.claim}"]
-    for one, judged in zip(run.outcome.findings, run.judged, strict=True):
-        lines += ["", f"  {_finding_title(one)}"]
-        lines += [f"    {line}" for line in text_table(COLUMNS, _finding_rows(one, judged))]
-        lines += [f"    {sentence}" for sentence in _finding_notes(one, judged.verdicts)]
+    for finding, assigned in zip(run.outcome.findings, run.verdicts, strict=True):
+        lines += ["", f"  {_finding_title(finding)}"]
+        lines += [
+            f"    {line}" for line in text_table(COLUMNS, _finding_rows(finding, assigned))
+        ]
+        lines += [f"    {sentence}" for sentence in _finding_notes(finding, assigned.verdicts)]
     lines += [f"  {remark}" for remark in run.outcome.remarks]
-    tally = ", ".join(f"{number} {word}" for word, number in _verdict_counts([run]) if number)
-    tally = tally or "nothing printed to compare with"
-    return "\n".join([*lines, "", f"  {tally}; {run.seconds:.0f} s", ""])
+    counts = [f"{run.count(word)} {word}" for word in VERDICTS if run.count(word)]
+    summary = ", ".join(counts) or "nothing printed to compare with"
+    return "\n".join([*lines, "", f"  {summary}; {run.seconds:.0f} s", ""])
 
 
-def report_sections(runs: Sequence[Run]) -> list[ReportSection]:
-    """Sections of the report: a summary of all verdicts, then the experiments one by one."""
-    sections = [ReportSection("", [PREFACE, _summary(runs)])]
+def sections(runs: Sequence[ExperimentRun]) -> list[ReportSection]:
+    """The report of all experiments: method and summary, then each finding with its numbers."""
+    found = [ReportSection("", [METHOD, _summary_table(runs)])]
     for run in runs:
         title = f"{run.experiment.name}: {run.experiment.covers}"
-        sections.append(ReportSection(title, [run.experiment.claim]))
-        for one, judged in zip(run.outcome.findings, run.judged, strict=True):
-            table = ReportTable(COLUMNS, _finding_rows(one, judged), _verdict_class)
-            notes = _finding_notes(one, judged.verdicts)
-            sections.append(ReportSection(_finding_title(one), [table, *notes], level=4))
-        figures = [ReportFigure(f"{run.experiment.name}-{name}") for name in run.outcome.figures]
-        sections.append(ReportSection("", [*run.outcome.remarks, *figures]))
-    return sections
+        found.append(ReportSection(title, [run.experiment.claim]))
+        for finding, assigned in zip(run.outcome.findings, run.verdicts, strict=True):
+            table = ReportTable(COLUMNS, _finding_rows(finding, assigned), _verdict_class)
+            notes = _finding_notes(finding, assigned.verdicts)
+            found.append(ReportSection(_finding_title(finding), [table, *notes], level=3))
+        figures = [ReportFigure(figure_name(run, name)) for name in run.outcome.figures]
+        found.append(ReportSection("", [*run.outcome.remarks, *figures]))
+    return found
 
 
-def _finding_title(one: Finding) -> str:
-    printed = one.published
-    unit = "" if printed.unit in ("", "1") else f", {printed.unit}"
-    return f"{printed.location}: {printed.quantity}{unit} ({printed.origin})"
+def figure_name(run: ExperimentRun, name: str) -> str:
+    """Name of the file of a figure, without its suffix."""
+    return f"{run.experiment.name}-{name}"
 
 
-def _finding_rows(one: Finding, judged: FindingVerdicts) -> list[tuple[str, ...]]:
-    """One row for each number: ours is that of the reading which the verdict rests on."""
-    rows = []
+def _finding_title(finding: Finding) -> str:
+    published = finding.published
+    unit = "" if published.unit in ("", "1") else f", {published.unit}"
+    return f"{published.location}: {published.quantity}{unit} ({published.origin})"
+
+
+def _finding_rows(finding: Finding, assigned: FindingVerdicts) -> list[tuple[str, ...]]:
+    """One row for each number; the computed one is by the interpretation of its verdict."""
+    published = finding.published
     columns = (
-        one.published.value_labels,
-        one.published.printed_text.split(),
-        judged.verdicts,
-        judged.interpretations,
+        published.value_labels,
+        published.printed_text.split(),
+        assigned.verdicts,
+        assigned.interpretations,
     )
-    for i, (label, published, word, reading) in enumerate(zip(*columns, strict=True)):
-        ours = float(one.interpretations[reading][i])
-        shown, difference = f"{ours:.6g}", f"{ours - float(published):+.2g}"
-        if np.isnan(ours):
-            shown = difference = "\N{EM DASH}"
-        allowed = str(one.published.tolerance)
-        rows.append((label.replace(",", ", "), published, shown, difference, allowed, word))
+    rows = []
+    for i, (label, printed, verdict, interpretation) in enumerate(zip(*columns, strict=True)):
+        value = float(finding.interpretations[interpretation][i])
+        computed, difference = f"{value:.6g}", f"{value - float(printed):+.2g}"
+        if np.isnan(value):
+            computed = difference = "\N{EM DASH}"
+        tolerance = str(published.tolerance)
+        rows.append((label.replace(",", ", "), printed, computed, difference, tolerance, verdict))
     return rows
 
 
-def _finding_notes(one: Finding, verdicts: Sequence[str]) -> list[str]:
-    """What further readings give, and why numbers cannot be reproduced."""
-    sentences = (
-        [f"Reading: {one.published.interpretation}."] if one.published.interpretation else []
-    )
-    if len(one.interpretations) > 1:
-        for name, values in one.interpretations.items():
+def _finding_notes(finding: Finding, verdicts: Sequence[str]) -> list[str]:
+    """Sentences on the values by each interpretation, and why numbers cannot be reproduced."""
+    published = finding.published
+    sentences = [f"Reading: {published.interpretation}."] if published.interpretation else []
+    if len(finding.interpretations) > 1:
+        for name, values in finding.interpretations.items():
             numbers = " ".join(f"{value:.5g}" for value in np.asarray(values))
-            hits = int(one.within_tolerance(name).sum())
+            hits = int(finding.within_tolerance(name).sum())
             sentences.append(f"{name}: {numbers} ({hits} of {len(verdicts)} within the tolerance)")
     if IRREPRODUCIBLE in verdicts:
-        sentences.append(f"Cannot be reproduced because {one.inconsistency}.")
+        sentences.append(f"Cannot be reproduced because {finding.inconsistency}.")
     return sentences
 
 
-def _verdict_counts(runs: Sequence[Run]) -> list[tuple[str, int]]:
-    return [(word, count_verdicts(runs, word)) for word in VERDICTS]
+def _summary_table(runs: Sequence[ExperimentRun]) -> ReportTable:
+    """Count of numbers by verdict, and wall time, for each experiment and for all."""
 
+    def row(name: str, runs: Sequence[ExperimentRun]) -> tuple[str, ...]:
+        counts = [sum(run.count(word) for run in runs) for word in VERDICTS]
+        seconds = sum(run.seconds for run in runs)
+        return (name, str(sum(counts)), *map(str, counts), f"{seconds:.0f}")
 
-def _summary(runs: Sequence[Run]) -> ReportTable:
-    """Table of how many numbers got which verdict."""
+    rows = [row(run.experiment.name, [run]) for run in runs]
     header = ("experiment", "numbers", *VERDICTS, "seconds")
-    rows = [_summary_row(run.experiment.name, [run], run.seconds) for run in runs]
-    total = _summary_row("all", runs, sum(run.seconds for run in runs))
-    return ReportTable(header, [*rows, total], _verdict_class)
-
-
-def _summary_row(name, runs, seconds) -> tuple[str, ...]:
-    numbers = [number for _, number in _verdict_counts(runs)]
-    return (name, str(sum(numbers)), *map(str, numbers), f"{seconds:.0f}")
+    return ReportTable(header, [*rows, row("all", runs)], _verdict_class)
 
 
 def _verdict_class(cell: str) -> str | None:
-    """The style of a verdict."""
+    """CSS class of a cell with a verdict."""
     return cell.split()[0] if cell in VERDICTS else None

@@ -77,9 +77,7 @@ def reproduce(
         report_progress(report.text(run))
         runs.append(run)
     sections = report.report_sections(runs)
-    write_report(
-        folder, report.REPORT_TITLE, sections, style=report.VERDICT_STYLE, overwrite=True
-    )
+    write_report(folder, report.REPORT_TITLE, sections, style=report.VERDICT_STYLE, overwrite=True)
     (folder / "report.json").write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
     return runs
 

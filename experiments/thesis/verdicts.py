@@ -1,6 +1,6 @@
-"""What a printed number is, and when it counts as reproduced.
+"""Published numbers, their tolerances, and the verdict on each: reproduced, explained, or not.
 
-A verdict is computed from a tolerance that the printed number carries; nobody types it in.
+A verdict is computed from the tolerance of the published number.
 """
 
 import dataclasses
@@ -15,11 +15,11 @@ import jaxbeam as jb
 
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
-    """How far ours may be from a printed number: the largest of what is given here.
+    """Allowed difference from a published number: the largest of three bounds.
 
-    `relative` is a share of the printed number, `absolute` is in its unit, `digits` in units of
-    its last digit (zeros at the end of a whole number are none); `basis` says for what kind of
-    number it is.
+    `relative` is a share of the number, `absolute` is in its unit, `digits` counts units of its
+    last printed digit (zeros at the end of a whole number are not digits). `basis` names the kind
+    of number that the tolerance is for.
     """
 
     basis: str
@@ -36,11 +36,11 @@ class Tolerance:
 
 @dataclasses.dataclass(frozen=True)
 class PublishedNumbers:
-    """Printed numbers of one kind: what, where, and how near ours must come.
+    """Published numbers of one quantity: location, unit, origin, tolerance, and the digits.
 
-    `printed_text` are written as printed, since their digits count; `labels` name them one by one.
-    `origin` is "measured" or "computed", by the thesis; `interpretation` is what was chosen where it is
-    ambiguous.
+    `printed_text` holds the numbers as printed, separated by spaces, and `labels` a name for each.
+    `origin` is "measured" or "computed", as the thesis says. `interpretation` says how an ambiguous
+    statement is read.
     """
 
     location: str
@@ -54,27 +54,26 @@ class PublishedNumbers:
 
     @property
     def numbers(self) -> np.ndarray:
-        """The values as numbers."""
+        """The values, (number,)."""
         return np.array([float(word) for word in self.printed_text.split()])
 
     @property
     def allowed_error(self) -> np.ndarray:
-        """How far ours may be from each of the values."""
-        last = self.tolerance.digits * np.array(
-            [_last_digit_unit(w) for w in self.printed_text.split()]
-        )
-        wide = self.tolerance.relative * np.abs(self.numbers)
-        return np.maximum(np.maximum(wide, last), self.tolerance.absolute)
+        """Allowed absolute difference from each value, (number,)."""
+        last_digits = [_last_digit_unit(word) for word in self.printed_text.split()]
+        by_digits = self.tolerance.digits * np.array(last_digits)
+        by_share = self.tolerance.relative * np.abs(self.numbers)
+        return np.maximum(np.maximum(by_share, by_digits), self.tolerance.absolute)
 
     @property
     def value_labels(self) -> list[str]:
-        """A label for each value."""
+        """One label for each value, empty where none is given."""
         labels = self.labels.split()
         return labels or [""] * self.numbers.size
 
 
 def _last_digit_unit(word: str) -> float:
-    """One unit of the last digit of a number; zeros at the end of a whole number are none."""
+    """One unit of the last printed digit; zeros at the end of a whole number are not digits."""
     if "." in word:
         return 10.0 ** -len(word.partition(".")[2])
     return 10.0 ** (len(word) - len(word.rstrip("0")))
@@ -83,15 +82,18 @@ def _last_digit_unit(word: str) -> float:
 REPRODUCED, EXPLAINED = "reproduced", "explained"
 IRREPRODUCIBLE, NOT_REPRODUCED = "cannot be reproduced", "not reproduced"
 VERDICTS = (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED)
+LITERAL = "as printed"  # name of the interpretation that takes the thesis at its word
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Printed numbers beside ours, by one reading of the thesis or by several.
+    """Published numbers beside computed ones, under one or more interpretations of the thesis.
 
-    The first of the `interpretations` is what the thesis says; the others are what it may have meant,
-    each named by a reason. `inconsistency` is why the numbers cannot be right for the rig that is
-    stated, if a computation has shown that, else empty.
+    `interpretations` maps a name to computed values (number,); the first takes the thesis at its
+    word, the others are what it may have meant. `inconsistency` is a computed proof that no value
+    can be right for the stated rig, or empty.
+
+    Raises ValueError if an interpretation has another count of values than is published.
     """
 
     published: PublishedNumbers
@@ -105,10 +107,12 @@ class Finding:
                 raise ValueError(f"{self.published.location}, {name}: {count} numbers are printed")
 
     def within_tolerance(self, interpretation: str) -> np.ndarray:
-        """Whether each number of a reading is as near as it must be."""
-        # The last bit of a difference of rounded numbers does not count.
-        far = np.abs(np.asarray(self.interpretations[interpretation]) - self.published.numbers)
-        return far <= self.published.allowed_error * (1 + 1e-9)
+        """Whether each computed number is within the tolerance, (number,)."""
+        computed = np.asarray(self.interpretations[interpretation])
+        # Differences of decimal numbers are off by rounding: 1.1 - 1.0 exceeds 0.1.
+        return np.abs(computed - self.published.numbers) <= self.published.allowed_error * (
+            1 + 1e-9
+        )
 
 
 def make_finding(
@@ -117,76 +121,82 @@ def make_finding(
     alternatives: Mapping[str, np.ndarray] | None = None,
     inconsistency: str = "",
 ) -> Finding:
-    """A finding by the reading as printed, and by `alternatives`, each named by what it takes instead."""
-    readings = {"as printed": values} | dict(alternatives or {})
-    return Finding(
-        published, {k: np.atleast_1d(np.asarray(v)) for k, v in readings.items()}, inconsistency
-    )
+    """A finding with `values` by the literal interpretation, and `alternatives` by name.
+
+    Values are numbers or arrays (number,). Raises ValueError if their count is not that published.
+    """
+    interpretations = {LITERAL: values} | dict(alternatives or {})
+    arrays = {name: np.atleast_1d(np.asarray(v)) for name, v in interpretations.items()}
+    return Finding(published, arrays, inconsistency)
 
 
 def best_interpretation(findings: Sequence[Finding]) -> str:
-    """Of the other readings that findings have in common, the one that meets most numbers.
+    """Name of the alternative with most numbers within tolerance over all findings.
 
-    One reading has to serve for all: no number gets one of its own. Empty if there is no other.
+    The findings have the same alternatives, so that one serves for all numbers. Empty if there are
+    none.
     """
-    others = list(findings[0].interpretations)[1:]
-    hits = {name: sum(int(one.within_tolerance(name).sum()) for one in findings) for name in others}
+    alternatives = list(findings[0].interpretations)[1:]
+    hits = {
+        name: sum(int(one.within_tolerance(name).sum()) for one in findings)
+        for name in alternatives
+    }
     return max(hits, key=lambda name: hits[name], default="")
 
 
 class FindingVerdicts(NamedTuple):
-    """Verdicts on the numbers of a finding, and for each the reading of ours it rests on."""
+    """Verdict on each number of a finding, and the interpretation that it rests on."""
 
     verdicts: list[str]
     interpretations: list[str]
 
 
 def assign_verdicts(findings: Sequence[Finding]) -> list[FindingVerdicts]:
-    """The verdicts on the numbers of each finding.
+    """Verdicts on the numbers of each finding.
 
-    Reproduced: the reading as printed is within the tolerance. Explained: another reading is, the
-    same for all findings that offer the same ones. Otherwise it cannot be reproduced, if there is
-    an obstacle, or is not.
+    "reproduced": the literal interpretation is within tolerance. "explained": the best alternative
+    is, which is the same for all findings that have the same alternatives. Otherwise "cannot be
+    reproduced" if the published numbers are inconsistent, else "not reproduced".
     """
-    judged = []
+    assigned = []
     for one in findings:
-        alike = [
-            other for other in findings if list(other.interpretations) == list(one.interpretations)
-        ]
-        first, second = next(iter(one.interpretations)), best_interpretation(alike)
+        same = [f for f in findings if list(f.interpretations) == list(one.interpretations)]
+        literal, alternative = next(iter(one.interpretations)), best_interpretation(same)
         explained = (
-            one.within_tolerance(second) if second else np.zeros(one.published.numbers.size, bool)
+            one.within_tolerance(alternative)
+            if alternative
+            else np.zeros(one.published.numbers.size, bool)
         )
-        words = [
-            REPRODUCED
-            if plain
-            else EXPLAINED
-            if other
-            else IRREPRODUCIBLE
-            if one.inconsistency
-            else NOT_REPRODUCED
-            for plain, other in zip(one.within_tolerance(first), explained, strict=True)
+        otherwise = IRREPRODUCIBLE if one.inconsistency else NOT_REPRODUCED
+        verdicts = [
+            REPRODUCED if by_literal else EXPLAINED if by_alternative else otherwise
+            for by_literal, by_alternative in zip(
+                one.within_tolerance(literal), explained, strict=True
+            )
         ]
-        judged.append(
-            FindingVerdicts(words, [second if word == EXPLAINED else first for word in words])
-        )
-    return judged
+        sources = [alternative if word == EXPLAINED else literal for word in verdicts]
+        assigned.append(FindingVerdicts(verdicts, sources))
+    return assigned
 
 
 @dataclasses.dataclass(frozen=True)
 class ExperimentResult:
-    """What an experiment found: numbers beside printed ones, figures by name, remarks."""
+    """Result of an experiment: findings, figures by name, and remarks.
+
+    A figure is None after it has been written to a file.
+    """
 
     findings: tuple[Finding, ...]
-    figures: Mapping[str, Figure | None]  # None once drawn to a file
+    figures: Mapping[str, Figure | None]
     remarks: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """One table or group of figures of the thesis: what it claims, and how that is computed.
+    """One table or group of figures of the thesis: what it covers and claims, and its computation.
 
-    `run` is given what loads a rig by its name, `jaxbeam.rigs.load` or something in its place.
+    `run(load_rig)` computes the result; `load_rig(name)` returns the case of a published rig, as
+    `jaxbeam.rigs.load` does.
     """
 
     name: str
@@ -195,10 +205,14 @@ class Experiment:
     run: Callable[[Callable[[str], jb.Case]], ExperimentResult]
 
 
-class Run(NamedTuple):
-    """An experiment, what it found, the verdicts on its numbers, and the seconds it took."""
+class ExperimentRun(NamedTuple):
+    """An experiment with its result, the verdicts on each finding, and the wall time (s)."""
 
     experiment: Experiment
     outcome: ExperimentResult
-    judged: list[FindingVerdicts]
+    verdicts: list[FindingVerdicts]
     seconds: float
+
+    def count(self, verdict: str) -> int:
+        """Number of published values with this verdict."""
+        return sum(one.verdicts.count(verdict) for one in self.verdicts)

@@ -17,7 +17,7 @@ def native(*, remove: bool = False, json_: Json = False) -> None:
     """
     from jaxbeam.integrator import native_peaks as compiled
 
-    path = compiled.binary()
+    path = compiled.library_path()
     if remove:
         compiled.remove()
     else:

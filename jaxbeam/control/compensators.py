@@ -16,7 +16,7 @@ from numpy.polynomial import polynomial
 from jaxbeam.case.controller import AbstractController, OwnFilter
 from jaxbeam.case.fields import POSITIVE, dimensions, is_known, known, number
 from jaxbeam.case.filters import filter_step
-from jaxbeam.control.feedback import pairing_fault
+from jaxbeam.control.feedback import pairing_error
 
 Polynomials = Float[Array, "power actuator"]  # in s (rad/s), the coefficients ascending
 
@@ -31,25 +31,25 @@ class AbstractCompensator(AbstractController):
     gains: Float[Array, " actuator"] = number("command per reading", "one gain for each actuator")
 
     @property
-    def knows_loads(self) -> bool:
+    def design_depends_on_loads(self) -> bool:
         return False
 
     @property
-    def memoryless(self) -> bool:
+    def stateless(self) -> bool:
         return self.period is None
 
     @abc.abstractmethod
-    def transfer(self) -> tuple[Polynomials, Polynomials]:
+    def transfer_function(self) -> tuple[Polynomials, Polynomials]:
         """Numerators and denominators of H(s), all of one degree, 1 or 2."""
 
-    def stretch(self) -> Float[Array, " *actuator"]:
+    def bilinear_factor(self) -> Float[Array, " *actuator"]:
         """The factor c (1/s) of the bilinear transform s = c (z - 1) / (z + 1)."""
         return 2 / self.period
 
-    def fault(self, case):
-        wrong = pairing_fault(self.gains, case)
-        if wrong is not None:
-            return wrong
+    def validate(self, case):
+        error = pairing_error(self.gains, case)
+        if error is not None:
+            return error
         loops = self.gains.shape[0]
         for field in dataclasses.fields(self):
             if "unit" in field.metadata and dimensions(field) == "*actuator":
@@ -69,27 +69,30 @@ class AbstractCompensator(AbstractController):
     def own_filters(self):
         if self.period is not None:
             return ()
-        numerator, denominator = self.transfer()
+        numerator, denominator = self.transfer_function()
         return tuple(
-            _realised(i, numerator[:, i], denominator[:, i]) for i in range(self.gains.shape[0])
+            _reading_filter(i, numerator[:, i], denominator[:, i])
+            for i in range(self.gains.shape[0])
         )
 
-    def init(self, model):
+    def init(self, plant):
         if self.period is None:
             return None
-        numerator, denominator = (_bilinear(part, self.stretch()) for part in self.transfer())
+        numerator, denominator = (
+            _bilinear_transform(part, self.bilinear_factor()) for part in self.transfer_function()
+        )
         section = jnp.concatenate([numerator, denominator]) / denominator[0]
         return section[None], jnp.zeros((1, 2, self.gains.shape[0]))
 
     def step(self, memory, measurement, t):
         if self.period is None:
             return measurement.readings[-self.gains.shape[0] :], memory
-        sections, passed = memory
+        sections, filter_states = memory
         readings = measurement.readings[: self.gains.shape[0]]
-        command, passed = filter_step(sections, passed, readings)
-        return command, (sections, passed)
+        command, filter_states = filter_step(sections, filter_states, readings)
+        return command, (sections, filter_states)
 
-    def _rows(self, *coefficients) -> Polynomials:
+    def _per_loop(self, *coefficients) -> Polynomials:
         """Coefficients, each one number or one for each loop, as rows of such for each."""
         return jnp.stack([jnp.broadcast_to(row, self.gains.shape) for row in coefficients])
 
@@ -104,9 +107,9 @@ class PD(AbstractCompensator):
         "s", "time constant with which the rate is smoothed", POSITIVE
     )
 
-    def transfer(self):
-        rise = self.gains * self.lag + self.rate_gains
-        return self._rows(-self.gains, -rise), self._rows(1.0, self.lag)
+    def transfer_function(self):
+        rate_numerator = self.gains * self.lag + self.rate_gains
+        return self._per_loop(-self.gains, -rate_numerator), self._per_loop(1.0, self.lag)
 
 
 class Lead(AbstractCompensator):
@@ -115,9 +118,14 @@ class Lead(AbstractCompensator):
     zero: Float[Array, " *actuator"] = number("Hz", "where the gain starts to rise", POSITIVE)
     pole: Float[Array, " *actuator"] = number("Hz", "where it stops to rise", POSITIVE)
 
-    def transfer(self):
-        rise, stop = 1 / (2 * jnp.pi * self.zero), 1 / (2 * jnp.pi * self.pole)
-        return self._rows(-self.gains, -self.gains * rise), self._rows(1.0, stop)
+    def transfer_function(self):
+        zero_time_constant, pole_time_constant = (
+            1 / (2 * jnp.pi * self.zero),
+            1 / (2 * jnp.pi * self.pole),
+        )
+        return self._per_loop(-self.gains, -self.gains * zero_time_constant), self._per_loop(
+            1.0, pole_time_constant
+        )
 
 
 class PositivePositionFeedback(AbstractCompensator):
@@ -135,17 +143,17 @@ class PositivePositionFeedback(AbstractCompensator):
         "1", "damping ratio of the oscillator", POSITIVE
     )
 
-    def transfer(self):
-        turn = 2 * jnp.pi * self.frequency
-        rest = turn**2
-        resonant = self._rows(rest, 2 * self.damping_ratio * turn, 1.0)
-        return self._rows(self.gains * rest, 0.0, 0.0), resonant
+    def transfer_function(self):
+        angular_frequency = 2 * jnp.pi * self.frequency
+        stiffness = angular_frequency**2
+        denominator = self._per_loop(stiffness, 2 * self.damping_ratio * angular_frequency, 1.0)
+        return self._per_loop(self.gains * stiffness, 0.0, 0.0), denominator
 
-    def stretch(self):
-        turn = 2 * jnp.pi * self.frequency
-        return turn / jnp.tan(turn * self.period / 2)
+    def bilinear_factor(self):
+        angular_frequency = 2 * jnp.pi * self.frequency
+        return angular_frequency / jnp.tan(angular_frequency * self.period / 2)
 
-    def fault(self, case):
+    def validate(self, case):
         frequency, period = self.frequency, self.period
         if period is not None and is_known(frequency) and is_known(period):
             highest, nyquist = float(known(frequency).max()), 0.5 / float(known(period))
@@ -154,30 +162,39 @@ class PositivePositionFeedback(AbstractCompensator):
                     f"frequency must be below half the sampling frequency, {nyquist:g} Hz;"
                     f" it is {highest:g} Hz: lower it, or sample faster"
                 )
-        return super().fault(case)
+        return super().validate(case)
 
 
-def _realised(
+def _reading_filter(
     sensor: int, numerator: Float[Array, " power"], denominator: Float[Array, " power"]
 ) -> OwnFilter:
     """States of a transfer function: x1 follows the reading, x2 is its rate over a frequency.
 
     At rest x1 is the reading; denominators are of degree 1 or 2.
     """
-    direct = numerator[-1] / denominator[-1]
-    rest = (numerator - direct * denominator)[:-1] / denominator[0]
+    feedthrough = numerator[-1] / denominator[-1]
+    output_row = (numerator - feedthrough * denominator)[:-1] / denominator[0]
     if denominator.shape[0] == 2:
         rate = (denominator[0] / denominator[1])[None]
-        return OwnFilter(sensor, -rate[None], rate, rest, direct)
-    turn, drag = jnp.sqrt(denominator[0] / denominator[2]), denominator[1] / denominator[2]
+        return OwnFilter(sensor, -rate[None], rate, output_row, feedthrough)
+    angular_frequency, damping_rate = (
+        jnp.sqrt(denominator[0] / denominator[2]),
+        denominator[1] / denominator[2],
+    )
     zero = jnp.zeros(())
-    matrix = jnp.stack([jnp.stack([zero, turn]), jnp.stack([-turn, -drag])])
+    matrix = jnp.stack(
+        [jnp.stack([zero, angular_frequency]), jnp.stack([-angular_frequency, -damping_rate])]
+    )
     return OwnFilter(
-        sensor, matrix, jnp.stack([zero, turn]), jnp.stack([rest[0], rest[1] * turn]), direct
+        sensor,
+        matrix,
+        jnp.stack([zero, angular_frequency]),
+        jnp.stack([output_row[0], output_row[1] * angular_frequency]),
+        feedthrough,
     )
 
 
-def _bilinear(coefficients: Polynomials, stretch) -> Float[Array, "3 actuator"]:
+def _bilinear_transform(coefficients: Polynomials, factor) -> Float[Array, "3 actuator"]:
     """Coefficients in 1/z of (1 + 1/z)^degree times a polynomial at s = c (z - 1) / (z + 1)."""
     degree = coefficients.shape[0] - 1
     powers = np.arange(degree + 1)
@@ -189,5 +206,5 @@ def _bilinear(coefficients: Polynomials, stretch) -> Float[Array, "3 actuator"]:
             for n in powers
         ]
     )
-    scaled = coefficients * jnp.asarray(stretch) ** powers[:, None]
+    scaled = coefficients * jnp.asarray(factor) ** powers[:, None]
     return jnp.pad(terms.T @ scaled, ((0, 2 - degree), (0, 0)))

@@ -11,11 +11,11 @@ from jaxbeam.case.fields import NOT_NEGATIVE, count, number
 from jaxbeam.model.modal_model import assemble
 from jaxbeam.model.state_space import LoadedBeam, loaded_beam
 
-OF_ACTUATORS = ("force_per_volt", "stiffness", "damping", "correction")
-OF_LOADS = ("mass", "speed", "entry_time")
+ACTUATOR_FIELDS = ("force_per_volt", "stiffness", "damping", "correction")
+LOAD_FIELDS = ("mass", "speed", "entry_time")
 
 
-class Beliefs(eqx.Module):
+class DesignModel(eqx.Module):
     """Numbers of actuators and loads as the designer believes them to be, and how many modes.
 
     Each is one number for all that have it, or a list with one for each actuator (or load).
@@ -44,61 +44,61 @@ class Beliefs(eqx.Module):
     )
     modes: int | None = count("modes of the beam that are modelled", default=None)
 
-    def fault(self, case: Any) -> str | None:
+    def validate(self, case: Any) -> str | None:
         """What is wrong with them in a case, as "key must ...", or None."""
         if self.modes is not None and self.modes > case.beam.modes:
             return f"modes must be at most {case.beam.modes}, the modes of the beam: raise those"
-        for names, parts in ((OF_ACTUATORS, case.actuators), (OF_LOADS, case.loads)):
+        for names, parts in ((ACTUATOR_FIELDS, case.actuators), (LOAD_FIELDS, case.loads)):
             for name in names:
                 value = getattr(self, name)
                 if value is None:
                     continue
                 if value.shape not in ((), (len(parts),)):
                     return f"{name} must be one number or {len(parts)}, not {value.shape[0]}"
-                if not any(_has(part, name) for part in parts):
+                if not any(_has_effect(part, name) for part in parts):
                     return f"{name} has no effect: no part of the case has a {name}"
         return None
 
-    def applied(self, model: LoadedBeam, coordinates: str) -> LoadedBeam:
+    def design_plant(self, plant: LoadedBeam, coordinates: str) -> LoadedBeam:
         """The state space of the case as believed, on the same modes of the beam or the first."""
-        case, modes = model.case, model.rig.modes
+        case, modes = plant.case, plant.rig.modes
         if self.modes is not None:
             case = eqx.tree_at(lambda c: c.beam, case, _with_modes(case.beam, self.modes))
             modes = modes.first(self.modes)
-        parts = self._changed(case.actuators, OF_ACTUATORS), self.loads(case)
+        parts = self._with_design_values(case.actuators, ACTUATOR_FIELDS), self.design_loads(case)
         case = eqx.tree_at(lambda c: (c.actuators, c.loads), case, parts)
         return loaded_beam(case, assemble(case, modes), coordinates)
 
-    def loads(self, case: Any) -> tuple:
+    def design_loads(self, case: Any) -> tuple:
         """The loads of a case as believed."""
-        return self._changed(case.loads, OF_LOADS)
+        return self._with_design_values(case.loads, LOAD_FIELDS)
 
-    def _changed(self, parts, names) -> tuple:
+    def _with_design_values(self, parts, names) -> tuple:
         """Parts of a case with those of these numbers that are believed to be others."""
         for name in names:
             value = getattr(self, name)
             if value is None:
                 continue
             values = jnp.broadcast_to(value, (len(parts),))
-            parts = tuple(_changed(part, name, values[i]) for i, part in enumerate(parts))
+            parts = tuple(_with_value(part, name, values[i]) for i, part in enumerate(parts))
         return parts
 
 
-def _with_modes(beam, count):
+def _with_modes(beam, mode_count):
     """The beam with fewer modes, for which a list of damping ratios loses its last ones."""
     ratio = beam.damping_ratio
     if ratio is not None and ratio.ndim:
-        ratio = ratio[:count]
-    return dataclasses.replace(beam, modes=count, damping_ratio=ratio)
+        ratio = ratio[:mode_count]
+    return dataclasses.replace(beam, modes=mode_count, damping_ratio=ratio)
 
 
-def _changed(part, name, value):
-    if not _has(part, name):
+def _with_value(part, name, value):
+    if not _has_effect(part, name):
         return part
     return eqx.tree_at(lambda p: getattr(p, name), part, value)
 
 
-def _has(part, name) -> bool:
+def _has_effect(part, name) -> bool:
     """Whether a number has a say in a part: a load that follows a table enters when that says."""
     tabulated = name == "entry_time" and part.times is not None
     return getattr(part, name, None) is not None and not tabulated

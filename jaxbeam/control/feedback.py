@@ -7,7 +7,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import count, number
 
 
-def pairing_fault(gains: Float[Array, " actuator"], case) -> str | None:
+def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
     """What is wrong with gains of loops from each sensor to the actuator of its number; or None."""
     loops, actuators = gains.shape[0], len(case.actuators)
     if loops != actuators:
@@ -38,18 +38,18 @@ class Feedback(AbstractController):
     )
 
     @property
-    def memoryless(self) -> bool:
+    def stateless(self) -> bool:
         return True
 
     @property
-    def knows_loads(self) -> bool:
+    def design_depends_on_loads(self) -> bool:
         return False
 
-    def fault(self, case):
+    def validate(self, case):
         actuators = len(case.actuators)
-        wrong = pairing_fault(self.gains, case)
-        if wrong is not None:
-            return wrong
+        error = pairing_error(self.gains, case)
+        if error is not None:
+            return error
         if self.higher_gains is not None and self.higher_gains.shape[1] != actuators:
             return (
                 f"higher_gains must have in each row a gain for each of {actuators} actuators,"
@@ -57,7 +57,7 @@ class Feedback(AbstractController):
             )
         return None
 
-    def init(self, model):
+    def init(self, plant):
         return None
 
     def step(self, memory, measurement, t):

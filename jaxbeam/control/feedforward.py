@@ -37,14 +37,14 @@ class Passage(AbstractController):
     )
 
     @property
-    def blind(self) -> bool:
+    def open_loop(self) -> bool:
         return True
 
     @property
-    def memoryless(self) -> bool:
+    def stateless(self) -> bool:
         return True
 
-    def fault(self, case):
+    def validate(self, case):
         if self.period is None:
             return "period must be given: kind 'passage' acts at its ticks"
         if not case.loads:
@@ -56,28 +56,28 @@ class Passage(AbstractController):
             )
         if not all(is_known(leaf) for leaf in jax.tree.leaves((self.gates, case))):
             return None
-        if np.any(~(np.diff(_times(self.gates, case.loads, case.beam.length)) > 0)):
+        if np.any(~(np.diff(_gate_times(self.gates, case.loads, case.beam.length)) > 0)):
             return "gates must be two places that every load passes, the first before the other"
         return None
 
-    def init(self, model: LoadedBeam):
-        times = jnp.stack([path.arrivals(self.gates)[:2] for path in model.traffic.motions])
-        return times, model.case.beam.length
+    def init(self, plant: LoadedBeam):
+        gate_times = jnp.stack([path.arrivals(self.gates)[:2] for path in plant.traffic.motions])
+        return gate_times, plant.case.beam.length
 
     def step(self, memory, measurement, t):
-        times, length = memory
-        speeds = jnp.diff(self.gates) / jnp.diff(times, axis=1)[:, 0]
-        behind = jnp.where(speeds < 0, length - self.gates[1], self.gates[1])
-        way = behind + (t + self.lead - times[:, 1]) * jnp.abs(speeds)
+        gate_times, length = memory
+        speeds = jnp.diff(self.gates) / jnp.diff(gate_times, axis=1)[:, 0]
+        gate_distance = jnp.where(speeds < 0, length - self.gates[1], self.gates[1])
+        distance = gate_distance + (t + self.lead - gate_times[:, 1]) * jnp.abs(speeds)
 
-        def read(row):
-            return jnp.interp(way / length, self.shares, row, left=0.0, right=0.0)
+        def interpolate(row):
+            return jnp.interp(distance / length, self.shares, row, left=0.0, right=0.0)
 
-        commands = jnp.where(t >= times[:, 1], jax.vmap(read)(self.values), 0.0)
+        commands = jnp.where(t >= gate_times[:, 1], jax.vmap(interpolate)(self.values), 0.0)
         return jnp.sum(commands, axis=1), memory
 
 
-def _times(gates, loads, length) -> Float[np.ndarray, "load 2"]:
+def _gate_times(gates, loads, length) -> Float[np.ndarray, "load 2"]:
     """When loads pass the gates (s), NaN where they do not."""
     found = np.stack([known(motion(load, length).arrivals(gates))[:2] for load in loads])
     return np.where(found < NEVER, found, np.nan)

@@ -18,17 +18,17 @@ from jaxbeam.case.filters import filter_step, initial, sections
 from jaxbeam.model.state_space import LoadedBeam
 
 
-class Watch(eqx.Module):
+class InternalModelState(eqx.Module):
     """Memory of `Relief`: lift (m per unit of a command), filters, and what has passed them.
 
     The filters of each sensor are those of its own, for the lift, and the notches.
     """
 
-    lift: Float[Array, "actuator actuator"]
-    filters: tuple[Float[Array, "_ 6"] | None, ...]
-    notches: Float[Array, "notch 6"] | None
-    passed: tuple[Float[Array, "_ 2"] | None, ...]
-    notched: Float[Array, "notch 2 actuator"] | None
+    static_lift: Float[Array, "actuator actuator"]
+    sensor_filters: tuple[Float[Array, "_ 6"] | None, ...]
+    notch_sections: Float[Array, "notch 6"] | None
+    sensor_filter_states: tuple[Float[Array, "_ 2"] | None, ...]
+    notch_states: Float[Array, "notch 2 actuator"] | None
 
 
 class Relief(AbstractController):
@@ -62,10 +62,10 @@ class Relief(AbstractController):
     )
 
     @property
-    def knows_loads(self) -> bool:
+    def design_depends_on_loads(self) -> bool:
         return False
 
-    def fault(self, case):
+    def validate(self, case):
         actuators = len(case.actuators)
         if self.period is None:
             return "period must be given: kind 'relief' acts at its ticks"
@@ -81,27 +81,31 @@ class Relief(AbstractController):
                     f"notches must be below half the sampling frequency, {nyquist:g} Hz: lower"
                     " them, or sample faster"
                 )
-        own = case.sensors[:actuators]
-        if len(own) < actuators or any(sensor.quantity != "deflection" for sensor in own):
+        paired_sensors = case.sensors[:actuators]
+        if len(paired_sensors) < actuators or any(
+            sensor.quantity != "deflection" for sensor in paired_sensors
+        ):
             return (
                 f"kind needs a sensor of deflection for each of {actuators} actuators, before all"
                 " other sensors"
             )
         return None
 
-    def init(self, model: LoadedBeam):
-        plant, sensors = model.unloaded, model.case.sensors[: self.values.shape[0]]
-        rows = jnp.linalg.solve(plant.A.T, plant.C[: len(sensors)].T).T
+    def init(self, plant: LoadedBeam):
+        system, sensors = plant.unloaded, plant.case.sensors[: self.values.shape[0]]
+        static_response = jnp.linalg.solve(system.A.T, system.C[: len(sensors)].T).T
         filters = tuple(
             None if sensor.filter is None else sections(sensor.filter, self.period)
             for sensor in sensors
         )
-        passed = tuple(None if part is None else initial(part, 0.0) for part in filters)
-        notches = None if self.notches is None else self._sections()
-        still = None if notches is None else initial(notches, jnp.zeros(len(sensors)))
-        return Watch(-rows @ plant.B, filters, notches, passed, still)
+        filter_states = tuple(None if part is None else initial(part, 0.0) for part in filters)
+        notches = None if self.notches is None else self._notch_sections()
+        notch_states = None if notches is None else initial(notches, jnp.zeros(len(sensors)))
+        return InternalModelState(
+            -static_response @ system.B, filters, notches, filter_states, notch_states
+        )
 
-    def _sections(self) -> Float[Array, "notch 6"]:
+    def _notch_sections(self) -> Float[Array, "notch 6"]:
         """The notches, sampled: bilinear transforms that are warped to meet their frequencies."""
         warped = jnp.tan(jnp.pi * self.notches * self.period)
         wide, one = 2 * self.notch_damping * warped, jnp.ones_like(warped)
@@ -111,20 +115,29 @@ class Relief(AbstractController):
         return jnp.stack([side, middle, side, one, middle, last], axis=1)
 
     def step(self, memory, measurement, t):
-        caused = memory.lift @ measurement.command
-        seen, passed = [], []
-        for value, filters, before in zip(caused, memory.filters, memory.passed, strict=True):
+        commanded_deflection = memory.lift @ measurement.command
+        filtered, filter_states = [], []
+        for value, filters, before in zip(
+            commanded_deflection, memory.filters, memory.passed, strict=True
+        ):
             value, after = (value, None) if filters is None else filter_step(filters, before, value)
-            seen.append(value)
-            passed.append(after)
-        own = measurement.readings[: caused.shape[0]]
-        offsets, notched = own - self.compensation * jnp.stack(seen), memory.notched
+            filtered.append(value)
+            filter_states.append(after)
+        readings = measurement.readings[: commanded_deflection.shape[0]]
+        load_deflection, notch_states = (
+            readings - self.compensation * jnp.stack(filtered),
+            memory.notch_states,
+        )
         if memory.notches is not None:
-            offsets, notched = filter_step(memory.notches, notched, offsets)
-        command = jax.vmap(lambda x, row: jnp.interp(x, self.readings, row))(offsets, self.values)
+            load_deflection, notch_states = filter_step(
+                memory.notches, notch_states, load_deflection
+            )
+        command = jax.vmap(lambda x, row: jnp.interp(x, self.readings, row))(
+            load_deflection, self.values
+        )
         return command, eqx.tree_at(
-            lambda m: (m.passed, m.notched),
+            lambda m: (m.passed, m.notch_states),
             memory,
-            (tuple(passed), notched),
+            (tuple(filter_states), notch_states),
             is_leaf=lambda x: x is None,
         )

@@ -14,15 +14,15 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.fields import POSITIVE, is_known, known, number
-from jaxbeam.control.load_position import Follower
-from jaxbeam.control.load_update import Listener
-from jaxbeam.estimation.constant_gain import offsets
-from jaxbeam.estimation.observability import deflections
+from jaxbeam.control.load_position import DeflectionIdentifier
+from jaxbeam.control.load_update import AbstractLoadIdentifier
+from jaxbeam.estimation.constant_gain import sensor_offsets
+from jaxbeam.estimation.observability import deflection_outputs
 from jaxbeam.model.modes import lay_out
 from jaxbeam.model.state_space import LoadedBeam, state_space
 from jaxbeam.runtime.compiling import compiled
 
-PLACES = 201  # at which influence lines are kept
+INFLUENCE_POSITIONS = 201  # at which influence lines are kept
 
 
 class Recognition(eqx.Module):
@@ -46,91 +46,92 @@ class Recognition(eqx.Module):
         "m", "deflection that tells of a load, without gates", POSITIVE, default=None
     )
 
-    def fault(self, case: Any) -> str | None:
+    def validate(self, case: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", or None."""
         if not any(sensor.quantity == "deflection" for sensor in case.sensors):
             return "until has no use without a sensor of deflection; add one"
         if (self.gates is None) == (self.threshold is None):
             return "gates or threshold must be given, and not both"
         if self.gates is None:
-            seeing = sum(sensor.quantity == "deflection" for sensor in case.sensors)
-            if seeing < 2:
+            deflection_sensors = sum(sensor.quantity == "deflection" for sensor in case.sensors)
+            if deflection_sensors < 2:
                 return "threshold needs two sensors of deflection or more; add one, or give gates"
             return None
         numbers = (self.gates, self.until, case.beam.length, case.loads[0].speed)
         if not all(is_known(value) for value in numbers):
             return None
         gates, until, length, speed = (known(value) for value in numbers)
-        way = np.sign(speed) * (gates - (length if speed < 0 else 0.0)) / length
-        if way[1] <= way[0]:
+        gate_shares = np.sign(speed) * (gates - (length if speed < 0 else 0.0)) / length
+        if gate_shares[1] <= gate_shares[0]:
             return "gates must be two places, that which the load passes first before the other"
-        if not way[1] < until <= 1:
-            return (
-                f"until must be beyond the second gate, at {way[1]:.3g} of the way, and at most 1"
-            )
+        if not gate_shares[1] < until <= 1:
+            return f"until must be beyond the second gate, at {gate_shares[1]:.3g} of the way, and at most 1"
         return None
 
-    def init(self, model: LoadedBeam, designed: LoadedBeam) -> Listener:
+    def identifier(self, plant: LoadedBeam, design_plant: LoadedBeam) -> AbstractLoadIdentifier:
         """The recogniser of the first load of a model; deflections are those of the design."""
-        plant, modes = designed.unloaded, designed.scale.shape[0]
-        length = model.case.beam.length
-        answer = jnp.linalg.solve(plant.A.T, plant.C[deflections(plant)].T).T
-        shapes = designed.rig.shapes(length * np.linspace(0, 1, PLACES), (0,))[0]
-        seen = deflections(plant)
+        system, modes = design_plant.unloaded, design_plant.scale.shape[0]
+        length = plant.case.beam.length
+        static_response = jnp.linalg.solve(system.A.T, system.C[deflection_outputs(system)].T).T
+        shapes = design_plant.rig.shapes(length * np.linspace(0, 1, INFLUENCE_POSITIONS), (0,))[0]
+        sensor_indices = deflection_outputs(system)
         common = {
             "length": length,
-            "gravity": designed.case.run.gravity,
-            "line": answer[:, modes : 2 * modes] @ (designed.scale[:, None] * shapes.T),
-            "lift": -answer @ plant.B,
-            "offset": offsets(designed)[seen],
-            "seen": tuple(int(i) for i in seen),
+            "gravity": design_plant.case.run.gravity,
+            "line": static_response[:, modes : 2 * modes]
+            @ (design_plant.scale[:, None] * shapes.T),
+            "lift": -static_response @ system.B,
+            "offset": sensor_offsets(design_plant)[sensor_indices],
+            "seen": tuple(int(i) for i in sensor_indices),
         }
         if self.gates is None:
             settings = {"until": self.until, "threshold": self.threshold}
-            return Follower(fit=jnp.zeros(8), **settings, **common)
-        times = model.traffic.motions[0].arrivals(self.gates)[:2]
-        return Recogniser(settings=self, times=times, fit=jnp.zeros(2), **common)
+            return DeflectionIdentifier(sums=jnp.zeros(8), **settings, **common)
+        times = plant.traffic.motions[0].arrivals(self.gates)[:2]
+        return GateIdentifier(settings=self, gate_times=times, sums=jnp.zeros(2), **common)
 
 
-class Recogniser(Listener):
-    """What is known of a load by now; `times` (s) are when it passes the gates."""
+class GateIdentifier(AbstractLoadIdentifier):
+    """What is known of a load by now; `gate_times` (s) are when it passes the gates."""
 
     settings: Recognition
-    times: Float[Array, "2"]
+    gate_times: Float[Array, "2"]
 
     @property
     def speed(self) -> Float[Array, ""]:
         """The speed (m/s), negative to the left; it is known from the second gate on."""
-        return jnp.diff(self.settings.gates)[0] / jnp.diff(self.times)[0]
+        return jnp.diff(self.settings.gates)[0] / jnp.diff(self.gate_times)[0]
 
     @property
-    def entry(self) -> Float[Array, ""]:
+    def entry_time(self) -> Float[Array, ""]:
         """When the load enters the beam (s), if it keeps its speed."""
         start = jnp.where(self.speed < 0, self.length, 0.0)
-        return self.times[1] + (start - self.settings.gates[1]) / self.speed
+        return self.gate_times[1] + (start - self.settings.gates[1]) / self.speed
 
     @property
     def mass(self) -> Float[Array, ""]:
         """The mass (kg) that fits what was heard; zero where nothing was."""
-        return self.mass_of(*self.fit)
+        return self.fitted_mass(*self.sums)
 
-    def share(self, t: Float[Array, ""]) -> Float[Array, ""]:
+    def crossing_share(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """The share of the way that is behind the load at a time (s)."""
-        return (t - self.entry) * jnp.abs(self.speed) / self.length
+        return (t - self.entry_time) * jnp.abs(self.speed) / self.length
 
-    def told(self, t: Float[Array, ""]) -> tuple[Array, Array]:
+    def identified(self, t: Float[Array, ""]) -> tuple[Array, Array]:
         """Whether speed and mass are known at a time (s)."""
-        passed = t >= self.times[1]
-        return passed, passed & (self.share(t) >= self.settings.until)
+        speed_identified = t >= self.gate_times[1]
+        return speed_identified, speed_identified & (self.crossing_share(t) >= self.settings.until)
 
-    def news(self, deflections, t):
-        share = self.share(t)
-        passed, done = self.told(t)
-        way = jnp.where(self.speed < 0, 1 - share, share)
-        places = np.linspace(0, 1, PLACES)
-        line = jax.vmap(lambda each: jnp.interp(way, places, each))(self.line)
-        listening = passed & ~done & (share > 0)
-        return jnp.where(listening, jnp.stack([line @ deflections, line @ line]), 0.0)
+    def innovation(self, deflections, t):
+        share = self.crossing_share(t)
+        passed, done = self.identified(t)
+        relative_position = jnp.where(self.speed < 0, 1 - share, share)
+        positions = np.linspace(0, 1, INFLUENCE_POSITIONS)
+        influence = jax.vmap(lambda each: jnp.interp(relative_position, positions, each))(
+            self.influence_lines
+        )
+        active = passed & ~done & (share > 0)
+        return jnp.where(active, jnp.stack([influence @ deflections, influence @ influence]), 0.0)
 
 
 class Recognised(NamedTuple):
@@ -149,10 +150,10 @@ def recognised(record: Any, settings: Recognition) -> Recognised:
     only. The true speed is that at entry. Raises ValueError for settings that do not suit the case.
     """
     case = record.case
-    fault = settings.fault(case)
-    if fault is not None:
-        raise ValueError(f"recognition.{fault}")
-    mass, speed = _replayed(settings, case, lay_out(case), record)
+    error = settings.validate(case)
+    if error is not None:
+        raise ValueError(f"recognition.{error}")
+    mass, speed = _replay(settings, case, lay_out(case), record)
     truth = float(case.loads[0].mass), float(case.loads[0].speed)
     found = float(mass), float(speed)
     errors = [value / true - 1 for value, true in zip(found, truth, strict=True)]
@@ -160,18 +161,18 @@ def recognised(record: Any, settings: Recognition) -> Recognised:
 
 
 @compiled
-def _replayed(settings: Recognition, case: Case, layout, record):
-    model = state_space(case, layout=layout)
-    start = settings.init(model, model)
-    still = jnp.zeros(model.rig.states)
+def _replay(settings: Recognition, case: Case, layout, record):
+    plant = state_space(case, layout=layout)
+    identifier = settings.identifier(plant, plant)
+    zero_state = jnp.zeros(plant.rig.states)
 
     def tick(fit, at):
         readings, command, t = at
-        heard = eqx.tree_at(lambda r: r.fit, start, fit)
-        return heard.hear(Measurement(readings, still, command), t).fit, None
+        current = eqx.tree_at(lambda r: r.fit, identifier, fit)
+        return current.update(Measurement(readings, zero_state, command), t).fit, None
 
     # A sample holds the command from its tick on; the law heard the one before.
-    before = jnp.concatenate([jnp.zeros_like(record.command[:1]), record.command[:-1]])
-    fit, _ = jax.lax.scan(tick, start.fit, (record.measured, before, record.times))
-    last = eqx.tree_at(lambda r: r.fit, start, fit)
-    return last.mass, last.speed
+    previous_commands = jnp.concatenate([jnp.zeros_like(record.command[:1]), record.command[:-1]])
+    fit, _ = jax.lax.scan(tick, identifier.sums, (record.measured, previous_commands, record.times))
+    final = eqx.tree_at(lambda r: r.fit, identifier, fit)
+    return final.mass, final.speed

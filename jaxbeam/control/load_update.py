@@ -10,21 +10,21 @@ from jaxtyping import Array, Float
 from jaxbeam.case.controller import Measurement
 
 
-class Listener(eqx.Module):
+class AbstractLoadIdentifier(eqx.Module):
     """What is known of a load by now.
 
-    `line` are the influence lines (m/N) of the sensors `seen` at places all along the beam, by the
-    modes of the design (`static.influence_line` is exact), `lift` the static deflections there per
-    unit of the commands. `fit` gathers the sums of the least squares, the only part that changes.
+    `influence_lines` are the influence lines (m/N) of the sensors `sensor_indices` at places all along the beam, by the
+    modes of the design (`static.influence_line` is exact), `static_lift` the static deflections there per
+    unit of the commands. `sums` gathers the sums of the least squares, the only part that changes.
     """
 
     length: Float[Array, ""]
     gravity: Float[Array, ""]
-    line: Float[Array, "sensor place"]
-    lift: Float[Array, "sensor actuator"]
+    influence_lines: Float[Array, "sensor place"]
+    static_lift: Float[Array, "sensor actuator"]
     offset: Float[Array, " sensor"]
-    fit: Float[Array, " sum"]
-    seen: tuple[int, ...] = eqx.field(static=True)
+    sums: Float[Array, " sum"]
+    sensor_indices: tuple[int, ...] = eqx.field(static=True)
 
     @property
     @abc.abstractmethod
@@ -33,7 +33,7 @@ class Listener(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def entry(self) -> Float[Array, ""]:
+    def entry_time(self) -> Float[Array, ""]:
         """When the load enters the beam (s), if it keeps its speed."""
 
     @property
@@ -42,22 +42,27 @@ class Listener(eqx.Module):
         """The mass (kg) that fits what was heard; zero where nothing was."""
 
     @abc.abstractmethod
-    def told(self, t: Float[Array, ""]) -> tuple[Array, Array]:
+    def identified(self, t: Float[Array, ""]) -> tuple[Array, Array]:
         """Whether speed and mass are known at a time (s)."""
 
     @abc.abstractmethod
-    def news(
+    def innovation(
         self, deflections: Float[Array, " sensor"], t: Float[Array, ""]
     ) -> Float[Array, " sum"]:
         """What is added to the sums for the deflections (m) under the load alone, at t (s)."""
 
-    def hear(self, measurement: Measurement, t: Float[Array, ""]) -> "Listener":
+    def update(self, measurement: Measurement, t: Float[Array, ""]) -> "AbstractLoadIdentifier":
         """The same after the readings of a tick at t (s)."""
-        readings = measurement.readings[np.array(self.seen)] - self.offset
-        news = self.news(readings - self.lift @ measurement.command, t)
-        return eqx.tree_at(lambda listener: listener.fit, self, self.fit + news)
+        readings = measurement.readings[np.array(self.sensor_indices)] - self.offset
+        increments = self.innovation(readings - self.static_lift @ measurement.command, t)
+        return eqx.tree_at(lambda listener: listener.fit, self, self.sums + increments)
 
-    def mass_of(self, across, along) -> Float[Array, ""]:
+    def fitted_mass(self, influence_reading_sum, squared_influence_sum) -> Float[Array, ""]:
         """The mass (kg) for the sums of line times reading, and of squares of the line."""
-        weight = jnp.where(along > 0, across / jnp.where(along > 0, along, 1.0), 0.0)
+        weight = jnp.where(
+            squared_influence_sum > 0,
+            influence_reading_sum
+            / jnp.where(squared_influence_sum > 0, squared_influence_sum, 1.0),
+            0.0,
+        )
         return weight / self.gravity

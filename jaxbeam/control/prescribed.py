@@ -31,18 +31,18 @@ class Prescribed(AbstractController):
     )
 
     @property
-    def memoryless(self) -> bool:
+    def stateless(self) -> bool:
         return True
 
     @property
-    def knows_loads(self) -> bool:
+    def design_depends_on_loads(self) -> bool:
         return False
 
     @property
-    def blind(self) -> bool:
+    def open_loop(self) -> bool:
         return True
 
-    def fault(self, case):
+    def validate(self, case):
         count = len(case.actuators)
         for name in ("offsets", "amplitudes", "phases", "values"):
             value = getattr(self, name)
@@ -62,19 +62,19 @@ class Prescribed(AbstractController):
             return "values must have a column for each of the times"
         return None
 
-    def init(self, model):
+    def init(self, plant):
         return None
 
     def step(self, memory, measurement, t):
         command = self.offsets
         if self.amplitudes is not None:
-            turn = 2 * jnp.pi * self.frequencies * t
-            turn = turn if self.phases is None else turn + self.phases
-            command = command + jnp.sum(self.amplitudes * jnp.sin(turn), axis=-1)
+            angle = 2 * jnp.pi * self.frequencies * t
+            angle = angle if self.phases is None else angle + self.phases
+            command = command + jnp.sum(self.amplitudes * jnp.sin(angle), axis=-1)
         if self.times is not None:
-            inside = [jnp.interp(t, self.times, row, left=0.0, right=0.0) for row in self.values]
-            command = command + jnp.stack(inside)
+            tabulated = [jnp.interp(t, self.times, row, left=0.0, right=0.0) for row in self.values]
+            command = command + jnp.stack(tabulated)
         return command, memory
 
-    def knots(self, case):
+    def breakpoints(self, case):
         return self.times

@@ -13,16 +13,16 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import INCREASING, choice, count, is_known, known, number, part
-from jaxbeam.control.feedback import Feedback, pairing_fault
+from jaxbeam.control.feedback import Feedback, pairing_error
 from jaxbeam.control.load_identification import Recognition
-from jaxbeam.control.load_update import Listener
+from jaxbeam.control.load_update import AbstractLoadIdentifier
 
 
-class Told(eqx.Module):
+class ScheduledFeedbackState(eqx.Module):
     """Memory of `ScheduledFeedback`: the mass (kg) as it is told, and what recognises it."""
 
     mass: Float[Array, ""]
-    recogniser: Listener | None
+    identifier: AbstractLoadIdentifier | None
 
 
 class ScheduledFeedback(AbstractController):
@@ -44,10 +44,10 @@ class ScheduledFeedback(AbstractController):
     recognition: Recognition | None = part("how the mass is found", Recognition)
 
     @property
-    def memoryless(self) -> bool:
+    def stateless(self) -> bool:
         return self.recognition is None
 
-    def fault(self, case):
+    def validate(self, case):
         if len(case.loads) != 1 or case.loads[0].mass is None:
             return "kind needs a single load, with a mass; or take kind 'feedback'"
         if self.masses.size == 0 or (is_known(self.masses) and np.any(known(self.masses) <= 0)):
@@ -57,31 +57,31 @@ class ScheduledFeedback(AbstractController):
                 f"gains must list in each row a gain for each of {self.masses.shape[0]} masses,"
                 f" not {self.gains.shape[1]}"
             )
-        wrong = pairing_fault(self.gains[:, 0], case)
-        if wrong is not None or self.recognition is None:
-            return wrong
+        error = pairing_error(self.gains[:, 0], case)
+        if error is not None or self.recognition is None:
+            return error
         if self.period is None:
             return "period must be given: the recognition of loads remembers"
-        wrong = self.recognition.fault(case)
-        return None if wrong is None else f"recognition.{wrong}"
+        error = self.recognition.validate(case)
+        return None if error is None else f"recognition.{error}"
 
-    def init(self, model: Any) -> Told:
-        heard = None if self.recognition is None else self.recognition.init(model, model)
-        return Told(jnp.asarray(model.case.loads[0].mass), heard)
+    def init(self, plant: Any) -> ScheduledFeedbackState:
+        identifier = None if self.recognition is None else self.recognition.identifier(plant, plant)
+        return ScheduledFeedbackState(jnp.asarray(plant.case.loads[0].mass), identifier)
 
-    def gains_for(self, mass: Float[Array, ""]) -> Float[Array, " actuator"]:
+    def gains_at(self, mass: Float[Array, ""]) -> Float[Array, " actuator"]:
         """The gains for a mass (kg)."""
         if self.between == "interpolated":
             return jax.vmap(lambda row: jnp.interp(mass, self.masses, row))(self.gains)
         last = self.masses.shape[0] - 1
-        place = jnp.searchsorted(self.masses, mass, side="right") - 1
-        return self.gains[:, jnp.clip(place, 0, last)]
+        interval = jnp.searchsorted(self.masses, mass, side="right") - 1
+        return self.gains[:, jnp.clip(interval, 0, last)]
 
     def step(self, memory, measurement, t):
         mass = memory.mass
-        if memory.recogniser is not None:
-            heard = memory.recogniser.hear(measurement, t)
-            memory = eqx.tree_at(lambda m: m.recogniser.fit, memory, heard.fit)
-            mass = jnp.where(heard.told(t)[1], heard.mass, self.masses[0])
-        law = Feedback(self.gains_for(mass), self.power)
+        if memory.identifier is not None:
+            identifier = memory.identifier.update(measurement, t)
+            memory = eqx.tree_at(lambda m: m.identifier.fit, memory, identifier.fit)
+            mass = jnp.where(identifier.told(t)[1], identifier.mass, self.masses[0])
+        law = Feedback(self.gains_at(mass), self.power)
         return law.step(None, measurement, t)[0], memory

@@ -14,16 +14,16 @@ class StateFeedback(AbstractStateLaw):
     )
 
     @property
-    def knows_loads(self) -> bool:
+    def design_depends_on_loads(self) -> bool:
         return self.estimator is not None
 
-    def fault(self, case):
-        wanted = (len(case.actuators), self.states(case))
-        if self.gain.shape != wanted:
-            return f"gain must have a row for each actuator, a column for each state: {wanted}"
-        return super().fault(case)
+    def validate(self, case):
+        shape = (len(case.actuators), self.state_count(case))
+        if self.gain.shape != shape:
+            return f"gain must have a row for each actuator, a column for each state: {shape}"
+        return super().validate(case)
 
-    def prepare(self, model, designed):
+    def prepare(self, plant, design_plant):
         return None
 
     def command(self, memory, estimate, measurement, t):

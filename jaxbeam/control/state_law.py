@@ -11,9 +11,9 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
 from jaxbeam.case.fields import choice, is_known, known, part
 from jaxbeam.case.loads import motion
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation import KINDS
-from jaxbeam.estimation.continuous import Flowing
+from jaxbeam.estimation.continuous import ContinuousEstimator
 from jaxbeam.model.modes import lay_out
 from jaxbeam.model.state_space import LoadedBeam, StateSpace, loaded_beam, state_space
 from jaxbeam.runtime.compiling import compiled
@@ -30,109 +30,115 @@ class AbstractStateLaw(AbstractController):
     coordinates: str = choice(
         "coordinates of the states", "modal", "sine", default="modal", kw_only=True
     )
-    design: Beliefs | None = part("what is believed of the plant", Beliefs, kw_only=True)
+    design: DesignModel | None = part("what is believed of the plant", DesignModel, kw_only=True)
     estimator: AbstractEstimator | None = part("what estimates the state", KINDS, kw_only=True)
 
     @property
-    def memoryless(self) -> bool:
+    def stateless(self) -> bool:
         return self.estimator is None or self.estimator.flows
 
     @abc.abstractmethod
-    def prepare(self, model: LoadedBeam, designed: LoadedBeam) -> Any:
-        """Memory of the law at the start of a run on `model`, designed for `designed`."""
+    def prepare(self, plant: LoadedBeam, design_plant: LoadedBeam) -> Any:
+        """Memory of the law at the start of a run on `plant`, designed for `design_plant`."""
 
     @abc.abstractmethod
     def command(self, memory: Any, estimate: Estimate, measurement, t) -> tuple[Any, Any]:
         """Commands at time t (s) for an estimate of the state, and the memory after it."""
 
-    def believed(self, model: LoadedBeam) -> LoadedBeam:
+    def design_plant(self, plant: LoadedBeam) -> LoadedBeam:
         """The model that the law is designed for, in its coordinates."""
         if self.design is None:
-            return loaded_beam(model.case, model.rig, self.coordinates)
-        return self.design.applied(model, self.coordinates)
+            return loaded_beam(plant.case, plant.rig, self.coordinates)
+        return self.design.design_plant(plant, self.coordinates)
 
-    def init(self, model):
-        designed = self.believed(model)
-        law = self.prepare(model, designed)
+    def init(self, plant):
+        design_plant = self.design_plant(plant)
+        law = self.prepare(plant, design_plant)
         if self.estimator is None:
-            return law, _seen(model, designed)
-        return law, self.estimator.init(designed)
+            return law, _design_state_map(plant, design_plant)
+        return law, self.estimator.init(design_plant)
 
     def step(self, memory, measurement, t):
-        law, own = memory
+        law, estimator_memory = memory
         if self.estimator is None:
-            estimate = Estimate(own @ measurement.state)
+            estimate = Estimate(estimator_memory @ measurement.state)
         else:
-            estimate, own = self.estimator.step(own, measurement, t)
-        wanted, law = self.command(law, estimate, measurement, t)
-        return wanted, (law, own)
+            estimate, estimator_memory = self.estimator.step(estimator_memory, measurement, t)
+        command, law = self.command(law, estimate, measurement, t)
+        return command, (law, estimator_memory)
 
     def own_states(self, memory):
-        own = memory[1]
-        return own.start.shape[0] if isinstance(own, Flowing) else 0
+        estimator_memory = memory[1]
+        return (
+            estimator_memory.initial_state.shape[0]
+            if isinstance(estimator_memory, ContinuousEstimator)
+            else 0
+        )
 
-    def flow(self, memory, own, measurement, t, limited):
-        law, flowing = memory
-        if not isinstance(flowing, Flowing):
-            return super().flow(memory, own, measurement, t, limited)
-        command = limited(self.command(law, flowing.estimate(own, t), measurement, t)[0])
-        return command, flowing.rates(own, measurement.readings, command, t)
+    def flow(self, memory, states, measurement, t, limited):
+        law, estimator = memory
+        if not isinstance(estimator, ContinuousEstimator):
+            return super().flow(memory, states, measurement, t, limited)
+        command = limited(self.command(law, estimator.estimate(states, t), measurement, t)[0])
+        return command, estimator.rates(states, measurement.readings, command, t)
 
-    def knots(self, case):
+    def breakpoints(self, case):
         """At every instant, an estimator's gain bends where loads are believed to come and go."""
         if self.period is not None or self.estimator is None:
             return None
-        loads = case.loads if self.design is None else self.design.loads(case)
+        loads = case.loads if self.design is None else self.design.design_loads(case)
         return np.ravel([known(motion(load, case.beam.length).window()) for load in loads])
 
-    def fault(self, case):
-        bonded = any(actuator.bonded() is not None for actuator in case.actuators)
+    def validate(self, case):
+        stiffened = any(actuator.bonded() is not None for actuator in case.actuators)
         if self.coordinates == "sine" and (
-            case.beam.ends != "pinned-pinned" or case.supports or bonded
+            case.beam.ends != "pinned-pinned" or case.supports or stiffened
         ):
             return (
                 "coordinates must be 'modal': the modes of this beam are not sin(n pi x / L);"
                 " only a uniform pinned-pinned beam without supports in between has those"
             )
-        fault = None if self.design is None else self.design.fault(case)
-        if fault is not None:
-            return f"design.{fault}"
-        if self.period is None and not self.memoryless:
+        error = None if self.design is None else self.design.validate(case)
+        if error is not None:
+            return f"design.{error}"
+        if self.period is None and not self.stateless:
             return "period must be given: this estimator steps from sample to sample"
         if self.period is None and self.estimator is None:
             return None
-        fault = None if self.estimator is None else self.estimator.fault(case, None)
-        if fault is None and all(is_known(leaf) for leaf in jax.tree.leaves((self, case))):
-            law, plain = jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), (self, case))
-            plant = _plant(law, plain, lay_out(plain))
+        error = None if self.estimator is None else self.estimator.fault(case, None)
+        if error is None and all(is_known(leaf) for leaf in jax.tree.leaves((self, case))):
+            law, concrete_case = jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), (self, case))
+            system = _unloaded_design_plant(law, concrete_case, lay_out(concrete_case))
             if self.period is not None:
-                self.look_at(plant, case)
-            fault = None if self.estimator is None else self.estimator.fault(case, plant)
-        return None if fault is None else f"estimator.{fault}"
+                self.warn(system, case)
+            error = None if self.estimator is None else self.estimator.fault(case, system)
+        return None if error is None else f"estimator.{error}"
 
-    def look_at(self, plant: StateSpace, case: Any) -> None:
+    def warn(self, system: StateSpace, case: Any) -> None:
         """Warn of what may go wrong on the plant it is designed for, before a sampled run."""
 
-    def modes(self, case: Any) -> int:
+    def mode_count(self, case: Any) -> int:
         """How many modes the law is designed for."""
-        known = None if self.design is None else self.design.modes
-        return case.beam.modes if known is None else known
+        design_modes = None if self.design is None else self.design.modes
+        return case.beam.modes if design_modes is None else design_modes
 
-    def states(self, case: Any) -> int:
+    def state_count(self, case: Any) -> int:
         """How many states the law is fed."""
-        own = sum(actuator.attachment().state_matrix.shape[0] for actuator in case.actuators)
-        return 2 * self.modes(case) + own
+        actuator_states = sum(
+            actuator.attachment().state_matrix.shape[0] for actuator in case.actuators
+        )
+        return 2 * self.mode_count(case) + actuator_states
 
 
 @compiled
-def _plant(law: AbstractStateLaw, case, layout) -> StateSpace:
+def _unloaded_design_plant(law: AbstractStateLaw, case, layout) -> StateSpace:
     """What the law is designed for, without loads."""
-    return law.believed(state_space(case, layout=layout)).unloaded
+    return law.design_plant(state_space(case, layout=layout)).unloaded
 
 
-def _seen(model: LoadedBeam, designed: LoadedBeam):
+def _design_state_map(plant: LoadedBeam, design_plant: LoadedBeam):
     """The states of the design for the states of the plant: all of them, or those it has."""
-    modal = 2 * model.scale.shape[0]
-    kept = 2 * designed.scale.shape[0]
-    states = model.to_rig(jnp.eye(model.rig.states))
-    return designed.from_rig(jnp.concatenate([states[:kept], states[modal:]]))
+    modal = 2 * plant.scale.shape[0]
+    kept = 2 * design_plant.scale.shape[0]
+    states = plant.to_rig(jnp.eye(plant.rig.states))
+    return design_plant.from_rig(jnp.concatenate([states[:kept], states[modal:]]))

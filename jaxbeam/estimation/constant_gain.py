@@ -11,10 +11,10 @@ from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.model.state_space import LoadedBeam
 
 
-class FixedGain(eqx.Module):
+class ConstantGainFilter(eqx.Module):
     """Memory of such an estimator: its design, the state it believes in, the command before.
 
-    The reading expected of a state is C x + D u + offset. The first `own` states are those of the
+    The reading expected of a state is C x + D u + offset. The first `plant_states` states are those of the
     plant, which others may follow that the sensors add.
     """
 
@@ -25,33 +25,35 @@ class FixedGain(eqx.Module):
     gain: Float[Array, "state sensor"]
     state: Float[Array, " state"]
     command: Float[Array, " actuator"]
-    own: int = eqx.field(static=True)
+    plant_states: int = eqx.field(static=True)
 
     @property
-    def plant_state(self) -> Float[Array, " own"]:
+    def plant_state(self) -> Float[Array, " plant_states"]:
         """The states of the plant."""
-        return self.state[: self.own]
+        return self.state[: self.plant_states]
 
-    def corrected(self, measurement: Measurement) -> "FixedGain":
+    def update(self, measurement: Measurement) -> "ConstantGainFilter":
         """The memory after the next tick."""
-        now = measurement.command
-        state = self.transition.mean(self.state, self.command, now)
-        surprise = measurement.readings - self.offset - self.C @ state - self.D @ now
-        return dataclasses.replace(self, state=state + self.gain @ surprise, command=now)
+        command = measurement.command
+        state = self.transition.predict(self.state, self.command, command)
+        innovation = measurement.readings - self.offset - self.C @ state - self.D @ command
+        return dataclasses.replace(self, state=state + self.gain @ innovation, command=command)
 
 
-def at_rest(
-    model: LoadedBeam,
+def constant_gain_filter(
+    plant: LoadedBeam,
     transition: Transition,
     C: Float[Array, "sensor state"],
     D: Float[Array, "sensor actuator"],
     gain: Float[Array, "state sensor"],
-) -> FixedGain:
+) -> ConstantGainFilter:
     """The memory at the start of a run, from rest."""
     state, command = jnp.zeros(C.shape[1]), jnp.zeros(D.shape[1])
-    return FixedGain(transition, C, D, offsets(model), gain, state, command, model.rig.states)
+    return ConstantGainFilter(
+        transition, C, D, sensor_offsets(plant), gain, state, command, plant.rig.states
+    )
 
 
-def offsets(model: LoadedBeam) -> Float[Array, " sensor"]:
+def sensor_offsets(plant: LoadedBeam) -> Float[Array, " sensor"]:
     """The constants that sensors add to what they read."""
-    return jnp.array([sensor.offset for sensor in model.case.sensors]).reshape(-1)
+    return jnp.array([sensor.offset for sensor in plant.case.sensors]).reshape(-1)

@@ -12,59 +12,61 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.estimator import Estimate
-from jaxbeam.estimation.sensor_chain import Sight
+from jaxbeam.estimation.sensor_chain import FilteredPlant
 from jaxbeam.model.state_space import StateSpace
 
 
-class Flowing(eqx.Module):
+class ContinuousEstimator(eqx.Module):
     """Memory of an estimator at every instant: its model and its gain, neither of which changes.
 
-    The estimate starts at `start`; its first `own` states are those of the plant. Either a `still`
-    model without loads has a constant `gain`. Or the loads are followed in a `view`, and the gain
-    is a `table` (`GainTable`) along the run, transposed and backward, over `duration` (s): then
+    The estimate starts at `initial_state`; its first `plant_states` states are those of the plant. Either a `unloaded`
+    model without loads has a constant `gain`. Or the loads are followed in a `filtered_plant`, and the gain
+    is a `gain_table` (`GainTable`) along the run, transposed and backward, over `duration` (s): then
     states of analogue filters follow those of the plant, and the weights of the loads, which are
-    told if `sought`.
+    told if `estimates_weights`.
     """
 
     offset: Float[Array, " sensor"]
-    start: Float[Array, " state"]
-    own: int = eqx.field(static=True)
-    still: StateSpace | None = None
+    initial_state: Float[Array, " state"]
+    plant_states: int = eqx.field(static=True)
+    unloaded: StateSpace | None = None
     gain: Float[Array, "state sensor"] | None = None
-    view: Sight | None = None
-    table: Any = None
+    filtered_plant: FilteredPlant | None = None
+    gain_table: Any = None
     duration: Float[Array, ""] | None = None
-    sought: bool = eqx.field(static=True, default=False)
+    estimates_weights: bool = eqx.field(static=True, default=False)
 
-    def plant(self, t: Float[Array, ""]) -> StateSpace:
+    def system_at(self, t: Float[Array, ""]) -> StateSpace:
         """The model at a time (s), its outputs what the sensors see."""
-        if self.still is not None:
-            return self.still
-        return self.view.behind(self.view.model.augmented(t))
+        if self.unloaded is not None:
+            return self.unloaded
+        return self.filtered_plant.with_filtered_outputs(self.filtered_plant.plant.augmented(t))
 
-    def estimate(self, moved: Float[Array, " state"], t: Float[Array, ""]) -> Estimate:
-        """What is believed at a time (s), `moved` being how far it has come from the start."""
-        state = self.start + moved
-        if not self.sought:
-            return Estimate(state[: self.own])
-        model = self.view.model
-        weights = state[model.rig.states :]
-        return Estimate(state[: self.own], jnp.where(model.traffic.on_beam(t), weights, 0.0))
+    def estimate(self, deviation: Float[Array, " state"], t: Float[Array, ""]) -> Estimate:
+        """What is believed at a time (s), `deviation` being how far it has come from the start."""
+        state = self.initial_state + deviation
+        if not self.estimates_weights:
+            return Estimate(state[: self.plant_states])
+        plant = self.filtered_plant.plant
+        weights = state[plant.rig.states :]
+        return Estimate(
+            state[: self.plant_states], jnp.where(plant.traffic.on_beam(t), weights, 0.0)
+        )
 
     def rates(
         self,
-        moved: Float[Array, " state"],
+        deviation: Float[Array, " state"],
         readings: Float[Array, " sensor"],
         command: Float[Array, " actuator"],
         t: Float[Array, ""],
     ) -> Float[Array, " state"]:
         """Rates of the estimate for readings and commands at a time (s)."""
-        plant, state = self.plant(t), self.start + moved
-        surprise = readings - self.offset - plant.C @ state - plant.D @ command
-        return plant.A @ state + plant.B @ command + self.at(t) @ surprise
+        system, state = self.system_at(t), self.initial_state + deviation
+        innovation = readings - self.offset - system.C @ state - system.D @ command
+        return system.A @ state + system.B @ command + self.gain_at(t) @ innovation
 
-    def at(self, t: Float[Array, ""]) -> Float[Array, "state sensor"]:
+    def gain_at(self, t: Float[Array, ""]) -> Float[Array, "state sensor"]:
         """The gain at a time (s)."""
         if self.gain is not None:
             return self.gain
-        return self.table(1 - t / self.duration).T
+        return self.gain_table(1 - t / self.duration).T

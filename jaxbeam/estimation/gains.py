@@ -38,19 +38,19 @@ def filter_gain(covariance: Square, C: Rows, R: Outputs) -> Float[Array, "state 
     return jnp.linalg.solve(C @ covariance @ C.T + R, C @ covariance).T
 
 
-def placed_gain(A: Square, C: Rows, wanted: Square) -> Float[Array, "state output"]:
-    """L with which A - L C has the eigenvalues of the matrix `wanted`; differentiable.
+def placed_gain(A: Square, C: Rows, desired: Square) -> Float[Array, "state output"]:
+    """L with which A - L C has the eigenvalues of the matrix `desired`; differentiable.
 
     From A'X - X wanted = C'C and L' = C X^-1 (Bhattacharyya and de Souza, Systems & Control
-    Letters 1, 1982). A and `wanted` must have no eigenvalue in common, and both be observable
+    Letters 1, 1982). A and `desired` must have no eigenvalue in common, and both be observable
     through C; the answer is nan or useless otherwise.
     """
     scale = balance(A)
-    A, wanted = A * scale / scale[:, None], wanted * scale / scale[:, None]
+    A, desired = A * scale / scale[:, None], desired * scale / scale[:, None]
     rows = C * scale
-    size = jnp.sqrt(jnp.sum(rows**2, axis=1))
-    rows = rows / size[:, None]
-    one = jnp.eye(A.shape[0])
-    sylvester = jnp.kron(A.T, one) - jnp.kron(one, wanted.T)
+    row_norms = jnp.sqrt(jnp.sum(rows**2, axis=1))
+    rows = rows / row_norms[:, None]
+    identity = jnp.eye(A.shape[0])
+    sylvester = jnp.kron(A.T, identity) - jnp.kron(identity, desired.T)
     X = jnp.linalg.solve(sylvester, (rows.T @ rows).reshape(-1)).reshape(A.shape)
-    return scale[:, None] * jnp.linalg.solve(X.T, rows.T) / size
+    return scale[:, None] * jnp.linalg.solve(X.T, rows.T) / row_norms

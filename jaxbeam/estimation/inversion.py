@@ -11,18 +11,18 @@ from jaxtyping import Array, Float
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
 from jaxbeam.case.fields import POSITIVE, known, number
-from jaxbeam.estimation.constant_gain import offsets
+from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.observability import (
-    UNSEEN,
+    UNOBSERVABLE,
     ConditioningWarning,
     conditioning,
-    deflection_rows,
-    deflections,
+    deflection_mode_shapes,
+    deflection_outputs,
 )
-from jaxbeam.estimation.sampled_plant import Transition, ticks
+from jaxbeam.estimation.sampled_plant import Transition, sample_timing
 from jaxbeam.numerics.discretisation import balance
 
-WORST = 100.0  # conditioning beyond which there is a warning
+MAX_CONDITION_NUMBER = 100.0  # conditioning beyond which there is a warning
 
 
 class Inversion(AbstractEstimator):
@@ -38,75 +38,92 @@ class Inversion(AbstractEstimator):
         "s", "of the lag that smooths the rates", POSITIVE, default=None
     )
 
-    def init(self, model):
-        plant = model.unloaded
-        rows = deflection_rows(plant)
-        modes, size = rows.shape[1], 2 * rows.shape[1]
-        inverse = jnp.zeros((modes, plant.C.shape[0]))
-        inverse = inverse.at[:, deflections(plant)].set(jnp.linalg.pinv(rows))
-        clock, own = ticks(model.case.controller), None
-        if plant.A.shape[0] > size:
+    def init(self, plant):
+        system = plant.unloaded
+        rows = deflection_mode_shapes(system)
+        modes, modal_states = rows.shape[1], 2 * rows.shape[1]
+        inverse = jnp.zeros((modes, system.C.shape[0]))
+        inverse = inverse.at[:, deflection_outputs(system)].set(jnp.linalg.pinv(rows))
+        timing, actuator_transition = sample_timing(plant.case.controller), None
+        if system.A.shape[0] > modal_states:
             # The states of actuators see the beam's, held, and then the commands, as inputs.
-            inputs = jnp.concatenate([plant.A[size:, :size], plant.B[size:]], axis=1)
-            inner = plant.A[size:, size:]
-            still, scale = jnp.zeros_like(inner), balance(inner)
-            own = clock.transition(lambda t: (inner, inputs), still, scale)
-        lag = 0.0 if self.time_constant is None else jnp.exp(-clock.period / self.time_constant)
-        share = (1 - jnp.asarray(lag, float)) / clock.period
-        state, command = jnp.zeros(plant.A.shape[0]), jnp.zeros(plant.B.shape[1])
-        return Inverted(inverse, share, clock.period, own, offsets(model), state, command)
+            inputs = jnp.concatenate(
+                [system.A[modal_states:, :modal_states], system.B[modal_states:]], axis=1
+            )
+            inner = system.A[modal_states:, modal_states:]
+            no_noise, scale = jnp.zeros_like(inner), balance(inner)
+            actuator_transition = timing.transition(lambda t: (inner, inputs), no_noise, scale)
+        smoothing = (
+            0.0 if self.time_constant is None else jnp.exp(-timing.period / self.time_constant)
+        )
+        difference_gain = (1 - jnp.asarray(smoothing, float)) / timing.period
+        state, command = jnp.zeros(system.A.shape[0]), jnp.zeros(system.B.shape[1])
+        return InversionState(
+            inverse,
+            difference_gain,
+            timing.period,
+            actuator_transition,
+            sensor_offsets(plant),
+            state,
+            command,
+        )
 
     def step(self, memory, measurement, t):
         memory = memory.fitted(measurement)
         return Estimate(memory.state), memory
 
-    def fault(self, case, plant):
+    def validate(self, case, system):
         if not any(sensor.quantity == "deflection" for sensor in case.sensors):
             return "kind needs sensors of deflection; add one, or take kind 'kalman'"
-        if plant is None:
+        if system is None:
             return None
-        rows = known(deflection_rows(plant))
-        size = np.linalg.norm(rows, axis=0)
-        if np.any(size < UNSEEN * size.max()) or known(conditioning(plant)) > 1 / UNSEEN:
+        rows = known(deflection_mode_shapes(system))
+        column_norms = np.linalg.norm(rows, axis=0)
+        if (
+            np.any(column_norms < UNOBSERVABLE * column_norms.max())
+            or known(conditioning(system)) > 1 / UNOBSERVABLE
+        ):
             return (
-                f"kind needs sensors of deflection that tell all {size.size} modes apart; move"
+                f"kind needs sensors of deflection that tell all {column_norms.size} modes apart; move"
                 " one off the nodes of the modes, or design for fewer modes"
             )
-        worst = float(known(conditioning(plant)))
-        if worst > WORST:
+        condition_number = float(known(conditioning(system)))
+        if condition_number > MAX_CONDITION_NUMBER:
             warnings.warn(
                 f"the sensors of deflection hardly tell some modes apart: errors of readings grow"
-                f" {worst:.3g} times; move sensors, or design for fewer modes",
+                f" {condition_number:.3g} times; move sensors, or design for fewer modes",
                 ConditioningWarning,
                 stacklevel=2,
             )
         return None
 
 
-class Inverted(eqx.Module):
+class InversionState(eqx.Module):
     """Memory of the inversion: its design, the state it found last, the command before.
 
-    `share` (1/s) is the weight of a difference in the rates, `period` (s) that between ticks;
-    `own` takes the states of the actuators on, None if they have none.
+    `difference_gain` (1/s) is the weight of a difference in the rates, `period` (s) that between ticks;
+    `actuator_transition` takes the states of the actuators on, None if they have none.
     """
 
-    inverse: Float[Array, "mode sensor"]
-    share: Float[Array, ""]
+    mode_shape_inverse: Float[Array, "mode sensor"]
+    difference_gain: Float[Array, ""]
     period: Float[Array, ""]
-    own: Transition | None
+    actuator_transition: Transition | None
     offset: Float[Array, " sensor"]
     state: Float[Array, " state"]
     command: Float[Array, " actuator"]
 
-    def fitted(self, measurement: Measurement) -> "Inverted":
+    def update(self, measurement: Measurement) -> "InversionState":
         """The memory after the next tick."""
-        modes, now = self.inverse.shape[0], measurement.command
+        modes, current_command = self.mode_shape_inverse.shape[0], measurement.command
         before, rates = self.state[:modes], self.state[modes : 2 * modes]
-        places = self.inverse @ (measurement.readings - self.offset)
-        kept = 1 - self.share * self.period
-        parts = [places, kept * rates + self.share * (places - before)]
-        if self.own is not None:
-            beam, own = self.state[: 2 * modes], self.state[2 * modes :]
-            inputs = (jnp.concatenate([beam, command]) for command in (self.command, now))
-            parts.append(self.own.mean(own, *inputs))
-        return dataclasses.replace(self, state=jnp.concatenate(parts), command=now)
+        coordinates = self.mode_shape_inverse @ (measurement.readings - self.offset)
+        smoothing = 1 - self.difference_gain * self.period
+        parts = [coordinates, smoothing * rates + self.difference_gain * (coordinates - before)]
+        if self.actuator_transition is not None:
+            beam, actuator_states = self.state[: 2 * modes], self.state[2 * modes :]
+            inputs = (
+                jnp.concatenate([beam, command]) for command in (self.command, current_command)
+            )
+            parts.append(self.actuator_transition.predict(actuator_states, *inputs))
+        return dataclasses.replace(self, state=jnp.concatenate(parts), command=current_command)

@@ -12,18 +12,18 @@ from jaxtyping import Array, Float
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
 from jaxbeam.case.fields import POSITIVE, choice, count, is_known, known, number
-from jaxbeam.estimation.constant_gain import at_rest, offsets
-from jaxbeam.estimation.continuous import Flowing
+from jaxbeam.estimation.constant_gain import constant_gain_filter, sensor_offsets
+from jaxbeam.estimation.continuous import ContinuousEstimator
 from jaxbeam.estimation.gains import filter_gain, kalman_gain, sampled_kalman_gain
-from jaxbeam.estimation.observability import modes_of, unseen_fault
-from jaxbeam.estimation.sampled_plant import ROUNDING, ticks
-from jaxbeam.estimation.sensor_chain import Chain, Sight, chain, sight
+from jaxbeam.estimation.observability import mode_count, observability_error
+from jaxbeam.estimation.sampled_plant import PERIOD_ROUNDING, sample_timing
+from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain, filtered_plant, sensor_chain
 from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.finite_horizon import finite_time
-from jaxbeam.numerics.intervals import symmetric
+from jaxbeam.numerics.finite_horizon import finite_horizon
+from jaxbeam.numerics.intervals import symmetric_part
 
-TURN = 3.0  # rad by which the fastest mode may turn within a stretch of a table
+MAX_PHASE_PER_INTERVAL = 3.0  # rad by which the fastest mode may turn within a stretch of a table
 
 Square = Float[Array, "state state"]
 
@@ -68,72 +68,83 @@ class Kalman(AbstractEstimator):
     points: int = count("stretches of the gain from event to event", default=400)
 
     @property
-    def flows(self) -> bool:
+    def continuous_time(self) -> bool:
         return True
 
-    def init(self, model):
-        if model.case.controller.period is None:
-            return self._flowing(model)
-        view, clock = sight(model), ticks(model.case.controller)
-        wide, intensity = view.model, self.intensity(view.model)
-        states, loads = intensity.shape[0], len(model.case.loads)
-        variance, scale = self.reading_variance(model), balance(wide.unloaded.A)
+    def init(self, plant):
+        if plant.case.controller.period is None:
+            return self._continuous(plant)
+        filtered, timing = filtered_plant(plant), sample_timing(plant.case.controller)
+        filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
+        states, loads = intensity.shape[0], len(plant.case.loads)
+        variance, scale = self.reading_variance(plant), balance(filtered_model.unloaded.A)
         if self.loads == "ignored":
-            plant = view.behind(wide.unloaded)
-            behind = chain(model, variance, clock, states, self.reach)
-            transition = behind.onward(lambda t: plant, intensity, scale)
-            C, D = behind.rows(plant.C, plant.D)
-            gain, _ = sampled_kalman_gain(transition.drift, C, transition.noise, behind.noise)
-            return at_rest(model, transition, C, D, gain)
-        behind = chain(model, variance, clock, states + loads, self.reach)
-        spread = jnp.zeros(loads)
+            system = filtered.with_filtered_outputs(filtered_model.unloaded)
+            sensors = sensor_chain(plant, variance, timing, states, self.reach)
+            transition = sensors.transition(lambda t: system, intensity, scale)
+            C, D = sensors.output_matrices(system.C, system.D)
+            gain, _ = sampled_kalman_gain(
+                transition.matrix, C, transition.noise_covariance, sensors.noise_covariance
+            )
+            return constant_gain_filter(plant, transition, C, D, gain)
+        sensors = sensor_chain(plant, variance, timing, states + loads, self.reach)
+        weight_variance = jnp.zeros(loads)
         if self.weight_deviation is not None:
-            spread = jnp.broadcast_to(self.weight_deviation**2, (loads,))
-        weights = jnp.zeros(behind.size).at[states : states + loads]
-        return Crossing(
-            view,
-            behind,
-            model.rig.states,
+            weight_variance = jnp.broadcast_to(self.weight_deviation**2, (loads,))
+        weight_states = jnp.zeros(sensors.state_count).at[states : states + loads]
+        return CrossingFilter(
+            filtered,
+            sensors,
+            plant.rig.states,
             jnp.append(scale, jnp.ones(loads)),
             jnp.pad(intensity, (0, loads)),
-            weights.set(model.weights),
-            jnp.diag(weights.set(spread)),
-            jnp.zeros(len(model.case.actuators)),
+            weight_states.set(plant.weights),
+            jnp.diag(weight_states.set(weight_variance)),
+            jnp.zeros(len(plant.case.actuators)),
         )
 
-    def _flowing(self, model: LoadedBeam) -> Flowing:
+    def _continuous(self, plant: LoadedBeam) -> ContinuousEstimator:
         """The filter at every instant."""
-        view, count = sight(model), len(model.case.sensors)
-        wide, intensity = view.model, self.intensity(view.model)
+        filtered, count = filtered_plant(plant), len(plant.case.sensors)
+        filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
         noise = jnp.diag(jnp.broadcast_to(self.measurement_intensity, (count,)))
-        states, loads = intensity.shape[0], len(model.case.loads)
-        offset, own = offsets(model), model.rig.states
+        states, loads = intensity.shape[0], len(plant.case.loads)
+        offset, plant_states = sensor_offsets(plant), plant.rig.states
         if self.loads == "ignored":
-            plant = view.behind(wide.unloaded)
-            gain, _ = kalman_gain(plant.A, plant.C, intensity, noise)
-            return Flowing(offset, jnp.zeros(states), own, still=plant, gain=gain)
-        spread, none = jnp.zeros(loads), jnp.zeros(states)
+            system = filtered.with_filtered_outputs(filtered_model.unloaded)
+            gain, _ = kalman_gain(system.A, system.C, intensity, noise)
+            return ContinuousEstimator(
+                offset, jnp.zeros(states), plant_states, unloaded=system, gain=gain
+            )
+        weight_variance, zero_state = jnp.zeros(loads), jnp.zeros(states)
         if self.weight_deviation is not None:
-            spread = jnp.broadcast_to(self.weight_deviation**2, (loads,))
-        end = model.case.run.duration
+            weight_variance = jnp.broadcast_to(self.weight_deviation**2, (loads,))
+        end = plant.case.run.duration
 
-        def dual(back):
+        def dual_system(back):
             """The plant a time (s) before the end, as that of a regulator with the same gain."""
-            plant = view.behind(wide.augmented(end - back))
+            plant = filtered.with_filtered_outputs(filtered_model.augmented(end - back))
             return plant.A.T, plant.C.T
 
-        windows = jnp.array([path.window() for path in wide.traffic.motions]).reshape(-1)
-        events = jnp.concatenate([jnp.zeros(1), jnp.clip(windows, 0.0, end), end[None]])
-        first, Q = jnp.diag(jnp.append(none, spread)), jnp.pad(intensity, (0, loads))
-        table = finite_time(dual, jnp.sort(end - events), self.points, Q, noise, first)[0]
-        return Flowing(
+        crossing_times = jnp.array(
+            [path.window() for path in filtered_model.traffic.motions]
+        ).reshape(-1)
+        events = jnp.concatenate([jnp.zeros(1), jnp.clip(crossing_times, 0.0, end), end[None]])
+        initial_covariance, Q = (
+            jnp.diag(jnp.append(zero_state, weight_variance)),
+            jnp.pad(intensity, (0, loads)),
+        )
+        table = finite_horizon(
+            dual_system, jnp.sort(end - events), self.points, Q, noise, initial_covariance
+        )[0]
+        return ContinuousEstimator(
             offset,
-            jnp.append(none, model.weights),
-            own,
-            view=view,
-            table=table,
+            jnp.append(zero_state, plant.weights),
+            plant_states,
+            filtered_plant=filtered,
+            gain_table=table,
             duration=end,
-            sought=self.loads == "estimated",
+            estimates_weights=self.loads == "estimated",
         )
 
     def step(self, memory, measurement, t):
@@ -146,21 +157,21 @@ class Kalman(AbstractEstimator):
         on_beam = memory.view.model.traffic.on_beam(t)
         return Estimate(memory.plant_state, jnp.where(on_beam, memory.weights, 0.0)), memory
 
-    def intensity(self, model: LoadedBeam) -> Square:
+    def noise_intensity(self, plant: LoadedBeam) -> Square:
         """Intensity of the white noise in the rates of the states."""
-        modes = model.scale.shape[0]
-        force = self.process_noise * model.scale**2
-        own = jnp.zeros(model.rig.states - 2 * modes)
-        return jnp.diag(jnp.concatenate([jnp.zeros(modes), force, own]))
+        modes = plant.scale.shape[0]
+        force = self.process_noise * plant.scale**2
+        actuator_intensity = jnp.zeros(plant.rig.states - 2 * modes)
+        return jnp.diag(jnp.concatenate([jnp.zeros(modes), force, actuator_intensity]))
 
-    def reading_variance(self, model: LoadedBeam) -> Float[Array, " sensor"]:
+    def reading_variance(self, plant: LoadedBeam) -> Float[Array, " sensor"]:
         """Variance of the noise of each reading."""
-        sensors = model.case.sensors
+        sensors = plant.case.sensors
         if self.measurement_noise is None:
             return jnp.stack([sensor.noise_covariance for sensor in sensors])
         return jnp.broadcast_to(self.measurement_noise**2, (len(sensors),))
 
-    def fault(self, case, plant):
+    def validate(self, case, system):
         if not case.sensors:
             return "kind needs sensors; add one"
         period = case.controller.period
@@ -175,96 +186,108 @@ class Kalman(AbstractEstimator):
         for i, sensor in enumerate(case.sensors):
             sampled = period is not None and sensor.delay is not None
             if sampled and is_known(sensor.delay) and is_known(period):
-                back = math.ceil(known(sensor.delay) / known(period) - ROUNDING)
-                if back > self.reach:
-                    return f"reach must be at least {back}, the periods of sensors.{i}.delay"
+                delay_periods = math.ceil(known(sensor.delay) / known(period) - PERIOD_ROUNDING)
+                if delay_periods > self.reach:
+                    return (
+                        f"reach must be at least {delay_periods}, the periods of sensors.{i}.delay"
+                    )
         if self.loads != "ignored" and not case.loads:
             return "loads must be 'ignored': there are none"
         if (self.loads == "estimated") != (self.weight_deviation is not None):
             return "weight_deviation and loads = 'estimated' belong together; give both or neither"
         sizes = {"measurement_noise": len(case.sensors), "weight_deviation": len(case.loads)}
         sizes["measurement_intensity"] = len(case.sensors)
-        if plant is not None:
-            sizes["process_noise"] = modes_of(plant)
+        if system is not None:
+            sizes["process_noise"] = mode_count(system)
         for name, size in sizes.items():
             value = getattr(self, name)
             if value is not None and value.shape not in ((), (size,)):
                 return f"{name} must be one number or {size}, not {value.shape[0]}"
-        if plant is None:
+        if system is None:
             return None
-        return unseen_fault(plant) or self._too_coarse(case, plant)
+        return observability_error(system) or self._points_error(case, system)
 
-    def _too_coarse(self, case, plant) -> str | None:
+    def _points_error(self, case, system) -> str | None:
         """Whether the fastest mode turns too far within a stretch of the gain's table."""
         if case.controller.period is not None or self.loads == "ignored":
             return None
-        modes = modes_of(plant)
-        fastest = np.max(np.abs(np.linalg.eigvals(known(plant.A)[: 2 * modes, : 2 * modes])))
-        needed = math.ceil(fastest * known(case.run.duration) / TURN)
-        if self.points >= needed:
+        modes = mode_count(system)
+        fastest_frequency = np.max(
+            np.abs(np.linalg.eigvals(known(system.A)[: 2 * modes, : 2 * modes]))
+        )
+        min_points = math.ceil(
+            fastest_frequency * known(case.run.duration) / MAX_PHASE_PER_INTERVAL
+        )
+        if self.points >= min_points:
             return None
-        return f"points must be at least {needed} for {modes} modes and a run so long"
+        return f"points must be at least {min_points} for {modes} modes and a run so long"
 
 
-class Prediction(NamedTuple):
+class OneStepPrediction(NamedTuple):
     """What is expected at a tick, before its readings are looked at, each with its covariance."""
 
     state: Float[Array, " state"]
     covariance: Square
     readings: Float[Array, " sensor"]
-    spread: Float[Array, "sensor sensor"]
+    innovation_covariance: Float[Array, "sensor sensor"]
     C: Float[Array, "sensor state"]
 
 
-class Crossing(eqx.Module):
+class CrossingFilter(eqx.Module):
     """Memory of a filter along a crossing.
 
-    The first `own` states are those of the plant; those of analogue filters follow, the weights of
-    the loads, and what else the sensors add (see `chain`). `scale` is the size of the states of the
-    plant with filters and weights, `intensity` that of the white noise in their rates.
+    The first `plant_states` states are those of the plant; those of analogue filters follow, the weights of
+    the loads, and what else the sensors add (see `sensor_chain`). `scale` is the size of the states of the
+    plant with filters and weights, `noise_intensity` that of the white noise in their rates.
     """
 
-    view: Sight
-    behind: Chain
-    own: int = eqx.field(static=True)
+    filtered: FilteredPlant
+    sensor_chain: SensorChain
+    plant_states: int = eqx.field(static=True)
     scale: Float[Array, " loaded"]
-    intensity: Float[Array, "loaded loaded"]
+    noise_intensity: Float[Array, "loaded loaded"]
     state: Float[Array, " state"]
     covariance: Square
     command: Float[Array, " actuator"]
 
     @property
-    def plant_state(self) -> Float[Array, " own"]:
+    def plant_state(self) -> Float[Array, " plant_states"]:
         """The states of the plant."""
-        return self.state[: self.own]
+        return self.state[: self.plant_states]
 
     @property
     def weights(self) -> Float[Array, " load"]:
         """The weights of the loads (N)."""
-        return self.state[self.view.model.rig.states : self.behind.plant]
+        return self.state[self.filtered.plant.rig.states : self.sensor_chain.plant_states]
 
-    def predicted(self, command: Float[Array, " actuator"], t: Float[Array, ""]) -> Prediction:
+    def predict(self, command: Float[Array, " actuator"], t: Float[Array, ""]) -> OneStepPrediction:
         """What is expected at the tick at t (s), the given command having acted until then."""
 
-        def plant(time):
-            return self.view.behind(self.view.model.augmented(time))
+        def system_at(time):
+            return self.filtered.with_filtered_outputs(self.filtered.plant.augmented(time))
 
-        transition = self.behind.onward(plant, self.intensity, self.scale, t)
-        state = transition.mean(self.state, self.command, command)
-        covariance = transition.covariance(self.covariance)
-        now = plant(t)
-        C, D = self.behind.rows(now.C, now.D)
-        readings = C @ state + D @ command + offsets(self.view.model)
-        return Prediction(state, covariance, readings, C @ covariance @ C.T + self.behind.noise, C)
+        transition = self.sensor_chain.transition(system_at, self.noise_intensity, self.scale, t)
+        state = transition.predict(self.state, self.command, command)
+        covariance = transition.predict_covariance(self.covariance)
+        system = system_at(t)
+        C, D = self.sensor_chain.output_matrices(system.C, system.D)
+        readings = C @ state + D @ command + sensor_offsets(self.filtered.plant)
+        return OneStepPrediction(
+            state,
+            covariance,
+            readings,
+            C @ covariance @ C.T + self.sensor_chain.noise_covariance,
+            C,
+        )
 
-    def corrected(self, measurement: Measurement, t: Float[Array, ""]) -> "Crossing":
+    def update(self, measurement: Measurement, t: Float[Array, ""]) -> "CrossingFilter":
         """The memory after the tick at t (s)."""
-        expected, noise = self.predicted(measurement.command, t), self.behind.noise
-        gain = filter_gain(expected.covariance, expected.C, noise)
-        state = expected.state + gain @ (measurement.readings - expected.readings)
+        prediction, noise = self.predict(measurement.command, t), self.sensor_chain.noise_covariance
+        gain = filter_gain(prediction.covariance, prediction.C, noise)
+        state = prediction.state + gain @ (measurement.readings - prediction.readings)
         # Joseph's form: symmetric and not negative, whatever the rounding.
-        left = jnp.eye(state.shape[0]) - gain @ expected.C
-        covariance = left @ expected.covariance @ left.T + gain @ noise @ gain.T
+        error_matrix = jnp.eye(state.shape[0]) - gain @ prediction.C
+        covariance = error_matrix @ prediction.covariance @ error_matrix.T + gain @ noise @ gain.T
         return dataclasses.replace(
-            self, state=state, covariance=symmetric(covariance), command=measurement.command
+            self, state=state, covariance=symmetric_part(covariance), command=measurement.command
         )

@@ -6,13 +6,17 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
 from jaxbeam.case.fields import POSITIVE, known, number
-from jaxbeam.estimation.constant_gain import FixedGain, at_rest, offsets
-from jaxbeam.estimation.continuous import Flowing
+from jaxbeam.estimation.constant_gain import (
+    ConstantGainFilter,
+    constant_gain_filter,
+    sensor_offsets,
+)
+from jaxbeam.estimation.continuous import ContinuousEstimator
 from jaxbeam.estimation.gains import placed_gain
-from jaxbeam.estimation.observability import modes_of, unseen_fault
-from jaxbeam.estimation.sampled_plant import Ticks, ticks
+from jaxbeam.estimation.observability import mode_count, observability_error
+from jaxbeam.estimation.sampled_plant import SampleTiming, sample_timing
 from jaxbeam.model.state_space import StateSpace
-from jaxbeam.numerics.discretisation import balance, hold
+from jaxbeam.numerics.discretisation import balance, c2d
 
 
 class Observer(AbstractEstimator):
@@ -33,45 +37,54 @@ class Observer(AbstractEstimator):
     )
 
     @property
-    def flows(self) -> bool:
+    def continuous_time(self) -> bool:
         return True
 
-    def init(self, model):
-        if model.case.controller.period is None:
-            plant, start = model.unloaded, jnp.zeros(model.rig.states)
-            gain = _placed(plant.A, plant.C, self.wanted(plant))
-            return Flowing(offsets(model), start, start.size, still=plant, gain=gain)
-        plant, clock = model.unloaded, ticks(model.case.controller)
-        still = jnp.zeros_like(plant.A)
-        transition = clock.transition(lambda t: (plant.A, plant.B), still, balance(plant.A))
-        gain = self.gain(plant, transition.drift, clock)
-        return at_rest(model, transition, plant.C, plant.D, gain)
+    def init(self, plant):
+        if plant.case.controller.period is None:
+            system, initial_state = plant.unloaded, jnp.zeros(plant.rig.states)
+            gain = _modal_placed_gain(system.A, system.C, self.desired_matrix(system))
+            return ContinuousEstimator(
+                sensor_offsets(plant), initial_state, initial_state.size, unloaded=system, gain=gain
+            )
+        system, timing = plant.unloaded, sample_timing(plant.case.controller)
+        no_noise = jnp.zeros_like(system.A)
+        transition = timing.transition(lambda t: (system.A, system.B), no_noise, balance(system.A))
+        gain = self.gain(system, transition.matrix, timing)
+        return constant_gain_filter(plant, transition, system.C, system.D, gain)
 
-    def step(self, memory: FixedGain, measurement, t):
-        memory = memory.corrected(measurement)
+    def step(self, memory: ConstantGainFilter, measurement, t):
+        memory = memory.update(measurement)
         return Estimate(memory.plant_state), memory
 
     def gain(
-        self, plant: StateSpace, drift: Float[Array, "state state"], clock: Ticks
+        self,
+        system: StateSpace,
+        transition_matrix: Float[Array, "state state"],
+        timing: SampleTiming,
     ) -> Float[Array, "state sensor"]:
-        """The gain for a plant whose state `drift` takes from tick to tick."""
-        wanted, _ = hold(self.wanted(plant), jnp.zeros((2 * modes_of(plant), 1)), clock.period)
-        return _placed(drift, plant.C @ drift, wanted)
+        """The gain for a plant whose state `transition_matrix` takes from tick to tick."""
+        desired, _ = c2d(
+            self.desired_matrix(system), jnp.zeros((2 * mode_count(system), 1)), timing.period
+        )
+        return _modal_placed_gain(transition_matrix, system.C @ transition_matrix, desired)
 
-    def wanted(self, plant: StateSpace) -> Float[Array, "modal modal"]:
+    def desired_matrix(self, system: StateSpace) -> Float[Array, "modal modal"]:
         """A state matrix (1/s) with the poles that are wanted for the error."""
-        modes = modes_of(plant)
+        modes = mode_count(system)
         if self.poles is None:
-            return self.speed * plant.A[: 2 * modes, : 2 * modes]
-        square, real = jnp.diag(jnp.sum(self.poles**2, axis=1)), jnp.diag(self.poles[:, 0])
-        return jnp.block([[jnp.zeros((modes, modes)), jnp.eye(modes)], [-square, 2 * real]])
+            return self.speed * system.A[: 2 * modes, : 2 * modes]
+        stiffness, real_parts = jnp.diag(jnp.sum(self.poles**2, axis=1)), jnp.diag(self.poles[:, 0])
+        return jnp.block(
+            [[jnp.zeros((modes, modes)), jnp.eye(modes)], [-stiffness, 2 * real_parts]]
+        )
 
-    def fault(self, case, plant):
+    def validate(self, case, system):
         if (self.poles is None) == (self.speed is None):
             return "poles or speed must be given, and not both"
-        if plant is None:
+        if system is None:
             return None
-        modes = modes_of(plant)
+        modes = mode_count(system)
         if self.poles is not None and self.poles.shape[0] != modes:
             return f"poles must list a pair for each of {modes} modes, not {self.poles.shape[0]}"
         if self.poles is not None and np.any(known(self.poles)[:, 0] >= 0):
@@ -79,14 +92,14 @@ class Observer(AbstractEstimator):
         if self.speed is not None and known(self.speed) <= 1:
             return "speed must be above 1"
         if self.speed is not None:
-            poles = np.linalg.eigvals(known(plant.A)[: 2 * modes, : 2 * modes])
+            poles = np.linalg.eigvals(known(system.A)[: 2 * modes, : 2 * modes])
             if np.max(poles.real) > -1e-9 * np.max(np.abs(poles)):
                 return "speed must not be used on a beam without damping; give poles instead"
-        return unseen_fault(plant)
+        return observability_error(system)
 
 
-def _placed(A, C, wanted) -> Float[Array, "state sensor"]:
+def _modal_placed_gain(A, C, desired) -> Float[Array, "state sensor"]:
     """The gain with which the states of the beam, the first ones, have a wanted state matrix."""
-    modal = wanted.shape[0]
-    gain = placed_gain(A[:modal, :modal], C[:, :modal], wanted)
+    modal = desired.shape[0]
+    gain = placed_gain(A[:modal, :modal], C[:, :modal], desired)
     return jnp.zeros((A.shape[0], C.shape[0])).at[:modal].set(gain)

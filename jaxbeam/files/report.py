@@ -147,6 +147,5 @@ def _html_table(table: ReportTable) -> str:
         return f"<tr>{''.join(inner)}</tr>"
 
     header = line("th", table.header, lambda cell: None)
-    return (
-        f"<table>{header}{''.join(line('td', row, table.cell_class) for row in table.rows)}</table>"
-    )
+    rows = "".join(line("td", row, table.cell_class) for row in table.rows)
+    return f"<table>{header}{rows}</table>"

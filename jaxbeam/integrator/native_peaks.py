@@ -24,12 +24,19 @@ from jaxbeam.integrator.step_matrices import CHUNK, make_rigging
 from jaxbeam.integrator.time_grid import Grid
 from jaxbeam.model.contact import Traffic
 from jaxbeam.model.modal_model import Rig
-from jaxbeam.numerics.peak_search import CLIMBS, ROUNDINGS, STARTS, VERTEX_ROUNDS, reach, through
+from jaxbeam.numerics.peak_search import (
+    ESTIMATE_ITERATIONS,
+    NEWTON_ITERATIONS,
+    START_POINTS,
+    TIE_ROUNDING_UNITS,
+    interpolation_matrix,
+    newton_step_limit,
+)
 from jaxbeam.runtime.native_library import Library
 
-FILL = 8  # numbers that fill whole vector registers of any machine
-CONSTANTS = {
-    "FILL": FILL,
+PADDING = 8  # numbers that fill whole vector registers of any machine
+C_CONSTANTS = {
+    "FILL": PADDING,
     "STEPS": CHUNK,
     "NODES": NODES,
     "TERMS": TERMS,
@@ -37,25 +44,25 @@ CONSTANTS = {
     "POINTS": len(LOOKED),
     "NEAR": NEAR,
     "BESIDE_END": (NEAR - 1) * float(np.diff(LOOKED)[0] / np.diff(LOOKED).max()) ** 2,
-    "REACH": reach(LOOKED),
-    "ROUNDS": VERTEX_ROUNDS,
-    "STARTS": STARTS,
-    "CLIMBS": CLIMBS,
-    "SLACK": ROUNDINGS * sys.float_info.epsilon,
+    "REACH": newton_step_limit(LOOKED),
+    "ROUNDS": ESTIMATE_ITERATIONS,
+    "STARTS": START_POINTS,
+    "CLIMBS": NEWTON_ITERATIONS,
+    "SLACK": TIE_ROUNDING_UNITS * sys.float_info.epsilon,
 }
-PARTS = ("exponentials", "lanes", "matrices", "path", "peaks", "steps", "tables", "work")
+HEADERS = ("exponentials", "lanes", "matrices", "path", "peaks", "steps", "tables", "work")
 LIBRARY = Library(
     name="native",
     sources=("native.c",),
-    headers=tuple(f"native_{part}.h" for part in PARTS),
-    constants=tuple(CONSTANTS.items()),
+    headers=tuple(f"native_{part}.h" for part in HEADERS),
+    constants=tuple(C_CONSTANTS.items()),
     targets=("march",),
 )
 
 
-def binary() -> pathlib.Path:
+def library_path() -> pathlib.Path:
     """Where the compiled C is, or would be: a file for this source, this machine and this JAX."""
-    return LIBRARY.binary()
+    return LIBRARY.library_path()
 
 
 def build() -> pathlib.Path:
@@ -72,70 +79,78 @@ def remove() -> None:
     LIBRARY.remove()
 
 
-def serves(case: Case) -> bool:
+def supports(case: Case) -> bool:
     """Whether steps of this case, if its peaks are swept, are those in C."""
-    return case.controller is None and ready()
+    return case.controller is None and available()
 
 
-def ready() -> bool:
+def available() -> bool:
     """Whether the C is compiled for this machine, and of use: computing on a CPU."""
-    return LIBRARY.ready()
+    return LIBRARY.available()
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 @jax.named_scope("native")
-def march(
-    slots: int,
-    wanted: Bool[Array, " task"],
-    rigs: Rig,
+def integrate_peaks(
+    max_loads: int,
+    mask: Bool[Array, " task"],
+    models: Rig,
     grids: Grid,
-    watched: Float[Array, "task place"],
-    traffic: Traffic,
+    positions: Float[Array, "task place"],
+    loads: Traffic,
 ) -> Found:
-    """What is found of tasks that C integrates one after the other, if it is `ready`.
+    """What is found of tasks that C integrates one after the other, if it is `available`.
 
     All have tasks as the first axis; a single rig is that of all. Grids are those of `even_grid`,
-    `watched` the places (m) at which peaks are looked for, on both sides of the beam; `slots` is
+    `positions` the places (m) at which peaks are looked for, on both sides of the beam; `max_loads` is
     how many loads may be on the beam at once. No driver, double precision. Tasks that are not
     wanted come out as at rest.
     """
-    shapes = rigs.modes.series
-    if rigs.mixing is not None:
-        shapes = shapes @ rigs.mixing[:, None]
-    numbers = np.asarray(GAUSS), lagrange(), through(LOOKED)[: len(LOOKED)].T, np.asarray(LOOKED)
-    given = (
-        *(wanted, rigs.state_matrix, rigs.modes.nodes, shapes),
+    shapes = models.modes.series
+    if models.mixing is not None:
+        shapes = shapes @ models.mixing[:, None]
+    numbers = (
+        np.asarray(GAUSS),
+        lagrange(),
+        interpolation_matrix(LOOKED)[: len(LOOKED)].T,
+        np.asarray(LOOKED),
+    )
+    arguments = (
+        *(mask, models.state_matrix, models.modes.nodes, shapes),
         *(grids.edges, grids.counts, grids.lengths, grids.active, grids.windows),
-        *(*jax.vmap(Traffic.pieces)(traffic), traffic.inertia, traffic.weight, watched),
+        *(*jax.vmap(Traffic.pieces)(loads), loads.inertia, loads.weight, positions),
         *(part[None] for part in numbers),
     )
-    tasks, loads, lanes = traffic.inertia.shape
-    places, modes = watched.shape[1], shapes.shape[-1]
-    blocks, side = rigs.state_matrix.shape[1:3]
-    beam = grids.counts.shape[1], blocks, side, modes // blocks, *shapes.shape[1:3]
-    sizes = *beam, slots, loads, places, lanes
-    room = LIBRARY.loaded().march_room
-    room.restype, room.argtypes = ctypes.c_int64, [ctypes.c_int64] * len(sizes)
-    results = [(tasks, lanes, count) for count in (places, places, loads, loads)]
+    tasks, load_count, batch_size = loads.inertia.shape
+    position_count, modes = positions.shape[1], shapes.shape[-1]
+    blocks, block_size = models.state_matrix.shape[1:3]
+    beam = grids.counts.shape[1], blocks, block_size, modes // blocks, *shapes.shape[1:3]
+    sizes = *beam, max_loads, load_count, position_count, batch_size
+    workspace_size = LIBRARY.load().march_room
+    workspace_size.restype, workspace_size.argtypes = ctypes.c_int64, [ctypes.c_int64] * len(sizes)
+    results = [
+        (tasks, batch_size, count)
+        for count in (position_count, position_count, load_count, load_count)
+    ]
     call = jax.ffi.ffi_call(
-        LIBRARY.target("march"),
-        [jax.ShapeDtypeStruct(shape, float) for shape in (*results, (room(*sizes),))],
+        LIBRARY.ffi_name("march"),
+        [jax.ShapeDtypeStruct(shape, float) for shape in (*results, (workspace_size(*sizes),))],
         vmap_method="sequential",
     )
-    return Found(*call(*given, slots=np.int64(slots))[:-1])
+    return Found(*call(*arguments, slots=np.int64(max_loads))[:-1])
 
 
-@march.defjvp
-def _march_jvp(slots, given, changes):
+@integrate_peaks.defjvp
+def _integrate_peaks_jvp(max_loads, primals, tangents):
     """C is not differentiated, but what it stands for."""
 
-    def plain(wanted, rigs, *rest):
-        def task(rig, grid, watched, traffic):
-            rigging = make_rigging(rig, grid, watched)
-            return plain_march(rigging, traffic, slots=slots)[0].found()
+    def jax_peaks(mask, models, *rest):
+        def task(model, grid, positions, loads):
+            discrete_model = make_rigging(model, grid, positions)
+            return plain_march(discrete_model, loads, slots=max_loads)[0].found()
 
-        tasks = wanted.shape[0]
-        rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape[1:])), rigs)
-        return jax.vmap(task)(rigs, *rest)
+        tasks = mask.shape[0]
+        models = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape[1:])), models)
+        return jax.vmap(task)(models, *rest)
 
-    return jax.jvp(plain, given, changes)
+    return jax.jvp(jax_peaks, primals, tangents)

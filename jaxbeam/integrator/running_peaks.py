@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.integrator.propagators import GAUSS, LOOKED
 from jaxbeam.integrator.step_matrices import Path, Tables
-from jaxbeam.numerics.peak_search import highest, refine, vertex
+from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
 
 NEAR = 1.1  # a peak between samples is less than this above the highest of them
 
@@ -48,7 +48,7 @@ class Extremes(eqx.Module):
 
     def peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
         """Largest size of deflection (m) of each watched place, and when (s); NaN if not sound."""
-        value, place = refine(self.samples, LOOKED, self.size)
+        value, place = refine_peak(self.samples, LOOKED, self.size)
         time = self.start + place * self.span
         return jnp.where(self.sound, value, jnp.nan), jnp.where(self.sound, time, jnp.nan)
 
@@ -69,9 +69,9 @@ def fold(best: Extremes, tables: Tables, path: Path, states, forces, commands) -
 
     def raised(best):
         score = jax.lax.optimization_barrier(
-            jax.vmap(lambda step: vertex(step, LOOKED, best.size))(samples)
+            jax.vmap(lambda step: estimate_peak(step, LOOKED, best.size))(samples)
         )
-        best_score, top = highest(score)
+        best_score, top = max_with_ties(score)
         top = jnp.max(jnp.where(top, np.arange(steps)[:, None, None], 0), axis=0)
         better = best_score > best.score
         chosen = jnp.take_along_axis(samples, top[None, None], axis=0)[0]

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.integrator.step_matrices import Tables
 from jaxbeam.model.contact import solve_contact
-from jaxbeam.numerics.batched_linalg import FEW, product, solve_small
+from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_small
 
 KEPT = "steps"  # states and forces in rows of steps, which reverse mode need not work out again
 
@@ -23,7 +23,7 @@ def contact(tables: Tables, inertia, weight, state, commands):
     """Contact forces (row, lane) of a step from this state under these commands, if any."""
 
     def pressed():
-        felt = product(tables.respond, state)
+        felt = matvec(tables.respond, state)
         if commands is not None:
             felt = felt + tables.commands.respond @ commands
         return solve_contact(tables.gains, inertia, weight + inertia * felt)
@@ -37,7 +37,7 @@ def advance(state, step):
     """One step of all lanes: the contact forces at the nodes, and the state at the end."""
     tables, inertia, weight, commands = step
     forces = contact(tables, inertia, weight, state, commands)
-    after = drifted(tables.drift, state) + product(tables.push, forces)
+    after = drifted(tables.drift, state) + matvec(tables.push, forces)
     if commands is not None:
         after = after + tables.commands.push @ commands
     return after, (state, forces)
@@ -86,7 +86,7 @@ def _undriven_jvp(given, changes):
 
     def step(change, parts):
         respond, drift, back, rest = parts
-        seen = product(respond, change)
+        seen = matvec(respond, change)
         return drifted(drift, change) + rest - jnp.sum(back * seen, axis=1), change
 
     parts = tables.respond, tables.drift, back, rest
@@ -96,7 +96,7 @@ def _undriven_jvp(given, changes):
 
 
 def _each(matrix: Float[Array, "step row column"], lanes: Float[Array, "step column lane"]):
-    return _sum(matrix[..., None], lanes) if max(matrix.shape[1:]) <= FEW else matrix @ lanes
+    return _sum(matrix[..., None], lanes) if max(matrix.shape[1:]) <= MAX_UNROLLED_TERMS else matrix @ lanes
 
 
 def _sum(matrix, lanes: Float[Array, "step column lane"]):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, assemble, section, supported
-from jaxbeam.numerics.piecewise import piecewise
+from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.runtime.compiling import compiled
 
 SOFTEST = 1e-10  # stiffness against rigid-body motion in E I / L^3: less is an unstable beam
@@ -53,7 +53,7 @@ class Compliance(eqx.Module):
     ) -> Float[Array, "*place source"]:
         """Deflection at positions y under each source, or its derivative by y."""
         between = _bending(self.nodes, self.rigidity, y, derivative, self.points)
-        of_nodes = piecewise(self.nodes, self.series, y, (derivative,))[0]
+        of_nodes = piecewise_chebyshev(self.nodes, self.series, y, (derivative,))[0]
         return of_nodes + between @ self.amounts
 
 
@@ -111,7 +111,7 @@ def compliance(case: Case, layout: Layout, x: Float[Array, " place"], order: int
         """Rows (point, unknown) of nodal forces."""
         rows = jnp.zeros((len(points.derivatives), stiffness.shape[0]))
         for derivative, index in points.groups():
-            there = piecewise(nodes, expand, points.places[index], (derivative,))[0]
+            there = piecewise_chebyshev(nodes, expand, points.places[index], (derivative,))[0]
             rows = rows.at[index].set(there)
         return rows
 

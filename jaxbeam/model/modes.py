@@ -21,8 +21,8 @@ from numpy.polynomial import legendre
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
-from jaxbeam.numerics.eigen import SAME_EIGENVALUE, eigen
-from jaxbeam.numerics.piecewise import piecewise, to_chebyshev
+from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
+from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
 
 SAME_PLACE = 1e-9  # of the length: closer nodes are one node
 HELD = {  # deflection, rotation
@@ -115,7 +115,7 @@ def _element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     mass = basis.T @ (weights[:, None] * basis)
     curvature = legendre.legder(basis, 2)
     bending = curvature.T @ (weights[: degree - 1, None] * curvature)
-    return to_chebyshev(degree + 1) @ basis, mass, bending
+    return legendre_to_chebyshev(degree + 1) @ basis, mass, bending
 
 
 class Modes(eqx.Module):
@@ -161,7 +161,7 @@ class Modes(eqx.Module):
     def repeated(self) -> Bool[Array, ""]:
         """Whether any two of the modes have (nearly) the same frequency."""
         low, high = self.stiffness[:-1], self.stiffness[1:]
-        return jnp.any(high - low <= SAME_EIGENVALUE * (self.unit + low + high))
+        return jnp.any(high - low <= REPEATED_EIGENVALUE_TOLERANCE * (self.unit + low + high))
 
     @property
     def damping_ratios(self) -> Float[Array, " mode"]:
@@ -180,7 +180,7 @@ class Modes(eqx.Module):
 
     def shapes_together(self, x, derivatives: tuple[int, ...]) -> Float[Array, "order *place mode"]:
         """Several derivatives of the mode shapes at once, which costs little more than one."""
-        return piecewise(self.nodes, self.series, x, derivatives)
+        return piecewise_chebyshev(self.nodes, self.series, x, derivatives)
 
 
 def _root(square):
@@ -211,7 +211,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
 def oriented(beam, values, coupling, nodes, series) -> Modes:
     """Modes of given stiffness (1/s^2), damped as the beam says, positive near the left end."""
     damping, damping_coupling = _damping(beam, values, coupling)
-    near_left = piecewise(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
+    near_left = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
     signs = jax.lax.stop_gradient(jnp.where(near_left < 0, -1.0, 1.0))
     swap = signs[:, None] * signs[None, :]
     return Modes(

@@ -24,7 +24,7 @@ from jaxbeam.case.filters import (
     sections as filter_sections,
 )
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.numerics.discretisation import cubics, evaluate, hold
+from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
 
 ROUNDING = 1e-6  # of a period: a sample this much before a tick of the clock is at the tick
 
@@ -121,7 +121,7 @@ def sense(
     seen = values
     if sensor.sampling_period is not None or sensor.delay is not None:
         late = ticks if sensor.delay is None else ticks - sensor.delay
-        seen = evaluate(times, cubics(times, values, rates), late)
+        seen = evaluate_cubics(times, hermite_cubics(times, values, rates), late)
     readings = convert(sensor, seen, noise)
     sections = design(sensor, spacing)
     if sections is None:
@@ -132,8 +132,8 @@ def sense(
 def _smooth(filter: Filter, times, spacing, values, rates):
     """Output of an analogue filter and its rate, at equally spaced times."""
     matrix, column, row, _ = analogue(filter)
-    drift, push = hold(matrix, column[:, None], spacing, degree=3)
-    driven = cubics(times, values, rates) @ push[..., 0]
+    drift, push = c2d(matrix, column[:, None], spacing, degree=3)
+    driven = hermite_cubics(times, values, rates) @ push[..., 0]
 
     def step(state, drive) -> Any:
         after = drift @ state + drive

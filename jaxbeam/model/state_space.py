@@ -24,7 +24,7 @@ from jaxbeam.model.contact import Traffic, contact_rows, traffic
 from jaxbeam.model.modal_model import Rig, rig_in_one
 from jaxbeam.model.modes import Layout
 from jaxbeam.numerics.batched_linalg import solve_small
-from jaxbeam.numerics.discretisation import hold
+from jaxbeam.numerics.discretisation import c2d
 from jaxbeam.runtime.compiling import compiled
 
 
@@ -57,7 +57,7 @@ class StateSpace(eqx.Module):
         """
         if self.period is not None:
             raise ValueError("the system is in discrete time already; take the continuous one")
-        drift, push = hold(self.A, self.B, period)
+        drift, push = c2d(self.A, self.B, period)
         parts = self.states, self.inputs, self.outputs
         return StateSpace(drift, push[0], self.C, self.D, *parts, jnp.asarray(period, float))
 

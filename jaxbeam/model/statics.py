@@ -15,7 +15,7 @@ from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check
 from jaxbeam.model.flexibility import check_held, compliance
 from jaxbeam.model.modes import Layout, lay_out
-from jaxbeam.numerics.peak_search import refine
+from jaxbeam.numerics.peak_search import refine_peak
 from jaxbeam.runtime.compiling import compiled
 
 # On a stretch of a crossing: a cubic of a cubic is known exactly by ten.
@@ -145,7 +145,7 @@ def _peak(case: Case, layout: Layout, x):
         place = jnp.clip(path.travel(times)[0] / length, 0.0, 1.0)
         pressed = load.weight(case.run.gravity) * active[:, None] * found(place)
         total = total + pressed
-    highest = jnp.max(refine(total, POINTS)[0], axis=0)
+    highest = jnp.max(refine_peak(total, POINTS)[0], axis=0)
     return (highest * length**3 / case.beam.rigidity).reshape(x.shape)
 
 

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-FEW = 12  # terms; XLA calls a library for products, which takes as long as adding these
+MAX_UNROLLED_TERMS = (
+    12  # terms; XLA calls a library for products, which takes as long as adding these
+)
 
 
 def solve_small(
@@ -23,30 +25,37 @@ def solve_small(
     No pivots are sought: for matrices that are positive, or the identity plus masses times a
     positive matrix. Linear in the right side, so that it can be transposed.
     """
-    return right if matrix.shape[0] == 0 else _solve(matrix, right)[0]
+    return right if matrix.shape[0] == 0 else _block_eliminate(matrix, right)[0]
 
 
-def _solve(matrix, *rights):
+def _block_eliminate(matrix, *rights):
     size = matrix.shape[0]
     if size <= 3:
-        inverse = _inverse(matrix)
-        return tuple(_times(inverse, right) for right in rights)
+        inverse = _cofactor_inverse(matrix)
+        return tuple(_unrolled_matmul(inverse, right) for right in rights)
     half = size // 2
-    tops = [matrix[:half, half:], *(right[:half] for right in rights)]
-    across, *upper = _solve(matrix[:half, :half], *tops)
-    below = matrix[half:, :half]
-    rests = [right[half:] - _times(below, top) for right, top in zip(rights, upper, strict=True)]
-    lower = _solve(matrix[half:, half:] - _times(below, across), *rests)
-    pairs = zip(upper, lower, strict=True)
-    return tuple(jnp.concatenate([top - _times(across, end), end]) for top, end in pairs)
+    upper_right_sides = [matrix[:half, half:], *(right[:half] for right in rights)]
+    upper_coupling, *upper_solutions = _block_eliminate(matrix[:half, :half], *upper_right_sides)
+    lower_coupling = matrix[half:, :half]
+    lower_right_sides = [
+        right[half:] - _unrolled_matmul(lower_coupling, top)
+        for right, top in zip(rights, upper_solutions, strict=True)
+    ]
+    lower_solutions = _block_eliminate(
+        matrix[half:, half:] - _unrolled_matmul(lower_coupling, upper_coupling), *lower_right_sides
+    )
+    pairs = zip(upper_solutions, lower_solutions, strict=True)
+    return tuple(
+        jnp.concatenate([top - _unrolled_matmul(upper_coupling, end), end]) for top, end in pairs
+    )
 
 
-def _times(a, b):
+def _unrolled_matmul(a, b):
     """Product of small matrices (row, row, lane), spelt out."""
     return sum(a[:, k, None] * b[k] for k in range(1, b.shape[0])) + a[:, 0, None] * b[0]
 
 
-def _inverse(matrix):
+def _cofactor_inverse(matrix):
     """Inverse of up to three rows, by cofactors."""
     size = matrix.shape[0]
     if size == 1:
@@ -66,16 +75,16 @@ def _inverse(matrix):
     return adjugate / jnp.sum(matrix[0] * adjugate[:, 0], axis=0)
 
 
-def product(
-    matrix: Float[Array, "row column"], lanes: Float[Array, "column lane"]
+def matvec(
+    matrix: Float[Array, "row column"], vectors: Float[Array, "column lane"]
 ) -> Float[Array, "row lane"]:
     """Product of a matrix with many columns, spelt out where few terms are added."""
-    if not 0 < lanes.shape[0] <= FEW:
-        return matrix @ lanes
-    return _times(matrix[..., None], lanes[:, None])[:, 0]
+    if not 0 < vectors.shape[0] <= MAX_UNROLLED_TERMS:
+        return matrix @ vectors
+    return _unrolled_matmul(matrix[..., None], vectors[:, None])[:, 0]
 
 
-def solve_any(
+def solve_unpivoted(
     matrix: Float[Array, "row row"], right: Float[Array, "row column"]
 ) -> Float[Array, "row column"]:
     """Solve a system of any size; under `vmap` many at a time, with the systems as the last axis.
@@ -87,28 +96,28 @@ def solve_any(
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x,
         right,
-        lambda _, b: _eliminated(matrix, b),
-        lambda _, b: _eliminated(matrix.T, b),
+        lambda _, b: _gauss_jordan(matrix, b),
+        lambda _, b: _gauss_jordan(matrix.T, b),
     )
 
 
 @jax.custom_batching.custom_vmap
-def _eliminated(matrix, right):
+def _gauss_jordan(matrix, right):
     """Gauss and Jordan's elimination of systems (row, column, *lane)."""
     size = matrix.shape[0]
     rows = np.arange(size).reshape(-1, *[1] * (matrix.ndim - 1))
 
-    def step(k, both):
-        row = jax.lax.dynamic_index_in_dim(both, k, 0, keepdims=False)
+    def step(k, augmented_matrix):
+        row = jax.lax.dynamic_index_in_dim(augmented_matrix, k, 0, keepdims=False)
         row = row / jax.lax.dynamic_index_in_dim(row, k, 0)
-        column = jax.lax.dynamic_index_in_dim(both, k, 1)
-        return jnp.where(rows == k, row, both - column * row)
+        column = jax.lax.dynamic_index_in_dim(augmented_matrix, k, 1)
+        return jnp.where(rows == k, row, augmented_matrix - column * row)
 
-    both = jnp.concatenate([matrix, right], axis=1)
-    return jax.lax.fori_loop(0, size, step, both)[:, size:]
+    augmented_matrix = jnp.concatenate([matrix, right], axis=1)
+    return jax.lax.fori_loop(0, size, step, augmented_matrix)[:, size:]
 
 
-@_eliminated.def_vmap
+@_gauss_jordan.def_vmap
 def _(count, batched, *systems):
     lanes = [
         jnp.moveaxis(part, 0, -1)
@@ -116,10 +125,10 @@ def _(count, batched, *systems):
         else jnp.broadcast_to(part[..., None], (*part.shape, count))
         for part, has in zip(systems, batched, strict=True)
     ]
-    return jnp.moveaxis(_eliminated(*lanes), -1, 0), True
+    return jnp.moveaxis(_gauss_jordan(*lanes), -1, 0), True
 
 
-def times(
+def matmul(
     a: Float[Array, "row term _"], b: Float[Array, "term column _"]
 ) -> Float[Array, "row column lane"]:
     """Products, spelt out where few terms are added, else by a library."""
@@ -127,60 +136,66 @@ def times(
         return jnp.tensordot(a[..., 0], b, 1)
     if b.shape[2] == 1:
         return jnp.moveaxis(jnp.tensordot(a, b[..., 0], ((1,), (0,))), -1, 1)
-    return _times(a, b) if b.shape[0] <= FEW else jnp.einsum("ik...,kj...->ij...", a, b)
+    return (
+        _unrolled_matmul(a, b)
+        if b.shape[0] <= MAX_UNROLLED_TERMS
+        else jnp.einsum("ik...,kj...->ij...", a, b)
+    )
 
 
-def turned(matrix: Float[Array, "row column lane"]) -> Float[Array, "column row lane"]:
+def transpose(matrix: Float[Array, "row column lane"]) -> Float[Array, "column row lane"]:
     """The transposes."""
     return jnp.swapaxes(matrix, 0, 1)
 
 
-def joined(*parts: Float[Array, "row _ _"]) -> Float[Array, "row column lane"]:
+def hstack(*parts: Float[Array, "row _ _"]) -> Float[Array, "row column lane"]:
     """Matrices side by side."""
-    lanes = lanes_of(parts)
+    batch_size = batch_size_of(parts)
     return jnp.concatenate(
-        [jnp.broadcast_to(part, (*part.shape[:2], lanes)) for part in parts], axis=1
+        [jnp.broadcast_to(part, (*part.shape[:2], batch_size)) for part in parts], axis=1
     )
 
 
-def solve_lanes(
+def solve_batch(
     matrix: Float[Array, "row row _"], right: Float[Array, "row column _"]
 ) -> Float[Array, "row column lane"]:
-    """As `solve_any`, with the systems as the last axis."""
-    lanes = lanes_of(matrix, right)
-    matrix, right = (jnp.broadcast_to(x, (*x.shape[:2], lanes)) for x in (matrix, right))
+    """As `solve_unpivoted`, with the systems as the last axis."""
+    batch_size = batch_size_of(matrix, right)
+    matrix, right = (jnp.broadcast_to(x, (*x.shape[:2], batch_size)) for x in (matrix, right))
     return jax.lax.custom_linear_solve(
-        lambda x: _times(matrix, x),
+        lambda x: _unrolled_matmul(matrix, x),
         right,
-        lambda _, b: _eliminated(matrix, b),
-        lambda _, b: _eliminated(turned(matrix), b),
+        lambda _, b: _gauss_jordan(matrix, b),
+        lambda _, b: _gauss_jordan(transpose(matrix), b),
     )
 
 
-def lanes_of(*args: Any) -> int:
+def batch_size_of(*args: Any) -> int:
     """How many lanes there are."""
     return max(part.shape[-1] for part in jax.tree.leaves(eqx.filter(args, eqx.is_array)))
 
 
-def each_lane(function: Callable, *args: Any) -> Any:
+def vmap_last_axis(function: Callable, *args: Any) -> Any:
     """What a function of arrays without lanes returns for each lane of these.
 
-    What lanes share has a last axis of length one, here and in `in_lanes`.
+    What lanes share has a last axis of length one, here and in `batch_axis_last`.
     """
     arrays, rest = eqx.partition(args, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
     axes = [None if leaf.shape[-1] == 1 else -1 for leaf in leaves]
-    bare = [leaf[..., 0] if axis is None else leaf for leaf, axis in zip(leaves, axes, strict=True)]
+    unbatched = [
+        leaf[..., 0] if axis is None else leaf for leaf, axis in zip(leaves, axes, strict=True)
+    ]
 
-    def alone(*given):
+    def unbatched_function(*given):
         return function(*eqx.combine(jax.tree.unflatten(structure, given), rest))
 
     if set(axes) <= {None}:
-        return jax.tree.map(lambda part: part[..., None], alone(*bare))
-    return jax.vmap(alone, axes, -1)(*bare)
+        return jax.tree.map(lambda part: part[..., None], unbatched_function(*unbatched))
+    return jax.vmap(unbatched_function, axes, -1)(*unbatched)
 
 
-def in_lanes(function: Callable, *args: Any) -> Any:
+def batch_axis_last(function: Callable, *args: Any) -> Any:
     """Call a function of trees of arrays (..., lane) with arrays that have no lanes.
 
     Under `vmap` what is mapped is the lanes: matrices are small, so what is done for an element of
@@ -188,16 +203,16 @@ def in_lanes(function: Callable, *args: Any) -> Any:
     """
     arrays, rest = eqx.partition(args, eqx.is_array)
 
-    def laid(lanes):
+    def call(lanes):
         return function(*eqx.combine(lanes, rest))
 
-    def alone(given):
-        found = laid(jax.tree.map(lambda part: part[..., None], given))
+    def unbatched_function(given):
+        found = call(jax.tree.map(lambda part: part[..., None], given))
         return jax.tree.map(lambda part: part[..., 0], found)
 
-    many = jax.custom_batching.custom_vmap(alone)
+    mapped_function = jax.custom_batching.custom_vmap(unbatched_function)
 
-    @many.def_vmap
+    @mapped_function.def_vmap
     def _(count, mapped, given):
         def last(part, has):
             return jnp.moveaxis(part, 0, -1) if has else part[..., None]
@@ -205,9 +220,9 @@ def in_lanes(function: Callable, *args: Any) -> Any:
         def first(part):
             return jnp.moveaxis(jnp.broadcast_to(part, (*part.shape[:-1], count)), -1, 0)
 
-        found = jax.tree.map(first, laid(jax.tree.map(last, given, *mapped)))
+        found = jax.tree.map(first, call(jax.tree.map(last, given, *mapped)))
         return found, jax.tree.map(lambda _: True, found)
 
-    whole = jax.custom_jvp(lambda given: many(given))
-    whole.defjvp(lambda given, rates: jax.jvp(alone, given, rates))
-    return whole(arrays)
+    differentiable_function = jax.custom_jvp(lambda given: mapped_function(given))
+    differentiable_function.defjvp(lambda given, rates: jax.jvp(unbatched_function, given, rates))
+    return differentiable_function(arrays)

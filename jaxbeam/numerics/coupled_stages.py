@@ -4,7 +4,7 @@
 
 A, B and E, the directions in which forces act, are constant; f are a few numbers, as the contact
 forces. Within a stretch F f and u are polynomials through their values at the Gauss nodes, to which
-the constant part answers exactly, with its cost (`answers`); demanding the law of f at the nodes
+the constant part answers exactly, with its cost (`stage_responses`); demanding the law of f at the nodes
 leaves one small linear system a stretch. So what bounds the length of a stretch is not how fast
 the constant part is, but how fast f and the wanted u change; in a plant with lags much faster than
 that, u is no polynomial, and `flows` are right with longer stretches.
@@ -20,44 +20,46 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbeam.numerics.batched_linalg import solve_any
-from jaxbeam.numerics.intervals import Commands, Inputs, Square, transposed
-from jaxbeam.numerics.stages import NODES, STAGES, Flow, on_commands
+from jaxbeam.numerics.batched_linalg import solve_unpivoted
+from jaxbeam.numerics.intervals import InputMatrix, InputWeight, Square, matrix_transpose
+from jaxbeam.numerics.stages import GAUSS_NODES, NODE_COUNT, Stage, command_cost_matrix
 
-TERMS = 12  # of the series for the shortest stretches
+TAYLOR_TERMS = 12  # of the series for the shortest stretches
 
 
-class Plant(eqx.Module):
+class ConstantPlant(eqx.Module):
     """The constant part of a plant; see the module."""
 
     A: Square
-    B: Inputs
+    B: InputMatrix
     E: Float[Array, "state direction"]
 
 
 class Coupling(eqx.Module):
     """What changes in time; see the module: F, V, S and D."""
 
-    shape: Float[Array, "*time direction force"]
-    rows: Float[Array, "*time force state"]
-    direct: Float[Array, "*time force input"]
-    back: Float[Array, "*time force force"]
+    force_distribution: Float[Array, "*time direction force"]
+    force_state_rows: Float[Array, "*time force state"]
+    command_feedthrough: Float[Array, "*time force input"]
+    force_feedthrough: Float[Array, "*time force force"]
 
 
-class Answers(eqx.Module):
+class StageResponse(eqx.Module):
     """What the constant part does over a stretch under inputs given at its Gauss nodes.
 
-    `inner` and `end` take (x, commands, directed forces) to the state at the nodes and at the end,
-    `toll` is what they cost. Commands and forces are ordered by node. What the state at
+    `state_at_nodes` and `state_at_end` take (x, commands, directed forces) to the state at the nodes and at the end,
+    `cost` is what they cost. Commands and forces are ordered by node. What the state at
     a node is made of lies together, as contact laws sum it.
     """
 
-    inner: Float[Array, "*length stage whole state"]
-    end: Float[Array, "*length state whole"]
-    toll: Float[Array, "*length whole whole"]
+    state_at_nodes: Float[Array, "*length stage whole state"]
+    state_at_end: Float[Array, "*length state whole"]
+    cost: Float[Array, "*length whole whole"]
 
 
-def answers(plant: Plant, Q: Square, length: Float[Array, ""], halvings: int) -> Answers:
+def stage_responses(
+    plant: ConstantPlant, Q: Square, length: Float[Array, ""], halvings: int
+) -> StageResponse:
     """Answers for stretches of a length (s), of half of it, and so on, the longest first.
 
     Inputs are first taken as polynomials sum_p c_p s^p / p! of the share s of the stretch that is
@@ -65,116 +67,158 @@ def answers(plant: Plant, Q: Square, length: Float[Array, ""], halvings: int) ->
     """
     inputs = jnp.concatenate([plant.B, plant.E], axis=1)
     states, count = inputs.shape
-    fractions = np.append(NODES, 1.0)
-    shortest = length / 2**halvings
-    drift, pushes = _series(plant.A * shortest, inputs, fractions)
+    fractions = np.append(GAUSS_NODES, 1.0)
+    shortest_length = length / 2**halvings
+    transition, input_responses = _phi_functions(plant.A * shortest_length, inputs, fractions)
     # To the nodes of the shortest stretch, from its start.
-    powers = fractions[:, None] ** np.arange(1, STAGES + 1)
-    inner = shortest * powers[:STAGES, :, None, None] * pushes[:STAGES]
-    inner = jnp.concatenate([drift[:STAGES], _flat(inner)], axis=2)
-    quadrature = (np.polynomial.legendre.leggauss(STAGES)[1] / 2)[:, None, None]
-    cost = jnp.tensordot(transposed(inner), quadrature * (Q @ inner), ((0, 2), (0, 1)))
+    powers = fractions[:, None] ** np.arange(1, NODE_COUNT + 1)
+    state_at_nodes = (
+        shortest_length * powers[:NODE_COUNT, :, None, None] * input_responses[:NODE_COUNT]
+    )
+    state_at_nodes = jnp.concatenate(
+        [transition[:NODE_COUNT], _flatten_node_columns(state_at_nodes)], axis=2
+    )
+    quadrature = (np.polynomial.legendre.leggauss(NODE_COUNT)[1] / 2)[:, None, None]
+    cost = jnp.tensordot(
+        matrix_transpose(state_at_nodes), quadrature * (Q @ state_at_nodes), ((0, 2), (0, 1))
+    )
 
-    def doubled(carry, _):
+    def double(carry, _):
         drift, pushes, cost, span = carry
-        after = _doubled(drift, pushes), _doubled_cost(drift[-1], span * pushes[-1], cost, count)
+        after = _double_phi(drift, pushes), _double_cost(drift[-1], span * pushes[-1], cost, count)
         return (*after[0], after[1], 2 * span), carry
 
-    start = (drift, pushes, shortest * cost, shortest)
-    last, before = jax.lax.scan(doubled, start, length=halvings)
-    drift, pushes, cost, span = jax.tree.map(
-        lambda few, one: jnp.concatenate([few, one[None]])[::-1], before, last
+    start = (transition, input_responses, shortest_length * cost, shortest_length)
+    longest, shorter = jax.lax.scan(double, start, length=halvings)
+    transition, input_responses, cost, lengths = jax.tree.map(
+        lambda few, one: jnp.concatenate([few, one[None]])[::-1], shorter, longest
     )
     # From coefficients to values at the nodes, commands first.
-    lagrange = _lagrange() * np.array([math.factorial(p) for p in range(STAGES)])  # node, power
+    lagrange = _lagrange_coefficients() * np.array(
+        [math.factorial(p) for p in range(NODE_COUNT)]
+    )  # node, power
     local = lagrange * powers[:, None]  # fraction, node, power: over each fraction by itself
-    pushed = jnp.einsum("cqp,lcpik->lciqk", local, pushes) * span[:, None, None, None, None]
-    whole = jnp.concatenate([drift, _ordered(pushed, plant)], axis=3)
-    mixed = cost[:, :states, states:].reshape(-1, states, STAGES, count)
-    mixed = _ordered(jnp.einsum("qp,lipk->liqk", lagrange, mixed), plant)
-    both = cost[:, states:, states:].reshape(-1, STAGES, count, STAGES, count)
-    both = jnp.einsum("qp,lpkxj->lqkxj", lagrange, both)
-    both = _ordered(jnp.einsum("qx,lpkxj->lpkqj", lagrange, both), plant)
-    both = _ordered(jnp.moveaxis(both, (1, 2), (-2, -1)), plant)
-    top = jnp.concatenate([cost[:, :states, :states], mixed], axis=2)
-    below = jnp.concatenate([transposed(mixed), both], axis=2)
-    return Answers(
-        transposed(whole[:, :STAGES]), whole[:, -1], jnp.concatenate([top, below], axis=1)
+    node_input_response = (
+        jnp.einsum("cqp,lcpik->lciqk", local, input_responses) * lengths[:, None, None, None, None]
+    )
+    state_response = jnp.concatenate(
+        [transition, _commands_before_forces(node_input_response, plant)], axis=3
+    )
+    cross_cost = cost[:, :states, states:].reshape(-1, states, NODE_COUNT, count)
+    cross_cost = _commands_before_forces(jnp.einsum("qp,lipk->liqk", lagrange, cross_cost), plant)
+    input_cost = cost[:, states:, states:].reshape(-1, NODE_COUNT, count, NODE_COUNT, count)
+    input_cost = jnp.einsum("qp,lpkxj->lqkxj", lagrange, input_cost)
+    input_cost = _commands_before_forces(jnp.einsum("qx,lpkxj->lpkqj", lagrange, input_cost), plant)
+    input_cost = _commands_before_forces(jnp.moveaxis(input_cost, (1, 2), (-2, -1)), plant)
+    top = jnp.concatenate([cost[:, :states, :states], cross_cost], axis=2)
+    below = jnp.concatenate([matrix_transpose(cross_cost), input_cost], axis=2)
+    return StageResponse(
+        matrix_transpose(state_response[:, :NODE_COUNT]),
+        state_response[:, -1],
+        jnp.concatenate([top, below], axis=1),
     )
 
 
-def coupled_flows(
-    plant: Plant,
-    answer: Answers,
+def coupled_stages(
+    plant: ConstantPlant,
+    response: StageResponse,
     coupling: Coupling,
-    R: Commands,
+    R: InputWeight,
     length: Float[Array, ""],
-) -> Flow:
+) -> Stage:
     """Flows over stretches of one length (s), from the coupling (stretch, stage) at their nodes."""
     states, inputs = plant.B.shape
-    known = states + STAGES * inputs  # the states at the start and the commands
-    stretches, forces = coupling.rows.shape[0], coupling.rows.shape[2]
-    size = STAGES * forces
+    free_columns = states + NODE_COUNT * inputs  # the states at the start and the commands
+    interval_count, forces = coupling.force_state_rows.shape[0], coupling.force_state_rows.shape[2]
+    size = NODE_COUNT * forces
     # What the law of f sees, of what is known and of f itself. Stretches come last, for small sums.
-    shape = jnp.moveaxis(coupling.shape, 0, -1)
-    seen = jnp.einsum("cwi,scri->cwrs", answer.inner, coupling.rows)
-    direct = jnp.moveaxis(coupling.direct, 0, -1).swapaxes(1, 2)  # stage, input, force, stretch
-    at_once = np.eye(STAGES)[:, :, None, None, None] * direct[:, None]
-    right = seen[:, :known].at[:, states:].add(at_once.reshape(STAGES, -1, forces, stretches))
-    right = right.swapaxes(1, 2).reshape(size, known, stretches)
-    felt = seen[:, known:].reshape(STAGES, STAGES, -1, forces, stretches)
-    felt = _summed(felt[:, :, :, :, None] * shape[:, :, None], 2).swapaxes(1, 2)
-    back = np.eye(forces)[:, :, None] + jnp.moveaxis(coupling.back, 0, -1)
-    law = np.eye(STAGES)[:, None, :, None, None] * back[:, :, None] - felt
-    force = jax.vmap(solve_any, -1)(law.reshape(size, size, stretches), right)
-    # What the forces do to the end, what they cost with what is known, and by themselves.
-    table = jnp.concatenate([answer.end, answer.toll])[:, known:]
-    table = table.reshape(-1, STAGES, shape.shape[1])
-    table = jnp.einsum("wqd,qdts->wqts", table, shape).reshape(-1, size, stretches)
-    directed = table[states + known :].reshape(STAGES, -1, size, stretches)
-    own = _summed(directed[:, :, None] * shape[:, :, :, None], 1).reshape(size, size, stretches)
-    push, mixed, own = (
-        jnp.moveaxis(part, -1, 0) for part in (table[:states], table[states : states + known], own)
+    distribution = jnp.moveaxis(coupling.force_distribution, 0, -1)
+    contact_rows = jnp.einsum("cwi,scri->cwrs", response.state_at_nodes, coupling.force_state_rows)
+    direct = jnp.moveaxis(coupling.command_feedthrough, 0, -1).swapaxes(
+        1, 2
+    )  # stage, input, force, stretch
+    direct_part = np.eye(NODE_COUNT)[:, :, None, None, None] * direct[:, None]
+    right = (
+        contact_rows[:, :free_columns]
+        .at[:, states:]
+        .add(direct_part.reshape(NODE_COUNT, -1, forces, interval_count))
     )
-    end = answer.end[:, :known] + push @ force
-    spent = jnp.pad(on_commands(R, length), (states, 0))
-    turn = transposed(force) @ (transposed(mixed) + own @ force / 2)
-    toll = answer.toll[:known, :known] + spent + turn + transposed(turn)
-    return Flow(end[..., :states], end[..., states:], toll)
+    right = right.swapaxes(1, 2).reshape(size, free_columns, interval_count)
+    force_on_force = contact_rows[:, free_columns:].reshape(
+        NODE_COUNT, NODE_COUNT, -1, forces, interval_count
+    )
+    force_on_force = _unrolled_sum(
+        force_on_force[:, :, :, :, None] * distribution[:, :, None], 2
+    ).swapaxes(1, 2)
+    force_feedthrough = np.eye(forces)[:, :, None] + jnp.moveaxis(coupling.force_feedthrough, 0, -1)
+    force_system = (
+        np.eye(NODE_COUNT)[:, None, :, None, None] * force_feedthrough[:, :, None] - force_on_force
+    )
+    force = jax.vmap(solve_unpivoted, -1)(force_system.reshape(size, size, interval_count), right)
+    # What the forces do to the end, what they cost with what is known, and by themselves.
+    force_response = jnp.concatenate([response.state_at_end, response.cost])[:, free_columns:]
+    force_response = force_response.reshape(-1, NODE_COUNT, distribution.shape[1])
+    force_response = jnp.einsum("wqd,qdts->wqts", force_response, distribution).reshape(
+        -1, size, interval_count
+    )
+    directed = force_response[states + free_columns :].reshape(NODE_COUNT, -1, size, interval_count)
+    force_cost = _unrolled_sum(directed[:, :, None] * distribution[:, :, :, None], 1).reshape(
+        size, size, interval_count
+    )
+    force_to_end, cross_cost, force_cost = (
+        jnp.moveaxis(part, -1, 0)
+        for part in (
+            force_response[:states],
+            force_response[states : states + free_columns],
+            force_cost,
+        )
+    )
+    end = response.state_at_end[:, :free_columns] + force_to_end @ force
+    command_cost = jnp.pad(command_cost_matrix(R, length), (states, 0))
+    force_part = matrix_transpose(force) @ (matrix_transpose(cross_cost) + force_cost @ force / 2)
+    cost = (
+        response.cost[:free_columns, :free_columns]
+        + command_cost
+        + force_part
+        + matrix_transpose(force_part)
+    )
+    return Stage(end[..., :states], end[..., states:], cost)
 
 
-def flows_of_kind(
-    plant: Plant,
-    every: Answers,
-    kind: Int[Array, ""],
+def stages_of_length(
+    plant: ConstantPlant,
+    responses: StageResponse,
+    length_index: Int[Array, ""],
     coupling: Coupling,
-    R: Commands,
+    R: InputWeight,
     length: Float[Array, ""],
-) -> Flow:
+) -> Stage:
     """Those over stretches of one of the lengths that there are answers for."""
-    answer = jax.tree.map(lambda part: jax.lax.dynamic_index_in_dim(part, kind, 0, False), every)
-    return coupled_flows(plant, answer, coupling, R, length)
+    response = jax.tree.map(
+        lambda part: jax.lax.dynamic_index_in_dim(part, length_index, 0, False), responses
+    )
+    return coupled_stages(plant, response, coupling, R, length)
 
 
-def law_solved(coupling: Coupling) -> Float[Array, "stretch stage force both"]:
+def explicit_force_law(coupling: Coupling) -> Float[Array, "stretch stage force both"]:
     """Rows that take state and command to f, its law being solved."""
-    law = jnp.eye(coupling.back.shape[-1]) + coupling.back
-    answer = jnp.concatenate([coupling.rows, coupling.direct], axis=3)
-    return jax.vmap(jax.vmap(solve_any))(law, answer)
+    law = jnp.eye(coupling.force_feedthrough.shape[-1]) + coupling.force_feedthrough
+    right_side = jnp.concatenate([coupling.force_state_rows, coupling.command_feedthrough], axis=3)
+    return jax.vmap(jax.vmap(solve_unpivoted))(law, right_side)
 
 
-def _summed(terms, axis):
+def _unrolled_sum(terms, axis):
     """A short sum, spelt out: it is not worth a loop."""
     return functools.reduce(operator.add, jnp.unstack(terms, axis=axis))
 
 
-def _flat(pushes):
+def _flatten_node_columns(input_responses):
     """Pushes (fraction, power, state, input) as columns (fraction, state, power and input)."""
-    ordered = jnp.moveaxis(pushes, 1, 2)
+    ordered = jnp.moveaxis(input_responses, 1, 2)
     return ordered.reshape(*ordered.shape[:2], -1)
 
 
-def _ordered(columns, plant: Plant):
+def _commands_before_forces(columns, plant: ConstantPlant):
     """Columns (..., node, input) in one row, the commands of all nodes before the forces."""
     inputs = plant.B.shape[1]
     commands, forces = columns[..., :inputs], columns[..., inputs:]
@@ -182,67 +226,75 @@ def _ordered(columns, plant: Plant):
     return jnp.concatenate([commands.reshape(shape), forces.reshape(shape)], axis=-1)
 
 
-def _series(x, inputs, fractions):
+def _phi_functions(x, inputs, fractions):
     """exp(c x), and phi_1 ... phi of c x times the inputs, for fractions c of a small x."""
     states = x.shape[0]
     columns = jnp.concatenate([jnp.eye(states), inputs], axis=1)
     rows = [columns]
-    for _ in range(TERMS - 1):
+    for _ in range(TAYLOR_TERMS - 1):
         rows.append(x @ rows[-1])
-    powers, terms = jnp.stack(rows), np.arange(TERMS)
-    shares = fractions[:, None] ** terms
-    orders = np.arange(STAGES + 1)[:, None] + terms
-    weights = shares[:, None] / np.vectorize(math.factorial)(orders).astype(float)
-    drift = jnp.tensordot(weights[:, 0], powers[:, :, :states], axes=1)
-    return drift, jnp.tensordot(weights[:, 1:], powers[:, :, states:], axes=1)
+    powers, terms = jnp.stack(rows), np.arange(TAYLOR_TERMS)
+    fraction_powers = fractions[:, None] ** terms
+    orders = np.arange(NODE_COUNT + 1)[:, None] + terms
+    weights = fraction_powers[:, None] / np.vectorize(math.factorial)(orders).astype(float)
+    transition = jnp.tensordot(weights[:, 0], powers[:, :, :states], axes=1)
+    return transition, jnp.tensordot(weights[:, 1:], powers[:, :, states:], axes=1)
 
 
-def _doubled(drift, pushes):
+def _double_phi(transition, input_responses):
     """The exponentials, and the phi functions (fraction, phi, state, input), of twice as much."""
-    halves = 0.5 ** np.arange(1, STAGES + 1)
-    after = drift[:, None] @ pushes + jnp.einsum("pq,cqik->cpik", _second().T, pushes)
-    return drift @ drift, after * halves[:, None, None]
+    halves = 0.5 ** np.arange(1, NODE_COUNT + 1)
+    after = transition[:, None] @ input_responses + jnp.einsum(
+        "pq,cqik->cpik", _second_half_matrix().T, input_responses
+    )
+    return transition @ transition, after * halves[:, None, None]
 
 
-def _doubled_cost(drift, pushes, cost, count):
+def _double_cost(transition, input_responses, cost, count):
     """What two stretches cost, for inputs given as coefficients over both."""
-    states = drift.shape[0]
-    first = 0.5 ** np.arange(STAGES)
-    early = _columns(pushes * first[:, None, None])
+    states = transition.shape[0]
+    first = 0.5 ** np.arange(NODE_COUNT)
+    first_half_inputs = _flatten_columns(input_responses * first[:, None, None])
     scale = np.append(np.ones(states), np.repeat(first, count))
-    later = jnp.asarray(_second() * first)  # coefficient within the second, over both
+    second_half_weights = jnp.asarray(
+        _second_half_matrix() * first
+    )  # coefficient within the second, over both
 
-    def onward(columns):
+    def to_second_half(columns):
         """Columns by coefficients within the second stretch, as those over both."""
-        split = columns.reshape(-1, STAGES, count)
-        return jnp.einsum("ipk,pq->iqk", split, later).reshape(columns.shape)
+        split = columns.reshape(-1, NODE_COUNT, count)
+        return jnp.einsum("ipk,pq->iqk", split, second_half_weights).reshape(columns.shape)
 
-    mixed, both = cost[:states, states:], cost[states:, states:]
-    across = onward(mixed)
-    carried = cost[:states, :states] @ jnp.concatenate([drift, early], axis=1)
-    corner = drift.T @ carried[:, :states]
-    beside = drift.T @ (carried[:, states:] + across)
-    crossed = early.T @ (carried[:, states:] / 2 + across)
-    rest = onward(onward(both).T) + crossed + crossed.T
-    top = jnp.concatenate([corner, beside], axis=1)
+    cross_cost, input_cost = cost[:states, states:], cost[states:, states:]
+    cross_second_half = to_second_half(cross_cost)
+    cost_of_end_state = cost[:states, :states] @ jnp.concatenate(
+        [transition, first_half_inputs], axis=1
+    )
+    state_cost = transition.T @ cost_of_end_state[:, :states]
+    new_cross_cost = transition.T @ (cost_of_end_state[:, states:] + cross_second_half)
+    end_state_cost = first_half_inputs.T @ (cost_of_end_state[:, states:] / 2 + cross_second_half)
+    new_input_cost = (
+        to_second_half(to_second_half(input_cost).T) + end_state_cost + end_state_cost.T
+    )
+    top = jnp.concatenate([state_cost, new_cross_cost], axis=1)
     return cost * scale * scale[:, None] + jnp.concatenate(
-        [top, jnp.concatenate([beside.T, rest], axis=1)]
+        [top, jnp.concatenate([new_cross_cost.T, new_input_cost], axis=1)]
     )
 
 
-def _columns(pushes):
+def _flatten_columns(input_responses):
     """Pushes (power, state, input) as columns (state, power and input)."""
-    return jnp.moveaxis(pushes, 0, 1).reshape(pushes.shape[1], -1)
+    return jnp.moveaxis(input_responses, 0, 1).reshape(input_responses.shape[1], -1)
 
 
 @functools.cache
-def _second() -> np.ndarray:
+def _second_half_matrix() -> np.ndarray:
     """Weights 1 / (q - p)!: coefficient q of (1 + s)^q / q! in s^p / p!."""
-    rows = range(STAGES)
+    rows = range(NODE_COUNT)
     return np.array([[1 / math.factorial(q - p) if q >= p else 0.0 for q in rows] for p in rows])
 
 
 @functools.cache
-def _lagrange() -> np.ndarray:
+def _lagrange_coefficients() -> np.ndarray:
     """Monomial coefficients (node, power) of the Lagrange polynomials through the Gauss nodes."""
-    return np.linalg.inv(NODES[:, None] ** np.arange(STAGES)).T
+    return np.linalg.inv(GAUSS_NODES[:, None] ** np.arange(NODE_COUNT)).T

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-def hold(
-    matrix: Float[Array, "state state"],
-    column: Float[Array, "state input"],
+def c2d(
+    A: Float[Array, "state state"],
+    B: Float[Array, "state input"],
     period: Float[Array, ""] | float,
     degree: int = 0,
 ) -> tuple[Float[Array, "state state"], Float[Array, "power state input"]]:
@@ -20,20 +20,20 @@ def hold(
     first-order hold with c_0 = u(0) and c_1 = u(h) - u(0). Exact, by one matrix exponential
     (Van Loan, IEEE Trans. Automatic Control 1978) of the balanced system.
     """
-    scale = balance(matrix)
-    matrix, column = matrix * scale / scale[:, None], column / scale[:, None]
-    states, inputs = column.shape
+    scale = balance(A)
+    A, B = A * scale / scale[:, None], B / scale[:, None]
+    states, inputs = B.shape
     powers = degree + 1
     # The derivatives of the input by s / h are further states, each the rate of the one before.
     block = jnp.zeros((states + inputs * powers,) * 2)
-    block = block.at[:states, :states].set(matrix * period)
-    block = block.at[:states, states : states + inputs].set(column * period)
+    block = block.at[:states, :states].set(A * period)
+    block = block.at[:states, states : states + inputs].set(B * period)
     block = block.at[states:, states:].set(np.kron(np.eye(powers, k=1), np.eye(inputs)))
-    whole = jax.scipy.linalg.expm(block, max_squarings=40)
-    push = whole[:states, states:].reshape(states, powers, inputs)
+    exponential = jax.scipy.linalg.expm(block, max_squarings=40)
+    input_matrix = exponential[:states, states:].reshape(states, powers, inputs)
     factorials = np.array([math.factorial(k) for k in range(powers)], float)
-    drift = whole[:states, :states] * scale[:, None] / scale
-    return drift, jnp.moveaxis(push, 1, 0) * factorials[:, None, None] * scale[:, None]
+    transition = exponential[:states, :states] * scale[:, None] / scale
+    return transition, jnp.moveaxis(input_matrix, 1, 0) * factorials[:, None, None] * scale[:, None]
 
 
 def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
@@ -43,7 +43,7 @@ def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
     """
     size = jnp.abs(matrix) * (1 - np.eye(matrix.shape[0]))
 
-    def even_out(_, scale):
+    def equalise(_, scale):
         scaled = size * scale / scale[:, None]
         rows, columns = jnp.sum(scaled, axis=1), jnp.sum(scaled, axis=0)
         both = (rows > 0) & (columns > 0)
@@ -51,10 +51,10 @@ def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
         return scale * ratio**0.25  # half the step for one state alone, as all move at once
 
     start = jnp.ones(matrix.shape[0])
-    return jax.lax.stop_gradient(jax.lax.fori_loop(0, 20, even_out, start))
+    return jax.lax.stop_gradient(jax.lax.fori_loop(0, 20, equalise, start))
 
 
-def cubics(
+def hermite_cubics(
     times: Float[Array, " time"],
     values: Float[Array, " time"],
     rates: Float[Array, " time"] | None = None,
@@ -63,22 +63,28 @@ def cubics(
 
     Straight lines if no rates (unit of the values per s) are given.
     """
-    rise = jnp.diff(values)
-    start, end = (rise, rise)
+    difference = jnp.diff(values)
+    start, end = (difference, difference)
     if rates is not None:
-        span = jnp.diff(times)
-        start, end = rates[:-1] * span, rates[1:] * span
-    return jnp.stack([values[:-1], start, 3 * rise - 2 * start - end, start + end - 2 * rise], -1)
+        duration = jnp.diff(times)
+        start, end = rates[:-1] * duration, rates[1:] * duration
+    return jnp.stack(
+        [values[:-1], start, 3 * difference - 2 * start - end, start + end - 2 * difference], -1
+    )
 
 
-def evaluate(
+def evaluate_cubics(
     times: Float[Array, " time"],
-    pieces: Float[Array, "interval power"],
-    at: Float[Array, " *place"],
+    coefficients: Float[Array, "interval power"],
+    query_times: Float[Array, " *place"],
 ) -> Float[Array, " *place"]:
     """Values of the cubics at any times (s); before the first and after the last they are held."""
-    interval = jnp.clip(jnp.searchsorted(times, at, side="right") - 1, 0, pieces.shape[0] - 1)
-    share = (at - times[interval]) / (times[interval + 1] - times[interval])
-    share = jnp.clip(share, 0.0, 1.0)[..., None]
-    chosen = pieces[interval]
-    return jnp.sum(chosen * share ** np.arange(chosen.shape[-1]), axis=-1)
+    interval = jnp.clip(
+        jnp.searchsorted(times, query_times, side="right") - 1, 0, coefficients.shape[0] - 1
+    )
+    fraction = (query_times - times[interval]) / (times[interval + 1] - times[interval])
+    fraction = jnp.clip(fraction, 0.0, 1.0)[..., None]
+    interval_coefficients = coefficients[interval]
+    return jnp.sum(
+        interval_coefficients * fraction ** np.arange(interval_coefficients.shape[-1]), axis=-1
+    )

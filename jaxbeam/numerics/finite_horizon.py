@@ -16,136 +16,181 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.numerics.batched_linalg import (
-    each_lane,
-    in_lanes,
-    lanes_of,
-    solve_any,
-    turned,
+    batch_axis_last,
+    batch_size_of,
+    solve_unpivoted,
+    transpose,
+    vmap_last_axis,
 )
-from jaxbeam.numerics.coupled_stages import Coupling, Plant, answers, flows_of_kind, law_solved
-from jaxbeam.numerics.gain_polynomials import pieces
+from jaxbeam.numerics.coupled_stages import (
+    ConstantPlant,
+    Coupling,
+    explicit_force_law,
+    stage_responses,
+    stages_of_length,
+)
+from jaxbeam.numerics.gain_polynomials import interpolate_gains
 from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.numerics.intervals import Commands, Square
-from jaxbeam.numerics.stages import NODES, carried, flows, on_commands
+from jaxbeam.numerics.intervals import InputWeight, Square
+from jaxbeam.numerics.stages import (
+    GAUSS_NODES,
+    collocated_stages,
+    command_cost_matrix,
+    riccati_recursion,
+)
 
-GROUP = 8  # stretches
+INTERVALS_PER_GROUP = 8  # stretches
 # Backward in time P hastens, right before an event, to what the plant from then on demands, and
 # rings for a while at twice the frequencies of the modes. So stretches of the last tenth of the
 # time since the event before are quartered, those of the tenth before halved, and what the last
 # group would last is cut into ever shorter stretches, so often halved.
-HALVINGS = 13
-LAYER = [2, 2, 2, *range(3, HALVINGS + 1), HALVINGS]
+MAX_HALVINGS = 13
+BOUNDARY_LAYER_HALVINGS = [2, 2, 2, *range(3, MAX_HALVINGS + 1), MAX_HALVINGS]
 
 # What changes in a plant, at times (s) of any shape.
-Changes = Callable[[Float[Array, "..."]], Coupling]
+CouplingFunction = Callable[[Float[Array, "..."]], Coupling]
 # State matrix and command matrix at a time (s).
-Matrices = Callable[[Float[Array, ""]], tuple[Float[Array, "..."], Float[Array, "..."]]]
+PlantMatrices = Callable[[Float[Array, ""]], tuple[Float[Array, "..."], Float[Array, "..."]]]
 
 
-def halvings(count: int) -> Int[np.ndarray, " group"]:
+def interval_halvings(min_intervals: int) -> Int[np.ndarray, " group"]:
     """How often the stretches of each group are halved, for at least so many stretches."""
-    whole = max(1, -(-count // GROUP))
-    tenth = whole // 10
-    before = np.repeat([0, 1, 2], [whole - 1 - 2 * tenth, 2 * tenth, 4 * tenth])
-    return np.concatenate([before, LAYER])
+    group_count = max(1, -(-min_intervals // INTERVALS_PER_GROUP))
+    tenth = group_count // 10
+    before = np.repeat([0, 1, 2], [group_count - 1 - 2 * tenth, 2 * tenth, 4 * tenth])
+    return np.concatenate([before, BOUNDARY_LAYER_HALVINGS])
 
 
-def shares(count: int) -> Float[np.ndarray, " edge"]:
+def breakpoint_fractions(min_intervals: int) -> Float[np.ndarray, " edge"]:
     """Edges of the stretches between two events, as shares, 0 to 1, of the time between them."""
-    lengths = np.repeat(0.5 ** halvings(count), GROUP)
+    lengths = np.repeat(0.5 ** interval_halvings(min_intervals), INTERVALS_PER_GROUP)
     return np.append(0.0, np.cumsum(lengths) / np.sum(lengths))
 
 
-def layer(count: int) -> Float[np.ndarray, " edge"]:
+def boundary_layer(min_intervals: int) -> Float[np.ndarray, " edge"]:
     """Edges of the fine layer before an event, as shares of the time since the one before."""
-    return 1 - shares(count)[-1 - GROUP * len(LAYER) : -1]
+    return (
+        1
+        - breakpoint_fractions(min_intervals)[
+            -1 - INTERVALS_PER_GROUP * len(BOUNDARY_LAYER_HALVINGS) : -1
+        ]
+    )
 
 
-def finite_time(
-    plant: Matrices,
+def finite_horizon(
+    plant: PlantMatrices,
     events: Float[Array, " event"],
-    count: int,
+    min_intervals: int,
     Q: Square,
-    R: Commands,
-    terminal: Square,
+    R: InputWeight,
+    terminal_cost: Square,
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """Gains that minimise x'Fx at the last event plus the integral of x'Qx + u'Ru, and P at edges.
 
-    There are at least so many stretches, and a fine layer, between events (s); F is `terminal`.
+    There are at least so many stretches, and a fine layer, between events (s); F is `terminal_cost`.
     """
     inputs = R.shape[0]
-    still = Plant(jnp.zeros_like(Q), jnp.zeros((Q.shape[0], inputs)), jnp.eye(Q.shape[0]))
+    zero_plant = ConstantPlant(
+        jnp.zeros_like(Q), jnp.zeros((Q.shape[0], inputs)), jnp.eye(Q.shape[0])
+    )
 
-    def make(_, R, times, length, kind):
+    def group_stages(_, R, times, length, length_index):
         A, B = jax.vmap(jax.vmap(plant))(times)
-        whole = jnp.broadcast_to(still.E, A.shape)
-        law = jnp.concatenate([A, B], axis=3)
-        return flows(A, B, Q, R, jnp.full(GROUP, length)), whole, law
+        identity = jnp.broadcast_to(zero_plant.E, A.shape)
+        force_law = jnp.concatenate([A, B], axis=3)
+        return (
+            collocated_stages(A, B, Q, R, jnp.full(INTERVALS_PER_GROUP, length)),
+            identity,
+            force_law,
+        )
 
-    return _backward(lambda: None, make, still, events, count, Q, R, terminal)
+    return _gains_and_costs(
+        lambda: None, group_stages, zero_plant, events, min_intervals, Q, R, terminal_cost
+    )
 
 
-def finite_time_coupled(
-    plant: Plant,
-    changes: Changes,
+def finite_horizon_coupled(
+    plant: ConstantPlant,
+    coupling_at: CouplingFunction,
     events: Float[Array, " event"],
-    count: int,
+    min_intervals: int,
     Q: Square,
-    R: Commands,
-    terminal: Square,
+    R: InputWeight,
+    terminal_cost: Square,
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """The same for a plant that changes by a few forces; much faster, see `coupled`."""
 
-    def prepare():
-        longest = jnp.diff(events) * (shares(count)[1] * 2.0 ** halvings(count)[0])
-        every = jax.vmap(lambda length: answers(plant, Q, length, HALVINGS))(longest)
-        return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), every)
+    def responses_of_all_lengths():
+        longest = jnp.diff(events) * (
+            breakpoint_fractions(min_intervals)[1] * 2.0 ** interval_halvings(min_intervals)[0]
+        )
+        responses = jax.vmap(lambda length: stage_responses(plant, Q, length, MAX_HALVINGS))(
+            longest
+        )
+        return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), responses)
 
-    def make(every, R, times, length, kind):
-        coupling = changes(times)
-        flow = flows_of_kind(plant, every, kind, coupling, R, length)
-        return flow, coupling.shape, law_solved(coupling)
+    def group_stages(responses, R, times, length, length_index):
+        coupling = coupling_at(times)
+        stages = stages_of_length(plant, responses, length_index, coupling, R, length)
+        return stages, coupling.force_distribution, explicit_force_law(coupling)
 
-    return _backward(prepare, make, plant, events, count, Q, R, terminal)
+    return _gains_and_costs(
+        responses_of_all_lengths, group_stages, plant, events, min_intervals, Q, R, terminal_cost
+    )
 
 
-def _backward(prepare, make, plant, events, count, Q, R, terminal):
-    """Gains and P, from what `make` tells of a group: flows, and what changes at their nodes.
+def _gains_and_costs(
+    stage_responses, group_stages, plant, events, min_intervals, Q, R, terminal_cost
+):
+    """Gains and P, from what `group_stages` tells of a group: flows, and what changes at their nodes.
 
-    It is given what `prepare` finds for all groups.
+    It is given what `stage_responses` finds for all groups.
     """
-    edges, spans = shares(count), jnp.diff(events)
-    steps = np.diff(edges).reshape(-1, GROUP)
-    within = edges[:-1].reshape(-1, GROUP)[:, :, None] + steps[:, :, None] * NODES
-    times = events[:-1, None, None, None] + spans[:, None, None, None] * within
-    lengths = spans[:, None] * steps[:, 0]
-    kinds = np.arange(spans.size)[:, None] * (HALVINGS + 1) + halvings(count)
-    given = times, lengths, jnp.asarray(kinds)
+    fractions, durations = breakpoint_fractions(min_intervals), jnp.diff(events)
+    steps = np.diff(fractions).reshape(-1, INTERVALS_PER_GROUP)
+    node_fractions = (
+        fractions[:-1].reshape(-1, INTERVALS_PER_GROUP)[:, :, None]
+        + steps[:, :, None] * GAUSS_NODES
+    )
+    times = events[:-1, None, None, None] + durations[:, None, None, None] * node_fractions
+    lengths = durations[:, None] * steps[:, 0]
+    length_indices = np.arange(durations.size)[:, None] * (MAX_HALVINGS + 1) + interval_halvings(
+        min_intervals
+    )
+    given = times, lengths, jnp.asarray(length_indices)
     groups = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), given)
-    inverse = solve_any(R, jnp.eye(R.shape[0]))
-    prepare = eqx.filter_closure_convert(prepare)
+    R_inverse = solve_unpivoted(R, jnp.eye(R.shape[0]))
+    stage_responses = eqx.filter_closure_convert(stage_responses)
     first = jax.tree.map(lambda part: part[0], groups)
-    make = eqx.filter_closure_convert(make, eqx.filter_eval_shape(prepare), R, *first)
-    costs, found = in_lanes(_swept, prepare, make, plant, groups, Q, R, inverse, terminal)
-    costs = jnp.concatenate([costs.reshape(-1, *Q.shape), terminal[None]])
-    inner = events[:-1, None] + spans[:, None] * edges[:-1]
-    marks = jnp.append(inner.reshape(-1), events[-1])
-    marks = (marks - marks[0]) / (marks[-1] - marks[0])
-    return GainTable(marks, found.reshape(-1, *found.shape[2:])), costs
+    group_stages = eqx.filter_closure_convert(
+        group_stages, eqx.filter_eval_shape(stage_responses), R, *first
+    )
+    costs, found = batch_axis_last(
+        _riccati_sweep, stage_responses, group_stages, plant, groups, Q, R, R_inverse, terminal_cost
+    )
+    costs = jnp.concatenate([costs.reshape(-1, *Q.shape), terminal_cost[None]])
+    inner = events[:-1, None] + durations[:, None] * fractions[:-1]
+    breakpoints = jnp.append(inner.reshape(-1), events[-1])
+    breakpoints = (breakpoints - breakpoints[0]) / (breakpoints[-1] - breakpoints[0])
+    return GainTable(breakpoints, found.reshape(-1, *found.shape[2:])), costs
 
 
-def _swept(prepare, make, plant, groups, Q, R, inverse, terminal):
+def _riccati_sweep(stage_responses, group_stages, plant, groups, Q, R, R_inverse, terminal_cost):
     """P at the starts of stretches and polynomials of the gain, of all groups, in lanes."""
-    known = each_lane(lambda prepare: prepare(), prepare)
-    free = jnp.zeros((*R.shape[:2], 1))  # commands, so that lanes with other R share the flows
+    responses = vmap_last_axis(lambda prepare: prepare(), stage_responses)
+    zero_R = jnp.zeros((*R.shape[:2], 1))  # commands, so that lanes with other R share the flows
 
-    def back(cost, group):
+    def backward_step(cost, group):
         length = group[1]
-        parts, shape, law = each_lane(lambda make, *rest: make(*rest), make, known, free, *group)
-        costs = carried(parts, each_lane(on_commands, R, length), cost)
-        found = pieces(plant, shape, law, costs, length, Q, inverse)
-        return (costs[0] + turned(costs[0])) / 2, (costs[:-1], found)
+        stages, shape, force_law = vmap_last_axis(
+            lambda make, *rest: make(*rest), group_stages, responses, zero_R, *group
+        )
+        costs = riccati_recursion(stages, vmap_last_axis(command_cost_matrix, R, length), cost)
+        found = interpolate_gains(plant, shape, force_law, costs, length, Q, R_inverse)
+        return (costs[0] + transpose(costs[0])) / 2, (costs[:-1], found)
 
-    given = prepare, make, plant, groups, Q, R, terminal
-    wide = jnp.broadcast_to(terminal, (*terminal.shape[:2], lanes_of(given)))
-    return jax.lax.scan(back, wide, groups, reverse=True)[1]
+    given = stage_responses, group_stages, plant, groups, Q, R, terminal_cost
+    batched_terminal_cost = jnp.broadcast_to(
+        terminal_cost, (*terminal_cost.shape[:2], batch_size_of(given))
+    )
+    return jax.lax.scan(backward_step, batched_terminal_cost, groups, reverse=True)[1]

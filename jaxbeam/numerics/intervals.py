@@ -16,49 +16,53 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Square = Float[Array, "state state"]
-Inputs = Float[Array, "state input"]
-Commands = Float[Array, "input input"]
+InputMatrix = Float[Array, "state input"]
+InputWeight = Float[Array, "input input"]
 
 
-class Stretch(eqx.Module):
+class Interval(eqx.Module):
     """What a stretch of time does to optimal state and costate; see the module."""
 
-    drift: Float[Array, "*batch state state"]
-    reach: Float[Array, "*batch state state"]
-    toll: Float[Array, "*batch state state"]
+    transition: Float[Array, "*batch state state"]
+    G: Float[Array, "*batch state state"]
+    H: Float[Array, "*batch state state"]
 
-    def then(self, later: "Stretch") -> "Stretch":
+    def compose(self, later: "Interval") -> "Interval":
         """This stretch followed by a later one."""
-        back = transposed(self.drift)
-        between = jnp.eye(self.drift.shape[-1]) + self.reach @ later.toll
-        passed = jnp.linalg.solve(between, jnp.concatenate([self.drift, self.reach], axis=-1))
-        drift, reach = jnp.split(passed, 2, axis=-1)
-        return Stretch(
-            drift=later.drift @ drift,
-            reach=later.reach + symmetric(later.drift @ reach @ transposed(later.drift)),
-            toll=self.toll + symmetric(back @ later.toll @ drift),
+        transition_transposed = matrix_transpose(self.transition)
+        coupling = jnp.eye(self.transition.shape[-1]) + self.G @ later.H
+        solved = jnp.linalg.solve(coupling, jnp.concatenate([self.transition, self.G], axis=-1))
+        transition, G = jnp.split(solved, 2, axis=-1)
+        return Interval(
+            transition=later.transition @ transition,
+            G=later.G + symmetric_part(later.transition @ G @ matrix_transpose(later.transition)),
+            H=self.H + symmetric_part(transition_transposed @ later.H @ transition),
         )
 
-    def before(self, cost: Square) -> Square:
+    def backward(self, cost: Square) -> Square:
         """P at its start for P at its end."""
-        between = jnp.eye(cost.shape[-1]) + self.reach @ cost
-        passed = jnp.linalg.solve(between, self.drift)
-        return self.toll + symmetric(transposed(self.drift) @ cost @ passed)
+        coupling = jnp.eye(cost.shape[-1]) + self.G @ cost
+        solved = jnp.linalg.solve(coupling, self.transition)
+        return self.H + symmetric_part(matrix_transpose(self.transition) @ cost @ solved)
 
 
-def even_units(reach: Square, toll: Square) -> Float[Array, ""]:
+def costate_unit(G: Square, H: Square) -> Float[Array, ""]:
     """The unit of the costate in which reach and toll are of like size; one if either is zero."""
-    above, below = jnp.sum(reach**2), jnp.sum(toll**2)
-    both = (above > 0) & (below > 0)
-    ratio = jnp.where(both, above, 1.0) / jnp.where(both, below, 1.0)
+    G_size, H_size = jnp.sum(G**2), jnp.sum(H**2)
+    both = (G_size > 0) & (H_size > 0)
+    ratio = jnp.where(both, G_size, 1.0) / jnp.where(both, H_size, 1.0)
     return jax.lax.stop_gradient(ratio**0.25)
 
 
-def transposed(matrix: Float[Array, "*batch row column"]) -> Float[Array, "*batch column row"]:
+def matrix_transpose(
+    matrix: Float[Array, "*batch row column"],
+) -> Float[Array, "*batch column row"]:
     """The transpose of a matrix."""
     return jnp.swapaxes(matrix, -1, -2)
 
 
-def symmetric(matrix: Float[Array, "*batch state state"]) -> Float[Array, "*batch state state"]:
+def symmetric_part(
+    matrix: Float[Array, "*batch state state"],
+) -> Float[Array, "*batch state state"]:
     """The symmetric part of a matrix."""
-    return (matrix + transposed(matrix)) / 2
+    return (matrix + matrix_transpose(matrix)) / 2

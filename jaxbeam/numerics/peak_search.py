@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-VERTEX_ROUNDS = 2  # of Newton's method for a close estimate
-ROUNDINGS = 8  # by which equal numbers may differ
-STARTS = 17  # places from which a peak is sought: closer than the extrema of the curve can be
-CLIMBS = 3  # rounds of Newton's method from each, and once more from the best
+ESTIMATE_ITERATIONS = 2  # of Newton's method for a close estimate
+TIE_ROUNDING_UNITS = 8  # by which equal numbers may differ
+START_POINTS = 17  # places from which a peak is sought: closer than the extrema of the curve can be
+NEWTON_ITERATIONS = 3  # rounds of Newton's method from each, and once more from the best
 
 
 class Curve(NamedTuple):
@@ -20,53 +20,57 @@ class Curve(NamedTuple):
 
     value: list
     slope: list
-    bend: list
+    curvature: list
 
 
 @functools.cache
-def through(points: tuple[float, ...]) -> np.ndarray:
+def interpolation_matrix(points: tuple[float, ...]) -> np.ndarray:
     """Matrix from samples at points in [0, 1] to coefficients of their curve, slope and bend."""
-    value = np.linalg.inv(_centred(points)[:, None] ** np.arange(len(points)))
+    value = np.linalg.inv(_to_unit_interval(points)[:, None] ** np.arange(len(points)))
     slope = np.polynomial.polynomial.polyder(value)
     return np.concatenate([value, slope, np.polynomial.polynomial.polyder(slope)])
 
 
-def reach(points: tuple[float, ...]) -> float:
-    """How far a step towards the peak may go in `vertex`: a few cross half of any gap."""
-    return float(np.diff(_centred(points)).max()) / 3
+def newton_step_limit(points: tuple[float, ...]) -> float:
+    """How far a step towards the peak may go in `estimate_peak`: a few cross half of any gap."""
+    return float(np.diff(_to_unit_interval(points)).max()) / 3
 
 
-def _centred(points: tuple[float, ...]) -> np.ndarray:
+def _to_unit_interval(points: tuple[float, ...]) -> np.ndarray:
     return 2 * np.array(points) - 1
 
 
-def _curve(samples: Float[Array, "point *rest"], points: tuple[float, ...]) -> Curve:
+def _interpolate(samples: Float[Array, "point *rest"], points: tuple[float, ...]) -> Curve:
     count = len(points)
-    rows = list(jnp.tensordot(through(points), samples, axes=1))
+    rows = list(jnp.tensordot(interpolation_matrix(points), samples, axes=1))
     return Curve(rows[:count], rows[count : 2 * count - 1], rows[2 * count - 1 :])
 
 
-def _value(coefficients: list, place):
+def _horner(coefficients: list, position):
     """The polynomial at a place, by Horner's rule."""
     value = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
-        value = coefficient + place * value
+        value = coefficient + position * value
     return value
 
 
-def _climb(curve: Curve, start, reach: float, rounds: int):
+def _newton_stationary_point(curve: Curve, start, step_limit: float, iterations: int):
     """Where the curve is flat near the start, by rounds of Newton's method within reach."""
 
-    def closer(_, place):
-        steep = _value(curve.bend, place)
-        flat = steep == 0
-        step = jnp.where(flat, 0.0, _value(curve.slope, place) / jnp.where(flat, 1.0, steep))
-        return jnp.clip(place - jnp.clip(step, -reach, reach), -1.0, 1.0)
+    def newton_step(_, position):
+        second_derivative = _horner(curve.curvature, position)
+        singular = second_derivative == 0
+        step = jnp.where(
+            singular,
+            0.0,
+            _horner(curve.slope, position) / jnp.where(singular, 1.0, second_derivative),
+        )
+        return jnp.clip(position - jnp.clip(step, -step_limit, step_limit), -1.0, 1.0)
 
-    return jax.lax.fori_loop(0, rounds, closer, start)
+    return jax.lax.fori_loop(0, iterations, newton_step, start)
 
 
-def highest(
+def max_with_ties(
     values: Float[Array, "some *rest"],
 ) -> tuple[Float[Array, " *rest"], Bool[Array, "some *rest"]]:
     """The highest of some values, and which of them are: quicker than `argmax`.
@@ -74,47 +78,55 @@ def highest(
     Those that differ by rounding count, as XLA may compute what is compared here once for the
     maximum and once more, rounded otherwise, for the comparison.
     """
-    top = jnp.max(values, axis=0)
-    slack = ROUNDINGS * jnp.finfo(values.dtype).eps
-    return top, values >= top - slack * jnp.abs(top)
+    maximum = jnp.max(values, axis=0)
+    tolerance = TIE_ROUNDING_UNITS * jnp.finfo(values.dtype).eps
+    return maximum, values >= maximum - tolerance * jnp.abs(maximum)
 
 
-def vertex(
-    samples: Float[Array, "point *rest"], points: tuple[float, ...], size: Callable = jnp.abs
+def estimate_peak(
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = jnp.abs
 ) -> Float[Array, " *rest"]:
     """Largest size of a value, closely estimated: sought from the largest sample alone.
 
-    Cheap, to tell which of many steps holds the peak; `refine` then finds it.
+    Cheap, to tell which of many steps holds the peak; `refine_peak` then finds it.
     """
-    sizes = size(samples)
-    largest = jnp.max(sizes, axis=0)
-    start = jnp.asarray(_centred(points), samples.dtype)[jnp.argmax(sizes, axis=0)]
-    curve = _curve(samples, points)
-    place = _climb(curve, start, reach(points), rounds=VERTEX_ROUNDS)
-    return jnp.maximum(size(_value(curve.value, place)), largest)
+    magnitudes = magnitude(samples)
+    largest = jnp.max(magnitudes, axis=0)
+    start = jnp.asarray(_to_unit_interval(points), samples.dtype)[jnp.argmax(magnitudes, axis=0)]
+    curve = _interpolate(samples, points)
+    position = _newton_stationary_point(
+        curve, start, newton_step_limit(points), iterations=ESTIMATE_ITERATIONS
+    )
+    return jnp.maximum(magnitude(_horner(curve.value, position)), largest)
 
 
 @jax.named_scope("peaks")
-def find(
-    samples: Float[Array, "point *rest"], points: tuple[float, ...], size: Callable = jnp.abs
+def locate_peak(
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = jnp.abs
 ) -> Float[Array, " *rest"]:
     """Where in [-1, 1] the polynomial through the samples has the largest size of a value."""
-    curve = _curve(samples, points)
+    curve = _interpolate(samples, points)
     # From everywhere, as peaks may tie; at an end Newton's method may run away to a lower place.
-    starts = np.linspace(-1.0, 1.0, STARTS).reshape(-1, *(1,) * (samples.ndim - 1))
-    starts = jnp.broadcast_to(starts.astype(samples.dtype), (STARTS, *samples.shape[1:]))
-    places = jnp.concatenate([starts, _climb(curve, starts, 2 / STARTS, CLIMBS)])
-    _, top = highest(size(_value(curve.value, places)))
-    place = jnp.max(jnp.where(top, places, -1.0), axis=0)
+    starts = np.linspace(-1.0, 1.0, START_POINTS).reshape(-1, *(1,) * (samples.ndim - 1))
+    starts = jnp.broadcast_to(starts.astype(samples.dtype), (START_POINTS, *samples.shape[1:]))
+    positions = jnp.concatenate(
+        [starts, _newton_stationary_point(curve, starts, 2 / START_POINTS, NEWTON_ITERATIONS)]
+    )
+    _, ties = max_with_ties(magnitude(_horner(curve.value, positions)))
+    position = jnp.max(jnp.where(ties, positions, -1.0), axis=0)
     # The height is right by now to nearly rounding, the place to the root of that: further rounds
     # mend this, unless the peak is at an end and there is nothing flat nearby.
-    flat = _climb(curve, place, 2 / STARTS, CLIMBS)
-    _, ahead = highest(size(_value(curve.value, jnp.stack([flat, place]))))
-    return jnp.where(ahead[0], flat, place)
+    stationary_point = _newton_stationary_point(
+        curve, position, 2 / START_POINTS, NEWTON_ITERATIONS
+    )
+    _, ties_of_two = max_with_ties(
+        magnitude(_horner(curve.value, jnp.stack([stationary_point, position])))
+    )
+    return jnp.where(ties_of_two[0], stationary_point, position)
 
 
-def refine(
-    samples: Float[Array, "point *rest"], points: tuple[float, ...], size: Callable = jnp.abs
+def refine_peak(
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = jnp.abs
 ) -> tuple[Float[Array, " *rest"], ...]:
     """Largest size of a value of the polynomial through the samples, and where in [0, 1] it is.
 
@@ -122,6 +134,6 @@ def refine(
     that at the fixed place of the peak, which is exact where the peak is a maximum inside the curve
     and where it is at an end that stays.
     """
-    place = find(jax.lax.stop_gradient(samples), points, size)
-    place = jax.lax.optimization_barrier(jax.lax.stop_gradient(place))
-    return size(_value(_curve(samples, points).value, place)), (place + 1) / 2
+    position = locate_peak(jax.lax.stop_gradient(samples), points, magnitude)
+    position = jax.lax.optimization_barrier(jax.lax.stop_gradient(position))
+    return magnitude(_horner(_interpolate(samples, points).value, position)), (position + 1) / 2

@@ -12,58 +12,62 @@ from jaxbeam.runtime.compiling import compiled
 
 
 @compiled  # many small operations, which one by one would take seconds to compile
-def piecewise(nodes, series, x, derivatives) -> Float[Array, "order *place column"]:
+def piecewise_chebyshev(nodes, series, x, derivatives) -> Float[Array, "order *place column"]:
     """Functions given by one Chebyshev series for each segment between nodes, at positions x.
 
     `series` is (segment, degree, column); the derivatives are by x, in the unit of the nodes.
     """
     x = jnp.asarray(x, float)
-    size = jnp.diff(nodes) / 2
+    half_length = jnp.diff(nodes) / 2
     segments, terms, modes = series.shape
-    stretched = [
-        jnp.asarray(_differentiate(terms, d), series.dtype) @ series / size[:, None, None] ** d
+    derivative_series = [
+        jnp.asarray(_derivative_matrix(terms, d), series.dtype)
+        @ series
+        / half_length[:, None, None] ** d
         for d in derivatives
     ]
-    series = jnp.stack(stretched, axis=2).reshape(segments, terms, len(derivatives) * modes)
+    series = jnp.stack(derivative_series, axis=2).reshape(segments, terms, len(derivatives) * modes)
     segment = jnp.sum(x[..., None] >= nodes[1:-1], axis=-1)
-    local = (x - nodes[segment]) / size[segment] - 1
-    values = _sums(series, local, segment)
+    local = (x - nodes[segment]) / half_length[segment] - 1
+    values = _evaluate_series(series, local, segment)
     return jnp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
 
 
 @jax.custom_jvp
-def _sums(series, local, segment):
+def _evaluate_series(series, local, segment):
     """The series of the segment of each place, summed at that place, -1 to 1, in its segment."""
-    return _added(_terms(series, local, segment), series)
+    return _sum_series(_segment_polynomials(series, local, segment), series)
 
 
-@_sums.defjvp
-def _sums_jvp(given, changes):
+@_evaluate_series.defjvp
+def _evaluate_series_jvp(given, changes):
     """What moves along a series meets its derivative: nothing else need be differentiated."""
     series, local, segment = given
-    change, moved, _ = changes
-    table = _terms(series, local, segment)
-    steeper = jnp.asarray(_differentiate(series.shape[1], 1), series.dtype) @ series
-    values, slopes = jnp.split(_added(table, jnp.concatenate([series, steeper], axis=2)), 2, -1)
-    return values, _added(table, change) + slopes * moved[..., None]
+    change, local_tangent, _ = changes
+    table = _segment_polynomials(series, local, segment)
+    derivative_series = jnp.asarray(_derivative_matrix(series.shape[1], 1), series.dtype) @ series
+    values, slopes = jnp.split(
+        _sum_series(table, jnp.concatenate([series, derivative_series], axis=2)), 2, -1
+    )
+    return values, _sum_series(table, change) + slopes * local_tangent[..., None]
 
 
-def _added(table, series):
+def _sum_series(table, series):
     segments, terms, columns = series.shape
     return table @ series.reshape(segments * terms, columns)
 
 
-def _terms(series, local, segment):
+def _segment_polynomials(series, local, segment):
     """The polynomials of all segments, zero but for those of the segment of each place."""
     segments, terms, _ = series.shape
-    table = _chebyshev_table(local, terms)
+    table = _chebyshev_polynomials(local, terms)
     masks = (segment[..., None] == s for s in range(segments))
     parts = [jnp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
     return jnp.concatenate(parts, axis=-1)
 
 
 @functools.cache
-def _differentiate(terms: int, times: int) -> np.ndarray:
+def _derivative_matrix(terms: int, times: int) -> np.ndarray:
     """Matrix that differentiates a Chebyshev series `times` times, keeping its length."""
     matrix = np.zeros((terms, terms))
     matrix[: terms - times] = chebyshev.chebder(np.eye(terms), times)[: terms - times]
@@ -71,7 +75,7 @@ def _differentiate(terms: int, times: int) -> np.ndarray:
 
 
 @functools.cache
-def to_chebyshev(terms: int) -> np.ndarray:
+def legendre_to_chebyshev(terms: int) -> np.ndarray:
     """Matrix from Legendre to Chebyshev coefficients, by the values at Chebyshev points."""
     points = chebyshev.chebpts1(terms)
     values = legendre.legvander(points, terms - 1)
@@ -79,7 +83,7 @@ def to_chebyshev(terms: int) -> np.ndarray:
     return scale * (chebyshev.chebvander(points, terms - 1).T @ values)
 
 
-def _chebyshev_table(t, terms: int):
+def _chebyshev_polynomials(t, terms: int):
     """Chebyshev polynomials of degree 0 to terms - 1 at t, along a new last axis.
 
     Built by doubling, T_(k+j) = 2 T_k T_j - T_(k-j), which takes few steps and does not lose

@@ -13,27 +13,38 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import is_known, known
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.intervals import Commands, Inputs, Square, Stretch, even_units, symmetric
+from jaxbeam.numerics.intervals import (
+    InputMatrix,
+    InputWeight,
+    Interval,
+    Square,
+    costate_unit,
+    symmetric_part,
+)
 
-Gain = tuple[Float[Array, "input state"], Square]
+GainAndCost = tuple[Float[Array, "input state"], Square]
 
-DOUBLINGS = 60  # at most, before an equation is taken for unsolvable
-VANISHED = 1e-9  # norm of a drift whose square does not count
+MAX_DOUBLINGS = 60  # at most, before an equation is taken for unsolvable
+TRANSITION_TOLERANCE = 1e-9  # norm of a drift whose square does not count
 
 
-def care(A: Square, B: Inputs, Q: Square, R: Commands, N: Inputs | None = None) -> Square:
+def care(
+    A: Square, B: InputMatrix, Q: Square, R: InputWeight, N: InputMatrix | None = None
+) -> Square:
     """The stabilising P of A'P + P A - (P B + N) R^-1 (B'P + N') + Q = 0, eq. (3.10) of the thesis.
 
     Differentiable. Raises ValueError for matrices of wrong size, an R that is
     not positive, a Q that is indefinite, and if there is no stabilising solution; under `jit` and
     `vmap` the answer is nan instead.
     """
-    _check(A, B, Q, R, N)
-    drift, reach, toll = _without_cross(A, B, Q, R, N)
-    return _solved(_care(drift, reach, toll))
+    _check_weights(A, B, Q, R, N)
+    state_matrix, G, H = _without_cross_weight(A, B, Q, R, N)
+    return _require_finite(_care(state_matrix, G, H))
 
 
-def lqr(A: Square, B: Inputs, Q: Square, R: Commands, N: Inputs | None = None) -> Gain:
+def lqr(
+    A: Square, B: InputMatrix, Q: Square, R: InputWeight, N: InputMatrix | None = None
+) -> GainAndCost:
     """Gain K (input, state) of u = -K x with the least integral of x'Qx + u'Ru + 2x'Nu, and P.
 
     K = R^-1 (B'P + N'), eqs (3.7) and (3.11) of the thesis. Raises as `care`.
@@ -43,17 +54,21 @@ def lqr(A: Square, B: Inputs, Q: Square, R: Commands, N: Inputs | None = None) -
     return jnp.linalg.solve(R, cross), cost
 
 
-def dare(A: Square, B: Inputs, Q: Square, R: Commands, N: Inputs | None = None) -> Square:
+def dare(
+    A: Square, B: InputMatrix, Q: Square, R: InputWeight, N: InputMatrix | None = None
+) -> Square:
     """The stabilising P of A'PA - (A'PB + N) (R + B'PB)^-1 (B'PA + N') + Q = P.
 
     Differentiable. Raises as `care`.
     """
-    _check(A, B, Q, R, N)
-    drift, reach, toll = _without_cross(A, B, Q, R, N)
-    return _solved(_dare(drift, reach, toll))
+    _check_weights(A, B, Q, R, N)
+    state_matrix, G, H = _without_cross_weight(A, B, Q, R, N)
+    return _require_finite(_dare(state_matrix, G, H))
 
 
-def dlqr(A: Square, B: Inputs, Q: Square, R: Commands, N: Inputs | None = None) -> Gain:
+def dlqr(
+    A: Square, B: InputMatrix, Q: Square, R: InputWeight, N: InputMatrix | None = None
+) -> GainAndCost:
     """Gain K (input, state) of u = -K x with the least sum of x'Qx + u'Ru + 2x'Nu, and P.
 
     Raises as `care`.
@@ -70,18 +85,18 @@ def lyapunov(A: Square, S: Square) -> Square:
     outer = scale * scale[:, None]
 
     def solve(matrix, right):
-        pole = _pole(matrix)
-        inverse = jnp.linalg.inv(pole * jnp.eye(matrix.shape[0]) - matrix)
-        drift = inverse @ (pole * jnp.eye(matrix.shape[0]) + matrix)
-        return _doubled_sum(drift, 2 * pole * inverse.T @ right @ inverse)
+        shift = _cayley_shift(matrix)
+        inverse = jnp.linalg.inv(shift * jnp.eye(matrix.shape[0]) - matrix)
+        discrete_matrix = inverse @ (shift * jnp.eye(matrix.shape[0]) + matrix)
+        return _stein_series(discrete_matrix, 2 * shift * inverse.T @ right @ inverse)
 
-    found = jax.lax.custom_linear_solve(
+    scaled_solution = jax.lax.custom_linear_solve(
         lambda x: -(scaled.T @ x + x @ scaled),
         S * outer,
         lambda _, right: solve(scaled, right),
         lambda _, right: solve(scaled.T, right),
     )
-    return found / outer
+    return scaled_solution / outer
 
 
 def stein(A: Square, S: Square) -> Square:
@@ -89,131 +104,140 @@ def stein(A: Square, S: Square) -> Square:
     scale = balance(A)
     scaled = A * scale / scale[:, None]
     outer = scale * scale[:, None]
-    found = jax.lax.custom_linear_solve(
+    scaled_solution = jax.lax.custom_linear_solve(
         lambda x: x - scaled.T @ x @ scaled,
         S * outer,
-        lambda _, right: _doubled_sum(scaled, right),
-        lambda _, right: _doubled_sum(scaled.T, right),
+        lambda _, right: _stein_series(scaled, right),
+        lambda _, right: _stein_series(scaled.T, right),
     )
-    return found / outer
+    return scaled_solution / outer
 
 
 @jax.custom_jvp
-def _care(drift, reach, toll):
+def _care(A, G, H):
     """P of drift'P + P drift - P reach P + toll = 0."""
-    scale = balance(drift)
+    scale = balance(A)
     outer = scale * scale[:, None]
-    drift, reach, toll = drift * scale / scale[:, None], reach / outer, toll * outer
-    unit = even_units(reach, toll)
-    reach, toll = reach / unit, toll * unit
+    A, G, H = A * scale / scale[:, None], G / outer, H * outer
+    unit = costate_unit(G, H)
+    G, H = G / unit, H * unit
     # Cayley's transform makes of it an equation in discrete time with the same solution.
-    size = drift.shape[0]
-    pole = _pole(drift)
-    shifted = jnp.linalg.inv(drift - pole * jnp.eye(size))
-    mixed = jnp.linalg.inv(drift.T - pole * jnp.eye(size) + toll @ shifted @ reach)
-    start = Stretch(
-        drift=jnp.eye(size) + 2 * pole * mixed.T,
-        reach=symmetric(2 * pole * shifted @ reach @ mixed),
-        toll=symmetric(2 * pole * mixed @ toll @ shifted),
+    size = A.shape[0]
+    shift = _cayley_shift(A)
+    shifted = jnp.linalg.inv(A - shift * jnp.eye(size))
+    mixed = jnp.linalg.inv(A.T - shift * jnp.eye(size) + H @ shifted @ G)
+    start = Interval(
+        transition=jnp.eye(size) + 2 * shift * mixed.T,
+        G=symmetric_part(2 * shift * shifted @ G @ mixed),
+        H=symmetric_part(2 * shift * mixed @ H @ shifted),
     )
-    cost = _endless(start)
+    cost = _doubled_to_infinity(start)
     for _ in range(2):
-        onward = drift - reach @ cost
-        cost = symmetric(lyapunov(onward, toll + cost @ reach @ cost))
+        closed_loop = A - G @ cost
+        cost = symmetric_part(lyapunov(closed_loop, H + cost @ G @ cost))
     return cost / outer / unit
 
 
 @_care.defjvp
 def _care_jvp(primals, tangents):
-    drift, reach, _ = primals
-    drift_change, reach_change, toll_change = tangents
+    A, G, _ = primals
+    A_tangent, G_tangent, H_tangent = tangents
     cost = _care(*primals)
-    felt = cost @ drift_change
-    source = felt + felt.T - cost @ reach_change @ cost + toll_change
-    return cost, lyapunov(drift - reach @ cost, source)
+    half_source = cost @ A_tangent
+    source = half_source + half_source.T - cost @ G_tangent @ cost + H_tangent
+    return cost, lyapunov(A - G @ cost, source)
 
 
 @jax.custom_jvp
-def _dare(drift, reach, toll):
+def _dare(A, G, H):
     """P of P = drift'P (1 + reach P)^-1 drift + toll."""
-    scale = balance(drift)
+    scale = balance(A)
     outer = scale * scale[:, None]
-    drift, reach, toll = drift * scale / scale[:, None], reach / outer, toll * outer
-    unit = even_units(reach, toll)
-    reach, toll = reach / unit, toll * unit
-    cost = _endless(Stretch(drift, reach, toll))
+    A, G, H = A * scale / scale[:, None], G / outer, H * outer
+    unit = costate_unit(G, H)
+    G, H = G / unit, H * unit
+    cost = _doubled_to_infinity(Interval(A, G, H))
     for _ in range(2):
-        onward = _closed(drift, reach, cost)
-        spent = cost @ onward
-        cost = symmetric(stein(onward, toll + spent.T @ reach @ spent))
+        closed_loop = _closed_loop_matrix(A, G, cost)
+        cost_closed_loop = cost @ closed_loop
+        cost = symmetric_part(stein(closed_loop, H + cost_closed_loop.T @ G @ cost_closed_loop))
     return cost / outer / unit
 
 
 @_dare.defjvp
 def _dare_jvp(primals, tangents):
-    drift, reach, _ = primals
-    drift_change, reach_change, toll_change = tangents
+    A, G, _ = primals
+    A_tangent, G_tangent, H_tangent = tangents
     cost = _dare(*primals)
-    onward = _closed(drift, reach, cost)
-    spent = cost @ onward
-    felt = spent.T @ drift_change
-    source = felt + felt.T - spent.T @ reach_change @ spent + toll_change
-    return cost, stein(onward, source)
+    closed_loop = _closed_loop_matrix(A, G, cost)
+    cost_closed_loop = cost @ closed_loop
+    half_source = cost_closed_loop.T @ A_tangent
+    source = (
+        half_source + half_source.T - cost_closed_loop.T @ G_tangent @ cost_closed_loop + H_tangent
+    )
+    return cost, stein(closed_loop, source)
 
 
-def _closed(drift, reach, cost):
+def _closed_loop_matrix(A, G, cost):
     """State matrix of the closed loop in discrete time."""
-    return jnp.linalg.solve(jnp.eye(drift.shape[0]) + reach @ cost, drift)
+    return jnp.linalg.solve(jnp.eye(A.shape[0]) + G @ cost, A)
 
 
-def _endless(start: Stretch) -> Square:
+def _doubled_to_infinity(interval: Interval) -> Square:
     """The toll of a stretch joined to itself for ever; nan if its drift does not die away."""
 
-    def lasts(state):
+    def unconverged(state):
         part, count = state
-        return (jnp.max(jnp.abs(part.drift)) > VANISHED) & (count < DOUBLINGS)
+        return (jnp.max(jnp.abs(part.drift)) > TRANSITION_TOLERANCE) & (count < MAX_DOUBLINGS)
 
-    part, _ = jax.lax.while_loop(lasts, lambda s: (s[0].then(s[0]), s[1] + 1), (start, 0))
-    return jnp.where(jnp.max(jnp.abs(part.drift)) <= VANISHED, part.toll, jnp.nan)
+    part, _ = jax.lax.while_loop(
+        unconverged, lambda s: (s[0].compose(s[0]), s[1] + 1), (interval, 0)
+    )
+    return jnp.where(jnp.max(jnp.abs(part.transition)) <= TRANSITION_TOLERANCE, part.H, jnp.nan)
 
 
-def _doubled_sum(drift, first):
+def _stein_series(A, first_term):
     """The sum of drift'^k first drift^k over all k, twice as many terms at a time."""
 
-    def lasts(state):
+    def unconverged(state):
         _, power, count = state
-        return (jnp.max(jnp.abs(power)) > VANISHED) & (count < DOUBLINGS)
+        return (jnp.max(jnp.abs(power)) > TRANSITION_TOLERANCE) & (count < MAX_DOUBLINGS)
 
     def double(state):
         total, power, count = state
         return total + power.T @ total @ power, power @ power, count + 1
 
-    total, power, _ = jax.lax.while_loop(lasts, double, (first, drift, 0))
-    return jnp.where(jnp.max(jnp.abs(power)) <= VANISHED, total, jnp.nan)
+    total, power, _ = jax.lax.while_loop(unconverged, double, (first_term, A, 0))
+    return jnp.where(jnp.max(jnp.abs(power)) <= TRANSITION_TOLERANCE, total, jnp.nan)
 
 
-def _pole(matrix):
+def _cayley_shift(matrix):
     """A rate larger than that of any eigenvalue, at which Cayley's transform is centred."""
     return 1.1 * jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + jnp.finfo(float).tiny
 
 
-def _without_cross(A, B, Q, R, N):
+def _without_cross_weight(A, B, Q, R, N):
     """State matrix, B R^-1 B' and state weight of the same problem without a cross weight."""
     inverse = jnp.linalg.inv(R)
-    reach = symmetric(B @ inverse @ B.T)
+    G = symmetric_part(B @ inverse @ B.T)
     if N is None:
-        return A, reach, Q
-    return A - B @ inverse @ N.T, reach, Q - symmetric(N @ inverse @ N.T)
+        return A, G, Q
+    return A - B @ inverse @ N.T, G, Q - symmetric_part(N @ inverse @ N.T)
 
 
-def _check(A, B, Q, R, N):
+def _check_weights(A, B, Q, R, N):
     """Raise ValueError for matrices that pose no problem of optimal control."""
     states, inputs = B.shape
-    wanted = {"A": (states, states), "Q": (states, states), "R": (inputs, inputs), "N": B.shape}
+    expected_shapes = {
+        "A": (states, states),
+        "Q": (states, states),
+        "R": (inputs, inputs),
+        "N": B.shape,
+    }
     for name, matrix in {"A": A, "Q": Q, "R": R, "N": N}.items():
-        if matrix is not None and matrix.shape != wanted[name]:
+        if matrix is not None and matrix.shape != expected_shapes[name]:
             raise ValueError(
-                f"{name} must be {wanted[name]} for a B of {B.shape}, not {matrix.shape}"
+                f"{name} must be {expected_shapes[name]} for a B of {B.shape}, not {matrix.shape}"
             )
     for name, weight in {"Q": Q, "R": R}.items():
         if not is_known(weight):
@@ -222,14 +246,18 @@ def _check(A, B, Q, R, N):
         size = np.max(np.abs(weight), initial=0.0)
         if np.max(np.abs(weight - weight.T), initial=0.0) > 1e-12 * size:
             raise ValueError(f"{name} must be symmetric; take the mean of it and its transpose")
-        least = np.min(np.linalg.eigvalsh(weight), initial=np.inf)
-        if name == "R" and least <= 0:
-            raise ValueError(f"R must be positive definite; its least eigenvalue is {least:g}")
-        if name == "Q" and least < -1e-12 * size:
-            raise ValueError(f"Q must not be negative; its least eigenvalue is {least:g}")
+        smallest_eigenvalue = np.min(np.linalg.eigvalsh(weight), initial=np.inf)
+        if name == "R" and smallest_eigenvalue <= 0:
+            raise ValueError(
+                f"R must be positive definite; its least eigenvalue is {smallest_eigenvalue:g}"
+            )
+        if name == "Q" and smallest_eigenvalue < -1e-12 * size:
+            raise ValueError(
+                f"Q must not be negative; its least eigenvalue is {smallest_eigenvalue:g}"
+            )
 
 
-def _solved(cost):
+def _require_finite(cost):
     if is_known(cost) and not np.all(np.isfinite(known(cost))):
         raise ValueError(
             "there is no stabilising solution: some undamped or growing mode is out of the reach"

@@ -16,123 +16,133 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.numerics.batched_linalg import (
-    in_lanes,
-    lanes_of,
-    solve_lanes,
-    times,
-    turned,
+    batch_axis_last,
+    batch_size_of,
+    matmul,
+    solve_batch,
+    transpose,
 )
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.intervals import Commands, Square, symmetric, transposed
+from jaxbeam.numerics.intervals import InputWeight, Square, matrix_transpose, symmetric_part
 
-STAGES = 6  # Gauss nodes of a stretch; order 12
-NODES = (np.polynomial.legendre.leggauss(STAGES)[0] + 1) / 2
+NODE_COUNT = 6  # Gauss nodes of a stretch; order 12
+GAUSS_NODES = (np.polynomial.legendre.leggauss(NODE_COUNT)[0] + 1) / 2
 
 
-class Flow(eqx.Module):
+class Stage(eqx.Module):
     """What a plant does over a stretch, and what it costs; see the module."""
 
-    drift: Float[Array, "*batch state state"]
-    push: Float[Array, "*batch state value"]
-    toll: Float[Array, "*batch both both"]
+    transition: Float[Array, "*batch state state"]
+    input_matrix: Float[Array, "*batch state value"]
+    cost: Float[Array, "*batch both both"]
 
 
-def flows(
+def collocated_stages(
     A: Float[Array, "stretch stage state state"],
     B: Float[Array, "stretch stage state input"],
     Q: Square,
-    R: Commands,
+    R: InputWeight,
     lengths: Float[Array, " stretch"],
-) -> Flow:
-    """Flows over stretches of given lengths (s) along a plant known at their Gauss nodes, `NODES`.
+) -> Stage:
+    """Flows over stretches of given lengths (s) along a plant known at their Gauss nodes, `GAUSS_NODES`.
 
     By collocation of x' = A x + B u, the cost by Gauss's rule: together the same as collocation of
     the equations of the optimal state and costate, of order 12 (Hager, Numer. Math. 87, 2000). Fast
     modes should turn by no more than about 2 rad in a stretch.
     """
     scale = balance(A[0, 0])
-    matrices, columns = A * scale / scale[:, None], B / scale[:, None]
+    scaled_A, scaled_B = A * scale / scale[:, None], B / scale[:, None]
 
-    def one(part):
+    def collocate(part):
         matrix, column, length = part
-        return _collocated(matrix, column, length, Q * scale * scale[:, None], R)
+        return _collocated_stage(matrix, column, length, Q * scale * scale[:, None], R)
 
-    found = jax.lax.map(one, (matrices, columns, lengths), batch_size=16)
-    held = jnp.concatenate([scale, jnp.ones(found.push.shape[-1])])
-    return Flow(
-        drift=found.drift * scale[:, None] / scale,
-        push=found.push * scale[:, None],
-        toll=found.toll / held / held[:, None],
+    scaled_stages = jax.lax.map(collocate, (scaled_A, scaled_B, lengths), batch_size=16)
+    scale_with_inputs = jnp.concatenate([scale, jnp.ones(scaled_stages.push.shape[-1])])
+    return Stage(
+        transition=scaled_stages.drift * scale[:, None] / scale,
+        input_matrix=scaled_stages.push * scale[:, None],
+        cost=scaled_stages.toll / scale_with_inputs / scale_with_inputs[:, None],
     )
 
 
-def costs_to_go(parts: Flow, terminal: Square) -> Float[Array, "edge state state"]:
+def costs_to_go(stages: Stage, terminal_cost: Square) -> Float[Array, "edge state state"]:
     """P at the start of each of successive stretches and, last, at the end, where it is given."""
-    return in_lanes(carried, parts, jnp.zeros((1, 1)), terminal)
+    return batch_axis_last(riccati_recursion, stages, jnp.zeros((1, 1)), terminal_cost)
 
 
-def carried(
-    parts: Flow,
-    effort: Float[Array, "#value #value #lane"],
-    terminal: Float[Array, "state state #lane"],
+def riccati_recursion(
+    stages: Stage,
+    command_cost: Float[Array, "#value #value #lane"],
+    terminal_cost: Float[Array, "state state #lane"],
 ) -> Float[Array, "edge state state lane"]:
     """P at the start of each of successive stretches and at the end, with lanes as the last axis.
 
-    Commands also cost `effort`, which lanes that share the flows need not share.
+    Commands also cost `command_cost`, which lanes that share the flows need not share.
     """
-    states = terminal.shape[0]
+    states = terminal_cost.shape[0]
 
-    def back(cost, part):
-        across, toll = part
-        total = toll + times(across, turned(times(across, cost)))
-        mixed = total[states:, :states]
-        answer = solve_lanes(total[states:, states:] + effort, mixed)
-        cost = total[:states, :states] - times(turned(mixed), answer)
+    def backward_step(cost, part):
+        across, stage_cost = part
+        quadratic_cost = stage_cost + matmul(across, transpose(matmul(across, cost)))
+        cross_cost = quadratic_cost[states:, :states]
+        gain = solve_batch(quadratic_cost[states:, states:] + command_cost, cross_cost)
+        cost = quadratic_cost[:states, :states] - matmul(transpose(cross_cost), gain)
         return cost, cost
 
-    across = jnp.concatenate([parts.drift, parts.push], axis=2).swapaxes(1, 2)
-    wide = jnp.broadcast_to(terminal, (states, states, lanes_of(parts, effort, terminal)))
-    costs = jax.lax.scan(back, wide, (across, parts.toll), reverse=True)[1]
-    return jnp.concatenate([costs, wide[None]])
+    transition_and_input = jnp.concatenate(
+        [stages.transition, stages.input_matrix], axis=2
+    ).swapaxes(1, 2)
+    batched_terminal_cost = jnp.broadcast_to(
+        terminal_cost, (states, states, batch_size_of(stages, command_cost, terminal_cost))
+    )
+    costs = jax.lax.scan(
+        backward_step, batched_terminal_cost, (transition_and_input, stages.cost), reverse=True
+    )[1]
+    return jnp.concatenate([costs, batched_terminal_cost[None]])
 
 
-def _collocated(matrix, column, length, Q, R) -> Flow:
+def _collocated_stage(A, B, length, Q, R) -> Stage:
     """The flow of a plant with (stage, state, ...) matrices; unknown are the rates h x'.
 
     x_i = x(start) + sum_j a_ij h x'_j.
     """
-    _, size, inputs = column.shape
-    matrix, column, values = length * matrix, length * column, STAGES * inputs
-    rows = STAGES * size
-    own = _UNTIL[:, None, :, None] * matrix[:, :, None, :]
+    _, size, inputs = B.shape
+    A, B, values = length * A, length * B, NODE_COUNT * inputs
+    rows = NODE_COUNT * size
+    state_coupling = _INTEGRATION_MATRIX[:, None, :, None] * A[:, :, None, :]
     # Each node has a command of its own.
-    pushed = np.eye(STAGES)[:, None, :, None] * column[:, :, None, :]
-    right = jnp.concatenate([matrix, pushed.reshape(STAGES, size, values)], axis=2)
+    input_coupling = np.eye(NODE_COUNT)[:, None, :, None] * B[:, :, None, :]
+    right = jnp.concatenate([A, input_coupling.reshape(NODE_COUNT, size, values)], axis=2)
     rates = jnp.linalg.solve(
-        jnp.eye(rows) - own.reshape(rows, rows), right.reshape(rows, size + values)
-    ).reshape(STAGES, size, size + values)
+        jnp.eye(rows) - state_coupling.reshape(rows, rows), right.reshape(rows, size + values)
+    ).reshape(NODE_COUNT, size, size + values)
     start = np.eye(size, size + values)
-    states = start + jnp.tensordot(_UNTIL, rates, axes=1)
-    end = start + jnp.tensordot(_WEIGHTS, rates, axes=1)
-    weighted = _WEIGHTS[:, None, None] * (Q @ states)
-    spent = symmetric(jnp.tensordot(transposed(states), weighted, ((0, 2), (0, 1))))
-    toll = length * spent + jnp.pad(on_commands(R, length), (size, 0))
-    return Flow(end[:, :size], end[:, size:], toll)
+    states = start + jnp.tensordot(_INTEGRATION_MATRIX, rates, axes=1)
+    end = start + jnp.tensordot(_QUADRATURE_WEIGHTS, rates, axes=1)
+    weighted = _QUADRATURE_WEIGHTS[:, None, None] * (Q @ states)
+    integrated_cost = symmetric_part(
+        jnp.tensordot(matrix_transpose(states), weighted, ((0, 2), (0, 1)))
+    )
+    cost = length * integrated_cost + jnp.pad(command_cost_matrix(R, length), (size, 0))
+    return Stage(end[:, :size], end[:, size:], cost)
 
 
-def on_commands(R: Commands, length: Float[Array, ""]) -> Float[Array, "value value"]:
+def command_cost_matrix(R: InputWeight, length: Float[Array, ""]) -> Float[Array, "value value"]:
     """What the commands cost over a stretch (s); Gauss's rule is exact for their squares."""
     # Where a stretch has no length they do nothing, and must not seem to be free.
-    span = jnp.where(length > 0, length, 1.0)
-    return span * jnp.kron(np.diag(_WEIGHTS), R)
+    safe_length = jnp.where(length > 0, length, 1.0)
+    return safe_length * jnp.kron(np.diag(_QUADRATURE_WEIGHTS), R)
 
 
 def _gauss_tableau():
     """Weights a_ij (up to each node) and b_j (over all) of the Gauss collocation method."""
-    powers = np.arange(1, STAGES + 1)
-    vandermonde = NODES[:, None] ** (powers - 1)
-    until = np.linalg.solve(vandermonde.T, (NODES[:, None] ** powers / powers).T).T
-    return until, np.linalg.solve(vandermonde.T, 1 / powers)
+    powers = np.arange(1, NODE_COUNT + 1)
+    vandermonde = GAUSS_NODES[:, None] ** (powers - 1)
+    integration_matrix = np.linalg.solve(
+        vandermonde.T, (GAUSS_NODES[:, None] ** powers / powers).T
+    ).T
+    return integration_matrix, np.linalg.solve(vandermonde.T, 1 / powers)
 
 
-_UNTIL, _WEIGHTS = _gauss_tableau()
+_INTEGRATION_MATRIX, _QUADRATURE_WEIGHTS = _gauss_tableau()

@@ -25,15 +25,23 @@ from typing import Any
 import jax
 from jax.experimental import serialize_executable
 
-OURS = ("jaxbeam", "tuning")  # whose source is part of the mark
+OWN_PACKAGES = ("jaxbeam", "tuning")  # whose source is part of the mark
 # What a program may be made of, by us or by one of these; a test compares with what is declared.
-BENEATH = (
+DEPENDENCIES = (
     *("jax", "jaxlib", "numpy", "scipy", "jaxtyping", "equinox", "optax"),
     *("diffrax", "optimistix", "lineax", "qpax", "blackjax"),
 )
-SAFE = {*OURS, "jax", "jaxlib", "equinox", "numpy", "scipy", *sys.stdlib_module_names}
+VERSIONED_PACKAGES = {
+    *OWN_PACKAGES,
+    "jax",
+    "jaxlib",
+    "equinox",
+    "numpy",
+    "scipy",
+    *sys.stdlib_module_names,
+}
 # Settings of JAX that change no program, or are told with each.
-ASIDE = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_enable_x64")
+IGNORED_SETTINGS = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_enable_x64")
 
 
 def cache_folder() -> pathlib.Path:
@@ -42,96 +50,96 @@ def cache_folder() -> pathlib.Path:
     return pathlib.Path(folder) / "jaxbeam"
 
 
-def machine() -> str:
+def machine_description() -> str:
     """What tells this machine from others, for which what was compiled here may not run."""
     try:
         lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         cpu = platform.processor()
     else:
-        told = {line for line in lines if line.startswith(("model name", "flags"))}
-        cpu = "".join(sorted(told))
+        cpu_lines = {line for line in lines if line.startswith(("model name", "flags"))}
+        cpu = "".join(sorted(cpu_lines))
     return "\n".join([sys.platform, platform.machine(), cpu])
 
 
-def folder() -> pathlib.Path | None:
+def program_folder() -> pathlib.Path | None:
     """Where programs are kept, if JAX is told where: those for CPUs, one device, one file each."""
-    given = jax.config.jax_compilation_cache_dir
-    if not given or "://" in given or not jax.config.jax_enable_compilation_cache:
+    configured = jax.config.jax_compilation_cache_dir
+    if not configured or "://" in configured or not jax.config.jax_enable_compilation_cache:
         return None
-    alone = jax.default_backend() == "cpu" and len(jax.local_devices()) == 1
-    return pathlib.Path(given) if alone else None
+    single_cpu = jax.default_backend() == "cpu" and len(jax.local_devices()) == 1
+    return pathlib.Path(configured) if single_cpu else None
 
 
-def place(function, identity: tuple) -> pathlib.Path | None:
+def cache_path(function, identity: tuple) -> pathlib.Path | None:
     """Where a program is kept, if there is a folder and all that decides the program is known.
 
     `identity` is all that tells it from other programs of the function, a `compiling.Compiled`.
     """
-    there = folder()
-    if there is None or not _ours(function):
+    directory = program_folder()
+    if directory is None or not _is_cacheable(function):
         return None
-    about = function.__module__, function.__name__, function.settings, identity, _settings()
+    key = function.__module__, function.__name__, function.settings, identity, _jax_settings()
     try:
-        described = _written(about)
-    except UNWRITTEN:
+        serialised_key = _serialise(key)
+    except SERIALISATION_ERRORS:
         return None
-    mark = hashlib.sha256(_surroundings() + described).hexdigest()[:32]
-    return there / f"jaxbeam-{function.__name__}-{mark}"
+    digest = hashlib.sha256(_environment_hash() + serialised_key).hexdigest()[:32]
+    return directory / f"jaxbeam-{function.__name__}-{digest}"
 
 
-def _ours(function) -> bool:
+def _is_cacheable(function) -> bool:
     """Whether it is ours and stands in a module: one within another may use what that was given."""
-    if function.__module__.split(".")[0] not in OURS:
+    if function.__module__.split(".")[0] not in OWN_PACKAGES:
         return False
     found = getattr(sys.modules[function.__module__], function.__qualname__, None)
     return found is function or found is function.__wrapped__
 
 
-def write(path: pathlib.Path, program: jax.stages.Compiled, returns: Any) -> None:
+def save_program(path: pathlib.Path, program: jax.stages.Compiled, outputs: Any) -> None:
     """Keep a program, and what is known of what it returns; do nothing where that cannot be."""
-    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), returns)
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), outputs)
     try:
-        content = _written((serialize_executable.serialize(program)[0], shapes))
+        content = _serialise((serialize_executable.serialize(program)[0], shapes))
         path.parent.mkdir(parents=True, exist_ok=True)
         # Made beside its place and moved there, so that nobody ever reads half of it.
-        with tempfile.TemporaryDirectory(dir=path.parent) as beside:
-            made = pathlib.Path(beside) / path.name
-            made.write_bytes(hashlib.sha256(content).digest() + content)
-            os.replace(made, path)
-    except (*UNWRITTEN, ValueError, NotImplementedError, OSError):
+        with tempfile.TemporaryDirectory(dir=path.parent) as temporary:
+            temporary_file = pathlib.Path(temporary) / path.name
+            temporary_file.write_bytes(hashlib.sha256(content).digest() + content)
+            os.replace(temporary_file, path)
+    except (*SERIALISATION_ERRORS, ValueError, NotImplementedError, OSError):
         pass  # it will be compiled again
 
 
-def read(path: pathlib.Path) -> tuple[bytes, Any] | None:
+def read_program(path: pathlib.Path) -> tuple[bytes, Any] | None:
     """The code of a program that is kept, and what it returns; None if it is missing or damaged."""
     try:
         found = path.read_bytes()
     except OSError:
         return None
-    mark, content = found[:32], found[32:]
-    return pickle.loads(content) if hashlib.sha256(content).digest() == mark else None
+    digest, content = found[:32], found[32:]
+    return pickle.loads(content) if hashlib.sha256(content).digest() == digest else None
 
 
-def load(code: bytes, given: Any, returns: Any) -> jax.stages.Compiled:
+def load_program(code: bytes, arguments: Any, outputs: Any) -> jax.stages.Compiled:
     """The program, for arguments and results of the structure of these."""
     if b"lapack" in code:  # only then, as it takes as long as loading all the rest
-        _lapack()
-    trees = jax.tree.structure((given, {})), jax.tree.structure(returns)
+        _load_lapack()
+    trees = jax.tree.structure((arguments, {})), jax.tree.structure(outputs)
     return serialize_executable.deserialize_and_load(code, *trees)
 
 
 @functools.cache
-def _lapack() -> None:
+def _load_lapack() -> None:
     """Have JAX load LAPACK, as it does when it lowers a program, and no sooner."""
     jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
 
 
-class _Foreign(Exception):
+class _ExternalCode(Exception):
     """Something depends on code whose version is not known."""
 
 
-UNWRITTEN = (_Foreign, pickle.PicklingError, AttributeError, TypeError)
+SERIALISATION_ERRORS = (_ExternalCode, pickle.PicklingError, AttributeError, TypeError)
 
 
 class _Pickler(pickle.Pickler):
@@ -143,8 +151,8 @@ class _Pickler(pickle.Pickler):
         Raises _Foreign if it is code that others may change.
         """
         named = isinstance(obj, type | types.FunctionType | types.BuiltinFunctionType)
-        if str((obj if named else type(obj)).__module__).split(".")[0] not in SAFE:
-            raise _Foreign(obj)
+        if str((obj if named else type(obj)).__module__).split(".")[0] not in VERSIONED_PACKAGES:
+            raise _ExternalCode(obj)
         if named:
             return NotImplemented
         # Marks, such as equinox has for what is missing, stay the very same objects.
@@ -154,7 +162,7 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def _written(obj) -> bytes:
+def _serialise(obj) -> bytes:
     """Something as bytes. Raises _Foreign, or an error of pickle, if it cannot be written."""
     file = io.BytesIO()
     pickler = _Pickler(file, protocol=5)
@@ -163,9 +171,9 @@ def _written(obj) -> bytes:
     return file.getvalue()
 
 
-def _settings() -> list[tuple[str, str]]:
+def _jax_settings() -> list[tuple[str, str]]:
     """The settings of JAX that may change a program."""
-    names = (name for name in sorted(jax.config.values) if not name.startswith(ASIDE))
+    names = (name for name in sorted(jax.config.values) if not name.startswith(IGNORED_SETTINGS))
     return [(name, repr(getattr(jax.config, name, None))) for name in names]
 
 
@@ -177,13 +185,18 @@ def _version(name: str) -> str:
 
 
 @functools.cache
-def _surroundings() -> bytes:
+def _environment_hash() -> bytes:
     """A number for our source, the packages beneath it, and the machine."""
-    marks = [machine(), jax.default_backend(), os.environ.get("XLA_FLAGS", ""), sys.version]
-    marks += map(_version, BENEATH)
-    found = hashlib.sha256("\n".join(marks).encode())
-    home = pathlib.Path(__file__).parents[2]
-    for path in sorted(path for package in OURS for path in (home / package).rglob("*")):
+    descriptions = [
+        machine_description(),
+        jax.default_backend(),
+        os.environ.get("XLA_FLAGS", ""),
+        sys.version,
+    ]
+    descriptions += map(_version, DEPENDENCIES)
+    digest = hashlib.sha256("\n".join(descriptions).encode())
+    root = pathlib.Path(__file__).parents[2]
+    for path in sorted(path for package in OWN_PACKAGES for path in (root / package).rglob("*")):
         if path.suffix in (".py", ".c", ".h"):
-            found.update(str(path.relative_to(home)).encode() + path.read_bytes())
-    return found.digest()
+            digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.digest()

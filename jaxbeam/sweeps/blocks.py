@@ -75,13 +75,13 @@ class Work:
         slots = len(case.loads)
         if slots > 1:
             slots = max(most_at_once(window) for window in windows())
-        self.form = Form(layout, couples(case), slots, native_peaks.serves(case) and not single)
+        self.form = Form(layout, couples(case), slots, native_peaks.supports(case) and not single)
         # C puts rigs on their steps itself.
         self.apart = case.controller is None and not self.form.by_hand
         job = self.job()
         # What takes longest to compile goes first; meanwhile the others are made ready for it.
         compiling = [
-            self.pool.submit(program.ahead(*arguments))
+            self.pool.submit(program.precompile(*arguments))
             for program, arguments in self._programs(job, tasks.heavy[parts[0]])
         ]
         entries, exits = np.moveaxis(windows(), 2, 0)
@@ -148,13 +148,13 @@ class Work:
 
     def _programs(self, job, heavy):
         """What finds the steps, slowest to compile first, with arguments of the right shapes."""
-        alike, _ = programs.rigs.blank(job, heavy)
+        alike, _ = programs.rigs.template(job, heavy)
         first = np.zeros(self.each, int)
         pace = np.ones(self.each), first
         wanted = first > 0
         rigs = alike if self.shared else jax.tree.map(lambda leaf: leaf[first], alike)
         given = job, wanted, rigs, self.tasks.heavy[first], pace
-        rigs = programs.riggings.blank(*given) if self.apart else self._bare(rigs)
+        rigs = programs.riggings.template(*given) if self.apart else self._bare(rigs)
         yield programs.block, (job, self.devices, wanted, rigs, *self._values_of(first), pace)
         if self.apart:
             yield programs.riggings, given
@@ -176,7 +176,7 @@ class Work:
         with jax.enable_x64(False) if single else contextlib.nullcontext():
             with self._compiling:  # others wait for the first, instead of compiling the same again
                 if (substeps, single) not in self._ready:
-                    programs.block.ahead(*arguments)()
+                    programs.block.precompile(*arguments)()
                     self._ready.add((substeps, single))
             results = programs.block(*arguments)
         found = {name: np.asarray(values) for name, values in results.items()}

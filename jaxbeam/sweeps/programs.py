@@ -23,7 +23,12 @@ from jaxbeam.integrator.step_matrices import make_rigging
 from jaxbeam.integrator.time_grid import even_grid, scheduled_grid
 from jaxbeam.model.contact import Traffic, traffic
 from jaxbeam.model.modal_model import Rig, rig
-from jaxbeam.runtime.compiling import ROUGHLY, SIDE_BY_SIDE, compiled, compiled_with
+from jaxbeam.runtime.compiling import (
+    LOW_OPTIMISATION,
+    PARALLEL_COMPILATION,
+    compiled,
+    compiled_with,
+)
 from jaxbeam.simulation.closed_loop import make_loop
 from jaxbeam.simulation.integration_plan import Form
 
@@ -72,7 +77,7 @@ class Job(NamedTuple):
         return make_rigging(assembled, self.grid(assembled, heavy, pace), places, driver)
 
 
-@compiled_with(**SIDE_BY_SIDE, **ROUGHLY)
+@compiled_with(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
 def rigs(job: Job, heavy):
     """Rigs of some tasks, and the longest step (s) each allows."""
 
@@ -96,7 +101,7 @@ def windows(case, addresses, heavy):
     return jax.vmap(task)(heavy)
 
 
-@compiled_with(**SIDE_BY_SIDE)
+@compiled_with(**PARALLEL_COMPILATION)
 def riggings(job: Job, wanted, rigs, heavy, pace):
     """Rigs on the steps of some tasks; a single rig is that of all, and stays single."""
     shared, own = _shared(rigs)
@@ -140,7 +145,7 @@ def _by_hand(job: Job, wanted, rigs, heavy, light, pace):
         return grid, job.varied(heavy).sensor_places, job.loads(heavy, light)
 
     arounds = jax.vmap(around)(own, heavy, light, pace)
-    return native_peaks.march(job.form.slots, wanted, rigs, *arounds)._asdict()
+    return native_peaks.integrate_peaks(job.form.slots, wanted, rigs, *arounds)._asdict()
 
 
 def _by_xla(job: Job, wanted, riggings, heavy, light, pace):

@@ -95,7 +95,7 @@ class Order:
 
     def fingerprint(self) -> str:
         """A number for all that shapes the results: case, values, settings and versions."""
-        by_hand = native_peaks.serves(self.case) and not (self.histories or self.single)
+        by_hand = native_peaks.supports(self.case) and not (self.histories or self.single)
         content = self.to_dict() | {
             "blocks": [RUNS, LANES, len(jax.local_devices())],
             "versions": [_version(), jax.__version__, by_hand],

@@ -14,8 +14,7 @@ from tqdm import tqdm
 from jaxbeam.case.case import Case
 from jaxbeam.simulation.integration_plan import TOLERANCE, sample_times
 from jaxbeam.simulation.record import sensor_labels
-from jaxbeam.sweeps import cluster
-from jaxbeam.sweeps import store as sweep_store
+from jaxbeam.sweeps import cluster, store as sweep_store
 from jaxbeam.sweeps.batches import Tasks
 from jaxbeam.sweeps.blocks import Work
 from jaxbeam.sweeps.specification import Order, make_order

@@ -13,7 +13,7 @@ from jaxbeam.analysis.linearised_loop import linear_loop
 from jaxbeam.analysis.margins import gramians, margins
 from jaxbeam.analysis.stability import _followed, frozen_poles, growth, stream
 from jaxbeam.analysis.stability_limits import limit
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.model.state_space import state_space
 from tests.modules import DATA
 
@@ -76,7 +76,7 @@ def regulator(**options):
     weights = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]
     return jb.LQR(
         state_weight=weights, command_weight=[9e-5], coordinates="sine",
-        design=Beliefs(force_per_volt=4.6), **options,
+        design=DesignModel(force_per_volt=4.6), **options,
     )  # fmt: skip
 
 

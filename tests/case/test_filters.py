@@ -16,7 +16,7 @@ from jaxbeam.case.filters import (
     initial,
     sections,
 )
-from jaxbeam.numerics.discretisation import hold
+from jaxbeam.numerics.discretisation import c2d
 from tests.differences import central
 
 ORDERS = [1, 2, 3, 5, 10]
@@ -112,12 +112,12 @@ def test_holds_are_exact(order):
     """Zero order against cont2discrete, first order against lsim, cubics against both halves."""
     matrix, column, row, direct = analogue(Filter(30.0, order))
     system = matrix, column[:, None], row[None], direct[None, None]
-    drift, push = hold(matrix, column[:, None], PERIOD)
+    drift, push = c2d(matrix, column[:, None], PERIOD)
     discrete = scipy.signal.cont2discrete([np.asarray(x) for x in system], PERIOD)
     assert_allclose(drift, discrete[0], rtol=1e-12, atol=1e-13)
     assert_allclose(push[0], discrete[1], rtol=1e-10, atol=1e-14)
 
-    drift, push = hold(matrix, column[:, None], PERIOD, degree=1)
+    drift, push = c2d(matrix, column[:, None], PERIOD, degree=1)
     times, signal = PERIOD * np.arange(400), SIGNAL[:, 0]
     expected = scipy.signal.lsim([np.asarray(x) for x in system], signal, times)[2]
     state, found = np.zeros(order), [np.zeros(order)]
@@ -128,8 +128,8 @@ def test_holds_are_exact(order):
 
     cubic = np.array([1.0, -2.0, 0.5, 3.0])  # in s / h; its halves in s / (h / 2), from the start
     second = np.polynomial.Polynomial(cubic)(np.polynomial.Polynomial([0.5, 0.5])).coef
-    drift, push = hold(matrix, column[:, None], 0.02, degree=3)
-    half_drift, half_push = hold(matrix, column[:, None], 0.01, degree=3)
+    drift, push = c2d(matrix, column[:, None], 0.02, degree=3)
+    half_drift, half_push = c2d(matrix, column[:, None], 0.01, degree=3)
     middle = np.tensordot(cubic * 0.5 ** np.arange(4), half_push[..., 0], axes=1)
     expected = half_drift @ middle + np.tensordot(second, half_push[..., 0], axes=1)
     assert_allclose(np.tensordot(cubic, push[..., 0], axes=1), expected, rtol=1e-11)
@@ -143,7 +143,7 @@ def test_derivatives_by_the_cutoff(order):
 
     def continuous(cutoff):
         matrix, column, _, _ = analogue(Filter(cutoff[0], order))
-        return jnp.concatenate([part.ravel() for part in hold(matrix, column[:, None], 0.01)])
+        return jnp.concatenate([part.ravel() for part in c2d(matrix, column[:, None], 0.01)])
 
     at = jnp.array([60.0])
     for function in (digital, continuous):

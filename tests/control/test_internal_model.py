@@ -53,7 +53,7 @@ def test_commands_are_those_of_the_table_for_readings_without_the_own_lift():
 
 def test_notches_are_the_analogue_ones_warped_to_their_frequencies():
     law = dataclasses.replace(LAW, notches=[16.0, 27.0], notch_damping=0.4)
-    made = law.init(jb.state_space(rig(law))).notches
+    made = law.init(jb.state_space(rig(law))).notch_sections
     # At rest 1, at its frequency 0, and in between what the analogue one gives a warped frequency.
     for hertz, section in zip([16.0, 27.0], np.asarray(made), strict=True):
         turn, at = 2 * 100.0 * np.tan(np.pi * hertz / 100.0), np.array([0.0, 9.0, hertz])

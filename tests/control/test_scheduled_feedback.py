@@ -50,8 +50,8 @@ def test_gains_are_those_for_the_mass():
         (0.4, [3.0, 4.0], [3.0, 4.0]),
         (0.9, [3.0, 4.0], [3.0, 4.0]),
     ):
-        assert_allclose(two.gains_for(jnp.asarray(mass)), line, rtol=1e-14)
-        assert_allclose(stepped.gains_for(jnp.asarray(mass)), steps, rtol=1e-14)
+        assert_allclose(two.gains_at(jnp.asarray(mass)), line, rtol=1e-14)
+        assert_allclose(stepped.gains_at(jnp.asarray(mass)), steps, rtol=1e-14)
     readings = jnp.array([-2.0, 0.5])
     memory = eqx.tree_at(lambda m: m.mass, two.init(jb.state_space(rig())), jnp.asarray(0.25))
     command, _ = two.step(memory, Measurement(readings, jnp.zeros(0), jnp.zeros(2)), 0.0)
@@ -169,7 +169,7 @@ def test_the_best_gain_is_lowest_by_the_oracle(loop):
         for other in (0.85, 1.18):
             assert peak(other * found.gain, found.mass) > lowest
     made = scheduled(loop, [light, heavy], "stepped")
-    assert_allclose(made.gains_for(jnp.asarray(0.1)), [light.gain], rtol=1e-12)
+    assert_allclose(made.gains_at(jnp.asarray(0.1)), [light.gain], rtol=1e-12)
     check(dataclasses.replace(loop, controller=made))
 
 

@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linear_loop
 from jaxbeam.case.validation import check
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation import Inversion, Kalman, Observer
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.simulation.closed_loop import loop_schedule
@@ -52,7 +52,7 @@ def loop(estimator, modes=3):
         sensors=[jb.Sensor(0.17, offset=1e-5), jb.Sensor(0.25)],
         loads=[jb.MovingMass(mass=MASS, speed=SPEED, entry_time=ENTRY)],
         controller=jb.LQR(
-            WEIGHTS, [EFFORT], design=Beliefs(modes=2, **BELIEVED), estimator=estimator
+            WEIGHTS, [EFFORT], design=DesignModel(modes=2, **BELIEVED), estimator=estimator
         ),
         run=jb.Run(END),
     )

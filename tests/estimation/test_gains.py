@@ -10,7 +10,7 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 from jaxbeam.estimation import kalman_gain, placed_gain, sampled_kalman_gain
-from jaxbeam.estimation.sampled_plant import Ticks
+from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.numerics.discretisation import balance
 from tests.differences import central
 
@@ -37,7 +37,9 @@ def _transition(ticks):
 
 def transition(period, late=None):
     """Over a period (s) whose command begins late by some s."""
-    return _transition(Ticks(jnp.asarray(period), None if late is None else jnp.asarray(late)))
+    return _transition(
+        SampleTiming(jnp.asarray(period), None if late is None else jnp.asarray(late))
+    )
 
 
 def test_kalman_gain_in_continuous_time():

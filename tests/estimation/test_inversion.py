@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation import ConditioningWarning, Inversion, Kalman, Observer, conditioning
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.modes import lay_out
@@ -139,7 +139,7 @@ def test_sensors_near_a_node_are_warned_about():
 
 def test_a_design_of_fewer_modes_asks_less_of_the_sensors():
     """Nodes of a mode that is not modelled do no harm; and case files hold estimators."""
-    case = loop([THIRD, 2 * THIRD], Kalman(1e-2, 1e-5), design=Beliefs(modes=2))
+    case = loop([THIRD, 2 * THIRD], Kalman(1e-2, 1e-5), design=DesignModel(modes=2))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check(case)

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linear_loop
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation import Kalman
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import Plan, form
@@ -35,7 +35,7 @@ def loop(estimator, command_weight=0.01, delay: float | None = DELAY, loads=True
             [command_weight],
             period=PERIOD,
             delay=delay,
-            design=Beliefs(modes=MODES),
+            design=DesignModel(modes=MODES),
             estimator=estimator,
         ),
         run=jb.Run(0.05),

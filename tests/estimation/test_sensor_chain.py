@@ -180,13 +180,13 @@ def test_the_steady_filter_is_what_a_long_run_comes_to():
         start = Kalman(FORCES, loads="known", reach=2).init(model)
         nothing = Measurement(jnp.asarray(OFFSET[:3]), jnp.zeros(5), jnp.zeros(1))
         later, _ = jax.lax.scan(
-            lambda memory, t: (memory.corrected(nothing, t), None),
+            lambda memory, t: (memory.update(nothing, t), None),
             start,
             PERIOD * jnp.arange(800),
         )
-        expected = later.predicted(jnp.zeros(1), jnp.asarray(4.0))
-        gain = expected.covariance @ expected.C.T @ jnp.linalg.inv(expected.spread)
-        return steady.gain, jnp.delete(gain, later.behind.plant - 1, axis=0)
+        expected = later.predict(jnp.zeros(1), jnp.asarray(4.0))
+        gain = expected.covariance @ expected.C.T @ jnp.linalg.inv(expected.innovation_covariance)
+        return steady.gain, jnp.delete(gain, later.sensor_chain.plant_states - 1, axis=0)
 
     steady, limit = found()
     size = np.max(np.abs(limit), axis=1, keepdims=True) + np.finfo(float).tiny

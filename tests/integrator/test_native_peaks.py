@@ -33,7 +33,7 @@ from jaxbeam.simulation.integration_plan import form
 from jaxbeam.sweeps.specification import make_order
 from jaxbeam.sweeps.store import FINGERPRINT
 
-pytestmark = pytest.mark.skipif(native_library.compiler() is None, reason="no C compiler here")
+pytestmark = pytest.mark.skipif(native_library.find_compiler() is None, reason="no C compiler here")
 
 ROOT = pathlib.Path(__file__).parents[2]
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
@@ -90,10 +90,10 @@ def folder(tmp_path_factory):
     """The C, compiled into a cache folder of these tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        assert not native_peaks.ready()
-        assert native_peaks.build() == native_peaks.binary()
-        assert native_peaks.ready()
-        yield native_peaks.binary().parent
+        assert not native_peaks.available()
+        assert native_peaks.build() == native_peaks.library_path()
+        assert native_peaks.available()
+        yield native_peaks.library_path().parent
 
 
 def swept(case, over):
@@ -148,7 +148,7 @@ jb.sweep(COUPLED, GRID, progress=False).to_netcdf(sys.argv[1], engine="h5netcdf"
 def test_narrower_machines_compute_the_same(without, tmp_path, monkeypatch):
     """In another process: one takes the steps of only one compiled library."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("CC", f"{native_library.compiler()} -mno-{without}")
+    monkeypatch.setenv("CC", f"{native_library.find_compiler()} -mno-{without}")
     path = tmp_path / "found.nc"
     subprocess.run([sys.executable, "-c", NARROW, str(path)], check=True, cwd=ROOT)
     monkeypatch.setattr(native_peaks, "ready", lambda: False)
@@ -177,7 +177,7 @@ def marched(case, by_hand, longest=1e-3):
             return best.peak()[0][:, 0]
         given = jnp.ones((), bool), assembled, grid, places, loads
         of_one = jax.tree.map(lambda leaf: leaf[None], given)
-        return native_peaks.march(known.slots, *of_one).peak_deflection[0, 0]
+        return native_peaks.integrate_peaks(known.slots, *of_one).peak_deflection[0, 0]
 
     return jax.jit(peaks)
 
@@ -232,14 +232,16 @@ def test_a_resumed_sweep_keeps_to_what_began_it():
 
 def test_what_cannot_be_loaded_is_left_alone(folder, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native_peaks.binary().parent.mkdir()
-    native_peaks.binary().write_bytes((folder / native_peaks.binary().name).read_bytes()[:1000])
-    assert not native_peaks.ready()
+    native_peaks.library_path().parent.mkdir()
+    native_peaks.library_path().write_bytes(
+        (folder / native_peaks.library_path().name).read_bytes()[:1000]
+    )
+    assert not native_peaks.available()
 
 
 def test_whatever_is_included_decides_the_name_of_a_library():
     """Else one would be taken that was compiled from an older header."""
-    folder, library = native_library.HERE, native_peaks.LIBRARY
+    folder, library = native_library.C_FOLDER, native_peaks.LIBRARY
     texts = [(folder / name).read_text() for name in library.sources + library.headers]
     included = re.findall(r'#include "(native_\w+\.h)"', "".join(texts))
     assert set(included) == set(library.headers)
@@ -257,7 +259,7 @@ def test_compilers_that_fail_are_told_of(monkeypatch, tmp_path):
     monkeypatch.setattr(shutil, "which", lambda _: None)
     with pytest.raises(RuntimeError, match="there is no C compiler here: install gcc or clang"):
         native_peaks.build()
-    assert not native_peaks.binary().exists()
+    assert not native_peaks.library_path().exists()
 
 
 def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
@@ -265,12 +267,12 @@ def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["native", "--json"])
     answer = json.loads(capsys.readouterr().out)
-    assert answer == {"path": str(native_peaks.binary()), "compiled": True}
-    assert native_peaks.binary().exists() and native_peaks.ready()
+    assert answer == {"path": str(native_peaks.library_path()), "compiled": True}
+    assert native_peaks.library_path().exists() and native_peaks.available()
     with pytest.raises(SystemExit, match="0"):
         main(["native", "--remove"])
     assert "sweeps do without" in capsys.readouterr().out
-    assert not native_peaks.binary().exists()
+    assert not native_peaks.library_path().exists()
 
 
 SEEK = """
@@ -293,13 +295,19 @@ def test_places_of_peaks_are_as_high_as_those_found_without_it(tmp_path):
     curves[:, 1] = np.cumsum(curves[:, 1], axis=0)  # less wild
     curves = curves.reshape(len(LOOKED), -1)
     (tmp_path / "seek.c").write_text(SEEK)
-    headers = native_library.HERE
-    words = [native_library.compiler(), *native_peaks.LIBRARY.flags, "-I", str(headers), "seek.c"]
+    headers = native_library.C_FOLDER
+    words = [
+        native_library.find_compiler(),
+        *native_peaks.LIBRARY.compiler_flags,
+        "-I",
+        str(headers),
+        "seek.c",
+    ]
     subprocess.run([*words, "-o", "seek.so"], check=True, cwd=tmp_path)
     pointer = np.ctypeslib.ndpointer(float, flags="C")
     seek = ctypes.CDLL(str(tmp_path / "seek.so")).seek
     seek.argtypes = [pointer, pointer, pointer, ctypes.c_int]
     heights = np.empty(curves.shape[1])
-    through = np.ascontiguousarray(peak_search.through(LOOKED)[: len(LOOKED)].T)
+    through = np.ascontiguousarray(peak_search.interpolation_matrix(LOOKED)[: len(LOOKED)].T)
     seek(curves, through, heights, heights.size)
-    assert_allclose(heights, peak_search.refine(jnp.asarray(curves), LOOKED)[0], rtol=1e-11)
+    assert_allclose(heights, peak_search.refine_peak(jnp.asarray(curves), LOOKED)[0], rtol=1e-11)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.numerics.batched_linalg import FEW, product, solve_any
+from jaxbeam.numerics.batched_linalg import FEW, matvec, solve_unpivoted
 from tests.differences import central
 
 RANDOM = np.random.default_rng(0)
@@ -23,15 +23,15 @@ def systems(size, *lanes):
 def test_systems_of_any_size_and_in_any_number(size):
     matrix, right = systems(size, 3, 4)
     expected = np.linalg.solve(matrix, right)
-    assert_allclose(jax.vmap(jax.vmap(solve_any))(matrix, right), expected, rtol=1e-9)
-    shared = jax.vmap(solve_any, (None, 0), 2)(matrix[0, 0], right[:, 0])
+    assert_allclose(jax.vmap(jax.vmap(solve_unpivoted))(matrix, right), expected, rtol=1e-9)
+    shared = jax.vmap(solve_unpivoted, (None, 0), 2)(matrix[0, 0], right[:, 0])
     assert_allclose(shared[..., 1], np.linalg.solve(matrix[0, 0], right[1, 0]), rtol=1e-9)
 
 
 @pytest.mark.parametrize("columns", [0, 1, FEW, FEW + 1])
 def test_products_spelt_out_or_not(columns):
     matrix, lanes = RANDOM.normal(size=(5, columns)), RANDOM.normal(size=(columns, 4))
-    found = product(jnp.asarray(matrix), jnp.asarray(lanes))
+    found = matvec(jnp.asarray(matrix), jnp.asarray(lanes))
     assert_allclose(found, matrix @ lanes, rtol=1e-13, atol=1e-14)
 
 
@@ -39,7 +39,7 @@ def test_slopes_forward_and_in_reverse():
     matrix, right = systems(3, 2)
 
     def one(x):
-        return jax.vmap(solve_any)(matrix * x[:, None, None], right + x[:, None, None] ** 2)
+        return jax.vmap(solve_unpivoted)(matrix * x[:, None, None], right + x[:, None, None] ** 2)
 
     at, weights = np.array([1.1, 0.7]), RANDOM.normal(size=(2, 3, 2))
     expected = central(one, at, 1e-4)

@@ -15,7 +15,10 @@ EQUAL = tuple(float(share) for share in np.linspace(0.0, 1.0, 7))
 EITHER = pytest.mark.parametrize("points", [EQUAL, LOOKED], ids=["equal", "of a step"])
 refine, vertex = (
     jax.jit(function, static_argnames="points")
-    for function in (jaxbeam.numerics.peak_search.refine, jaxbeam.numerics.peak_search.vertex)
+    for function in (
+        jaxbeam.numerics.peak_search.refine_peak,
+        jaxbeam.numerics.peak_search.estimate_peak,
+    )
 )
 
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from jaxbeam.numerics.riccati import care, dare, dlqr, lqr, lyapunov, stein
-from jaxbeam.numerics.stages import NODES, costs_to_go, flows
+from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, costs_to_go
 from tests.differences import central
 
 R = jnp.array([[0.1, 0.02], [0.02, 0.3]])
@@ -118,8 +118,8 @@ def test_backward_equation_as_a_stiff_integrator_solves_it():
 
     @jax.jit
     def solve():
-        A, B = jax.vmap(jax.vmap(varying))(edges[:-1, None] + lengths[:, None] * NODES)
-        parts = flows(A, B, jnp.asarray(Q), jnp.asarray(weight), lengths)
+        A, B = jax.vmap(jax.vmap(varying))(edges[:-1, None] + lengths[:, None] * GAUSS_NODES)
+        parts = collocated_stages(A, B, jnp.asarray(Q), jnp.asarray(weight), lengths)
         return costs_to_go(parts, jnp.asarray(Q))
 
     def back(s, cost):

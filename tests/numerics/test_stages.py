@@ -8,13 +8,13 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BarycentricInterpolator
 
-from jaxbeam.numerics.coupled_stages import Coupling, Plant, answers, coupled_flows
-from jaxbeam.numerics.stages import NODES, costs_to_go, flows
+from jaxbeam.numerics.coupled_stages import ConstantPlant, Coupling, coupled_stages, stage_responses
+from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, costs_to_go
 
 STATES, INPUTS, DIRECTIONS, FORCES, HALVINGS = 4, 2, 3, 2, 3
 START, LENGTH = 0.4, 0.1
 RANDOM = np.random.default_rng(0)
-PLANT = Plant(
+PLANT = ConstantPlant(
     *(jnp.asarray(2 * RANDOM.normal(size=(STATES, n))) for n in (STATES, INPUTS, DIRECTIONS))
 )
 Q, R = jnp.asarray(np.eye(STATES) + 0.2), jnp.array([[0.3, 0.1], [0.1, 0.5]])
@@ -34,37 +34,41 @@ def matrices(t):
     """The same plant, its forces eliminated."""
     part = coupling(t)
     law = jnp.linalg.solve(
-        jnp.eye(FORCES) + part.back, jnp.concatenate([part.rows, part.direct], axis=1)
+        jnp.eye(FORCES) + part.force_feedthrough,
+        jnp.concatenate([part.force_state_rows, part.command_feedthrough], axis=1),
     )
-    push = PLANT.E @ part.shape
+    push = PLANT.E @ part.force_distribution
     return PLANT.A + push @ law[:, :STATES], PLANT.B + push @ law[:, STATES:]
 
 
 def nodes(count):
     """Gauss nodes of so many stretches over the time that is looked at."""
-    return START + LENGTH * (np.arange(count)[:, None] + NODES) / count
+    return START + LENGTH * (np.arange(count)[:, None] + GAUSS_NODES) / count
 
 
 def by_collocation(count):
     at = jax.vmap(jax.vmap(matrices))(nodes(count))
-    return flows(*at, Q, R, jnp.full(count, LENGTH / count))
+    return collocated_stages(*at, Q, R, jnp.full(count, LENGTH / count))
 
 
 def by_forces(count):
     """With the answers for a stretch of this length, as it is halved from a longer one."""
     length, kind = jnp.asarray(LENGTH / count), HALVINGS - 1
-    answer = answers(PLANT, Q, length * 2**kind, HALVINGS)
+    answer = stage_responses(PLANT, Q, length * 2**kind, HALVINGS)
     parts = jax.vmap(jax.vmap(coupling))(nodes(count))
-    return coupled_flows(PLANT, jax.tree.map(lambda x: x[kind], answer), parts, R, length)
+    return coupled_stages(PLANT, jax.tree.map(lambda x: x[kind], answer), parts, R, length)
 
 
 @pytest.mark.parametrize("made", [by_collocation, by_forces])
 def test_a_flow_is_what_the_plant_does_and_costs(made):
     flow = jax.jit(made, static_argnums=0)(1)
     # Of a degree that Gauss's rule for the cost, too, is exact for.
-    start, powers = RANDOM.normal(size=STATES), NODES[:, None] ** np.arange(4)
+    start, powers = RANDOM.normal(size=STATES), GAUSS_NODES[:, None] ** np.arange(4)
     values = powers @ RANDOM.normal(size=(4, INPUTS))
-    command, plant = BarycentricInterpolator(START + LENGTH * NODES, values), jax.jit(matrices)
+    command, plant = (
+        BarycentricInterpolator(START + LENGTH * GAUSS_NODES, values),
+        jax.jit(matrices),
+    )
 
     def rate(t, state):
         (A, B), x, u = plant(t), state[:STATES], command(t)
@@ -83,5 +87,5 @@ def test_both_lead_to_the_same_costs():
         jax.jit(lambda made=made: costs_to_go(made(4), Q))() for made in (by_collocation, by_forces)
     )
     assert_allclose(by_force, collocated, rtol=1e-10)
-    still = flows(*jax.vmap(jax.vmap(matrices))(nodes(1)), Q, R, jnp.zeros(1))
+    still = collocated_stages(*jax.vmap(jax.vmap(matrices))(nodes(1)), Q, R, jnp.zeros(1))
     assert_allclose(costs_to_go(still, 3 * Q)[0], 3 * Q, rtol=1e-14)

@@ -61,7 +61,7 @@ def first_of(pair: Pair):
 def folder(tmp_path, monkeypatch):
     """A cache folder of its own; functions of this file are trusted not to change."""
     monkeypatch.setattr(compile_cache, "OURS", ("jaxbeam", "tuning", "tests"))
-    monkeypatch.setattr(compile_cache, "SAFE", {*compile_cache.SAFE, "tests"})
+    monkeypatch.setattr(compile_cache, "SAFE", {*compile_cache.VERSIONED_PACKAGES, "tests"})
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     again()
@@ -72,8 +72,8 @@ def folder(tmp_path, monkeypatch):
 
 def again():
     """Forget all, as the next process would not know it."""
-    compiling.forget()
-    compile_cache._surroundings.cache_clear()
+    compiling.clear_caches()
+    compile_cache._environment_hash.cache_clear()
     TRACED.clear()
 
 
@@ -92,7 +92,7 @@ def test_what_an_earlier_process_has_compiled_is_not_traced_again(folder):
     (first, total), count = called(pairs, POINTS, "as given")
     assert count == 1 and len(kept(folder)) == 1
     again()
-    blank, _ = pairs.blank(POINTS, "as given")
+    blank, _ = pairs.template(POINTS, "as given")
     (second, other), count = called(pairs, POINTS, "as given")
     assert count == 0 and len(kept(folder)) == 1
     assert jax.tree.structure(first) == jax.tree.structure(second) == jax.tree.structure(blank)
@@ -155,7 +155,7 @@ def changed_setting(patch):
 
 
 def changed_source(patch):
-    before = compile_cache._surroundings()
+    before = compile_cache._environment_hash()
     patch.setattr(compile_cache, "_surroundings", lambda: before + b"changed")
 
 
@@ -184,15 +184,15 @@ def test_what_else_decides_a_program_is_part_of_its_place(folder, change, monkey
 
 
 def test_a_changed_source_is_noticed(folder, tmp_path, monkeypatch):
-    before = compile_cache._surroundings()
+    before = compile_cache._environment_hash()
     home = tmp_path / "jaxbeam"
     home.mkdir()
     monkeypatch.setattr(compile_cache, "__file__", str(home / "runtime" / "compile_cache.py"))
     marks = [before]
     for text in ("a = 1\n", "a = 2\n"):
         (home / "modes.py").write_text(text)
-        compile_cache._surroundings.cache_clear()
-        marks.append(compile_cache._surroundings())
+        compile_cache._environment_hash.cache_clear()
+        marks.append(compile_cache._environment_hash())
     assert len(set(marks)) == 3
 
 
@@ -213,17 +213,17 @@ def test_versions_of_all_that_compiles_are_part_of_the_place(monkeypatch):
     for name in declared & {one.name.lower() for one in importlib.metadata.distributions()}:
         needs = importlib.metadata.requires(name) or []
         if any(re.match(r"jax(lib)?\b(?!.*extra ==)", one) for one in needs):
-            assert name in compile_cache.BENEATH
-    before, version = compile_cache._surroundings(), importlib.metadata.version
+            assert name in compile_cache.DEPENDENCIES
+    before, version = compile_cache._environment_hash(), importlib.metadata.version
     for changed in ("diffrax", "jaxlib"):
-        compile_cache._surroundings.cache_clear()
+        compile_cache._environment_hash.cache_clear()
 
         def newer(name, changed=changed):
             return "99" if name == changed else version(name)
 
         with monkeypatch.context() as patch:
             patch.setattr(importlib.metadata, "version", newer)
-            assert compile_cache._surroundings() != before
+            assert compile_cache._environment_hash() != before
 
 
 def test_what_depends_on_code_of_others_is_not_kept(folder, monkeypatch):

@@ -39,7 +39,7 @@ def halves(x, words: str):
 
 
 def test_what_it_will_return_is_known_before_it_is_compiled():
-    blank, real = halves.blank(POINTS[:2], "as given"), halves(POINTS[:2], "as given")
+    blank, real = halves.template(POINTS[:2], "as given"), halves(POINTS[:2], "as given")
     assert jax.tree.structure(blank) == jax.tree.structure(real)
     assert_allclose(real["half"], POINTS[:1])
     assert (blank["words"], blank["count"]) == (real["words"], real["count"]) == ("as given", 2)
@@ -55,12 +55,12 @@ def test_what_was_compiled_ahead_is_not_traced_again():
         return 2 * x
 
     for _ in range(3):
-        counted.ahead(POINTS)()
+        counted.precompile(POINTS)()
         assert_allclose(counted(POINTS), 2 * POINTS)
-    counted.ahead(POINTS[:2])()
+    counted.precompile(POINTS[:2])()
     assert traced == [(3,), (2,)]
-    compiling.forget()
-    counted.ahead(POINTS)()
+    compiling.clear_caches()
+    counted.precompile(POINTS)()
     assert traced == [(3,), (2,), (3,)]
 
 
@@ -68,9 +68,9 @@ def test_settings_that_are_not_known_are_left_out(monkeypatch):
     known = {"xla_backend_optimization_level": 1}
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(compiling, "OPTIONS", {"xla_no_such_setting": True, **known})
-    compiling._known.cache_clear()
+    compiling._supported_options.cache_clear()
     try:
-        assert compiling.options() == known
+        assert compiling.xla_options() == known
         assert_allclose(compiled(jnp.cos)(0.5), np.cos(0.5), rtol=1e-14)
     finally:
-        compiling._known.cache_clear()
+        compiling._supported_options.cache_clear()

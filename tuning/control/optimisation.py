@@ -172,7 +172,7 @@ class Optimisation:
     def compile(self, target: WeightsAndLimits, points: Float[np.ndarray, "start free"]) -> None:
         """Compile the program of every step, of whose results nothing is wanted yet."""
         rows = jnp.asarray(self._batch_runs(0, 0))
-        _values_and_gradients.ahead(
+        _values_and_gradients.precompile(
             *self._program_arguments, jnp.asarray(points), jnp.asarray(SHARPNESS[0]), rows, target
         )()
 

@@ -12,7 +12,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Bool, Float
 
-from jaxbeam.runtime.compiling import compiled, options
+from jaxbeam.runtime.compiling import compiled, xla_options
 from tuning.fit.loss import check_loss, robust_residual, variance_factor
 from tuning.fit.uncertainty.covariance import Uncertainty, autocorrelation_factor, uncertainty
 from tuning.parameters.free import FreeParameter
@@ -141,8 +141,10 @@ class LeastSquares:
         # under one that is empty.
         empty = jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ()))
         with ThreadPoolExecutor(1) as pool, empty:
-            linear = pool.submit(jax.jit(self._linearised_function).lower(point).compile, options())
-            minimise = jax.jit(self._minimise_function).lower(*given).compile(options())
+            linear = pool.submit(
+                jax.jit(self._linearised_function).lower(point).compile, xla_options()
+            )
+            minimise = jax.jit(self._minimise_function).lower(*given).compile(xla_options())
             return linear.result(), minimise
 
     def solve(

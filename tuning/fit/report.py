@@ -1,40 +1,17 @@
 """A written account of an identification: Markdown and HTML, with tables and figures."""
 
-import html as escaping
 import os
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxbeam.files.report import html_table, markdown_table, page
+from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable
+from jaxbeam.files.report import write_report as write_files
 from tuning.fit.identify import Fit
 from tuning.fit.model_validation import HeldOutPrediction, ModelCriteria, channel_residuals
 from tuning.fit.summary import remarks
 from tuning.fit.uncertainty.posterior import Posterior
 from tuning.fit.uncertainty.profile import Profile
-
-
-class ReportTable(NamedTuple):
-    """A table of an account."""
-
-    header: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-
-
-class ReportFigure(NamedTuple):
-    """A figure of an account, and the name of its file without the suffix."""
-
-    name: str
-    figure: Any  # of matplotlib, which is imported only where something is drawn
-
-
-class ReportSection(NamedTuple):
-    """A heading and what is below it: sentences, tables and pictures."""
-
-    title: str
-    parts: list[str | ReportTable | ReportFigure]
 
 
 def write_report(
@@ -51,18 +28,9 @@ def write_report(
 
     Raises FileExistsError if the folder is not empty and `overwrite` is not set.
     """
-    folder = Path(folder)
-    if folder.exists() and any(folder.iterdir()) and not overwrite:
-        raise FileExistsError(f"the folder {folder} is not empty; choose another, or overwrite it")
-    folder.mkdir(parents=True, exist_ok=True)
     sections = report_sections(fit, profiles, posterior, unseen, rivals)
-    for section in sections:
-        for part in section.parts:
-            if isinstance(part, ReportFigure):
-                part.figure.savefig(folder / f"{part.name}.png")
     title = fit.case.title or "Identification"
-    (folder / "report.md").write_text(markdown(title, sections), encoding="utf-8")
-    (folder / "report.html").write_text(html(title, sections), encoding="utf-8")
+    write_files(folder, title, sections, overwrite=overwrite)
 
 
 def report_sections(
@@ -105,37 +73,6 @@ def report_sections(
     if models:
         sections.append(ReportSection("Rival models", [_model_table(models)]))
     return sections
-
-
-def markdown(title: str, sections: Sequence[ReportSection]) -> str:
-    """The account in Markdown, pictures beside it."""
-    lines = [f"# {title}", ""]
-    for section in sections:
-        lines += [f"## {section.title}", ""]
-        for part in section.parts:
-            if isinstance(part, ReportTable):
-                lines += markdown_table(*part)
-            elif isinstance(part, ReportFigure):
-                lines += [f"![{part.name}]({part.name}.png)", ""]
-            else:
-                lines += [part, ""]
-    return "\n".join(lines)
-
-
-def html(title: str, sections: Sequence[ReportSection]) -> str:
-    """The account as a page, pictures beside it."""
-    safe = escaping.escape
-    body = [f"<h1>{safe(title)}</h1>"]
-    for section in sections:
-        body.append(f"<h2>{safe(section.title)}</h2>")
-        for part in section.parts:
-            if isinstance(part, ReportTable):
-                body.append(html_table(*part))
-            elif isinstance(part, ReportFigure):
-                body.append(f'<img src="{part.name}.png" alt="{part.name}">')
-            else:
-                body.append(f"<p>{safe(part)}</p>")
-    return page(title, body)
 
 
 def _parameter_table(fit: Fit) -> ReportTable:

@@ -5,41 +5,43 @@ import numpy as np
 
 from jaxbeam.model.contact import contact_rows
 from jaxbeam.model.state_space import LoadedBeam
-from jaxbeam.numerics.coupled_stages import Coupling, Plant
-from jaxbeam.numerics.finite_horizon import Changes
+from jaxbeam.numerics.coupled_stages import ConstantPlant, Coupling
+from jaxbeam.numerics.finite_horizon import CouplingFunction
 
 
-def coupled_beam(model: LoadedBeam, weights: bool) -> tuple[Plant, Changes]:
+def crossing_plant(plant: LoadedBeam, with_weights: bool) -> tuple[ConstantPlant, CouplingFunction]:
     """The rig of a model, and its contact forces r at given times (s), both in its states.
 
-    With `weights`, those of the loads are further, constant states, as in `LoadedBeam.augmented`.
+    With `with_weights`, those of the loads are further, constant states, as in `LoadedBeam.augmented`.
     The contact law is r = -W - m (rows z + S (S' r + forces of the commands)), S being the shapes.
     """
-    rig, loads = model.rig, model.weights.shape[0]
-    modes, states = model.scale.shape[0], rig.states
+    modal_model, load_count = plant.rig, plant.weights.shape[0]
+    modes, states = plant.scale.shape[0], modal_model.states
     rates = np.arange(1, 2 * modes, 2)
-    free, more = model.unloaded, loads if weights else 0
-    plant = Plant(
-        jnp.pad(free.A, (0, more)),
-        jnp.pad(free.B, ((0, more), (0, 0))),
-        jnp.pad(model.from_rig(jnp.eye(states)[:, rates]), ((0, more), (0, 0))),
+    unloaded, weight_states = plant.unloaded, load_count if with_weights else 0
+    unloaded_plant = ConstantPlant(
+        jnp.pad(unloaded.A, (0, weight_states)),
+        jnp.pad(unloaded.B, ((0, weight_states), (0, 0))),
+        jnp.pad(plant.from_rig(jnp.eye(states)[:, rates]), ((0, weight_states), (0, 0))),
     )
-    to_rig, pushed = model.to_rig(jnp.eye(states)), rig.command_matrix[rates]
-    mass = model.traffic.inertia
+    to_modal, command_rows = plant.to_rig(jnp.eye(states)), modal_model.command_matrix[rates]
+    mass = plant.traffic.inertia
 
-    def changes(times):
-        position, speed, acceleration = model.traffic.travel(times)
-        active = model.traffic.on_beam(times)
+    def contact_coupling(times):
+        position, speed, acceleration = plant.traffic.travel(times)
+        active = plant.traffic.on_beam(times)
         shape, rows = (
             jnp.moveaxis(part.reshape(*active.shape, -1), 0, -2)
-            for part in contact_rows(rig, position, speed, acceleration, active)
+            for part in contact_rows(modal_model, position, speed, acceleration, active)
         )
-        known = jnp.broadcast_to(jnp.eye(loads)[:, :more], (*times.shape, loads, more))
+        weight_columns = jnp.broadcast_to(
+            jnp.eye(load_count)[:, :weight_states], (*times.shape, load_count, weight_states)
+        )
         return Coupling(
-            shape=jnp.swapaxes(shape, -1, -2),
-            rows=jnp.concatenate([-mass * (rows @ to_rig), -known], axis=-1),
-            direct=-mass * (shape @ pushed),
-            back=mass * (shape @ jnp.swapaxes(shape, -1, -2)),
+            force_distribution=jnp.swapaxes(shape, -1, -2),
+            force_state_rows=jnp.concatenate([-mass * (rows @ to_modal), -weight_columns], axis=-1),
+            command_feedthrough=-mass * (shape @ command_rows),
+            force_feedthrough=mass * (shape @ jnp.swapaxes(shape, -1, -2)),
         )
 
-    return plant, changes
+    return unloaded_plant, contact_coupling

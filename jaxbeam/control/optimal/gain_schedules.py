@@ -9,33 +9,33 @@ from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics.gain_table import GainTable
 
 
-class Schedule(eqx.Module):
+class GainSchedule(eqx.Module):
     """Gains over a crossing from `start` to `end` (s), and the gain from then on.
 
-    That dies away with a time constant `fade` (s), or does not if that is None. `known` are the
+    That dies away with a time constant `fade_time` (s), or does not if that is None. `load_weights` are the
     weights of the loads (N), which have columns of their own behind the states.
     """
 
     table: GainTable
-    rest: Float[Array, "actuator column"]
-    known: Float[Array, " load"]
+    final_gain: Float[Array, "actuator column"]
+    load_weights: Float[Array, " load"]
     start: Float[Array, ""]
     end: Float[Array, ""]
-    fade: Float[Array, ""] | None = None
+    fade_time: Float[Array, ""] | None = None
 
     def gain(self, t: Float[Array, ""]) -> Float[Array, "actuator column"]:
         """The gain at a time (s); zero before the first load enters."""
-        share = (t - self.start) / (self.end - self.start)
-        rest = self.rest
-        if self.fade is not None:
-            rest = rest * jnp.exp(-jnp.maximum(t - self.end, 0.0) / self.fade)
-        gain = jnp.where(t < self.end, self.table(share), rest)
+        crossing_share = (t - self.start) / (self.end - self.start)
+        final_gain = self.final_gain
+        if self.fade_time is not None:
+            final_gain = final_gain * jnp.exp(-jnp.maximum(t - self.end, 0.0) / self.fade_time)
+        gain = jnp.where(t < self.end, self.table(crossing_share), final_gain)
         return jnp.where(t < self.start, 0.0, gain)
 
 
-def crossing(model: LoadedBeam) -> Float[Array, " event"]:
+def crossing_events(plant: LoadedBeam) -> Float[Array, " event"]:
     """Times (s) at which loads enter and leave, ascending; the run's end for loads that stay."""
-    windows = [path.window() for path in model.traffic.motions]
+    windows = [path.window() for path in plant.traffic.motions]
     events = jnp.sort(jnp.array(windows).reshape(-1))
-    last = jnp.max(jnp.where(events < NEVER, events, model.case.run.duration))
-    return jnp.minimum(events, last)
+    last_event = jnp.max(jnp.where(events < NEVER, events, plant.case.run.duration))
+    return jnp.minimum(events, last_event)

@@ -24,16 +24,21 @@ from jaxbeam.case.fields import (
     number,
 )
 from jaxbeam.case.loads import motion
-from jaxbeam.control.optimal.crossing_plant import coupled_beam
-from jaxbeam.control.optimal.gain_schedules import Schedule, crossing
-from jaxbeam.control.optimal.sampling_loss import warn_if_slow
+from jaxbeam.control.optimal.crossing_plant import crossing_plant
+from jaxbeam.control.optimal.gain_schedules import GainSchedule, crossing_events
+from jaxbeam.control.optimal.sampling_loss import warn_slow_sampling
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import LoadedBeam
-from jaxbeam.numerics.finite_horizon import finite_time, finite_time_coupled, layer
-from jaxbeam.numerics.gain_table import GainTable, edges_between, even, step_by_step
+from jaxbeam.numerics.finite_horizon import boundary_layer, finite_horizon, finite_horizon_coupled
+from jaxbeam.numerics.gain_table import (
+    GainTable,
+    breakpoints_between,
+    frozen_time_gains,
+    uniform_fractions,
+)
 from jaxbeam.numerics.riccati import lqr
 
-TURN = 3.0  # rad by which the fastest mode may turn within a stretch of a table
+MAX_PHASE_PER_INTERVAL = 3.0  # rad by which the fastest mode may turn within a stretch of a table
 
 
 class AbstractRegulator(AbstractStateLaw):
@@ -61,11 +66,11 @@ class AbstractRegulator(AbstractStateLaw):
     )
 
     @abc.abstractmethod
-    def gains(self, model: LoadedBeam) -> Any:
+    def gains(self, plant: LoadedBeam) -> Any:
         """The gains designed for a model, in the states of that model."""
 
-    def fault(self, case):
-        states, commands = self.states(case), len(case.actuators)
+    def validate(self, case):
+        states, commands = self.state_count(case), len(case.actuators)
         sizes = {
             "state_weight": states,
             "command_weight": commands,
@@ -80,22 +85,24 @@ class AbstractRegulator(AbstractStateLaw):
             return "places and place_weight belong together; give both or neither"
         if self.places is not None and self.places.shape != self.place_weight.shape:
             return "place_weight must have an entry for each of the places"
-        return super().fault(case)
+        return super().validate(case)
 
-    def look_at(self, plant, case):
-        warn_if_slow(plant, float(known(self.period)), float(known(case.run.duration)))
+    def warn(self, system, case):
+        warn_slow_sampling(system, float(known(self.period)), float(known(case.run.duration)))
 
-    def weights(self, model: LoadedBeam) -> tuple[Array, Array]:
+    def weights(self, plant: LoadedBeam) -> tuple[Array, Array]:
         """Q and R for the states of a model."""
         Q = jnp.diag(self.state_weight)
         if self.places is not None:
-            shape = model.rig.shapes(self.places, (0,))[0] / model.scale
-            rows = jnp.zeros((shape.shape[0], Q.shape[0])).at[:, : shape.shape[1]].set(shape)
-            Q = Q + rows.T @ (self.place_weight[:, None] * rows)
+            shape = plant.rig.shapes(self.places, (0,))[0] / plant.scale
+            deflection_rows = (
+                jnp.zeros((shape.shape[0], Q.shape[0])).at[:, : shape.shape[1]].set(shape)
+            )
+            Q = Q + deflection_rows.T @ (self.place_weight[:, None] * deflection_rows)
         return Q, jnp.diag(self.command_weight)
 
     @property
-    def shares(self) -> Float[Array, " state"]:
+    def feedback_shares(self) -> Float[Array, " state"]:
         """The share of each state that is fed back."""
         return jnp.ones_like(self.state_weight) if self.feedback is None else self.feedback
 
@@ -104,15 +111,15 @@ class LQR(AbstractRegulator):
     """The time-invariant regulator for the rig without loads, eq. (5.7) of the thesis."""
 
     @property
-    def knows_loads(self) -> bool:
+    def design_depends_on_loads(self) -> bool:
         return self.estimator is not None
 
-    def gains(self, model):
-        plant = model.unloaded
-        return lqr(plant.A, plant.B, *self.weights(model))[0]
+    def gains(self, plant):
+        system = plant.unloaded
+        return lqr(system.A, system.B, *self.weights(plant))[0]
 
-    def prepare(self, model, designed):
-        return self.gains(designed) * self.shares
+    def prepare(self, plant, design_plant):
+        return self.gains(design_plant) * self.feedback_shares
 
     def command(self, memory, estimate, measurement, t):
         return -memory @ estimate.state, memory
@@ -142,54 +149,62 @@ class AbstractScheduledRegulator(AbstractRegulator):
     )
     points: int = count("stretches of the table from event to event", default=1600)
 
-    def fault(self, case):
+    def validate(self, case):
         if not case.loads:
             return "kind needs loads to be designed for; add one, or take kind 'lqr'"
         if (self.after == "fade") != (self.fade_time is not None):
             return "fade_time belongs to after = 'fade'; give both or neither"
-        return super().fault(case)
+        return super().validate(case)
 
     @property
-    def feeds_loads_forward(self) -> bool:
+    def load_feedforward(self) -> bool:
         """Whether the weights of the loads are fed forward."""
         return False
 
-    def prepare(self, model, designed):
-        table = self.gains(designed)
-        loads = designed.weights if self.feeds_loads_forward else jnp.zeros(0)
-        last = table(jnp.ones(()))
+    def prepare(self, plant, design_plant):
+        table = self.gains(design_plant)
+        load_weights = design_plant.weights if self.load_feedforward else jnp.zeros(0)
+        gain_at_exit = table(jnp.ones(()))
         if self.after == "time-invariant":
-            plant = designed.unloaded
-            last = lqr(plant.A, plant.B, *self.weights(designed))[0]
-        rest = jnp.zeros((last.shape[0], self.shares.shape[0] + loads.shape[0]))
+            system = design_plant.unloaded
+            gain_at_exit = lqr(system.A, system.B, *self.weights(design_plant))[0]
+        final_gain = jnp.zeros(
+            (gain_at_exit.shape[0], self.feedback_shares.shape[0] + load_weights.shape[0])
+        )
         if self.after != "none":
-            rest = rest.at[:, : self.shares.shape[0]].set(last[:, : self.shares.shape[0]])
-        shares = jnp.concatenate([self.shares, jnp.ones_like(loads)])
+            final_gain = final_gain.at[:, : self.feedback_shares.shape[0]].set(
+                gain_at_exit[:, : self.feedback_shares.shape[0]]
+            )
+        shares = jnp.concatenate([self.feedback_shares, jnp.ones_like(load_weights)])
         table = GainTable(table.edges, table.pieces * shares)
-        events = crossing(designed if self.entries == "predicted" else model)
-        return Schedule(table, rest * shares, loads, events[0], events[-1], self.fade_time)
+        events = crossing_events(design_plant if self.entries == "predicted" else plant)
+        return GainSchedule(
+            table, final_gain * shares, load_weights, events[0], events[-1], self.fade_time
+        )
 
     def events(self, case: Any) -> Float[np.ndarray, " event"]:
         """Times (s) of entry and exit by which the table runs, ascending."""
-        loads = believed_loads(self, case) if self.entries == "predicted" else case.loads
+        loads = design_loads(self, case) if self.entries == "predicted" else case.loads
         windows = [known(motion(load, case.beam.length).window()) for load in loads]
         return np.sort(np.ravel(windows))
 
-    def knots(self, case):
+    def breakpoints(self, case):
         """At every instant, the gain jumps at predicted entries and exits, where no load does."""
-        others = super().knots(case)
+        estimator_breakpoints = super().breakpoints(case)
         if self.period is not None or self.entries == "measured":
-            return others
-        return np.append([] if others is None else others, self.events(case))
+            return estimator_breakpoints
+        return np.append(
+            [] if estimator_breakpoints is None else estimator_breakpoints, self.events(case)
+        )
 
     def command(self, memory, estimate, measurement, t):
-        loads = memory.known
-        if self.feeds_loads_forward and estimate.weights is not None:
-            loads = estimate.weights
-        return -memory.gain(t) @ jnp.concatenate([estimate.state, loads]), memory
+        load_weights = memory.known
+        if self.load_feedforward and estimate.weights is not None:
+            load_weights = estimate.weights
+        return -memory.gain(t) @ jnp.concatenate([estimate.state, load_weights]), memory
 
 
-class AbstractForesighted(AbstractScheduledRegulator):
+class AbstractFiniteHorizonRegulator(AbstractScheduledRegulator):
     """What those regulators share that are found backward in time.
 
     `terminal_weight` is the diagonal of F, eq. (3.3) of the thesis; Q if left out. On a rig of 7
@@ -203,39 +218,45 @@ class AbstractForesighted(AbstractScheduledRegulator):
         "s/unit of the state^2", "weight of each state at the end", NOT_NEGATIVE, default=None
     )
 
-    def fault(self, case):
-        return super().fault(case) or too_coarse(self, case)
+    def validate(self, case):
+        return super().validate(case) or points_error(self, case)
 
-    def gains(self, model):
-        return optimal(self, model)[0]
+    def gains(self, plant):
+        return finite_horizon_gains(self, plant)[0]
 
-    def knots(self, case):
+    def breakpoints(self, case):
         """At every instant, the fast layer of the gains before each event must be resolved, too."""
         if self.period is not None:
             return None
-        events, others = self.events(case), super().knots(case)
-        spans = np.diff(events[events < known(case.run.duration)])
-        layers = events[1 : spans.size + 1, None] - spans[:, None] * layer(self.points)
-        return np.append([] if others is None else others, layers)
+        events, estimator_breakpoints = self.events(case), super().breakpoints(case)
+        crossing_intervals = np.diff(events[events < known(case.run.duration)])
+        boundary_layers = events[1 : crossing_intervals.size + 1, None] - crossing_intervals[
+            :, None
+        ] * boundary_layer(self.points)
+        return np.append(
+            [] if estimator_breakpoints is None else estimator_breakpoints, boundary_layers
+        )
 
 
 class StepLQR(AbstractScheduledRegulator):
     """At each time the regulator of the plant frozen then, eqs (3.10) and (3.11) of the thesis."""
 
-    def gains(self, model):
-        def plant(t):
-            return model.A(t), model.B(t)
+    def gains(self, plant):
+        def system_at(t):
+            return plant.A(t), plant.B(t)
 
-        return step_by_step(
-            plant, edges_between(crossing(model), even(self.points)), *self.weights(model)
+        return frozen_time_gains(
+            system_at,
+            breakpoints_between(crossing_events(plant), uniform_fractions(self.points)),
+            *self.weights(plant),
         )
 
 
-class FiniteLQR(AbstractForesighted):
+class FiniteLQR(AbstractFiniteHorizonRegulator):
     """The optimal regulator over the crossing, eqs (3.3) to (3.9) of the thesis."""
 
 
-class AugmentedLQR(AbstractForesighted):
+class AugmentedLQR(AbstractFiniteHorizonRegulator):
     """The optimal regulator over the crossing that knows the loads, eq. (5.8) of the thesis.
 
     The weights of all loads are constant states of the model: the command answers those on the
@@ -243,55 +264,57 @@ class AugmentedLQR(AbstractForesighted):
     """
 
     @property
-    def feeds_loads_forward(self) -> bool:
+    def load_feedforward(self) -> bool:
         return True
 
 
-def optimal(
-    regulator: AbstractForesighted, model: LoadedBeam
+def finite_horizon_gains(
+    regulator: AbstractFiniteHorizonRegulator, plant: LoadedBeam
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """Table of optimal gains for a model, and P at its edges, load states included."""
-    Q, R = regulator.weights(model)
+    Q, R = regulator.weights(plant)
     F = Q if regulator.terminal_weight is None else jnp.diag(regulator.terminal_weight)
-    loads = len(model.case.loads) if regulator.feeds_loads_forward else 0
+    load_count = len(plant.case.loads) if regulator.load_feedforward else 0
 
-    Q, F = (jnp.pad(weight, (0, loads)) for weight in (Q, F))
-    rest = crossing(model), regulator.points, Q, R, F
-    if model.rig.states == 2 * model.scale.shape[0]:
-        return finite_time_coupled(*coupled_beam(model, loads > 0), *rest)
+    Q, F = (jnp.pad(weight, (0, load_count)) for weight in (Q, F))
+    problem = crossing_events(plant), regulator.points, Q, R, F
+    if plant.rig.states == 2 * plant.scale.shape[0]:
+        return finite_horizon_coupled(*crossing_plant(plant, load_count > 0), *problem)
 
     # Commands to a lag much faster than a stretch are no polynomials, as they are taken for there.
-    def plant(t):
-        system = model.augmented(t) if loads else model.at(t)
-        return system.A, system.B[:, : len(model.case.actuators)]
+    def system_at(t):
+        system = plant.augmented(t) if load_count else plant.at(t)
+        return system.A, system.B[:, : len(plant.case.actuators)]
 
-    return finite_time(plant, *rest)
+    return finite_horizon(system_at, *problem)
 
 
-def believed_loads(regulator: AbstractScheduledRegulator, case: Any) -> tuple:
+def design_loads(regulator: AbstractScheduledRegulator, case: Any) -> tuple:
     """The loads of a case as the design believes them to be."""
-    return case.loads if regulator.design is None else regulator.design.loads(case)
+    return case.loads if regulator.design is None else regulator.design.design_loads(case)
 
 
-def too_coarse(regulator: AbstractScheduledRegulator, case: Any, slowest=None) -> str | None:
+def points_error(
+    regulator: AbstractScheduledRegulator, case: Any, slowest_speed=None
+) -> str | None:
     """Whether the fastest mode turns too far within a stretch, by the formula for pinned ends.
 
-    A sentence, or None. Loads are as fast as believed, or have the `slowest` speed (m/s).
+    A sentence, or None. Loads are as fast as believed, or have the `slowest_speed` speed (m/s).
     """
     beam = case.beam
-    loads = believed_loads(regulator, case)
-    speeds = [load.speed for load in loads] if slowest is None else [slowest]
+    loads = design_loads(regulator, case)
+    speeds = [load.speed for load in loads] if slowest_speed is None else [slowest_speed]
     numbers = (beam.length, beam.rigidity, beam.linear_density, *speeds)
     if not all(value is not None and is_known(value) for value in numbers):
         return None
     length, rigidity, density, *speeds = (float(known(value)) for value in numbers)
-    modes = regulator.modes(case)
-    fastest = (modes * math.pi / length) ** 2 * (rigidity / density) ** 0.5
-    span = length / max(min(abs(speed) for speed in speeds), 1e-300)
-    needed = math.ceil(fastest * span / TURN)
-    if regulator.points >= needed:
+    modes = regulator.mode_count(case)
+    fastest_frequency = (modes * math.pi / length) ** 2 * (rigidity / density) ** 0.5
+    crossing_time = length / max(min(abs(speed) for speed in speeds), 1e-300)
+    min_points = math.ceil(fastest_frequency * crossing_time / MAX_PHASE_PER_INTERVAL)
+    if regulator.points >= min_points:
         return None
     return (
-        f"points must be at least {needed} for {modes} modes and a crossing of {span:.3g} s:"
+        f"points must be at least {min_points} for {modes} modes and a crossing of {crossing_time:.3g} s:"
         " in each stretch the fastest mode may turn by some radians only"
     )

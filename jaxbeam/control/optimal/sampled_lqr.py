@@ -7,14 +7,14 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, is_known, known, number
 from jaxbeam.control.optimal.lqr import AbstractRegulator
-from jaxbeam.estimation.sampled_plant import ticks, whole_and_sum
+from jaxbeam.estimation.sampled_plant import exponential_and_gramian, sample_timing
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.intervals import Commands, Inputs, Square, symmetric
+from jaxbeam.numerics.intervals import InputMatrix, InputWeight, Square, symmetric_part
 from jaxbeam.numerics.riccati import dlqr
 
 # With the command before among the states.
-Both = Float[Array, "both both"]
-Pushes = Float[Array, "both input"]
+AugmentedSquare = Float[Array, "both both"]
+AugmentedInputs = Float[Array, "both input"]
 
 
 class DiscreteLQR(AbstractRegulator):
@@ -35,93 +35,97 @@ class DiscreteLQR(AbstractRegulator):
     )
 
     @property
-    def knows_loads(self) -> bool:
+    def design_depends_on_loads(self) -> bool:
         return self.estimator is not None
 
     @property
-    def remembers(self) -> bool:
+    def feeds_back_command(self) -> bool:
         """Whether the command last given is among the states."""
         return self.delay is not None or self.input_rate_weight is not None
 
-    def gains(self, model):
-        plant, clock = model.unloaded, ticks(self)
-        Q, R = self.weights(model)
-        A, B, Q, R, N = sampled_problem(plant.A, plant.B, Q, R, clock.period, clock.late)
+    def gains(self, plant):
+        system, timing = plant.unloaded, sample_timing(self)
+        Q, R = self.weights(plant)
+        A, B, Q, R, N = discrete_lq_problem(
+            system.A, system.B, Q, R, timing.period, timing.input_delay
+        )
         if self.input_rate_weight is not None:
-            toll = jnp.diag(self.input_rate_weight) / clock.period
-            states, commands = plant.B.shape
-            Q = Q.at[states:, states:].add(toll)
-            N = N.at[states:].add(-toll)
-            R = R + toll
-        if not self.remembers:
-            states = plant.A.shape[0]
+            rate_cost = jnp.diag(self.input_rate_weight) / timing.period
+            states, commands = system.B.shape
+            Q = Q.at[states:, states:].add(rate_cost)
+            N = N.at[states:].add(-rate_cost)
+            R = R + rate_cost
+        if not self.feeds_back_command:
+            states = system.A.shape[0]
             A, B, Q, N = A[:states, :states], B[:states], Q[:states, :states], N[:states]
         return dlqr(A, B, Q, R, N)[0]
 
-    def prepare(self, model, designed):
-        gain = self.gains(designed)
-        last = jnp.ones(gain.shape[1] - self.shares.shape[0])
-        return gain * jnp.concatenate([self.shares, last])
+    def prepare(self, plant, design_plant):
+        gain = self.gains(design_plant)
+        command_shares = jnp.ones(gain.shape[1] - self.feedback_shares.shape[0])
+        return gain * jnp.concatenate([self.feedback_shares, command_shares])
 
     def command(self, memory, estimate, measurement, t):
-        last = [measurement.command] if self.remembers else []
-        return -memory @ jnp.concatenate([estimate.state, *last]), memory
+        previous_command = [measurement.command] if self.feeds_back_command else []
+        return -memory @ jnp.concatenate([estimate.state, *previous_command]), memory
 
-    def fault(self, case):
+    def validate(self, case):
         if self.period is None:
             return "period must be given: kind 'dlqr' designs for commands that are held so long"
-        told = self.delay is not None and is_known(self.delay) and is_known(self.period)
-        if told and known(self.delay) >= known(self.period):
+        concrete_delay = self.delay is not None and is_known(self.delay) and is_known(self.period)
+        if concrete_delay and known(self.delay) >= known(self.period):
             return "delay must be less than the period: one command may be under way, not more"
         rate = self.input_rate_weight
         if rate is not None and rate.shape[0] != len(case.actuators):
             return f"input_rate_weight must have {len(case.actuators)} entries, not {rate.shape[0]}"
-        return super().fault(case)
+        return super().validate(case)
 
 
-def sampled_problem(
+def discrete_lq_problem(
     A: Square,
-    B: Inputs,
+    B: InputMatrix,
     Q: Square,
-    R: Commands,
+    R: InputWeight,
     period: Float[Array, ""],
-    late: Float[Array, ""] | None = None,
-) -> tuple[Both, Pushes, Both, Commands, Pushes]:
+    input_delay: Float[Array, ""] | None = None,
+) -> tuple[AugmentedSquare, AugmentedInputs, AugmentedSquare, InputWeight, AugmentedInputs]:
     """The discrete problem (A, B, Q, R, N) that costs what the integral of x'Qx + u'Ru does.
 
     Its states are x and the command before; its sum is of s'Qs + u'Ru + 2 s'Nu over those states s
-    and commands u, which are held for a period (s) and begin `late` (s) after the sample. Exact
+    and commands u, which are held for a period (s) and begin `input_delay` (s) after the sample. Exact
     (Van Loan, IEEE Trans. Automatic Control 23, 1978), differentiable.
     """
     states, commands = B.shape
-    rate = jnp.pad(jnp.concatenate([A, B], axis=1), ((0, commands), (0, 0)))
+    augmented_matrix = jnp.pad(jnp.concatenate([A, B], axis=1), ((0, commands), (0, 0)))
     scale = jnp.concatenate([balance(A), jnp.ones(commands)])
-    outer = scale * scale[:, None]
-    toll = block_diag(Q, R)
+    cost_scale = scale * scale[:, None]
+    cost_rate = block_diag(Q, R)
 
-    def over(span):
+    def propagator_and_cost(span):
         """Propagator of x and a held command, and what they cost, over a span (s)."""
-        matrix = rate * scale / scale[:, None] * span
-        flow, cost = whole_and_sum(matrix.T, span * toll * outer)
-        return flow.T * scale[:, None] / scale, cost / outer
+        matrix = augmented_matrix * scale / scale[:, None] * span
+        flow, cost = exponential_and_gramian(matrix.T, span * cost_rate * cost_scale)
+        return flow.T * scale[:, None] / scale, cost / cost_scale
 
     one, none = np.eye(commands), np.zeros((commands, commands))
-    keep = np.concatenate([np.zeros((commands, states)), none, one], axis=1)
-    start = jnp.eye(states + commands, states + 2 * commands)  # x and v, of (x, v, u)
+    command_rows = np.concatenate([np.zeros((commands, states)), none, one], axis=1)
+    state_at_change = jnp.eye(states + commands, states + 2 * commands)  # x and v, of (x, v, u)
     cost = jnp.zeros((states + 2 * commands,) * 2)
-    if late is not None:
-        flow, spent = over(late)
-        cost = start.T @ spent @ start
-        start = flow @ start
-    flow, spent = over(period if late is None else period - late)
-    begun = jnp.concatenate([start[:states], keep])
-    cost = symmetric(cost + begun.T @ spent @ begun)
-    after = jnp.concatenate([(flow @ begun)[:states], keep])
-    held = states + commands
+    if input_delay is not None:
+        propagator, interval_cost = propagator_and_cost(input_delay)
+        cost = state_at_change.T @ interval_cost @ state_at_change
+        state_at_change = propagator @ state_at_change
+    propagator, interval_cost = propagator_and_cost(
+        period if input_delay is None else period - input_delay
+    )
+    state_after_change = jnp.concatenate([state_at_change[:states], command_rows])
+    cost = symmetric_part(cost + state_after_change.T @ interval_cost @ state_after_change)
+    next_state = jnp.concatenate([(propagator @ state_after_change)[:states], command_rows])
+    state_count = states + commands
     return (
-        after[:, :held],
-        after[:, held:],
-        cost[:held, :held],
-        cost[held:, held:],
-        cost[:held, held:],
+        next_state[:, :state_count],
+        next_state[:, state_count:],
+        cost[:state_count, :state_count],
+        cost[state_count:, state_count:],
+        cost[:state_count, state_count:],
     )

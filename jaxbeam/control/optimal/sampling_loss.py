@@ -16,8 +16,10 @@ from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
 from jaxbeam.model.state_space import StateSpace, state_space
 
-KEPT = 0.3  # of the reach of commands: less is worth a warning, so beyond 0.93 of the limit
-UNREACHED = 1e-9  # of the largest push that a mode could get: less is none
+MIN_REACHABILITY = (
+    0.3  # of the reach of commands: less is worth a warning, so beyond 0.93 of the limit
+)
+UNCONTROLLABLE = 1e-9  # of the largest push that a mode could get: less is none
 
 
 class SamplingWarning(UserWarning):
@@ -33,16 +35,16 @@ def sampling_limit(case: Case) -> Float[Array, " mode"]:
     `jit`. Raises ValueError for a faulty case.
     """
     check(case)
-    return jnp.asarray(np.pi / _oscillations(state_space(case).unloaded)[0].imag)
+    return jnp.asarray(np.pi / _oscillatory_modes(state_space(case).unloaded)[0].imag)
 
 
-def warn_if_slow(plant: StateSpace, period: float, horizon: float) -> None:
+def warn_slow_sampling(system: StateSpace, period: float, memory_time: float) -> None:
     """Warn (SamplingWarning) if commands held for a period (s) hardly reach a mode of a plant.
 
-    `horizon` (s) is as in `reach_kept`.
+    `memory_time` (s) is as in `sampled_reachability`.
     """
-    share, pole = reach_kept(plant, period, horizon)
-    if share >= KEPT:
+    share, pole = sampled_reachability(system, period, memory_time)
+    if share >= MIN_REACHABILITY:
         return
     warnings.warn(
         f"commands held for {period:.4g} s hardly reach the mode at {pole / (2 * np.pi):.4g} Hz,"
@@ -53,42 +55,52 @@ def warn_if_slow(plant: StateSpace, period: float, horizon: float) -> None:
     )
 
 
-def reach_kept(plant: StateSpace, period: float, horizon: float) -> tuple[float, float]:
+def sampled_reachability(
+    system: StateSpace, period: float, memory_time: float
+) -> tuple[float, float]:
     """Which share of the reach of commands is left when they are held, and the mode it is worst in.
 
     The reach of commands is the controllability Gramian of a mode: the states of it that commands
-    of unit energy attain, with a memory that fades over a `horizon` (s), which keeps that of
+    of unit energy attain, with a memory that fades over a `memory_time` (s), which keeps that of
     undamped modes finite. The share is the least over both directions of a mode, so it is zero
     where the samples lose control of it; the mode is given by omega (1/s). Modes that do not
     oscillate or that no command reaches are left out; without others the share is 1. In the
     coordinates of the mode both Gramians are known in closed form.
     """
-    poles, rows = _oscillations(plant)
-    push = rows @ known(plant.B)
-    most = np.linalg.norm(rows, axis=1) * np.linalg.norm(known(plant.B))
-    reached = np.linalg.norm(push, axis=1) > UNREACHED * most
-    shares = [_kept(*at, period, horizon) for at in zip(poles[reached], push[reached], strict=True)]
+    poles, rows = _oscillatory_modes(system)
+    modal_inputs = rows @ known(system.B)
+    max_input = np.linalg.norm(rows, axis=1) * np.linalg.norm(known(system.B))
+    controllable = np.linalg.norm(modal_inputs, axis=1) > UNCONTROLLABLE * max_input
+    shares = [
+        _mode_reachability(*at, period, memory_time)
+        for at in zip(poles[controllable], modal_inputs[controllable], strict=True)
+    ]
     if not shares:
         return 1.0, 0.0
     worst = int(np.argmin(shares))
-    return shares[worst], float(poles[reached][worst].imag)
+    return shares[worst], float(poles[controllable][worst].imag)
 
 
-def _kept(pole: complex, push: np.ndarray, period: float, horizon: float) -> float:
+def _mode_reachability(
+    pole: complex, modal_input: np.ndarray, period: float, memory_time: float
+) -> float:
     """The share that is left of the reach of a mode, and of its conjugate, with pushes l'B."""
-    pole = pole - 0.5 / horizon
-    pair, push = np.array([pole, np.conj(pole)]), np.stack([push, np.conj(push)])
-    held = push * (np.expm1(pair * period) / pair)[:, None]
+    pole = pole - 0.5 / memory_time
+    pair, modal_input = (
+        np.array([pole, np.conj(pole)]),
+        np.stack([modal_input, np.conj(modal_input)]),
+    )
+    sampled_input = modal_input * (np.expm1(pair * period) / pair)[:, None]
     sums = pair[:, None] + pair.conj()
-    whole = push @ push.conj().T / -sums
-    left = held @ held.conj().T / -np.expm1(sums * period) / period
-    return float(max(scipy.linalg.eigvalsh(left, whole)[0], 0.0))
+    continuous_gramian = modal_input @ modal_input.conj().T / -sums
+    sampled_gramian = sampled_input @ sampled_input.conj().T / -np.expm1(sums * period) / period
+    return float(max(scipy.linalg.eigvalsh(sampled_gramian, continuous_gramian)[0], 0.0))
 
 
-def _oscillations(plant: StateSpace) -> tuple[np.ndarray, np.ndarray]:
+def _oscillatory_modes(system: StateSpace) -> tuple[np.ndarray, np.ndarray]:
     """Oscillating poles (1/s, those with positive imaginary part) and their left eigenvectors."""
-    found = scipy.linalg.eig(known(plant.A), left=True, right=False)
-    poles, ways = found[0], found[1]
-    chosen = np.flatnonzero(poles.imag > 1e-6 * np.abs(poles))
-    chosen = chosen[np.argsort(poles[chosen].imag)]
-    return poles[chosen], ways[:, chosen].conj().T
+    found = scipy.linalg.eig(known(system.A), left=True, right=False)
+    poles, left_vectors = found[0], found[1]
+    oscillatory = np.flatnonzero(poles.imag > 1e-6 * np.abs(poles))
+    oscillatory = oscillatory[np.argsort(poles[oscillatory].imag)]
+    return poles[oscillatory], left_vectors[:, oscillatory].conj().T

@@ -10,27 +10,27 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import INCREASING, choice, is_known, known, number, part
 from jaxbeam.control.load_identification import Recognition
-from jaxbeam.control.load_update import Listener
-from jaxbeam.control.optimal.gain_schedules import Schedule
-from jaxbeam.control.optimal.lqr import FiniteLQR, too_coarse
+from jaxbeam.control.load_update import AbstractLoadIdentifier
+from jaxbeam.control.optimal.gain_schedules import GainSchedule
+from jaxbeam.control.optimal.lqr import FiniteLQR, points_error
 from jaxbeam.model.contact import traffic
 from jaxbeam.model.state_space import LoadedBeam
 
 
-class Family(eqx.Module):
+class GainScheduleGrid(eqx.Module):
     """Schedules for each mass and speed, and what is known of the load.
 
-    `told` are its mass (kg), speed (m/s) and time of entry (s) if they are given beforehand;
+    `given` are its mass (kg), speed (m/s) and time of entry (s) if they are given beforehand;
     `gravity` (m/s^2) makes a weight of the mass.
     """
 
-    schedules: Schedule
+    schedules: GainSchedule
     masses: Float[Array, " mass"]
     speeds: Float[Array, " speed"]
     length: Float[Array, ""]
-    told: Float[Array, "3"]
+    given: Float[Array, "3"]
     gravity: Float[Array, ""]
-    recogniser: Listener | None
+    identifier: AbstractLoadIdentifier | None
 
 
 class ScheduledLQR(FiniteLQR):
@@ -58,59 +58,64 @@ class ScheduledLQR(FiniteLQR):
     recognition: Recognition | None = part("how mass and speed are found", Recognition)
 
     @property
-    def memoryless(self) -> bool:
-        return super().memoryless and self.recognition is None
+    def stateless(self) -> bool:
+        return super().stateless and self.recognition is None
 
     @property
-    def feeds_loads_forward(self) -> bool:
+    def load_feedforward(self) -> bool:
         return self.loads == "known"
 
-    def prepare(self, model, designed):
-        load = designed.case.loads[0]
+    def prepare(self, plant, design_plant):
+        load = design_plant.case.loads[0]
         speeds = jnp.abs(load.speed)[None] if self.speeds is None else self.speeds
-        single = super().prepare
+        design_one = super().prepare
 
-        def member(mass, speed):
-            return single(model, _crossed_by(designed, mass, speed))
+        def design(mass, speed):
+            return design_one(plant, _with_crossing_load(design_plant, mass, speed))
 
-        members = jax.vmap(jax.vmap(member, (None, 0)), (0, None))(self.masses, speeds)
-        heard = None if self.recognition is None else self.recognition.init(model, designed)
-        told = jnp.stack([load.mass, jnp.abs(load.speed), load.entry_time])
-        length, gravity = model.case.beam.length, designed.case.run.gravity
-        return Family(members, self.masses, speeds, length, told, gravity, heard)
+        schedules = jax.vmap(jax.vmap(design, (None, 0)), (0, None))(self.masses, speeds)
+        identifier = (
+            None if self.recognition is None else self.recognition.identifier(plant, design_plant)
+        )
+        given = jnp.stack([load.mass, jnp.abs(load.speed), load.entry_time])
+        length, gravity = plant.case.beam.length, design_plant.case.run.gravity
+        return GainScheduleGrid(schedules, self.masses, speeds, length, given, gravity, identifier)
 
     def command(self, memory, estimate, measurement, t):
         mass, speed, entry = memory.told
-        begun = jnp.ones((), bool)
-        if memory.recogniser is not None:
-            heard = memory.recogniser.hear(measurement, t)
-            memory = eqx.tree_at(lambda m: m.recogniser.fit, memory, heard.fit)
-            begun, weighed = heard.told(t)
-            mass = jnp.where(weighed, heard.mass, memory.masses[0])
-            speed, entry = jnp.abs(heard.speed), heard.entry
+        speed_identified = jnp.ones((), bool)
+        if memory.identifier is not None:
+            identifier = memory.identifier.update(measurement, t)
+            memory = eqx.tree_at(lambda m: m.identifier.fit, memory, identifier.fit)
+            speed_identified, mass_identified = identifier.told(t)
+            mass = jnp.where(mass_identified, identifier.mass, memory.masses[0])
+            speed, entry = jnp.abs(identifier.speed), identifier.entry_time
         end = entry + memory.length / speed
         weights = jnp.zeros(0)
-        if self.feeds_loads_forward:
-            held = jnp.clip(mass, memory.masses[0], memory.masses[-1])
-            weights = (held * memory.gravity)[None]
+        if self.load_feedforward:
+            clamped_mass = jnp.clip(mass, memory.masses[0], memory.masses[-1])
+            weights = (clamped_mass * memory.gravity)[None]
 
-        def answer(schedule):
+        def command_of(schedule):
             stretched = dataclasses.replace(schedule, known=weights, start=entry, end=end)
             return super(ScheduledLQR, self).command(stretched, estimate, measurement, t)[0]
 
-        answers = jax.vmap(jax.vmap(answer))(memory.schedules)
-        shares = self._shares(memory.masses, mass), self._shares(memory.speeds, speed)
-        command = jnp.einsum("m,v,mva->a", *shares, answers)
-        return jnp.where(begun, command, 0.0), memory
+        commands = jax.vmap(jax.vmap(command_of))(memory.schedules)
+        shares = (
+            self._interpolation_weights(memory.masses, mass),
+            self._interpolation_weights(memory.speeds, speed),
+        )
+        command = jnp.einsum("m,v,mva->a", *shares, commands)
+        return jnp.where(speed_identified, command, 0.0), memory
 
-    def _shares(self, grid, value) -> Float[Array, " design"]:
+    def _interpolation_weights(self, grid, value) -> Float[Array, " design"]:
         """What each design of a grid contributes at a value."""
         if self.between == "nearest":
             return jax.nn.one_hot(jnp.argmin(jnp.abs(grid - value)), grid.shape[0], dtype=float)
         ones = jnp.eye(grid.shape[0])
         return jax.vmap(lambda one: jnp.interp(value, grid, one))(ones)
 
-    def fault(self, case):
+    def validate(self, case):
         if len(case.loads) != 1 or any(
             getattr(load, name) is None for load in case.loads for name in ("mass", "speed")
         ):
@@ -124,27 +129,27 @@ class ScheduledLQR(FiniteLQR):
         if self.recognition is not None:
             if self.period is None:
                 return "period must be given: the recognition of loads remembers"
-            fault = self.recognition.fault(case)
-            if fault is not None:
-                return f"recognition.{fault}"
+            error = self.recognition.validate(case)
+            if error is not None:
+                return f"recognition.{error}"
         if self.speeds is not None:
-            fault = too_coarse(self, case, self.speeds[0])
-            if fault is not None:
-                return fault
-        return super().fault(case)
+            error = points_error(self, case, self.speeds[0])
+            if error is not None:
+                return error
+        return super().validate(case)
 
 
 def _not_positive(values) -> bool:
     return is_known(values) and bool(np.any(known(values) <= 0))
 
 
-def _crossed_by(model: LoadedBeam, mass, speed) -> LoadedBeam:
+def _with_crossing_load(plant: LoadedBeam, mass, speed) -> LoadedBeam:
     """The model with another mass, which keeps another speed, in the direction of its load."""
-    load = model.case.loads[0]
+    load = plant.case.loads[0]
     changed = eqx.tree_at(
         lambda x: (x.mass, x.speed, x.deceleration),
         load,
         (mass, jnp.sign(load.speed) * speed, jnp.zeros(())),
     )
-    case = eqx.tree_at(lambda c: c.loads, model.case, (changed,))
-    return dataclasses.replace(model, case=case, traffic=traffic(case))
+    case = eqx.tree_at(lambda c: c.loads, plant.case, (changed,))
+    return dataclasses.replace(plant, case=case, traffic=traffic(case))

@@ -13,17 +13,21 @@ import importlib.util
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-TOLERANCE = 1e-13  # of qpax's residuals, in the one form of `qp`; solutions are then right to 1e-9
-STEPS = 100
-ACCEPTED = 1e-9  # error of the conditions of optimality with which a solution is believed
+QPAX_TOLERANCE = (
+    1e-13  # of qpax's residuals, in the one form of `qp`; solutions are then right to 1e-9
+)
+MAX_STEPS = 100
+OPTIMALITY_TOLERANCE = (
+    1e-9  # error of the conditions of optimality with which a solution is believed
+)
 
 
-def installed() -> bool:
+def is_installed() -> bool:
     """Whether the package is there."""
     return importlib.util.find_spec("qpax") is not None
 
 
-def nearest(
+def least_distance(
     G: Float[Array, "row variable"], h: Float[Array, " row"]
 ) -> tuple[Float[Array, " variable"], Float[Array, " row"], Bool[Array, ""], Int[Array, ""]]:
     """The z nearest to the origin with G z <= h, multipliers, whether it is proven, and steps.
@@ -31,25 +35,25 @@ def nearest(
     Proven is what qpax flags as converged and the conditions of optimality confirm. Raises
     ImportError, saying what to install, if qpax is missing.
     """
-    if not installed():
+    if not is_installed():
         raise ImportError("qpax is not installed; install it with: pip install 'qpax>=0.1.4'")
     qpax = importlib.import_module("qpax")
 
     rows, variables = G.shape
-    none = jnp.zeros((0, variables)), jnp.zeros(0)
-    z, slack, weight, _, converged, steps = qpax.solve_qp(
+    no_equalities = jnp.zeros((0, variables)), jnp.zeros(0)
+    z, slack, multipliers, _, converged, steps = qpax.solve_qp(
         jnp.eye(variables),
         jnp.zeros(variables),
-        *none,
+        *no_equalities,
         G,
         h,
         backend="i",
-        solver_tol=TOLERANCE,
-        max_iter=STEPS,
+        solver_tol=QPAX_TOLERANCE,
+        max_iter=MAX_STEPS,
     )
-    stationary, limits = z + G.T @ weight, jnp.maximum(G @ z - h, 0.0)
-    pairs = jnp.minimum(jnp.abs(weight), jnp.abs(h - G @ z))
-    error = jnp.max(jnp.abs(jnp.concatenate([stationary, limits, pairs])))
-    finite = jnp.all(jnp.isfinite(z)) & jnp.all(jnp.isfinite(weight))
-    believed = (converged == 1) & finite & (error <= ACCEPTED * (1 + jnp.max(jnp.abs(z))))
-    return z, jnp.maximum(weight, 0.0), believed, steps
+    stationarity, violation = z + G.T @ multipliers, jnp.maximum(G @ z - h, 0.0)
+    complementarity = jnp.minimum(jnp.abs(multipliers), jnp.abs(h - G @ z))
+    error = jnp.max(jnp.abs(jnp.concatenate([stationarity, violation, complementarity])))
+    finite = jnp.all(jnp.isfinite(z)) & jnp.all(jnp.isfinite(multipliers))
+    solved = (converged == 1) & finite & (error <= OPTIMALITY_TOLERANCE * (1 + jnp.max(jnp.abs(z))))
+    return z, jnp.maximum(multipliers, 0.0), solved, steps

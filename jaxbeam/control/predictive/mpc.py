@@ -21,15 +21,15 @@ from jaxbeam.case.fields import (
     known,
     number,
 )
-from jaxbeam.control.predictive.by_qpax import installed
+from jaxbeam.control.predictive.by_qpax import is_installed
 from jaxbeam.control.predictive.prediction import (
     Prediction,
-    Sampled,
-    incremental,
-    moves,
+    SampledPlant,
+    incremental_model,
+    move_basis,
+    move_maps,
     predict,
-    pulses,
-    sample,
+    sampled_plant,
 )
 from jaxbeam.control.predictive.qp import METHODS, solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
@@ -37,30 +37,30 @@ from jaxbeam.model.state_space import LoadedBeam
 from jaxbeam.numerics.riccati import dare
 
 
-class Design(eqx.Module):
+class MPCDesign(eqx.Module):
     """What is designed before the first tick.
 
-    `plant` and `prediction` are those of the unloaded plant. `model` is what the future is read
+    `sampled_plant` and `prediction` are those of the unloaded plant. `plant` is what the future is read
     from at each tick, with loads of no mass if they only weigh on it; None if it stays the same.
     Commands are within their limits and rates where rows @ variables <= top - side @ u(k-1).
     """
 
-    plant: Sampled
+    sampled_plant: SampledPlant
     prediction: Prediction
     C: Float[Array, "output state"]
-    steps: Float[Array, "horizon actuator variable"]
-    rows: Float[Array, "row variable"]
-    top: Float[Array, " row"]
-    side: Float[Array, "row actuator"]
-    tail: Float[Array, "both both"] | None
-    model: LoadedBeam | None
+    move_maps: Float[Array, "horizon actuator variable"]
+    limit_rows: Float[Array, "row variable"]
+    limits: Float[Array, " row"]
+    limit_command_rows: Float[Array, "row actuator"]
+    terminal_cost: Float[Array, "both both"] | None
+    plant: LoadedBeam | None
 
 
-class Memory(eqx.Module):
+class MPCState(eqx.Module):
     """What is kept from tick to tick: the state, and how often no solution has been found."""
 
-    design: Design
-    state: Float[Array, " state"]
+    design: MPCDesign
+    previous_state: Float[Array, " previous_state"]
     failures: Float[Array, ""]
 
 
@@ -68,7 +68,7 @@ class MPC(AbstractStateLaw):
     """Model predictive control, eqs (7.1) to (7.30) of the thesis; it needs a period.
 
     Controlled are the deflections at `places`, at the sensors if left out, `horizon` periods
-    ahead, by `moves` moves; with a `laguerre_pole` the moves go on through the horizon and are
+    ahead, by `move_maps` moves; with a `laguerre_pole` the moves go on through the horizon and are
     made up of so many Laguerre functions. What the last period brought that the model does not
     explain is taken to go on: this is the incremental form (7.1), and rids the loop of an offset
     by constant loads. With loads "known" their weights are fed forward as they travel, those still
@@ -115,10 +115,10 @@ class MPC(AbstractStateLaw):
     solver: str = choice("how moves are found", *METHODS, "unconstrained", default="interior")
 
     @property
-    def memoryless(self) -> bool:
+    def stateless(self) -> bool:
         return False
 
-    def fault(self, case):
+    def validate(self, case):
         outputs = len(case.sensors) if self.places is None else self.places.shape[0]
         sizes = {
             "move_weight": ((), (len(case.actuators),)),
@@ -128,8 +128,8 @@ class MPC(AbstractStateLaw):
         }
         if self.period is None:
             return "period must be given: predictive control acts at samples"
-        late = None if self.delay is None else self.delay - self.period
-        if late is not None and is_known(late) and known(late) >= 0:
+        excess_delay = None if self.delay is None else self.delay - self.period
+        if excess_delay is not None and is_known(excess_delay) and known(excess_delay) >= 0:
             return "delay must be less than the period: no longer one is predicted"
         if self.moves > self.horizon:
             return f"moves must be at most the horizon, {self.horizon}, not {self.moves}"
@@ -143,7 +143,7 @@ class MPC(AbstractStateLaw):
         pole = self.laguerre_pole
         if pole is not None and is_known(pole) and known(pole) >= 1:
             return f"laguerre_pole must be below 1, not {known(pole):g}"
-        if self.solver == "qpax" and not installed():
+        if self.solver == "qpax" and not is_installed():
             return "solver must be another: qpax is not installed (pip install 'qpax>=0.1.4')"
         if self.loads == "known" and not case.loads:
             return "loads must be 'ignored' where there are none"
@@ -152,62 +152,66 @@ class MPC(AbstractStateLaw):
                 f"terminal must be 'none': {len(case.actuators)} actuators cannot bring"
                 f" {outputs} deflections to zero, so that the cost after the horizon is infinite"
             )
-        return super().fault(case)
+        return super().validate(case)
 
     def failures(self, memory):
         return memory[0].failures
 
-    def prepare(self, model, designed):
-        actuators = model.case.actuators
-        plant = self._sampled(designed.unloaded, 0)
-        steps = moves(pulses(self.horizon, self.moves, self.laguerre_pole), len(actuators))
-        C = self._outputs(designed, plant.A.shape[0])
+    def prepare(self, plant, design_plant):
+        actuators = plant.case.actuators
+        sampled_plant = self._sampled_plant(design_plant.unloaded, 0)
+        maps = move_maps(move_basis(self.horizon, self.moves, self.laguerre_pole), len(actuators))
+        C = self._deflection_rows(design_plant, sampled_plant.A.shape[0])
         # Of plain moves those after the last are none: the limits hold there too.
-        free = self.horizon if self.laguerre_pole is not None else self.moves
-        design = Design(
-            plant,
-            predict(_repeated(plant, self.horizon), C, steps, jnp.zeros(0)),
+        limited_periods = self.horizon if self.laguerre_pole is not None else self.moves
+        design = MPCDesign(
+            sampled_plant,
+            predict(_repeat(sampled_plant, self.horizon), C, maps, jnp.zeros(0)),
             C,
-            steps,
-            *_bounds(actuators, steps[:free], self.period),
-            self._tail(plant, C),
-            self._read_from(designed),
+            maps,
+            *_command_limits(actuators, maps[:limited_periods], self.period),
+            self._terminal_cost(sampled_plant, C),
+            self._prediction_plant(design_plant),
         )
-        return Memory(design, jnp.zeros(plant.A.shape[0]), jnp.zeros(()))
+        return MPCState(design, jnp.zeros(sampled_plant.A.shape[0]), jnp.zeros(()))
 
     def command(self, memory, estimate, measurement, t):
-        design, before = memory.design, measurement.command
+        design, previous_command = memory.design, measurement.command
         state = estimate.state
         if self.delay is not None:
-            state = jnp.concatenate([state, before])
-        past, prediction, weights = self._seen_from(design, t, estimate)
-        explained = past.A @ memory.state + past.B @ before + past.E @ weights
-        known = jnp.concatenate([state, state - explained, before, jnp.ones(1)])
-        move, solved = self._move(design, prediction, known, before)
-        command = before + jnp.where(solved, move, 0.0)
-        return command, Memory(design, state, memory.failures + ~solved)
+            state = jnp.concatenate([state, previous_command])
+        past_plant, prediction, weights = self._predict(design, t, estimate)
+        predicted_state = (
+            past_plant.A @ memory.state + past_plant.B @ previous_command + past_plant.E @ weights
+        )
+        current_state = jnp.concatenate(
+            [state, state - predicted_state, previous_command, jnp.ones(1)]
+        )
+        move, solved = self._first_move(design, prediction, current_state, previous_command)
+        command = previous_command + jnp.where(solved, move, 0.0)
+        return command, MPCState(design, state, memory.failures + ~solved)
 
-    def _outputs(self, designed, states):
+    def _deflection_rows(self, design_plant, state_count):
         """Rows that take the states to the deflections that are controlled."""
         places = self.places
         if places is None:
-            places = designed.case.sensor_places
-        shape = designed.rig.shapes(places, (0,))[0] / designed.scale
-        return jnp.zeros((shape.shape[0], states)).at[:, : shape.shape[1]].set(shape)
+            places = design_plant.case.sensor_places
+        shape = design_plant.rig.shapes(places, (0,))[0] / design_plant.scale
+        return jnp.zeros((shape.shape[0], state_count)).at[:, : shape.shape[1]].set(shape)
 
-    def _sampled(self, system, loads) -> Sampled:
-        B, B_f = jnp.split(system.B, [system.B.shape[1] - loads], axis=1)
-        return sample(system.A, B, B_f, self.period, self.delay)
+    def _sampled_plant(self, system, load_count) -> SampledPlant:
+        B, B_f = jnp.split(system.B, [system.B.shape[1] - load_count], axis=1)
+        return sampled_plant(system.A, B, B_f, self.period, self.delay)
 
-    def _read_from(self, designed) -> LoadedBeam | None:
+    def _prediction_plant(self, design_plant) -> LoadedBeam | None:
         """The model from which the future is read at each tick, if it changes."""
         if self.prediction == "time-varying":
-            return designed
+            return design_plant
         if self.loads == "ignored":
             return None
-        return eqx.tree_at(lambda m: m.traffic.inertia, designed, replace_fn=jnp.zeros_like)
+        return eqx.tree_at(lambda m: m.traffic.inertia, design_plant, replace_fn=jnp.zeros_like)
 
-    def _seen_from(self, design, t, estimate):
+    def _predict(self, design, t, estimate):
         """The plant over the last period, the prediction, and the weights of the loads in it."""
         if design.model is None:
             return design.plant, design.prediction, jnp.zeros(0)
@@ -216,89 +220,116 @@ class MPC(AbstractStateLaw):
             weights = jnp.zeros_like(weights)
         elif estimate.weights is not None:
             weights = estimate.weights
-        middles = t + (jnp.arange(-1, self.horizon) + 0.5) * self.period
-        frozen = jax.vmap(lambda time: self._sampled(design.model.at(time), weights.shape[0]))
-        plants = frozen(middles)
+        midpoints = t + (jnp.arange(-1, self.horizon) + 0.5) * self.period
+        sample_frozen = jax.vmap(
+            lambda time: self._sampled_plant(design.model.at(time), weights.shape[0])
+        )
+        plants = sample_frozen(midpoints)
         past, future = (jax.tree.map(lambda p, s=s: p[s], plants) for s in (0, slice(1, None)))
         return past, predict(future, design.C, design.steps, weights), weights
 
-    def _weights(self, outputs):
+    def _output_weights(self, output_count):
         """Weights (horizon, output) of squared deflections."""
-        ahead = jnp.ones(self.horizon) if self.horizon_weight is None else self.horizon_weight
-        each = jnp.ones(outputs) if self.output_weight is None else self.output_weight
-        return ahead[:, None] * jnp.broadcast_to(each, (outputs,))
+        period_weights = (
+            jnp.ones(self.horizon) if self.horizon_weight is None else self.horizon_weight
+        )
+        output_weights = (
+            jnp.ones(output_count) if self.output_weight is None else self.output_weight
+        )
+        return period_weights[:, None] * jnp.broadcast_to(output_weights, (output_count,))
 
-    def _tail(self, plant, C):
+    def _terminal_cost(self, sampled_plant, C):
         """P of the cost after the horizon, of the incremental model with the regulator's law."""
         if self.terminal == "none":
             return None
-        A, B, seen = incremental(plant.A, plant.B, C)
-        Q = seen.T @ (self._weights(C.shape[0])[-1, :, None] * seen)
+        A, B, output_rows = incremental_model(sampled_plant.A, sampled_plant.B, C)
+        Q = output_rows.T @ (self._output_weights(C.shape[0])[-1, :, None] * output_rows)
         return dare(A, B, Q, jnp.diag(jnp.broadcast_to(self.move_weight, B.shape[1])))
 
-    def program(self, design: Design, prediction: Prediction, known, before):
+    def quadratic_program(
+        self, design: MPCDesign, prediction: Prediction, current_state, previous_command
+    ):
         """The quadratic program of a tick: H, f, M and gamma of `solve_qp`.
 
-        `known` is what the free response follows from, the state, its change that the model does
-        not explain, the command `before`, and 1.
+        `current_state` is what the free response follows from, the state, its change that the model does
+        not explain, the command `previous_command`, and 1.
         """
-        free = prediction.F @ known
-        weight, Phi, steps = self._weights(free.shape[1]), prediction.Phi, design.steps
-        if design.tail is not None:
+        free_response = prediction.F @ current_state
+        weight, Phi, move_maps = (
+            self._output_weights(free_response.shape[1]),
+            prediction.Phi,
+            design.move_maps,
+        )
+        if design.terminal_cost is not None:
             weight = weight.at[-1].set(0.0)  # P has it
-        price = jnp.broadcast_to(self.move_weight, before.shape)
-        effort = jnp.einsum("hav,a,haw->vw", steps, price, steps)
-        H = jnp.einsum("hov,ho,how->vw", Phi, weight, Phi) + effort
-        f = jnp.einsum("hov,ho,ho->v", Phi, weight, free)
-        if design.tail is not None:
-            pull = prediction.end_phi.T @ design.tail
-            H, f = H + pull @ prediction.end_phi, f + pull @ (prediction.end @ known)
+        move_weights = jnp.broadcast_to(self.move_weight, previous_command.shape)
+        move_cost = jnp.einsum("hav,a,haw->vw", move_maps, move_weights, move_maps)
+        H = jnp.einsum("hov,ho,how->vw", Phi, weight, Phi) + move_cost
+        f = jnp.einsum("hov,ho,ho->v", Phi, weight, free_response)
+        if design.terminal_cost is not None:
+            terminal_gradient = prediction.terminal_phi.T @ design.terminal_cost
+            H, f = (
+                H + terminal_gradient @ prediction.terminal_phi,
+                f + terminal_gradient @ (prediction.terminal @ current_state),
+            )
         H, f = 2 * H, 2 * f
-        M, gamma = design.rows, design.top - design.side @ before
+        M, gamma = design.limit_rows, design.limits - design.limit_command_rows @ previous_command
         if self.solver == "unconstrained":
             return H, f, M[:0], gamma[:0]
         if self.soft_limit is not None:
-            return self._softened(H, f, M, gamma, Phi, free)
+            return self._with_soft_limits(H, f, M, gamma, Phi, free_response)
         return H, f, M, gamma
 
-    def _move(self, design, prediction, known, before):
+    def _first_move(self, design, prediction, current_state, previous_command):
         """The first move, and whether there is one that solves the problem."""
-        H, f, M, gamma = self.program(design, prediction, known, before)
-        steps = design.steps
+        H, f, M, gamma = self.quadratic_program(design, prediction, current_state, previous_command)
+        move_maps = design.steps
         if M.shape[0] == 0:
-            return steps[0] @ -jnp.linalg.solve(H, f), jnp.ones((), bool)
+            return move_maps[0] @ -jnp.linalg.solve(H, f), jnp.ones((), bool)
         found = solve_qp(H, f, M, gamma, self.solver)
-        return steps[0] @ found.x[: steps.shape[2]], found.solved
+        return move_maps[0] @ found.x[: move_maps.shape[2]], found.solved
 
-    def _softened(self, H, f, M, gamma, Phi, free):
+    def _with_soft_limits(self, H, f, M, gamma, Phi, free_response):
         """The problem with an excess over the soft limit for each output as further variables."""
         horizon, outputs, variables = Phi.shape
         H = jax.scipy.linalg.block_diag(H, 2 * self.soft_weight * jnp.eye(outputs))
         excess = jnp.tile(jnp.eye(outputs), (horizon, 1))
-        rows, now = Phi.reshape(-1, variables), free.reshape(-1)
+        rows, free_deflections = Phi.reshape(-1, variables), free_response.reshape(-1)
         limit = jnp.tile(jnp.broadcast_to(self.soft_limit, (outputs,)), horizon)
         M = jnp.block([[M, jnp.zeros((M.shape[0], outputs))], [rows, -excess], [-rows, -excess]])
-        return H, jnp.pad(f, (0, outputs)), M, jnp.concatenate([gamma, limit - now, limit + now])
+        return (
+            H,
+            jnp.pad(f, (0, outputs)),
+            M,
+            jnp.concatenate([gamma, limit - free_deflections, limit + free_deflections]),
+        )
 
 
-def _repeated(plant: Sampled, times: int) -> Sampled:
+def _repeat(plant: SampledPlant, times: int) -> SampledPlant:
     return jax.tree.map(lambda part: jnp.broadcast_to(part, (times, *part.shape)), plant)
 
 
-def _bounds(actuators, steps, period):
+def _command_limits(actuators, move_maps, period):
     """Limits and rates of the actuators as rows @ variables <= top - side @ u(k-1), eq. (7.28)."""
-    count, variables = len(actuators), steps.shape[2]
-    rows, tops, sides = [jnp.zeros((0, variables))], [jnp.zeros(0)], [jnp.zeros((0, count))]
-    total = jnp.cumsum(steps, axis=0)
+    count, variables = len(actuators), move_maps.shape[2]
+    rows, limit_values, command_rows = (
+        [jnp.zeros((0, variables))],
+        [jnp.zeros(0)],
+        [jnp.zeros((0, count))],
+    )
+    cumulative_moves = jnp.cumsum(move_maps, axis=0)
     for i, actuator in enumerate(actuators):
         limits, rate = actuator.command_limits(), actuator.command_rate()
         bounds = []
         if limits is not None:
-            bounds += [(total[:, i], limits[1], 1.0), (-total[:, i], -limits[0], -1.0)]
+            bounds += [
+                (cumulative_moves[:, i], limits[1], 1.0),
+                (-cumulative_moves[:, i], -limits[0], -1.0),
+            ]
         if rate is not None:
-            bounds += [(sign * steps[:, i], rate * period, 0.0) for sign in (1.0, -1.0)]
+            bounds += [(sign * move_maps[:, i], rate * period, 0.0) for sign in (1.0, -1.0)]
         for row, top, sign in bounds:
             rows.append(row)
-            tops.append(jnp.full(row.shape[0], top))
-            sides.append(jnp.zeros((row.shape[0], count)).at[:, i].set(sign))
-    return jnp.concatenate(rows), jnp.concatenate(tops), jnp.concatenate(sides)
+            limit_values.append(jnp.full(row.shape[0], top))
+            command_rows.append(jnp.zeros((row.shape[0], count)).at[:, i].set(sign))
+    return jnp.concatenate(rows), jnp.concatenate(limit_values), jnp.concatenate(command_rows)

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.numerics.discretisation import hold
+from jaxbeam.numerics.discretisation import c2d
 
 
-class Sampled(NamedTuple):
+class SampledPlant(NamedTuple):
     """A plant over a period, or over several along a first axis; see the module.
 
     If commands begin late, the ones before are further states.
@@ -29,53 +29,58 @@ class Prediction(NamedTuple):
     """Outputs to come as Y = F known + Phi variables, eq. (7.4), and where the state ends.
 
     `known` is (x(k), w, u(k-1), 1), with a column of F for each; that of 1 is what the loads do.
-    `end` and `end_phi` do the same for x(k+N) - x(k+N-1) followed by y(k+N), N the horizon.
+    `terminal` and `terminal_phi` do the same for x(k+N) - x(k+N-1) followed by y(k+N), N the horizon.
     """
 
     F: Float[Array, "horizon output known"]
     Phi: Float[Array, "horizon output variable"]
-    end: Float[Array, "both known"]
-    end_phi: Float[Array, "both variable"]
+    terminal: Float[Array, "both known"]
+    terminal_phi: Float[Array, "both variable"]
 
 
-def sample(
+def sampled_plant(
     A: Float[Array, "state state"],
     B: Float[Array, "state actuator"],
     B_f: Float[Array, "state load"],
     period: Float[Array, ""],
     delay: Float[Array, ""] | None = None,
-) -> Sampled:
+) -> SampledPlant:
     """The plant z' = A z + B u + B_f W over a period (s), its inputs held. Exact.
 
     With a `delay` (s), at most the period, commands begin that much later.
     """
     actuators, loads = B.shape[1], B_f.shape[1]
-    drift, push = hold(A, jnp.concatenate([B, B_f], axis=1), period)
-    push, load = push[0, :, :actuators], push[0, :, actuators:]
+    transition, input_matrix = c2d(A, jnp.concatenate([B, B_f], axis=1), period)
+    input_matrix, load_matrix = input_matrix[0, :, :actuators], input_matrix[0, :, actuators:]
     if delay is None:
-        return Sampled(drift, push, load)
-    now = hold(A, B, period - delay)[1][0]
-    none = jnp.zeros((actuators, drift.shape[0]))
-    return Sampled(
-        A=jnp.block([[drift, push - now], [none, jnp.zeros((actuators, actuators))]]),
-        B=jnp.concatenate([now, jnp.eye(actuators)]),
-        E=jnp.concatenate([load, jnp.zeros((actuators, loads))]),
+        return SampledPlant(transition, input_matrix, load_matrix)
+    late_input_matrix = c2d(A, B, period - delay)[1][0]
+    none = jnp.zeros((actuators, transition.shape[0]))
+    return SampledPlant(
+        A=jnp.block(
+            [
+                [transition, input_matrix - late_input_matrix],
+                [none, jnp.zeros((actuators, actuators))],
+            ]
+        ),
+        B=jnp.concatenate([late_input_matrix, jnp.eye(actuators)]),
+        E=jnp.concatenate([load_matrix, jnp.zeros((actuators, loads))]),
     )
 
 
-def incremental(
+def incremental_model(
     A: Float[Array, "state state"],
     B: Float[Array, "state actuator"],
     C: Float[Array, "output state"],
 ) -> tuple[Float[Array, "both both"], Float[Array, "both actuator"], Float[Array, "output both"]]:
     """The plant in (x(k) - x(k-1), y(k)), driven by moves: A, B and C of eq. (7.1)."""
     states, outputs = A.shape[0], C.shape[0]
-    drift = jnp.block([[A, jnp.zeros((states, outputs))], [C @ A, jnp.eye(outputs)]])
-    seen = jnp.concatenate([jnp.zeros((outputs, states)), jnp.eye(outputs)], axis=1)
-    return drift, jnp.concatenate([B, C @ B]), seen
+    transition = jnp.block([[A, jnp.zeros((states, outputs))], [C @ A, jnp.eye(outputs)]])
+    output_rows = jnp.concatenate([jnp.zeros((outputs, states)), jnp.eye(outputs)], axis=1)
+    return transition, jnp.concatenate([B, C @ B]), output_rows
 
 
-def pulses(
+def move_basis(
     horizon: int, terms: int, pole: Float[Array, ""] | None = None
 ) -> Float[Array, "horizon term"]:
     """Sequences of which moves are made up: one for each of the first moves, or Laguerre's.
@@ -85,48 +90,59 @@ def pulses(
     """
     if pole is None:
         return jnp.eye(horizon, terms)
-    rest = 1 - pole**2
-    first = jnp.sqrt(rest) * jnp.cumprod(jnp.concatenate([jnp.ones(1), jnp.full(terms - 1, -pole)]))
-    column = jnp.concatenate([pole[None], rest * first[: terms - 1] / jnp.sqrt(rest)])
+    pole_complement = 1 - pole**2
+    first = jnp.sqrt(pole_complement) * jnp.cumprod(
+        jnp.concatenate([jnp.ones(1), jnp.full(terms - 1, -pole)])
+    )
+    column = jnp.concatenate(
+        [pole[None], pole_complement * first[: terms - 1] / jnp.sqrt(pole_complement)]
+    )
     step = jnp.array(
         [[column[i - j] if i >= j else 0.0 for j in range(terms)] for i in range(terms)]
     )
-    _, found = jax.lax.scan(lambda now, _: (step @ now, now), first, length=horizon)
-    return found
+    _, sequences = jax.lax.scan(lambda now, _: (step @ now, now), first, length=horizon)
+    return sequences
 
 
-def moves(shapes: Float[Array, "horizon term"], actuators: int) -> Float[Array, "..."]:
+def move_maps(basis: Float[Array, "horizon term"], actuators: int) -> Float[Array, "..."]:
     """Moves (horizon, actuator, variable), with a variable for each term and actuator."""
-    return jax.vmap(lambda row: jnp.kron(row[None], jnp.eye(actuators)))(shapes)
+    return jax.vmap(lambda row: jnp.kron(row[None], jnp.eye(actuators)))(basis)
 
 
 def predict(
-    plants: Sampled,
+    plants: SampledPlant,
     C: Float[Array, "output state"],
-    steps: Float[Array, "horizon actuator variable"],
-    weights: Float[Array, " load"],
+    move_maps: Float[Array, "horizon actuator variable"],
+    load_weights: Float[Array, " load"],
 ) -> Prediction:
     """F and Phi of a plant given over each of the periods to come, eqs (7.5) and (7.10).
 
-    `steps` are the moves that the variables make, `weights` those of the loads (N). For a plant
+    `move_maps` are the moves that the variables make, `load_weights` those of the loads (N). For a plant
     that does not vary, F known is F (x(k) - x(k-1), y(k)) of the thesis.
     """
     states, actuators = plants.B.shape[-2:]
-    split = 2 * states + actuators + 1
-    columns = split + steps.shape[2]
-    held = jnp.eye(actuators, columns, k=2 * states)
-    commands = held + jnp.pad(jnp.cumsum(steps, axis=0), ((0, 0), (0, 0), (split, 0)))
+    known_count = 2 * states + actuators + 1
+    columns = known_count + move_maps.shape[2]
+    previous_command = jnp.eye(actuators, columns, k=2 * states)
+    commands = previous_command + jnp.pad(
+        jnp.cumsum(move_maps, axis=0), ((0, 0), (0, 0), (known_count, 0))
+    )
     unexplained = jnp.eye(states, columns, k=states)
 
-    def onward(state, period):
+    def advance(state, period):
         plant, command = period
-        after = plant.A @ state + plant.B @ command + unexplained
-        after = after.at[:, split - 1].add(plant.E @ weights)
-        return after, after
+        next_state = plant.A @ state + plant.B @ command + unexplained
+        next_state = next_state.at[:, known_count - 1].add(plant.E @ load_weights)
+        return next_state, next_state
 
-    now = jnp.eye(states, columns)
-    _, trail = jax.lax.scan(onward, now, (plants, commands))
-    outputs = C @ trail
-    trail = jnp.concatenate([now[None], trail])
-    end = jnp.concatenate([trail[-1] - trail[-2], outputs[-1]])
-    return Prediction(outputs[..., :split], outputs[..., split:], end[:, :split], end[:, split:])
+    initial_state = jnp.eye(states, columns)
+    _, trajectory = jax.lax.scan(advance, initial_state, (plants, commands))
+    outputs = C @ trajectory
+    trajectory = jnp.concatenate([initial_state[None], trajectory])
+    terminal = jnp.concatenate([trajectory[-1] - trajectory[-2], outputs[-1]])
+    return Prediction(
+        outputs[..., :known_count],
+        outputs[..., known_count:],
+        terminal[:, :known_count],
+        terminal[:, known_count:],
+    )

@@ -8,9 +8,9 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
 from jaxbeam.control import DiscreteLQR, StateFeedback
-from jaxbeam.control.optimal.gain_schedules import Schedule
+from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.control.optimal.lqr import LQR, AbstractScheduledRegulator
-from jaxbeam.control.optimal.scheduled_lqr import Family, ScheduledLQR
+from jaxbeam.control.optimal.scheduled_lqr import GainScheduleGrid, ScheduledLQR
 from jaxbeam.estimation import Observer
 from jaxbeam.files.export.gains import Gains
 from jaxbeam.model.modes import lay_out
@@ -88,7 +88,7 @@ def _filters(case: Case) -> np.ndarray:
 def _designed(case: Case, layout, shares):
     """What gains are made of, see `_tabulated`, and the estimator (see `Gains`)."""
     model, law = state_space(case, layout=layout), case.controller
-    designed = law.believed(model)
+    designed = law.design_plant(model)
     estimator = jnp.zeros((0, 0))
     if law.estimator is not None:
         made = law.estimator.init(designed)
@@ -108,12 +108,12 @@ def _tabulated(law, model, designed, shares):
     """
     memory = law.gain if isinstance(law, StateFeedback) else law.prepare(model, designed)
     one = jnp.zeros(1), jnp.zeros(1)
-    if isinstance(memory, Family):
+    if isinstance(memory, GainScheduleGrid):
         tables = jax.vmap(jax.vmap(lambda each: jax.vmap(each.table)(shares)))(memory.schedules)
-        crossing = memory.length / memory.told[1]
+        crossing = memory.length / memory.given[1]
         grid = memory.masses, memory.speeds
-        return designed.unloaded, grid, tables, memory.schedules.rest, crossing
-    if isinstance(memory, Schedule):
+        return designed.unloaded, grid, tables, memory.schedules.final_gain, crossing
+    if isinstance(memory, GainSchedule):
         table, crossing = jax.vmap(memory.table)(shares), memory.end - memory.start
-        return designed.unloaded, one, table[None, None], memory.rest[None, None], crossing
+        return designed.unloaded, one, table[None, None], memory.final_gain[None, None], crossing
     return designed.unloaded, one, memory[None, None, None], memory[None, None], 0.0

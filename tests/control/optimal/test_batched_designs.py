@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.control import DiscreteLQR, ScheduledLQR
-from jaxbeam.control.optimal.lqr import optimal
+from jaxbeam.control.optimal.lqr import finite_horizon_gains
 from jaxbeam.estimation import Kalman, Observer
 from jaxbeam.model.modes import lay_out
 from tests.differences import central
@@ -106,7 +106,9 @@ def test_what_designs_share_makes_no_difference(actuator, varied):
 
     def pieces(share):
         changed = jb.replace(case, {varied: share * start})
-        return optimal(changed.controller, jb.state_space(changed, layout=layout))[0].pieces
+        return finite_horizon_gains(changed.controller, jb.state_space(changed, layout=layout))[
+            0
+        ].coefficients
 
     def size(share):
         return jnp.sum(pieces(share)[:, 0] ** 2)

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.analysis.stability_limits import limit
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from tests.analysis import test_stability as oracle
 from tests.analysis.test_stability import LENGTH, MASS, SPEED, rig, written_out
 
@@ -52,7 +52,7 @@ def test_weights_of_deflections_add_to_those_of_states():
 
 
 def test_a_suspension_may_be_left_out_of_the_design(monkeypatch):
-    law = jb.LQR(STATES, [9e-5], coordinates="sine", design=Beliefs(stiffness=0.0, damping=0.0))
+    law = jb.LQR(STATES, [9e-5], coordinates="sine", design=DesignModel(stiffness=0.0, damping=0.0))
     case, real = rig(law), [written_out(SPEED * t, SPEED, MASS, 4.6) for t in TIMES]
     monkeypatch.setattr(oracle, "SPRING", 0.0)
     monkeypatch.setattr(oracle, "DAMPER", 0.0)
@@ -64,7 +64,7 @@ def test_beliefs_in_mass_and_speed_shape_the_table():
     """The gain is that for the place of the load, as the load believed in passes it."""
     believed = 0.3, 0.8
     law = jb.StepLQR(
-        STATES, [9e-5], coordinates="sine", points=300, design=Beliefs(mass=0.3, speed=0.8)
+        STATES, [9e-5], coordinates="sine", points=300, design=DesignModel(mass=0.3, speed=0.8)
     )
     loops = []
     for x in SPEED * TIMES:

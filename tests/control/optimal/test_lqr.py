@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.validation import check
 from jaxbeam.control import LQR, AugmentedLQR, FiniteLQR, StepLQR
-from jaxbeam.control.design_model import Beliefs
-from jaxbeam.control.optimal.lqr import optimal
+from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.optimal.lqr import finite_horizon_gains
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.modules import DATA
 
@@ -25,7 +25,7 @@ WEIGHTS = {
     "coordinates": "sine",
 }
 FEW = [1, 1, 0, 1, 0, 0, 0]  # q1, q2 and the rate of q1 are fed back
-DESIGN = Beliefs(force_per_volt=4.6)
+DESIGN = DesignModel(force_per_volt=4.6)
 # Deflections (m) of the loop with the finite-time gain, 0.055 and 0.273 s after the exit: P and the
 # loop by scipy's Radau to 1e-10 (the same to 1e-11), P as its dense output, on the same A(t), B(t).
 AFTER_EXIT = [4.737544e-07, 7.254085e-11]
@@ -102,7 +102,7 @@ def test_predicted_cost_is_the_cost_simulated_and_the_gain_is_optimal(model):
     regulator = FiniteLQR(**WEIGHTS, points=400)
     Q, R = regulator.weights(model)
     start = jnp.array([1e-3, -2e-4, 1e-4, 0.02, 0.01, -0.03, 0.3])
-    table, costs = eqx.filter_jit(lambda m: optimal(regulator, m))(model)
+    table, costs = eqx.filter_jit(lambda m: finite_horizon_gains(regulator, m))(model)
     end = 0.6 / 0.55
     times = jnp.linspace(0.0, end, 40001)  # a lag of 0.1 ms, by Runge and Kutta's method
     step = times[1]
@@ -143,7 +143,7 @@ def test_case_files_hold_regulators():
 
 
 def test_stretches_are_counted_for_the_modes_that_are_designed_for():
-    few = Beliefs(modes=1)
+    few = DesignModel(modes=1)
     check(rig(FiniteLQR([1.0] * 3, [1.0], points=100, design=few)))
 
 
@@ -156,7 +156,10 @@ def test_stretches_are_counted_for_the_modes_that_are_designed_for():
         (LQR([1.0] * 7, [1.0, 1.0]), "command_weight must have 1 entries"),
         (LQR([1.0] * 7, [1.0], places=[0.3]), "places and place_weight belong together"),
         (LQR([1.0] * 7, [1.0], places=[0.9], place_weight=[1.0]), "places must lie on the beam"),
-        (LQR([1.0] * 7, [1.0], design=Beliefs(correction=0.3)), "design.correction has no effect"),
+        (
+            LQR([1.0] * 7, [1.0], design=DesignModel(correction=0.3)),
+            "design.correction has no effect",
+        ),
         (FiniteLQR([1.0] * 7, [1.0], points=100), "points must be at least"),
     ],
 )

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 import jaxbeam as jb
 from jaxbeam.case.validation import check
 from jaxbeam.control import AugmentedLQR, ScheduledLQR
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.simulation.closed_loop import loop_schedule
 from tests.control.optimal.test_regulators import (
@@ -40,7 +40,7 @@ from tests.runs import plan_of
 PREDICTED = {"masses": (0.36, 0.15), "speeds": (1.6, 1.9), "entries": (0.013, 0.095)}
 TRUE = {"masses": MASSES, "speeds": SPEEDS, "entries": ENTRIES}
 EVERY = np.union1d(TIMES, np.linspace(0.0, EVENTS[-1], 801))
-BELIEFS = Beliefs(
+BELIEFS = DesignModel(
     mass=PREDICTED["masses"], speed=PREDICTED["speeds"], entry_time=PREDICTED["entries"]
 )
 LAW = AugmentedLQR(**WEIGHTS, points=300, design=BELIEFS, entries="predicted")
@@ -100,7 +100,7 @@ def deflections(predicted):
 def simulated(predicted):
     """The run on `EVERY` under the law for what is predicted, in single steps between them."""
     numbers = {"mass": "masses", "speed": "speeds", "entry_time": "entries"}
-    beliefs = Beliefs(**{name: predicted[key] for name, key in numbers.items()})
+    beliefs = DesignModel(**{name: predicted[key] for name, key in numbers.items()})
     case = rig(dataclasses.replace(LAW, design=beliefs))
     plan = plan_of(case, substeps=1, even=False)
     plan = dataclasses.replace(plan, schedule=loop_schedule(case, EVERY))
@@ -142,7 +142,7 @@ def test_case_files_hold_predictions():
 def test_what_is_no_prediction_is_refused():
     table = jb.MovingMass(mass=0.2, times=[0.0, 0.3], positions=[0.0, 0.6])
     case = dataclasses.replace(rig(LAW), loads=(table,))
-    late = dataclasses.replace(LAW, design=Beliefs(entry_time=0.1))
+    late = dataclasses.replace(LAW, design=DesignModel(entry_time=0.1))
     with pytest.raises(ValueError, match=r"design\.entry_time has no effect"):
         check(dataclasses.replace(case, controller=late))
     one = dataclasses.replace(rig(), loads=rig().loads[:1])

@@ -16,8 +16,8 @@ from jaxbeam.analysis.linearised_loop import linear_loop
 from jaxbeam.case.validation import check
 from jaxbeam.cli import main
 from jaxbeam.control import LQR, DiscreteLQR, SamplingWarning
-from jaxbeam.control.optimal.sampled_lqr import sampled_problem
-from jaxbeam.control.optimal.sampling_loss import reach_kept
+from jaxbeam.control.optimal.sampled_lqr import discrete_lq_problem
+from jaxbeam.control.optimal.sampling_loss import sampled_reachability
 from jaxbeam.model.modes import lay_out
 
 WEIGHTS = {
@@ -86,7 +86,7 @@ def integrated(A, B, Q, R, spans):
 def test_the_sampled_problem_is_the_integral(model, late):
     plant, period = model.unloaded, 2e-3
     Q, R = LQR(**WEIGHTS).weights(model)
-    A, B, Qs, Rs, N = sampled_problem(
+    A, B, Qs, Rs, N = discrete_lq_problem(
         plant.A, plant.B, Q, R, jnp.asarray(period), None if late is None else jnp.asarray(late)
     )
     spans = (0.0 if late is None else late, period - (late or 0.0))
@@ -189,7 +189,7 @@ def test_control_is_lost_at_the_limit():
 
     shares = []
     for share in (0.25, 0.5, 0.9, 1.0, 1.25, 2.0):
-        kept, omega = reach_kept(plant, share * limit, 0.2)
+        kept, omega = sampled_reachability(plant, share * limit, 0.2)
         assert omega == pytest.approx(np.pi / limit)
         assert_allclose(kept, smallest(share * limit), rtol=1e-6, atol=1e-9)
         shares.append(kept)

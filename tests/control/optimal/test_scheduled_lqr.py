@@ -13,7 +13,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.control import FiniteLQR, ScheduledLQR
-from jaxbeam.control.optimal.gain_schedules import Schedule
+from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.modes import lay_out
 from jaxbeam.model.statics import influence_line, static_lift
@@ -92,7 +92,7 @@ def test_what_is_left_after_the_exit(fade, left):
     fade = None if fade is None else jnp.asarray(fade)
     table = GainTable(jnp.array([0.0, 1.0]), jnp.ones((1, 4, 1, 1)))
     at = jnp.asarray
-    schedule = Schedule(table, 3 * jnp.ones((1, 1)), jnp.zeros(0), at(1.0), at(2.0), fade)
+    schedule = GainSchedule(table, 3 * jnp.ones((1, 1)), jnp.zeros(0), at(1.0), at(2.0), fade)
     assert schedule.gain(at(0.5)) == 0.0
     assert schedule.gain(at(1.5)) == 1 + 0.5 + 0.25 + 0.125
     assert_allclose(schedule.gain(at(3.0)), 3 * left, rtol=1e-12)
@@ -131,17 +131,17 @@ def test_what_is_recognised_is_followed():
     def run(case):
         model = jb.state_space(case, layout=layout)
         memory = case.controller.init(model)
-        line, lift = memory[0].recogniser.line, memory[0].recogniser.lift
+        line, lift = memory[0].identifier.line, memory[0].identifier.lift
         sent = jnp.full(1, 0.7)
 
         def tick(fit, t):
             place = jnp.asarray(jnp.round((t - 0.2) / 0.75 * 200), int)
             static = 9.81 * 0.3 * line[:, place] + lift @ sent
             readings = jnp.stack([static[0], jnp.asarray(7.0), static[1]])
-            before = eqx.tree_at(lambda m: m[0].recogniser.fit, memory, fit)
+            before = eqx.tree_at(lambda m: m[0].identifier.fit, memory, fit)
             seen = Measurement(readings, state, sent)
             answer, after = case.controller.step(before, seen, t)
-            return after[0].recogniser.fit, (answer[0], after[0].recogniser.mass)
+            return after[0].identifier.fit, (answer[0], after[0].identifier.mass)
 
         return jax.lax.scan(tick, jnp.zeros(2), times)[1]
 
@@ -168,21 +168,21 @@ def test_a_way_is_found_from_deflections_alone():
     @eqx.filter_jit
     def run(case):
         model = jb.state_space(case, layout=layout)
-        start = settings.init(model, model)
-        places = jnp.linspace(0, 0.6, start.line.shape[1])
+        start = settings.identifier(model, model)
+        places = jnp.linspace(0, 0.6, start.influence_lines.shape[1])
         sent = jnp.full(1, 0.7)
 
         def tick(fit, t):
             way = 0.6 - 0.8 * (t - 0.2)
             on = (way > 0) & (way < 0.6)
-            line = jax.vmap(lambda each: jnp.interp(way, places, each))(start.line)
-            static = jnp.where(on, 0.3 * 9.81 * line, 0.0) + start.lift @ sent
+            line = jax.vmap(lambda each: jnp.interp(way, places, each))(start.influence_lines)
+            static = jnp.where(on, 0.3 * 9.81 * line, 0.0) + start.static_lift @ sent
             readings = jnp.stack([static[0], jnp.asarray(7.0), static[1] + 1e-4])
             before = eqx.tree_at(lambda m: m.fit, start, fit)
-            after = before.hear(Measurement(readings, jnp.zeros(5), sent), t)
-            return after.fit, (after.told(t)[0], after.speed, after.entry, after.mass)
+            after = before.update(Measurement(readings, jnp.zeros(5), sent), t)
+            return after.fit, (after.told(t)[0], after.speed, after.entry_time, after.mass)
 
-        return jax.lax.scan(tick, start.fit, times)[1]
+        return jax.lax.scan(tick, start.sums, times)[1]
 
     told, speed, entry, mass = map(np.asarray, run(case))
     at = np.argmax(told)
@@ -211,12 +211,14 @@ def test_a_load_at_rest_is_seen_where_it_is():
     """Everywhere: at the pins rounding is all that bends the beam, and may look like any place."""
     case = rig()
     model = jb.state_space(case)
-    follower = jb.Recognition(threshold=1e-9, until=0.9).init(model, model)
+    follower = jb.Recognition(threshold=1e-9, until=0.9).identifier(model, model)
     places = np.linspace(0.02, 0.58, 5001)
-    grid = np.linspace(0, 0.6, follower.line.shape[1])
-    lines = np.stack([np.interp(places, grid, line) for line in np.asarray(follower.line)], axis=1)
+    grid = np.linspace(0, 0.6, follower.influence_lines.shape[1])
+    lines = np.stack(
+        [np.interp(places, grid, line) for line in np.asarray(follower.influence_lines)], axis=1
+    )
     news = np.asarray(
-        jax.vmap(lambda seen: follower.news(seen, jnp.zeros(())))(jnp.asarray(5.0 * lines))
+        jax.vmap(lambda seen: follower.innovation(seen, jnp.zeros(())))(jnp.asarray(5.0 * lines))
     )
     assert_allclose(news[:, 3] / news[:, 0], places, atol=1e-3)
 
@@ -230,15 +232,15 @@ def test_influence_and_lift_are_the_static_ones():
     @eqx.filter_jit
     def prepared(case):
         model = jb.state_space(case, layout=layout)
-        return RECOGNITION.init(model, model)
+        return RECOGNITION.identifier(model, model)
 
     found = prepared(case)
-    places = jnp.linspace(0, 0.6, found.line.shape[1])
+    places = jnp.linspace(0, 0.6, found.influence_lines.shape[1])
     tail = 2 * 0.6**3 / (11.68 * np.pi**4) * np.sum(np.arange(13.0, 1000.0) ** -4)
     exact = influence_line(case, jnp.array([0.2, 0.45]), places).T
-    assert_allclose(found.line, exact, rtol=0, atol=tail)
+    assert_allclose(found.influence_lines, exact, rtol=0, atol=tail)
     lift = static_lift(case, jnp.array([0.2, 0.45])).T
-    assert_allclose(found.lift, lift, rtol=1e-3)
+    assert_allclose(found.static_lift, lift, rtol=1e-3)
 
 
 def test_case_files_hold_schedules():

@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.control.design_model import Beliefs
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation import Kalman
 from tests.control.predictive.test_mpc import PATCH, PERIOD, THESIS, mpc, rig
 
@@ -45,7 +45,7 @@ def estimated(readings, commands):
 @pytest.mark.slow
 def test_three_modes_estimated_on_twelve():
     """Commands are those of the law fed by a filter of numpy's; the peak still falls by a sixth."""
-    believing = {"design": Beliefs(modes=3), "estimator": Kalman(INTENSITY, NOISE)}
+    believing = {"design": DesignModel(modes=3), "estimator": Kalman(INTENSITY, NOISE)}
     case = rig(mpc(**believing), modes=12)
     law, model = case.controller, jb.state_space(case)
     middles = (np.arange(TICKS * FINE) + 0.5) * PERIOD / FINE

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
-from jaxbeam.control.predictive.prediction import incremental
+from jaxbeam.control.predictive.prediction import incremental_model
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.numerics.riccati import dlqr
 from tests.control.predictive.test_mpc import PATCH, PERIOD, mpc, rig
@@ -57,7 +57,7 @@ def test_the_unconstrained_law():
     output, ahead = 3.0, np.linspace(1.0, 2.0, 6)
     controller = mpc(output_weight=output, horizon_weight=ahead, solver="unconstrained")
     states = np.random.default_rng(0).normal(size=(2, 6)) * 1e-3
-    wide, push, seen = map(np.asarray, incremental(*incremental_plant(rig(controller))))
+    wide, push, seen = map(np.asarray, incremental_model(*incremental_plant(rig(controller))))
     power = [np.linalg.matrix_power(wide, n) for n in range(7)]
     F = np.concatenate([seen @ power[n] for n in range(1, 7)])
     Phi = np.array(
@@ -77,7 +77,7 @@ def test_the_terminal_cost_makes_it_the_regulator():
     """Dual mode, eq. (7.31): with it at any horizon, and without at a long one."""
     states = np.random.default_rng(0).normal(size=(2, 6)) * 1e-3
     A, B, C = incremental_plant(rig())
-    wide, push, seen = incremental(A, B, C)
+    wide, push, seen = incremental_model(A, B, C)
     gain = dlqr(wide, push, seen.T @ seen, 1e-11 * jnp.eye(1))[0]
     first = -gain @ np.concatenate([states[0], C @ states[0]])
     second = first - gain @ np.concatenate([states[1] - states[0], C @ states[1]])

@@ -6,12 +6,12 @@ import scipy.linalg
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxbeam.control.predictive.prediction import (
-    Sampled,
-    incremental,
-    moves,
+    SampledPlant,
+    incremental_model,
+    move_basis,
+    move_maps,
     predict,
-    pulses,
-    sample,
+    sampled_plant,
 )
 
 
@@ -25,9 +25,9 @@ def plant(states=4, inputs=2, outputs=2, seed=0):
 def test_prediction_is_that_of_the_incremental_model():
     """F and Phi as eq. (7.5) spells them, from the matrices of eq. (7.1)."""
     A, B, C = plant()
-    wide, push, seen = map(np.asarray, incremental(A, B, C))
-    steps = moves(pulses(5, 3), 2)
-    many = Sampled(*(jnp.stack([part] * 5) for part in (A, B, jnp.zeros((4, 0)))))
+    wide, push, seen = map(np.asarray, incremental_model(A, B, C))
+    steps = move_maps(move_basis(5, 3), 2)
+    many = SampledPlant(*(jnp.stack([part] * 5) for part in (A, B, jnp.zeros((4, 0)))))
     found = predict(many, C, steps, jnp.zeros(0))
     power = [np.linalg.matrix_power(wide, n) for n in range(6)]
     F = np.stack([seen @ power[n] for n in range(1, 6)])
@@ -41,13 +41,13 @@ def test_prediction_is_that_of_the_incremental_model():
     rest = now - A @ before - B @ command
     free = found.F @ np.concatenate([now, rest, command, [1.0]])
     assert_allclose(free, F @ np.concatenate([now - before, C @ now]), atol=1e-13)
-    assert_allclose(found.end[4:], found.F[-1], atol=1e-14)
+    assert_allclose(found.terminal[4:], found.F[-1], atol=1e-14)
 
 
 def test_sampling_with_a_delay():
     rng = np.random.default_rng(2)
     A, B, E = (jnp.asarray(rng.normal(size=s)) for s in ((3, 3), (3, 1), (3, 2)))
-    found = sample(A, B, E, jnp.array(0.3), jnp.array(0.1))
+    found = sampled_plant(A, B, E, jnp.array(0.3), jnp.array(0.1))
     state, before, command, weights = rng.normal(size=3), *rng.normal(size=2), rng.normal(size=2)
     for span, u in ((0.1, before), (0.2, command)):  # by the exponential of the forced system
         rate = np.block([[A, (B[:, 0] * u + E @ weights)[:, None]], [np.zeros((1, 4))]])
@@ -61,6 +61,6 @@ def test_sampling_with_a_delay():
 
 def test_laguerre_functions():
     """Orthonormal; the first moves at pole 0."""
-    found = pulses(200, 5, jnp.array(0.7))
+    found = move_basis(200, 5, jnp.array(0.7))
     assert_allclose(found.T @ found, np.eye(5), atol=1e-12)
-    assert_array_equal(pulses(6, 4, jnp.array(0.0)), pulses(6, 4))
+    assert_array_equal(move_basis(6, 4, jnp.array(0.0)), move_basis(6, 4))

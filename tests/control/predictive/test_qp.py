@@ -154,7 +154,7 @@ def test_what_is_no_problem_is_not_solved(method):
     eye, ones = jnp.eye(2), jnp.ones(2)
     numbers = [(-eye, ones, ones), (eye, ones * jnp.nan, ones), (eye, ones, -ones * jnp.inf)]
     for H, f, gamma in numbers:
-        assert solve_qp(H, f, eye, gamma, method).verdict == UNFINISHED
+        assert solve_qp(H, f, eye, gamma, method).status == UNFINISHED
 
 
 def test_unknown_methods_are_refused():

@@ -15,7 +15,7 @@ from tests.control.predictive.test_mpc import mpc, rig
 from tests.control.predictive.test_qp import FEASIBLE, problems
 from tests.differences import central
 
-there = pytest.mark.skipif(not by_qpax.installed(), reason="qpax is not installed")
+there = pytest.mark.skipif(not by_qpax.is_installed(), reason="qpax is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_its_flag_alone_would_not_do():
 def test_limits_that_are_not_felt_cost_nothing():
     found = solve_qp(2 * jnp.eye(2), jnp.array([1.0, -1.0]), jnp.eye(2), jnp.ones(2), "qpax")
     assert_allclose(found.x, [-0.5, 0.5], rtol=1e-15)
-    assert found.verdict == SOLVED and found.steps == 0
+    assert found.status == SOLVED and found.steps == 0
 
 
 @there
@@ -93,6 +93,6 @@ def test_predictive_control_gives_the_same_commands():
 def test_where_it_is_missing_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ImportError, match="pip install 'qpax>=0.1.4'"):
-        by_qpax.nearest(jnp.ones((1, 1)), jnp.ones(1))
+        by_qpax.least_distance(jnp.ones((1, 1)), jnp.ones(1))
     with pytest.raises(ValueError, match="controller.solver must be another: qpax is not"):
         check(rig(mpc(solver="qpax")))

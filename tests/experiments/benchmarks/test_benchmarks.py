@@ -97,7 +97,10 @@ def test_steps_of_a_law_are_timed():
 
 
 def test_designs_are_timed():
-    for times in (regulator_designs.time_invariant(2), regulator_designs.time_finite_horizon(2, 8, True, 1 / 256)):
+    for times in (
+        regulator_designs.time_invariant(2),
+        regulator_designs.time_finite_horizon(2, 8, True, 1 / 256),
+    ):
         assert times.compiling > 0 and times.run > 0
 
 

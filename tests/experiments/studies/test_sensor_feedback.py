@@ -59,7 +59,9 @@ def off(rig, side, factor, more=0.01, run=None):
     )
     case = jb.replace(dataclasses.replace(real, controller=law), run or {})
     believed = {tuned_feedforward.RIGIDITY: float(case.beam.flexural_rigidity)}
-    changed = jb.replace(case, {tuned_feedforward.RIGIDITY: factor * believed[tuned_feedforward.RIGIDITY]})
+    changed = jb.replace(
+        case, {tuned_feedforward.RIGIDITY: factor * believed[tuned_feedforward.RIGIDITY]}
+    )
     return with_fixed_design(changed, believed, lay_out(known_case(changed)))
 
 
@@ -82,6 +84,10 @@ def test_it_stays_stable_as_loads_leave_a_softer_beam():
 
 def test_corners_of_the_bench():
     """15 ms and the filter of the other rig, the case otherwise as it is."""
-    assert set(sensor_feedback.corners("B").values()) == {(0.015, 10.0), (0.01, 20.0), (0.015, 20.0)}
+    assert set(sensor_feedback.corners("B").values()) == {
+        (0.015, 10.0),
+        (0.01, 20.0),
+        (0.015, 20.0),
+    }
     real, _ = sensor_feedback.prepared("C", rigs.load("C"))
     assert {float(s.filter.cutoff) for s in sensor_feedback.filtered(real, 10.0).sensors} == {10.0}

@@ -32,7 +32,10 @@ def test_critical_speed_of_the_denser_beam():
     speed = np.pi / LENGTH * np.sqrt(RIGIDITY / heavier)
     ours = LENGTH * frequencies._frequency_at_patch_density(one_span(rigs.load)) / np.pi
     np.testing.assert_allclose(ours, speed, rtol=1e-9)
-    assert abs(speed - published.CRITICAL_SPEEDS.numbers[0]) < published.CRITICAL_SPEEDS.allowed_error[0]
+    assert (
+        abs(speed - published.CRITICAL_SPEEDS.numbers[0])
+        < published.CRITICAL_SPEEDS.allowed_error[0]
+    )
 
 
 def mobility(s, mass):
