@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.numerics.batched_linalg import FEW, matvec, solve_unpivoted
+from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_unpivoted
 from tests.differences import central
 
 RANDOM = np.random.default_rng(0)
@@ -28,7 +28,7 @@ def test_systems_of_any_size_and_in_any_number(size):
     assert_allclose(shared[..., 1], np.linalg.solve(matrix[0, 0], right[1, 0]), rtol=1e-9)
 
 
-@pytest.mark.parametrize("columns", [0, 1, FEW, FEW + 1])
+@pytest.mark.parametrize("columns", [0, 1, MAX_UNROLLED_TERMS, MAX_UNROLLED_TERMS + 1])
 def test_products_spelt_out_or_not(columns):
     matrix, lanes = RANDOM.normal(size=(5, columns)), RANDOM.normal(size=(columns, 4))
     found = matvec(jnp.asarray(matrix), jnp.asarray(lanes))
