@@ -32,8 +32,8 @@ HAND_SET = jb.PD(gains=[300.0], rate_gains=[3.0], lag=[0.002], period=0.004)
 FREE_GAINS = {"controller.gains.0": (0.0, 3000.0), "controller.rate_gains.0": (0.0, 20.0)}
 MODES = 3  # of the model that the controller is tuned on
 LOAD_CASES = tuning.LoadCases(
-    training=tuning.grid({MASS: [0.2, 0.4], SPEED: [1.5, 2.0]}),
-    held_out=tuning.grid({MASS: [0.25, 0.35], SPEED: [1.6, 1.9]}),
+    training=tuning.full_grid({MASS: [0.2, 0.4], SPEED: [1.5, 2.0]}),
+    held_out=tuning.full_grid({MASS: [0.25, 0.35], SPEED: [1.6, 1.9]}),
 )
 STEPS = 30
 

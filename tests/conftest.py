@@ -74,10 +74,10 @@ def _close_figures():
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _forget_compiled():
+def _clear_compiled():
     """Drop what a file compiled: kept for all files it would take several gigabytes."""
     yield
     if "jaxbeam.runtime.compiling" in sys.modules:
-        sys.modules["jaxbeam.runtime.compiling"].forget()
+        sys.modules["jaxbeam.runtime.compiling"].clear_caches()
     elif "jax" in sys.modules:
         sys.modules["jax"].clear_caches()

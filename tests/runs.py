@@ -6,7 +6,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.oracles.loads import Load
 
 
@@ -21,11 +21,13 @@ def load_of(load: Load):
     )
 
 
-def plan_of(case: jb.Case, substeps: int = 12, even: bool = True, slots: int | None = None) -> Plan:
+def plan_of(
+    case: jb.Case, substeps: int = 12, even: bool = True, slots: int | None = None
+) -> IntegrationPlan:
     """A plan with a given number of steps a sample, which spares the search for it."""
-    shape = form(case)
-    shape = dataclasses.replace(shape, slots=slots or shape.slots)
-    return Plan(shape, substeps, lead=0, even=even, error=0.0)
+    shape = static_shapes(case)
+    shape = dataclasses.replace(shape, slots=slots or shape.max_loads)
+    return IntegrationPlan(shape, substeps, lead_samples=0, equally_spaced=even, error=0.0)
 
 
 def assert_close(found, expected, tolerance: float) -> None:

@@ -24,7 +24,7 @@ jaxbeam.sweeps
 jaxbeam.analysis
 jaxbeam.plot
 jaxbeam
-tuning.checkpoint  tuning.optional
+tuning.aliases  tuning.checkpoint  tuning.optional
 tuning.logs
 tuning.parameters  tuning.modal
 tuning.fit

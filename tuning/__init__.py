@@ -1,25 +1,26 @@
-"""tuning: what measured logs say about a rig, and controllers tuned for it."""
+"""Identification of models from measured logs, and tuning of controllers for them."""
 
 import os
 
-# XLA's threads hand each other the matrices of a batch and wait for them. Where all wait at once,
-# nothing goes on for ever, as was seen with two threads and gradients of many runs; with eight it
-# was not. XLA reads this before it computes anything; a setting given stays.
+# XLA's threads pass the matrices of a batch to each other and wait for them. With two threads and
+# gradients of many runs they were seen to wait for each other for ever; with eight they were not.
+# XLA reads this variable before its first computation; a setting by the user prevails.
 os.environ.setdefault("PJRT_NPROC", str(max(8, os.cpu_count() or 1)))
 
-from tuning.control.integer_choices import tune_choices
-from tuning.control.load_cases import LoadCases, draws, grid, read_load_cases
+from tuning.aliases import OLD_NAMES, warn_of_old_name
+from tuning.control.integer_choices import tune_integers
+from tuning.control.load_cases import LoadCases, full_grid, latin_hypercube, read_load_cases
 from tuning.control.objective import Objective
 from tuning.control.pareto import lexicographic, pareto
-from tuning.control.plants import adopt, draw_plants
+from tuning.control.plants import draw_plants, with_identified_plant
 from tuning.control.reduced_order import tune_reduced
-from tuning.control.stability_constraint import Stable
+from tuning.control.stability_constraint import StabilityConstraint
 from tuning.control.tune import tune
-from tuning.control.tuning_result import Tuned
-from tuning.fit.experiment_design import sharpen
+from tuning.control.tuning_result import TuningResult
+from tuning.fit.experiment_design import design_experiment
 from tuning.fit.frequency_responses import Responses, identify_responses, responses_of
 from tuning.fit.identify import Fit, identify
-from tuning.fit.model_validation import compare_fits, cross_validate, hold_out
+from tuning.fit.model_validation import compare_fits, cross_validate, predict_held_out
 from tuning.fit.report import write_report
 from tuning.fit.storage import load_fit, save_fit
 from tuning.fit.uncertainty.posterior import sample
@@ -29,33 +30,33 @@ from tuning.logs.log import Log
 from tuning.logs.quality import find_faults, mask
 from tuning.logs.reading import read_log, read_logs
 from tuning.modal.modal import ModalFit, identify_modes
-from tuning.parameters.prior import Belief
+from tuning.parameters.prior import Prior
 
 __all__ = [
-    "Belief",
     "Fit",
     "LoadCases",
     "Log",
     "ModalFit",
     "Objective",
+    "Prior",
     "Responses",
-    "Stable",
-    "Tuned",
-    "adopt",
+    "StabilityConstraint",
+    "TuningResult",
     "compare_fits",
     "cross_validate",
+    "design_experiment",
     "draw_plants",
-    "draws",
     "find_faults",
-    "grid",
-    "hold_out",
+    "full_grid",
     "identify",
     "identify_modes",
     "identify_responses",
+    "latin_hypercube",
     "lexicographic",
     "load_fit",
     "mask",
     "pareto",
+    "predict_held_out",
     "profile",
     "read_load_cases",
     "read_log",
@@ -63,10 +64,17 @@ __all__ = [
     "responses_of",
     "sample",
     "save_fit",
-    "sharpen",
     "tune",
-    "tune_choices",
+    "tune_integers",
     "tune_reduced",
     "weigh",
+    "with_identified_plant",
     "write_report",
 ]
+
+
+def __getattr__(name: str):
+    if name not in OLD_NAMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warn_of_old_name(f"tuning.{name}", f"tuning.{OLD_NAMES[name]}")
+    return globals()[OLD_NAMES[name]]

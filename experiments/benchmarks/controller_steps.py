@@ -20,7 +20,7 @@ import warnings
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam.analysis.computing_time import StepTimes, step_times
+from jaxbeam.analysis.computing_time import ComputingTimes, computing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control import KINDS, SamplingWarning
 from jaxbeam.simulation.simulate import ContactLossWarning
@@ -101,12 +101,12 @@ def patch_case(controller: AbstractController) -> jb.Case:
     )
 
 
-def measure(controller: AbstractController) -> StepTimes:
+def measure(controller: AbstractController) -> ComputingTimes:
     """Time the steps that a controller makes in the crossing."""
     with warnings.catch_warnings():
         for kind in (ContactLossWarning, SamplingWarning):
             warnings.simplefilter("ignore", kind)
-        return step_times(jb.simulate(patch_case(controller), tolerance=1e-4))
+        return computing_times(jb.simulate(patch_case(controller), tolerance=1e-4))
 
 
 def main() -> None:

@@ -25,7 +25,7 @@ from experiments.benchmarks.timing import interleaved_best
 from jaxbeam.integrator.propagators import GAUSS, LOOKED
 from jaxbeam.numerics.peak_search import interpolation_matrix, newton_step_limit
 from jaxbeam.sweeps import programs
-from jaxbeam.sweeps.specification import make_order
+from jaxbeam.sweeps.specification import sweep_specification
 
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", "-lm")
 Library = Callable[..., None]
@@ -48,12 +48,14 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     """The beam as one array, and for each speed what a crossing takes: all as kernel.c has it."""
     case = one_span_case(modes)
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
-    runner = make_order(case, over, False, False, TOLERANCE, "double").work()
-    steps, _ = runner.steps()
+    runner = sweep_specification(case, over, False, False, TOLERANCE, "double").runner()
+    steps, _ = runner.choose_step_sizes()
     mask = np.ones(SPEEDS.size, bool)
-    models = jax.tree.map(lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), runner.rigs)
+    models = jax.tree.map(lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), runner.models)
     step_size = steps, np.zeros(steps.size, int)
-    found = programs.riggings(runner.job(), mask, models, runner.tasks.heavy, step_size)
+    found = programs.discrete_models(
+        runner.program(), mask, models, runner.batches.shared_values, step_size
+    )
     discrete_models = jax.tree.map(np.asarray, found)
     pinned_beam = PinnedBeam(modes)
     rates = discrete_models.rig.state_matrix[0, :, 1, :]
@@ -78,7 +80,7 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     parts = [*numbers, pinned_beam.frequencies**2, discrete_models.flexibility[0]]
     beam = np.concatenate([np.ravel(part) for part in parts])
     crossings = []
-    for i, speed in enumerate(runner.tasks.heavy[:, 0]):
+    for i, speed in enumerate(runner.batches.shared_values[:, 0]):
         task = jax.tree.map(lambda leaf, i=i: leaf[i], discrete_models)
         on, last = np.flatnonzero(task.grid.counts)  # the crossing, and what comes after it
         kinds = [int(task.grid.kind[panel]) for panel in (on, last)]

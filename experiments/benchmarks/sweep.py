@@ -30,8 +30,8 @@ from experiments.benchmarks.timing import Timing, interleaved_best, time_call
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulation.integration_plan import make_plan
-from jaxbeam.simulation.simulate import readings
+from jaxbeam.simulation.integration_plan import integration_plan
+from jaxbeam.simulation.simulate import simulate_readings
 
 MASSES = np.linspace(0.1, 1.0, 64)
 SPEEDS = np.linspace(0.3, 10.0, 64)
@@ -136,13 +136,13 @@ def derivatives() -> list[tuple[str, float]]:
     """Time of a misfit's jvp, Jacobian over six numbers and gradient in reverse, in plain runs."""
     case = jb.replace(one_span_case(3), {"run.duration": 1.2})
     times = jnp.arange(1200) / 1000.0
-    plan = make_plan(case, times)
+    plan = integration_plan(case, times)
     start = jnp.array([float(jb.addresses(case)[address]) for address in FREE])
-    measured = readings(case, times, plan)
+    measured = simulate_readings(case, times, plan)
 
     def residual(values):
         varied = jb.replace(case, dict(zip(FREE, values, strict=True)))
-        return readings(varied, times, plan) - measured
+        return simulate_readings(varied, times, plan) - measured
 
     def misfit(values):
         return jnp.sum(residual(values) ** 2)

@@ -36,7 +36,7 @@ from tuning.control.optimisers import METHODS
 from tuning.control.run_set import make_run_set
 
 KNOTS, STEPS, GRADIENT_COST, EVALUATION_FACTOR, SEED = 11, 80, 4, 10, 0
-LOADS = tuning.grid({"loads.0.mass": [0.261, 0.509], "loads.0.speed": [0.5, 1.0]})
+LOADS = tuning.full_grid({"loads.0.mass": [0.261, 0.509], "loads.0.speed": [0.5, 1.0]})
 
 
 class SearchResult(NamedTuple):
@@ -103,7 +103,7 @@ def run_evolution(
 def run_gradients(case: jb.Case, free: dict, method: str) -> tuple[float, SearchResult]:
     """Worst peaks at the start and where gradients lead; timed when all is compiled."""
     loads = tuning.LoadCases(LOADS)
-    options = {"steps": STEPS, "method": method, "bounds": False, "progress": False}
+    options = {"steps": STEPS, "method": method, "least_peaks": False, "progress": False}
     tuning.tune(case, free, loads, **options)
     began = time.perf_counter()
     found = tuning.tune(case, free, loads, **options)

@@ -79,7 +79,7 @@ def bench_case(rig: str, case: jb.Case) -> tuple[jb.Case, tuple[dict[str, float]
     duration = float(case.beam.length) / min(SPEEDS[rig]) + ENTRY_TIME + 0.1
     case = dataclasses.replace(case, run=jb.Run(duration=duration, sample_rate=200.0))
     law = jb.load_case(FOLDER / f"{rig}.toml").controller
-    loads = tuning.grid(
+    loads = tuning.full_grid(
         {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS[rig], "loads.0.entry_time": [ENTRY_TIME]}
     )
     return dataclasses.replace(with_noise_and_filters(rig, case, SEED), controller=law), loads
@@ -164,7 +164,7 @@ def largest_real_part(real: jb.Case, law: jb.Relief, run: dict[str, float]) -> f
     for factor in (1.0, *RIGIDITY_ERRORS.values()):
         other_beam = jb.replace(case, {RIGIDITY: factor * design_numbers[RIGIDITY]})
         other_beam = with_fixed_design(other_beam, design_numbers, lay_out(known_case(other_beam)))
-        found.append(frozen_poles(other_beam, times).largest.max())
+        found.append(frozen_poles(other_beam, times).largest_real_part.max())
     return float(max(found))
 
 

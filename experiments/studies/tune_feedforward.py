@@ -63,7 +63,7 @@ def training_loads(rig: str) -> tuple[dict[str, float], ...]:
     )
 
 
-def tune_law(rig: str, progress: bool = True) -> tuning.Tuned:
+def tune_law(rig: str, progress: bool = True) -> tuning.TuningResult:
     """Tune the table and its lead for the worst of all loads on rig B or C."""
     case = rigs.load(rig)
     slowest = float(case.beam.length) / min(SPEEDS[rig])

@@ -107,7 +107,7 @@ def training_loads(rig: str = "B") -> tuple[dict[str, float], ...]:
     )
 
 
-def stability_constraint(law: jb.Relief) -> tuning.Stable:
+def stability_constraint(law: jb.Relief) -> tuning.StabilityConstraint:
     """Where poles may lie along crossings, for a table that bends where no load is: on both sides.
 
     The loads are slow: fast ones of half the beam's mass move poles to the right by themselves.
@@ -117,21 +117,21 @@ def stability_constraint(law: jb.Relief) -> tuning.Stable:
         {f"controller.readings.{k}": x + side for k, x in enumerate(breakpoints)}
         for side in (-READING_OFFSET, READING_OFFSET)
     ]
-    loads = tuning.grid(
+    loads = tuning.full_grid(
         {"loads.0.mass": (*MASSES, sum(MASSES) / 2), "loads.0.speed": [CROSSING_SPEED]}
     )
-    return tuning.Stable(
-        largest=MAX_REAL_PART,
-        delay=EXTRA_DELAY,
-        spread={RIGIDITY: RIGIDITY_TOLERANCE},
-        places=CROSSING_POSITIONS,
+    return tuning.StabilityConstraint(
+        max_real_part=MAX_REAL_PART,
+        extra_delay=EXTRA_DELAY,
+        parameter_tolerance={RIGIDITY: RIGIDITY_TOLERANCE},
+        instants=CROSSING_POSITIONS,
         crossings=tuple(load | side for load in loads for side in shifted_tables),
     )
 
 
 def tune_law(
     rig: str, file: Path | None = None, steps: int = STEPS, progress: bool = True
-) -> tuning.Tuned:
+) -> tuning.TuningResult:
     """Tune the table for the worst of all loads on rig B or C; a file keeps the search."""
     case = with_noise_and_filters(rig, rigs.load(rig))
     slowest = float(case.beam.length) / min(SPEEDS)

@@ -79,7 +79,7 @@ def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
     """Run all laws on the held-out loads of a rig."""
     duration = float(case.beam.length) / min(SPEEDS[rig]) + ENTRY_TIME + 0.1
     case = dataclasses.replace(case, run=jb.Run(duration=duration, sample_rate=200.0))
-    loads = tuning.grid(
+    loads = tuning.full_grid(
         {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS[rig], "loads.0.entry_time": [ENTRY_TIME]}
     )
     ideal = jb.load_case(FOLDER / f"{rig}.toml").controller

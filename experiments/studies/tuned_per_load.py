@@ -21,7 +21,7 @@ from experiments.studies.tune_sensor_feedback import with_noise_and_filters
 from experiments.studies.tuned_feedforward import ENTRY_TIME
 from jaxbeam import rigs
 
-HELD_OUT_LOADS = tuning.grid(
+HELD_OUT_LOADS = tuning.full_grid(
     {
         "loads.0.mass": [0.322, 0.42],
         "loads.0.speed": [0.35, 0.95],

@@ -1,4 +1,4 @@
-"""Beams of chapter 2 that are no rigs of their own: that of rig A bare, over one span and two."""
+"""Cases that several experiments share: beams of chapter 2, a shaker, and changes of a case."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ def one_span(load_rig) -> jb.Case:
 
 
 def two_spans(load_rig, modes: int = 8) -> jb.Case:
-    """The beam of rig A over two of its spans, of which rigidity and density "stay unchanged"."""
+    """Two spans of the beam of rig A, whose rigidity and density "stay unchanged"."""
     one = one_span(load_rig)
     return dataclasses.replace(
         one,
@@ -22,10 +22,35 @@ def two_spans(load_rig, modes: int = 8) -> jb.Case:
     )
 
 
+def data_physics_v4() -> jb.Electrodynamic:
+    """The electrodynamic shaker of Table 2.3, at 0.5 m."""
+    return jb.Electrodynamic(
+        0.5, 0.82, 5e-5, 4.2, back_emf=4.2, mass=0.02, stiffness=9700.0, damping=0.55
+    )
+
+
 def as_moving_force(case: jb.Case) -> jb.Case:
-    """The same case with loads that weigh as much and have no inertia."""
+    """The case with moving forces of the same weights instead of masses."""
     loads = [jb.MovingForce(mass=load.mass, speed=load.speed) for load in case.loads]
     return dataclasses.replace(case, loads=tuple(loads))
+
+
+def with_modes(case: jb.Case, modes: int) -> jb.Case:
+    """The case with another number of modes."""
+    return dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=modes))
+
+
+def with_duration(case: jb.Case, duration, sample_rate: float | None = None) -> jb.Case:
+    """The case with another duration (s) and, if given, another sample rate (Hz)."""
+    rate = case.run.sample_rate if sample_rate is None else np.asarray(sample_rate)
+    run = dataclasses.replace(case.run, duration=np.asarray(duration), sample_rate=rate)
+    return dataclasses.replace(case, run=run)
+
+
+def with_sensors(case: jb.Case, *positions: float, duration: float) -> jb.Case:
+    """The case with deflection sensors at positions (m), for a duration (s)."""
+    sensors = tuple(jb.Sensor(position) for position in positions)
+    return with_duration(dataclasses.replace(case, sensors=sensors), duration)
 
 
 def critical_speed(case: jb.Case) -> float:
@@ -33,13 +58,6 @@ def critical_speed(case: jb.Case) -> float:
     return 2 * float(case.beam.length) * float(jb.modes(case).frequencies[0])
 
 
-def with_modes(case: jb.Case, modes: int) -> jb.Case:
-    """The same case with another number of modes."""
-    return dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=modes))
-
-
-def with_sensors(case: jb.Case, *positions: float, duration: float) -> jb.Case:
-    """The same case with sensors at places (m), for a duration (s)."""
-    sensors = tuple(jb.Sensor(place) for place in positions)
-    run = dataclasses.replace(case.run, duration=np.asarray(duration))
-    return dataclasses.replace(case, sensors=sensors, run=run)
+def reduction(uncontrolled, controlled) -> np.ndarray:
+    """Reduction of a peak by control, in percent of the uncontrolled peak."""
+    return 100 * (1 - np.asarray(controlled) / np.asarray(uncontrolled))

@@ -31,9 +31,7 @@ def as_text(run: ExperimentRun) -> str:
     lines = [f"{run.experiment.name}: {run.experiment.covers}", f"  {run.experiment.claim}"]
     for finding, assigned in zip(run.outcome.findings, run.verdicts, strict=True):
         lines += ["", f"  {_finding_title(finding)}"]
-        lines += [
-            f"    {line}" for line in text_table(COLUMNS, _finding_rows(finding, assigned))
-        ]
+        lines += [f"    {line}" for line in text_table(COLUMNS, _finding_rows(finding, assigned))]
         lines += [f"    {sentence}" for sentence in _finding_notes(finding, assigned.verdicts)]
     lines += [f"  {remark}" for remark in run.outcome.remarks]
     counts = [f"{run.count(word)} {word}" for word in VERDICTS if run.count(word)]

@@ -1,4 +1,4 @@
-"""The thesis, reproduced: all experiments by name, run and written up in one report."""
+"""Runs experiments by name, and writes their numbers, verdicts and figures to one report."""
 
 import dataclasses
 import importlib
@@ -14,7 +14,13 @@ import jax
 
 import jaxbeam as jb
 from experiments.thesis import report
-from experiments.thesis.verdicts import VERDICTS, Experiment, Run, assign_verdicts
+from experiments.thesis.verdicts import (
+    VERDICTS,
+    Experiment,
+    ExperimentRun,
+    Finding,
+    assign_verdicts,
+)
 from jaxbeam import rigs
 from jaxbeam.files.report import check_report_folder, write_report
 
@@ -36,24 +42,30 @@ OUTPUT_FOLDER = "out/reproduce"
 
 def experiments() -> dict[str, Experiment]:
     """All experiments by name, in the order of the thesis."""
-    found = (importlib.import_module(f"experiments.{name}").EXPERIMENT for name in MODULES)
-    return {one.name: one for one in found}
+    found = [importlib.import_module(f"experiments.{name}").EXPERIMENT for name in MODULES]
+    return {experiment.name: experiment for experiment in found}
 
 
 def select_experiments(names: Sequence[str]) -> list[Experiment]:
-    """The experiments of these names. Raises ValueError for a name that none has."""
-    known = experiments()
+    """Experiments by name. Raises ValueError for an unknown name."""
+    available = experiments()
     for name in names:
-        if name not in known:
-            raise ValueError(f"there is no experiment {name!r}; there are {', '.join(known)}")
-    return [known[name] for name in names]
+        if name not in available:
+            raise ValueError(f"there is no experiment {name!r}; there are {', '.join(available)}")
+    return [available[name] for name in names]
 
 
-def run_experiment(experiment: Experiment, load_rig: Callable[[str], jb.Case] = rigs.load) -> Run:
-    """Run one experiment on the published rigs, or on what is loaded in their place."""
+def run_experiment(
+    experiment: Experiment, load_rig: Callable[[str], jb.Case] = rigs.load
+) -> ExperimentRun:
+    """Run one experiment, with verdicts and wall time (s).
+
+    `load_rig(name)` returns the case of a rig; the published rigs if left out.
+    """
     start = time.perf_counter()
     outcome = experiment.run(load_rig)
-    return Run(experiment, outcome, assign_verdicts(outcome.findings), time.perf_counter() - start)
+    verdicts = assign_verdicts(outcome.findings)
+    return ExperimentRun(experiment, outcome, verdicts, time.perf_counter() - start)
 
 
 def reproduce(
@@ -62,88 +74,95 @@ def reproduce(
     overwrite: bool = False,
     report_progress: Callable[[str], None] = print,
     processes: int = 1,
-) -> list[Run]:
-    """Run experiments and write figures, numbers and one report into a folder.
+) -> list[ExperimentRun]:
+    """Run experiments in `processes` and write report.md, .html, .json and figures to a folder.
 
-    So many `processes` share the experiments; each is told as text as soon as it and all before
-    it are done. Raises ValueError for an unknown name,
-    FileExistsError if the folder is not empty and may not be overwritten.
+    `report_progress` receives the text of each experiment, in order. Raises ValueError for an
+    unknown name, FileExistsError if the folder is not empty and `overwrite` is not set.
     """
-    selected, folder = [one.name for one in select_experiments(names)], Path(folder)
+    select_experiments(names)
+    folder = Path(folder)
     check_report_folder(folder, overwrite)
     folder.mkdir(parents=True, exist_ok=True)
     runs = []
-    for run in _run_all(selected, folder, processes):
-        report_progress(report.text(run))
+    for run in _run_all(names, folder, processes):
+        report_progress(report.as_text(run))
         runs.append(run)
-    sections = report.report_sections(runs)
-    write_report(folder, report.REPORT_TITLE, sections, style=report.VERDICT_STYLE, overwrite=True)
+    sections = report.sections(runs)
+    write_report(folder, report.TITLE, sections, style=report.VERDICT_STYLE, overwrite=True)
     (folder / "report.json").write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
     return runs
 
 
-def _run_all(names: Sequence[str], folder: Path, processes: int) -> Iterator[Run]:
-    """Runs of experiments, in their order, with their figures in the folder."""
+def _run_all(names: Sequence[str], folder: Path, processes: int) -> Iterator[ExperimentRun]:
+    """Run experiments in order and save their figures to the folder."""
+    selected = select_experiments(names)
     if processes == 1:
-        yield from (_save_figures(run_experiment(one), folder) for one in select_experiments(names))
+        yield from (_save_figures(run_experiment(one), folder) for one in selected)
         return
-    # Each process has a Python lock of its own, under which programs are traced.
+    # Processes, not threads: tracing holds Python's lock.
     settings = (jax.config.jax_compilation_cache_dir,)
     pool = ProcessPoolExecutor(processes, get_context("spawn"), _initialise_process, settings)
     with pool:
-        parts = pool.map(_run_in_process, names, [folder] * len(names))
-        for experiment, part in zip(select_experiments(names), parts, strict=True):
-            yield Run(experiment, *part)
+        results = pool.map(_run_in_process, names, [folder] * len(names))
+        for experiment, result in zip(selected, results, strict=True):
+            yield ExperimentRun(experiment, *result)
 
 
 def _run_in_process(name: str, folder: Path) -> tuple:
-    """What a process brings back of an experiment: all but the experiment itself."""
-    (one,) = select_experiments([name])
-    _, *rest = _save_figures(run_experiment(one), folder)
-    return tuple(rest)
+    """Result, verdicts and wall time of an experiment, which itself cannot be pickled."""
+    (experiment,) = select_experiments([name])
+    _, *result = _save_figures(run_experiment(experiment), folder)
+    return tuple(result)
 
 
-def _save_figures(run: Run, folder: Path) -> Run:
-    """Write the figures of a run; only their names are kept, for the report."""
+def _save_figures(run: ExperimentRun, folder: Path) -> ExperimentRun:
+    """Save the figures of a run to files, and drop them from it."""
     for name, figure in run.outcome.figures.items():
-        figure.savefig(folder / f"{run.experiment.name}-{name}.png")
+        if figure is not None:
+            figure.savefig(folder / f"{report.figure_name(run, name)}.png")
     names = dict.fromkeys(run.outcome.figures)
     return run._replace(outcome=dataclasses.replace(run.outcome, figures=names))
 
 
 def _initialise_process(cache_folder: str | None) -> None:
-    """Set a process up as the command line is: compiled programs are kept, warnings are short."""
+    """Settings of a worker process: the compile cache, and warnings of one line."""
     jax.config.update("jax_compilation_cache_dir", cache_folder)
     warnings.formatwarning = lambda message, *_: f"jaxbeam: warning: {message}\n"
 
 
-def as_dict(runs: Sequence[Run]) -> dict:
-    """All numbers and verdicts as plain lists and words."""
+def as_dict(runs: Sequence[ExperimentRun]) -> dict:
+    """Numbers and verdicts of all runs as lists and strings, for JSON."""
     return {
-        "summary": {word: report.count_verdicts(runs, word) for word in VERDICTS},
+        "summary": {word: sum(run.count(word) for run in runs) for word in VERDICTS},
         "experiments": {
             run.experiment.name: {
                 "claim": run.experiment.claim,
                 "seconds": run.seconds,
                 "remarks": list(run.outcome.remarks),
                 "findings": [
-                    {
-                        "where": one.published.location,
-                        "what": one.published.quantity,
-                        "unit": one.published.unit,
-                        "kind": one.published.origin,
-                        "tolerance": str(one.published.tolerance),
-                        "labels": one.published.value_labels,
-                        "published": one.published.numbers.tolist(),
-                        "readings": {
-                            k: list(map(float, v)) for k, v in one.interpretations.items()
-                        },
-                        "verdicts": judged.verdicts,
-                        "obstacle": one.inconsistency,
-                    }
-                    for one, judged in zip(run.outcome.findings, run.judged, strict=True)
+                    _finding_as_dict(finding, assigned.verdicts)
+                    for finding, assigned in zip(run.outcome.findings, run.verdicts, strict=True)
                 ],
             }
             for run in runs
         },
+    }
+
+
+def _finding_as_dict(finding: Finding, verdicts: list[str]) -> dict:
+    published = finding.published
+    return {
+        "where": published.location,
+        "what": published.quantity,
+        "unit": published.unit,
+        "kind": published.origin,
+        "tolerance": str(published.tolerance),
+        "labels": published.value_labels,
+        "published": published.numbers.tolist(),
+        "readings": {
+            name: list(map(float, values)) for name, values in finding.interpretations.items()
+        },
+        "verdicts": verdicts,
+        "obstacle": finding.inconsistency,
     }

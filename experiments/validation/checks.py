@@ -17,12 +17,12 @@ import scipy.sparse
 
 import jaxbeam as jb
 from jaxbeam import rigs
-from jaxbeam.analysis.bound.input_influence import reach
+from jaxbeam.analysis.bound.input_influence import input_influence
 from jaxbeam.case.filters import filter_history, initial, sections
 from jaxbeam.estimation import kalman_gain, sampled_kalman_gain
 from jaxbeam.integrator.adaptive_reference import simulate_adaptive
 from jaxbeam.model.statics import static_peak
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 from tests import loop_as_oracle
 from tests.as_oracle import as_oracle
 from tests.differences import central
@@ -222,7 +222,7 @@ def gradients() -> Iterator[Check]:
     free = ("beam.flexural_rigidity", "beam.damping_ratio", "loads.0.mass", "loads.0.speed",
             "sensors.0.position")  # fmt: skip
     sizes = jnp.array([jb.addresses(case)[address] for address in free])
-    plan = make_plan(case, None, 1e-9)
+    plan = integration_plan(case, None, 1e-9)
 
     @jax.jit
     def peaks(point):
@@ -290,9 +290,9 @@ def bounds() -> Iterator[Check]:
     """The least peak that any controller leaves."""
     case = jb.replace(rigs.load("B"), {"loads.0.speed": 1.0, "run.duration": 0.8})
     best = jb.bound(case)
-    influence = reach(case, best.places, best.period, best.spacing)
-    free = influence.free @ influence.rows[0]
-    response = np.einsum("m,tmk->tk", influence.rows[0], influence.response[..., 0])
+    influence = input_influence(case, best.positions, best.period, best.spacing)
+    free = influence.unforced @ influence.deflection_rows[0]
+    response = np.einsum("m,tmk->tk", influence.deflection_rows[0], influence.response[..., 0])
     count, scale = response.shape[1], 1e3
     one = np.ones((free.size, 1))
     rows = np.block([[scale * response, -one], [-scale * response, -one]])

@@ -12,8 +12,8 @@ from jaxbeam.integrator.integrate import march
 from jaxbeam.integrator.step_matrices import both_sides
 from jaxbeam.model.statics import static_peak
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulation.integration_plan import TOLERANCE, make_plan, sample_times
-from jaxbeam.simulation.simulate import prepare
+from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
+from jaxbeam.simulation.simulate import integration_setup
 
 
 class Envelope(NamedTuple):
@@ -32,15 +32,15 @@ def envelope(case: Case, x, tolerance: float = TOLERANCE) -> Envelope:
     time step meets the tolerance.
     """
     x = jnp.asarray(x, float)
-    plan = make_plan(case, tolerance=tolerance)
+    plan = integration_plan(case, tolerance=tolerance)
     check_on_beam("x", x, case.beam.length)
     return _envelope(case, dataclasses.replace(plan, error=0.0), sample_times(case), x)
 
 
 @compiled
 def _envelope(case, plan, times, x):
-    rigging, loads, driver, *_ = prepare(case, plan, times, x)
-    best, _ = march(both_sides(rigging), loads, slots=plan.form.slots, driver=driver)
+    rigging, loads, driver, *_ = integration_setup(case, plan, times, x)
+    best, _ = march(both_sides(rigging), loads, slots=plan.shapes.slots, driver=driver)
     highest, lowest = jnp.split(best.peak()[0][:, 0], 2)
     return Envelope(-lowest, highest)
 

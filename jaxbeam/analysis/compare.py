@@ -1,6 +1,6 @@
 """Several controllers on the same case, beside no control and the best that is possible.
 
-To add a figure of merit, give `Merits` a field, `merits_of` its value and the table of
+To add a figure of merit, give `PerformanceMetrics` a field, `performance_metrics` its value and the table of
 `jaxbeam compare` (in `cli.comparing`) a column.
 """
 
@@ -13,10 +13,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.analysis.bound.bound import HELD, Bound, bound
-from jaxbeam.analysis.computing_time import StepTimes, step_times
-from jaxbeam.analysis.crossing_margin import Reserve, reserve
-from jaxbeam.analysis.limit_cycles import Swings, swings
+from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, Bound, bound
+from jaxbeam.analysis.computing_time import ComputingTimes, computing_times
+from jaxbeam.analysis.crossing_margin import StabilityMargin, stability_margin
+from jaxbeam.analysis.limit_cycles import CommandOscillation, command_oscillations
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.loads import motion
@@ -24,7 +24,7 @@ from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
 
-class Merits(NamedTuple):
+class PerformanceMetrics(NamedTuple):
     """How a controller does on a case; deflections are those of the sensor where they are largest.
 
     Peak (m), at samples and in between; root mean square (m) over the run; largest deflection (m)
@@ -39,37 +39,37 @@ class Merits(NamedTuple):
     after_exit: float
     effort: Float[np.ndarray, " actuator"]
     saturated: Float[np.ndarray, " actuator"]
-    step_times: StepTimes
+    step_times: ComputingTimes
     share: float
-    reserve: Reserve
-    swings: tuple[Swings, ...]
+    reserve: StabilityMargin
+    swings: tuple[CommandOscillation, ...]
 
 
 class Comparison(eqx.Module):
     """What `compare` returns: the bound, and by name records and merits of the controllers.
 
-    `free` is the run without control, `best` that with the commands of the `bound`.
+    `uncontrolled` is the run without control, `optimal` that with the commands of the `bound`.
     """
 
     case: Case
-    free: Record
-    best: Record
+    uncontrolled: Record
+    optimal: Record
     records: dict[str, Record]
-    merits: dict[str, Merits]
+    metrics: dict[str, PerformanceMetrics]
     bound: Bound
 
-    def loop(self, name: str) -> str:
+    def loop_summary(self, name: str) -> str:
         """In words: how much a controller is at its limits, and whether its loop holds still."""
-        merits = self.merits[name]
+        merits = self.metrics[name]
         parts = []
         if merits.saturated.any():
             shares = ", ".join(f"{share:.1%}" for share in merits.saturated)
             parts.append(f"at its limits {shares} of the run")
-        lost = merits.reserve.unstable
-        if lost is not None:
+        unstable = merits.reserve.unstable
+        if unstable is not None:
             parts.append(
-                f"unstable with the loads parked where they are from t = {lost.start:.3g} to"
-                f" {lost.end:.3g} s: deviations grow by {lost.rate:.3g} 1/s at {lost.frequency:.3g}"
+                f"unstable with the loads parked where they are from t = {unstable.start:.3g} to"
+                f" {unstable.end:.3g} s: deviations grow by {unstable.rate:.3g} 1/s at {unstable.frequency:.3g}"
                 " Hz, so lower the gains, or shorten filters and delays"
             )
         for i, one in enumerate(merits.swings):
@@ -96,20 +96,23 @@ def compare(
     """
     if not controllers:
         raise ValueError("there is nothing to compare: give at least one controller")
-    free_case = dataclasses.replace(case, controller=None)
-    own = [float(c.period) for c in controllers.values() if c.period is not None]
-    period = min(own, default=HELD) if period is None else period
-    limit = bound(free_case, period=period)
+    uncontrolled_case = dataclasses.replace(case, controller=None)
+    periods = [float(c.period) for c in controllers.values() if c.period is not None]
+    period = min(periods, default=DEFAULT_PERIOD) if period is None else period
+    least_peak = bound(uncontrolled_case, period=period)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
-        free = simulate(free_case)
-        records = {name: _run(case, name, one) for name, one in controllers.items()}
-        best = _run(case, "the bound", limit.controller())
-    merits = {name: merits_of(record, free, limit) for name, record in records.items()}
-    return Comparison(free_case, free, best, records, merits, limit)
+        uncontrolled = simulate(uncontrolled_case)
+        records = {name: _simulate_with(case, name, one) for name, one in controllers.items()}
+        optimal = _simulate_with(case, "the bound", least_peak.controller())
+    metrics = {
+        name: performance_metrics(record, uncontrolled, least_peak)
+        for name, record in records.items()
+    }
+    return Comparison(uncontrolled_case, uncontrolled, optimal, records, metrics, least_peak)
 
 
-class Standing(NamedTuple):
+class MetricsOverCases(NamedTuple):
     """How a controller does over several load cases.
 
     Its largest peak (m); the least and the mean share of the attainable reduction; the largest
@@ -124,42 +127,44 @@ class Standing(NamedTuple):
     saturated: float
 
 
-def standings(found: Sequence[Comparison]) -> dict[str, Standing]:
+def metrics_over_cases(comparisons: Sequence[Comparison]) -> dict[str, MetricsOverCases]:
     """By controller, how it does over comparisons of the same controllers on several load cases."""
     table = {}
-    for name in found[0].merits:
-        each = [one.merits[name] for one in found]
-        shares = [merits.share for merits in each]
-        table[name] = Standing(
-            peak=float(np.max([merits.peak for merits in each])),
+    for name in comparisons[0].metrics:
+        metrics = [one.metrics[name] for one in comparisons]
+        shares = [merits.share for merits in metrics]
+        table[name] = MetricsOverCases(
+            peak=float(np.max([merits.peak for merits in metrics])),
             worst_share=float(np.min(shares)),
             mean_share=float(np.mean(shares)),
-            after_exit=float(np.max([merits.after_exit for merits in each])),
-            saturated=float(np.max([merits.saturated for merits in each])),
+            after_exit=float(np.max([merits.after_exit for merits in metrics])),
+            saturated=float(np.max([merits.saturated for merits in metrics])),
         )
     return table
 
 
-def _run(case: Case, name: str, controller: AbstractController) -> Record:
+def _simulate_with(case: Case, name: str, controller: AbstractController) -> Record:
     try:
         return simulate(dataclasses.replace(case, controller=controller))
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
 
-def merits_of(record: Record, free: Record, limit: Bound) -> Merits:
+def performance_metrics(
+    record: Record, uncontrolled: Record, least_peak: Bound
+) -> PerformanceMetrics:
     """The merits of a run, held against the run without control and the bound of its case."""
     deflection, times = np.asarray(record.deflection), np.asarray(record.times)
-    leaves = [motion(load, record.case.beam.length).window()[1] for load in record.case.loads]
-    after = np.abs(deflection[times > max(float(end) for end in leaves)])
-    return Merits(
+    exit_times = [motion(load, record.case.beam.length).window()[1] for load in record.case.loads]
+    after_exit = np.abs(deflection[times > max(float(end) for end in exit_times)])
+    return PerformanceMetrics(
         peak=float(np.max(record.peak_deflection)),
         rms=float(np.sqrt(np.mean(deflection**2, axis=0)).max()),
-        after_exit=float(after.max()) if after.size else np.nan,
+        after_exit=float(after_exit.max()) if after_exit.size else np.nan,
         effort=np.asarray(record.effort),
         saturated=np.asarray(record.saturated).mean(axis=0),
-        step_times=step_times(record),
-        share=limit.share(record),
-        reserve=reserve(record.case),
-        swings=swings(record, free),
+        step_times=computing_times(record),
+        share=least_peak.share(record),
+        reserve=stability_margin(record.case),
+        swings=command_oscillations(record, uncontrolled),
     )

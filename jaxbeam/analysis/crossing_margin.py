@@ -7,8 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.analysis.frozen_loop import OpenLoop, open_loop
-from jaxbeam.analysis.linearised_loop import LinearLoop, linear, prepared
+from jaxbeam.analysis.frozen_loop import LoopDynamics, loop_dynamics
+from jaxbeam.analysis.linearised_loop import LinearisedLoop, linearise, loop_timing
 from jaxbeam.analysis.margins import margins
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.fields import known
@@ -16,11 +16,11 @@ from jaxbeam.case.loads import motion
 from jaxbeam.control import MPC
 from jaxbeam.model.modes import lay_out
 
-PLACES = 13  # of the loads along a crossing, at which margins are looked for
-STILL = 1e-6  # 1/s: what moves at a smaller rate neither grows nor dies out
+LOAD_POSITIONS = 13  # of the loads along a crossing, at which margins are looked for
+MIN_RATE = 1e-6  # 1/s: what moves at a smaller rate neither grows nor dies out
 
 
-class Unstable(NamedTuple):
+class UnstableInterval(NamedTuple):
     """Where a loop is unstable with its loads parked: at their places from `start` to `end` (s).
 
     `rate` (1/s) is the fastest growth of small deviations, at a `frequency` (Hz).
@@ -32,7 +32,7 @@ class Unstable(NamedTuple):
     frequency: float
 
 
-class Reserve(NamedTuple):
+class StabilityMargin(NamedTuple):
     """How much more gain (a factor) and delay (s) a loop bears at any one of its commands.
 
     The loads are parked, in several places along the crossing, of which the worst counts; a law
@@ -44,10 +44,10 @@ class Reserve(NamedTuple):
     gain: float
     delay: float
     obstacle: str = ""
-    unstable: Unstable | None = None
+    unstable: UnstableInterval | None = None
 
 
-def reserve(case: Case) -> Reserve:
+def stability_margin(case: Case) -> StabilityMargin:
     """The stability margins of the loop of a case, the worst along the crossing.
 
     Parked loads lack the terms of their motion, which act as damping of either sign: what those do
@@ -55,61 +55,69 @@ def reserve(case: Case) -> Reserve:
     """
     controller = case.controller
     if controller is None or controller.blind:
-        return _without("commands that do not depend on readings close no loop")
+        return _no_margin("commands that do not depend on readings close no loop")
     if isinstance(controller, MPC) and controller.solver != "unconstrained":
-        return _without("a law that heeds limits bends at them: no linear loop stands for it")
+        return _no_margin("a law that heeds limits bends at them: no linear loop stands for it")
     try:
-        clock = prepared(case)
+        timing = loop_timing(case)
     except ValueError as error:
-        return _without(str(error))
-    loop = open_loop(case, lay_out(known_case(case)))
-    loops, lost = [], []
-    for t in _along(case):
-        parked = _changing(linear(_parked(loop, t), clock, jnp.asarray(t)))
-        if not np.all(np.isfinite(parked.closed)):
-            return _without("the law finds no rest under loads that are parked")
-        rightmost = complex(parked.poles()[0])
-        if abs(rightmost.real) < STILL:
-            return _without("a part of the loop, as a mode without damping, never comes to rest")
+        return _no_margin(str(error))
+    loop = loop_dynamics(case, lay_out(known_case(case)))
+    loops, unstable = [], []
+    for t in _crossing_times(case):
+        stationary = _without_constant_states(
+            linearise(_with_stationary_loads(loop, t), timing, jnp.asarray(t))
+        )
+        if not np.all(np.isfinite(stationary.closed_matrix)):
+            return _no_margin("the law finds no rest under loads that are parked")
+        rightmost = complex(stationary.poles()[0])
+        if abs(rightmost.real) < MIN_RATE:
+            return _no_margin("a part of the loop, as a mode without damping, never comes to rest")
         if rightmost.real > 0:
-            lost.append((float(t), rightmost.real, abs(rightmost.imag) / (2 * np.pi)))
-        loops.append(parked)
-    if lost:
-        _, rate, frequency = max(lost, key=lambda one: one[1])
-        return Reserve(0.0, 0.0, "", Unstable(lost[0][0], lost[-1][0], rate, frequency))
+            unstable.append((float(t), rightmost.real, abs(rightmost.imag) / (2 * np.pi)))
+        loops.append(stationary)
+    if unstable:
+        _, rate, frequency = max(unstable, key=lambda one: one[1])
+        return StabilityMargin(
+            0.0, 0.0, "", UnstableInterval(unstable[0][0], unstable[-1][0], rate, frequency)
+        )
     with np.errstate(divide="ignore"):  # a loop without gain bears any
-        each = [margins(one, i) for one in loops for i in range(len(case.actuators))]
-    return Reserve(min(one.gain for one in each), min(one.delay for one in each))
-
-
-def _without(obstacle: str) -> Reserve:
-    return Reserve(np.nan, np.nan, obstacle)
-
-
-def _parked(loop: OpenLoop, t: float) -> OpenLoop:
-    """The loop with its loads at rest where they are at t (s)."""
-    loop, none = loop.frozen(jnp.asarray(t)), jnp.zeros(())
-    still = tuple(
-        dataclasses.replace(load, speed=none, acceleration=none)
-        for load in loop.wide.traffic.motions
+        margins_found = [margins(one, i) for one in loops for i in range(len(case.actuators))]
+    return StabilityMargin(
+        min(one.gain for one in margins_found), min(one.delay for one in margins_found)
     )
-    return eqx.tree_at(lambda loop: loop.wide.traffic.motions, loop, still)
 
 
-def _changing(loop: LinearLoop) -> LinearLoop:
+def _no_margin(obstacle: str) -> StabilityMargin:
+    return StabilityMargin(np.nan, np.nan, obstacle)
+
+
+def _with_stationary_loads(loop: LoopDynamics, t: float) -> LoopDynamics:
+    """The loop with its loads at rest where they are at t (s)."""
+    loop, zero = loop.freeze_loads(jnp.asarray(t)), jnp.zeros(())
+    stationary = tuple(
+        dataclasses.replace(load, speed=zero, acceleration=zero)
+        for load in loop.augmented_plant.traffic.motions
+    )
+    return eqx.tree_at(lambda loop: loop.wide.traffic.motions, loop, stationary)
+
+
+def _without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:
     """A sampled loop without what stays as it is from tick to tick, such as a law's counters."""
     if loop.period is None:
         return loop
     size = loop.A.shape[0]
-    stays = np.all(np.asarray(loop.A) == np.eye(size), axis=1) & ~np.any(loop.B, axis=1)
-    kept = ~stays
-    return LinearLoop(loop.A[kept][:, kept], loop.B[kept], loop.K[:, kept], loop.period, loop.modal)
+    constant = np.all(np.asarray(loop.A) == np.eye(size), axis=1) & ~np.any(loop.B, axis=1)
+    kept = ~constant
+    return LinearisedLoop(
+        loop.A[kept][:, kept], loop.B[kept], loop.K[:, kept], loop.period, loop.modal_states
+    )
 
 
-def _along(case: Case) -> np.ndarray:
+def _crossing_times(case: Case) -> np.ndarray:
     """Instants (s) from the first entry to the last exit, or the end of the run."""
     if not case.loads:
         return np.zeros(1)
     windows = [motion(load, case.beam.length).window() for load in case.loads]
     entries, exits = known(jnp.array(windows)).T
-    return np.linspace(entries.min(), min(exits.max(), known(case.run.duration)), PLACES)
+    return np.linspace(entries.min(), min(exits.max(), known(case.run.duration)), LOAD_POSITIONS)

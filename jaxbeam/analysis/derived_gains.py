@@ -13,19 +13,19 @@ import scipy
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxbeam.analysis.crossing_margin import reserve
+from jaxbeam.analysis.crossing_margin import stability_margin
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import known
 from jaxbeam.control import Feedback, Recognition, ScheduledFeedback
 from jaxbeam.model.statics import influence_line, static_lift
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
-POSITIONS = 201  # of the load, at which the static deflection is looked for
-TRIED = 8  # gains from the largest one down, by equal factors
-LEAST = 1 / 64  # the smallest of them, of the largest
-EXACT = 1e-3  # how exactly the best gain is found, relative
-TOLERANCE = 1e-5  # of the runs
+LOAD_POSITIONS = 201  # of the load, at which the static deflection is looked for
+TRIAL_GAINS = 8  # gains from the largest one down, by equal factors
+MIN_GAIN_RATIO = 1 / 64  # the smallest of them, of the largest
+GAIN_TOLERANCE = 1e-3  # how exactly the best gain is found, relative
+RUN_TOLERANCE = 1e-5  # of the runs
 
 
 class BestGain(NamedTuple):
@@ -54,77 +54,92 @@ def equivalent_gains(
         raise ValueError(
             f"there are only {len(case.sensors)} sensors for {actuators} actuators; add some"
         )
-    places = np.asarray(case.sensor_places)[:actuators]
-    ways = np.linspace(0, float(case.beam.length), POSITIONS)
-    sunk = float(case.run.gravity) * -np.asarray(influence_line(case, places, ways)).min(axis=0)
-    lifts = np.diagonal(np.asarray(static_lift(case, places)))
+    sensor_positions = np.asarray(case.sensor_places)[:actuators]
+    load_positions = np.linspace(0, float(case.beam.length), LOAD_POSITIONS)
+    static_deflections = float(case.run.gravity) * -np.asarray(
+        influence_line(case, sensor_positions, load_positions)
+    ).min(axis=0)
+    static_lifts = np.diagonal(np.asarray(static_lift(case, sensor_positions)))
 
-    def found(free, lift):
-        def rest(w):
+    def equivalent_gain(free, lift):
+        def residual(w):
             return w + lift * gain * w**power - free
 
-        return gain * scipy.optimize.brentq(rest, 0.0, free, xtol=1e-15) ** (power - 1)
+        return gain * scipy.optimize.brentq(residual, 0.0, free, xtol=1e-15) ** (power - 1)
 
-    rows = zip(sunk, lifts, strict=True)
-    return np.array([[found(each * mass, lift) for mass in masses] for each, lift in rows])
+    rows = zip(static_deflections, static_lifts, strict=True)
+    return np.array(
+        [[equivalent_gain(each * mass, lift) for mass in masses] for each, lift in rows]
+    )
 
 
 def best_gains(
-    case: Case, masses: ArrayLike, most: float, margin: float | None = None
+    case: Case, masses: ArrayLike, max_gain: float, margin: float | None = None
 ) -> list[BestGain]:
-    """For each mass (kg) the gain, up to `most`, that leaves the lowest peak of the run.
+    """For each mass (kg) the gain, up to `max_gain`, that leaves the lowest peak of the run.
 
     The case has a controller of kind "feedback"; all its loops are given the same gain, in its own
-    units, and its power. Gains from `most` down to a 64th are tried, then the best is sought
+    units, and its power. Gains from `max_gain` down to a 64th are tried, then the best is sought
     between its neighbours. With a `margin` only gains count with which the loop bears that much
-    more with the loads parked anywhere on the way (see `reserve`); without, also those of
+    more with the loads parked anywhere on the way (see `stability_margin`); without, also those of
     loops that would be unstable if the load stayed, but not within the crossing.
 
     Raises ValueError for another controller, a faulty case, and if no gain that is tried has the
     margin.
     """
-    law = case.controller
-    if type(law) is not Feedback or law.higher_gains is not None:
+    controller = case.controller
+    if type(controller) is not Feedback or controller.higher_gains is not None:
         raise ValueError("gains are derived for a controller of kind 'feedback' with one power")
     masses = [float(mass) for mass in np.atleast_1d(np.asarray(masses, float))]
-    free = dataclasses.replace(case, controller=None)
-    plan = make_plan(_with(case, most, max(masses)), None, TOLERANCE)
-    plain = make_plan(_with(free, None, max(masses)), None, TOLERANCE)
+    uncontrolled_case = dataclasses.replace(case, controller=None)
+    plan = integration_plan(_case_with(case, max_gain, max(masses)), None, RUN_TOLERANCE)
+    uncontrolled_plan = integration_plan(
+        _case_with(uncontrolled_case, None, max(masses)), None, RUN_TOLERANCE
+    )
     found = []
     for mass in masses:
-        top = most if margin is None else _steady(case, mass, most, margin)
-        gain, peak = _lowest(lambda g, m=mass: _peak(_with(case, g, m), plan), top)
-        found.append(BestGain(mass, gain, peak, _peak(_with(free, None, mass), plain)))
+        largest = (
+            max_gain if margin is None else _largest_gain_with_margin(case, mass, max_gain, margin)
+        )
+        gain, peak = _minimise_peak(lambda g, m=mass: _peak(_case_with(case, g, m), plan), largest)
+        found.append(
+            BestGain(
+                mass,
+                gain,
+                peak,
+                _peak(_case_with(uncontrolled_case, None, mass), uncontrolled_plan),
+            )
+        )
     return found
 
 
-def scheduled(
+def scheduled_controller(
     case: Case,
-    found: list[BestGain],
+    best: list[BestGain],
     between: str = "interpolated",
-    recognition: Recognition | None = None,
+    load_identification: Recognition | None = None,
 ) -> ScheduledFeedback:
     """The controller with the gains that `best_gains` found for a case, all else as in its own.
 
     Raises ValueError if masses do not increase.
     """
-    masses = [each.mass for each in found]
+    masses = [each.mass for each in best]
     if np.any(np.diff(masses) <= 0):
         raise ValueError("masses must increase")
-    law = case.controller
+    controller = case.controller
     return ScheduledFeedback(
         masses=masses,
-        gains=[[each.gain for each in found]] * len(case.actuators),
-        power=law.power,
+        gains=[[each.gain for each in best]] * len(case.actuators),
+        power=controller.power,
         between=between,
-        recognition=recognition,
-        period=law.period,
-        delay=law.delay,
-        resolution=law.resolution,
+        recognition=load_identification,
+        period=controller.period,
+        delay=controller.delay,
+        resolution=controller.resolution,
     )
 
 
-def _with(case: Case, gain: float | None, mass: float) -> Case:
+def _case_with(case: Case, gain: float | None, mass: float) -> Case:
     """The case with this gain in every loop, if there are loops, and this mass."""
     change = {"loads.0.mass": mass}
     if gain is not None:
@@ -140,35 +155,38 @@ def _peak(case: Case, plan) -> float:
     return peak if np.isfinite(peak) else np.inf
 
 
-def _lowest(peak, top: float) -> tuple[float, float]:
+def _minimise_peak(peak, max_gain: float) -> tuple[float, float]:
     """Where a function of the gain is lowest up to a top, and its value there."""
-    gains = top * np.geomspace(LEAST, 1, TRIED)
+    gains = max_gain * np.geomspace(MIN_GAIN_RATIO, 1, TRIAL_GAINS)
     tried = [peak(gain) for gain in gains]
     best = int(np.argmin(tried))
-    ends = np.log(gains[[max(best - 1, 0), min(best + 1, TRIED - 1)]])
+    ends = np.log(gains[[max(best - 1, 0), min(best + 1, TRIAL_GAINS - 1)]])
     refined = scipy.optimize.minimize_scalar(
-        lambda x: peak(np.exp(x)), bounds=tuple(ends), method="bounded", options={"xatol": EXACT}
+        lambda x: peak(np.exp(x)),
+        bounds=tuple(ends),
+        method="bounded",
+        options={"xatol": GAIN_TOLERANCE},
     )
     if refined.fun < tried[best]:
         return float(np.exp(refined.x)), float(refined.fun)
     return float(gains[best]), tried[best]
 
 
-def _steady(case: Case, mass: float, most: float, margin: float) -> float:
-    """The largest gain up to `most` with a margin, to EXACT."""
+def _largest_gain_with_margin(case: Case, mass: float, max_gain: float, margin: float) -> float:
+    """The largest gain up to `max_gain` with a margin, to EXACT."""
 
-    def lacks(gain):
-        return not reserve(_with(case, gain, mass)).gain >= margin
+    def lacks_margin(gain):
+        return not stability_margin(_case_with(case, gain, mass)).gain >= margin
 
-    if not lacks(most):
-        return most
-    low, high = LEAST * most, most
-    if lacks(low):
+    if not lacks_margin(max_gain):
+        return max_gain
+    low, high = MIN_GAIN_RATIO * max_gain, max_gain
+    if lacks_margin(low):
         raise ValueError(
             f"a mass of {mass:g} kg leaves a gain margin below {margin:g} even with a gain of"
             f" {low:g}; ask for less, or lower the largest gain"
         )
-    while high / low > 1 + EXACT:
+    while high / low > 1 + GAIN_TOLERANCE:
         middle = np.sqrt(low * high)
-        low, high = (low, middle) if lacks(middle) else (middle, high)
+        low, high = (low, middle) if lacks_margin(middle) else (middle, high)
     return float(low)

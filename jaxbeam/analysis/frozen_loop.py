@@ -24,24 +24,24 @@ from jaxbeam.model.sensor_signals import design, init, read
 from jaxbeam.model.state_space import LoadedBeam, loaded_beam
 from jaxbeam.runtime.compiling import compiled
 
-ROUNDING = 1e-9  # of a period: shorter differences are none
+PERIOD_TOLERANCE = 1e-9  # of a period: shorter differences are none
 
 
-class Clock(NamedTuple):
+class LoopTiming(NamedTuple):
     """When things happen within a sampling period, in s and in whole periods."""
 
     period: float
     delay: float
-    lags: tuple[float, ...]
+    sensor_delays: tuple[float, ...]
 
 
-class Frozen(AbstractMotion):
+class FrozenTrajectory(AbstractMotion):
     """A load stopped in mid-motion: it keeps position, speed and acceleration."""
 
     position: Float[Array, ""]
     speed: Float[Array, ""]
     acceleration: Float[Array, ""]
-    on: Any
+    on_beam: Any
     length: Float[Array, ""]
 
     def travel(self, t):
@@ -50,200 +50,253 @@ class Frozen(AbstractMotion):
         return tuple(jnp.broadcast_to(part, shape) for part in parts)
 
     def window(self):
-        return jnp.where(self.on, -NEVER, NEVER), jnp.asarray(NEVER)
+        return jnp.where(self.on_beam, -NEVER, NEVER), jnp.asarray(NEVER)
 
-    def arrivals(self, places):
+    def passage_times(self, positions):
         return jnp.zeros(0)
 
 
-class OpenLoop(eqx.Module):
+class LoopDynamics(eqx.Module):
     """The plant with the filters of its sensors, and the law, as functions of their states.
 
-    `wide` is the plant with those filters as further states, `seen` what the sensors see of it;
-    `memory` is the law's at the start, of which only the leaves that `changes` marks ever change.
+    `augmented_plant` is the plant with those filters as further states, `output_rows` what the sensors see of it;
+    `initial_memory` is the law's at the start, of which only the leaves that `changes` marks ever change.
     """
 
-    model: LoadedBeam
-    wide: LoadedBeam
-    seen: Float[Array, "sensor state"]
-    memory: Any
+    plant: LoadedBeam
+    augmented_plant: LoadedBeam
+    output_rows: Float[Array, "sensor state"]
+    initial_memory: Any
 
-    def frozen(self, t) -> "OpenLoop":
+    def freeze_loads(self, t) -> "LoopDynamics":
         """The same with the loads stopped in mid-motion."""
-        loads, length = self.wide.traffic, self.model.case.beam.length
+        loads, length = self.augmented_plant.traffic, self.plant.case.beam.length
         on = loads.on_beam(t)
         motions = tuple(
-            Frozen(*path.travel(t), on[i], length) for i, path in enumerate(loads.motions)
+            FrozenTrajectory(*path.travel(t), on[i], length) for i, path in enumerate(loads.motions)
         )
         return eqx.tree_at(lambda loop: loop.wide.traffic.motions, self, motions)
 
-    def parts(self, t):
+    def continuous_dynamics(self, t):
         """A, B, the rates that the weights cause, and commands as a function of the state.
 
         States of its own that a law has are the last, about those at the start of a run.
         """
-        system, held = self.wide.at(t), len(self.model.case.actuators)
-        controller, size = self.model.case.controller, system.A.shape[0]
-        none = jnp.zeros(held)
+        system, command_count = self.augmented_plant.at(t), len(self.plant.case.actuators)
+        controller, size = self.plant.case.controller, system.A.shape[0]
+        zero_command = jnp.zeros(command_count)
 
-        def answer(state, limited):
+        def control_law(state, limited):
             # The sensors are ideal here; what filters of the law's own give follows.
             inner, own = state[:size], state[size:]
-            measurement = self._measured(self._signals(inner, none, t), inner, none)
-            return controller.flow(self.memory, own, measurement, t, limited)
+            measurement = self._measurement(
+                self._sensor_inputs(inner, zero_command, t), inner, zero_command
+            )
+            return controller.flow(self.initial_memory, own, measurement, t, limited)
 
         def command(state):
-            return answer(state, lambda wanted: wanted)[0]
+            return control_law(state, lambda wanted: wanted)[0]
 
         def rates(state, given):
-            return answer(state, lambda wanted: given)[1]
+            return control_law(state, lambda wanted: given)[1]
 
-        own = controller.own_states(self.memory)
-        still = jnp.zeros(size + own)
-        slopes, pushes = jax.jacfwd(rates, argnums=(0, 1))(still, none)
-        A = jnp.concatenate([jnp.pad(system.A, ((0, 0), (0, own))), slopes])
-        push = jnp.concatenate([system.B[:, :held], pushes])
-        load = jnp.append(system.B[:, held:] @ self.wide.weights, rates(still, none))
-        return A, push, load, command
+        controller_states = controller.own_states(self.initial_memory)
+        zero_state = jnp.zeros(size + controller_states)
+        controller_rows, controller_inputs = jax.jacfwd(rates, argnums=(0, 1))(
+            zero_state, zero_command
+        )
+        A = jnp.concatenate([jnp.pad(system.A, ((0, 0), (0, controller_states))), controller_rows])
+        input_matrix = jnp.concatenate([system.B[:, :command_count], controller_inputs])
+        weight_rates = jnp.append(
+            system.B[:, command_count:] @ self.augmented_plant.weights,
+            rates(zero_state, zero_command),
+        )
+        return A, input_matrix, weight_rates, command
 
-    def at_rest(self, clock: Clock):
+    def rest_state(self, timing: LoopTiming):
         """State of the sampled loop at rest as one vector, and the function that unpacks it."""
-        case = self.model.case
+        case = self.plant.case
         filters = [
-            init(sensor, design(sensor, clock.period), jnp.zeros(())) for sensor in case.sensors
+            init(sensor, design(sensor, timing.period), jnp.zeros(())) for sensor in case.sensors
         ]
-        seen = [jnp.zeros(_whole(lag / clock.period)[2]) for lag in clock.lags]
-        waiting = jnp.zeros((_whole(clock.delay / clock.period)[0] + 1, len(case.actuators)))
-        state = jnp.zeros(self.wide.rig.states)
-        return ravel_pytree((state, filters, seen, self._moving(self.memory), waiting))
+        signal_history = [
+            jnp.zeros(_split_delay(lag / timing.period)[2]) for lag in timing.sensor_delays
+        ]
+        command_queue = jnp.zeros(
+            (_split_delay(timing.delay / timing.period)[0] + 1, len(case.actuators))
+        )
+        state = jnp.zeros(self.augmented_plant.rig.states)
+        return ravel_pytree(
+            (
+                state,
+                filters,
+                signal_history,
+                self._state_of_memory(self.initial_memory),
+                command_queue,
+            )
+        )
 
-    def tick(self, clock: Clock, state, t, given=None, substeps: int = 1):
+    def sampling_step(self, timing: LoopTiming, state, t, command_given=None, substeps: int = 1):
         """The loop from just before a tick at t (s) to just before the next, and the commands.
 
         The commands given are used in place of those of the law. Moving loads are followed in
         `substeps` between any two changes of the command.
         """
-        now, filters, seen, own, waiting = state
-        case, seen, states, readings = self.model.case, list(seen), [], []
-        late, share, _ = _whole(clock.delay / clock.period)
-        signals = self._signals(now, waiting[late], t)
-        looks = {}
+        plant_state, filters, signal_history, controller_memory, command_queue = state
+        case, signal_history, states, readings = self.plant.case, list(signal_history), [], []
+        whole_periods, share, _ = _split_delay(timing.delay / timing.period)
+        signals = self._sensor_inputs(plant_state, command_queue[whole_periods], t)
+        delayed_samples = {}
         for i, sensor in enumerate(case.sensors):
-            whole, left, reach = _whole(clock.lags[i] / clock.period)
-            if left:
-                looks.setdefault((1 - left) * clock.period, []).append(i)
+            whole, remainder, history_length = _split_delay(timing.sensor_delays[i] / timing.period)
+            if remainder:
+                delayed_samples.setdefault((1 - remainder) * timing.period, []).append(i)
             else:
-                seen[i] = jnp.concatenate([signals[i : i + 1], seen[i]])
-            sections = design(sensor, clock.period)
-            reading, after = read(_ideal(sensor), sections, filters[i], seen[i][whole])
+                signal_history[i] = jnp.concatenate([signals[i : i + 1], signal_history[i]])
+            sections = design(sensor, timing.period)
+            reading, after = read(
+                _ideal_sensor(sensor), sections, filters[i], signal_history[i][whole]
+            )
             readings.append(reading)
             states.append(after)
-            seen[i] = seen[i][:reach]
+            signal_history[i] = signal_history[i][:history_length]
         readings = jnp.stack(readings) if readings else jnp.zeros(0)
-        wanted, own = self._law(self._with(own), readings, now, waiting[late], t)
-        waiting = jnp.concatenate([(wanted if given is None else given)[None], waiting])
+        controller_command, controller_memory = self._controller_step(
+            self._memory_with_state(controller_memory),
+            readings,
+            plant_state,
+            command_queue[whole_periods],
+            t,
+        )
+        command_queue = jnp.concatenate(
+            [(controller_command if command_given is None else command_given)[None], command_queue]
+        )
         # Within the period the command changes once, and sensors with a lag look at the beam.
-        change = share * clock.period
-        stops = sorted({0.0, change, *looks, clock.period})
-        for start, end in zip(stops[:-1], stops[1:], strict=True):
-            command = waiting[late + 1] if end <= change else waiting[late]
-            now = self._onward(now, command, t + start, end - start, substeps)
-            for i in looks.get(end, ()):
-                signal = self._signals(now, command, t + end)[i : i + 1]
-                seen[i] = jnp.concatenate([signal, seen[i]])[: seen[i].shape[0]]
-        return (now, states, seen, self._moving(own), waiting[: late + 1]), wanted
+        change = share * timing.period
+        events = sorted({0.0, change, *delayed_samples, timing.period})
+        for start, end in zip(events[:-1], events[1:], strict=True):
+            command = (
+                command_queue[whole_periods + 1] if end <= change else command_queue[whole_periods]
+            )
+            plant_state = self._advance_plant(
+                plant_state, command, t + start, end - start, substeps
+            )
+            for i in delayed_samples.get(end, ()):
+                signal = self._sensor_inputs(plant_state, command, t + end)[i : i + 1]
+                signal_history[i] = jnp.concatenate([signal, signal_history[i]])[
+                    : signal_history[i].shape[0]
+                ]
+        return (
+            plant_state,
+            states,
+            signal_history,
+            self._state_of_memory(controller_memory),
+            command_queue[: whole_periods + 1],
+        ), controller_command
 
-    def _onward(self, state, command, t, span, substeps):
+    def _advance_plant(self, state, command, t, duration, substeps):
         """The plant after a span (s) under held commands.
 
         Each substep is two exponentials of matrices at Gauss nodes (order 4; Blanes and Moan,
         Applied Numerical Mathematics 56, 2006), exact if the loads are frozen.
         """
-        inputs = jnp.concatenate([command, self.wide.weights])
+        inputs = jnp.concatenate([command, self.augmented_plant.weights])
 
-        def matrix(time):
+        def augmented_matrix(time):
             # Inputs are further states that stay: so the matrix is the same for all of them.
-            system = self.wide.at(time)
+            system = self.augmented_plant.at(time)
             top = jnp.concatenate([system.A, system.B], axis=1)
             return jnp.pad(top, ((0, inputs.shape[0]), (0, 0)))
 
         start = jnp.concatenate([state, inputs])
-        return through(matrix, t, span, substeps, start)[: state.shape[0]]
+        return propagate(augmented_matrix, t, duration, substeps, start)[: state.shape[0]]
 
-    def _signals(self, state, command, t):
+    def _sensor_inputs(self, state, command, t):
         """What the sensors see of the plant with their analogue filters."""
-        signals = self.seen @ self.wide.to_rig(state)
-        quick = np.array([s.quantity == "acceleration" for s in self.model.case.sensors], bool)
-        if not quick.any():
+        signals = self.output_rows @ self.augmented_plant.to_rig(state)
+        measures_acceleration = np.array(
+            [s.quantity == "acceleration" for s in self.plant.case.sensors], bool
+        )
+        if not measures_acceleration.any():
             return signals
-        system = self.wide.at(t)
-        felt = system.C @ state + system.D @ jnp.concatenate([command, self.wide.weights])
-        return jnp.where(quick, felt, signals)
+        system = self.augmented_plant.at(t)
+        accelerations = system.C @ state + system.D @ jnp.concatenate(
+            [command, self.augmented_plant.weights]
+        )
+        return jnp.where(measures_acceleration, accelerations, signals)
 
-    def _law(self, memory, readings, state, command, t):
-        seen = self._measured(readings, state, command)
-        return self.model.case.controller.step(memory, seen, t)
+    def _controller_step(self, memory, readings, state, command, t):
+        measurement = self._measurement(readings, state, command)
+        return self.plant.case.controller.step(memory, measurement, t)
 
-    def _measured(self, readings, state, command):
-        inner = self.wide.to_rig(state)[: self.model.rig.states]
-        return Measurement(readings, self.model.from_rig(inner), command)
+    def _measurement(self, readings, state, command):
+        model_state = self.augmented_plant.to_rig(state)[: self.plant.rig.states]
+        return Measurement(readings, self.plant.from_rig(model_state), command)
 
-    def _changes(self) -> list[bool]:
+    def _changing_leaves(self) -> list[bool]:
         """Which leaves of the law's memory its steps change; the others are its design."""
-        case, leaves = self.model.case, jax.tree.leaves(self.memory)
-        state = jnp.zeros(self.wide.rig.states)
+        case, leaves = self.plant.case, jax.tree.leaves(self.initial_memory)
+        state = jnp.zeros(self.augmented_plant.rig.states)
         readings, command = jnp.zeros(len(case.sensors)), jnp.zeros(len(case.actuators))
 
         def after(leaves):
-            memory = jax.tree.unflatten(jax.tree.structure(self.memory), leaves)
-            return jax.tree.leaves(self._law(memory, readings, state, command, jnp.zeros(()))[1])
+            memory = jax.tree.unflatten(jax.tree.structure(self.initial_memory), leaves)
+            return jax.tree.leaves(
+                self._controller_step(memory, readings, state, command, jnp.zeros(()))[1]
+            )
 
         traced = jax.make_jaxpr(after)(leaves).jaxpr
         return [a is not b for a, b in zip(traced.invars, traced.outvars, strict=True)]
 
-    def _moving(self, memory):
+    def _state_of_memory(self, memory):
         """The leaves of a memory of the law that its steps change."""
-        pairs = zip(jax.tree.leaves(memory), self._changes(), strict=True)
+        pairs = zip(jax.tree.leaves(memory), self._changing_leaves(), strict=True)
         return [leaf for leaf, changes in pairs if changes]
 
-    def _with(self, moving):
+    def _memory_with_state(self, state):
         """The law's memory with these leaves in place of those that change."""
-        leaves, structure = jax.tree.flatten(self.memory)
-        fresh = iter(moving)
-        pairs = zip(leaves, self._changes(), strict=True)
+        leaves, structure = jax.tree.flatten(self.initial_memory)
+        fresh = iter(state)
+        pairs = zip(leaves, self._changing_leaves(), strict=True)
         leaves = [next(fresh) if changes else leaf for leaf, changes in pairs]
         return jax.tree.unflatten(structure, leaves)
 
 
-def open_loop(case: Case, layout: Layout) -> OpenLoop:
+def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
     """The opened loop of a case with a controller. May be traced and batched."""
-    return _opened(case, rig_in_one(case, layout))
+    return _loop_dynamics(case, rig_in_one(case, layout))
 
 
 @compiled
-def _opened(case, assembled):
-    model = loaded_beam(case, assembled)
-    wide_rig, seen = sensed(model)
-    wide = eqx.tree_at(lambda m: m.rig, model, wide_rig)
-    return OpenLoop(model, wide, seen, case.controller.init(model))
+def _loop_dynamics(case, model):
+    plant = loaded_beam(case, model)
+    augmented_model, output_rows = sensed(plant)
+    augmented_plant = eqx.tree_at(lambda m: m.rig, plant, augmented_model)
+    return LoopDynamics(plant, augmented_plant, output_rows, case.controller.init(plant))
 
 
-def through(matrix, t, span, substeps: int, start):
+def propagate(matrix, t, duration, substeps: int, start):
     """x(t + span) of x' = matrix(time) x with x(t) = start, a vector or a matrix; order 4."""
-    step = span / substeps
-    early, late = 0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6
-    near, far = (0.25 + math.sqrt(3) / 6) * step, (0.25 - math.sqrt(3) / 6) * step
+    step = duration / substeps
+    first_node, second_node = 0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6
+    larger_weight, smaller_weight = (
+        (0.25 + math.sqrt(3) / 6) * step,
+        (0.25 - math.sqrt(3) / 6) * step,
+    )
 
-    def on(state, time):
-        first, second = matrix(time + early * step), matrix(time + late * step)
-        for part in (near * first + far * second, far * first + near * second):
+    def step_state(state, time):
+        first, second = matrix(time + first_node * step), matrix(time + second_node * step)
+        for part in (
+            larger_weight * first + smaller_weight * second,
+            smaller_weight * first + larger_weight * second,
+        ):
             state = jax.scipy.linalg.expm(part, max_squarings=40) @ state
         return state, None
 
-    return jax.lax.scan(on, start, t + step * np.arange(substeps))[0]
+    return jax.lax.scan(step_state, start, t + step * np.arange(substeps))[0]
 
 
-def _ideal(sensor):
+def _ideal_sensor(sensor):
     """The sensor without what is not linear in it: its range and its resolution."""
     fields = ("range", "resolution", "offset")
     return eqx.tree_at(
@@ -254,9 +307,9 @@ def _ideal(sensor):
     )
 
 
-def _whole(periods: float) -> tuple[int, float, int]:
+def _split_delay(periods: float) -> tuple[int, float, int]:
     """Whole periods in a lag, the share of one that is left, and how many periods it reaches."""
-    whole = math.floor(periods + ROUNDING)
-    share = max(periods - whole, 0.0)
-    share = share if share > ROUNDING else 0.0
-    return whole, share, whole + (share > 0)
+    whole = math.floor(periods + PERIOD_TOLERANCE)
+    remainder = max(periods - whole, 0.0)
+    remainder = remainder if remainder > PERIOD_TOLERANCE else 0.0
+    return whole, remainder, whole + (remainder > 0)

@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.simulation.record import Record
 
-SMALLEST = 0.2  # of the whole span of a history: what turns back after less has not turned
-MORE = 4  # swings more than without control: two whole cycles
+MIN_SWING = 0.2  # of the whole span of a history: what turns back after less has not turned
+MIN_EXTRA_SWINGS = 4  # swings more than without control: two whole cycles
 
 
-class Swings(NamedTuple):
+class CommandOscillation(NamedTuple):
     """How a command swings: how often more than the deflection at its sensor does without control.
 
     `frequency` (Hz) is that of its swings, NaN if there are not two; `at_limits` counts those that
@@ -25,54 +25,58 @@ class Swings(NamedTuple):
     @property
     def oscillates(self) -> bool:
         """Whether it swings to and fro at least twice, on account of the loop."""
-        return self.extra >= MORE
+        return self.extra >= MIN_EXTRA_SWINGS
 
     @property
     def limit_cycle(self) -> bool:
         """Whether it is the limits that hold the swings: four or more of them end there."""
-        return self.oscillates and self.at_limits >= MORE
+        return self.oscillates and self.at_limits >= MIN_EXTRA_SWINGS
 
 
-def swings(record: Record, free: Record) -> tuple[Swings, ...]:
+def command_oscillations(record: Record, uncontrolled: Record) -> tuple[CommandOscillation, ...]:
     """How each command of a run swings, beside the run without control.
 
     The first command is held against the first sensor, the second against the second, and so on;
     further ones against the last. What the passing loads themselves make a command do is left out
     by that.
     """
-    beam, last = np.asarray(free.deflection), len(free.case.sensors) - 1
+    deflection, last = np.asarray(uncontrolled.deflection), len(uncontrolled.case.sensors) - 1
     columns = zip(np.asarray(record.command).T, np.asarray(record.saturated).T, strict=True)
     return tuple(
-        counted(np.asarray(record.times), *column, beam[:, min(i, last)])
+        count_oscillations(np.asarray(record.times), *column, deflection[:, min(i, last)])
         for i, column in enumerate(columns)
     )
 
 
-def counted(
+def count_oscillations(
     times: Float[np.ndarray, " time"],
     command: Float[np.ndarray, " time"],
     saturated: Bool[np.ndarray, " time"],
-    beam: Float[np.ndarray, " time"],
-) -> Swings:
+    deflection: Float[np.ndarray, " time"],
+) -> CommandOscillation:
     """How a command swings, at a limit where it is `saturated`, beside a deflection of the beam."""
-    turns, usual = turning_points(command), turning_points(beam)
-    gaps = np.diff(times[turns])
+    command_turns, deflection_turns = turning_points(command), turning_points(deflection)
+    gaps = np.diff(times[command_turns])
     frequency = float(1 / (2 * np.median(gaps))) if gaps.size else np.nan
-    return Swings(max(len(turns) - len(usual), 0), frequency, int(np.sum(saturated[turns])))
+    return CommandOscillation(
+        max(len(command_turns) - len(deflection_turns), 0),
+        frequency,
+        int(np.sum(saturated[command_turns])),
+    )
 
 
 def turning_points(history: Float[np.ndarray, " time"]) -> list[int]:
     """Where a history turns back by more than a share of its whole span: places of its extremes."""
     if not np.all(np.isfinite(history)) or np.ptp(history) == 0:
         return []
-    least, turns, extreme, sense = SMALLEST * np.ptp(history), [], 0, 0.0
+    min_swing, turns, extreme, direction = MIN_SWING * np.ptp(history), [], 0, 0.0
     for k, value in enumerate(history):
         change = value - history[extreme]
-        if sense == 0:  # until it has moved at all
-            if abs(change) > least:
-                sense, extreme = np.sign(change), k
-        elif sense * change >= 0:
+        if direction == 0:  # until it has moved at all
+            if abs(change) > min_swing:
+                direction, extreme = np.sign(change), k
+        elif direction * change >= 0:
             extreme = k
-        elif abs(change) > least:
-            turns, extreme, sense = [*turns, extreme], k, -sense
+        elif abs(change) > min_swing:
+            turns, extreme, direction = [*turns, extreme], k, -direction
     return turns

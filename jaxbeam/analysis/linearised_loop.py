@@ -14,21 +14,21 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxbeam.analysis.frozen_loop import ROUNDING, Clock, OpenLoop, open_loop
+from jaxbeam.analysis.frozen_loop import PERIOD_TOLERANCE, LoopDynamics, LoopTiming, loop_dynamics
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
 from jaxbeam.model.modes import lay_out
 from jaxbeam.runtime.compiling import compiled
 
-SETTLING = 8  # steps of Newton's method towards the state about which a law is made linear
-NEAR = 1e-10  # to an eigenvalue, relative: where inverse iteration is centred
+NEWTON_ITERATIONS = 8  # steps of Newton's method towards the state about which a law is made linear
+EIGENVALUE_OFFSET = 1e-10  # to an eigenvalue, relative: where inverse iteration is centred
 
 
-class LinearLoop(eqx.Module):
+class LinearisedLoop(eqx.Module):
     """Matrices of the loop at an instant, opened at the commands: u = K z closes it.
 
-    With a `period` (s) they take deviations from tick to tick. `modal` is the number of leading
+    With a `period` (s) they take deviations from tick to tick. `modal_states` is the number of leading
     states that are coordinates of modes and their rates (continuous time: in the order of
     `state_space`).
     """
@@ -37,28 +37,30 @@ class LinearLoop(eqx.Module):
     B: Float[Array, "state actuator"]
     K: Float[Array, "actuator state"]
     period: float | None = eqx.field(static=True)
-    modal: int = eqx.field(static=True)
+    modal_states: int = eqx.field(static=True)
 
     @property
-    def closed(self) -> Float[Array, "state state"]:
+    def closed_matrix(self) -> Float[Array, "state state"]:
         """The state matrix of the closed loop."""
         return self.A + self.B @ self.K
 
-    def rate(self) -> Float[Array, ""]:
+    def growth_rate(self) -> Float[Array, ""]:
         """The largest real part of the poles in 1/s; differentiable to first order, on a CPU.
 
         Other poles may coincide, as those of a delay do; the rightmost must be a simple one.
         """
-        fixed = jax.lax.stop_gradient(self.closed)
-        values, vectors = jnp.linalg.eig(fixed)
-        first = jnp.argmax(values.real if self.period is None else jnp.abs(values))
-        value, right = values[first], vectors[:, first]
+        constant_matrix = jax.lax.stop_gradient(self.closed_matrix)
+        values, vectors = jnp.linalg.eig(constant_matrix)
+        dominant = jnp.argmax(values.real if self.period is None else jnp.abs(values))
+        value, right = values[dominant], vectors[:, dominant]
         # The left eigenvector by inverse iteration: those of other poles may not exist.
-        shifted = fixed.T - value * (1 + NEAR) * jnp.eye(fixed.shape[0])
+        shifted = constant_matrix.T - value * (1 + EIGENVALUE_OFFSET) * jnp.eye(
+            constant_matrix.shape[0]
+        )
         left = jnp.ones_like(right)
         for _ in range(2):
             left = jnp.linalg.solve(shifted, left / jnp.linalg.norm(left))
-        value = value + left @ ((self.closed - fixed) @ right) / (left @ right)
+        value = value + left @ ((self.closed_matrix - constant_matrix) @ right) / (left @ right)
         return value.real if self.period is None else jnp.log(jnp.abs(value)) / self.period
 
     def poles(self) -> np.ndarray:
@@ -66,29 +68,29 @@ class LinearLoop(eqx.Module):
 
         Those of a sampled loop are log(z) / period, with frequencies up to half the sampling's.
         """
-        found = np.linalg.eigvals(known(self.closed)).astype(complex)
+        poles = np.linalg.eigvals(known(self.closed_matrix)).astype(complex)
         if self.period is not None:
             # What a delay lets vanish at once would be at minus infinity.
             tiny = np.finfo(float).tiny
-            found = np.log(np.where(found == 0, tiny, found)) / self.period
-        return found[np.argsort(-found.real)]
+            poles = np.log(np.where(poles == 0, tiny, poles)) / self.period
+        return poles[np.argsort(-poles.real)]
 
 
-def linear_loop(case: Case, t: float) -> LinearLoop:
+def linearised_loop(case: Case, t: float) -> LinearisedLoop:
     """The loop of a case with its loads frozen at a time t (s), about the rest they cause there.
 
     Frozen loads keep place, speed and acceleration. A law that is not linear is made so about the
     deflection under the frozen weights. Raises ValueError for a faulty case, one without a
     controller, and one whose sensors are not read at the controller's own ticks.
     """
-    clock = prepared(case)
-    return linear(open_loop(case, lay_out(known_case(case))), clock, jnp.asarray(float(t)))
+    timing = loop_timing(case)
+    return linearise(loop_dynamics(case, lay_out(known_case(case))), timing, jnp.asarray(float(t)))
 
 
-def prepared(case: Case) -> Clock | None:
+def loop_timing(case: Case) -> LoopTiming | None:
     """Check that the loop of a case can be made linear, and give its clock, if it has one.
 
-    Raises ValueError as `linear_loop` does.
+    Raises ValueError as `linearised_loop` does.
     """
     check(case)
     controller = case.controller
@@ -98,44 +100,50 @@ def prepared(case: Case) -> Clock | None:
         return None
     period = float(known(controller.period))
     for i, sensor in enumerate(case.sensors):
-        own = sensor.sampling_period
-        if own is not None and abs(float(known(own)) - period) > ROUNDING * period:
+        sampling_period = sensor.sampling_period
+        if (
+            sampling_period is not None
+            and abs(float(known(sampling_period)) - period) > PERIOD_TOLERANCE * period
+        ):
             raise ValueError(
                 f"sensors.{i}.sampling_period must be the controller's, {period:g} s, for the loop"
-                f" to repeat itself from tick to tick; it is {float(known(own)):g} s"
+                f" to repeat itself from tick to tick; it is {float(known(sampling_period)):g} s"
             )
-    lags = tuple(0.0 if s.delay is None else float(known(s.delay)) for s in case.sensors)
+    sensor_delays = tuple(0.0 if s.delay is None else float(known(s.delay)) for s in case.sensors)
     delay = 0.0 if controller.delay is None else float(known(controller.delay))
-    return Clock(period, delay, lags)
+    return LoopTiming(period, delay, sensor_delays)
 
 
 @compiled
-def linear(loop: OpenLoop, clock: Clock | None, t) -> LinearLoop:
+def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoop:
     """A loop with its loads frozen at t (s), linear about the rest under their weights."""
-    loop, modal = loop.frozen(t), 2 * loop.model.scale.shape[0]
-    if clock is None:
-        A, push, load, command = loop.parts(t)
-        about = _rest(lambda state: A @ state + push @ command(state) + load, jnp.zeros(A.shape[0]))
-        return LinearLoop(A, push, jax.jacfwd(command)(about), None, modal)
-    start, rebuild = loop.at_rest(clock)
+    loop, modal_states = loop.freeze_loads(t), 2 * loop.plant.scale.shape[0]
+    if timing is None:
+        A, input_matrix, weight_rates, command = loop.continuous_dynamics(t)
+        equilibrium = _equilibrium(
+            lambda state: A @ state + input_matrix @ command(state) + weight_rates,
+            jnp.zeros(A.shape[0]),
+        )
+        return LinearisedLoop(A, input_matrix, jax.jacfwd(command)(equilibrium), None, modal_states)
+    start, rebuild = loop.rest_state(timing)
 
-    def onward(state, given):
-        after, wanted = loop.tick(clock, rebuild(state), t, given)
+    def sampling_step(state, given):
+        after, wanted = loop.sampling_step(timing, rebuild(state), t, given)
         return ravel_pytree(after)[0], wanted
 
-    about = _rest(lambda state: onward(state, None)[0] - state, start)
-    wanted = onward(about, None)[1]
-    (A, B), (K, _) = jax.jacfwd(onward, argnums=(0, 1))(about, wanted)
-    return LinearLoop(A, B, K, clock.period, modal)
+    equilibrium = _equilibrium(lambda state: sampling_step(state, None)[0] - state, start)
+    command_at_equilibrium = sampling_step(equilibrium, None)[1]
+    (A, B), (K, _) = jax.jacfwd(sampling_step, argnums=(0, 1))(equilibrium, command_at_equilibrium)
+    return LinearisedLoop(A, B, K, timing.period, modal_states)
 
 
-def _rest(change, start):
+def _equilibrium(change, start):
     """Where nothing changes, by Newton's method; the start if there is no such place near."""
 
-    def closer(state, _):
+    def newton_step(state, _):
         step = jnp.linalg.lstsq(jax.jacfwd(change)(state), -change(state))[0]
         return state + step, None
 
-    found = jax.lax.scan(closer, start, length=SETTLING)[0]
+    found = jax.lax.scan(newton_step, start, length=NEWTON_ITERATIONS)[0]
     # Where it lies moves the poles of a law that is not linear; derivatives pass over that.
     return jax.lax.stop_gradient(jnp.where(jnp.all(jnp.isfinite(found)), found, start))

@@ -12,34 +12,34 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from jaxbeam.analysis.linearised_loop import LinearLoop
+from jaxbeam.analysis.linearised_loop import LinearisedLoop
 from jaxbeam.case.fields import known
 from jaxbeam.model.state_space import StateSpace
 from jaxbeam.numerics.discretisation import balance
 
-POINTS = 400  # frequencies around each pole
-DEFECTIVE = 1e12  # conditioning of eigenvectors beyond which they are too few
-BELOW = 1e-3  # lowest frequency looked at, relative to the lowest pole
-DOUBLINGS = 60
-VANISHED = 1e-9  # norm of a power of the state matrix that adds nothing any more
+POINTS_PER_POLE = 400  # frequencies around each pole
+MAX_CONDITION = 1e12  # conditioning of eigenvectors beyond which they are too few
+LOWEST_FREQUENCY = 1e-3  # lowest frequency looked at, relative to the lowest pole
+MAX_DOUBLINGS = 60
+POWER_TOLERANCE = 1e-9  # norm of a power of the state matrix that adds nothing any more
 
 
 class Margins(NamedTuple):
-    """Margins of a loop broken at one command; infinite (or zero, `gain_down`) if there is none.
+    """Margins of a loop broken at one command; infinite (or zero, `lower_gain`) if there is none.
 
     The loop stays stable while its gain is multiplied by less than `gain` and more than
-    `gain_down`, its phase lags by less than `phase` (rad) more, or its delay grows by less than
-    `delay` (s). `distance` is the least distance of the Nyquist curve from the critical point.
+    `lower_gain`, its phase lags by less than `phase` (rad) more, or its delay grows by less than
+    `delay` (s). `modulus_margin` is the least distance of the Nyquist curve from the critical point.
     """
 
     gain: float
-    gain_down: float
+    lower_gain: float
     phase: float
     delay: float
-    distance: float
+    modulus_margin: float
 
 
-def margins(loop: LinearLoop, actuator: int = 0) -> Margins:
+def margins(loop: LinearisedLoop, actuator: int = 0) -> Margins:
     """Margins at one command of a loop that is stable, from its frequency response L(i omega).
 
     u = K (s - A)^-1 B u: the critical point is L = K (s - A)^-1 B = 1; s is exp(i omega period)
@@ -51,13 +51,13 @@ def margins(loop: LinearLoop, actuator: int = 0) -> Margins:
     others = np.arange(B.shape[1]) != actuator
     A = A + B[:, others] @ K[others]
     column, row = B[:, actuator], K[actuator]
-    values, transfer = _transfer(A, column, row)
+    values, transfer = _transfer_function(A, column, row)
 
     def response(omega):
         s = 1j * np.atleast_1d(omega)
         return transfer(s if loop.period is None else np.exp(s * loop.period))
 
-    omega = _frequencies(values, loop.period)
+    omega = _frequency_grid(values, loop.period)
     curve = response(omega)
 
     def crossings(function):
@@ -76,28 +76,28 @@ def margins(loop: LinearLoop, actuator: int = 0) -> Margins:
         lag = np.angle(response(w)[0]) % (2 * np.pi)
         phases.append(min(lag, 2 * np.pi - lag))
         delays.append(lag / w)
-    near = int(np.argmin(np.abs(1 - curve)))
-    around = omega[max(near - 1, 0)], omega[min(near + 1, omega.size - 1)]
+    nearest = int(np.argmin(np.abs(1 - curve)))
+    bracket = omega[max(nearest - 1, 0)], omega[min(nearest + 1, omega.size - 1)]
     least = scipy.optimize.minimize_scalar(
-        lambda w: abs(1 - response(w)[0]), bounds=around, options={"xatol": 1e-9 * around[1]}
+        lambda w: abs(1 - response(w)[0]), bounds=bracket, options={"xatol": 1e-9 * bracket[1]}
     )
     found = Margins(
         gain=min((g for g in gains if g > 1), default=np.inf),
-        gain_down=max((g for g in gains if 0 < g < 1), default=0.0),
+        lower_gain=max((g for g in gains if 0 < g < 1), default=0.0),
         phase=min(phases),
         delay=min(delays),
-        distance=min(least.fun, abs(1 - curve[near])),
+        modulus_margin=min(least.fun, abs(1 - curve[nearest])),
     )
     return Margins(*map(float, found))
 
 
-def _transfer(A, column, row):
+def _transfer_function(A, column, row):
     """The poles of row (s - A)^-1 column, and that as a function of many s (rad/s, or z)."""
     values, vectors = np.linalg.eig(A)
-    if np.linalg.cond(vectors) < DEFECTIVE:
+    if np.linalg.cond(vectors) < MAX_CONDITION:
         # In its eigenvectors: one division for each frequency and pole.
-        parts = (row @ vectors) * np.linalg.solve(vectors, column.astype(complex))
-        return values, lambda s: (parts / (s[:, None] - values)).sum(axis=1)
+        residues = (row @ vectors) * np.linalg.solve(vectors, column.astype(complex))
+        return values, lambda s: (residues / (s[:, None] - values)).sum(axis=1)
     # What waits for several periods has too few eigenvectors: by back substitution then.
     found = scipy.linalg.schur(A, output="complex")
     triangle, basis = np.asarray(found[0]), np.asarray(found[1])
@@ -113,18 +113,20 @@ def _transfer(A, column, row):
     return np.diag(triangle), transfer
 
 
-def _frequencies(poles, period) -> np.ndarray:
+def _frequency_grid(poles, period) -> np.ndarray:
     """Frequencies (rad/s) that resolve every peak of a response with these poles."""
     if period is not None:
         poles = np.log(np.where(poles == 0, np.finfo(float).tiny, poles)) / period
     size = np.abs(poles[poles != 0])
-    top = 1e3 * size.max() if period is None else np.pi / period
-    found = [np.geomspace(min(BELOW * size.min(), top / 2), top, 4 * POINTS)]
+    highest = 1e3 * size.max() if period is None else np.pi / period
+    grid = [
+        np.geomspace(min(LOWEST_FREQUENCY * size.min(), highest / 2), highest, 4 * POINTS_PER_POLE)
+    ]
     for pole in poles:
         # Densest within its half-width.
-        found.append(pole.imag + abs(pole.real) * np.sinh(np.linspace(-6, 6, POINTS)))
-    omega = np.unique(np.concatenate(found))
-    return omega[(omega > 0) & (omega <= top)]
+        grid.append(pole.imag + abs(pole.real) * np.sinh(np.linspace(-6, 6, POINTS_PER_POLE)))
+    omega = np.unique(np.concatenate(grid))
+    return omega[(omega > 0) & (omega <= highest)]
 
 
 class Gramians(NamedTuple):
@@ -140,12 +142,12 @@ class Gramians(NamedTuple):
     hankel: Float[Array, " state"]
 
     @property
-    def reached(self) -> Float[Array, " state"]:
+    def reachable_size(self) -> Float[Array, " state"]:
         """The root of each state's entry in the Gramian of controllability."""
         return jnp.linalg.norm(self.controllability, axis=1)
 
     @property
-    def seen(self) -> Float[Array, " state"]:
+    def observable_size(self) -> Float[Array, " state"]:
         """The root of each state's entry in the Gramian of observability."""
         return jnp.linalg.norm(self.observability, axis=1)
 
@@ -166,27 +168,27 @@ def gramians(system: StateSpace) -> Gramians:
         inverse = jnp.linalg.inv(pole * jnp.eye(A.shape[0]) - A)
         A, root = inverse @ (pole * jnp.eye(A.shape[0]) + A), jnp.sqrt(2 * pole)
         B, C = root * inverse @ B, root * C @ inverse
-    reach, view = _factor(A, B), _factor(A.T, C.T)
-    if not bool(jnp.all(jnp.isfinite(reach)) & jnp.all(jnp.isfinite(view))):
+    controllability, observability = _gramian_factor(A, B), _gramian_factor(A.T, C.T)
+    if not bool(jnp.all(jnp.isfinite(controllability)) & jnp.all(jnp.isfinite(observability))):
         raise ValueError("Gramians need a stable system; damp every mode, rigid ones too")
-    hankel = jnp.linalg.svd(view.T @ reach, compute_uv=False)
-    return Gramians(reach * scale[:, None], view / scale[:, None], hankel)
+    hankel = jnp.linalg.svd(observability.T @ controllability, compute_uv=False)
+    return Gramians(controllability * scale[:, None], observability / scale[:, None], hankel)
 
 
-def _factor(A, B):
+def _gramian_factor(A, B):
     """L with L L' = sum of A^k B B' A'^k, twice as many terms at a time; nan if it grows."""
     size = A.shape[0]
-    first = _narrow(B)
+    first = _square_factor(B)
     factor = jnp.zeros((size, size)).at[:, : first.shape[1]].set(first)
 
     def double(_, state):
         factor, power = state
-        return _narrow(jnp.concatenate([factor, power @ factor], axis=1)), power @ power
+        return _square_factor(jnp.concatenate([factor, power @ factor], axis=1)), power @ power
 
-    factor, power = jax.lax.fori_loop(0, DOUBLINGS, double, (factor, A))
-    return jnp.where(jnp.max(jnp.abs(power)) < VANISHED, factor, jnp.nan)
+    factor, power = jax.lax.fori_loop(0, MAX_DOUBLINGS, double, (factor, A))
+    return jnp.where(jnp.max(jnp.abs(power)) < POWER_TOLERANCE, factor, jnp.nan)
 
 
-def _narrow(wide):
+def _square_factor(factor):
     """A square (or narrower) L with L L' = wide wide'."""
-    return jnp.linalg.qr(wide.T, mode="r").T
+    return jnp.linalg.qr(factor.T, mode="r").T

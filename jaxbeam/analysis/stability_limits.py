@@ -11,10 +11,10 @@ from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import known
 
 # What is above zero for an unstable case.
-Measure = Callable[[Case], float]
+StabilityMeasure = Callable[[Case], float]
 
 
-class LoadLimits(NamedTuple):
+class LoadStabilityLimits(NamedTuple):
     """From which mass (kg) and which speed (m/s, its size) of its load a loop is unstable.
 
     Infinite where no limit was found, zero where all that was tried is unstable; None where the
@@ -25,28 +25,28 @@ class LoadLimits(NamedTuple):
     speed: float | None
 
 
-def frozen(case: Case) -> float:
+def largest_frozen_pole(case: Case) -> float:
     """The largest real part (1/s) of the frozen poles over the crossing."""
-    return float(frozen_poles(case).largest.max())
+    return float(frozen_poles(case).largest_real_part.max())
 
 
-def streaming(spacing: float) -> Measure:
+def stream_excess(spacing: float) -> StabilityMeasure:
     """By how much the largest multiplier of a stream, loads a `spacing` (s) apart, exceeds one."""
-    return lambda case: stream(case, spacing).largest - 1
+    return lambda case: stream(case, spacing).largest_multiplier - 1
 
 
-def limit(
+def stability_limit(
     case: Case,
     address: str,
     low: float,
     high: float,
-    measure: Measure = frozen,
+    measure: StabilityMeasure = largest_frozen_pole,
     points: int = 25,
 ) -> float | None:
     """The least value of a number of the case between two at which the loop turns unstable.
 
     For the margin in mass or speed give `loads.0.mass` or `loads.0.speed`. `measure` is above
-    zero for an unstable case: `frozen`, `streaming(spacing)`, or any other, such as
+    zero for an unstable case: `largest_frozen_pole`, `streaming(spacing)`, or any other, such as
     `lambda case: growth(case).factor.max() - 10` (by choice). Values at `points` steps are tried,
     then the first change is bracketed to 1e-6. The bounds have the sign of the number, the larger
     size last. None if there is no such value. Raises ValueError for an address that is not there,
@@ -55,24 +55,27 @@ def limit(
     if not 0 < low < high and not high < low < 0:
         raise ValueError(f"low and high must be positive and ascend; they are {low:g}, {high:g}")
 
-    def at(value):
+    def measure_at(value):
         return measure(replace(case, {address: float(value)}))
 
     values = np.geomspace(low, high, points)
-    if at(values[0]) > 0:
+    if measure_at(values[0]) > 0:
         raise ValueError(f"the loop is unstable already at {address} = {low:g}; start lower")
-    for below, above in zip(values[:-1], values[1:], strict=True):
-        if at(above) > 0:
-            return float(scipy.optimize.brentq(at, below, above, rtol=1e-6))
+    for lower, upper in zip(values[:-1], values[1:], strict=True):
+        if measure_at(upper) > 0:
+            return float(scipy.optimize.brentq(measure_at, lower, upper, rtol=1e-6))
     return None
 
 
-def load_limits(
-    case: Case, measure: Measure = frozen, most: float = 10.0, points: int = 12
-) -> LoadLimits:
+def load_stability_limits(
+    case: Case,
+    measure: StabilityMeasure = largest_frozen_pole,
+    factor: float = 10.0,
+    points: int = 12,
+) -> LoadStabilityLimits:
     """From which mass and which speed of its first load a loop is unstable, all else kept.
 
-    Tried are values up to `most` times as large as that of the case, or, where the case is unstable
+    Tried are values up to `factor` times as large as that of the case, or, where the case is unstable
     as it is, down to as many times smaller ones. Laws are designed anew for each. Raises ValueError
     for a case without loads, and as `measure`.
     """
@@ -80,15 +83,15 @@ def load_limits(
         raise ValueError("there is no load whose mass or speed could have a limit; add one")
     unstable = measure(case) > 0
 
-    def of(name):
+    def limit_of(name):
         value = getattr(case.loads[0], name)
         if value is None or known(value) == 0:
             return None
         value, address = float(known(value)), f"loads.0.{name}"
-        low, high = (value / most, value) if unstable else (value, value * most)
+        low, high = (value / factor, value) if unstable else (value, value * factor)
         if unstable and measure(replace(case, {address: low})) > 0:
             return 0.0
-        found = limit(case, address, low, high, measure, points)
+        found = stability_limit(case, address, low, high, measure, points)
         return np.inf if found is None else abs(found)
 
-    return LoadLimits(of("mass"), of("speed"))
+    return LoadStabilityLimits(limit_of("mass"), limit_of("speed"))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.files.case_file import load_case, load_controller, with_settings
-from jaxbeam.sweeps.batches import MOST_RUNS
+from jaxbeam.sweeps.batches import MAX_RUNS
 
 
 def read_case(path: Path, settings: Iterable[str]) -> Case:
@@ -71,8 +71,8 @@ def sweep_values(over: Iterable[str]) -> dict[str, list[float]]:
             values[address] = _numbers("--over", text, value.split(","))
             continue
         limits = _numbers("--over", text, value.split(":"))
-        if len(limits) == 3 and limits[2] > MOST_RUNS:
-            raise ValueError(f"--over {text}: a range may have {MOST_RUNS:.0e} values, no more")
+        if len(limits) == 3 and limits[2] > MAX_RUNS:
+            raise ValueError(f"--over {text}: a range may have {MAX_RUNS:.0e} values, no more")
         if len(limits) != 3 or limits[2] < 1 or limits[2] % 1:
             raise ValueError(
                 f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"

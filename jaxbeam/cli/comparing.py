@@ -51,7 +51,7 @@ def compare(
         Draw deflections and commands to this file, OUT.png.
     """
     import jaxbeam as jb
-    from jaxbeam.analysis.compare import compare, standings
+    from jaxbeam.analysis.compare import compare, metrics_over_cases
 
     values = sweep_values(over)
     check_suffix(output, ".png", "a comparison")
@@ -64,7 +64,7 @@ def compare(
     for one in cases_compared:
         check(one)
     comparisons = [compare(one, laws, period) for one in cases_compared]
-    table = standings(comparisons)
+    table = metrics_over_cases(comparisons)
     if output:
         from jaxbeam.plot import plot_comparison
 

@@ -164,7 +164,7 @@ def _fit(case, files, fault_kinds, free, prior, scale, output, overwrite, settin
 
 def _priors_by_address(free, prior, scale) -> dict:
     """Bounds, priors and scales by address, of the options that name them."""
-    from tuning.parameters.prior import Belief
+    from tuning.parameters.prior import Prior
 
     scales = dict(assignment("--scale", text) for text in scale)
     priors = {}
@@ -186,7 +186,7 @@ def _priors_by_address(free, prior, scale) -> dict:
     for address, pair in bounds.items():
         prior = priors.get(address, (None, None))
         try:
-            priors_by_address[address] = Belief(
+            priors_by_address[address] = Prior(
                 *(pair or (None, None)), *prior, scale=scales.get(address, "plain")
             )
         except ValueError as error:

@@ -32,7 +32,8 @@ def judge(
     logs = [log for path in unseen for log in tuning.read_logs(path)]
     rivals = tuning.compare_fits(fits_by_name) if len(fits_by_name) > 1 else []
     held_out = {
-        name: tuning.hold_out(fit, logs) if logs else [] for name, fit in fits_by_name.items()
+        name: tuning.predict_held_out(fit, logs) if logs else []
+        for name, fit in fits_by_name.items()
     }
     if json_:
         error_ratios = {
@@ -93,7 +94,9 @@ def sharpen(
     for text in over:
         assignment("--over", text)
     bounds = dict(bounds_of(text, "--over") for text in over)
-    design = tuning.sharpen(read_case(case, set_), free, bounds, target=target, noise=noise)
+    design = tuning.design_experiment(
+        read_case(case, set_), free, bounds, target=target, noise=noise
+    )
     if output:
         save_case(design.case, output, overwrite=True)  # checked before the work
     if json_:

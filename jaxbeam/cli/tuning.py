@@ -153,22 +153,24 @@ def tune(
     total_objective = tuning.Objective(weights or {"peak": 1.0}, over, limits=limits)
     problem = parsed_case, dict(bounds_of(text) for text in free), loads
     shared_options = {
-        "stable": None if stable is None else tuning.Stable(stable, reserve, shares),
+        "stable": None if stable is None else tuning.StabilityConstraint(stable, reserve, shares),
         "method": method or ("lbfgs" if front_limits or rank else "adam"),
         "steps": steps, "seed": seed, "bounds": bounds, "progress": not json_,
     }  # fmt: skip
     if front_limits:
-        tuning_result = tuning.control.pareto(
+        tuning_result = tuning.pareto(
             *problem, total_objective, *front_limits, **shared_options
         )
         results = tuning_result.tuned
     elif rank:
-        results = tuning.lexicographic(*problem, rank.split(","), over=over, **shared_options)[-1:]
+        results = tuning.lexicographic(
+            *problem, rank.split(","), aggregation=over, **shared_options
+        )[-1:]
         tuning_result = results[0]
     elif choose:
         integer_choices = dict(_integer_choices(text) for text in choose)
         search_options = {"batch": batch, "starts": starts}
-        tuning_result = tuning.tune_choices(
+        tuning_result = tuning.tune_integers(
             parsed_case,
             integer_choices,
             *problem[1:],
@@ -224,7 +226,9 @@ def _with_identified_plant(case, loads, file: Path, count: int, sampled: bool, s
     fit = tuning.load_fit(file.with_suffix(".npz"))
     source = tuning.sample(fit, seed=seed) if sampled else fit
     plants_drawn = tuning.draw_plants(source, 2 * count, seed)
-    return tuning.adopt(case, fit), loads.across(plants_drawn[:count], plants_drawn[count:])
+    return tuning.with_identified_plant(case, fit), loads.across(
+        plants_drawn[:count], plants_drawn[count:]
+    )
 
 
 def _output_files(output: Path | None, count: int) -> list[Path]:

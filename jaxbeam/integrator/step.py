@@ -96,7 +96,11 @@ def _undriven_jvp(given, changes):
 
 
 def _each(matrix: Float[Array, "step row column"], lanes: Float[Array, "step column lane"]):
-    return _sum(matrix[..., None], lanes) if max(matrix.shape[1:]) <= MAX_UNROLLED_TERMS else matrix @ lanes
+    return (
+        _sum(matrix[..., None], lanes)
+        if max(matrix.shape[1:]) <= MAX_UNROLLED_TERMS
+        else matrix @ lanes
+    )
 
 
 def _sum(matrix, lanes: Float[Array, "step column lane"]):

@@ -37,12 +37,14 @@ def plot_poles(
     )
     plane.set(xlabel="real part (1/s)", ylabel="imaginary part (rad/s)", title="frozen poles")
     real_part_axes = right[0]
-    real_part_axes.plot(poles_along_crossing.times, poles_along_crossing.largest, color=INK)
+    real_part_axes.plot(
+        poles_along_crossing.times, poles_along_crossing.largest_real_part, color=INK
+    )
     real_part_axes.axhline(0, color=ALARM, linewidth=0.8)
     real_part_axes.fill_between(
         poles_along_crossing.times,
         0,
-        np.maximum(poles_along_crossing.largest, 0),
+        np.maximum(poles_along_crossing.largest_real_part, 0),
         color=ALARM,
         alpha=0.2,
         linewidth=0,

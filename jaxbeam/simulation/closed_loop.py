@@ -27,268 +27,324 @@ from jaxbeam.model.sensor_filters import sensed
 from jaxbeam.model.sensor_signals import design, init, noise_samples, read
 from jaxbeam.model.state_space import LoadedBeam, state_space
 
-ITERATIONS = 4  # of Newton's method for a law at every instant; one would do for a linear law
+NEWTON_ITERATIONS = (
+    4  # of Newton's method for a law at every instant; one would do for a linear law
+)
 
 
 def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> Schedule:
     """When the controller of a case acts and its sensors are read, up to the last sample (s)."""
     controller, end = case.controller, samples[-1]
-    knots = controller.knots(case)
-    knots = np.zeros(0) if knots is None else known(knots)
+    breakpoints = controller.knots(case)
+    breakpoints = np.zeros(0) if breakpoints is None else known(breakpoints)
     if controller.period is None:
-        return merged(samples, np.zeros(0), 0.0, [], [], knots)
+        return merged(samples, np.zeros(0), 0.0, [], [], breakpoints)
 
     def clock(period):
         return np.arange(int(np.floor(end / period * (1 + 1e-12))) + 1) * period
 
     period = float(known(controller.period))
-    own = [period if s.sampling_period is None else known(s.sampling_period) for s in case.sensors]
-    late = [0.0 if s.delay is None else float(known(s.delay)) for s in case.sensors]
+    sampling_periods = [
+        period if s.sampling_period is None else known(s.sampling_period) for s in case.sensors
+    ]
+    delays = [0.0 if s.delay is None else float(known(s.delay)) for s in case.sensors]
     delay = 0.0 if controller.delay is None else float(known(controller.delay))
-    return merged(samples, clock(period), delay, [clock(float(p)) for p in own], late, knots)
+    return merged(
+        samples,
+        clock(period),
+        delay,
+        [clock(float(p)) for p in sampling_periods],
+        delays,
+        breakpoints,
+    )
 
 
-class Loop(AbstractDriver):
+class ClosedLoop(AbstractDriver):
     """The driver made of the controller of a case. Lanes share the controller, not its memory.
 
-    `designed` is that memory at the start, which holds what the controller works out beforehand.
-    So many states of a law that acts at every instant are `flowing`: they are the last of the
+    `initial_memory` is that memory at the start, which holds what the controller works out beforehand.
+    So many states of a law that acts at every instant are `controller_states`: they are the last of the
     rig's, and their rates the last of the commands.
     """
 
-    model: LoadedBeam
-    designed: Any
-    rig: Rig
-    seen: Float[Array, "sensor state"]
-    traffic: Traffic
+    plant: LoadedBeam
+    initial_memory: Any
+    model: Rig
+    output_rows: Float[Array, "sensor state"]
+    loads: Traffic
     schedule: Schedule
-    sections: tuple
+    filter_sections: tuple
     noise: Float[Array, "read sensor"] | None
-    bound: Float[Array, " state"]
-    inner: bool = eqx.field(static=True)
-    flowing: int = eqx.field(static=True)
+    state_bound: Float[Array, " state"]
+    implicit: bool = eqx.field(static=True)
+    controller_states: int = eqx.field(static=True)
 
-    def start(self, lanes: int) -> Any:
-        controller, case = self.model.case.controller, self.model.case
-        memory = _every_lane(self.designed, lanes)
+    def start(self, batch_size: int) -> Any:
+        controller, case = self.plant.case.controller, self.plant.case
+        memory = _broadcast_to_batch(self.initial_memory, batch_size)
         if controller.period is None:
-            return memory, jnp.zeros((self.rig.command_matrix.shape[1], lanes))
-        commands = jnp.zeros((len(case.actuators), lanes))
-        pairs = zip(case.sensors, self.sections, strict=True)
-        sensing = [init(sensor, sections, jnp.zeros(lanes)) for sensor, sections in pairs]
-        rest = [
-            read(sensor, sections, state, jnp.zeros(lanes))[0]
-            for sensor, sections, state in zip(case.sensors, self.sections, sensing, strict=True)
+            return memory, jnp.zeros((self.model.command_matrix.shape[1], batch_size))
+        commands = jnp.zeros((len(case.actuators), batch_size))
+        pairs = zip(case.sensors, self.filter_sections, strict=True)
+        sensor_memory = [
+            init(sensor, sections, jnp.zeros(batch_size)) for sensor, sections in pairs
         ]
-        rest = jnp.stack(rest) if rest else jnp.zeros((0, lanes))
-        shown = jnp.broadcast_to(rest, (self.schedule.newest + 1, *rest.shape))
-        waiting = jnp.zeros((self.schedule.waiting + 1, *commands.shape))
-        return memory, commands, sensing, shown, waiting
+        readings_at_rest = [
+            read(sensor, sections, state, jnp.zeros(batch_size))[0]
+            for sensor, sections, state in zip(
+                case.sensors, self.filter_sections, sensor_memory, strict=True
+            )
+        ]
+        readings_at_rest = (
+            jnp.stack(readings_at_rest) if readings_at_rest else jnp.zeros((0, batch_size))
+        )
+        reading_history = jnp.broadcast_to(
+            readings_at_rest, (self.schedule.newest + 1, *readings_at_rest.shape)
+        )
+        command_queue = jnp.zeros((self.schedule.waiting + 1, *commands.shape))
+        return memory, commands, sensor_memory, reading_history, command_queue
 
-    def drive(self, memory, state, moment: Moment, states):
-        if self.model.case.controller.period is None:
-            return self._at_every_instant(memory, state, moment, states)
+    def inputs(self, memory, state, step_info: Moment, states):
+        if self.plant.case.controller.period is None:
+            return self._continuous_inputs(memory, state, step_info, states)
         memory = jax.lax.cond(
-            moment.edge >= 0,
-            lambda memory: self._act(memory, state, moment),
+            step_info.edge >= 0,
+            lambda memory: self._process_event(memory, state, step_info),
             lambda memory: memory,
             memory,
         )
-        active = memory[1]
-        return jnp.broadcast_to(active, (NODES, *active.shape)), memory
+        command = memory[1]
+        return jnp.broadcast_to(command, (NODES, *command.shape)), memory
 
-    def _at_every_instant(self, memory, state, moment: Moment, states):
-        own, last = memory
-        times = moment.start + moment.span * GAUSS
-        if not self.inner:
-            commands = jax.vmap(lambda time: self._answer(own, state, time))(times)
-            return commands, (own, commands[-1])
+    def _continuous_inputs(self, memory, state, step_info: Moment, states):
+        controller_memory, last_command = memory
+        times = step_info.start + step_info.span * GAUSS
+        if not self.implicit:
+            commands = jax.vmap(lambda time: self._control_law(controller_memory, state, time))(
+                times
+            )
+            return commands, (controller_memory, commands[-1])
 
-        def wanted(commands):
-            return jax.vmap(lambda *at: self._answer(own, *at))(states(commands), times)
+        def commands_for(commands):
+            return jax.vmap(lambda *at: self._control_law(controller_memory, *at))(
+                states(commands), times
+            )
 
-        guess = jnp.broadcast_to(last, (NODES, *last.shape))
-        commands = newton(wanted, guess, ITERATIONS)
-        return commands, (own, commands[-1])
+        guess = jnp.broadcast_to(last_command, (NODES, *last_command.shape))
+        commands = newton_fixed_point(commands_for, guess, NEWTON_ITERATIONS)
+        return commands, (controller_memory, commands[-1])
 
-    def at_instants(self, states: Float[Array, "time state"], times: Float[Array, " time"]):
+    def commands_at(self, states: Float[Array, "time state"], times: Float[Array, " time"]):
         """Commands (time, command) of a law at every instant, for a single lane.
 
         Behind those to the actuators are the rates of the law's own states.
         """
-        own = _every_lane(self.designed, 1)
-        return jax.vmap(lambda state, time: self._answer(own, state[:, None], time)[:, 0])(
-            states, times
-        )
+        controller_memory = _broadcast_to_batch(self.initial_memory, 1)
+        return jax.vmap(
+            lambda state, time: self._control_law(controller_memory, state[:, None], time)[:, 0]
+        )(states, times)
 
-    def _answer(self, own, state, time):
+    def _control_law(self, controller_memory, state, time):
         """Commands (actuator, lane) of a law at every instant to a state; rates of own states."""
-        case, seen = self.model.case, self.seen @ state
-        pairs = zip(case.sensors, seen[: len(case.sensors)], strict=True)
+        case, outputs = self.plant.case, self.output_rows @ state
+        pairs = zip(case.sensors, outputs[: len(case.sensors)], strict=True)
         readings = [read(sensor, None, None, value)[0] for sensor, value in pairs]
         # What filters of the law's own give follows.
-        shown = jnp.stack([*readings, *seen[len(case.sensors) :]]) if seen.shape[0] else seen
-        none = jnp.zeros((len(case.actuators), state.shape[-1]))
-        moving = state[state.shape[0] - self.flowing :]
+        readings = (
+            jnp.stack([*readings, *outputs[len(case.sensors) :]]) if outputs.shape[0] else outputs
+        )
+        no_command = jnp.zeros((len(case.actuators), state.shape[-1]))
+        controller_state = state[state.shape[0] - self.controller_states :]
 
-        def single(own, moving, *seen):
+        def law(own, moving, *seen):
             return jnp.concatenate(
-                case.controller.flow(own, moving, Measurement(*seen), time, self._limited)
+                case.controller.flow(own, moving, Measurement(*seen), time, self._limit_commands)
             )
 
-        ordered = self.model.from_rig(state[: self.model.rig.states])
-        every = jax.vmap(single, in_axes=-1, out_axes=-1)
-        return every(own, moving, shown, ordered, none)
+        plant_state = self.plant.from_rig(state[: self.plant.rig.states])
+        batched_law = jax.vmap(law, in_axes=-1, out_axes=-1)
+        return batched_law(controller_memory, controller_state, readings, plant_state, no_command)
 
-    def _act(self, memory, state, moment: Moment):
+    def _process_event(self, memory, state, step_info: Moment):
         """All that is due at an edge: readings, a new command, and commands that begin."""
-        own, active, sensing, shown, waiting = memory
-        case, schedule, edge = self.model.case, self.schedule, moment.edge
-        signals = self._signals(state, active, moment.start)
+        controller_memory, command, sensor_memory, reading_history, command_queue = memory
+        case, schedule, event = self.plant.case, self.schedule, step_info.edge
+        signals = self._sensor_inputs(state, command, step_info.start)
         readings, states = [], []
         for i, sensor in enumerate(case.sensors):
-            number = schedule.reads[edge, i]
+            number = schedule.reads[event, i]
             noise = None if self.noise is None else self.noise[number, i]
-            reading, after = read(sensor, self.sections[i], sensing[i], signals[i], noise)
+            reading, after = read(
+                sensor, self.filter_sections[i], sensor_memory[i], signals[i], noise
+            )
             due = number >= 0
-            readings.append(jnp.where(due, reading, shown[0, i]))
-            states.append(_choose(due, after, sensing[i]))
-            history = jnp.where(due, jnp.roll(shown[:, i], 1, axis=0), shown[:, i])
-            shown = shown.at[:, i].set(history.at[0].set(readings[-1]))
+            readings.append(jnp.where(due, reading, reading_history[0, i]))
+            states.append(_tree_where(due, after, sensor_memory[i]))
+            history = jnp.where(
+                due, jnp.roll(reading_history[:, i], 1, axis=0), reading_history[:, i]
+            )
+            reading_history = reading_history.at[:, i].set(history.at[0].set(readings[-1]))
 
-        def tick(inputs):
+        def sampling_step(inputs):
             own, waiting = inputs
-            arrived = self._arrived(shown, edge)
-            wanted, own = self._step(own, arrived, state, active, moment.start)
-            command = self._limited(wanted, waiting[0])
+            arrived = self._available_readings(reading_history, event)
+            wanted, own = self._controller_step(own, arrived, state, command, step_info.start)
+            command = self._limit_commands(wanted, waiting[0])
             return own, jnp.roll(waiting, 1, axis=0).at[0].set(command)
 
-        own, waiting = jax.lax.cond(
-            schedule.tick[edge] >= 0, tick, lambda inputs: inputs, (own, waiting)
+        controller_memory, command_queue = jax.lax.cond(
+            schedule.tick[event] >= 0,
+            sampling_step,
+            lambda inputs: inputs,
+            (controller_memory, command_queue),
         )
-        begins = schedule.apply[edge]
-        active = jnp.where(begins >= 0, waiting[jnp.maximum(begins, 0)], active)
-        return own, active, states, shown, waiting
+        command_index = schedule.apply[event]
+        command = jnp.where(
+            command_index >= 0, command_queue[jnp.maximum(command_index, 0)], command
+        )
+        return controller_memory, command, states, reading_history, command_queue
 
-    def shows(self, memory, moment: Moment):
+    def observe(self, memory, step_info: Moment):
         """Readings (sensor, lane) that have arrived, and failures (lane) of the controller."""
-        controller = self.model.case.controller
+        controller = self.plant.case.controller
         if controller.period is None:
             return None
-        return self._arrived(memory[3], moment.edge), self.failures(memory)
+        return self._available_readings(memory[3], step_info.edge), self.failures(memory)
 
     def failures(self, memory) -> Float[Array, " lane"]:
         """How many steps of the controller found no solution until now, in every lane."""
-        own, commands = memory[:2]
-        count = self.model.case.controller.failures
-        return jax.vmap(count, in_axes=-1, out_axes=-1, axis_size=commands.shape[-1])(own)
+        controller_memory, commands = memory[:2]
+        count = self.plant.case.controller.failures
+        return jax.vmap(count, in_axes=-1, out_axes=-1, axis_size=commands.shape[-1])(
+            controller_memory
+        )
 
-    def _arrived(self, shown, edge):
+    def _available_readings(self, reading_history, event):
         """The newest readings (sensor, lane) that have arrived by an edge."""
-        newest = [shown[self.schedule.age[edge, i], i] for i in range(shown.shape[1])]
-        return jnp.stack(newest) if newest else shown[0]
+        newest = [
+            reading_history[self.schedule.age[event, i], i] for i in range(reading_history.shape[1])
+        ]
+        return jnp.stack(newest) if newest else reading_history[0]
 
-    def _signals(self, state, command, time):
+    def _sensor_inputs(self, state, command, time):
         """What the sensors see at an instant (sensor, lane)."""
-        signals = self.seen @ state
-        sensors = self.model.case.sensors
+        signals = self.output_rows @ state
+        sensors = self.plant.case.sensors
         if not any(sensor.quantity == "acceleration" for sensor in sensors):
             return signals
-        _, moving = at_instant(self.rig, self.traffic, time, state, command)
+        _, accelerations = at_instant(self.model, self.loads, time, state, command)
         for i, sensor in enumerate(sensors):
             if sensor.quantity == "acceleration":
-                shape = self.rig.shapes(sensor.position, (0,))[0]
-                signals = signals.at[i].set(shape @ moving)
+                shape = self.model.shapes(sensor.position, (0,))[0]
+                signals = signals.at[i].set(shape @ accelerations)
         return signals
 
-    def _step(self, own, readings, state, command, time):
+    def _controller_step(self, controller_memory, readings, state, command, time):
         """The controller's step in every lane."""
 
-        def single(own, *seen):
-            return self.model.case.controller.step(own, Measurement(*seen), time)
+        def step(own, *seen):
+            return self.plant.case.controller.step(own, Measurement(*seen), time)
 
-        ordered = self.model.from_rig(state[: self.model.rig.states])
-        return jax.vmap(single, in_axes=-1, out_axes=-1)(own, readings, ordered, command)
+        plant_state = self.plant.from_rig(state[: self.plant.rig.states])
+        return jax.vmap(step, in_axes=-1, out_axes=-1)(
+            controller_memory, readings, plant_state, command
+        )
 
-    def _limited(self, wanted, before=None):
+    def _limit_commands(self, commands, previous=None):
         """Commands as the actuators take them: rounded, within limits and rates of change."""
-        controller, case = self.model.case.controller, self.model.case
+        controller, case = self.plant.case.controller, self.plant.case
         if controller.resolution is not None:
-            rounded = controller.resolution * jnp.round(wanted / controller.resolution)
-            wanted = wanted + jax.lax.stop_gradient(rounded - wanted)
+            rounded = controller.resolution * jnp.round(commands / controller.resolution)
+            commands = commands + jax.lax.stop_gradient(rounded - commands)
         rows = []
         for i, actuator in enumerate(case.actuators):
-            command, limits, rate = wanted[i], actuator.command_limits(), actuator.command_rate()
+            command, limits, rate = commands[i], actuator.command_limits(), actuator.command_rate()
             if limits is not None:
                 command = jnp.clip(command, limits[0], limits[1])
-            if rate is not None and before is not None:
+            if rate is not None and previous is not None:
                 change = rate * controller.period
-                command = jnp.clip(command, before[i] - change, before[i] + change)
+                command = jnp.clip(command, previous[i] - change, previous[i] + change)
             rows.append(command)
         return jnp.stack(rows)
 
 
-def newton(wanted, guess: Float[Array, "*shape lane"], iterations: int):
+def newton_fixed_point(function, guess: Float[Array, "*shape lane"], iterations: int):
     """Find what a function gives back unchanged, in each lane by itself, by Newton's method."""
-    lanes = guess.shape[-1]
-    size = guess.size // lanes
-    units = jnp.broadcast_to(jnp.eye(size)[..., None], (size, size, lanes))
+    batch_size = guess.shape[-1]
+    size = guess.size // batch_size
+    unit_vectors = jnp.broadcast_to(jnp.eye(size)[..., None], (size, size, batch_size))
 
-    def closer(value, _):
-        found, change = jax.linearize(wanted, value)
-        slopes = jax.vmap(change)(units.reshape(size, *guess.shape)).reshape(units.shape)
-        short = (found - value).reshape(size, lanes)
-        step = jnp.linalg.solve((units - slopes).T, short.T[..., None])
+    def iterate(value, _):
+        value_of_function, derivative = jax.linearize(function, value)
+        slopes = jax.vmap(derivative)(unit_vectors.reshape(size, *guess.shape)).reshape(
+            unit_vectors.shape
+        )
+        residual = (value_of_function - value).reshape(size, batch_size)
+        step = jnp.linalg.solve((unit_vectors - slopes).T, residual.T[..., None])
         return value + step[..., 0].T.reshape(guess.shape), None
 
-    return jax.lax.scan(closer, guess, length=iterations)[0]
+    return jax.lax.scan(iterate, guess, length=iterations)[0]
 
 
-def _every_lane(memory, lanes: int):
+def _broadcast_to_batch(memory, batch_size: int):
     """The same memory in all lanes, along a new last axis."""
     return jax.tree.map(
-        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf)[..., None], (*jnp.shape(leaf), lanes)),
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf)[..., None], (*jnp.shape(leaf), batch_size)),
         memory,
     )
 
 
-def _choose(condition, new, old):
+def _tree_where(condition, new, old):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def make_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) -> Loop:
+def closed_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) -> ClosedLoop:
     """The driver for a case that has a controller; its `rig` is the plant to integrate."""
-    model = state_space(case, layout=layout)
-    wide, seen = sensed(model)
+    plant = state_space(case, layout=layout)
+    augmented_model, output_rows = sensed(plant)
     controller = case.controller
     if controller.period is None:
-        sections, noise = (None,) * len(case.sensors), None
+        filter_sections, noise = (None,) * len(case.sensors), None
     else:
-        sections = tuple(design(sensor, controller.period) for sensor in case.sensors)
+        filter_sections = tuple(design(sensor, controller.period) for sensor in case.sensors)
         noise = None
         if any(sensor.noise is not None for sensor in case.sensors):
             noise = noise_samples(case.run.seed, len(case.sensors), schedule.most_reads)
-    inner = controller.period is None and not controller.blind
-    designed = controller.init(model)  # once: it may solve Riccati equations
-    flowing = controller.own_states(designed) if inner else 0
-    wide, seen = with_flowing(wide, seen, flowing)
+    implicit = controller.period is None and not controller.blind
+    initial_memory = controller.init(plant)  # once: it may solve Riccati equations
+    controller_states = controller.own_states(initial_memory) if implicit else 0
+    augmented_model, output_rows = _with_controller_states(
+        augmented_model, output_rows, controller_states
+    )
     # A deflection about as large as the beam is long: modes are of the order sqrt(2 / mass).
     beam = case.beam
-    most = beam.length * jnp.sqrt(beam.linear_density * beam.length / 2)
-    bound = jnp.full(wide.states, jnp.inf).at[0 : 2 * beam.modes : 2].set(most)
-    return Loop(
-        model, designed, wide, seen, loads, schedule, sections, noise, bound, inner, flowing
+    max_deflection = beam.length * jnp.sqrt(beam.linear_density * beam.length / 2)
+    state_bound = (
+        jnp.full(augmented_model.states, jnp.inf).at[0 : 2 * beam.modes : 2].set(max_deflection)
+    )
+    return ClosedLoop(
+        plant,
+        initial_memory,
+        augmented_model,
+        output_rows,
+        loads,
+        schedule,
+        filter_sections,
+        noise,
+        state_bound,
+        implicit,
+        controller_states,
     )
 
 
-def with_flowing(
-    rig: Rig, seen: Float[Array, "sensor state"], count: int
+def _with_controller_states(
+    model: Rig, output_rows: Float[Array, "sensor state"], count: int
 ) -> tuple[Rig, Float[Array, "sensor all"]]:
     """A rig with so many more states, whose rates are its last commands; no sensor sees them."""
     if count == 0:
-        return rig, seen
-    matrix = jnp.pad(rig.state_matrix, ((0, 0), (0, count), (0, count)))
-    command = jax.scipy.linalg.block_diag(rig.command_matrix, jnp.eye(count))
-    parts = matrix, command
-    wide = eqx.tree_at(lambda r: (r.state_matrix, r.command_matrix), rig, parts)
-    return wide, jnp.pad(seen, ((0, 0), (0, count)))
+        return model, output_rows
+    state_matrix = jnp.pad(model.state_matrix, ((0, 0), (0, count), (0, count)))
+    command_matrix = jax.scipy.linalg.block_diag(model.command_matrix, jnp.eye(count))
+    parts = state_matrix, command_matrix
+    augmented = eqx.tree_at(lambda r: (r.state_matrix, r.command_matrix), model, parts)
+    return augmented, jnp.pad(output_rows, ((0, 0), (0, count)))

@@ -31,7 +31,7 @@ class Record(eqx.Module):
     `failures` counts the steps until then in which the controller found no solution of what it
     solves at each, and fell back.
     Where a control loop diverges the samples are NaN from then on, and the peaks are NaN.
-    `error_estimate` is relative to the largest deflection. `shown` is what the sensors have told
+    `error_estimate` is relative to the largest deflection. `controller_readings` is what the sensors have told
     a controller that samples by then, None without one.
     """
 
@@ -52,7 +52,7 @@ class Record(eqx.Module):
     contact_lost_position: Float[Array, " load"]
     error_estimate: Float[Array, ""]
     steps: int = eqx.field(static=True)
-    shown: Float[Array, "time sensor"] | None = None
+    controller_readings: Float[Array, "time sensor"] | None = None
 
     def at(self, x, quantity: str = "deflection", fibre_distance=None) -> Float[Array, "time ..."]:
         """History of a quantity at positions x (m) of any shape, in SI units.
@@ -60,8 +60,8 @@ class Record(eqx.Module):
         Strain is that of the fibre `fibre_distance` (m) above the neutral axis, -z w_xx. Raises
         ValueError for an unknown quantity, or strain without a fibre.
         """
-        motion = self.coordinates, self.rates, self.accelerations
-        return history(self.modes, motion, x, quantity, fibre_distance)
+        coordinates = self.coordinates, self.rates, self.accelerations
+        return history(self.modes, coordinates, x, quantity, fibre_distance)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
         return self.at(self.case.sensor_places, quantity)
@@ -104,20 +104,20 @@ class Record(eqx.Module):
 
         Raises ValueError for a filter that samples at these times do not suit (see `sense`).
         """
-        if self.shown is not None:
-            return self.shown
-        motion = self.coordinates, self.rates, self.accelerations
-        return measure(self.case, self.modes, *motion, self.times, noisy=True)
+        if self.controller_readings is not None:
+            return self.controller_readings
+        coordinates = self.coordinates, self.rates, self.accelerations
+        return measure(self.case, self.modes, *coordinates, self.times, noisy=True)
 
     @property
     def saturated(self) -> Bool[Array, "time actuator"]:
         """Whether each command is at a limit of its actuator."""
         columns = [jnp.zeros(self.times.shape, bool) for _ in self.case.actuators]
         for i, actuator in enumerate(self.case.actuators):
-            limits, given = actuator.command_limits(), self.command[:, i]
+            limits, command = actuator.command_limits(), self.command[:, i]
             if limits is not None:
                 rounding = 1e-9 * (limits[1] - limits[0])
-                columns[i] = (given <= limits[0] + rounding) | (given >= limits[1] - rounding)
+                columns[i] = (command <= limits[0] + rounding) | (command >= limits[1] - rounding)
         return jnp.array(columns).reshape(len(columns), -1).T
 
     @property
@@ -133,8 +133,8 @@ class Record(eqx.Module):
     @property
     def diverged_time(self) -> Float[Array, ""]:
         """Time (s) of the first sample after the control loop diverged, NaN if it did not."""
-        gone = jnp.any(jnp.isnan(self.coordinates), axis=1)
-        return jnp.where(jnp.any(gone), self.times[jnp.argmax(gone)], jnp.nan)
+        diverged = jnp.any(jnp.isnan(self.coordinates), axis=1)
+        return jnp.where(jnp.any(diverged), self.times[jnp.argmax(diverged)], jnp.nan)
 
     @property
     def verdict(self) -> str:
@@ -147,13 +147,17 @@ class Record(eqx.Module):
             )
         lost = np.asarray(known(self.contact_lost_time))
         where = np.asarray(known(self.contact_lost_position))
-        least = np.asarray(known(self.lowest_contact_force))
-        pulls = [
+        lowest_force = np.asarray(known(self.lowest_contact_force))
+        contact_losses = [
             f"load {i} would have to pull, first at t = {lost[i]:.4g} s, x = {where[i]:.4g} m "
-            f"(smallest contact force {least[i]:.4g} N)"
+            f"(smallest contact force {lowest_force[i]:.4g} N)"
             for i in np.flatnonzero(np.isfinite(lost))
         ]
-        parts = ["; ".join(pulls) if pulls else "every load presses on the beam throughout"]
+        parts = [
+            "; ".join(contact_losses)
+            if contact_losses
+            else "every load presses on the beam throughout"
+        ]
         failures = int(known(self.failures)[-1])
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")
@@ -175,7 +179,7 @@ class Record(eqx.Module):
                 np.asarray(getattr(self.modes, name)),
                 {"units": unit, "long_name": words},
             )
-            for name, (dims, unit, words) in _OF_MODES.items()
+            for name, (dims, unit, words) in _MODE_VARIABLES.items()
         }
         coordinates = {
             "time": ("time", np.asarray(self.times), {"units": "s"}),
@@ -222,7 +226,7 @@ _VARIABLES = {
     "contact_lost_time": (("load",), "s", "first time at which the load would have to pull"),
     "contact_lost_position": (("load",), "m", "where the load would first have to pull"),
 }
-_OF_MODES = {
+_MODE_VARIABLES = {
     "stiffness": (("mode",), "1/s^2", "stiffness of the mode"),
     "damping": (("mode",), "1/s", "damping of the mode"),
     "coupling": (("mode", "other_mode"), "1/s^2", "stiffness between repeated modes"),
@@ -231,7 +235,7 @@ _OF_MODES = {
     "series": (("segment", "degree", "mode"), "kg^-0.5", "Chebyshev series of the mode shapes"),
     "unit": ((), "1/s^2", "flexural rigidity / (mass per length x length^4)"),
 }
-_STORED = [name for name in _VARIABLES if name in Record.__annotations__]
+_STORED_VARIABLES = [name for name in _VARIABLES if name in Record.__annotations__]
 
 
 def record_from_xarray(dataset: "xarray.Dataset") -> Record:
@@ -249,34 +253,34 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         "actuator": len(case.actuators),
         **dataset.sizes,
     }
-    possible = *_STORED, "measured"
-    shapes = {name: [sizes.get(d, 0) for d in _VARIABLES[name][0]] for name in possible}
+    may_be_empty = *_STORED_VARIABLES, "measured"
+    shapes = {name: [sizes.get(d, 0) for d in _VARIABLES[name][0]] for name in may_be_empty}
     empty = {
         name: (_VARIABLES[name][0], np.zeros(shape))
         for name, shape in shapes.items()
         if 0 in shape and name not in dataset.variables
     }
     dataset = dataset.assign(empty)
-    of_modes = {name: f"mode_{name}" for name in _OF_MODES}
-    wanted = (*_STORED, *of_modes.values(), "time")
-    absent = [name for name in wanted if name not in dataset.variables]
-    if absent:
-        raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(absent)}")
-    values = {name: jnp.asarray(dataset[name].values) for name in _STORED}
+    mode_variables = {name: f"mode_{name}" for name in _MODE_VARIABLES}
+    required = (*_STORED_VARIABLES, *mode_variables.values(), "time")
+    missing = [name for name in required if name not in dataset.variables]
+    if missing:
+        raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(missing)}")
+    values = {name: jnp.asarray(dataset[name].values) for name in _STORED_VARIABLES}
     return Record(
         case=case,
         modes=Modes(
-            **{name: jnp.asarray(dataset[label].values) for name, label in of_modes.items()}
+            **{name: jnp.asarray(dataset[label].values) for name, label in mode_variables.items()}
         ),
         times=jnp.asarray(dataset["time"].values),
         error_estimate=jnp.asarray(float(dataset.attrs["error_estimate"])),
         steps=int(dataset.attrs["steps"]),
-        shown=jnp.asarray(dataset["measured"].values) if _samples(case) else None,
+        controller_readings=jnp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
         **values,
     )
 
 
-def _samples(case: Case) -> bool:
+def _is_sampled(case: Case) -> bool:
     return case.controller is not None and case.controller.period is not None
 
 

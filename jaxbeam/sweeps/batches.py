@@ -10,49 +10,53 @@ import re
 import numpy as np
 from jaxtyping import Float, Int
 
-LIGHT = re.compile(r"loads\.\d+\.(mass|force)|run\.gravity")
-MOST_RUNS = 10**9  # of a sweep: more would not fit into any memory
-LANES = 256  # more lanes in one task fall out of the cache
+BATCHED_ADDRESS = re.compile(r"loads\.\d+\.(mass|force)|run\.gravity")
+MAX_RUNS = 10**9  # of a sweep: more would not fit into any memory
+MAX_BATCH_SIZE = 256  # more lanes in one task fall out of the cache
 
 
 @dataclasses.dataclass(frozen=True)
-class Tasks:
-    """Runs by task and lane: `heavy` values decide the path and the rig, `light` the loads.
+class Batches:
+    """Runs by task and lane: `shared_values` values decide the path and the rig, `batched_values` the loads.
 
-    `index` is the number of the run, -1 for lanes that only fill up a task.
+    `run_index` is the number of the run, -1 for lanes that only fill up a task.
     """
 
-    heavy_addresses: tuple[str, ...]
-    light_addresses: tuple[str, ...]
-    heavy: Float[np.ndarray, "task heavy"]
-    light: Float[np.ndarray, "task lane light"]
-    index: Int[np.ndarray, "task lane"]
+    shared_addresses: tuple[str, ...]
+    batched_addresses: tuple[str, ...]
+    shared_values: Float[np.ndarray, "task heavy"]
+    batched_values: Float[np.ndarray, "task lane light"]
+    run_index: Int[np.ndarray, "task lane"]
 
 
-def arrange(
-    addresses: list[str], runs: Float[np.ndarray, "run address"], alone: bool = False
-) -> Tasks:
+def make_batches(
+    addresses: list[str], runs: Float[np.ndarray, "run address"], one_run_each: bool = False
+) -> Batches:
     """Arrange runs, given by their values at the addresses (SI units), into tasks and lanes.
 
-    Runs on one path share a task unless they are to be `alone`: a controller that is designed for
+    Runs on one path share a task unless they are to be `one_run_each`: a controller that is designed for
     the loads is another one in each.
     """
-    is_light = np.array([bool(LIGHT.fullmatch(address)) and not alone for address in addresses])
-    heavy, light = runs[:, ~is_light], runs[:, is_light]
-    order = np.lexsort((np.zeros(len(runs)), *heavy.T[::-1]))
-    apart = np.any(np.diff(heavy[order], axis=0) != 0, axis=1)
-    members = np.split(order, np.flatnonzero(apart) + 1)
-    lanes = min(LANES, max(part.size for part in members))
-    rows = [part[i : i + lanes] for part in members for i in range(0, part.size, lanes)]
-    index = np.full((len(rows), lanes), -1)
+    is_batched = np.array(
+        [bool(BATCHED_ADDRESS.fullmatch(address)) and not one_run_each for address in addresses]
+    )
+    shared_values, batched_values = runs[:, ~is_batched], runs[:, is_batched]
+    order = np.lexsort((np.zeros(len(runs)), *shared_values.T[::-1]))
+    new_path = np.any(np.diff(shared_values[order], axis=0) != 0, axis=1)
+    runs_by_path = np.split(order, np.flatnonzero(new_path) + 1)
+    batch_size = min(MAX_BATCH_SIZE, max(part.size for part in runs_by_path))
+    rows = [
+        part[i : i + batch_size] for part in runs_by_path for i in range(0, part.size, batch_size)
+    ]
+    index = np.full((len(rows), batch_size), -1)
     for row, runs_of_row in zip(index, rows, strict=True):
         row[: runs_of_row.size] = runs_of_row
-    filled = np.where(index < 0, index[:, :1], index)
+    padded_index = np.where(index < 0, index[:, :1], index)
     names = np.array(addresses)
-    return Tasks(
-        tuple(names[~is_light].tolist()),
-        tuple(names[is_light].tolist()),
-        heavy[filled[:, 0]],
-        light[filled],
+    return Batches(
+        tuple(names[~is_batched].tolist()),
+        tuple(names[is_batched].tolist()),
+        shared_values[padded_index[:, 0]],
+        batched_values[padded_index],
         index,
     )

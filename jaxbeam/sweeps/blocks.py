@@ -18,19 +18,24 @@ from jaxbeam.integrator.events import sampled
 from jaxbeam.model.modal_model import couples
 from jaxbeam.model.modes import Layout, lay_out
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Form, most_at_once, sample_times
+from jaxbeam.simulation.integration_plan import StaticShapes, max_concurrent_loads, sample_times
 from jaxbeam.sweeps import programs
-from jaxbeam.sweeps.batches import Tasks
-from jaxbeam.sweeps.step_size import ORDER, choose_steps, drawn, rounding
+from jaxbeam.sweeps.batches import Batches
+from jaxbeam.sweeps.step_size import (
+    CONVERGENCE_ORDER,
+    choose_step_sizes,
+    rounding_error,
+    stratified_sample,
+)
 
-RUNS = 512  # in a block, at most, about: each is one call and one write
-BLOCKS = 8  # at least, if each then has more runs than are tried at once: for all cores
-TRIED = 256  # runs, about, at once while time steps are looked for
-PACES = 4  # at which time steps are measured, at least
-PLACE = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
+MAX_BLOCK_RUNS = 512  # in a block, at most, about: each is one call and one write
+MIN_BLOCKS = 8  # at least, if each then has more runs than are tried at once: for all cores
+MAX_TRIAL_RUNS = 256  # runs, about, at once while time steps are looked for
+MIN_TRIAL_BATCHES = 4  # at which time steps are measured, at least
+POSITION_ADDRESS = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
 
 
-class Work:
+class Runner:
     """All tasks of a sweep, cut into blocks of equal shape.
 
     `single` says that runs are integrated in single precision; rigs and propagators are made in
@@ -39,191 +44,252 @@ class Work:
     """
 
     def __init__(
-        self, case: Case, tasks: Tasks, histories: bool, tolerance: float, single: bool = False
+        self, case: Case, batches: Batches, histories: bool, tolerance: float, single: bool = False
     ):
-        self.case, self.tasks, self.histories, self.tolerance = case, tasks, histories, tolerance
+        self.case, self.batches, self.histories, self.tolerance = (
+            case,
+            batches,
+            histories,
+            tolerance,
+        )
         self.single = single
         self.schedule = None
         if case.controller is not None:
             self.schedule = loop_schedule(case, np.asarray(sample_times(case)))
         elif histories:
             self.schedule = sampled(sample_times(case), True)
-        count, lanes = tasks.index.shape
+        count, batch_size = batches.run_index.shape
         # Twice as many threads as cores: some hand over work while others wait for theirs.
         self.pool = ThreadPoolExecutor(2 * (os.cpu_count() or 1))
         # What finds the steps is compiled below, all else when it is first wanted.
-        self._compiling, self._ready = threading.Lock(), {(None, False)}
+        self._compile_lock, self._compiled_variants = threading.Lock(), {(None, False)}
         # Each device takes an equal part of a block.
         self.devices = len(jax.local_devices())
-        most, tried = (max(1, runs * self.devices // lanes) for runs in (RUNS, TRIED))
-        self.tried = _filled(min(count, tried), self.devices)
-        self.each = max(self.tried, _filled(min(count // BLOCKS, most), self.devices))
-        self.blocks = -(-count // self.each)
-        self.addresses = (tasks.heavy_addresses, tasks.light_addresses)
-        layout = _common_layout(case, tasks)
+        max_batches, trial_batches = (
+            max(1, runs * self.devices // batch_size) for runs in (MAX_BLOCK_RUNS, MAX_TRIAL_RUNS)
+        )
+        self.trial_batches = _round_up(min(count, trial_batches), self.devices)
+        self.batches_per_block = max(
+            self.trial_batches, _round_up(min(count // MIN_BLOCKS, max_batches), self.devices)
+        )
+        self.block_count = -(-count // self.batches_per_block)
+        self.addresses = (batches.shared_addresses, batches.batched_addresses)
+        layout = _common_layout(case, batches)
         # Loads, settings of the run and controllers leave the rig as it is: one serves all tasks,
         # but not on several devices, each of which takes its part of them.
-        outside = ("loads.", "run.", "controller.")
-        alike = all(name.startswith(outside) for name in self.addresses[0])
-        self.shared = alike and self.devices == 1
-        parts = [[0]] if self.shared else np.resize(np.arange(count), (self.blocks, self.each))
+        leaves_model_unchanged = ("loads.", "run.", "controller.")
+        same_model = all(name.startswith(leaves_model_unchanged) for name in self.addresses[0])
+        self.same_model = same_model and self.devices == 1
+        parts = (
+            [[0]]
+            if self.same_model
+            else np.resize(np.arange(count), (self.block_count, self.batches_per_block))
+        )
 
         def windows():
-            return np.asarray(programs.windows(case, self.addresses[0], tasks.heavy))
+            return np.asarray(
+                programs.entry_exit_times(case, self.addresses[0], batches.shared_values)
+            )
 
         # One load takes one slot, whenever it comes: what is compiled below need not wait for that.
-        slots = len(case.loads)
-        if slots > 1:
-            slots = max(most_at_once(window) for window in windows())
-        self.form = Form(layout, couples(case), slots, native_peaks.supports(case) and not single)
+        max_loads = len(case.loads)
+        if max_loads > 1:
+            max_loads = max(max_concurrent_loads(window) for window in windows())
+        self.shapes = StaticShapes(
+            layout, couples(case), max_loads, native_peaks.supports(case) and not single
+        )
         # C puts rigs on their steps itself.
-        self.apart = case.controller is None and not self.form.by_hand
-        job = self.job()
+        self.discretise_separately = case.controller is None and not self.shapes.native
+        program = self.program()
         # What takes longest to compile goes first; meanwhile the others are made ready for it.
-        compiling = [
+        compilations = [
             self.pool.submit(program.precompile(*arguments))
-            for program, arguments in self._programs(job, tasks.heavy[parts[0]])
+            for program, arguments in self._programs_to_compile(
+                program, batches.shared_values[parts[0]]
+            )
         ]
         entries, exits = np.moveaxis(windows(), 2, 0)
-        for program in compiling:
+        for program in compilations:
             program.result()  # raises what went wrong
-        found = [programs.rigs(job, tasks.heavy[part]) for part in parts]
-        if self.shared:
-            self.rigs, limit = found[0]
+        model_groups = [
+            programs.modal_models(program, batches.shared_values[part]) for part in parts
+        ]
+        if self.same_model:
+            self.models, limit = model_groups[0]
             limits = np.repeat(np.asarray(limit), count)
         else:
-            self.rigs, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
+            self.models, limits = jax.tree.map(
+                lambda *leaves: np.concatenate(leaves), *model_groups
+            )
         limits = limits[:count]
         limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
-        duration = _values(case, tasks, "run.duration")
-        spans = np.minimum(exits, duration[:, None]) - entries
-        spans = np.where(spans > 0, spans, duration[:, None])
-        crossing = np.min(spans, axis=1, initial=np.inf)
-        crossing = np.where(np.isfinite(crossing), crossing, duration)
-        self.paces = 1 / crossing
-        self.limits = np.minimum(limits, duration)
+        duration = _values_at(case, batches, "run.duration")
+        times_on_beam = np.minimum(exits, duration[:, None]) - entries
+        times_on_beam = np.where(times_on_beam > 0, times_on_beam, duration[:, None])
+        crossing_time = np.min(times_on_beam, axis=1, initial=np.inf)
+        crossing_time = np.where(np.isfinite(crossing_time), crossing_time, duration)
+        self.crossing_rates = 1 / crossing_time
+        self.max_steps = np.minimum(limits, duration)
         if case.controller is not None:  # between its samples there is a step at least
-            self.limits = np.minimum(self.limits, self.schedule.lengths.max())
+            self.max_steps = np.minimum(self.max_steps, self.schedule.lengths.max())
         # As found for beams of one and two spans, 1 to 12 modes, at fast and slow crossings, errors
         # of 1e-7.
         modes = case.beam.modes
-        self.guesses = crossing / (20 * modes + 1.84 * crossing / limits / np.sqrt(modes))
-        self.guesses *= (tolerance / 1e-7) ** (1 / ORDER)
+        self.initial_steps = crossing_time / (
+            20 * modes + 1.84 * crossing_time / limits / np.sqrt(modes)
+        )
+        self.initial_steps *= (tolerance / 1e-7) ** (1 / CONVERGENCE_ORDER)
 
-    def steps(self) -> tuple[Float[np.ndarray, " task"], float]:
+    def choose_step_sizes(self) -> tuple[Float[np.ndarray, " task"], float]:
         """Time steps (s) of all tasks, and the relative error of peaks seen with them.
 
         Raises RuntimeError if no time step meets the tolerance.
         """
-        count = _filled(PACES, self.tried)
+        count = _round_up(MIN_TRIAL_BATCHES, self.trial_batches)
 
-        def measure(chosen, steps, more=0, single=False):
-            batches = chosen.size // self.tried
+        def peaks(chosen, steps, more=0, single=False):
+            batches = chosen.size // self.trial_batches
             parts = zip(np.split(chosen, batches), np.split(steps, batches), strict=True)
-            found = [self._run(*part, None, single, more)["peak_deflection"] for part in parts]
+            found = [
+                self._integrate(*part, None, single, more)["peak_deflection"] for part in parts
+            ]
             return np.concatenate(found)
 
-        given = self.paces, self.guesses, self.limits, count, self.tolerance
-        steps, error = choose_steps(measure, *given, self.pool.map)
+        given = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
+        steps, error = choose_step_sizes(peaks, *given, self.pool.map)
         if self.single:
-            some = drawn(self.paces, count)
-            error += rounding(
-                *(measure(some, steps[some], single=single) for single in (False, True))
+            sample = stratified_sample(self.crossing_rates, count)
+            error += rounding_error(
+                *(peaks(sample, steps[sample], single=single) for single in (False, True))
             )
         return steps, error
 
-    def runs(self, number: int) -> int:
+    def run_count(self, number: int) -> int:
         """How many runs are in a block, apart from those that only fill it up."""
-        tasks = slice(number * self.each, (number + 1) * self.each)
-        return int((self.tasks.index[tasks] >= 0).sum())
+        tasks = slice(number * self.batches_per_block, (number + 1) * self.batches_per_block)
+        return int((self.batches.run_index[tasks] >= 0).sum())
 
-    def block(self, number: int, steps: Float[np.ndarray, " task"]) -> dict[str, np.ndarray]:
+    def compute_block(
+        self, number: int, steps: Float[np.ndarray, " task"]
+    ) -> dict[str, np.ndarray]:
         """Results of a block of tasks, (task, lane, ...), with the steps (s) of all tasks."""
-        count = self.tasks.index.shape[0]
-        chosen = np.arange(number * self.each, (number + 1) * self.each) % count
+        count = self.batches.run_index.shape[0]
+        batch_indices = (
+            np.arange(number * self.batches_per_block, (number + 1) * self.batches_per_block)
+            % count
+        )
         substeps = None
         if self.histories:
             substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
-        return self._run(chosen, steps[chosen], substeps, self.single)
+        return self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
 
-    def _programs(self, job, heavy):
+    def _programs_to_compile(self, program, shared_values):
         """What finds the steps, slowest to compile first, with arguments of the right shapes."""
-        alike, _ = programs.rigs.template(job, heavy)
-        first = np.zeros(self.each, int)
-        pace = np.ones(self.each), first
-        wanted = first > 0
-        rigs = alike if self.shared else jax.tree.map(lambda leaf: leaf[first], alike)
-        given = job, wanted, rigs, self.tasks.heavy[first], pace
-        rigs = programs.riggings.template(*given) if self.apart else self._bare(rigs)
-        yield programs.block, (job, self.devices, wanted, rigs, *self._values_of(first), pace)
-        if self.apart:
-            yield programs.riggings, given
-        yield programs.rigs, (job, heavy)
+        model_template, _ = programs.modal_models.template(program, shared_values)
+        indices = np.zeros(self.batches_per_block, int)
+        step_size = np.ones(self.batches_per_block), indices
+        mask = indices > 0
+        models = (
+            model_template
+            if self.same_model
+            else jax.tree.map(lambda leaf: leaf[indices], model_template)
+        )
+        discretise_arguments = program, mask, models, self.batches.shared_values[indices], step_size
+        models = (
+            programs.discrete_models.template(*discretise_arguments)
+            if self.discretise_separately
+            else self._models_without_controller(models)
+        )
+        yield (
+            programs.integrate_block,
+            (program, self.devices, mask, models, *self._values_of(indices), step_size),
+        )
+        if self.discretise_separately:
+            yield programs.discrete_models, discretise_arguments
+        yield programs.modal_models, (program, shared_values)
 
-    def _run(self, chosen, steps, substeps, single, more=0):
+    def _integrate(self, batch_indices, steps, substeps, single, extra_steps=0):
         # What is not a whole block is spread over it, so that each device has its part.
-        places = np.arange(chosen.size) * self.each // chosen.size
-        wanted = np.zeros(self.each, bool)
-        wanted[places] = True
-        among = np.cumsum(wanted) - 1
-        chosen, steps = chosen[among], steps[among]
-        pace = steps, np.full(chosen.size, more)
-        job, rigs = self.job(substeps), self._rigs_of(chosen)
-        given = job, wanted, rigs, self.tasks.heavy[chosen], pace
-        rigs = programs.riggings(*given) if self.apart else self._bare(rigs)
-        arguments = job, self.devices, wanted, rigs, *self._values_of(chosen), pace
-        arguments = jax.tree.map(_shortened, arguments) if single else arguments
+        rows = np.arange(batch_indices.size) * self.batches_per_block // batch_indices.size
+        mask = np.zeros(self.batches_per_block, bool)
+        mask[rows] = True
+        nearest_row = np.cumsum(mask) - 1
+        batch_indices, steps = batch_indices[nearest_row], steps[nearest_row]
+        step_size = steps, np.full(batch_indices.size, extra_steps)
+        program, models = self.program(substeps), self._models_of(batch_indices)
+        discretise_arguments = (
+            program,
+            mask,
+            models,
+            self.batches.shared_values[batch_indices],
+            step_size,
+        )
+        models = (
+            programs.discrete_models(*discretise_arguments)
+            if self.discretise_separately
+            else self._models_without_controller(models)
+        )
+        arguments = program, self.devices, mask, models, *self._values_of(batch_indices), step_size
+        arguments = jax.tree.map(_to_single_precision, arguments) if single else arguments
         with jax.enable_x64(False) if single else contextlib.nullcontext():
-            with self._compiling:  # others wait for the first, instead of compiling the same again
-                if (substeps, single) not in self._ready:
-                    programs.block.precompile(*arguments)()
-                    self._ready.add((substeps, single))
-            results = programs.block(*arguments)
+            with (
+                self._compile_lock
+            ):  # others wait for the first, instead of compiling the same again
+                if (substeps, single) not in self._compiled_variants:
+                    programs.integrate_block.precompile(*arguments)()
+                    self._compiled_variants.add((substeps, single))
+            results = programs.integrate_block(*arguments)
         found = {name: np.asarray(values) for name, values in results.items()}
         # Histories are large, and copied only where some of them were not wanted.
-        return found if wanted.all() else {name: found[name][places] for name in found}
+        return found if mask.all() else {name: found[name][rows] for name in found}
 
-    def _rigs_of(self, chosen):
+    def _models_of(self, batch_indices):
         """Rigs of some tasks."""
-        return self.rigs if self.shared else jax.tree.map(lambda leaf: leaf[chosen], self.rigs)
+        return (
+            self.models
+            if self.same_model
+            else jax.tree.map(lambda leaf: leaf[batch_indices], self.models)
+        )
 
-    def _bare(self, rigs):
-        """Rigs that `programs.block` takes; none with a controller, which has one of its own."""
-        return rigs if self.case.controller is None else None
+    def _models_without_controller(self, models):
+        """Rigs that `programs.integrate_block` takes; none with a controller, which has one of its own."""
+        return models if self.case.controller is None else None
 
-    def _values_of(self, chosen):
+    def _values_of(self, batch_indices):
         """What varies in some tasks, and in their lanes."""
-        return self.tasks.heavy[chosen], self.tasks.light[chosen]
+        return self.batches.shared_values[batch_indices], self.batches.batched_values[batch_indices]
 
-    def job(self, substeps: int | None = None) -> programs.Job:
+    def program(self, substeps: int | None = None) -> programs.Program:
         """What all tasks share; with `substeps` from sample to sample histories are kept."""
         scheduled = substeps is not None or self.case.controller is not None
-        clock = (self.schedule if scheduled else None), substeps
-        return programs.Job(self.case, self.form, *self.addresses, *clock)
+        sampling = (self.schedule if scheduled else None), substeps
+        return programs.Program(self.case, self.shapes, *self.addresses, *sampling)
 
 
-def _filled(count: int, unit: int) -> int:
+def _round_up(count: int, unit: int) -> int:
     """The next multiple of a unit."""
     return -(-count // unit) * unit
 
 
-def _values(case: Case, tasks: Tasks, address: str) -> np.ndarray:
+def _values_at(case: Case, batches: Batches, address: str) -> np.ndarray:
     """A number of the case in every task."""
-    if address in tasks.heavy_addresses:
-        return tasks.heavy[:, tasks.heavy_addresses.index(address)]
-    return np.full(tasks.heavy.shape[0], float(value_at(case, address)))
+    if address in batches.shared_addresses:
+        return batches.shared_values[:, batches.shared_addresses.index(address)]
+    return np.full(batches.shared_values.shape[0], float(value_at(case, address)))
 
 
-def _common_layout(case: Case, tasks: Tasks) -> Layout:
+def _common_layout(case: Case, batches: Batches) -> Layout:
     """One layout for all tasks: the same order of places, degrees high enough for each.
 
     Raises ValueError if places change their order along the beam within the sweep.
     """
-    moved = [i for i, name in enumerate(tasks.heavy_addresses) if PLACE.fullmatch(name)]
-    if not moved:
+    varying_positions = [
+        i for i, name in enumerate(batches.shared_addresses) if POSITION_ADDRESS.fullmatch(name)
+    ]
+    if not varying_positions:
         return lay_out(case)
-    values = np.unique(tasks.heavy[:, moved], axis=0)
-    names = [tasks.heavy_addresses[i] for i in moved]
+    values = np.unique(batches.shared_values[:, varying_positions], axis=0)
+    names = [batches.shared_addresses[i] for i in varying_positions]
     layouts = [lay_out(replace(case, dict(zip(names, row, strict=True)))) for row in values]
     degrees = (
         np.max([layout.degrees for layout in layouts], axis=0)
@@ -239,7 +305,7 @@ def _common_layout(case: Case, tasks: Tasks) -> Layout:
     return common.pop()
 
 
-def _shortened(leaf):
+def _to_single_precision(leaf):
     """Numbers in half the length."""
     if not eqx.is_array(leaf) or leaf.dtype == bool:
         return leaf

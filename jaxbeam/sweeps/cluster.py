@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxbeam.sweeps import store
-from jaxbeam.sweeps.blocks import Work
-from jaxbeam.sweeps.specification import order_from_dict
+from jaxbeam.sweeps.blocks import Runner
+from jaxbeam.sweeps.specification import specification_from_dict
 
 if TYPE_CHECKING:
     import distributed  # comes with the extra `cluster` only
 
-BUNDLE = 16  # blocks handed out at once, at most: some tenths of a second
-SHARES = 4  # bundles for each thread, at least, so that all finish at one time
+MAX_BUNDLE = 16  # blocks handed out at once, at most: some tenths of a second
+BUNDLES_PER_THREAD = 4  # bundles for each thread, at least, so that all finish at one time
 
 
 def connect(address: str) -> "distributed.Client":
@@ -41,12 +41,12 @@ def connect(address: str) -> "distributed.Client":
         raise ConnectionError(f"no Dask scheduler answers at {address}: {reason}") from None
 
 
-def compute(
-    client: "distributed.Client", mark: str, path: Path, blocks: list[int]
+def compute_blocks(
+    client: "distributed.Client", fingerprint: str, path: Path, blocks: list[int]
 ) -> Iterator[int]:
     """Have the workers of a cluster compute blocks of a sweep and write them to its store.
 
-    `mark` is the fingerprint of the sweep. Gives the number of each block that is done. Raises
+    `fingerprint` is the fingerprint of the sweep. Gives the number of each block that is done. Raises
     RuntimeError if there are no workers or they keep dying, and whatever a worker raises.
     """
     from distributed import KilledWorker, as_completed
@@ -54,9 +54,9 @@ def compute(
     threads = sum(client.nthreads().values())
     if not threads:
         raise RuntimeError("the cluster has no workers; start some, then resume")
-    size = max(1, min(BUNDLE, len(blocks) // (SHARES * threads)))
+    size = max(1, min(MAX_BUNDLE, len(blocks) // (BUNDLES_PER_THREAD * threads)))
     bundles = [blocks[i : i + size] for i in range(0, len(blocks), size)]
-    futures = client.map(work_off, bundles, mark=mark, path=path, pure=False)
+    futures = client.map(compute_and_store, bundles, mark=fingerprint, path=path, pure=False)
     try:
         for future in as_completed(futures, loop=client.loop):
             yield from future.result()
@@ -69,39 +69,39 @@ def compute(
         client.cancel(futures)
 
 
-def work_off(blocks: list[int], mark: str, path: Path) -> list[int]:
+def compute_and_store(blocks: list[int], fingerprint: str, path: Path) -> list[int]:
     """Compute blocks and write them to the store at a path; what a worker does.
 
     Raises ValueError if the worker's versions differ from those that began the sweep, or if it
     does not see the store.
     """
-    if store.status(path) != ("unfinished", mark):
+    if store.status(path) != ("unfinished", fingerprint):
         raise ValueError(
             f"a worker does not find the sweep at {path}; put the store where all machines see it"
         )
-    keeper = store.Disk(path)
-    work, made = _work(mark, keeper)
-    if made != mark:
+    block_store = store.ZarrStore(path)
+    runner, own_fingerprint = _runner(fingerprint, block_store)
+    if own_fingerprint != fingerprint:
         raise ValueError(
             "a worker has another version of jaxbeam or JAX than that which began the sweep, or"
             " only one of them has the steps that `jaxbeam native` compiles; install the same"
             " everywhere"
         )
     for block in blocks:
-        if not keeper.done(block):
-            keeper.write(block, work.block(block, keeper.steps[:-1]))
+        if not block_store.is_done(block):
+            block_store.write(block, runner.compute_block(block, block_store.steps[:-1]))
     return blocks
 
 
-_preparing = threading.Lock()
-_known: dict[str, tuple[Work, str]] = {}
+_runners_lock = threading.Lock()
+_runners: dict[str, tuple[Runner, str]] = {}
 
 
-def _work(mark: str, keeper: store.Disk) -> tuple[Work, str]:
+def _runner(fingerprint: str, block_store: store.ZarrStore) -> tuple[Runner, str]:
     """The blocks of a sweep, prepared once in each process, and the fingerprint made there."""
-    with _preparing:
-        if mark not in _known:
-            order = order_from_dict(keeper.order())
-            _known.clear()
-            _known[mark] = order.work(), order.fingerprint()
-        return _known[mark]
+    with _runners_lock:
+        if fingerprint not in _runners:
+            specification = specification_from_dict(block_store.specification())
+            _runners.clear()
+            _runners[fingerprint] = specification.runner(), specification.fingerprint()
+        return _runners[fingerprint]

@@ -29,11 +29,11 @@ from jaxbeam.runtime.compiling import (
     compiled,
     compiled_with,
 )
-from jaxbeam.simulation.closed_loop import make_loop
-from jaxbeam.simulation.integration_plan import Form
+from jaxbeam.simulation.closed_loop import closed_loop
+from jaxbeam.simulation.integration_plan import StaticShapes
 
 
-class Job(NamedTuple):
+class Program(NamedTuple):
     """What all tasks share: the case, its form, and the addresses of what varies.
 
     With a `schedule` steps go from edge to edge of it, with `substeps` so many, and histories are
@@ -41,175 +41,197 @@ class Job(NamedTuple):
     """
 
     case: Case
-    form: Form
-    heavy_addresses: tuple[str, ...]
-    light_addresses: tuple[str, ...]
+    shapes: StaticShapes
+    shared_addresses: tuple[str, ...]
+    batched_addresses: tuple[str, ...]
     schedule: Schedule | None = None
     substeps: int | None = None
 
-    def varied(self, heavy) -> Case:
+    def case_with(self, shared_values) -> Case:
         """The case of a task."""
-        return replace(self.case, dict(zip(self.heavy_addresses, heavy, strict=True)))
+        return replace(self.case, dict(zip(self.shared_addresses, shared_values, strict=True)))
 
-    def loads(self, heavy, light) -> Traffic:
+    def loads(self, shared_values, batched_values) -> Traffic:
         """The loads of a task, in all its lanes."""
-        varied = self.varied(heavy)
+        varied = self.case_with(shared_values)
 
-        def press(values):
-            pairs = zip(self.light_addresses, values, strict=True)
+        def load_parameters(values):
+            pairs = zip(self.batched_addresses, values, strict=True)
             loads = traffic(replace(varied, dict(pairs)))
             return loads.inertia[:, 0], loads.weight[:, 0]
 
-        inertia, weight = jax.vmap(press, out_axes=1)(light)
+        inertia, weight = jax.vmap(load_parameters, out_axes=1)(batched_values)
         return Traffic(traffic(varied).motions, inertia, weight)
 
-    def grid(self, assembled, heavy, pace):
+    def grid(self, model, shared_values, step_size):
         """The steps of a task. Its pace: the longest (s), and how many more between events."""
-        varied, (longest, more) = self.varied(heavy), pace
+        varied, (max_step, extra_steps) = self.case_with(shared_values), step_size
         if self.schedule is None:
-            return even_grid(varied, assembled, longest, more)
-        finer = jnp.ceil(jnp.max(self.schedule.lengths) / longest).astype(int) + more
-        return scheduled_grid(varied, assembled, self.schedule, self.substeps or finer)
+            return even_grid(varied, model, max_step, extra_steps)
+        substeps = jnp.ceil(jnp.max(self.schedule.lengths) / max_step).astype(int) + extra_steps
+        return scheduled_grid(varied, model, self.schedule, self.substeps or substeps)
 
-    def rigging(self, assembled, heavy, pace, driver=None):
+    def discretise(self, model, shared_values, step_size, policy=None):
         """The rig of a task on its steps."""
-        places = self.varied(heavy).sensor_places
-        return make_rigging(assembled, self.grid(assembled, heavy, pace), places, driver)
+        positions = self.case_with(shared_values).sensor_places
+        return make_rigging(model, self.grid(model, shared_values, step_size), positions, policy)
 
 
 @compiled_with(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
-def rigs(job: Job, heavy):
+def modal_models(program: Program, shared_values):
     """Rigs of some tasks, and the longest step (s) each allows."""
 
-    def task(values):
-        varied = job.varied(values)
-        assembled = rig(varied, job.form.layout, job.form.coupled)
-        return assembled, longest_step(assembled, varied.loads)
+    def model_and_limit(values):
+        varied = program.case_with(values)
+        model = rig(varied, program.shapes.layout, program.shapes.coupled)
+        return model, longest_step(model, varied.loads)
 
-    return jax.lax.map(task, heavy)  # traced in less time than side by side
+    return jax.lax.map(model_and_limit, shared_values)  # traced in less time than side by side
 
 
 @compiled
-def windows(case, addresses, heavy):
+def entry_exit_times(case, addresses, shared_values):
     """Times of entry and exit (task, load, 2) of the loads."""
 
-    def task(values):
+    def entry_exit_times_of(values):
         varied = replace(case, dict(zip(addresses, values, strict=True)))
-        paths = [motion(load, varied.beam.length) for load in varied.loads]
-        return jnp.array([path.window() for path in paths]).reshape(-1, 2)
+        trajectories = [motion(load, varied.beam.length) for load in varied.loads]
+        return jnp.array([path.window() for path in trajectories]).reshape(-1, 2)
 
-    return jax.vmap(task)(heavy)
+    return jax.vmap(entry_exit_times_of)(shared_values)
 
 
 @compiled_with(**PARALLEL_COMPILATION)
-def riggings(job: Job, wanted, rigs, heavy, pace):
+def discrete_models(program: Program, mask, models, shared_values, step_size):
     """Rigs on the steps of some tasks; a single rig is that of all, and stays single."""
-    shared, own = _shared(rigs)
+    shared_model, own_models = _split_shared_model(models)
 
-    def task(own, heavy, pace):
-        return _without_rig(job.rigging(shared or own, heavy, pace))
+    def discretise_one(own, heavy, pace):
+        return _without_model(program.discretise(shared_model or own, heavy, pace))
 
-    if (shared or jax.tree.map(lambda leaf: leaf[0], own)).modes_per_block == 1:
+    if (shared_model or jax.tree.map(lambda leaf: leaf[0], own_models)).modes_per_block == 1:
         # Modes that nothing couples take so little that calling the kernels is what costs.
-        found = jax.vmap(task)(own, heavy, pace)
+        discretised = jax.vmap(discretise_one)(own_models, shared_values, step_size)
     else:
-        found = _map(lambda values: task(*values), wanted, (own, heavy, pace))
-    return _with_rig(found, rigs)
+        discretised = _map_masked(
+            lambda values: discretise_one(*values), mask, (own_models, shared_values, step_size)
+        )
+    return _with_model(discretised, models)
 
 
 @compiled
-def block(job: Job, devices: int, wanted, rigs, heavy, light, pace):
+def integrate_block(
+    program: Program, devices: int, mask, models, shared_values, batched_values, step_size
+):
     """Results of some tasks: lanes side by side, tasks one after the other, shared by devices.
 
-    `rigs` are on their steps, or bare, and are then put on them here; None with a controller, which
+    `models` are on their steps, or bare, and are then put on them here; None with a controller, which
     has a rig of its own.
     """
-    if job.form.by_hand and job.substeps is None and light.dtype == jnp.float64:
-        part = functools.partial(_by_hand, job)
+    if program.shapes.native and program.substeps is None and batched_values.dtype == jnp.float64:
+        integrate = functools.partial(_native_results, program)
     else:
-        part = functools.partial(_by_xla, job)
-        if isinstance(rigs, Rig):
-            rigs = riggings(job, wanted, rigs, heavy, pace)
+        integrate = functools.partial(_compiled_results, program)
+        if isinstance(models, Rig):
+            models = discrete_models(program, mask, models, shared_values, step_size)
     if devices > 1:
         mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
-        part = jax.shard_map(part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    return part(wanted, rigs, heavy, light, pace)
+        integrate = jax.shard_map(
+            integrate, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+        )
+    return integrate(mask, models, shared_values, batched_values, step_size)
 
 
-def _by_hand(job: Job, wanted, rigs, heavy, light, pace):
+def _native_results(program: Program, mask, models, shared_values, batched_values, step_size):
     """Results by C, which wants to know when and where to step, and where to look."""
-    shared, own = _shared(rigs)
+    shared_model, own_models = _split_shared_model(models)
 
-    def around(own, heavy, light, pace):
-        grid = job.grid(shared or own, heavy, pace)
-        return grid, job.varied(heavy).sensor_places, job.loads(heavy, light)
+    def integration_inputs(own, heavy, light, pace):
+        grid = program.grid(shared_model or own, heavy, pace)
+        return grid, program.case_with(heavy).sensor_places, program.loads(heavy, light)
 
-    arounds = jax.vmap(around)(own, heavy, light, pace)
-    return native_peaks.integrate_peaks(job.form.slots, wanted, rigs, *arounds)._asdict()
+    inputs = jax.vmap(integration_inputs)(own_models, shared_values, batched_values, step_size)
+    return native_peaks.integrate_peaks(program.shapes.max_loads, mask, models, *inputs)._asdict()
 
 
-def _by_xla(job: Job, wanted, riggings, heavy, light, pace):
+def _compiled_results(program: Program, mask, discrete, shared_values, batched_values, step_size):
     """Results by compiled steps."""
-    if riggings is None:
-        return _map(lambda values: _driven(job, *values), wanted, (heavy, light, pace))
-    shared, own = _shared(riggings.rig)
+    if discrete is None:
+        return _map_masked(
+            lambda values: _closed_loop_results(program, *values),
+            mask,
+            (shared_values, batched_values, step_size),
+        )
+    shared_model, own_models = _split_shared_model(discrete.rig)
 
     def task(values):
         rigging, own, heavy, light = values
-        rigging = _with_rig(rigging, shared or own)
-        return _results(job, rigging, job.varied(heavy), job.loads(heavy, light))
+        rigging = _with_model(rigging, shared_model or own)
+        return _results(program, rigging, program.case_with(heavy), program.loads(heavy, light))
 
-    return _map(task, wanted, (_without_rig(riggings), own, heavy, light))
-
-
-def _driven(job: Job, heavy, light, pace):
-    """Results of a task with a controller."""
-    varied, loads = job.varied(heavy), job.loads(heavy, light)
-    driver = make_loop(varied, job.form.layout, loads, job.schedule)
-    return _results(job, job.rigging(driver.rig, heavy, pace, driver), varied, loads, driver)
-
-
-def _results(job: Job, rigging, varied: Case, loads: Traffic, driver=None):
-    """What is found of a task, by name."""
-    slots, substeps, history = job.form.slots, job.substeps, {}
-    if substeps is None:
-        best, memory = march(rigging, loads, slots=slots, driver=driver)
-    else:
-        grid = rigging.grid
-        steps = grid.counts.shape[0] * substeps
-        best, states, *_, memory = trace(rigging, loads, slots=slots, steps=steps, driver=driver)
-        samples = states[substeps * grid.place[job.schedule.samples]]
-        rows = rigging.rig.shapes(varied.sensor_places, (0,))[0]
-        modal = samples[:, 0 : 2 * varied.beam.modes : 2]
-        history["deflection"] = jnp.einsum("sm,tml->lts", rows, modal)
-    if driver is not None:
-        history["controller_failures"] = driver.failures(memory)
-    return best.found()._asdict() | history
-
-
-def _map(task, wanted, values):
-    """What `task` makes of each of the values that are wanted, one after the other."""
-    task = jax.jit(task)  # which is then traced once
-    shapes = jax.eval_shape(task, jax.tree.map(lambda leaf: leaf[0], values))
-
-    def nothing(values):
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-    return jax.lax.map(
-        lambda given: jax.lax.cond(given[0], task, nothing, given[1]), (wanted, values)
+    return _map_masked(
+        task, mask, (_without_model(discrete), own_models, shared_values, batched_values)
     )
 
 
-def _shared(rigs: Rig):
+def _closed_loop_results(program: Program, shared_values, batched_values, step_size):
+    """Results of a task with a controller."""
+    varied, loads = program.case_with(shared_values), program.loads(shared_values, batched_values)
+    policy = closed_loop(varied, program.shapes.layout, loads, program.schedule)
+    return _results(
+        program,
+        program.discretise(policy.model, shared_values, step_size, policy),
+        varied,
+        loads,
+        policy,
+    )
+
+
+def _results(program: Program, discrete, varied: Case, loads: Traffic, policy=None):
+    """What is found of a task, by name."""
+    max_loads, substeps, history = program.shapes.max_loads, program.substeps, {}
+    if substeps is None:
+        running_peaks, memory = march(discrete, loads, slots=max_loads, driver=policy)
+    else:
+        grid = discrete.grid
+        steps = grid.counts.shape[0] * substeps
+        running_peaks, states, *_, memory = trace(
+            discrete, loads, slots=max_loads, steps=steps, driver=policy
+        )
+        samples = states[substeps * grid.place[program.schedule.samples]]
+        rows = discrete.rig.shapes(varied.sensor_places, (0,))[0]
+        modal = samples[:, 0 : 2 * varied.beam.modes : 2]
+        history["deflection"] = jnp.einsum("sm,tml->lts", rows, modal)
+    if policy is not None:
+        history["controller_failures"] = policy.failures(memory)
+    return running_peaks.found()._asdict() | history
+
+
+def _map_masked(function, mask, values):
+    """What `function` makes of each of the values that are wanted, one after the other."""
+    function = jax.jit(function)  # which is then traced once
+    shapes = jax.eval_shape(function, jax.tree.map(lambda leaf: leaf[0], values))
+
+    def zeros(values):
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    return jax.lax.map(
+        lambda given: jax.lax.cond(given[0], function, zeros, given[1]), (mask, values)
+    )
+
+
+def _split_shared_model(models: Rig):
     """The rig that all tasks share, if they do, and what each has of its own."""
-    if rigs.state_matrix.shape[0] > 1:
-        return None, rigs
-    return jax.tree.map(lambda leaf: leaf[0], rigs), None
+    if models.state_matrix.shape[0] > 1:
+        return None, models
+    return jax.tree.map(lambda leaf: leaf[0], models), None
 
 
-def _without_rig(rigging):
-    return eqx.tree_at(lambda rigging: rigging.rig, rigging, None)
+def _without_model(discrete):
+    return eqx.tree_at(lambda rigging: rigging.rig, discrete, None)
 
 
-def _with_rig(rigging, rig):
-    return eqx.tree_at(lambda rigging: rigging.rig, rigging, rig, is_leaf=lambda leaf: leaf is None)
+def _with_model(discrete, model):
+    return eqx.tree_at(
+        lambda rigging: rigging.rig, discrete, model, is_leaf=lambda leaf: leaf is None
+    )

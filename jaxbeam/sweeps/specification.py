@@ -18,25 +18,25 @@ from jaxbeam.case.declared_checks import in_words
 from jaxbeam.case.validation import check
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
-from jaxbeam.sweeps.batches import LANES, MOST_RUNS, Tasks, arrange
-from jaxbeam.sweeps.blocks import RUNS, Work
+from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, MAX_RUNS, Batches, make_batches
+from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
 
 # Whether these are right depends on each other: places, and entries of a list.
-TOGETHER = re.compile(
+JOINTLY_CHECKED = re.compile(
     r"beam\.length|(supports|actuators|sensors)\.\d+\.(position|start|end)|.*\.\d+"
 )
 
 PRECISIONS = ("double", "single")
 
 # What decides when a controller acts and its sensors are read.
-CLOCK = re.compile(
+CLOCK_ADDRESS = re.compile(
     r"run\.(duration|sample_rate)|controller\.(period|delay|times\.\d+)"
     r"|sensors\.\d+\.(sampling_period|delay)"
 )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Order:
+class SweepSpecification:
     """A case, the values at some of its addresses, and how they are to be run.
 
     Either all combinations of the values, or with `paired` the first of each, the second of each,
@@ -68,37 +68,37 @@ class Order:
         columns = values if self.paired else np.meshgrid(*values, indexing="ij")
         return np.stack([column.ravel() for column in columns], axis=-1)
 
-    def tasks(self) -> Tasks:
+    def batches(self) -> Batches:
         """The runs, arranged into tasks."""
-        alone = self.case.controller is not None and self.case.controller.knows_loads
-        return arrange(list(self.axes), self.runs(), alone)
+        one_run_each = self.case.controller is not None and self.case.controller.knows_loads
+        return make_batches(list(self.axes), self.runs(), one_run_each)
 
-    def work(self) -> Work:
+    def runner(self) -> Runner:
         """The runs, cut into blocks.
 
         Raises ValueError if places along the beam change their order within the sweep.
         """
-        return Work(self.case, self.tasks(), self.histories, self.tolerance, self.single)
+        return Runner(self.case, self.batches(), self.histories, self.tolerance, self.single)
 
     @functools.cached_property
-    def words(self) -> dict[str, Any]:
+    def case_dict(self) -> dict[str, Any]:
         """The case in plain words and numbers."""
         return case_to_dict(self.case)
 
     def to_dict(self) -> dict[str, Any]:
-        """The order in plain words and numbers, which `order_from_dict` makes an order again."""
+        """The order in plain words and numbers, which `specification_from_dict` makes an order again."""
         return {
-            "case": self.words,
+            "case": self.case_dict,
             "axes": {address: values.tolist() for address, values in self.axes.items()},
             "settings": [self.paired, self.histories, self.tolerance, self.single],
         }
 
     def fingerprint(self) -> str:
         """A number for all that shapes the results: case, values, settings and versions."""
-        by_hand = native_peaks.supports(self.case) and not (self.histories or self.single)
+        native_steps = native_peaks.supports(self.case) and not (self.histories or self.single)
         content = self.to_dict() | {
-            "blocks": [RUNS, LANES, len(jax.local_devices())],
-            "versions": [_version(), jax.__version__, by_hand],
+            "blocks": [MAX_BLOCK_RUNS, MAX_BATCH_SIZE, len(jax.local_devices())],
+            "versions": [_version(), jax.__version__, native_steps],
         }
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
@@ -108,20 +108,20 @@ def _version() -> str:
     return importlib.metadata.version("jaxbeam")
 
 
-def order_from_dict(content: dict[str, Any]) -> Order:
+def specification_from_dict(content: dict[str, Any]) -> SweepSpecification:
     """An order from its plain words and numbers, taken to be right."""
     axes = {address: np.asarray(values, float) for address, values in content["axes"].items()}
-    return Order(case_from_dict(content["case"]), axes, *content["settings"])
+    return SweepSpecification(case_from_dict(content["case"]), axes, *content["settings"])
 
 
-def make_order(
+def sweep_specification(
     case: Case,
     over: dict[str, Any],
     paired: bool,
     histories: bool,
     tolerance: float,
     precision: str,
-) -> Order:
+) -> SweepSpecification:
     """Check a case and the values it is to be swept over, and put them together.
 
     Raises ValueError for an unknown address, faulty or too many values, a case without sensors, or
@@ -140,7 +140,7 @@ def make_order(
         raise ValueError("give at least one address to sweep over, with a list of values")
     if not case.sensors:
         raise ValueError("the case has no sensors, and peaks are taken there; add one to `sensors`")
-    axes = {address: _values(case, address, given) for address, given in over.items()}
+    axes = {address: _checked_values(case, address, given) for address, given in over.items()}
     for address in axes:
         if histories and address in ("run.duration", "run.sample_rate"):
             raise ValueError(
@@ -149,47 +149,51 @@ def make_order(
     sizes = {address: values.size for address, values in axes.items()}
     if paired and len(set(sizes.values())) > 1:
         raise ValueError(f"paired values must be equally many, not {sizes}")
-    order = Order(case, axes, paired, histories, tolerance, single)
-    if math.prod(order.shape) > MOST_RUNS:
+    specification = SweepSpecification(case, axes, paired, histories, tolerance, single)
+    if math.prod(specification.shape) > MAX_RUNS:
         raise ValueError(
-            f"{math.prod(order.shape):.1e} combinations of values are too many; a sweep may have"
-            f" {MOST_RUNS:.0e} runs: split it"
+            f"{math.prod(specification.shape):.1e} combinations of values are too many; a sweep may have"
+            f" {MAX_RUNS:.0e} runs: split it"
         )
-    joint = [name for name in axes if TOGETHER.fullmatch(name)]
+    jointly_checked = [name for name in axes if JOINTLY_CHECKED.fullmatch(name)]
     # What each number may be is a range: the ends of its values tell. In a grid these meet those of
     # others, and are checked with them; of paired values they may never.
-    ends = {name: (axes[name].min(), axes[name].max()) for name in axes if name not in joint}
+    ranges = {
+        name: (axes[name].min(), axes[name].max()) for name in axes if name not in jointly_checked
+    }
     if paired:
-        rows = [{name: value} for name, values in ends.items() for value in values]
+        rows = [{name: value} for name, values in ranges.items() for value in values]
     else:
-        rows = [dict(zip(ends, row, strict=True)) for row in zip(*ends.values(), strict=True)]
-    columns = [list(axes).index(name) for name in joint]
-    if joint:
+        rows = [dict(zip(ranges, row, strict=True)) for row in zip(*ranges.values(), strict=True)]
+    columns = [list(axes).index(name) for name in jointly_checked]
+    if jointly_checked:
         rows += [
-            dict(zip(joint, row, strict=True))
-            for row in np.unique(order.runs()[:, columns], axis=0)
+            dict(zip(jointly_checked, row, strict=True))
+            for row in np.unique(specification.runs()[:, columns], axis=0)
         ]
     for row in rows:
         check(replace(case, row))
-    return order
+    return specification
 
 
-def _values(case: Case, address: str, given: Any) -> Float[np.ndarray, " value"]:
+def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.ndarray, " value"]:
     """The values of an address, as far as they can be checked without those of others."""
     if np.ndim(value_at(case, address)):
         raise ValueError(f"{address} is a list; sweep over one of its entries, {address}.0")
     try:
-        values = np.atleast_1d(np.asarray(given, float))
+        values = np.atleast_1d(np.asarray(values_given, float))
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{address} takes a list of numbers, not {in_words(given)}") from None
+        raise ValueError(
+            f"{address} takes a list of numbers, not {in_words(values_given)}"
+        ) from None
     if values.ndim != 1 or values.size == 0:
         raise ValueError(f"{address} takes a list of values, not one of shape {values.shape}")
-    if case.controller is not None and CLOCK.fullmatch(address):
+    if case.controller is not None and CLOCK_ADDRESS.fullmatch(address):
         raise ValueError(
             f"{address} sets the clock of the run, which all runs with a controller share:"
             " make a sweep for each of its values"
         )
-    if not TOGETHER.fullmatch(address):
+    if not JOINTLY_CHECKED.fullmatch(address):
         # Zero may be left out of what is allowed.
         for value in values[~np.isfinite(values) | (values == 0)][:1]:
             check(replace(case, {address: value}))

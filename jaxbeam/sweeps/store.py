@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
     import zarr  # takes long to import; only sweeps that are kept need it
 
-FINGERPRINT = "jaxbeam_sweep"
-BLOCKS = "blocks"
-DAMAGE = (OSError, ValueError, KeyError, TypeError, RuntimeError)  # what zarr raises for it
+FINGERPRINT_ATTRIBUTE = "jaxbeam_sweep"
+BLOCKS_GROUP = "blocks"
+DAMAGE_ERRORS = (OSError, ValueError, KeyError, TypeError, RuntimeError)  # what zarr raises for it
 
 
 @runtime_checkable
-class Keeper(Protocol):
+class BlockStore(Protocol):
     """Keeps finished blocks: in memory or on disk."""
 
     def missing(self) -> list[int]:
@@ -48,7 +48,7 @@ class Keeper(Protocol):
         ...
 
 
-class Memory(Keeper):
+class MemoryStore(BlockStore):
     """Keeps blocks in memory."""
 
     def __init__(self, blocks: int):
@@ -68,8 +68,8 @@ class Memory(Keeper):
         pass
 
 
-class Disk(Keeper):
-    """Keeps blocks in a zarr store; `steps` is what `create` was given with them.
+class ZarrStore(BlockStore):
+    """Keeps blocks in a zarr store; `steps` is what `create_store` was given with them.
 
     Raises ValueError if it cannot be read.
     """
@@ -78,66 +78,66 @@ class Disk(Keeper):
         import zarr
 
         self._path = path
-        with _reading(path):
-            self._blocks: Any = zarr.open_group(path, mode="r+")[BLOCKS]
+        with _explaining_damage(path):
+            self._blocks: Any = zarr.open_group(path, mode="r+")[BLOCKS_GROUP]
             self.steps = np.asarray(self._blocks["steps"][:])
             self._flags = self._blocks["done"]
             self._count = self._flags.shape[0]
         self._arrays: dict[str, Any] = {}  # opened once: to open one takes as long as to write
 
-    def order(self) -> dict[str, Any]:
-        """What was ordered, as it was given to `create`."""
-        with _reading(self._path):
+    def specification(self) -> dict[str, Any]:
+        """What was ordered, as it was given to `create_store`."""
+        with _explaining_damage(self._path):
             return json.loads(np.asarray(self._blocks["order"][:]).tobytes())
 
     def missing(self) -> list[int]:
-        marked = [block for block in range(self._count) if self._flagged(block)]
-        damaged = [] if self._readable() else [b for b in marked if not self._sound(b)]
+        flagged = [block for block in range(self._count) if self._is_flagged(block)]
+        damaged = [] if self._all_readable() else [b for b in flagged if not self._is_intact(b)]
         if damaged:
             warnings.warn(
                 f"{self._path}: {len(damaged)} finished blocks are damaged and are computed again",
                 stacklevel=3,
             )
-        return sorted(set(range(self._count)) - set(marked) | set(damaged))
+        return sorted(set(range(self._count)) - set(flagged) | set(damaged))
 
-    def done(self, block: int) -> bool:
+    def is_done(self, block: int) -> bool:
         """Whether a block has been written."""
-        return self._flagged(block) and self._sound(block)
+        return self._is_flagged(block) and self._is_intact(block)
 
     def write(self, block: int, results: dict[str, np.ndarray]) -> None:
-        with _writing(self._path):
+        with _explaining_write_errors(self._path):
             for name, values in results.items():
                 size = values.shape[0]
-                self._array(name, values)[block * size : (block + 1) * size] = values
+                self._result_array(name, values)[block * size : (block + 1) * size] = values
             self._flags[block] = True
 
     def collect(self) -> dict[str, np.ndarray]:
-        with _reading(self._path):
+        with _explaining_damage(self._path):
             return {name: np.asarray(self._blocks[name][:]) for name in self._names()}
 
     def finish(self, dataset: xarray.Dataset) -> None:
-        with _writing(self._path):
+        with _explaining_write_errors(self._path):
             # What an interrupted attempt has left may be incomplete.
-            for part in self._path.iterdir():
-                if part.is_dir() and part.name != BLOCKS:
-                    shutil.rmtree(part)
+            for folder in self._path.iterdir():
+                if folder.is_dir() and folder.name != BLOCKS_GROUP:
+                    shutil.rmtree(folder)
             # Words of fixed length have no settled place in the format, words of any length do.
-            words = dataset["sensor"].values.astype(object)
-            dataset.assign_coords(sensor=words).to_zarr(
+            labels = dataset["sensor"].values.astype(object)
+            dataset.assign_coords(sensor=labels).to_zarr(
                 self._path,
                 mode="a",
                 consolidated=False,
                 write_empty_chunks=True,
-                encoding={name: {"compressors": _checked()} for name in dataset.variables},
+                encoding={name: {"compressors": _checksummed()} for name in dataset.variables},
             )
             # From here on the store is complete: a group is one by its description.
-            (self._path / BLOCKS / "zarr.json").unlink()
-            shutil.rmtree(self._path / BLOCKS)
+            (self._path / BLOCKS_GROUP / "zarr.json").unlink()
+            shutil.rmtree(self._path / BLOCKS_GROUP)
 
     def _names(self) -> list[str]:
         return sorted(set(self._blocks.array_keys()) - {"done", "steps", "order"})
 
-    def _array(self, name: str, values: np.ndarray) -> Any:
+    def _result_array(self, name: str, values: np.ndarray) -> Any:
         """The array for all results of a name, created from those of the first block."""
         if name not in self._arrays:
             if name not in self._blocks:
@@ -146,81 +146,81 @@ class Disk(Keeper):
                     shape=(self._count * values.shape[0], *values.shape[1:]),
                     chunks=values.shape,
                     dtype=values.dtype,
-                    **_careful(),
+                    **_array_options(),
                 )
             self._arrays[name] = self._blocks[name]
         return self._arrays[name]
 
-    def _flagged(self, block: int) -> bool:
-        if not (self._path / BLOCKS / "done" / "c" / str(block)).is_file():
+    def _is_flagged(self, block: int) -> bool:
+        if not (self._path / BLOCKS_GROUP / "done" / "c" / str(block)).is_file():
             return False
         try:
             return bool(self._flags[block])
-        except DAMAGE:
+        except DAMAGE_ERRORS:
             return False
 
-    def _readable(self) -> bool:
+    def _all_readable(self) -> bool:
         """Whether all that is there can be read, found out quickly."""
         try:
-            whole = all(_is_whole(self._blocks[name]) for name in self._names())
+            whole = all(_is_complete(self._blocks[name]) for name in self._names())
             return whole and bool(self.collect())
         except ValueError:
             return False
 
-    def _sound(self, block: int) -> bool:
+    def _is_intact(self, block: int) -> bool:
         """Whether all results of a block are there and can be read."""
         try:
             for name in self._names():
                 array = self._blocks[name]
                 size = array.chunks[0]
                 chunk = Path("c", str(block), *["0"] * (array.ndim - 1))
-                if not (self._path / BLOCKS / name / chunk).is_file():
+                if not (self._path / BLOCKS_GROUP / name / chunk).is_file():
                     return False
                 array[block * size : (block + 1) * size]
-        except DAMAGE:
+        except DAMAGE_ERRORS:
             return False
         return True
 
 
-def read(path: Path) -> xarray.Dataset:
+def read_dataset(path: Path) -> xarray.Dataset:
     """The dataset of a complete store. Raises ValueError if part of it is missing or damaged."""
     import xarray
     import zarr
 
-    shutil.rmtree(path / BLOCKS, ignore_errors=True)  # a kill may have left its chunks behind
-    with _reading(path):
+    shutil.rmtree(path / BLOCKS_GROUP, ignore_errors=True)  # a kill may have left its chunks behind
+    with _explaining_damage(path):
         group = zarr.open_group(path, mode="r")
-        parts: dict[str, Any] = {
+        arrays: dict[str, Any] = {
             part.name: group[part.name] for part in path.iterdir() if part.is_dir()
         }
-        broken = [name for name, array in parts.items() if not _is_whole(array)]
-        if broken:
-            raise ValueError(f"parts of {', '.join(sorted(broken))} are missing")
+        incomplete = [name for name, array in arrays.items() if not _is_complete(array)]
+        if incomplete:
+            raise ValueError(f"parts of {', '.join(sorted(incomplete))} are missing")
         return xarray.open_zarr(path, consolidated=False).load()
 
 
-def _checked():
+def _checksummed():
     from zarr.codecs import ZstdCodec
 
     return [ZstdCodec(checksum=True)]
 
 
-def _careful() -> dict[str, Any]:
+def _array_options() -> dict[str, Any]:
     """How arrays are written so that what is damaged or missing can be told."""
-    return {"compressors": _checked(), "config": {"write_empty_chunks": True}}
+    return {"compressors": _checksummed(), "config": {"write_empty_chunks": True}}
 
 
-def _is_whole(array: zarr.Array) -> bool:
+def _is_complete(array: zarr.Array) -> bool:
     """Whether every chunk of an array is there: zarr reads those that are not as zeros."""
     return array.nchunks_initialized == array.nchunks
 
 
 @contextlib.contextmanager
-def _reading(path: Path):
+def _explaining_damage(path: Path):
     """Turn what damaged files make zarr raise into one sentence."""
     try:
         yield
-    except DAMAGE as error:
+    except DAMAGE_ERRORS as error:
         raise ValueError(
             f"{path} is damaged ({' '.join(str(error).split())}): make the sweep anew, under"
             " another name or with overwrite"
@@ -228,7 +228,7 @@ def _reading(path: Path):
 
 
 @contextlib.contextmanager
-def _writing(path: Path):
+def _explaining_write_errors(path: Path):
     """Say in one sentence what kept a sweep from being written, and that nothing is lost."""
     try:
         yield
@@ -249,16 +249,16 @@ def status(path: Path) -> tuple[str, str] | None:
     if not path.exists():
         return None
     try:
-        fingerprint = str(zarr.open_group(path, mode="r").attrs[FINGERPRINT])
+        fingerprint = str(zarr.open_group(path, mode="r").attrs[FINGERPRINT_ATTRIBUTE])
     except (KeyError, OSError, ValueError):
         raise FileExistsError(
             f"{path} exists and is not a sweep of jaxbeam; choose another name"
         ) from None
-    unfinished = (path / BLOCKS / "zarr.json").exists()
+    unfinished = (path / BLOCKS_GROUP / "zarr.json").exists()
     return "unfinished" if unfinished else "complete", fingerprint
 
 
-def prepare(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> str:
+def resolve_action(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> str:
     """Decide what to do about a path: "new", "resume" or "complete"; nothing is changed there.
 
     Raises FileExistsError if a sweep is there and neither `resume` nor `overwrite` is set, and
@@ -266,25 +266,25 @@ def prepare(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> str:
     """
     if resume and overwrite:
         raise ValueError("resume continues a sweep, overwrite discards it; choose one of them")
-    found = status(path)
-    if found is None or overwrite:
-        check_folder(path)
+    existing = status(path)
+    if existing is None or overwrite:
+        check_writable(path)
         return "new"
     if not resume:
         raise FileExistsError(
-            f"{path} holds a sweep already ({found[0]}); resume it, overwrite it, or choose "
+            f"{path} holds a sweep already ({existing[0]}); resume it, overwrite it, or choose "
             "another name"
         )
-    if found[1] != fingerprint:
+    if existing[1] != fingerprint:
         raise ValueError(
             f"{path} holds a sweep of another case, other values or settings, or by another"
             " version (steps that `jaxbeam native` has compiled are one): it cannot be resumed with"
             " these; choose another name, or overwrite it"
         )
-    return "complete" if found[0] == "complete" else "resume"
+    return "complete" if existing[0] == "complete" else "resume"
 
 
-def check_folder(path: Path) -> None:
+def check_writable(path: Path) -> None:
     """Raises OSError, before any work, if nothing can be written beside a path."""
     try:
         tempfile.TemporaryFile(dir=path.parent).close()
@@ -295,14 +295,14 @@ def check_folder(path: Path) -> None:
         ) from None
 
 
-def create(
+def create_store(
     path: Path,
     fingerprint: str,
-    order: dict[str, Any],
+    specification: dict[str, Any],
     blocks: int,
     steps: np.ndarray,
     overwrite: bool = False,
-) -> Disk:
+) -> ZarrStore:
     """Start a store for a number of blocks; `steps` (s) are the time steps of the tasks.
 
     What was ordered, in plain words and numbers, is kept with them. With `overwrite` what is at
@@ -311,17 +311,21 @@ def create(
     import zarr
 
     # Built aside and moved into place: a store either exists whole or not at all.
-    fresh = path.with_name(f".{path.name}.new")
-    shutil.rmtree(fresh, ignore_errors=True)
-    with _writing(path):
-        group = zarr.create_group(fresh)
-        inner = group.create_group(BLOCKS)
-        inner.create_array("done", shape=(blocks,), chunks=(1,), dtype=bool, fill_value=False)
-        inner.create_array("steps", data=np.asarray(steps, float), compressors=_checked())
-        words = np.frombuffer(json.dumps(order).encode(), np.uint8)
-        inner.create_array("order", data=words, compressors=_checked())
-        group.attrs[FINGERPRINT] = fingerprint
+    temporary_path = path.with_name(f".{path.name}.new")
+    shutil.rmtree(temporary_path, ignore_errors=True)
+    with _explaining_write_errors(path):
+        group = zarr.create_group(temporary_path)
+        blocks_group = group.create_group(BLOCKS_GROUP)
+        blocks_group.create_array(
+            "done", shape=(blocks,), chunks=(1,), dtype=bool, fill_value=False
+        )
+        blocks_group.create_array(
+            "steps", data=np.asarray(steps, float), compressors=_checksummed()
+        )
+        specification_bytes = np.frombuffer(json.dumps(specification).encode(), np.uint8)
+        blocks_group.create_array("order", data=specification_bytes, compressors=_checksummed())
+        group.attrs[FINGERPRINT_ATTRIBUTE] = fingerprint
         if overwrite:
             shutil.rmtree(path, ignore_errors=True)
-        fresh.rename(path)
-    return Disk(path)
+        temporary_path.rename(path)
+    return ZarrStore(path)

@@ -15,9 +15,9 @@ from jaxbeam.case.case import Case
 from jaxbeam.simulation.integration_plan import TOLERANCE, sample_times
 from jaxbeam.simulation.record import sensor_labels
 from jaxbeam.sweeps import cluster, store as sweep_store
-from jaxbeam.sweeps.batches import Tasks
-from jaxbeam.sweeps.blocks import Work
-from jaxbeam.sweeps.specification import Order, make_order
+from jaxbeam.sweeps.batches import Batches
+from jaxbeam.sweeps.blocks import Runner
+from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -67,58 +67,64 @@ def sweep(
     """
     if client is not None and store is None:
         raise ValueError("workers write their blocks to a store; name one")
-    order = make_order(case, over, paired, histories, tolerance, precision)
+    specification = sweep_specification(case, over, paired, histories, tolerance, precision)
     path = None if store is None else Path(store).absolute()
-    mark = order.fingerprint()
-    state = "new" if path is None else sweep_store.prepare(path, mark, resume, overwrite)
+    fingerprint = specification.fingerprint()
+    state = (
+        "new" if path is None else sweep_store.resolve_action(path, fingerprint, resume, overwrite)
+    )
     if path is not None and state == "complete":
-        return sweep_store.read(path)
+        return sweep_store.read_dataset(path)
 
-    work = order.work()
+    runner = specification.runner()
     if path is not None and state == "resume":
-        keeper = sweep_store.Disk(path)
-        steps, error = keeper.steps[:-1], float(keeper.steps[-1])
+        block_store = sweep_store.ZarrStore(path)
+        steps, error = block_store.steps[:-1], float(block_store.steps[-1])
     else:
-        steps, error = work.steps()
+        steps, error = runner.choose_step_sizes()
         if path is None:
-            keeper = sweep_store.Memory(work.blocks)
+            block_store = sweep_store.MemoryStore(runner.block_count)
         else:
-            kept = np.append(steps, error)
-            content = order.to_dict()
-            keeper = sweep_store.create(path, mark, content, work.blocks, kept, overwrite)
-    todo = keeper.missing()
+            step_sizes_and_error = np.append(steps, error)
+            content = specification.to_dict()
+            block_store = sweep_store.create_store(
+                path, fingerprint, content, runner.block_count, step_sizes_and_error, overwrite
+            )
+    missing = block_store.missing()
     # The first block is always computed here: the arrays of the store are made for it.
-    here = todo if client is None else todo[:1]
-    with _progress(work, todo, progress) as bar:
-        for block in _compute(work, here, steps, keeper):
-            bar.update(work.runs(block))
+    computed_locally = missing if client is None else missing[:1]
+    with _progress(runner, missing, progress) as progress_bar:
+        for block in _compute(runner, computed_locally, steps, block_store):
+            progress_bar.update(runner.run_count(block))
         if client is not None:
-            for block in cluster.compute(client, mark, path, todo[1:]):
-                bar.update(work.runs(block))
-    dataset = _label(order, work.tasks, keeper.collect())
-    dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT: mark}
-    keeper.finish(dataset)
+            for block in cluster.compute_blocks(client, fingerprint, path, missing[1:]):
+                progress_bar.update(runner.run_count(block))
+    dataset = _to_dataset(specification, runner.batches, block_store.collect())
+    dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT_ATTRIBUTE: fingerprint}
+    block_store.finish(dataset)
     return dataset
 
 
-def _progress(work: Work, todo: list[int], shown: bool) -> tqdm:
+def _progress(runner: Runner, missing: list[int], visible: bool) -> tqdm:
     """A bar that counts runs, those that are done already among them."""
-    count = int(np.sum(work.tasks.index >= 0))
-    left = sum(work.runs(block) for block in todo)
-    return tqdm(total=count, initial=count - left, unit="run", disable=not shown, file=sys.stderr)
+    count = int(np.sum(runner.batches.run_index >= 0))
+    left = sum(runner.run_count(block) for block in missing)
+    return tqdm(total=count, initial=count - left, unit="run", disable=not visible, file=sys.stderr)
 
 
-def _compute(work: Work, blocks: list[int], steps, keeper: sweep_store.Keeper) -> Iterator[int]:
+def _compute(
+    runner: Runner, blocks: list[int], steps, block_store: sweep_store.BlockStore
+) -> Iterator[int]:
     """Compute blocks on all cores and keep them, giving the number of each that is done."""
-    results = work.pool.map(lambda block: (block, work.block(block, steps)), blocks)
+    results = runner.pool.map(lambda block: (block, runner.compute_block(block, steps)), blocks)
     # Closed early, by an error or the keyboard, blocks not yet begun are called off.
     with closing(results):  # type: ignore[type-var]
         for block, result in results:
-            keeper.write(block, result)
+            block_store.write(block, result)
             yield block
 
 
-_UNITS = {
+_VARIABLES = {
     "peak_deflection": ("m", "largest absolute deflection", ("sensor",)),
     "peak_time": ("s", "time of the largest absolute deflection", ("sensor",)),
     "lowest_contact_force": ("N", "smallest contact force", ("load",)),
@@ -128,36 +134,42 @@ _UNITS = {
 }
 
 
-def _label(order: Order, tasks: Tasks, results: dict[str, np.ndarray]) -> "xarray.Dataset":
+def _to_dataset(
+    specification: SweepSpecification, batches: Batches, results: dict[str, np.ndarray]
+) -> "xarray.Dataset":
     """Results of all tasks as a dataset labelled by address."""
     import xarray
 
-    case, dims, shape = order.case, order.dims, order.shape
-    real = tasks.index >= 0
+    case, dims, shape = specification.case, specification.dims, specification.shape
+    mask = batches.run_index >= 0
     flat = {}
     for name, values in results.items():
-        values = values[: tasks.index.shape[0]][real]
+        values = values[: batches.run_index.shape[0]][mask]
         flat[name] = np.empty_like(values)
-        flat[name][tasks.index[real]] = values
+        flat[name][batches.run_index[mask]] = values
     peaks = flat["peak_deflection"]
     failed = ~np.all(np.isfinite(peaks), axis=1)
     variables: dict[str, Any] = {
         "failed": (dims, failed.reshape(shape), {"long_name": "whether the run failed"})
     }
     for name, values in flat.items():
-        unit, words, own = _UNITS[name]
+        unit, words, dims_of_variable = _VARIABLES[name]
         values = np.where(failed.reshape(-1, *(1,) * (values.ndim - 1)), np.nan, values)
         attributes = {"units": unit, "long_name": words}
-        variables[name] = ((*dims, *own), values.reshape(*shape, *values.shape[1:]), attributes)
+        variables[name] = (
+            (*dims, *dims_of_variable),
+            values.reshape(*shape, *values.shape[1:]),
+            attributes,
+        )
     coordinates: dict[str, Any] = {
-        address: ("run" if order.paired else address, values)
-        for address, values in order.axes.items()
+        address: ("run" if specification.paired else address, values)
+        for address, values in specification.axes.items()
     }
     coordinates["sensor"] = ("sensor", sensor_labels(case))
     if "deflection" in flat:
         coordinates["time"] = ("time", np.asarray(sample_times(case)), {"units": "s"})
     attributes = {
         "title": case.title,
-        "case": json.dumps(order.words),
+        "case": json.dumps(specification.case_dict),
     }
     return xarray.Dataset(variables, coordinates, attributes)

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.compare import compare
-from jaxbeam.analysis.computing_time import step_times
-from jaxbeam.analysis.crossing_margin import PLACES, reserve
+from jaxbeam.analysis.computing_time import computing_times
+from jaxbeam.analysis.crossing_margin import LOAD_POSITIONS, stability_margin
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.plot import plot_comparison
@@ -102,7 +102,7 @@ def test_merits_are_those_of_the_records(found):
     assert found.merits["wild"].share < 0
     assert found.merits["wild"].saturated[0] > 0.1 > found.merits["weak"].saturated[0]
     assert found.bound.share(found.best) > 0.99
-    assert np.all(np.isnan(step_times(found.free)))
+    assert np.all(np.isnan(computing_times(found.free)))
 
 
 def critical_gain(case: jb.Case, place: float) -> float:
@@ -125,7 +125,9 @@ def critical_gain(case: jb.Case, place: float) -> float:
 
 
 def test_the_margin_is_that_of_the_worst_place_of_the_parked_mass(found):
-    gains = [critical_gain(found.records["weak"].case, x) for x in np.linspace(0, 0.6, PLACES)]
+    gains = [
+        critical_gain(found.records["weak"].case, x) for x in np.linspace(0, 0.6, LOAD_POSITIONS)
+    ]
     assert_allclose(found.merits["weak"].reserve.gain, min(gains) / 2000.0, rtol=1e-9)
     assert 0 < found.merits["weak"].reserve.delay < 0.01
     assert found.merits["weak"].reserve.obstacle == ""
@@ -142,7 +144,7 @@ def test_what_is_no_linear_loop_has_no_margin(found, folder):
             "sensors.0.sampling_period must be the controller's",
         ),
     ):
-        missing = reserve(dataclasses.replace(found.case, **changes))
+        missing = stability_margin(dataclasses.replace(found.case, **changes))
         assert np.isnan(missing.gain) and np.isnan(missing.delay)
         assert obstacle in missing.obstacle
 

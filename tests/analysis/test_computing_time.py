@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.analysis.computing_time import WALKED, _changes, _ticks, timed
+from jaxbeam.analysis.computing_time import MAX_STEPS, _changing_leaves, _sample_indices, time_steps
 from jaxbeam.case.controller import AbstractController
 
 
@@ -29,7 +29,7 @@ def test_the_worst_step_is_told_from_the_median():
     law = Laborious(period=0.01)
     memory, none = law.init(None), np.zeros((41, 0))
     seen = jnp.asarray(readings), jnp.asarray(none), jnp.zeros((41, 1))
-    found = timed(law, memory, seen, jnp.arange(41) * 0.01)
+    found = time_steps(law, memory, seen, jnp.arange(41) * 0.01)
     assert 8 * found.median < found.worst < 100 * found.median
     assert 1e-8 < found.median < 1e-4
     # In a batch all wait for the slowest, but many share the call.
@@ -39,10 +39,10 @@ def test_the_worst_step_is_told_from_the_median():
 def test_only_what_a_step_changes_is_carried():
     law = Laborious(period=0.01)
     seen = jnp.ones(1), jnp.zeros(0), jnp.zeros(1)
-    assert _changes(law, law.init(None), seen, jnp.zeros(())) == (False, True)
+    assert _changing_leaves(law, law.init(None), seen, jnp.zeros(())) == (False, True)
 
 
 def test_ticks_are_the_samples_at_multiples_of_the_period():
     times = np.arange(0, 1001) / 1000
-    assert _ticks(times, jnp.asarray(0.01)).tolist() == list(range(0, 1001, 10))
-    assert _ticks(times, None).tolist() == list(range(WALKED))
+    assert _sample_indices(times, jnp.asarray(0.01)).tolist() == list(range(0, 1001, 10))
+    assert _sample_indices(times, None).tolist() == list(range(MAX_STEPS))

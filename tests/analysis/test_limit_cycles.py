@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.crossing_margin import reserve
-from jaxbeam.analysis.limit_cycles import counted, swings, turning_points
+from jaxbeam.analysis.crossing_margin import stability_margin
+from jaxbeam.analysis.limit_cycles import command_oscillations, count_oscillations, turning_points
 from jaxbeam.rigs import load
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 
 TIMES = np.arange(2001) / 1000
 
@@ -26,12 +26,12 @@ def test_turning_points_are_extremes_that_count():
 
 def test_swings_are_counted_beside_those_of_the_beam():
     growing, still = np.exp(TIMES) * np.sin(2 * np.pi * 9.0 * TIMES), np.zeros(TIMES.size)
-    free = counted(TIMES, growing, still > 0, still)
+    free = count_oscillations(TIMES, growing, still > 0, still)
     assert free.oscillates and not free.limit_cycle
     assert_allclose(free.frequency, 9.0, rtol=0.02)
-    held = counted(TIMES, np.clip(growing, -2, 2), np.abs(growing) >= 2, still)
+    held = count_oscillations(TIMES, np.clip(growing, -2, 2), np.abs(growing) >= 2, still)
     assert held.limit_cycle and held.at_limits > 10
-    forced = counted(TIMES, -growing, still > 0, growing)
+    forced = count_oscillations(TIMES, -growing, still > 0, growing)
     assert forced.extra == 0 and not forced.oscillates
 
 
@@ -55,7 +55,7 @@ def test_growth_with_a_parked_load_is_that_of_the_reference():
         controller=jb.Feedback([2e3]),
         run=jb.Run(1.2),
     )
-    lost = reserve(case).unstable
+    lost = stability_margin(case).unstable
     assert lost is not None and lost.start < 0.6 < lost.end
     assert_allclose(lost.rate, 0.6891684603605122, rtol=1e-6)
     assert_allclose(2 * np.pi * lost.frequency, 62.83126204745206, rtol=1e-6)
@@ -70,14 +70,14 @@ def test_too_high_a_gain_ends_in_a_limit_cycle_as_published():
     """
     case = unstable_rig(3.0, 0.03, 0.01)
     free = dataclasses.replace(case, controller=None)
-    plan, plain = make_plan(case, None, 1e-4), make_plan(free, None, 1e-4)
+    plan, plain = integration_plan(case, None, 1e-4), integration_plan(free, None, 1e-4)
     for mass, cycles in ((0.261, False), (0.322, True), (0.509, True)):
         heavy = {"loads.0.mass": mass}
-        found = swings(
+        found = command_oscillations(
             jb.simulate(jb.replace(case, heavy), plan=plan),
             jb.simulate(jb.replace(free, heavy), plan=plain),
         )
         assert [one.limit_cycle for one in found] == [cycles, cycles]
-    lost = reserve(jb.replace(case, {"loads.0.mass": 0.322})).unstable
+    lost = stability_margin(jb.replace(case, {"loads.0.mass": 0.322})).unstable
     assert lost is not None and lost.rate > 1
     assert_allclose(found[0].frequency, lost.frequency, rtol=0.25)

@@ -7,7 +7,7 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linear_loop
+from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.analysis.margins import margins
 from tests.loop_as_oracle import span_of
 
@@ -50,5 +50,5 @@ def critical(case: jb.Case, waiting: int) -> float:
 def test_commands_that_wait_for_several_periods(waiting):
     """Their chain of states has a single eigenvector."""
     case = rig(waiting * PERIOD)
-    found = margins(linear_loop(case, 0.0))
+    found = margins(linearised_loop(case, 0.0))
     assert_allclose(found.gain, critical(case, waiting) / GAIN, rtol=1e-8)

@@ -9,10 +9,10 @@ import scipy.integrate
 import scipy.linalg
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linear_loop
+from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.analysis.margins import gramians, margins
-from jaxbeam.analysis.stability import _followed, frozen_poles, growth, stream
-from jaxbeam.analysis.stability_limits import limit
+from jaxbeam.analysis.stability import _tracked_branches, frozen_poles, growth, stream
+from jaxbeam.analysis.stability_limits import stability_limit
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.model.state_space import state_space
 from tests.modules import DATA
@@ -96,7 +96,7 @@ def test_frozen_poles_of_the_published_regulator():
     printed = REFERENCE["frozen_closed_loop_poles_time_invariant_all_states_mass_at_0.25m"]
     printed = np.array([complex(*pole) for pole in printed])
     np.testing.assert_allclose(np.sort_complex(found.poles[1]), np.sort_complex(printed), rtol=1e-6)
-    assert found.largest[2] == pytest.approx(found.poles[2].real.max())
+    assert found.largest_real_part[2] == pytest.approx(found.poles[2].real.max())
 
 
 def test_pole_of_the_published_filtered_loop():
@@ -109,18 +109,18 @@ def test_pole_of_the_published_filtered_loop():
         loads=[jb.MovingMass(mass=0.509, times=[0.0, 1.0], positions=[0.3, 0.3])],
         controller=jb.Feedback([2000.0 * 200.0]),
     )  # fmt: skip
-    loop = linear_loop(case, 0.5)
+    loop = linearised_loop(case, 0.5)
     rightmost = loop.poles()[0]
     assert rightmost.real == pytest.approx(0.6891684603605122, rel=1e-6)
     assert abs(rightmost.imag) == pytest.approx(62.83126204745206, rel=1e-8)
-    assert loop.rate() == pytest.approx(rightmost.real, rel=1e-9)
+    assert loop.growth_rate() == pytest.approx(rightmost.real, rel=1e-9)
 
 
 def test_branches_are_followed_through_a_crossing():
     t = np.linspace(-1, 1, 21)
     up, down = -1 + 0.5 * t + 3j, -1 - 0.4 * t + 3j + 0.05j
     sorted_by_size = np.sort(np.stack([up, down], axis=1), axis=1)
-    followed = _followed(sorted_by_size)
+    followed = _tracked_branches(sorted_by_size)
     np.testing.assert_array_equal(followed[:, 0], np.where(followed[0, 0] == up[0], up, down))
 
 
@@ -140,7 +140,7 @@ def test_sampled_poles_are_those_of_the_simulated_decay():
         controller=case.controller,
         run=jb.Run(duration=1.0, sample_rate=250.0),
     )
-    poles = linear_loop(case, 0.9).poles()
+    poles = linearised_loop(case, 0.9).poles()
     record = jb.simulate(case)
     z = np.exp(poles[0] * 0.004)
     assert poles[1] == pytest.approx(poles[0].conj()) and poles[2].real < poles[0].real - 5
@@ -196,7 +196,9 @@ def test_multipliers_of_a_stream_against_scipy():
 def test_sampled_stream_comes_to_the_continuous_one():
     def largest(period):
         law = jb.StateFeedback(gain=GAIN, coordinates="sine", period=period)
-        return stream(jb.replace(rig(law, modes=2), {"loads.0.speed": 20.0}), 0.04).largest
+        return stream(
+            jb.replace(rig(law, modes=2), {"loads.0.speed": 20.0}), 0.04
+        ).largest_multiplier
 
     # A hold is late by half a period: the difference is of first order.
     exact = largest(None)
@@ -211,27 +213,27 @@ def test_limit_of_a_gain_is_its_gain_margin():
     )
 
     def worst(case):
-        return frozen_poles(case, np.array([0.5])).largest.max()
+        return frozen_poles(case, np.array([0.5])).largest_real_part.max()
 
-    found = limit(case, "controller.gains.0", 100.0, 1e5, worst, points=8)
-    margin = margins(linear_loop(case, 0.5))
+    found = stability_limit(case, "controller.gains.0", 100.0, 1e5, worst, points=8)
+    margin = margins(linearised_loop(case, 0.5))
     assert found == pytest.approx(100.0 * margin.gain, rel=1e-5)
-    assert margin.gain_down == 0.0
+    assert margin.lower_gain == 0.0
     with pytest.raises(ValueError, match="unstable already at controller.gains.0 = 20000"):
-        limit(case, "controller.gains.0", 2e4, 1e5, worst)
-    assert limit(case, "controller.gains.0", 100.0, 200.0, worst, points=2) is None
+        stability_limit(case, "controller.gains.0", 2e4, 1e5, worst)
+    assert stability_limit(case, "controller.gains.0", 100.0, 200.0, worst, points=2) is None
 
 
 def test_margins_against_python_control():
     control = pytest.importorskip("control")
-    loop = linear_loop(rig(jb.Feedback([3000.0]), modes=2), 0.0)
+    loop = linearised_loop(rig(jb.Feedback([3000.0]), modes=2), 0.0)
     found = margins(loop)
     system = control.ss(*(np.asarray(part) for part in (loop.A, loop.B, -loop.K)), 0)
     gain, phase, distance, _, crossover, _ = control.stability_margins(system)
     assert found.gain == pytest.approx(gain, rel=1e-6)
     assert found.phase == pytest.approx(np.radians(phase), rel=1e-6)
     assert found.delay == pytest.approx(np.radians(phase) / crossover, rel=1e-6)
-    assert found.distance == pytest.approx(distance, rel=1e-6)
+    assert found.modulus_margin == pytest.approx(distance, rel=1e-6)
     # Nothing that is fed back comes round: no gain and no delay of it matters.
     silent = dataclasses.replace(loop, K=0.0 * loop.K)
     assert margins(silent) == (np.inf, 0.0, np.inf, np.inf, 1.0)
@@ -239,7 +241,7 @@ def test_margins_against_python_control():
 
 def test_at_the_gain_margin_a_pole_is_on_the_limit():
     # Here it leaves through -1, at half the sampling frequency.
-    loop = linear_loop(rig(regulator(period=0.002)), 0.0)
+    loop = linearised_loop(rig(regulator(period=0.002)), 0.0)
     A, B, K = (np.asarray(part) for part in (loop.A, loop.B, loop.K))
     gain = margins(loop).gain
     assert np.abs(np.linalg.eigvals(A + gain * B @ K)).max() == pytest.approx(1.0, abs=1e-9)
@@ -248,10 +250,10 @@ def test_at_the_gain_margin_a_pole_is_on_the_limit():
 
 
 def test_delay_margin_is_the_delay_that_destabilises():
-    found = margins(linear_loop(rig(jb.Feedback([1500.0], period=0.002), modes=2), 0.0))
+    found = margins(linearised_loop(rig(jb.Feedback([1500.0], period=0.002), modes=2), 0.0))
     for share, stable in ((0.98, True), (1.02, False)):
         later = jb.Feedback([1500.0], period=0.002, delay=share * found.delay)
-        poles = linear_loop(rig(later, modes=2), 0.0).poles()
+        poles = linearised_loop(rig(later, modes=2), 0.0).poles()
         assert (poles.real.max() < 0) == stable
 
 
@@ -264,20 +266,20 @@ def test_gramians_against_scipy():
     scale = np.sqrt(np.outer(np.diag(reach), np.diag(reach)))
     product = np.asarray(found.controllability @ found.controllability.T)
     np.testing.assert_allclose(product / scale, reach / scale, atol=1e-10)
-    np.testing.assert_allclose(found.reached, np.sqrt(np.diag(reach)), rtol=1e-9)
-    np.testing.assert_allclose(found.seen, np.sqrt(np.diag(view)), rtol=1e-6)
+    np.testing.assert_allclose(found.reachable_size, np.sqrt(np.diag(reach)), rtol=1e-9)
+    np.testing.assert_allclose(found.observable_size, np.sqrt(np.diag(view)), rtol=1e-6)
     expected = np.sort(np.sqrt(np.abs(np.linalg.eigvals(reach @ view))))[::-1]
     np.testing.assert_allclose(found.hankel[:6], expected[:6], rtol=1e-6)
     sampled = plant.discretize(0.003)
     A, B = np.asarray(sampled.A), np.asarray(sampled.B)
     reach = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
-    np.testing.assert_allclose(gramians(sampled).reached, np.sqrt(np.diag(reach)), rtol=1e-8)
+    np.testing.assert_allclose(gramians(sampled).reachable_size, np.sqrt(np.diag(reach)), rtol=1e-8)
 
 
 def test_what_has_no_answer_is_refused():
     case = rig(jb.Feedback([1.0], period=0.01))
     with pytest.raises(ValueError, match="there is no loop: the case has no controller"):
-        linear_loop(rig(None), 0.0)
+        linearised_loop(rig(None), 0.0)
     with pytest.raises(ValueError, match="spacing must be a whole number of the controller's"):
         stream(case, 0.0155)
     with pytest.raises(ValueError, match="a stream repeats the one load of a case; this has 0"):
@@ -285,15 +287,15 @@ def test_what_has_no_answer_is_refused():
     with pytest.raises(ValueError, match="there is no crossing: the case has no loads"):
         growth(rig(jb.Feedback([1.0]), loads=[]))
     with pytest.raises(ValueError, match="low and high must be positive and ascend"):
-        limit(case, "loads.0.mass", 2.0, 1.0)
+        stability_limit(case, "loads.0.mass", 2.0, 1.0)
     with pytest.raises(ValueError, match="the loop is unstable as it is"):
-        margins(linear_loop(rig(jb.Feedback([-1e6], period=0.01)), 0.0))
+        margins(linearised_loop(rig(jb.Feedback([-1e6], period=0.01)), 0.0))
     slow = jb.Case(
         beam=case.beam, actuators=case.actuators, controller=case.controller,
         sensors=[jb.Sensor(0.25, sampling_period=0.02)], run=case.run,
     )  # fmt: skip
     with pytest.raises(ValueError, match="sensors.0.sampling_period must be the controller's"):
-        linear_loop(slow, 0.0)
+        linearised_loop(slow, 0.0)
     free = jb.Case(beam=jb.Beam(1.0, 1.0, 1.0, modes=2), sensors=[jb.Sensor(0.2)])
     with pytest.raises(ValueError, match="Gramians need a stable system"):
         gramians(state_space(free).unloaded)

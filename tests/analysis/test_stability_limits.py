@@ -10,7 +10,11 @@ import scipy.optimize
 
 import jaxbeam as jb
 from jaxbeam.analysis.stability import frozen_poles, growth, stream
-from jaxbeam.analysis.stability_limits import LoadLimits, load_limits, streaming
+from jaxbeam.analysis.stability_limits import (
+    LoadStabilityLimits,
+    load_stability_limits,
+    stream_excess,
+)
 from jaxbeam.cli import main
 from tests.analysis import test_stability as oracle
 from tests.analysis.test_stability import LENGTH, MASS, SPEED, regulator, rig, written_out
@@ -33,7 +37,7 @@ def fastest_growth(speed, mass):
 def test_margins_of_the_published_regulator():
     """Where the largest real part of written-out poles over the crossing turns positive."""
     case = jb.replace(rig(regulator()), {"loads.0.mass": 0.15})
-    found = load_limits(case, most=2.0, points=3)
+    found = load_stability_limits(case, factor=2.0, points=3)
     mass = scipy.optimize.brentq(lambda m: fastest_growth(SPEED, m), 0.15, 0.3, rtol=1e-7)
     assert found.mass == pytest.approx(mass, rel=1e-5)
     assert found.speed == np.inf and fastest_growth(2 * SPEED, 0.15) < 0
@@ -45,7 +49,7 @@ def test_margins_of_the_published_regulator():
 )
 def test_limits_are_sought_upward_or_downward(limit, expected):
     case = rig(jb.Feedback([1.0]))
-    found = load_limits(case, lambda case: float(case.loads[0].mass) - limit, points=4)
+    found = load_stability_limits(case, lambda case: float(case.loads[0].mass) - limit, points=4)
     assert found.mass == pytest.approx(expected, rel=1e-5)
     assert found.speed == (np.inf if limit > MASS else 0.0)
 
@@ -53,12 +57,14 @@ def test_limits_are_sought_upward_or_downward(limit, expected):
 def test_what_a_load_lacks_has_no_limit():
     parked = [jb.MovingMass(mass=0.1, times=[0.0, 1.0], positions=[0.2, 0.2])]
     case = rig(jb.Feedback([1.0]), loads=parked)
-    assert load_limits(case, lambda case: -1.0, points=2) == LoadLimits(np.inf, None)
+    assert load_stability_limits(case, lambda case: -1.0, points=2) == LoadStabilityLimits(
+        np.inf, None
+    )
     left = rig(jb.Feedback([1.0]), loads=[jb.MovingMass(mass=0.1, speed=-1.0)])
-    found = load_limits(left, lambda case: -2.0 - float(case.loads[0].speed), points=4)
-    assert found == LoadLimits(np.inf, pytest.approx(2.0, rel=1e-5))
+    found = load_stability_limits(left, lambda case: -2.0 - float(case.loads[0].speed), points=4)
+    assert found == LoadStabilityLimits(np.inf, pytest.approx(2.0, rel=1e-5))
     with pytest.raises(ValueError, match="there is no load whose mass or speed"):
-        load_limits(rig(jb.Feedback([1.0]), loads=[]))
+        load_stability_limits(rig(jb.Feedback([1.0]), loads=[]))
 
 
 def test_branches_are_followed_where_modes_cross():
@@ -119,16 +125,18 @@ def test_a_stream_may_be_stable_where_frozen_poles_are_not():
     """A beam without control dissipates, whatever crosses it; its frozen poles at 12 m/s grow."""
     row, speed, spacing = np.zeros((1, 5)), 12.0, 1.5 * LENGTH / 12.0
     case = streamed(row, speed, MASS)
-    worst, found = frozen_poles(case).largest.max(), stream(case, spacing)
+    worst, found = frozen_poles(case).largest_real_part.max(), stream(case, spacing)
     assert worst == pytest.approx(largest_frozen(row, speed, MASS), rel=1e-6) and worst > 10
     expected = np.abs(np.linalg.eigvals(period(row, speed, MASS, spacing))).max()
-    assert found.largest == pytest.approx(expected, rel=1e-4) and found.stable
+    assert found.largest_multiplier == pytest.approx(expected, rel=1e-4) and found.stable
     slow = dataclasses.replace(case.loads[0], speed=np.asarray(6.0))
-    limits = load_limits(dataclasses.replace(case, loads=(slow,)), streaming(0.15), 3.0, 3)
-    assert limits == LoadLimits(np.inf, np.inf)
+    limits = load_stability_limits(
+        dataclasses.replace(case, loads=(slow,)), stream_excess(0.15), 3.0, 3
+    )
+    assert limits == LoadStabilityLimits(np.inf, np.inf)
     # By its frozen poles it would have a limit.
     limit = scipy.optimize.brentq(lambda v: largest_frozen(row, v, MASS), 6.0, 12.0, rtol=1e-7)
-    found = load_limits(dataclasses.replace(case, loads=(slow,)), most=3.0, points=3)
+    found = load_stability_limits(dataclasses.replace(case, loads=(slow,)), factor=3.0, points=3)
     assert found.speed == pytest.approx(limit, rel=1e-5)
 
 
@@ -137,7 +145,7 @@ def test_a_crossing_may_amplify_where_every_frozen_pole_decays(monkeypatch):
     monkeypatch.setattr(oracle, "DAMPER", 166.8)
     row, speed, mass = np.array([[-1740.0, 7280.0, -45.0, -290.0, 0.0]]), 10.77, 0.125
     case = streamed(row, speed, mass)
-    found, worst = growth(case, 20), frozen_poles(case).largest.max()
+    found, worst = growth(case, 20), frozen_poles(case).largest_real_part.max()
     assert worst == pytest.approx(largest_frozen(row, speed, mass), rel=1e-6) and worst < -2.5
     n, half = np.arange(1, 3) * np.pi / LENGTH, oracle.DENSITY * LENGTH / 2
     pushed = np.sin(n * oracle.PLACE)
@@ -157,9 +165,12 @@ def test_the_command_tells_limits_and_multipliers(tmp_path, capsys):
         main(["stability", str(tmp_path / "case.toml"), "--limits", "--spacing", "0.15"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
-    assert f"multiplied by at most {stream(case, 0.15).largest:.4g} each time: stable" in text
+    assert (
+        f"multiplied by at most {stream(case, 0.15).largest_multiplier:.4g} each time: stable"
+        in text
+    )
     mass = float(re.search(r"loads frozen the loop is unstable from (\S+) kg on", text)[1])
     for share, unstable in ((0.999, False), (1.001, True)):
         poles = frozen_poles(jb.replace(case, {"loads.0.mass": share * mass}))
-        assert (poles.largest.max() > 0) == unstable
+        assert (poles.largest_real_part.max() > 0) == unstable
     assert "with a stream the loop is unstable at no" in text

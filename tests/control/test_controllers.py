@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.differences import central
 from tests.loop_as_oracle import expected
 
@@ -30,8 +30,10 @@ HELD = jb.Case(
 )
 
 
-def planned(case: jb.Case, times=TIMES, substeps: int = 1) -> Plan:
-    return Plan(form(case), substeps, 0, False, 0.0, loop_schedule(case, np.asarray(times)))
+def planned(case: jb.Case, times=TIMES, substeps: int = 1) -> IntegrationPlan:
+    return IntegrationPlan(
+        static_shapes(case), substeps, 0, False, 0.0, loop_schedule(case, np.asarray(times))
+    )
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linear_loop
+from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.loop_as_oracle import expected, span_of
 
 PERIOD = 2e-3
@@ -133,7 +133,7 @@ def test_a_quick_compensator_is_its_continuous_transfer_function():
 def test_a_loop_with_compensators_is_that_of_the_oracle():
     times = np.linspace(0.0, 0.2, 41)
     case = dataclasses.replace(CASE, controller=COMPENSATORS["ppf"][0])
-    plan = Plan(form(case), 2, 0, False, 0.0, loop_schedule(case, times))
+    plan = IntegrationPlan(static_shapes(case), 2, 0, False, 0.0, loop_schedule(case, times))
     record = jb.simulate(case, jnp.asarray(times), plan)
     filters = sampled("ppf")
     memories = [np.zeros(len(low) - 1) for _, low in filters]
@@ -168,7 +168,7 @@ def test_positive_position_feedback_damps_the_mode_it_is_tuned_to():
     plant = control.ss(a, np.append(np.zeros(n), push)[:, None], np.append(push, np.zeros(n)), 0.0)
     oscillator = control.tf([gain * first**2], [1.0, 2 * ratio * first, first**2])
     truth = control.feedback(plant, oscillator, sign=1).poles()
-    found = linear_loop(case, 0.0).poles()[: truth.size]
+    found = linearised_loop(case, 0.0).poles()[: truth.size]
     near = np.abs(found[:, None] - truth).min(axis=1)
     assert np.all(near < 1e-3 * np.abs(found))
     assert truth.real.max() < -2 * 0.01 * first  # twice the damping of the beam's own
@@ -194,7 +194,7 @@ def test_poles_without_sampling_are_those_of_python_control(name):
     )
     filters = control.append(*(control.ss(control.tf(*loop)) for loop in COMPENSATORS[name][1]))
     truth = control.feedback(plant, filters, sign=1).poles()
-    found = linear_loop(case, 0.0).poles()
+    found = linearised_loop(case, 0.0).poles()
     assert found.size == truth.size
     order = np.lexsort((found.imag, found.real.round(3)))
     expected_order = np.lexsort((truth.imag, truth.real.round(3)))

@@ -9,7 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.derived_gains import BestGain, best_gains, equivalent_gains, scheduled
+from jaxbeam.analysis.derived_gains import (
+    BestGain,
+    best_gains,
+    equivalent_gains,
+    scheduled_controller,
+)
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.control import ScheduledFeedback
@@ -168,7 +173,7 @@ def test_the_best_gain_is_lowest_by_the_oracle(loop):
         assert found.peak < 0.95 * found.uncontrolled
         for other in (0.85, 1.18):
             assert peak(other * found.gain, found.mass) > lowest
-    made = scheduled(loop, [light, heavy], "stepped")
+    made = scheduled_controller(loop, [light, heavy], "stepped")
     assert_allclose(made.gains_at(jnp.asarray(0.1)), [light.gain], rtol=1e-12)
     check(dataclasses.replace(loop, controller=made))
 
@@ -190,4 +195,4 @@ def test_other_laws_are_refused():
     with pytest.raises(ValueError, match="only 0 sensors for 1 actuators"):
         equivalent_gains(dataclasses.replace(rig(), sensors=()), [0.2], 1.0)
     with pytest.raises(ValueError, match="masses must increase"):
-        scheduled(rig(law()), [BestGain(mass, 1.0, 1.0, 1.0) for mass in (0.2, 0.1)])
+        scheduled_controller(rig(law()), [BestGain(mass, 1.0, 1.0, 1.0) for mass in (0.2, 0.1)])

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.loop_as_oracle import expected, parts_of
 from tests.modules import DATA
 from tests.oracles import closed_loop
@@ -121,7 +121,7 @@ def test_loops_of_two_spans_are_those_of_the_oracle(sampled):
         )
         case = dataclasses.replace(case, actuators=patches)
     times = np.arange(71) / 100
-    plan = Plan(form(case), 16, 0, False, 0.0, loop_schedule(case, times))
+    plan = IntegrationPlan(static_shapes(case), 16, 0, False, 0.0, loop_schedule(case, times))
     record = jb.simulate(case, jnp.asarray(times), plan)
     truth = expected(case, times)
     if sampled:

@@ -16,13 +16,13 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linear_loop
+from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.validation import check
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation import Inversion, Kalman, Observer
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.differences import central
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant
@@ -151,7 +151,7 @@ def test_poles_of_a_loop_with_a_kalman_filter():
     A, B, C, _ = SampledPlant(span, [], *parts).matrices(0.0)
     L = steady_gain(F, H)
     whole = np.block([[A, -B @ K], [L @ C, F - G @ K - L @ H]])
-    found = np.asarray(linear_loop(case, -1.0).poles())
+    found = np.asarray(linearised_loop(case, -1.0).poles())
     expected = np.linalg.eigvals(whole)
     assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-6)
 
@@ -162,7 +162,7 @@ def test_poles_of_an_observer_are_where_they_were_wanted():
     A, B, _, K = at_rest(case)
     own = 1.5 * np.linalg.eigvals(A[:4, :4]), [-400.0]  # and of the shaker, uncorrected
     expected = np.concatenate([np.linalg.eigvals(A - B @ K), *own])
-    found = np.asarray(linear_loop(case, -1.0).poles())
+    found = np.asarray(linearised_loop(case, -1.0).poles())
     assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-6)
 
 
@@ -172,7 +172,7 @@ def test_gradients():
     names = ("process_noise", "measurement_intensity", "weight_deviation")
     sizes = jnp.array([FORCE, INTENSITY, DEVIATION])
     times = jnp.asarray(TIMES)
-    plan = Plan(form(case), 1, 0, False, 0.0, loop_schedule(case, TIMES))
+    plan = IntegrationPlan(static_shapes(case), 1, 0, False, 0.0, loop_schedule(case, TIMES))
 
     @jax.jit
     def cost(point):

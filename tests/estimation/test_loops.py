@@ -9,11 +9,11 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linear_loop
+from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation import Kalman
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.differences import central
 from tests.loop_as_oracle import expected, parts_of
 from tests.oracles.sampled_plant import SampledPlant
@@ -90,7 +90,7 @@ class NumpyKalman:
 
 
 def run(case):
-    plan = Plan(form(case), 2, 0, False, 0.0, loop_schedule(case, TIMES))
+    plan = IntegrationPlan(static_shapes(case), 2, 0, False, 0.0, loop_schedule(case, TIMES))
     return jb.simulate(case, jnp.asarray(TIMES), plan)
 
 
@@ -140,7 +140,7 @@ def test_modes_that_are_not_modelled_spill_over():
     radius = {}  # of the loops on both beams, for two weights of the command
     for weight in (0.3, 1e-4):
         case = loop(Kalman(FORCE, NOISE), weight, None, loads=False)
-        found = np.linalg.eigvals(linear_loop(case, 0.0).closed)
+        found = np.linalg.eigvals(linearised_loop(case, 0.0).closed_matrix)
         expected = np.linalg.eigvals(sampled_loop(case, 4))
         largest = -np.sort(-np.abs(expected))[:6]
         assert_allclose(-np.sort(-np.abs(found))[:6], largest, rtol=1e-6)
@@ -155,7 +155,7 @@ def test_gradients_through_loop_and_estimator():
     case = loop(Kalman(FORCE, NOISE), modes=2)
     names = ("controller.estimator.process_noise", "controller.command_weight.0", "loads.0.mass")
     sizes = jnp.array([FORCE, 0.01, 0.4])
-    plan = Plan(form(case), 1, 0, False, 0.0, loop_schedule(case, TIMES))
+    plan = IntegrationPlan(static_shapes(case), 1, 0, False, 0.0, loop_schedule(case, TIMES))
 
     @jax.jit
     @jax.value_and_grad

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linear_loop
+from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check
 from jaxbeam.estimation import Observer
@@ -64,7 +64,7 @@ def test_an_observer_does_not_shift_the_poles_of_the_regulator():
     law = np.linalg.eigvals(drift - push @ np.array(GAIN))
     wanted = np.array([[a + 1j * b, a - 1j * b] for a, b in POLES]).ravel()
     expected = np.concatenate([law, np.exp(PERIOD * np.append(wanted, -400.0))])
-    found = np.linalg.eigvals(linear_loop(case, 0.0).closed)
+    found = np.linalg.eigvals(linearised_loop(case, 0.0).closed_matrix)
     found = found[np.abs(found) > 1e-6]  # what the loop remembers beside them is forgotten at once
     assert_allclose(sorted_poles(found), sorted_poles(expected), atol=1e-7)
 

@@ -16,7 +16,7 @@ from jaxbeam.case.validation import check
 from jaxbeam.estimation import Kalman
 from jaxbeam.model.modes import lay_out
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant
 
@@ -151,7 +151,7 @@ def crossing():
 
 def simulated(case):
     times = np.arange(51) * 2e-3
-    plan = Plan(form(case), 2, 0, False, 0.0, loop_schedule(case, times))
+    plan = IntegrationPlan(static_shapes(case), 2, 0, False, 0.0, loop_schedule(case, times))
     return jb.simulate(case, jnp.asarray(times), plan)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.integrator.adaptive_reference import simulate_adaptive
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 
 TIMES = jnp.linspace(0.0, 0.5, 101)
 BEAM = jb.Beam(1.2, 11.68, 0.535, [0.01, 0.03, 0.02], "pinned-clamped", modes=3)
@@ -50,7 +50,7 @@ SHAKER_SUSPENSION = jb.replace(
 @pytest.fixture(scope="module")
 def plans():
     """A plan for each of the two structures, so that each is compiled once."""
-    return {len(case.loads): make_plan(case, TIMES, 1e-10) for case in _STRUCTURES}
+    return {len(case.loads): integration_plan(case, TIMES, 1e-10) for case in _STRUCTURES}
 
 
 _STRUCTURES = [TWO_SPANS_AND_A_STREAM, SHAKER_SUSPENSION]

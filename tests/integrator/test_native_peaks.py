@@ -29,9 +29,9 @@ from jaxbeam.model.contact import traffic
 from jaxbeam.model.modal_model import rig
 from jaxbeam.numerics import peak_search
 from jaxbeam.runtime import native_library
-from jaxbeam.simulation.integration_plan import form
-from jaxbeam.sweeps.specification import make_order
-from jaxbeam.sweeps.store import FINGERPRINT
+from jaxbeam.simulation.integration_plan import static_shapes
+from jaxbeam.sweeps.specification import sweep_specification
+from jaxbeam.sweeps.store import FINGERPRINT_ATTRIBUTE
 
 pytestmark = pytest.mark.skipif(native_library.find_compiler() is None, reason="no C compiler here")
 
@@ -123,7 +123,7 @@ def test_results_are_those_without_it(case, over):
     assert_allclose(by_hand.peak_time, plain.peak_time, atol=2e-7)
     # Another step would be another result, and a sweep that took no steps by C the very same.
     assert np.any(by_hand.peak_deflection != plain.peak_deflection)
-    assert by_hand.attrs[FINGERPRINT] != plain.attrs[FINGERPRINT]
+    assert by_hand.attrs[FINGERPRINT_ATTRIBUTE] != plain.attrs[FINGERPRINT_ATTRIBUTE]
 
 
 def test_a_beam_without_loads_stays_at_rest():
@@ -165,7 +165,7 @@ def test_some_of_these_cases_lose_contact():
 
 def marched(case, by_hand, longest=1e-3):
     """Peaks at the sensors of a single run, as a function of its mass (kg)."""
-    known = form(case)
+    known = static_shapes(case)
 
     def peaks(mass):
         varied = replace(case, {"loads.0.mass": mass})
@@ -173,11 +173,11 @@ def marched(case, by_hand, longest=1e-3):
         grid, places = even_grid(varied, assembled, jnp.asarray(longest)), varied.sensor_places
         loads = traffic(varied)
         if not by_hand:
-            best, _ = march(make_rigging(assembled, grid, places), loads, slots=known.slots)
+            best, _ = march(make_rigging(assembled, grid, places), loads, slots=known.max_loads)
             return best.peak()[0][:, 0]
         given = jnp.ones((), bool), assembled, grid, places, loads
         of_one = jax.tree.map(lambda leaf: leaf[None], given)
-        return native_peaks.integrate_peaks(known.slots, *of_one).peak_deflection[0, 0]
+        return native_peaks.integrate_peaks(known.max_loads, *of_one).peak_deflection[0, 0]
 
     return jax.jit(peaks)
 
@@ -216,7 +216,7 @@ def test_a_resumed_sweep_keeps_to_what_began_it():
         for ready in (True, False):
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(native_peaks, "ready", lambda ready=ready: ready)
-                order = make_order(case, GRID, False, histories, 1e-7, precision)
+                order = sweep_specification(case, GRID, False, histories, 1e-7, precision)
                 yield order.fingerprint()
 
     assert len(set(marks(False, "double"))) == 2

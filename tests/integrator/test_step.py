@@ -8,7 +8,7 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.integrator.step import advance, undriven
 from jaxbeam.integrator.step_matrices import Tables
-from jaxbeam.simulation.simulate import readings
+from jaxbeam.simulation.simulate import simulate_readings
 from tests.runs import plan_of
 
 STEPS, LANES = 5, 3
@@ -120,7 +120,7 @@ def test_backward_keeps_little_of_each_step():
 
         def misfit(mass):
             varied = jb.replace(case, {"loads.0.mass": mass})
-            return jnp.sum(readings(varied, times, plan) ** 2)
+            return jnp.sum(simulate_readings(varied, times, plan) ** 2)
 
         return jax.jit(jax.grad(misfit)).lower(0.5).compile().memory_analysis().temp_size_in_bytes
 

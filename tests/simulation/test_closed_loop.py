@@ -18,8 +18,8 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.model.sensor_signals import noise_samples
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Plan, form
-from jaxbeam.simulation.simulate import readings
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
+from jaxbeam.simulation.simulate import simulate_readings
 from tests.loop_as_oracle import expected, span_of
 from tests.modules import DATA
 
@@ -35,9 +35,11 @@ def loop(actuators, sensors, controller, beam=BEAM, loads=(MASS,), duration=0.4)
     return jb.Case(beam, (), actuators, sensors, loads, controller, jb.Run(duration))
 
 
-def planned(case: jb.Case, times, substeps: int) -> Plan:
+def planned(case: jb.Case, times, substeps: int) -> IntegrationPlan:
     """A plan of so many steps between edges, whose error nobody measured."""
-    return Plan(form(case), substeps, 0, False, 0.0, loop_schedule(case, np.asarray(times)))
+    return IntegrationPlan(
+        static_shapes(case), substeps, 0, False, 0.0, loop_schedule(case, np.asarray(times))
+    )
 
 
 def run(case: jb.Case, times=TIMES, substeps: int = 2) -> jb.Record:
@@ -160,7 +162,7 @@ def test_fits_see_the_readings_of_a_loop_without_noise():
     noisy = dataclasses.replace(silent.sensors[0], noise=jnp.array(1e-3))
     case = dataclasses.replace(silent, sensors=(noisy,))
     plan = planned(case, TIMES, 2)
-    found = jax.jit(lambda: readings(case, jnp.asarray(TIMES), plan))()
+    found = jax.jit(lambda: simulate_readings(case, jnp.asarray(TIMES), plan))()
     truth = expected(silent, TIMES).shown
     assert_allclose(found, truth, rtol=0, atol=1e-9 * np.max(np.abs(truth)))
 

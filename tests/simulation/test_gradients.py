@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 
 # A load that enters over the free end loses contact; the model is bilateral, and smooth in it.
 pytestmark = [
@@ -63,7 +63,7 @@ class Problem:
         values = np.array([found[a] for a in entries])
         self.case, self.addresses, self.sizes = case, entries, np.where(values == 0, 1, values)
         self.point = jnp.asarray(values / self.sizes)
-        self.plan = make_plan(case, TIMES)
+        self.plan = integration_plan(case, TIMES)
         record = jb.simulate(case, TIMES, self.plan)
         self.peaks = record.peak_deflection
         self.scale = jnp.std(record.measured, axis=0)

@@ -18,7 +18,7 @@ from jaxbeam.integrator.step_matrices import make_rigging
 from jaxbeam.integrator.time_grid import even_grid
 from jaxbeam.model.contact import traffic
 from jaxbeam.model.modal_model import rig
-from jaxbeam.simulation.integration_plan import form
+from jaxbeam.simulation.integration_plan import static_shapes
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations
 from tests.oracles.closed_forms import (
@@ -318,7 +318,7 @@ def test_the_integrator_converges_with_twice_the_order_of_its_nodes():
     """To the state of the modal equations, with the mass still on the beam."""
     span, load = dataclasses.replace(SPAN, modes=2), Load(0.5, 1.5)
     case = jb.replace(case_of(span, [load]), {"run.duration": 0.32})
-    shape = form(case)
+    shape = static_shapes(case)
 
     @eqx.filter_jit
     def end(longest):

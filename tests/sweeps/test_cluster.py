@@ -15,8 +15,8 @@ import jaxbeam as jb
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.sweeps import cluster
-from jaxbeam.sweeps.specification import make_order, order_from_dict
-from jaxbeam.sweeps.store import Disk, create
+from jaxbeam.sweeps.specification import specification_from_dict, sweep_specification
+from jaxbeam.sweeps.store import ZarrStore, create_store
 from tests.sweeps.test_sweep import CASE
 
 distributed = pytest.importorskip("distributed")
@@ -80,9 +80,9 @@ def test_two_workers_one_of_them_killed_make_the_same_store(workers, alone, tmp_
             raise KeyboardInterrupt
         write(self, block, results)
 
-    write = Disk.write
+    write = ZarrStore.write
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Disk, "write", stop)
+        patch.setattr(ZarrStore, "write", stop)
         with pytest.raises(KeyboardInterrupt):
             jb.sweep(CASE, OVER, store=second, progress=False)
     case = tmp_path / "case.toml"
@@ -98,8 +98,8 @@ def test_two_workers_one_of_them_killed_make_the_same_store(workers, alone, tmp_
 
 
 def test_an_order_travels_in_plain_words_and_numbers():
-    order = make_order(CASE, OVER, False, False, 1e-7, "double")
-    again = order_from_dict(order.to_dict())
+    order = sweep_specification(CASE, OVER, False, False, 1e-7, "double")
+    again = specification_from_dict(order.to_dict())
     assert again.fingerprint() == order.fingerprint()
     np.testing.assert_array_equal(again.runs(), order.runs())
 
@@ -107,12 +107,12 @@ def test_an_order_travels_in_plain_words_and_numbers():
 def test_workers_refuse_what_they_would_spoil(tmp_path, monkeypatch):
     path = tmp_path / "runs.zarr"
     with pytest.raises(ValueError, match="where all machines see it"):
-        cluster.work_off([0], "mark", path)
-    order = make_order(CASE, {"loads.0.mass": [0.1]}, False, False, 1e-7, "double")
-    create(path, "mark", order.to_dict(), 1, np.ones(2))
+        cluster.compute_and_store([0], "mark", path)
+    order = sweep_specification(CASE, {"loads.0.mass": [0.1]}, False, False, 1e-7, "double")
+    create_store(path, "mark", order.to_dict(), 1, np.ones(2))
     monkeypatch.setattr(cluster, "_work", lambda mark, keeper: (None, "other"))
     with pytest.raises(ValueError, match="another version of jaxbeam"):
-        cluster.work_off([0], "mark", path)
+        cluster.compute_and_store([0], "mark", path)
     with pytest.raises(ValueError, match="write their blocks to a store; name one"):
         jb.sweep(CASE, {"loads.0.mass": [0.1]}, client=object())
 

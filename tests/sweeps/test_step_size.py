@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from jaxbeam.sweeps.step_size import MARGIN, SURE, choose_steps, drawn, errors, spread
+from jaxbeam.sweeps.step_size import (
+    LIMIT_RATIO,
+    SAFETY_FACTOR,
+    choose_step_sizes,
+    log_spaced_sample,
+    step_errors,
+    stratified_sample,
+)
 
 ORDER = 12
 
@@ -27,7 +34,7 @@ def test_steps_meet_the_tolerance_and_waste_little(off):
     best = 0.3 / paces**0.7  # steps at which the error is one
     tolerance = 1e-7
     longest = best * tolerance ** (1 / ORDER)
-    steps, error = choose_steps(
+    steps, error = choose_step_sizes(
         task(paces, best), paces, off * longest, np.full(50, np.inf), 8, tolerance
     )
     assert np.all(steps <= longest * 1.05)
@@ -38,7 +45,7 @@ def test_steps_meet_the_tolerance_and_waste_little(off):
 def test_limits_are_kept():
     paces = np.geomspace(1, 10, 20)
     limits = np.linspace(0.01, 0.02, 20)
-    steps, _ = choose_steps(task(paces, np.ones(20)), paces, np.full(20, 5.0), limits, 4, 1e-6)
+    steps, _ = choose_step_sizes(task(paces, np.ones(20)), paces, np.full(20, 5.0), limits, 4, 1e-6)
     assert np.all(steps <= limits) and np.all(steps > 0.95 * limits)
 
 
@@ -52,7 +59,7 @@ def test_steps_far_below_their_guess_are_checked_but_not_searched(best):
         tried.append(steps.max())
         return measure(chosen, steps)
 
-    steps, error = choose_steps(watched, paces, SURE * limits, limits, 4, 1e-6)
+    steps, error = choose_step_sizes(watched, paces, LIMIT_RATIO * limits, limits, 4, 1e-6)
     assert error <= 1e-6
     if best == 1.0:
         assert np.all(steps == limits) and len(tried) == 2  # coarse and fine, of the check
@@ -65,18 +72,20 @@ def test_failed_runs_do_not_decide():
     good = task(paces, np.ones(20) * 0.1)
     bad = task(paces, np.ones(20) * 0.1, failing=(0, 7))
     settings = (paces, np.full(20, 0.02), np.full(20, 1.0), 8, 1e-6)
-    np.testing.assert_allclose(choose_steps(bad, *settings)[0], choose_steps(good, *settings)[0])
+    np.testing.assert_allclose(
+        choose_step_sizes(bad, *settings)[0], choose_step_sizes(good, *settings)[0]
+    )
     nothing = task(paces, np.ones(20), failing=range(20))
-    steps, error = choose_steps(nothing, *settings)
+    steps, error = choose_step_sizes(nothing, *settings)
     assert error == 0 and np.all(steps == 0.02)
 
 
 def test_a_wrong_measure_is_found_on_the_random_few():
     """Steps are good at the paces that were tried, too long between them: they are shortened."""
     paces = np.geomspace(1, 10, 64)
-    tried = np.unique(spread(paces, 4))
+    tried = np.unique(log_spaced_sample(paces, 4))
     best = np.where(np.isin(np.arange(64), tried), 0.5, 0.25)
-    steps, error = choose_steps(
+    steps, error = choose_step_sizes(
         task(paces, best), paces, np.full(64, 0.1), np.full(64, np.inf), 4, 1e-6
     )
     assert error <= 1e-6
@@ -92,20 +101,20 @@ def test_settled_runs_are_not_measured_again():
         tried.append(set(np.asarray(chosen).tolist()))
         return measure(chosen, steps)
 
-    guesses = np.full(4, 0.9 * 0.1 * (1e-7 / MARGIN) ** (1 / ORDER))
+    guesses = np.full(4, 0.9 * 0.1 * (1e-7 / SAFETY_FACTOR) ** (1 / ORDER))
     guesses[-1] *= 2
-    choose_steps(watched, paces, guesses, np.ones(4), 4, 1e-7)
+    choose_step_sizes(watched, paces, guesses, np.ones(4), 4, 1e-7)
     # Twice each, coarse and fine: all of them, the quickest, and the random few at the end.
     assert tried == [{0, 1, 2, 3}] * 2 + [{3}] * 2 + [{0, 1, 2, 3}] * 2
 
 
 def test_a_guess_that_is_good_but_short_is_made_longer():
     paces, best = np.geomspace(1, 10, 20), np.full(20, 0.1)
-    longest = 0.1 * (1e-7 / MARGIN) ** (1 / ORDER)
-    steps, error = choose_steps(
+    longest = 0.1 * (1e-7 / SAFETY_FACTOR) ** (1 / ORDER)
+    steps, error = choose_step_sizes(
         task(paces, best), paces, np.full(20, 0.7 * longest), np.ones(20), 4, 1e-7
     )
-    assert np.all(steps > 0.9 * longest) and error <= 1e-7 / MARGIN
+    assert np.all(steps > 0.9 * longest) and error <= 1e-7 / SAFETY_FACTOR
 
 
 def test_no_step_will_do():
@@ -114,7 +123,7 @@ def test_no_step_will_do():
 
     paces = np.geomspace(1, 10, 8)
     with pytest.raises(RuntimeError, match="no time step makes the peaks agree to 1e-06"):
-        choose_steps(measure, paces, np.full(8, 0.1), np.full(8, 1.0), 4, 1e-6)
+        choose_step_sizes(measure, paces, np.full(8, 0.1), np.full(8, 1.0), 4, 1e-6)
 
 
 def test_error_is_that_of_the_worst_lane():
@@ -123,24 +132,24 @@ def test_error_is_that_of_the_worst_lane():
         peaks[:, 1] += steps[:, None]
         return peaks
 
-    error = errors(measure, np.arange(2), np.array([0.3, 0.6]))
+    error = step_errors(measure, np.arange(2), np.array([0.3, 0.6]))
     np.testing.assert_allclose(error, [0.06 / 1.24, 0.12 / 1.48])
 
 
 def test_spread_is_even_in_log_pace():
     """From half a gap above the slowest to the quickest."""
     paces = np.geomspace(1, 1e7, 71)[np.random.default_rng(1).permutation(71)]
-    np.testing.assert_allclose(np.log10(paces[spread(paces, 3)]), [1.2, 4.1, 7.0])
-    assert len(spread(np.ones(5), 3)) == 3
+    np.testing.assert_allclose(np.log10(paces[log_spaced_sample(paces, 3)]), [1.2, 4.1, 7.0])
+    assert len(log_spaced_sample(np.ones(5), 3)) == 3
 
 
 @given(st.integers(1, 200), st.integers(1, 30), st.integers(0, 2**32 - 1))
 def test_one_is_drawn_from_each_part(tasks, count, seed):
     paces = np.random.default_rng(seed).permutation(np.geomspace(1, 10, tasks))
-    ranks = np.sort(paces).searchsorted(paces[drawn(paces, count)])
+    ranks = np.sort(paces).searchsorted(paces[stratified_sample(paces, count)])
     edges = np.arange(count + 1) * tasks / count
     assert np.all((ranks + 1 > edges[:-1]) & (ranks < edges[1:]))
-    np.testing.assert_array_equal(drawn(paces, count), drawn(paces, count))
+    np.testing.assert_array_equal(stratified_sample(paces, count), stratified_sample(paces, count))
 
 
 def test_the_more_tasks_the_more_are_tried():
@@ -152,18 +161,18 @@ def test_the_more_tasks_the_more_are_tried():
             asked.append(len(chosen))
             return measure(chosen, steps)
 
-        choose_steps(watched, paces, np.full(tasks, 0.01), np.ones(tasks), 4, 1e-7)
+        choose_step_sizes(watched, paces, np.full(tasks, 0.01), np.ones(tasks), 4, 1e-7)
         assert asked[-1] == tried
 
 
 def test_between_two_paces_the_shorter_step_holds():
     """Runs between may be worse than both, so nothing is interpolated."""
     paces = np.geomspace(1, 10, 41)
-    measured = np.sort(spread(paces, 4))
+    measured = np.sort(log_spaced_sample(paces, 4))
     best = np.full(41, 0.2)
     best[measured[2]] = 0.1
     guesses = np.full(41, 0.02)
-    steps, _ = choose_steps(task(paces, best), paces, guesses, np.ones(41), 4, 1e-7)
+    steps, _ = choose_step_sizes(task(paces, best), paces, guesses, np.ones(41), 4, 1e-7)
     near = np.arange(measured[1] + 1, measured[3])
     np.testing.assert_allclose(steps[near], steps[measured[2]])
     assert np.all(steps[[measured[1], measured[3]]] > 1.4 * steps[measured[2]])

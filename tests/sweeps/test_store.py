@@ -11,7 +11,7 @@ import xarray
 
 import jaxbeam as jb
 from jaxbeam.simulation.record import read_record
-from jaxbeam.sweeps.store import Disk
+from jaxbeam.sweeps.store import ZarrStore
 from tests.modules import module_files, parse
 from tests.sweeps.test_sweep import CASE
 from tuning import read_logs
@@ -25,7 +25,7 @@ def sweep(store: Path, **options) -> xarray.Dataset:
 
 def stop_after(blocks: int, store: Path) -> None:
     """Begin a sweep and interrupt it after some blocks."""
-    write = Disk.write
+    write = ZarrStore.write
 
     def stop(self, block, results):
         if block == blocks:
@@ -33,7 +33,7 @@ def stop_after(blocks: int, store: Path) -> None:
         write(self, block, results)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Disk, "write", stop)
+        patch.setattr(ZarrStore, "write", stop)
         with pytest.raises(KeyboardInterrupt):
             sweep(store)
 
@@ -132,7 +132,7 @@ def test_a_full_disk_costs_no_finished_block(begun, whole, tmp_path):
             sweep(path, resume=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert Disk(path).missing() == [2]
+    assert ZarrStore(path).missing() == [2]
     xarray.testing.assert_identical(sweep(path, resume=True), whole[1])
     assert not list(path.rglob("*.partial"))
 

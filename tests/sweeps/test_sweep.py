@@ -15,8 +15,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.model.statics import static_peak
-from jaxbeam.sweeps.batches import arrange
-from jaxbeam.sweeps.blocks import Work
+from jaxbeam.sweeps.batches import make_batches
+from jaxbeam.sweeps.blocks import Runner
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=[0.03, 0.02], modes=2),
@@ -205,12 +205,12 @@ def test_every_run_is_in_one_lane(count, paths, seed):
     random = np.random.default_rng(seed)
     speeds = random.integers(0, paths, count).astype(float)
     masses = random.random(count)
-    tasks = arrange(["loads.0.speed", "loads.0.mass"], np.stack([speeds, masses], axis=1))
-    real = tasks.index >= 0
-    assert sorted(tasks.index[real]) == list(range(count))
-    rows = np.broadcast_to(tasks.heavy[:, None, 0], tasks.index.shape)
-    assert_array_equal(rows[real], speeds[tasks.index[real]])
-    assert_array_equal(tasks.light[..., 0][real], masses[tasks.index[real]])
+    tasks = make_batches(["loads.0.speed", "loads.0.mass"], np.stack([speeds, masses], axis=1))
+    real = tasks.run_index >= 0
+    assert sorted(tasks.run_index[real]) == list(range(count))
+    rows = np.broadcast_to(tasks.shared_values[:, None, 0], tasks.run_index.shape)
+    assert_array_equal(rows[real], speeds[tasks.run_index[real]])
+    assert_array_equal(tasks.batched_values[..., 0][real], masses[tasks.run_index[real]])
 
 
 def test_the_bar_stays_out_of_standard_output(capfd):
@@ -238,8 +238,8 @@ def test_longest_steps_do_not_blow_up(modes, damping):
         run=jb.Run(duration=6.5),
     )
     runs = np.array([(mass, speed) for speed in speeds for mass in masses])
-    work = Work(case, arrange(["loads.0.mass", "loads.0.speed"], runs), False, 1e-3)
-    peaks = work.block(0, work.limits)["peak_deflection"]  # speed, mass, sensor
+    work = Runner(case, make_batches(["loads.0.mass", "loads.0.speed"], runs), False, 1e-3)
+    peaks = work.compute_block(0, work.max_steps)["peak_deflection"]  # speed, mass, sensor
     ratio = peaks / (masses[:, None] * np.asarray(static_peak(case, np.array([0.15, 0.3]))))
     assert ratio.min() > 0.99 and ratio.max() < 1.15
 

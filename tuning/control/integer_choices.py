@@ -11,7 +11,7 @@ from jaxbeam.case.case import Case
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.tune import ParameterBounds, tune
-from tuning.control.tuning_result import Tuned
+from tuning.control.tuning_result import TuningResult
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -22,10 +22,10 @@ class IntegerSearchResult:
     """
 
     choices: tuple[dict[str, int], ...]
-    tuned: tuple[Tuned, ...]
+    tuned: tuple[TuningResult, ...]
 
     @property
-    def best(self) -> Tuned:
+    def best(self) -> TuningResult:
         """The tuning that has come furthest down on training runs."""
         ranks = [
             (found.stability_violation > 0, found.run_sets[0].objective[1]) for found in self.tuned
@@ -44,7 +44,7 @@ class IntegerSearchResult:
         return "\n".join([*lines, "", str(self.best)])
 
 
-def tune_choices(
+def tune_integers(
     case: Case,
     choices: Mapping[str, Sequence[int]],
     free: ParameterBounds,

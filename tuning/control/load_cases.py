@@ -62,13 +62,13 @@ def _all_pairs(
     return tuple({**run, **plant} for run in runs for plant in plants)
 
 
-def grid(values: Mapping[str, Sequence[float]]) -> tuple[AddressValues, ...]:
+def full_grid(values: Mapping[str, Sequence[float]]) -> tuple[AddressValues, ...]:
     """Every combination of the values given by address."""
     rows = itertools.product(*values.values())
     return tuple(dict(zip(values, map(float, row), strict=True)) for row in rows)
 
 
-def draws(
+def latin_hypercube(
     ranges: Mapping[str, Sequence[float]], count: int, seed: int = 0
 ) -> tuple[AddressValues, ...]:
     """Values drawn evenly from a range for each address, spread as a Latin hypercube.
@@ -131,7 +131,7 @@ def _table_runs(table, draw_options, where: str) -> tuple[AddressValues, ...]:
     if "draws" not in draw_options:
         if draw_options:
             raise ValueError(f"{where}.seed is for drawing: say how many with draws = 12")
-        return grid(table) if table else ()
+        return full_grid(table) if table else ()
     for address, entries in table.items():
         if len(entries) != 2:
             raise ValueError(
@@ -139,7 +139,7 @@ def _table_runs(table, draw_options, where: str) -> tuple[AddressValues, ...]:
                 f" {len(entries)} entries"
             )
     try:
-        return draws(table, draw_options["draws"], draw_options.get("seed", 0))
+        return latin_hypercube(table, draw_options["draws"], draw_options.get("seed", 0))
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 

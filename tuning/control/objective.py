@@ -34,13 +34,13 @@ class Objective:
     (`rms`), the largest `after_exit` of the last load (relative to the peak); the root mean square
     of the commands, relative to the largest within their limits (`effort`); and the largest change
     of a contact force, relative to the weight (`contact`: how rough the ride is). Runs count by
-    their "mean", their "worst", or ("cvar") the mean of the worst `share` of them. Figures with
+    their "mean", their "worst", or ("cvar") the mean of the worst `tail_share` of them. Figures with
     `limits` must not exceed those, runs taken together likewise.
     """
 
     weights: dict[str, float] = dataclasses.field(default_factory=lambda: {"peak": 1.0})
-    over: str = "worst"
-    share: float = 0.25
+    aggregation: str = "worst"
+    tail_share: float = 0.25
     limits: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
@@ -53,10 +53,10 @@ class Objective:
             raise ValueError("an objective needs merits with positive, finite weights")
         if any(not 0 < value < float("inf") for value in self.limits.values()):
             raise ValueError("limits of merits must be positive and finite")
-        if self.over not in AGGREGATIONS:
-            raise ValueError(f"over may be {', '.join(AGGREGATIONS)}, not {self.over!r}")
-        if not 0 < self.share <= 1:
-            raise ValueError(f"share must be above 0 and at most 1; it is {self.share:g}")
+        if self.aggregation not in AGGREGATIONS:
+            raise ValueError(f"over may be {', '.join(AGGREGATIONS)}, not {self.aggregation!r}")
+        if not 0 < self.tail_share <= 1:
+            raise ValueError(f"share must be above 0 and at most 1; it is {self.tail_share:g}")
 
     @property
     def target(self) -> WeightsAndLimits:
@@ -89,11 +89,11 @@ class Objective:
         self, values: Float[Array, " run"], sharpness: Sharpness = None
     ) -> Float[Array, ""]:
         """One number for the values of all runs; smooth if a sharpness is given."""
-        if self.over == "mean":
+        if self.aggregation == "mean":
             return jnp.mean(values)
-        if self.over == "worst":
+        if self.aggregation == "worst":
             return smooth_max(values, sharpness)
-        count = max(1, round(self.share * values.shape[0]))
+        count = max(1, round(self.tail_share * values.shape[0]))
         return jnp.mean(jnp.sort(values)[-count:])
 
 

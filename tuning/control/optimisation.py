@@ -55,8 +55,8 @@ class PenalisedObjective:
     """What programs are compiled for: how numbers are mapped, how runs are taken together."""
 
     parameters: tuple[FreeParameter, ...]
-    over: str
-    share: float
+    aggregation: str
+    tail_share: float
     penalty: Callable | None
 
     def evaluate(self, point, run_set: RunSet, target: WeightsAndLimits, *sharpnesses):
@@ -65,7 +65,7 @@ class PenalisedObjective:
         values = {number.address: number.from_unbounded(y) for number, y in pairs}
         found = run_set.histories(values)
         penalty = 0.0 if self.penalty is None else self.penalty(values)
-        own = Objective(over=self.over, share=self.share)
+        own = Objective(aggregation=self.aggregation, tail_share=self.tail_share)
         return tuple(
             own.penalised(run_set.merits_of(found, sharp), target, sharp) + penalty
             for sharp in sharpnesses
@@ -138,7 +138,10 @@ class Optimisation:
         )
 
         penalised = PenalisedObjective(
-            tuple(map(_without_start, parameters)), objective.over, objective.share, penalty
+            tuple(map(_without_start, parameters)),
+            objective.aggregation,
+            objective.tail_share,
+            penalty,
         )
         self._program_arguments = penalised, batch is not None, run_set
         self._evaluate_true = functools.partial(_true_values, penalised, run_set)

@@ -8,9 +8,9 @@ import numpy as np
 from jaxbeam.case.case import Case
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import MERITS, Objective
-from tuning.control.stability_constraint import Stable
+from tuning.control.stability_constraint import StabilityConstraint
 from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments
-from tuning.control.tuning_result import Tuned
+from tuning.control.tuning_result import TuningResult
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -19,7 +19,7 @@ class ParetoFront:
 
     merit: str
     limits: tuple[float, ...]
-    tuned: tuple[Tuned, ...]
+    tuned: tuple[TuningResult, ...]
 
     def points(self, held_out: bool = False) -> np.ndarray:
         """For each limit the merit and the objective (limit, 2), of training or held-out runs."""
@@ -51,12 +51,12 @@ def pareto(
     merit: str,
     limits: Sequence[float],
     *,
-    stable: Stable | None = None,
-    places: Sequence[float] | None = None,
+    stable: StabilityConstraint | None = None,
+    positions: Sequence[float] | None = None,
     method: str = "lbfgs",
     steps: int = 80,
     seed: int = 0,
-    bounds: bool = True,
+    least_peaks: bool = True,
     progress: bool = True,
 ) -> ParetoFront:
     """Tune for an objective under each of some limits on a merit (see `Objective`).
@@ -71,8 +71,8 @@ def pareto(
     objectives = [_with_limits(objective, {merit: limit}) for limit in limits]
     if not objectives:
         raise ValueError("a front needs at least one limit")
-    check_arguments(free, cases, objectives[0], method, steps, bounds=bounds)
-    problem = TuningProblem(case, free, cases, objectives[0], stable, places, bounds)
+    check_arguments(free, cases, objectives[0], method, steps, least_peaks=least_peaks)
+    problem = TuningProblem(case, free, cases, objectives[0], stable, positions, least_peaks)
     return ParetoFront(
         merit, limits, tuple(_tune_each(problem, objectives, method, steps, seed, progress))
     )
@@ -85,15 +85,15 @@ def lexicographic(
     merits: Sequence[str],
     *,
     slack: float = 0.01,
-    over: str = "worst",
-    stable: Stable | None = None,
-    places: Sequence[float] | None = None,
+    aggregation: str = "worst",
+    stable: StabilityConstraint | None = None,
+    positions: Sequence[float] | None = None,
     method: str = "lbfgs",
     steps: int = 80,
     seed: int = 0,
-    bounds: bool = True,
+    least_peaks: bool = True,
     progress: bool = True,
-) -> tuple[Tuned, ...]:
+) -> tuple[TuningResult, ...]:
     """Tune for merits in order of rank: each is lowered as far as those before it allow.
 
     What a merit has come to, plus the share `slack` of it, is a limit for all that follow. One
@@ -104,15 +104,15 @@ def lexicographic(
     if not merits or len(set(merits)) < len(merits):
         raise ValueError("name at least one merit, and each once, the most important first")
     check_arguments(
-        free, cases, Objective(dict.fromkeys(merits, 1.0)), method, steps, bounds=bounds
+        free, cases, Objective(dict.fromkeys(merits, 1.0)), method, steps, least_peaks=least_peaks
     )
     problem = TuningProblem(
-        case, free, cases, Objective({merits[0]: 1.0}, over), stable, places, bounds
+        case, free, cases, Objective({merits[0]: 1.0}, aggregation), stable, positions, least_peaks
     )
     found, limits = [], {}
     optimisation, points = problem.optimisation(method, steps), None
     for merit in merits:
-        objective = Objective({merit: 1.0}, over, limits=dict(limits))
+        objective = Objective({merit: 1.0}, aggregation, limits=dict(limits))
         points = optimisation.start_points(1, seed, points)
         state = optimisation.run(objective.target, points, seed, progress=progress)
         points = state.best[0]

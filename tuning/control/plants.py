@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 MAX_DRAWS_PER_PLANT = 100  # draws for each that has to lie within the bounds
 
 
-def adopt(case: Case, found: Fit | Posterior) -> Case:
+def with_identified_plant(case: Case, found: Fit | Posterior) -> Case:
     """The case with the numbers of beam, supports, actuators and sensors that were identified.
 
     Numbers of loads and of single logs stay as they are in the case. Raises ValueError if the case

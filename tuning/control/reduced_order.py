@@ -12,7 +12,7 @@ from jaxbeam.control.optimal.lqr import AbstractRegulator
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.tune import ParameterBounds, tune
-from tuning.control.tuning_result import Tuned
+from tuning.control.tuning_result import TuningResult
 
 FEEDBACK_ADDRESS = "controller.feedback"
 SHARE_PENALTY = 10.0  # of the objective, for shares that together are one off
@@ -28,8 +28,8 @@ class ReducedFeedback:
 
     fed_back: tuple[int, ...]
     shares: Float[np.ndarray, " state"]
-    relaxed: Tuned
-    tuned: Tuned
+    relaxed: TuningResult
+    tuned: TuningResult
 
     def __str__(self) -> str:
         lines = [f"{'state':<8}{'share':>8}  fed back"]
@@ -85,7 +85,7 @@ def tune_reduced(
         dict(free) | shared,
         cases,
         objective,
-        price=penalty,
+        penalty=penalty,
         **options,
     )
     found = {n.address: x for n, x in zip(relaxed.parameters, relaxed.values, strict=True)}

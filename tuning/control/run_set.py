@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbeam.analysis.bound.bound import HELD, least_achievable
+from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, least_achievable_peak
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.model.contact import traffic
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulation.integration_plan import Plan, make_plan, sample_times
+from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan, sample_times
 from jaxbeam.simulation.record import Record
-from jaxbeam.simulation.simulate import Histories, histories, simulate
+from jaxbeam.simulation.simulate import Histories, simulate, simulate_histories
 from tuning.control.fixed_design import with_fixed_design
 from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_case
 from tuning.control.objective import Sharpness, run_merits
@@ -37,7 +37,7 @@ class RunSet(eqx.Module):
 
     runs: Sequence[AddressValues]
     stacked: Case
-    plan: Plan
+    plan: IntegrationPlan
     error: Float[np.ndarray, ""]
     times: Float[Array, " time"]
     positions: Float[Array, " place"]
@@ -56,7 +56,7 @@ class RunSet(eqx.Module):
         """Histories of all runs, along a first axis, with other numbers at some addresses."""
 
         def single(case):
-            return histories(
+            return simulate_histories(
                 self._case_with_values(case, values), self.times, self.plan, self.positions
             )
 
@@ -92,7 +92,7 @@ class RunSet(eqx.Module):
         return eqx.tree_at(lambda b: (b.stacked, b.free, b.after), self, some)
 
     def _case_with_values(self, case: Case, values: Mapping[str, Any]) -> Case:
-        return with_fixed_design(replace(case, values), self.nominal, self.plan.form.layout)
+        return with_fixed_design(replace(case, values), self.nominal, self.plan.shapes.layout)
 
 
 def make_run_set(
@@ -155,8 +155,8 @@ def _uncontrolled_deflections(
 
 def _least_peaks(cases: list[Case], positions) -> Float[np.ndarray, " run"]:
     period = cases[0].controller.period
-    hold_period = HELD if period is None else float(period)
-    return np.array([least_achievable(own, positions, hold_period) for own in cases])
+    hold_period = DEFAULT_PERIOD if period is None else float(period)
+    return np.array([least_achievable_peak(own, positions, hold_period) for own in cases])
 
 
 def stacked_cases(cases: list[Case]) -> Case:
@@ -165,24 +165,26 @@ def stacked_cases(cases: list[Case]) -> Case:
 
 
 @compiled
-def _deflections(stacked: Case, times, plan: Plan, positions) -> Float[Array, "run time place"]:
-    return jax.vmap(lambda own: histories(own, times, plan, positions).deflection)(stacked)
+def _deflections(
+    stacked: Case, times, plan: IntegrationPlan, positions
+) -> Float[Array, "run time place"]:
+    return jax.vmap(lambda own: simulate_histories(own, times, plan, positions).deflection)(stacked)
 
 
-def _common_plan(cases: list[Case]) -> tuple[Plan, float]:
+def _common_plan(cases: list[Case]) -> tuple[IntegrationPlan, float]:
     """One plan for cases alike in structure, fine enough for each, and its error apart from it.
 
     Runs whose plans differ in nothing but the error share what is compiled.
 
     Raises ValueError if they differ in more than numbers.
     """
-    plans = [make_plan(own, tolerance=PEAK_TOLERANCE) for own in cases]
-    if len({plan.form.layout for plan in plans}) > 1:
+    plans = [integration_plan(own, tolerance=PEAK_TOLERANCE) for own in cases]
+    if len({plan.shapes.layout for plan in plans}) > 1:
         raise ValueError("the runs differ in the order of places along the beam; tune them apart")
-    max_loads = max(plan.form.slots for plan in plans)
+    max_loads = max(plan.shapes.max_loads for plan in plans)
     common = dataclasses.replace(
         plans[0],
-        form=dataclasses.replace(plans[0].form, slots=max_loads),
+        shapes=dataclasses.replace(plans[0].shapes, slots=max_loads),
         substeps=max(plan.substeps for plan in plans),
         error=0.0,
     )

@@ -25,10 +25,10 @@ from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.optimisation import Optimisation, OptimisationState
 from tuning.control.optimisers import optimiser
-from tuning.control.plants import adopt, draw_plants
+from tuning.control.plants import draw_plants, with_identified_plant
 from tuning.control.run_set import RunSet, make_run_set
-from tuning.control.stability_constraint import STABILITY_PENALTY_SLOPE, Stable
-from tuning.control.tuning_result import RunSetResult, StartResult, Tuned
+from tuning.control.stability_constraint import STABILITY_PENALTY_SLOPE, StabilityConstraint
+from tuning.control.tuning_result import RunSetResult, StartResult, TuningResult
 from tuning.parameters.free import free_parameters
 
 if TYPE_CHECKING:
@@ -46,19 +46,19 @@ def tune(
     *,
     plant: Fit | Posterior | None = None,
     plants: int = 4,
-    stable: Stable | None = None,
-    price: Callable | None = None,
-    places: Sequence[float] | None = None,
+    stable: StabilityConstraint | None = None,
+    penalty: Callable | None = None,
+    positions: Sequence[float] | None = None,
     method: str = "adam",
     steps: int = 80,
     batch: int | None = None,
     starts: int = 1,
     seed: int = 0,
-    bounds: bool = True,
+    least_peaks: bool = True,
     checkpoint: str | os.PathLike | None = None,
     resume: bool = False,
     progress: bool = True,
-) -> Tuned:
+) -> TuningResult:
     """Tune numbers of a controlled case over many runs; prove them on runs held out.
 
     `free` gives addresses, each with its bounds or None: gains and weights of the controller, but
@@ -66,11 +66,11 @@ def tune(
     closed loop, limits included, side by side; a `method` follows the gradient of the `objective`,
     whose maxima are smooth at first and ever sharper, for a number of `steps`, from the case's own
     numbers and from `starts` - 1 random ones at once. What is kept is the best that was met by the
-    true objective, the start included. `places` (m) are where deflections count, the sensors' if
+    true objective, the start included. `positions` (m) are where deflections count, the sensors' if
     left out. `stable` asks for a loop that stays stable along the crossings, with room to spare
     (what violates it is kept only where nothing met satisfies it, and the result says so). A
-    `price`, a differentiable function of the values by address, is added to the objective. With
-    `bounds` every run is also held against the least peak that is possible.
+    `penalty`, a differentiable function of the values by address, is added to the objective. With
+    `least_peaks` every run is also held against the least peak that is possible.
 
     The method is "adam" or "lbfgs" (optax) or "bfgs" (optimistix); each step simulates all runs
     once. With a `batch`, for Adam only, a step simulates so many of them, drawn by the `seed`.
@@ -87,18 +87,18 @@ def tune(
     """
     objective = Objective() if objective is None else objective
     if plant is not None:
-        case = adopt(case, plant)
+        case = with_identified_plant(case, plant)
         drawn = draw_plants(plant, 2 * plants, seed)
         cases = cases.across(drawn[:plants], drawn[plants:])
     check_arguments(
-        free, cases, objective, method, steps, starts=starts, batch=batch, bounds=bounds
+        free, cases, objective, method, steps, starts=starts, batch=batch, least_peaks=least_peaks
     )
     file = None if checkpoint is None else Path(checkpoint)
     if file is not None and file.exists() and not resume:
         raise FileExistsError(f"{file} exists; resume the search, or name another file")
-    if file is not None and price is not None:
+    if file is not None and penalty is not None:
         raise ValueError("a search with a price of its own cannot be kept: leave out checkpoint")
-    problem = TuningProblem(case, free, cases, objective, stable, places, bounds, price)
+    problem = TuningProblem(case, free, cases, objective, stable, positions, least_peaks, penalty)
     optimisation = problem.optimisation(method, steps, batch)
     digest = fingerprint(problem.description | {"settings": [method, steps, batch, starts, seed]})
     points = optimisation.start_points(starts, seed)
@@ -123,12 +123,12 @@ def check_arguments(
     *,
     starts: int = 1,
     batch: int | None = None,
-    bounds: bool = True,
+    least_peaks: bool = True,
 ) -> None:
     """Refuse what could only fail later. Raises ValueError, saying what and why."""
     if steps < 1 or starts < 1:
         raise ValueError(f"steps and starts must be 1 or more; they are {steps} and {starts}")
-    if "shortfall" in objective.weights | objective.limits and not bounds:
+    if "shortfall" in objective.weights | objective.limits and not least_peaks:
         raise ValueError("the shortfall is that behind the bounds: leave bounds on to tune for it")
     optimiser(method, steps)
     runs = len(cases.training)
@@ -157,7 +157,7 @@ class TuningProblem:
         free: ParameterBounds,
         cases: LoadCases,
         objective: Objective,
-        stable: Stable | None = None,
+        stable: StabilityConstraint | None = None,
         positions: Sequence[float] | None = None,
         least_peaks: bool = True,
         penalty: Callable | None = None,
@@ -201,7 +201,7 @@ class TuningProblem:
 
     def tuning_result(
         self, optimisation: Optimisation, state: OptimisationState, objective: Objective
-    ) -> Tuned:
+    ) -> TuningResult:
         """What a search came to, on training and held-out runs."""
         values = optimisation.best_values(state)
         before = {number.address: number.start for number in self.parameters}
@@ -212,7 +212,7 @@ class TuningProblem:
                 _run_set_result("held out", self.held_out_runs, objective, before, after)
             )
         order = np.argsort(state.best_value).tolist()
-        return Tuned(
+        return TuningResult(
             case=replace(self.case, after),
             parameters=self.parameters,
             values=values,

@@ -48,7 +48,7 @@ class StartResult(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Tuned:
+class TuningResult:
     """Result of a tuning: the tuned case, and what it does to training and held-out runs.
 
     `history` holds the true objective by step and start, NaN where the loop diverged, which

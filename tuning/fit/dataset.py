@@ -11,8 +11,8 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.validation import check
 from jaxbeam.integrator.events import Schedule, stacked
-from jaxbeam.simulation.integration_plan import Plan, make_plan
-from jaxbeam.simulation.simulate import readings
+from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan
+from jaxbeam.simulation.simulate import simulate_readings
 from tuning.logs.log import Log
 from tuning.logs.pairing import case_of_log, check_loads, check_times, pad_cases, sensor_readings
 from tuning.parameters.free import LOG_ADDRESS, with_values
@@ -34,7 +34,7 @@ class Dataset:
     nominal_case: Case
     cases: list[Case]
     logs: list[Log]
-    plan: Plan
+    plan: IntegrationPlan
     times: Float[np.ndarray, "log time"]
     measured: Float[np.ndarray, "log time channel"]
     mask: Float[np.ndarray, "log time channel"]
@@ -77,7 +77,7 @@ class Dataset:
         def simulated(run, values):
             case, times, schedule = run
             case = replace(case, dict(zip(simulated_addresses, values, strict=True)) | zero_offsets)
-            return readings(case, times, dataclasses.replace(self.plan, schedule=schedule))
+            return simulate_readings(case, times, dataclasses.replace(self.plan, schedule=schedule))
 
         def gather(values):
             return jnp.where(which < 0, own, values[which])
@@ -130,13 +130,14 @@ class Dataset:
         """
         for i, (case, times) in enumerate(zip(self.cases, self.times, strict=True)):
             try:
-                plan = make_plan(
+                plan = integration_plan(
                     with_values(case, i, values), jnp.asarray(times), SIMULATION_TOLERANCE
                 )
             except (ValueError, RuntimeError) as error:
                 return f", to a case that cannot be: {error}"
             changed = (
-                plan.form.layout != self.plan.form.layout or plan.form.slots > self.plan.form.slots
+                plan.shapes.layout != self.plan.shapes.layout
+                or plan.shapes.max_loads > self.plan.shapes.max_loads
             )
             if changed or plan.substeps > 2 * self.plan.substeps:
                 return ", but far from the start: fit once more with these values as the start"
@@ -177,22 +178,22 @@ def make_dataset(case: Case, logs: list[Log]) -> Dataset:
         measured.append(np.pad(values, ((0, count - log.times.size), (0, 0))))
         mask.append(np.pad(valid, ((0, count - log.times.size), (0, 0))))
     plans = [
-        make_plan(own, jnp.asarray(t), SIMULATION_TOLERANCE)
+        integration_plan(own, jnp.asarray(t), SIMULATION_TOLERANCE)
         for own, t in zip(cases, times, strict=True)
     ]
-    if len({plan.form.layout for plan in plans}) > 1:
+    if len({plan.shapes.layout for plan in plans}) > 1:
         raise ValueError("the logs differ in the order of places along the beam; fit them apart")
     static_shapes = dataclasses.replace(
-        plans[0].form,
-        slots=max(plan.form.slots for plan in plans),
-        coupled=any(plan.form.coupled for plan in plans),
+        plans[0].shapes,
+        slots=max(plan.shapes.max_loads for plan in plans),
+        coupled=any(plan.shapes.coupled for plan in plans),
     )
     plan = dataclasses.replace(
         plans[0],
-        form=static_shapes,
+        shapes=static_shapes,
         substeps=max(plan.substeps for plan in plans),
-        lead=max(plan.lead for plan in plans),
-        even=all(plan.even for plan in plans),
+        lead=max(plan.lead_samples for plan in plans),
+        equally_spaced=all(plan.equally_spaced for plan in plans),
         schedule=None,
     )
     schedules = [own.schedule for own in plans]

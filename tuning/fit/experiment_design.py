@@ -17,8 +17,8 @@ from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.fields import known
 from jaxbeam.case.validation import check
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulation.integration_plan import Plan, make_plan, sample_times
-from jaxbeam.simulation.simulate import readings
+from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan, sample_times
+from jaxbeam.simulation.simulate import simulate_readings
 from tuning.parameters.free import unit_at
 
 SIMULATION_TOLERANCE = 1e-5  # of the simulation, relative to the largest deflection
@@ -60,7 +60,7 @@ class ExperimentDesign:
         return "\n".join(lines)
 
 
-def sharpen(
+def design_experiment(
     case: Case,
     free: Sequence[str],
     over: Mapping[str, tuple[float, float]],
@@ -94,7 +94,9 @@ def sharpen(
         chosen = replace(case, dict(zip(over, choice, strict=True)))
 
         def predict(values):
-            return readings(replace(chosen, dict(zip(free, values, strict=True))), times, plan)
+            return simulate_readings(
+                replace(chosen, dict(zip(free, values, strict=True))), times, plan
+            )
 
         jacobian = jax.jacfwd(predict)(nominal) / noise_levels[:, None]
         rows = jacobian.reshape(-1, len(free)) * jnp.where(nominal == 0, 1.0, jnp.abs(nominal))
@@ -136,8 +138,8 @@ def sharpen(
     )
 
 
-def _integration_plan(case: Case) -> Plan:
-    return make_plan(case, sample_times(case), SIMULATION_TOLERANCE)
+def _integration_plan(case: Case) -> IntegrationPlan:
+    return integration_plan(case, sample_times(case), SIMULATION_TOLERANCE)
 
 
 def _minimise(objective, start: Float[np.ndarray, " choice"]) -> Float[np.ndarray, " choice"]:

@@ -22,7 +22,7 @@ from tuning.fit.least_squares import MAX_STEPS, LeastSquares
 from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.logs.log import Log
 from tuning.parameters.free import FreeParameter, free_parameters
-from tuning.parameters.prior import Belief
+from tuning.parameters.prior import Prior
 
 MIN_RELATIVE_SD = 1e-3  # relative deviation of a measured response: no sensor is better calibrated
 
@@ -33,7 +33,7 @@ class Responses:
 
     `values` are complex, in SI units of output per input; `pairs` in the words of
     `jaxbeam.frequency_response`; `deviations` relative standard deviations of the values, one for
-    all if not known. `parked` are masses on the beam: (position in m, mass in kg) each.
+    all if not known. `stationary` are masses on the beam: (position in m, mass in kg) each.
 
     Raises ValueError if shapes disagree, frequencies do not ascend from above zero, or a value is
     zero or not finite.
@@ -43,7 +43,7 @@ class Responses:
     values: Complex[np.ndarray, "frequency pair"]
     pairs: tuple[tuple[str, str], ...]
     deviations: Float[np.ndarray, "frequency pair"] | None = None
-    parked: Parked = ()
+    stationary: Parked = ()
     source: str = "responses"
 
     def __post_init__(self):
@@ -63,12 +63,12 @@ class Responses:
             )
 
 
-def responses_of(log: Log, segment: float | None = None, least: float = 0.8) -> Responses:
+def responses_of(log: Log, segment: float | None = None, min_coherence: float = 0.8) -> Responses:
     """Estimate the responses of the sensors in a log to the one command in it.
 
     H1 = S_uy / S_uu by Welch's method in segments of so many seconds (an eighth of the log if left
     out); relative deviations follow from the coherence g^2 as sqrt((1 - g^2) / (2 n g^2)) (Bendat
-    and Piersol, Random Data, section 9.1). Frequencies with less than the `least` coherence at
+    and Piersol, Random Data, section 9.1). Frequencies with less than the `min_coherence` coherence at
     some sensor are left out. Segments much shorter than the vibration rings make damping look
     larger than it is.
 
@@ -93,9 +93,9 @@ def responses_of(log: Log, segment: float | None = None, least: float = 0.8) -> 
         values.append(cross / np.maximum(power, 1e-300))
         coherences.append(scipy.signal.coherence(command, log.values[:, i], rate, nperseg=size)[1])
     coherence = np.stack(coherences, axis=1)
-    kept = (frequencies > 0) & np.all(coherence >= least, axis=1)
+    kept = (frequencies > 0) & np.all(coherence >= min_coherence, axis=1)
     if kept.sum() < 3:
-        raise ValueError(f"{log.source}: hardly any frequency has a coherence of {least:g}")
+        raise ValueError(f"{log.source}: hardly any frequency has a coherence of {min_coherence:g}")
     coherence = coherence[kept]
     deviations = np.sqrt((1 - coherence) / (2 * averages * coherence))
     return Responses(
@@ -128,7 +128,7 @@ class _ResponseData:
         def predict(values):
             changed = replace(case, dict(zip(addresses, values, strict=True)))
             response = frequency_response(
-                changed, frequencies, given.pairs, given.parked, layout
+                changed, frequencies, given.pairs, given.stationary, layout
             ).values
             # Relative to what was measured, phases do not wrap.
             log_ratio = jnp.log(response / measured)
@@ -192,7 +192,7 @@ class ResponseFit:
 def identify_responses(
     case: Case,
     measured: Responses,
-    free: Mapping[str, tuple[float, float] | Belief | None] | Sequence[str],
+    free: Mapping[str, tuple[float, float] | Prior | None] | Sequence[str],
     *,
     loss: str = "squares",
 ) -> ResponseFit:
@@ -207,7 +207,7 @@ def identify_responses(
     parameters = free_parameters([case], bounds, 1.0)
     measured_logarithms = _weighted_logarithms(measured)[None]
     # A first call outside of any compiling checks case, pairs and parked masses.
-    frequency_response(case, measured.frequencies[:2], measured.pairs, measured.parked)
+    frequency_response(case, measured.frequencies[:2], measured.pairs, measured.stationary)
     data = _ResponseData(case, measured, measured_logarithms, np.ones(measured_logarithms.shape))
     found = LeastSquares(data, parameters, loss).solve(measured_logarithms)
     values = {n.address: float(v) for n, v in zip(parameters, found.values, strict=True)}

@@ -16,12 +16,12 @@ from tuning.checkpoint import fingerprint
 from tuning.fit.dataset import Dataset, make_dataset
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares, LeastSquaresSolution
 from tuning.fit.loss import check_loss
-from tuning.fit.multi_start import LocalMinimum, coarse_search
+from tuning.fit.multi_start import LocalMinimum, multi_start
 from tuning.fit.summary import fit_table
 from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.logs.log import Log
 from tuning.parameters.free import LOG_ADDRESS, FreeParameter, free_parameters, with_values
-from tuning.parameters.prior import Belief
+from tuning.parameters.prior import Prior
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class Fit:
 def identify(
     case: Case,
     logs: Log | Sequence[Log],
-    free: Mapping[str, tuple[float, float] | Belief | None] | Sequence[str] | str,
+    free: Mapping[str, tuple[float, float] | Prior | None] | Sequence[str] | str,
     *,
     loss: str = "squares",
     stages: Sequence[Sequence[str]] = (),
@@ -157,7 +157,7 @@ def identify(
 ) -> Fit:
     """Fit numbers of a case to logs of runs with known loads.
 
-    `free` names addresses, each with bounds (low, high), a `Belief` (bounds, scale, prior) or
+    `free` names addresses, each with bounds (low, high), a `Prior` (bounds, scale, prior) or
     None; a number of one log, such as its load's speed, is at `logs.0.loads.0.speed`, one of every
     log at `logs.*.loads.0.speed`. Loads are those of the logs, or else the case's.
     The sum of squared residuals over their noise (and of the priors' pulls) is minimised by
@@ -190,7 +190,7 @@ def identify(
     minima, start = (), None
     if starts > 1:
         digest = _search_digest(dataset, parameters, loss, starts, seed)
-        minima = tuple(coarse_search(least_squares, dataset.measured, starts, seed, file, digest))
+        minima = tuple(multi_start(least_squares, dataset.measured, starts, seed, file, digest))
         start = minima[0].unbounded
     for mask in stage_masks:
         start = least_squares.solve(dataset.measured, start=start, free=mask).unbounded

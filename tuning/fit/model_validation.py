@@ -218,7 +218,7 @@ def cross_validate(fit: Fit) -> list[HeldOutPrediction]:
     return found
 
 
-def hold_out(fit: Fit, logs: Sequence[Log]) -> list[HeldOutPrediction]:
+def predict_held_out(fit: Fit, logs: Sequence[Log]) -> list[HeldOutPrediction]:
     """Predict logs that the fit has not seen with the fitted case, and their own loads.
 
     Raises ValueError as `identify` does for logs that do not match the case.

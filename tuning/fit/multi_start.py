@@ -49,7 +49,7 @@ def draw_start_points(
     return np.concatenate([own, np.stack(columns, axis=1)])
 
 
-def coarse_search(
+def multi_start(
     least_squares: LeastSquares,
     measured: Float[np.ndarray, "log time channel"],
     count: int,

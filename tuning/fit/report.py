@@ -5,8 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable
-from jaxbeam.files.report import write_report as write_files
+from jaxbeam.files.report import (
+    ReportFigure,
+    ReportSection,
+    ReportTable,
+    write_report as write_files,
+)
 from tuning.fit.identify import Fit
 from tuning.fit.model_validation import HeldOutPrediction, ModelCriteria, channel_residuals
 from tuning.fit.summary import remarks
@@ -20,15 +24,15 @@ def write_report(
     *,
     profiles: Sequence[Profile] = (),
     posterior: Posterior | None = None,
-    unseen: Sequence[HeldOutPrediction] = (),
-    rivals: Sequence[ModelCriteria] = (),
+    held_out: Sequence[HeldOutPrediction] = (),
+    models: Sequence[ModelCriteria] = (),
     overwrite: bool = False,
 ) -> None:
     """Write report.md, report.html and their pictures to a folder.
 
     Raises FileExistsError if the folder is not empty and `overwrite` is not set.
     """
-    sections = report_sections(fit, profiles, posterior, unseen, rivals)
+    sections = report_sections(fit, profiles, posterior, held_out, models)
     title = fit.case.title or "Identification"
     write_files(folder, title, sections, overwrite=overwrite)
 

@@ -16,7 +16,7 @@ from tuning.fit.least_squares import LeastSquares
 from tuning.fit.multi_start import LocalMinimum
 from tuning.logs.log import Log
 from tuning.parameters.free import FreeParameter
-from tuning.parameters.prior import Belief
+from tuning.parameters.prior import Prior
 
 FORMAT = "jaxbeam fit 1"
 _FIT_ARRAYS = ("values", "errors", "correlation", "noise", "fitted", "colour")
@@ -68,9 +68,7 @@ def load_fit(path: str | os.PathLike) -> Fit:
         _read_log(i, entry, header["given"]["beam"], arrays)
         for i, entry in enumerate(header["logs"])
     ]
-    parameters = [
-        FreeParameter(**{**n, "belief": Belief(**n["belief"])}) for n in header["numbers"]
-    ]
+    parameters = [FreeParameter(**{**n, "belief": Prior(**n["belief"])}) for n in header["numbers"]]
     dataset = make_dataset(case_from_dict(header["given"]), logs)
     minima = [
         LocalMinimum(

@@ -61,12 +61,12 @@ class Weighing:
 
 
 def weigh(
-    case: Case, log: Log, speeds: tuple[float, float], most: int = 3, both_ways: bool = True
+    case: Case, log: Log, speeds: tuple[float, float], max_count: int = 3, both_ways: bool = True
 ) -> Weighing:
     """Find the masses, speeds and entry times of the loads that crossed a known beam in a log.
 
     `speeds` (m/s) are the lowest and highest that come into question, in both directions or only
-    from the left; at `most` so many loads are looked for. Offsets of the sensors are fitted along.
+    from the left; at `max_count` so many loads are looked for. Offsets of the sensors are fitted along.
     Loads of the case or the log are not used.
 
     Raises ValueError if a sensor does not measure deflection, speeds are not 0 < low < high, or no
@@ -84,9 +84,9 @@ def weigh(
     if first.residual_rms > _MAX_RESIDUAL_SHARE * pursuit.readings_rms:
         raise ValueError(f"{log.source}: no load shows in it at these speeds")
     found = first
-    while len(found.loads) < most and (more := pursuit.find(len(found.loads) + 1)).residual_rms < (
-        _MAX_MISFIT_RATIO * found.residual_rms
-    ):
+    while len(found.loads) < max_count and (
+        more := pursuit.find(len(found.loads) + 1)
+    ).residual_rms < (_MAX_MISFIT_RATIO * found.residual_rms):
         found = more
     fits: dict[str, Fit] = {}
     while True:
@@ -94,7 +94,7 @@ def weigh(
         fit = fits[_count_text(count)] = _fit_loads(case, log, found.loads)
         if (
             min(channel.p_value for channel in channel_residuals(fit)) > WHITENESS_SIGNIFICANCE
-            or count >= most
+            or count >= max_count
         ):
             break
         if len(fits) > 1 and compare_fits(fits)[0].name != _count_text(count):

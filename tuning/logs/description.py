@@ -21,7 +21,7 @@ _COLUMN_KEYS = {
 
 
 @dataclass(frozen=True)
-class Sidecar:
+class LogDescription:
     """What the file beside a log says; empty where there is none."""
 
     time: str | None = None
@@ -55,7 +55,7 @@ class Sidecar:
         return None if position is None else float(position)
 
 
-def read_sidecar(log: Path) -> Sidecar:
+def read_description(log: Path) -> LogDescription:
     """Read the TOML file beside a log, if there is one.
 
     Raises ValueError, naming file and key, for TOML that cannot be read, unknown keys (with the
@@ -63,13 +63,13 @@ def read_sidecar(log: Path) -> Sidecar:
     """
     path = log.with_suffix(".toml")
     if not path.is_file():
-        return Sidecar()
+        return LogDescription()
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path}: {error}") from None
     if "beam" in data:  # a case file that happens to have the name of the log
-        return Sidecar()
+        return LogDescription()
     _check_keys(path, "", data, _KEYS)
     columns = {}
     for name, entry in data.get("columns", {}).items():
@@ -84,7 +84,7 @@ def read_sidecar(log: Path) -> Sidecar:
     for name, entry in data.get("runs", {}).items():
         _check_keys(path, f"runs.{name}.", entry, ("loads",))
         runs[name] = _loads(path, f"runs.{name}.", entry)
-    return Sidecar(data.get("time"), columns, loads, runs)
+    return LogDescription(data.get("time"), columns, loads, runs)
 
 
 def _check_keys(path, prefix, data, known) -> None:

@@ -31,7 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.description import Sidecar, read_sidecar
+from tuning.logs.description import LogDescription, read_description
 from tuning.logs.log import Log, check_samples
 from tuning.logs.quality import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
@@ -90,7 +90,7 @@ def read_logs(
     }
     if run is not None and run not in tables:
         raise ValueError(f"{path}: it has no run {run!r}; it has {', '.join(map(repr, tables))}")
-    sidecar = read_sidecar(path)
+    sidecar = read_description(path)
     if unknown := [name for name in sidecar.runs if name not in tables]:
         raise ValueError(
             f"{path.with_suffix('.toml')}: runs.{unknown[0]} is no run of {path.name}; it has "
@@ -120,7 +120,9 @@ def _split_runs(name: str, table: LogTable) -> dict[str, LogTable]:
     }
 
 
-def _make_log(path, run, table: LogTable, sidecar: Sidecar, columns, units, time, missing) -> Log:
+def _make_log(
+    path, run, table: LogTable, sidecar: LogDescription, columns, units, time, missing
+) -> Log:
     """Make a log of one run, in SI units."""
     names = _check_names(path, table.names)
     time_column = _time_column(path, table, time or sidecar.time)
@@ -204,7 +206,7 @@ def _time_column(path, table: LogTable, requested: str | None) -> str:
 
 
 def _unit_of(
-    path, table: LogTable, name: str, declared: Mapping[str, str | None], sidecar: Sidecar
+    path, table: LogTable, name: str, declared: Mapping[str, str | None], sidecar: LogDescription
 ):
     """Return the unit of a column, as text and as what it means."""
     in_file = table.units[table.names.index(name)]

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.fields import known
 from jaxbeam.case.sensors import QUANTITIES, Sensor
-from tuning.parameters.prior import Belief, as_prior
+from tuning.parameters.prior import Prior, as_prior
 
 LOG_ADDRESS = re.compile(r"logs\.(\d+)\.(.+)")
 BOUND_MARGIN = 1e-3  # of the distance between bounds: a start on a bound is moved in by so much
@@ -33,7 +33,7 @@ class FreeParameter:
     low: float
     high: float
     typical_size: float
-    prior: Belief = Belief()
+    prior: Prior = Prior()
 
     def to_unbounded(self, value: float) -> float:
         """Search variable of a value; one on a bound is moved in a little."""
@@ -98,13 +98,13 @@ class FreeParameter:
 
 def free_parameters(
     cases: list[Case],
-    bounds: dict[str, tuple[float, float] | Belief | None],
+    bounds: dict[str, tuple[float, float] | Prior | None],
     largest_reading: float,
 ) -> list[FreeParameter]:
     """Look up the free numbers in the cases of the logs.
 
     An address is that of the case, shared by all logs, or `logs.1.loads.0.speed` for a number of
-    one log, or `logs.*.loads.0.speed` for one of each log. Each has bounds, None or a `Belief`.
+    one log, or `logs.*.loads.0.speed` for one of each log. Each has bounds, None or a `Prior`.
     Without bounds a number stays on its side of zero, but for offsets and entry times.
     The typical size of a number is the distance of its bounds, or else itself; that of an offset
     is the largest `largest_reading`, that of an entry time the duration.

@@ -11,7 +11,7 @@ SCALES = ("plain", "log", "logit")
 
 
 @dataclasses.dataclass(frozen=True)
-class Belief:
+class Prior:
     """Bounds of a free number, the scale on which it is searched, and a prior; all optional.
 
     With `mean` and `deviation` (SI units) the number is believed to be so beforehand: normally
@@ -59,8 +59,8 @@ class Belief:
         return (value - self.mean) / self.deviation
 
 
-def as_prior(bounds: Any) -> Belief:
+def as_prior(bounds: Any) -> Prior:
     """A belief as it is, or what bounds (low, high) or None mean."""
-    if isinstance(bounds, Belief):
+    if isinstance(bounds, Prior):
         return bounds
-    return Belief() if bounds is None else Belief(*(float(bound) for bound in bounds))
+    return Prior() if bounds is None else Prior(*(float(bound) for bound in bounds))

@@ -1,7 +1,8 @@
-"""Moving masses and moving forces: Figs 2.23 to 2.27.
+"""Amplification by moving masses and moving forces: Figs 2.23 to 2.27.
 
-Amplification is the largest dynamic over the largest static deflection at a midspan; free vibration
-after the exit counts. The maps show where a mass would have to pull on the beam to stay on it.
+Amplification is the largest dynamic over the largest static deflection at a midspan, free vibration
+after the exit included. The maps mark where the contact force becomes negative: the mass would have
+to pull on the beam to stay on it.
 """
 
 import dataclasses
@@ -20,35 +21,38 @@ from experiments.thesis.cases import (
     with_sensors,
 )
 from experiments.thesis.chapter2 import published
-from experiments.thesis.chapter2.amplification_figures import draw_curves, draw_histories, draw_map
+from experiments.thesis.chapter2.amplification_figures import (
+    draw_curves,
+    draw_histories,
+    draw_map,
+)
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.simulate import ContactLossWarning
 
-MASSES = np.append(np.linspace(0.05, 0.6, 18), [0.26, 0.261, 0.5])  # kg; also those printed
-ONE_RATIOS = np.append(np.geomspace(0.05, 0.2, 9)[:-1], np.linspace(0.2, 1.2, 21))
-TWO_RATIOS = np.append(np.geomspace(0.05, 0.2, 9)[:-1], np.linspace(0.2, 2.0, 37))
+MASSES = np.append(np.linspace(0.05, 0.6, 18), [0.26, 0.261, 0.5])  # kg; the last as printed
+# Speeds over the critical speed, of one span and of two.
+ONE_SPAN_RATIOS = np.append(np.geomspace(0.05, 0.2, 9)[:-1], np.linspace(0.2, 1.2, 21))
+TWO_SPAN_RATIOS = np.append(np.geomspace(0.05, 0.2, 9)[:-1], np.linspace(0.2, 2.0, 37))
 DURATION = 1.0  # s: the slowest crossing, and free vibration after all others
 TOLERANCE = 1e-4  # relative, of peaks
-MODE_SENSITIVITY = (
-    0.02  # by so much must twice the modes change an amplification that means nothing
-)
+MODE_SENSITIVITY = 0.02  # relative change with twice the modes from which modes matter
 WHILE_LOADED = "while the load is on the beam"
-SHAKER_POSITION, SHAKER_STIFFNESS = (
-    0.5,
-    12000.0,
-)  # m and N/m: the shaker that section 2.3 names, without current
+# The shaker of section 2.3 without current is a spring: m, N/m.
+SHAKER_POSITION, SHAKER_STIFFNESS = 0.5, 12000.0
 ON_SHAKER_SPRING = (
     f"on the spring of the shaker, {SHAKER_STIFFNESS:g} N/m, in ratios to its own critical speed"
 )
-DAMPING = 0.03
-SINE_FREQUENCIES, SINE_AMPLITUDES = (2.0, 4.0), (0.0, 1.0, 2.0)
+DAMPING = 0.03  # damping ratio of all other rigs
+SINE_FREQUENCIES, SINE_AMPLITUDES = (2.0, 4.0), (0.0, 1.0, 2.0)  # Hz, V, of Fig. 2.22
 
 
 class AmplificationSweep(NamedTuple):
-    """Amplification (mass, speed, place), and the lowest contact force in weights (mass, speed).
+    """Amplification of a sweep over masses (kg) and speeds over the critical speed.
 
-    `amplification_on_beam` is the amplification until the load leaves.
+    `amplification` (mass, speed, sensor) is that of the whole run, `amplification_on_beam` that
+    until the load leaves. `contact_force_ratio` (mass, speed) is the lowest contact force over the
+    weight, negative where the mass would have to pull.
     """
 
     masses: np.ndarray
@@ -58,7 +62,7 @@ class AmplificationSweep(NamedTuple):
     contact_force_ratio: np.ndarray
 
     def at(self, mass: float, ratio: float, sensor: int = 0) -> np.ndarray:
-        """Amplification in the whole run and until the load leaves, at values swept over."""
+        """Amplification in the whole run and until the load leaves, (2,), at swept values."""
         i, j = np.argmin(np.abs(self.masses - mass)), np.argmin(np.abs(self.speed_ratios - ratio))
         return np.array(
             [values[i, j, sensor] for values in (self.amplification, self.amplification_on_beam)]
@@ -66,7 +70,7 @@ class AmplificationSweep(NamedTuple):
 
 
 def sweep_amplification(case: jb.Case, masses, ratios) -> AmplificationSweep:
-    """Amplification at the sensors over masses (kg) and speeds, in ratios to the critical one."""
+    """Amplification at the sensors over masses (kg) and speeds over the critical speed."""
     masses, ratios = np.sort(masses), np.asarray(ratios)
     speeds = critical_speed(case) * ratios
     mass, speed, on_beam_only = (
@@ -89,21 +93,17 @@ def sweep_amplification(case: jb.Case, masses, ratios) -> AmplificationSweep:
 
 
 def run(load_rig) -> ExperimentResult:
-    """Amplifications of one and two spans by masses and forces, and their histories."""
+    """Amplification of one and two spans by masses and by forces, with histories and maps."""
     one = with_sensors(one_span(load_rig), 0.3, duration=DURATION)
     two = with_sensors(two_spans(load_rig), 0.3, 0.9, duration=DURATION)
     undamped = jb.replace(two, {"beam.damping_ratio": 0.0})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)  # the maps show it
-        mass_one, mass_two = (
-            sweep_amplification(one, MASSES, ONE_RATIOS),
-            sweep_amplification(two, MASSES, TWO_RATIOS),
-        )
-        force_one, force_two = (
-            sweep_amplification(as_moving_force(case), [1.0], ratios)
-            for case, ratios in ((one, ONE_RATIOS), (two, TWO_RATIOS))
-        )
-        yang = sweep_amplification(as_moving_force(undamped), [1.0], TWO_RATIOS[:24])
+        mass_one = sweep_amplification(one, MASSES, ONE_SPAN_RATIOS)
+        mass_two = sweep_amplification(two, MASSES, TWO_SPAN_RATIOS)
+        force_one = sweep_amplification(as_moving_force(one), [1.0], ONE_SPAN_RATIOS)
+        force_two = sweep_amplification(as_moving_force(two), [1.0], TWO_SPAN_RATIOS)
+        yang = sweep_amplification(as_moving_force(undamped), [1.0], TWO_SPAN_RATIOS[:24])
         more_modes = sweep_amplification(with_modes(two, 16), [0.261], [0.45, 1.75])
         on_spring = _on_spring(one)
         history, figures = _histories(load_rig)
@@ -134,7 +134,7 @@ def run(load_rig) -> ExperimentResult:
             )
         ),
     )
-    two_words = "first midspan", "second midspan"
+    midspans = "first midspan", "second midspan"
     figures |= {
         "fig-2-25": draw_curves(
             force_one, mass_one, ((0.26, 0, "0.26 kg"), (0.5, 0, "0.5 kg")), "Fig. 2.25"
@@ -142,17 +142,17 @@ def run(load_rig) -> ExperimentResult:
         "fig-2-27": draw_curves(
             force_two,
             mass_two,
-            [(0.261, i, word) for i, word in enumerate(two_words)],
+            [(0.261, i, name) for i, name in enumerate(midspans)],
             "Fig. 2.27, 0.261 kg",
         ),
         "map-one-span": draw_map(mass_one, ("midspan",), "one span, 3 modes"),
-        "map-two-spans": draw_map(mass_two, two_words, "two spans, 8 modes"),
+        "map-two-spans": draw_map(mass_two, midspans, "two spans, 8 modes"),
     }
     return ExperimentResult(findings, figures)
 
 
 def _on_spring(bare: jb.Case) -> np.ndarray:
-    """Amplifications of Fig. 2.25 with the spring of the shaker below the beam."""
+    """Amplification of Fig. 2.25, (3,), with the beam on the spring of the shaker."""
     case = dataclasses.replace(
         bare, supports=(jb.Support(SHAKER_POSITION, stiffness=SHAKER_STIFFNESS),)
     )
@@ -163,24 +163,25 @@ def _on_spring(bare: jb.Case) -> np.ndarray:
 
 
 def _inconsistency_fig_2_25(interpretations) -> str:
-    """Why no reading meets all numbers of Fig. 2.25, if each is met by one."""
+    """Why no interpretation yields all numbers of Fig. 2.25 where each number is yielded by one."""
     printed = published.ONE_SPAN_AMPLIFICATION
     near = np.abs(np.array(interpretations) - printed.numbers) <= printed.allowed_error
     if not near.any(axis=0).all() or near.all(axis=1).any():
         return ""
     return (
-        "it is not told whether the beam had the shaker on it, nor until when peaks count: each"
-        " number is met by one of these readings, but all by none"
+        "it is not stated whether the shaker was on the beam, nor until when peaks count: each"
+        " number follows from one of these readings, but all from none"
     )
 
 
 def _with_interpretations(values):
+    """Amplification of whole runs, and of the crossing alone as the other interpretation."""
     whole, on = np.array(values).T
     return whole, {WHILE_LOADED: on}
 
 
 def _mode_dependence(more_modes: AmplificationSweep, coarse, fine) -> str:
-    """Why amplifications say nothing: the mass has left the beam, and the modes kept matter."""
+    """Why an amplification depends on the number of modes: the mass has lost contact. Or empty."""
     change = np.max(np.abs(np.array(fine) / np.array(coarse) - 1))
     if more_modes.contact_force_ratio.max() > 0 or change < MODE_SENSITIVITY:
         return ""
@@ -192,7 +193,7 @@ def _mode_dependence(more_modes: AmplificationSweep, coarse, fine) -> str:
 
 
 def _histories(load_rig):
-    """Rig D and slow crossings, by a mass and by a force: Figs 2.23, 2.24 and 2.26."""
+    """Histories of a moving mass and of a moving force: Figs 2.23, 2.24 and 2.26."""
     rig_d = load_rig("D")
     ratio, between, mass, force = _free_vibration(rig_d)
     damped, _, _, _ = _free_vibration(jb.replace(rig_d, {"beam.damping_ratio": DAMPING}))
@@ -217,7 +218,9 @@ def _histories(load_rig):
             {f"damping ratio {DAMPING:g}, as for all rigs of the thesis": damped},
         ),
         make_finding(
-            published.FREE_PHASE_DIFFERENCE, between, {"in phase or opposed, no more": reversed_by}
+            published.FREE_PHASE_DIFFERENCE,
+            between,
+            {"either in phase or in antiphase": reversed_by},
         ),
         make_finding(
             published.FORCE_MASS_DIFFERENCE,
@@ -229,8 +232,11 @@ def _histories(load_rig):
 
 
 def _free_vibration(case: jb.Case):
-    """Free vibration after the exit: amplitude of a force over that of a mass, and the phase
-    (degree) between both; and the runs, of the mass and of the force."""
+    """Free vibration after the exit, by a moving force and by a moving mass.
+
+    Returns the ratio of amplitudes (force over mass), the phase between them (degree), and the
+    records of the mass and of the force.
+    """
     mass, force = (jb.simulate(one) for one in (case, as_moving_force(case)))
     after = np.asarray(mass.times) > float(case.beam.length / case.loads[0].speed)
     free = [np.abs(np.asarray(run.deflection)[after]).max() for run in (force, mass)]
@@ -244,7 +250,7 @@ def _free_vibration(case: jb.Case):
 
 
 def _peak_difference(case: jb.Case, volts: float) -> float:
-    """By how much (mm) the peaks of a mass and of a force differ while the shaker is driven."""
+    """Difference (mm) of the peaks of a mass and of a force while the shaker is driven by sines."""
     prescribed = jb.Prescribed(
         offsets=[0.0], amplitudes=[[volts, volts]], frequencies=SINE_FREQUENCIES
     )
@@ -256,20 +262,21 @@ def _peak_difference(case: jb.Case, volts: float) -> float:
 
 
 def _unknown_voltage(peak_differences) -> str:
-    """Why a difference says nothing that any voltage could have made; empty if none could."""
+    """Why the difference of Fig. 2.24 depends on the voltage, which is not printed; or empty."""
     if not peak_differences[0] < published.FORCE_MASS_DIFFERENCE.numbers[0] < max(peak_differences):
         return ""
     return (
-        f"the voltage is not printed, and a mass that the shaker moves pushes back: sines of"
-        f" {SINE_FREQUENCIES[0]:g} and {SINE_FREQUENCIES[1]:g} Hz (Fig. 2.22) of 0 to {SINE_AMPLITUDES[-1]:g} V each make the"
-        f" difference {peak_differences[0]:.3f} to {max(peak_differences):.3f} mm"
+        f"the voltage is not printed, and the inertia of the mass acts on what the shaker moves:"
+        f" sines of {SINE_FREQUENCIES[0]:g} and {SINE_FREQUENCIES[1]:g} Hz (Fig. 2.22) of 0 to"
+        f" {SINE_AMPLITUDES[-1]:g} V each make the difference {peak_differences[0]:.3f} to"
+        f" {max(peak_differences):.3f} mm"
     )
 
 
 EXPERIMENT = Experiment(
     "amplification",
     "Figs 2.23 to 2.27",
-    "Beyond a tenth of the critical speed a moving mass does more than a moving force, and the more"
-    " the heavier it is.",
+    "Beyond a tenth of the critical speed a moving mass deflects the beam more than a moving force,"
+    " and the more, the heavier it is.",
     run,
 )

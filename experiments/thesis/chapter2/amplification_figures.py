@@ -1,4 +1,4 @@
-"""Pictures of moving masses and forces: histories, amplification over speed, and maps."""
+"""Figures of moving masses and forces: histories, amplification over speed, and maps."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,7 +11,10 @@ LIFT_OFF_LABEL = "the mass would have to pull"
 
 @use_style
 def draw_histories(pairs) -> Figure:
-    """Deflections by a moving mass and a moving force, one panel for each (mass, force) of runs."""
+    """Deflection histories by a moving mass and a moving force, one panel for each pair of runs.
+
+    `pairs` maps a title to the records (mass, force).
+    """
     figure = Figure(figsize=(7.2, 2.1 * len(pairs)))
     for axes, (title, runs) in zip(figure.subplots(len(pairs), 1), pairs.items(), strict=True):
         histories = [np.asarray(run.deflection)[:, 0] for run in runs]
@@ -42,7 +45,11 @@ def draw_histories(pairs) -> Figure:
 
 @use_style
 def draw_curves(force, mass, panels, title: str) -> Figure:
-    """Amplification over the speed ratio: `panels` are (mass in kg, place, words)."""
+    """Amplification over the speed ratio, by a force and a mass.
+
+    `force` and `mass` are sweeps of amplification; each of `panels` is a mass (kg), the number of a
+    sensor, and a title.
+    """
     figure, highest = Figure(figsize=(7.2, 3.2)), 0.0
     for axes, (panel_mass, sensor, panel_title) in zip(
         figure.subplots(1, len(panels), sharey=True), panels, strict=True
@@ -54,7 +61,7 @@ def draw_curves(force, mass, panels, title: str) -> Figure:
             color=colour(0),
             label="moving force",
         )
-        lifts_off = mass.contact[i] < 0
+        lifts_off = mass.contact_force_ratio[i] < 0
         curve = mass.amplification[i, :, sensor]
         axes.plot(mass.speed_ratios, curve, "--", color=colour(1), label="moving mass")
         axes.fill_between(
@@ -83,17 +90,20 @@ def draw_curves(force, mass, panels, title: str) -> Figure:
 
 @use_style
 def draw_map(mass, panel_titles, title: str) -> Figure:
-    """Amplification over mass and speed ratio; hatched where a mass would have to pull."""
+    """Amplification over mass and speed ratio, hatched where the mass would have to pull.
+
+    `mass` is a sweep of amplification; there is one panel, with a title, for each sensor.
+    """
     figure = Figure(figsize=(1.4 + 3.4 * len(panel_titles), 3.6))
     panels = figure.subplots(1, len(panel_titles), sharey=True, squeeze=False)[0]
-    lifts_off = mass.contact < 0
+    lifts_off = mass.contact_force_ratio < 0
     in_contact = np.where(lifts_off[..., None], np.nan, mass.amplification)
     highest = np.ceil(4 * np.nanmax(in_contact)) / 4
     fills, lines = np.arange(0.9, highest + 0.01, 0.05), np.arange(1, highest + 0.01, 0.25)
     for i, (axes, panel_title) in enumerate(zip(panels, panel_titles, strict=True)):
         axes.set_facecolor(SHADE)
         over = mass.speed_ratios, mass.masses
-        # All of it, so that colours reach the edge of what is then covered.
+        # Drawn everywhere, so that colours reach the edge of the hatched cover.
         filled = axes.contourf(
             *over, mass.amplification[..., i], fills, cmap="YlGnBu", extend="both"
         )

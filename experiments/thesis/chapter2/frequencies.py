@@ -17,7 +17,7 @@ TABLE_2_2_BEAM = {"beam.flexural_rigidity": 12.11, "beam.mass_per_length": 0.541
 
 
 def run(load_rig) -> ExperimentResult:
-    """Frequencies of two spans, exactly and in sine modes, and the speeds that follow."""
+    """Frequencies of two spans, exact and by sine modes, and the critical speeds that follow."""
     one, two = one_span(load_rig), two_spans(load_rig)
     table_2_2_case = jb.replace(two, TABLE_2_2_BEAM)
     exact, printed_exact = (
@@ -98,7 +98,7 @@ def run(load_rig) -> ExperimentResult:
 
 
 def _critical_speeds(span, one_span_frequency, two_span_frequencies):
-    """Critical speeds: of one span, and of two by their first and second mode."""
+    """Critical speeds (m/s) from angular frequencies (rad/s): of one span, and of two by mode."""
     return np.array(
         [
             span * one_span_frequency / np.pi,
@@ -109,9 +109,9 @@ def _critical_speeds(span, one_span_frequency, two_span_frequencies):
 
 
 def _frequency_at_patch_density(one):
-    """The first angular frequency (rad/s) of rig A with the density of the patch rigs.
+    """First angular frequency (rad/s) of rig A with the density of the patch rigs.
 
-    3.3 mm of 65 GPa have the 11.68 N m^2 printed for rig A; its 0.535 kg/m are those of
+    A height of 3.3 mm and 65 GPa give the 11.68 N m^2 printed for rig A. Its 0.535 kg/m follow from
     2700 kg/m^3, while beams of that modulus have 2800 kg/m^3 elsewhere.
     """
     section = jb.Beam(
@@ -122,26 +122,23 @@ def _frequency_at_patch_density(one):
 
 
 def _frequencies_on_suspension(case, stiffness):
-    """Natural frequencies (Hz) of the beam on the suspension of its shaker."""
+    """Natural frequencies (Hz) of the beam on its shaker with a suspension stiffness (N/m)."""
     case = jb.replace(case, {"actuators.0.stiffness": stiffness})
     return np.sqrt(np.linalg.eigvalsh(np.asarray(rig(case, lay_out(case)).stiffness()))) / 2 / np.pi
 
 
 @use_style
 def _draw(two: jb.Case) -> Figure:
-    """Fig. 2.4: eight modes, exact and in eight sine modes on a stiff spring."""
+    """Fig. 2.4: eight mode shapes, exact and by eight sine modes on a stiff spring."""
     x = np.linspace(0, float(two.beam.length), 400)
     figure = Figure(figsize=(7.2, 6.4))
     panels = figure.subplots(4, 2, sharex=True)
-    found = [model.shapes(x, 0) for model in (jb.modes(two), sine_basis_modes(two))]
-    line_labels = "exact", "8 sine modes"
+    shapes = [np.asarray(basis.shapes(x, 0)) for basis in (jb.modes(two), sine_basis_modes(two))]
+    labels = "exact", "8 sine modes"
     for i, axes in enumerate(panels.flat):
-        # The exact ones dashed on top.
-        for j, dashes in ((1, "-"), (0, "--")):
-            shape = np.asarray(found[j])[:, i]
-            axes.plot(
-                x, shape / np.abs(shape).max(), dashes, color=colour(1 - j), label=line_labels[j]
-            )
+        for j, dashes in ((1, "-"), (0, "--")):  # the exact ones dashed on top
+            shape = shapes[j][:, i] / np.abs(shapes[j][:, i]).max()
+            axes.plot(x, shape, dashes, color=colour(1 - j), label=labels[j])
         axes.plot([0, x[-1] / 2, x[-1]], [0, 0, 0], "^", color="k", markersize=4, clip_on=False)
         axes.set(title=f"mode {i + 1}", ylim=(-1.15, 1.15), yticks=(-1, 0, 1), xlim=(0, x[-1]))
     for axes in panels[-1]:
@@ -154,7 +151,7 @@ def _draw(two: jb.Case) -> Figure:
 EXPERIMENT = Experiment(
     "frequencies",
     "Tables 2.1, 2.2, Fig. 2.4, critical speeds",
-    "Two equal spans have the frequencies printed; eight sine modes on a stiff spring come near"
-    " for all but the last.",
+    "Two equal spans have the printed frequencies; eight sine modes on a stiff spring approximate"
+    " all but the last.",
     run,
 )

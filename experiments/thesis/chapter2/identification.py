@@ -1,23 +1,23 @@
-"""What the thesis fitted by hand, by gradients: damping, suspension and patch factors.
+"""Damping, suspension and patch factors that the thesis fitted by hand, identified from logs.
 
 The measured logs are not available. Those in `logs` were made by finite elements with the numbers
-fitted by hand (python -m tests.tuning.make_rig_logs); the fits begin a quarter off them.
+fitted by hand (python -m tests.tuning.make_rig_logs); the fits start a quarter above them.
 """
 
-import dataclasses
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
 import tuning
+from experiments.thesis.cases import with_modes
 from experiments.thesis.chapter2 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.plot.style import colour, set_title, use_style
 
 LOGS = Path(__file__).parent / "logs"
-START_FACTOR = 1.25  # how far off the fits begin
-MODES = 12  # eight leave out half of the noise on two spans
+START_FACTOR = 1.25  # start values over the values fitted by hand
+MODES = 12  # of the finite elements; eight leave an error of half the noise on two spans
 DAMPING = "beam.damping_ratio"
 PATCH_FACTORS = "actuators.0.correction", "actuators.1.correction"
 HAND_FITTED = {
@@ -33,19 +33,19 @@ PUBLISHED = {
 
 
 def with_log_modes(case: jb.Case) -> jb.Case:
-    """A published rig with as many modes as its log shows."""
-    return dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=MODES))
+    """A published rig with as many modes as the finite elements of its log."""
+    return with_modes(case, MODES)
 
 
 def fit_rig(rig: str, load_rig) -> tuning.Fit:
-    """The numbers of a rig that were fitted by hand, from its log."""
+    """Fit of the parameters of a rig that were fitted by hand, from its log."""
     start = {address: START_FACTOR * value for address, value in HAND_FITTED[rig].items()}
     case = jb.replace(with_log_modes(load_rig(rig)), start)
     return tuning.identify(case, tuning.read_log(LOGS / f"{rig}.csv"), list(start))
 
 
 def run(load_rig) -> ExperimentResult:
-    """All fits, with what they say of their numbers."""
+    """Fits of rigs A, B and C, with 95 % intervals as remarks."""
     fits = {rig: fit_rig(rig, load_rig) for rig in HAND_FITTED}
     findings = [make_finding(PUBLISHED[rig], found.values) for rig, found in fits.items()]
     remarks = ["The measured logs are not available: these come from finite elements."]
@@ -59,7 +59,7 @@ def run(load_rig) -> ExperimentResult:
 
 @use_style
 def _draw(fits) -> Figure:
-    """Measured and fitted deflections, and what is left, rig by rig."""
+    """Logged and fitted deflections above, residuals below; a column for each rig."""
     figure = Figure(figsize=(7.2, 5.6))
     columns = figure.subplots(2, len(fits), sharex="col").T
     for (above, below), (rig, found) in zip(columns, fits.items(), strict=True):
@@ -72,13 +72,13 @@ def _draw(fits) -> Figure:
     figure.axes[0].set_ylabel("deflection (mm)")
     figure.axes[len(fits)].set_ylabel("residual (µm)")
     figure.axes[0].legend()
-    set_title(figure, "What was fitted by hand, fitted by gradients")
+    set_title(figure, "Logs of rigs A, B and C, and models identified from them")
     return figure
 
 
 EXPERIMENT = Experiment(
     "identification",
     "hand fits of damping, shaker and patches: 2.1.2, 2.2.4, 2.4.2",
-    "From logs of such rigs, gradients find the numbers that the thesis fitted by hand.",
+    "Identification from logs of such rigs finds the numbers that the thesis fitted by hand.",
     run,
 )

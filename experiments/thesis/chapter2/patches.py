@@ -1,4 +1,4 @@
-"""What the patch rigs and the first-order shaker are made of: 2.2.3, 2.4.2 and eq. (2.43)."""
+"""Constants of patches, beam sections and the first-order shaker: 2.2.3, 2.4.2, eq. (2.43)."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,12 +10,12 @@ from jaxbeam.model.statics import static_lift
 from jaxbeam.plot.style import colour, set_title, use_style
 
 WIDTH, MODULUS, DENSITY = 0.1, 65e9, 2800.0  # m, Pa, kg/m^3
-HEIGHT, REFITTED_HEIGHT = 2.83e-3, 2.9e-3  # m: as printed, and the one that the printed section has
-PATCH_VOLTAGE = 1500.0  # at the patch
+HEIGHT, SECTION_HEIGHT = 2.83e-3, 2.9e-3  # m: as printed, and as the printed section implies
+PATCH_VOLTAGE = 1500.0  # V at the patch
 
 
 def run(load_rig) -> ExperimentResult:
-    """Constants of patch, section and shaker from what the thesis makes them of."""
+    """Constants of patch, section and shaker, from the numbers that the thesis derives them from."""
     patch = jb.Patch(
         0.2575,
         0.3425,
@@ -31,7 +31,7 @@ def run(load_rig) -> ExperimentResult:
         make_finding(
             published.PATCH_SECTION,
             _section_constants(HEIGHT),
-            {"h = 2.9 mm": _section_constants(REFITTED_HEIGHT)},
+            {"h = 2.9 mm": _section_constants(SECTION_HEIGHT)},
         ),
         make_finding(published.SHAKER_CUTOFF, load_rig("A").actuators[0].bandwidth / (2 * np.pi)),
     )
@@ -39,13 +39,14 @@ def run(load_rig) -> ExperimentResult:
 
 
 def _section_constants(height):
+    """Flexural rigidity (N m^2) and mass per length (kg/m) of a section of some height (m)."""
     beam = jb.Beam(0.6, width=WIDTH, height=height, youngs_modulus=MODULUS, density=DENSITY)
     return [beam.rigidity, beam.linear_density]
 
 
 @use_style
 def _draw(load_rig) -> Figure:
-    """How far each patch lifts the beams of rigs B and C, statically."""
+    """Static deflection of rigs B and C by each patch."""
     figure = Figure(figsize=(7.2, 2.8))
     for axes, rig in zip(figure.subplots(1, 2, sharey=True), "BC", strict=True):
         case = load_rig(rig)
@@ -67,6 +68,7 @@ def _draw(load_rig) -> Figure:
 EXPERIMENT = Experiment(
     "patches",
     "constants of patch, section and shaker",
-    "The constants printed for the patch rigs and the first-order shaker follow from their parts.",
+    "The printed constants of the patch rigs and of the first-order shaker follow from the printed"
+    " dimensions and material constants.",
     run,
 )

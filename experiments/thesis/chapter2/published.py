@@ -30,7 +30,7 @@ ANALYTICAL_FREQUENCIES = PublishedNumbers(
     EIGENVALUE_TABLE,
     "20.387 31.849 81.550 103.212 183.488 215.343 326.2 368.249",
     MODE_LABELS,
-    "12.11 N m^2 and 0.5411 kg/m stand beside the table",
+    "12.11 N m^2 and 0.5411 kg/m, as beside the table",
 )
 APPROXIMATE_FREQUENCIES = PublishedNumbers(
     "Table 2.2",
@@ -96,7 +96,7 @@ SHAKER_MODES = PublishedNumbers(
     SAME_MODEL,
     "24 72 159",
     "1 2 3",
-    "the stiffness of the shaker is not named there; 3500 N/m where it is active",
+    "the stiffness of the shaker is not stated there; 3500 N/m as where it is active",
 )
 
 # Patches and sections.
@@ -111,7 +111,7 @@ PATCH_SECTION = PublishedNumbers(
     FORMULA,
     "13.211 0.812",
     "EI rhoA",
-    "h = 2.83 mm stands beside it; 65 GPa, 2800 kg/m^3",
+    "h = 2.83 mm as printed beside it; 65 GPa, 2800 kg/m^3",
 )
 SHAKER_CUTOFF = PublishedNumbers(
     "2.2.3", "cutoff of the first-order shaker", HZ, "computed", FORMULA, "1591.5"

@@ -1,4 +1,4 @@
-"""The electrodynamic shaker on the beam of rig A in the frequency domain: Figs 2.15 to 2.20."""
+"""Frequency responses of the electrodynamic shaker on the beam of rig A: Figs 2.15 to 2.20."""
 
 import dataclasses
 
@@ -7,8 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
+from experiments.thesis.cases import data_physics_v4
 from experiments.thesis.chapter2 import published
-from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
+from experiments.thesis.verdicts import LITERAL, Experiment, ExperimentResult, make_finding
 from jaxbeam.model.channels import shaker_chain
 from jaxbeam.model.frequency_response import FrequencyResponse, extremes, frequency_response
 from jaxbeam.plot.style import colour, set_title, use_style
@@ -21,48 +22,41 @@ RIGID = {"flexural_rigidity": 1.022e5, "mass_per_length": 11.016}  # Fig. 2.20
 MASS_IN_IMPEDANCE = "the mass in eq. (2.26), but not in (2.33)"
 
 
-def data_physics_v4() -> jb.Electrodynamic:
-    """The shaker of Table 2.3, at 0.5 m."""
-    return jb.Electrodynamic(
-        0.5, 0.82, 5e-5, 4.2, back_emf=4.2, mass=0.02, stiffness=9700.0, damping=0.55
-    )
-
-
 def run(load_rig) -> ExperimentResult:
-    """Force drops and peaks of the force per voltage, the beam free or with 0.5 kg on it."""
-    rig = dataclasses.replace(load_rig("A").beam, modes=4)
-    aluminium_beam = jb.Beam(rig.length, damping_ratio=rig.damping_ratio, modes=4, **ALUMINIUM)
+    """Dips and peaks of the force per voltage, the beam bare or with 0.5 kg on it."""
+    printed = dataclasses.replace(load_rig("A").beam, modes=4)
+    aluminium_beam = jb.Beam(
+        printed.length, damping_ratio=printed.damping_ratio, modes=4, **ALUMINIUM
+    )
     undamped = dataclasses.replace(aluminium_beam, damping_ratio=0.0)
     beams = {
-        "as printed": rig,
+        LITERAL: printed,
         "aluminium of 70 GPa, 2700 kg/m^3, 3.3 mm high": aluminium_beam,
         "the same without damping": undamped,
     }
-    free = {word: _features(_response(beam)) for word, beam in beams.items()}
-    with_mass = {word: _features(_response(beam, STATIONARY_MASS)) for word, beam in beams.items()}
-    with_mass[MASS_IN_IMPEDANCE] = _features(_mass_in_impedance_only(rig))
+    free = {name: _features(_response(beam)) for name, beam in beams.items()}
+    with_mass = {name: _features(_response(beam, STATIONARY_MASS)) for name, beam in beams.items()}
+    with_mass[MASS_IN_IMPEDANCE] = _features(_mass_in_impedance_only(printed))
     with_mass[f"{MASS_IN_IMPEDANCE}, beam of aluminium"] = _features(
         _mass_in_impedance_only(aluminium_beam)
     )
-    transmitted = max(_peaks(_response(rig), 2), key=lambda pair: pair[1])
+    transmitted = max(_peaks(_response(printed), 2), key=lambda pair: pair[1])
 
-    def make_findings(printed, found, what):
-        values = {word: what(one) for word, one in found.items()}
-        return make_finding(printed, values.pop("as printed"), values)
+    def by_beam(published_numbers, features, select):
+        values = {name: select(one) for name, one in features.items()}
+        return make_finding(published_numbers, values.pop(LITERAL), values)
 
     findings = (
-        make_findings(published.FORCE_DROPS, free, lambda one: one["drops"][:4]),
-        make_findings(published.SHAKER_GAIN, free, lambda one: [one["low"], one["peak"][1]]),
-        make_findings(published.SHAKER_PEAK_FREQUENCY, free, lambda one: one["peak"][0]),
+        by_beam(published.FORCE_DROPS, free, lambda one: one["drops"][:4]),
+        by_beam(published.SHAKER_GAIN, free, lambda one: [one["low"], one["peak"][1]]),
+        by_beam(published.SHAKER_PEAK_FREQUENCY, free, lambda one: one["peak"][0]),
         make_finding(published.TRANSMITTED_PEAK_FREQUENCY, transmitted[0]),
-        make_findings(published.STATIONARY_MASS_DROP, with_mass, lambda one: one["drops"][0]),
-        make_findings(
-            published.STATIONARY_MASS_PEAK_FREQUENCY, with_mass, lambda one: one["peak"][0]
-        ),
-        make_findings(published.STATIONARY_MASS_PEAK, with_mass, lambda one: one["peak"][1]),
+        by_beam(published.STATIONARY_MASS_DROP, with_mass, lambda one: one["drops"][0]),
+        by_beam(published.STATIONARY_MASS_PEAK_FREQUENCY, with_mass, lambda one: one["peak"][0]),
+        by_beam(published.STATIONARY_MASS_PEAK, with_mass, lambda one: one["peak"][1]),
     )
-    stiff = dataclasses.replace(rig, **{key: np.asarray(value) for key, value in RIGID.items()})
-    return ExperimentResult(findings, {"responses": _draw(rig, stiff)})
+    stiff = dataclasses.replace(printed, **{key: np.asarray(value) for key, value in RIGID.items()})
+    return ExperimentResult(findings, {"responses": _draw(printed, stiff)})
 
 
 def _response(beam: jb.Beam, stationary_masses=()) -> FrequencyResponse:
@@ -71,9 +65,9 @@ def _response(beam: jb.Beam, stationary_masses=()) -> FrequencyResponse:
 
 
 def _mass_in_impedance_only(beam: jb.Beam) -> FrequencyResponse:
-    """With the parked mass in the coil's impedance, eq. (2.26), but not in eq. (2.33).
+    """Response with the stationary mass in the coil's impedance, eq. (2.26), but not in eq. (2.33).
 
-    Both have the accelerance of the beam in them, and (2.30) with the mass is written for one.
+    Both contain the accelerance of the beam, and eq. (2.30) with the mass is written for one.
     """
     bare, with_mass = _response(beam).values, _response(beam, STATIONARY_MASS)
     force = with_mass.values[:, 3] / with_mass.values[:, 2] * bare[:, 2]
@@ -81,16 +75,21 @@ def _mass_in_impedance_only(beam: jb.Beam) -> FrequencyResponse:
 
 
 def _peaks(response: FrequencyResponse, pair: int) -> list[tuple[float, float]]:
-    """Peaks of a response: frequency (Hz) and height."""
-    return [(place, height) for word, place, height in extremes(response, pair) if word == "peak"]
+    """Peaks of one input-output pair of a response: frequency (Hz) and magnitude."""
+    return [(at, magnitude) for kind, at, magnitude in extremes(response, pair) if kind == "peak"]
 
 
 def _features(response: FrequencyResponse) -> dict:
-    """Of the force per voltage: its start (N/V), drops (Hz) and largest peak (Hz, N/V)."""
+    """Features of the force per voltage.
+
+    "low": its value at the lowest frequency (N/V), "drops": dips below that (Hz), "peak": the
+    largest peak (Hz, N/V).
+    """
     found = extremes(response, 3)
-    drops = [place for word, place, height in found if word == "dip" and height < found[0][2]]
+    low = found[0][2]
+    drops = [at for kind, at, magnitude in found if kind == "dip" and magnitude < low]
     return {
-        "low": found[0][2],
+        "low": low,
         "drops": drops,
         "peak": max(_peaks(response, 3), key=lambda pair: pair[1]),
     }
@@ -98,7 +97,7 @@ def _features(response: FrequencyResponse) -> dict:
 
 @use_style
 def _draw(beam, stiff) -> Figure:
-    """Magnitudes along the chain of the shaker, with the axes of Figs 2.15 to 2.18 and 2.20."""
+    """Magnitudes from voltage to force on the beam, with the axes of Figs 2.15 to 2.18, 2.20."""
     figure = Figure(figsize=(7.2, 5.6))
     panels = figure.subplots(2, 2, sharex=True)
     free, with_mass, rigid = _response(beam), _response(beam, STATIONARY_MASS), _response(stiff)

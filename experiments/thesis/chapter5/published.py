@@ -69,7 +69,7 @@ AUGMENTED_FAST = PublishedNumbers(
 )
 SUMMARY_OPTIMAL = PublishedNumbers(
     "Table 8.1",
-    "one span, 0.509 kg, less by optimal control",
+    "one span, 0.509 kg, reduction by optimal control",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -78,7 +78,7 @@ SUMMARY_OPTIMAL = PublishedNumbers(
 )
 PARTIAL_FEEDBACK = PublishedNumbers(
     "Fig. 5.13",
-    "0.261 kg at 0.55 m/s, less with few states",
+    "0.261 kg at 0.55 m/s, reduction with few states",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -87,7 +87,7 @@ PARTIAL_FEEDBACK = PublishedNumbers(
 )
 GAIN_SCHEDULING = PublishedNumbers(
     "Fig. 5.24",
-    "0.509 kg, less with the gain for it than with that for 0.261 kg",
+    "0.509 kg, gain designed for it instead of for 0.261 kg, further reduction",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -104,16 +104,16 @@ DEEPEST_POSITION = PublishedNumbers(
 )
 MODE_TRUNCATION = PublishedNumbers(
     "Fig. 5.11",
-    "bare beam, 0.261 kg at 0.55 m/s, less deep under the load with two modes",
+    "bare beam, 0.261 kg at 0.55 m/s, deflection under the load, shortfall with two modes",
     "%",
     "computed",
     SAME_MODEL,
     "1.14",
-    interpretation="against three modes, the number that is not told",
+    interpretation="against three modes; the thesis does not state against how many",
 )
 OBSERVED_REGULATOR = PublishedNumbers(
     "Fig. 5.5",
-    "sampled regulator with an observer, less at 0.25 m",
+    "sampled regulator with an observer, reduction at 0.25 m",
     "%",
     "computed",
     COMPUTED_REDUCTION,
@@ -161,7 +161,7 @@ MOVED_SHAKER_GAIN = PublishedNumbers(
 )
 UNSTABLE_FROZEN_POLES = PublishedNumbers(
     "Figs 5.17, 5.18",
-    "frozen poles of the time-varying loop to the right: 1, or none: 0",
+    "time-varying loop, frozen poles in the right half-plane: yes 1, no 0",
     "1",
     "computed",
     YES_OR_NO,
@@ -171,11 +171,11 @@ UNSTABLE_FROZEN_POLES = PublishedNumbers(
 )
 FROZEN_POLE_LIMITS = PublishedNumbers(
     "5.2",
-    "few states, frozen poles to the right from",
+    "few states, speed and mass from which frozen poles are unstable",
     "m/s, kg",
     "computed",
     COMPUTED_CURVE,
     "5.6 6.5",
     "speed,0.509kg mass,0.55m/s",
-    "the speed that is shown is taken for the limit",
+    "the speed shown is taken as the limit",
 )

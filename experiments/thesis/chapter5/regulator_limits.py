@@ -15,7 +15,7 @@ import jaxbeam as jb
 from experiments.thesis.chapter5 import published
 from experiments.thesis.verdicts import Finding, make_finding
 from jaxbeam.analysis.stability import frozen_poles, growth
-from jaxbeam.analysis.stability_limits import limit
+from jaxbeam.analysis.stability_limits import stability_limit
 from jaxbeam.numerics.riccati import dlqr, stein
 from jaxbeam.plot.poles import plot_poles
 
@@ -176,7 +176,7 @@ def largest_real_part(case: jb.Case, crossing_share: float = 1.0) -> float:
     return float(
         frozen_poles(
             case, crossing_share * np.linspace(0, crossing, LOAD_POSITIONS)[1:-1]
-        ).largest.max()
+        ).largest_real_part.max()
     )
 
 
@@ -184,5 +184,5 @@ def _stability_limit(case, address, bounds, rate) -> float:
     """From which value of a number the loop is unstable; the lower bound if there already."""
     if rate(jb.replace(case, {address: bounds[0]})) > 0:
         return bounds[0]
-    found = limit(case, address, bounds[0], bounds[1], rate, points=5)
+    found = stability_limit(case, address, bounds[0], bounds[1], rate, points=5)
     return np.inf if found is None else found

@@ -21,7 +21,7 @@ from experiments.thesis.chapter6.gain_scheduling import (
 )
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
 from jaxbeam.plot.style import colour, set_title, use_style
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 MASSES = (0.261, 0.322, 0.371, 0.509)  # kg
@@ -56,7 +56,7 @@ def with_feedback(
 def simulate_changes(case: jb.Case, changes) -> list[jb.Record]:
     """A case with several changes of its numbers, compiled once."""
     cases = [jb.replace(case, change) for change in changes]
-    plan = make_plan(cases[-1], None, TOLERANCE)
+    plan = integration_plan(cases[-1], None, TOLERANCE)
     with warnings.catch_warnings():
         # Under gains that are too high loads would have to pull; the numbers show it.
         warnings.simplefilter("ignore", ContactLossWarning)

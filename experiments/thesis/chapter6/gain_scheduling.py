@@ -12,8 +12,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from jaxbeam.analysis.crossing_margin import reserve
-from jaxbeam.analysis.derived_gains import BestGain, best_gains, equivalent_gains, scheduled
+from jaxbeam.analysis.crossing_margin import stability_margin
+from jaxbeam.analysis.derived_gains import (
+    BestGain,
+    best_gains,
+    equivalent_gains,
+    scheduled_controller,
+)
 from jaxbeam.control import ScheduledFeedback
 from jaxbeam.plot.style import colour, set_title, use_style
 
@@ -70,7 +75,7 @@ def derived_schedules(
         "by statics": ScheduledFeedback(
             masses=masses, gains=statics, period=own.period, delay=own.delay
         ),
-        "by optimisation": scheduled(case, best),
+        "by optimisation": scheduled_controller(case, best),
     }
     uncontrolled = np.array([one.uncontrolled for one in best])
     reductions = {}
@@ -83,7 +88,9 @@ def derived_schedules(
         for one, share in zip(best, reductions["by optimisation"], strict=True)
     )
     numbers = ({"loads.0.mass": one.mass, "controller.gains.0": one.gain} for one in best)
-    unstable_count = sum(reserve(jb.replace(case, each)).unstable is not None for each in numbers)
+    unstable_count = sum(
+        stability_margin(jb.replace(case, each)).unstable is not None for each in numbers
+    )
     remark = (
         f"Gains by optimisation of the crossing, in the loop as a schedule k(m): {gains_text}. If the"
         f" load stayed on the beam, {unstable_count} of these {len(best)} loops would be unstable."

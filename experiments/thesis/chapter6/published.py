@@ -29,7 +29,7 @@ CUBIC_S1 = PublishedNumbers(
 )
 CUBIC_REDUCTION_S1 = PublishedNumbers(
     "Table 6.1",
-    "s1, less by cubic",
+    "s1, reduction by cubic",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -41,7 +41,7 @@ LINEAR_S1 = PublishedNumbers(
 )
 LINEAR_REDUCTION_S1 = PublishedNumbers(
     "Table 6.1",
-    "s1, less by linear",
+    "s1, reduction by linear",
     "%",
     "computed",
     COMPUTED_REDUCTION,
@@ -71,7 +71,7 @@ CUBIC_S3 = PublishedNumbers(
 )
 CUBIC_REDUCTION_S3 = PublishedNumbers(
     "Table 6.2",
-    "s3, less by cubic",
+    "s3, reduction by cubic",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -83,7 +83,7 @@ LINEAR_S3 = PublishedNumbers(
 )
 LINEAR_REDUCTION_S3 = PublishedNumbers(
     "Table 6.2",
-    "s3, less by linear",
+    "s3, reduction by linear",
     "%",
     "computed",
     COMPUTED_REDUCTION,
@@ -110,7 +110,7 @@ CUBIC_UP = PublishedNumbers(
 )
 CUBIC_REDUCTION_UP = PublishedNumbers(
     "Table 6.3",
-    "s3 upwards, less by cubic",
+    "s3 upwards, reduction by cubic",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -127,7 +127,12 @@ FEEDBACK_VOLTAGE = PublishedNumbers(
     "m1,span1 m4,span2",
 )
 TWO_MASSES = PublishedNumbers(
-    "Fig. 6.11", "s3, less by cubic for two masses", "%", "measured", MEASURED_REDUCTION, "10.5"
+    "Fig. 6.11",
+    "s3, reduction by cubic for two masses",
+    "%",
+    "measured",
+    MEASURED_REDUCTION,
+    "10.5",
 )
 UNSTABLE_MASS = PublishedNumbers(
     "Fig. 6.10",
@@ -136,7 +141,7 @@ UNSTABLE_MASS = PublishedNumbers(
     "measured",
     FORMULA,
     "0.322",
-    interpretation="of the masses tried; unstable is what drives the commands to their limits",
+    interpretation="of the masses tried; unstable means commands that grow to their limits",
 )
 SWITCHING_MASSES = PublishedNumbers(
     "Fig. 6.7",
@@ -157,7 +162,7 @@ EQUIVALENT_LINEAR_GAIN = PublishedNumbers(
 )
 ONE_SPAN_LINEAR = PublishedNumbers(
     "Fig. 6.6",
-    "one span, less by linear, least and most",
+    "one span, reduction by linear, least and most",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -166,7 +171,7 @@ ONE_SPAN_LINEAR = PublishedNumbers(
 )
 ONE_SPAN_CUBIC = PublishedNumbers(
     "Fig. 6.6",
-    "one span, less by cubic, least and most",
+    "one span, reduction by cubic, least and most",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -178,13 +183,13 @@ FREE_VIBRATION_FREQUENCY = PublishedNumbers(
 )
 OSCILLATES = PublishedNumbers(
     "Fig. 6.4",
-    "one span, cubic, 0.509 kg at 0.28 m/s, oscillates: 1, or not: 0",
+    "one span, cubic, 0.509 kg at 0.28 m/s, oscillates: yes 1, no 0",
     "1",
     "measured",
     YES_OR_NO,
     "1 0",
     "10-Hz-filter 5-Hz-filter",
-    "more than 0.1 mm from crest to trough counts",
+    "an oscillation of more than 0.1 mm from crest to trough",
 )
 OSCILLATION_FREQUENCY = PublishedNumbers(
     "Fig. 6.4",
@@ -196,7 +201,7 @@ OSCILLATION_FREQUENCY = PublishedNumbers(
 )
 LIGHTEST_MASS_REDUCTION = PublishedNumbers(
     "Fig. 6.2",
-    "one span, 0.261 kg, less by feedback",
+    "one span, 0.261 kg, reduction by feedback",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -208,7 +213,7 @@ GAIN_MARGIN = PublishedNumbers(
 )
 SUMMARY_ONE = PublishedNumbers(
     "Table 8.1",
-    "one span, 0.509 kg, less by feedback",
+    "one span, 0.509 kg, reduction by feedback",
     "%",
     "measured",
     MEASURED_REDUCTION,
@@ -217,7 +222,7 @@ SUMMARY_ONE = PublishedNumbers(
 )
 SUMMARY_TWO = PublishedNumbers(
     "Table 8.1",
-    "two spans, 0.509 kg, less by feedback",
+    "two spans, 0.509 kg, reduction by feedback",
     "%",
     "measured",
     MEASURED_REDUCTION,

@@ -15,12 +15,12 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments.thesis.chapter7 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, make_finding
-from jaxbeam.analysis.bound.input_influence import reach
+from jaxbeam.analysis.bound.input_influence import input_influence
 from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.plot.style import GREY, colour, set_title, use_style
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 
 PERIOD, SPEED = 0.01, 1.0  # s, m/s
 LOW_MOVE_WEIGHT, HIGH_MOVE_WEIGHT = 1e-11, 1e-6  # r_w
@@ -59,7 +59,9 @@ def simulate_mpc(
     case = dataclasses.replace(case, controller=law)
     times = np.arange(round(float(case.run.duration) / PERIOD) + 1) * PERIOD
     # Enough steps for the fastest mode to turn by a radian or two in each.
-    plan = Plan(form(case), 2 * case.beam.modes, 0, False, 0.0, loop_schedule(case, times))
+    plan = IntegrationPlan(
+        static_shapes(case), 2 * case.beam.modes, 0, False, 0.0, loop_schedule(case, times)
+    )
     return jb.simulate(case, jnp.asarray(times), plan)
 
 
@@ -197,13 +199,13 @@ def _peaks_by_half(record: jb.Record) -> np.ndarray:
 def _attainable_in_second_half(case: jb.Case) -> float:
     """The largest reduction (%) at the first sensor in the second half that is possible at all."""
     position = np.array([float(case.sensors[0].position)])
-    influence = reach(case, position, PERIOD, PERIOD / 2)
+    influence = input_influence(case, position, PERIOD, PERIOD / 2)
     crossing = float(case.beam.length) / SPEED
-    second = (influence.instants >= crossing / 2) & (influence.instants <= crossing)
+    second = (influence.times >= crossing / 2) & (influence.times <= crossing)
     influence = eqx.tree_at(
         lambda r: (r.instants, r.free, r.response),
         influence,
-        (influence.instants[second], influence.free[second], influence.response[second]),
+        (influence.times[second], influence.unforced[second], influence.response[second]),
     )
     low, high = np.array([actuator.command_limits() for actuator in case.actuators]).T
     peak, _, _ = least_peak(influence, low, high, np.full(low.shape, np.inf))

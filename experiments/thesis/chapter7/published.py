@@ -6,7 +6,7 @@ from experiments.thesis.verdicts import PublishedNumbers
 # Model predictive control, 0.509 kg at 1 m/s.
 ONE_SPAN_REDUCTION = PublishedNumbers(
     "Fig. 7.1, Table 8.1",
-    "one span, less by predictive control",
+    "one span, reduction by predictive control",
     "%",
     "computed",
     COMPUTED_REDUCTION,
@@ -23,7 +23,7 @@ ONE_SPAN_SATURATION = PublishedNumbers(
 )
 TWO_SPAN_REDUCTION = PublishedNumbers(
     "Fig. 7.5, Table 8.1",
-    "two spans, less by predictive control",
+    "two spans, reduction by predictive control",
     "%",
     "computed",
     COMPUTED_REDUCTION,
@@ -33,7 +33,7 @@ TWO_SPAN_REDUCTION = PublishedNumbers(
 )
 REDUCED_MODEL = PublishedNumbers(
     "Fig. 7.9",
-    "two spans, controller with 3 modes on 12, reduces the peaks: 1, or not: 0",
+    "two spans, controller with 3 modes on 12, reduces the peaks: yes 1, no 0",
     "1",
     "computed",
     YES_OR_NO,
@@ -51,7 +51,7 @@ ONE_MOVE_PEAKS = PublishedNumbers(
 )
 SECOND_HALF_REDUCTION = PublishedNumbers(
     "Figs 7.5, 7.7",
-    "two spans, s1, less in the second half",
+    "two spans, s1, reduction in the second half",
     "%",
     "computed",
     COMPUTED_REDUCTION,

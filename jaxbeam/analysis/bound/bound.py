@@ -1,6 +1,6 @@
 """The limit nobody can beat: the least peak deflection that commands within limits leave.
 
-For known loads the deflection is linear in the commands (`reach`), so the least peak over all
+For known loads the deflection is linear in the commands (`input_influence`), so the least peak over all
 histories of commands is a linear program,
 
     minimise p   subject to   |free(x, t) + sum_k response_k(x, t) u_k| <= p,
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxbeam.analysis.bound.input_influence import TOLERANCE, reach
+from jaxbeam.analysis.bound.input_influence import TOLERANCE, input_influence
 from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
@@ -28,15 +28,15 @@ from jaxbeam.case.validation import check
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.model.channels import takes_commands
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulation.integration_plan import form, run_extremes, suitable_step
+from jaxbeam.simulation.integration_plan import choose_step_size, run_peaks, static_shapes
 from jaxbeam.simulation.record import Record
 
-HELD = 0.01  # s: over which commands are held, where no controller says
+DEFAULT_PERIOD = 0.01  # s: over which commands are held, where no controller says
 
-_extremes = compiled(run_extremes)
+_run_peaks = compiled(run_peaks)
 
 
-class Binding(NamedTuple):
+class ActiveConstraints(NamedTuple):
     """Where and when the peak cannot be lowered: places (m), instants (s), and weights.
 
     The weights, multipliers of the linear program, have the sign of the deflection, and their sizes
@@ -44,15 +44,15 @@ class Binding(NamedTuple):
     no less than it, and the largest of these deflections no less than their sum.
     """
 
-    places: Float[np.ndarray, " binding"]
-    instants: Float[np.ndarray, " binding"]
+    positions: Float[np.ndarray, " binding"]
+    times: Float[np.ndarray, " binding"]
     weights: Float[np.ndarray, " binding"]
 
 
 class Bound(eqx.Module):
     """The least achievable peak deflection of a case, and commands that attain it.
 
-    `peak` (m) is the largest absolute deflection at the `places` (m), at instants at most `spacing`
+    `peak` (m) is the largest absolute deflection at the `positions` (m), at instants at most `spacing`
     (s) apart; that in between may be a little larger. `uncontrolled` (m) is the peak without
     commands. `commands` start at `times` (s) and are held over `period` (s); of the many that
     attain the peak (to 1e-5) they are calm ones.
@@ -60,12 +60,12 @@ class Bound(eqx.Module):
 
     peak: float
     uncontrolled: float
-    places: Float[np.ndarray, " place"]
+    positions: Float[np.ndarray, " place"]
     times: Float[np.ndarray, " hold"]
     commands: Float[np.ndarray, "hold actuator"]
     period: float
     spacing: float
-    binding: Binding
+    active_constraints: ActiveConstraints
 
     @property
     def reduction(self) -> float:
@@ -79,10 +79,10 @@ class Bound(eqx.Module):
         that at the places of the bound; where these are not the sensors of the run, among samples.
         """
         sensors = np.array([float(sensor.position) for sensor in record.case.sensors])
-        if np.array_equal(sensors, self.places):
+        if np.array_equal(sensors, self.positions):
             peak = np.max(np.asarray(record.peak_deflection))
         else:
-            peak = np.max(np.abs(np.asarray(record.at(self.places))))
+            peak = np.max(np.abs(np.asarray(record.at(self.positions))))
         attainable = self.uncontrolled - self.peak
         return float((self.uncontrolled - peak) / attainable) if attainable > 0 else np.nan
 
@@ -97,13 +97,13 @@ class Bound(eqx.Module):
 
 def bound(
     case: Case,
-    places: ArrayLike | None = None,
+    positions: ArrayLike | None = None,
     period: float | None = None,
     spacing: float | None = None,
 ) -> Bound:
     """The least peak deflection of a case that any controller can achieve, and how.
 
-    The peak is that at the sensors, or at given `places` (m from the left end); take many for the
+    The peak is that at the sensors, or at given `positions` (m from the left end); take many for the
     whole beam. Commands are held over `period` (s): by default that of the case's controller, or
     0.01 s. They stay within the limits and rates of the actuators, and are free where there are
     none; resolution, delay, and the controller of the case play no part. The deflection is looked
@@ -113,24 +113,28 @@ def bound(
     for times that are not positive, for limits that rates cannot reach from zero, and under
     differentiation (it has no derivatives); RuntimeError if the linear program fails.
     """
-    found = _bound(case, places, period, spacing)
-    return dataclasses.replace(found, uncontrolled=_uncontrolled(case, found.places))
+    found = _bound_without_baseline(case, positions, period, spacing)
+    return dataclasses.replace(found, uncontrolled=_uncontrolled_peak(case, found.positions))
 
 
-def least_achievable(case: Case, places: ArrayLike | None, period: float) -> float:
+def least_achievable_peak(case: Case, positions: ArrayLike | None, period: float) -> float:
     """The peak of `bound` alone (m), sooner; raises what that raises."""
-    return _bound(case, places, period, None).peak
+    return _bound_without_baseline(case, positions, period, None).peak
 
 
-def _bound(case: Case, places, period, spacing) -> Bound:
+def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
     """The bound of a case, but for the peak without commands."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(case)):
         raise ValueError("a bound cannot be differentiated or compiled; call it on plain numbers")
     check(case)
-    own = None if case.controller is None else case.controller.period
-    period = float(HELD if own is None else own) if period is None else float(period)
+    own_period = None if case.controller is None else case.controller.period
+    period = (
+        float(DEFAULT_PERIOD if own_period is None else own_period)
+        if period is None
+        else float(period)
+    )
     spacing = 1 / float(case.run.sample_rate) if spacing is None else float(spacing)
-    places = _places(case, places)
+    positions = _checked_positions(case, positions)
     if not case.actuators:
         raise ValueError("without actuators there is nothing to command; add one for a bound")
     if not any(map(takes_commands, case.actuators)):
@@ -143,46 +147,50 @@ def _bound(case: Case, places, period, spacing) -> Bound:
         raise ValueError(f"period {period:g} s is longer than the run, {case.run.duration:g} s")
     if not case.loads:
         raise ValueError("without loads nothing deflects the beam; add one for a bound")
-    found = reach(case, places, period, spacing)
-    if not np.any(found.free @ found.rows.T):
+    influence = input_influence(case, positions, period, spacing)
+    if not np.any(influence.unforced @ influence.deflection_rows.T):
         raise ValueError("no load deflects the beam at these places during the run")
-    if not np.any(found.response):
+    if not np.any(influence.response):
         raise ValueError("no command moves the beam; move an actuator off the supports and nodes")
-    peak, commands, weights = least_peak(found, *_ranges(case, period))
+    peak, commands, weights = least_peak(influence, *_command_limits(case, period))
     when, where = np.nonzero(weights)
     return Bound(
         peak=float(peak),
         uncontrolled=np.nan,
-        places=places,
-        times=found.holds,
+        positions=positions,
+        times=influence.hold_times,
         commands=commands,
         period=period,
         spacing=spacing,
-        binding=Binding(places[where], found.instants[when], weights[when, where]),
+        active_constraints=ActiveConstraints(
+            positions[where], influence.times[when], weights[when, where]
+        ),
     )
 
 
-def _places(case: Case, places) -> Float[np.ndarray, " place"]:
-    if places is None:
-        places = case.sensor_places
-    places = np.asarray(places, float).ravel()
-    if places.size == 0:
+def _checked_positions(case: Case, positions) -> Float[np.ndarray, " place"]:
+    if positions is None:
+        positions = case.sensor_places
+    positions = np.asarray(positions, float).ravel()
+    if positions.size == 0:
         raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")
-    for i, place in enumerate(places):
+    for i, place in enumerate(positions):
         check_on_beam(f"places.{i}", place, case.beam.length)
-    return places
+    return positions
 
 
-def _uncontrolled(case: Case, places) -> float:
+def _uncontrolled_peak(case: Case, positions) -> float:
     """The largest deflection (m) at some places without commands, at all times."""
-    plain = eqx.tree_at(lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None)
-    shape = form(plain)
-    step, _ = suitable_step(plain, shape, TOLERANCE)
-    best = _extremes(plain, shape, jnp.asarray(step), jnp.asarray(places))
-    return float(jnp.max(best.peak()[0]))
+    uncontrolled_case = eqx.tree_at(
+        lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None
+    )
+    shapes = static_shapes(uncontrolled_case)
+    step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
+    running_peaks = _run_peaks(uncontrolled_case, shapes, jnp.asarray(step), jnp.asarray(positions))
+    return float(jnp.max(running_peaks.peak()[0]))
 
 
-def _ranges(case: Case, period: float):
+def _command_limits(case: Case, period: float):
     """Smallest and largest command to each actuator, and its largest change between holds."""
     limits = [actuator.command_limits() for actuator in case.actuators]
     rates = [actuator.command_rate() for actuator in case.actuators]

@@ -23,59 +23,63 @@ from jaxbeam.integrator.time_grid import scheduled_grid
 from jaxbeam.model.contact import Traffic, traffic
 from jaxbeam.model.modal_model import rig
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulation.integration_plan import Form, form, suitable_step
+from jaxbeam.simulation.integration_plan import StaticShapes, choose_step_size, static_shapes
 
 TOLERANCE = 1e-9  # relative to the largest deflection
-LANES = 256  # at once; more fall out of the cache
-MOST = 3e8  # numbers in a response: some gigabytes
+MAX_BATCH_SIZE = 256  # at once; more fall out of the cache
+MAX_RESPONSE_SIZE = 3e8  # numbers in a response: some gigabytes
 
 
-class Reach(eqx.Module):
+class InputInfluence(eqx.Module):
     """Motion without commands, and what a unit command during each hold adds to it.
 
-    Commands are held from one of the `holds` (s) to the next. Motion is that at the `instants` (s)
-    in coordinates of the rig, which `rows` take to the deflection (m) at some places; it is right
+    Commands are held from one of the `hold_times` (s) to the next. Motion is that at the `times` (s)
+    in coordinates of the rig, which `deflection_rows` take to the deflection (m) at some places; it is right
     to about 1e-9.
     """
 
-    rows: Float[np.ndarray, "place mode"]
-    holds: Float[np.ndarray, " hold"]
-    instants: Float[np.ndarray, " instant"]
-    free: Float[np.ndarray, "instant mode"]
+    deflection_rows: Float[np.ndarray, "place mode"]
+    hold_times: Float[np.ndarray, " hold"]
+    times: Float[np.ndarray, " instant"]
+    unforced: Float[np.ndarray, "instant mode"]
     response: Float[np.ndarray, "instant mode hold actuator"]
 
     def deflection(
         self, commands: Float[np.ndarray, "hold actuator"]
     ) -> Float[np.ndarray, "instant place"]:
         """Deflection (m) under a history of commands."""
-        return (self.free + np.tensordot(self.response, commands, axes=2)) @ self.rows.T
+        return (
+            self.unforced + np.tensordot(self.response, commands, axes=2)
+        ) @ self.deflection_rows.T
 
 
-class _Units(AbstractDriver):
-    """To each lane one unit command: to actuator `which`, during hold number `hold`."""
+class _UnitCommands(AbstractDriver):
+    """To each lane one unit command: to actuator `actuator_index`, during hold number `hold_index`."""
 
     schedule: Schedule
-    hold: Int[Array, " lane"]
-    which: Int[Array, " lane"]
-    bound: Float[Array, " state"]
+    hold_index: Int[Array, " lane"]
+    actuator_index: Int[Array, " lane"]
+    state_bound: Float[Array, " state"]
     actuators: int = eqx.field(static=True)
-    inner: bool = eqx.field(static=True, default=False)
+    implicit: bool = eqx.field(static=True, default=False)
 
-    def start(self, lanes):
+    def start(self, batch_size):
         return jnp.zeros((), int)
 
-    def drive(self, memory, state, moment, states):
-        tick = self.schedule.tick[moment.edge]
-        now = jnp.where((moment.edge >= 0) & (tick >= 0), tick, memory)
-        own = self.which == np.arange(self.actuators)[:, None]
-        given = jnp.where(own & (self.hold == now), 1.0, 0.0)
-        return jnp.broadcast_to(given, (NODES, *given.shape)), now
+    def inputs(self, memory, state, step_info, states):
+        hold_started = self.schedule.tick[step_info.edge]
+        current_hold = jnp.where((step_info.edge >= 0) & (hold_started >= 0), hold_started, memory)
+        is_commanded = self.actuator_index == np.arange(self.actuators)[:, None]
+        given = jnp.where(is_commanded & (self.hold_index == current_hold), 1.0, 0.0)
+        return jnp.broadcast_to(given, (NODES, *given.shape)), current_hold
 
-    def shows(self, memory, moment):
+    def observe(self, memory, step_info):
         return None
 
 
-def reach(case: Case, places: Float[np.ndarray, " place"], period: float, spacing: float) -> Reach:
+def input_influence(
+    case: Case, positions: Float[np.ndarray, " place"], period: float, spacing: float
+) -> InputInfluence:
     """Free motion of a case, and responses to commands held over a period (s), for some places (m).
 
     The controller of the case, if any, plays no part. Instants are at most `spacing` (s) apart;
@@ -86,67 +90,82 @@ def reach(case: Case, places: Float[np.ndarray, " place"], period: float, spacin
     """
     duration = float(case.run.duration)
     count = max(1, int(np.ceil(duration / period * (1 - 1e-12))))
-    each = max(1, int(np.ceil(period / spacing * (1 - 1e-9))))
-    holds = np.arange(count) * period
-    instants = np.append(np.arange(count * each) * (period / each), duration)
-    instants = instants[(instants < duration * (1 - 1e-9)) | (instants == duration)]
+    steps_per_hold = max(1, int(np.ceil(period / spacing * (1 - 1e-9))))
+    hold_times = np.arange(count) * period
+    times = np.append(np.arange(count * steps_per_hold) * (period / steps_per_hold), duration)
+    times = times[(times < duration * (1 - 1e-9)) | (times == duration)]
     actuators = len(case.actuators)
-    size = instants.size * case.beam.modes * count * actuators
-    if size > MOST:
+    size = times.size * case.beam.modes * count * actuators
+    if size > MAX_RESPONSE_SIZE:
         raise ValueError(
-            f"{count} holds and {instants.size} instants are too many to keep; hold commands for"
+            f"{count} holds and {times.size} instants are too many to keep; hold commands for"
             f" longer than {period:g} s, or save samples more rarely (run.sample_rate)"
         )
-    plain = eqx.tree_at(lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None)
-    shape = form(plain)
-    step, _ = suitable_step(plain, shape, TOLERANCE)
-    schedule = merged(instants, holds, 0.0, [], [], np.zeros(0))
-    substeps = max(1, int(np.ceil(float(np.diff(instants).max()) / step)))
+    uncontrolled_case = eqx.tree_at(
+        lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None
+    )
+    shapes = static_shapes(uncontrolled_case)
+    step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
+    schedule = merged(times, hold_times, 0.0, [], [], np.zeros(0))
+    substeps = max(1, int(np.ceil(float(np.diff(times).max()) / step)))
     # A lane that waits for hold -1 or for one after the end is given no command.
-    hold = np.append(-1, np.repeat(np.arange(count), actuators))
-    which = np.append(0, np.tile(np.arange(actuators), count))
-    lanes = min(LANES, hold.size)
-    idle = -hold.size % lanes
-    hold, which = np.append(hold, np.full(idle, count)), np.append(which, np.zeros(idle, int))
-    found = np.concatenate(
+    hold_index = np.append(-1, np.repeat(np.arange(count), actuators))
+    actuator_index = np.append(0, np.tile(np.arange(actuators), count))
+    batch_size = min(MAX_BATCH_SIZE, hold_index.size)
+    padding = -hold_index.size % batch_size
+    hold_index, actuator_index = (
+        np.append(hold_index, np.full(padding, count)),
+        np.append(actuator_index, np.zeros(padding, int)),
+    )
+    coordinates = np.concatenate(
         [
-            np.asarray(_answers(plain, shape, schedule, substeps, *some))
-            for some in zip(hold.reshape(-1, lanes), which.reshape(-1, lanes), strict=True)
+            np.asarray(_unit_responses(uncontrolled_case, shapes, schedule, substeps, *some))
+            for some in zip(
+                hold_index.reshape(-1, batch_size),
+                actuator_index.reshape(-1, batch_size),
+                strict=True,
+            )
         ],
         axis=-1,
     )
-    response = found[..., 1 : count * actuators + 1]
-    return Reach(
-        np.asarray(_rows(plain, shape, jnp.asarray(places))),
-        holds,
-        instants,
-        found[..., 0],
+    response = coordinates[..., 1 : count * actuators + 1]
+    return InputInfluence(
+        np.asarray(_deflection_rows(uncontrolled_case, shapes, jnp.asarray(positions))),
+        hold_times,
+        times,
+        coordinates[..., 0],
         response.reshape(*response.shape[:2], count, actuators),
     )
 
 
 @compiled
-def _rows(case: Case, form: Form, places):
-    return rig(case, form.layout).shapes(places, (0,))[0]
+def _deflection_rows(case: Case, shapes: StaticShapes, positions):
+    return rig(case, shapes.layout).shapes(positions, (0,))[0]
 
 
 @compiled
-def _answers(case: Case, form: Form, schedule: Schedule, substeps: int, hold, which):
-    """Coordinates (instant, mode, lane) under the weights where `hold` is -1, else under a unit."""
-    assembled, own = rig(case, form.layout), traffic(case)
-    size = (len(own.motions), hold.shape[0])
+def _unit_responses(
+    case: Case, shapes: StaticShapes, schedule: Schedule, substeps: int, hold_index, actuator_index
+):
+    """Coordinates (instant, mode, lane) under the weights where `hold_index` is -1, else under a unit."""
+    model, weights_of_case = rig(case, shapes.layout), traffic(case)
+    size = (len(weights_of_case.motions), hold_index.shape[0])
     loads = Traffic(
-        own.motions,
-        jnp.broadcast_to(own.inertia, size),
-        jnp.where(hold == -1, jnp.broadcast_to(own.weight, size), 0.0),
+        weights_of_case.motions,
+        jnp.broadcast_to(weights_of_case.inertia, size),
+        jnp.where(hold_index == -1, jnp.broadcast_to(weights_of_case.weight, size), 0.0),
     )
-    endless = jnp.full(assembled.states, jnp.inf)
-    driver = _Units(
-        schedule=schedule, hold=hold, which=which, bound=endless, actuators=len(case.actuators)
+    state_bound = jnp.full(model.states, jnp.inf)
+    policy = _UnitCommands(
+        schedule=schedule,
+        hold_index=hold_index,
+        actuator_index=actuator_index,
+        state_bound=state_bound,
+        actuators=len(case.actuators),
     )
-    grid = scheduled_grid(case, assembled, schedule, substeps)
+    grid = scheduled_grid(case, model, schedule, substeps)
     steps = grid.counts.shape[0] * substeps
-    rigging = make_rigging(assembled, grid, None, driver)
-    _, states, *_ = trace(rigging, loads, slots=form.slots, steps=steps, driver=driver)
-    edges = substeps * grid.place[schedule.samples]
-    return states[edges][:, : 2 * case.beam.modes : 2]
+    discrete = make_rigging(model, grid, None, policy)
+    _, states, *_ = trace(discrete, loads, slots=shapes.max_loads, steps=steps, driver=policy)
+    sample_steps = substeps * grid.place[schedule.samples]
+    return states[sample_steps][:, : 2 * case.beam.modes : 2]

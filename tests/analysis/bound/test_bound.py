@@ -14,9 +14,9 @@ from scipy.optimize import OptimizeResult, linprog
 
 import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import bound
-from jaxbeam.analysis.bound.input_influence import reach
+from jaxbeam.analysis.bound.input_influence import input_influence
 from jaxbeam.analysis.bound.linear_program import least_peak
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 from tests.modules import DATA as DATA_FOLDER
 
 DATA = json.loads((DATA_FOLDER / "bounds.json").read_text())
@@ -55,7 +55,7 @@ def best():
 @pytest.fixture(scope="module")
 def found():
     """What commands do to the rig, at its sensor."""
-    return reach(patched(), np.array([0.3]), 0.01, 0.001)
+    return input_influence(patched(), np.array([0.3]), 0.01, 0.001)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def numbers(found):
 )
 def test_reference_numbers(name, modes):
     expected, case = DATA[name], patched(modes)
-    found = reach(case, np.array([0.3]), 0.01, 0.01)
+    found = input_influence(case, np.array([0.3]), 0.01, 0.01)
     free = np.max(np.abs(found.deflection(np.zeros((60, 1)))))
     assert_allclose(free, expected["uncontrolled_m"], rtol=2e-9)
     # Those programs are in metres, and solvers by default keep rows to 1e-7.
@@ -93,8 +93,8 @@ def test_multipliers_prove_the_bound(best, numbers):
     """Weak duality, which needs no solver: no commands within limits bring the sum below it."""
     free, response = numbers
     weights = np.zeros(free.size)
-    instants = np.searchsorted(np.arange(601) / 1000, best.binding.instants - 1e-9)
-    np.add.at(weights, instants, best.binding.weights)
+    instants = np.searchsorted(np.arange(601) / 1000, best.active_constraints.instants - 1e-9)
+    np.add.at(weights, instants, best.active_constraints.weights)
     assert np.sum(np.abs(weights)) <= 1 + 1e-9
     slopes = weights @ response
     least = weights @ free + np.sum(np.minimum(-2.5 * slopes, 7.5 * slopes))
@@ -156,7 +156,7 @@ RIVALS = patched(controller=jb.StateFeedback(np.zeros((1, 10)), period=0.01))
 
 @pytest.fixture(scope="module")
 def rivals_plan():
-    return make_plan(jb.replace(RIVALS, {"controller.gain": np.ones((1, 10))}))
+    return integration_plan(jb.replace(RIVALS, {"controller.gain": np.ones((1, 10))}))
 
 
 @pytest.mark.slow
@@ -182,7 +182,7 @@ def test_no_controller_beats_it(rivals_plan, mass, speed, strength, seed):
 
 
 def test_more_places_raise_it(best):
-    whole = bound(patched(), places=np.linspace(0.0, 0.6, 61))
+    whole = bound(patched(), positions=np.linspace(0.0, 0.6, 61))
     assert best.peak < whole.peak < best.uncontrolled
     assert whole.uncontrolled >= best.uncontrolled * (1 - 1e-9)
 
@@ -247,7 +247,7 @@ FAULTS = {
     ),
     "without loads": lambda: bound(dataclasses.replace(patched(), loads=())),
     "add a sensor, or give places": lambda: bound(dataclasses.replace(patched(), sensors=())),
-    "places.1 must lie on the beam": lambda: bound(patched(), places=[0.1, 0.7]),
+    "places.1 must lie on the beam": lambda: bound(patched(), positions=[0.1, 0.7]),
     "must be positive": lambda: bound(patched(), period=-0.01),
     "longer than the run": lambda: bound(patched(), period=1.0),
     "too many to keep": lambda: bound(patched(), period=1e-4, spacing=1e-5),

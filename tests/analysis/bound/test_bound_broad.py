@@ -9,7 +9,7 @@ from hypothesis import given, settings
 
 import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import bound
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 
 PERIOD = 0.01
 WHOLE = np.linspace(0.05, 1.15, 23)
@@ -32,7 +32,7 @@ CASE = jb.Case(
 
 @pytest.fixture(scope="module")
 def plan():
-    return make_plan(CASE)
+    return integration_plan(CASE)
 
 
 @pytest.mark.slow

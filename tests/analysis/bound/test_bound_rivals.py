@@ -9,7 +9,7 @@ from hypothesis import given, settings
 
 import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import bound
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 
 PERIOD = 0.02
 CASE = jb.Case(
@@ -33,7 +33,7 @@ CASES = {name: dataclasses.replace(CASE, controller=law) for name, law in LAWS.i
 
 @pytest.fixture(scope="module")
 def plans():
-    return {name: make_plan(case, None, 1e-6) for name, case in CASES.items()}
+    return {name: integration_plan(case, None, 1e-6) for name, case in CASES.items()}
 
 
 @pytest.mark.slow

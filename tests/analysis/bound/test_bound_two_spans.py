@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import bound
-from jaxbeam.analysis.bound.input_influence import Reach
+from jaxbeam.analysis.bound.input_influence import InputInfluence
 from jaxbeam.analysis.bound.linear_program import least_peak
 from tests.modules import DATA
 
@@ -55,7 +55,7 @@ def held(k):
     return whole
 
 
-def reached() -> Reach:
+def reached() -> InputInfluence:
     """Motion of the oracle at the ends of the holds."""
     n, size = NUMBERS.size, 2 * NUMBERS.size
     free, response = np.zeros((HOLDS + 1, n)), np.zeros((HOLDS + 1, n, HOLDS, 2))
@@ -67,12 +67,12 @@ def reached() -> Reach:
         units[:, k] += whole[:size, size : size + 2]
         free[k + 1], response[k + 1] = state[:n], units[:n]
     rows, holds = np.array([shapes(x) for x in SENSORS]), np.arange(HOLDS) * KNOWN["period_s"]
-    return Reach(rows, holds, np.arange(HOLDS + 1) * KNOWN["period_s"], free, response)
+    return InputInfluence(rows, holds, np.arange(HOLDS + 1) * KNOWN["period_s"], free, response)
 
 
 def test_the_program_has_the_bound_of_the_reference():
     found = reached()
-    free = np.max(np.abs(found.free @ found.rows.T))
+    free = np.max(np.abs(found.unforced @ found.deflection_rows.T))
     assert_allclose(free, KNOWN["uncontrolled_m"], rtol=1e-6)
     low, high = np.array([[-2.5, -2.5], [7.5, 7.5]]) * 200
     peak, commands, _ = least_peak(found, low, high, np.full(2, np.inf))

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.stability import frozen_poles
-from jaxbeam.analysis.stability_limits import limit
+from jaxbeam.analysis.stability_limits import stability_limit
 from jaxbeam.control.design_model import DesignModel
 from tests.analysis import test_stability as oracle
 from tests.analysis.test_stability import LENGTH, MASS, SPEED, rig, written_out
@@ -94,5 +94,5 @@ def test_the_margin_in_mass_is_where_a_pole_crosses():
 
     assert largest(0.01) < 0 < largest(0.1)
     expected = scipy.optimize.brentq(largest, 0.01, 0.1, rtol=1e-9)
-    found = limit(case, "loads.0.mass", 0.01, 0.1, points=3)
+    found = stability_limit(case, "loads.0.mass", 0.01, 0.1, points=3)
     assert found == pytest.approx(expected, rel=1e-5)

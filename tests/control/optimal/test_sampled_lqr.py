@@ -12,7 +12,7 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linear_loop
+from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.validation import check
 from jaxbeam.cli import main
 from jaxbeam.control import LQR, DiscreteLQR, SamplingWarning
@@ -257,5 +257,5 @@ def test_in_the_loop_it_is_what_was_designed(model):
     state, _ = integrated(*map(np.asarray, (plant.A, plant.B, Q, R)), (5e-4, 1.5e-3))
     drift, push = np.vstack([state[:, :8], np.zeros((1, 8))]), np.append(state[:, 8:], [[1.0]], 0)
     expected = np.abs(np.linalg.eigvals(drift - push @ np.asarray(designed(law, model))))
-    found = np.abs(np.linalg.eigvals(linear_loop(rig(law), 0.0).closed))
+    found = np.abs(np.linalg.eigvals(linearised_loop(rig(law), 0.0).closed_matrix))
     assert_allclose(np.sort(found)[-7:], np.sort(expected)[-7:], rtol=1e-7)

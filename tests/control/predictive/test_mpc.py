@@ -17,7 +17,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.model.modes import lay_out
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import Plan, form
+from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.differences import central
 from tests.modules import DATA
 
@@ -48,7 +48,7 @@ def mpc(**settings) -> jb.MPC:
 def run(case: jb.Case, substeps: int) -> jb.Record:
     """A run sampled at its ticks, in so many steps from tick to tick."""
     times = np.arange(round(float(case.run.duration) / PERIOD) + 1) * PERIOD
-    plan = Plan(form(case), substeps, 0, False, 0.0, loop_schedule(case, times))
+    plan = IntegrationPlan(static_shapes(case), substeps, 0, False, 0.0, loop_schedule(case, times))
     return jb.simulate(case, jnp.asarray(times), plan)
 
 

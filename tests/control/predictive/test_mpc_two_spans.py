@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 from tests.differences import central
 
 CASE = jb.Case(
@@ -34,7 +34,7 @@ def test_derivatives_of_a_closed_loop_of_two_spans():
     there the program's own derivative is smoothed (see `control.qp`), and no tick is at such a
     point here, which the agreement of differences of two steps proves.
     """
-    plan, sizes = make_plan(CASE, None, 1e-6), [jb.addresses(CASE)[name] for name in FREE]
+    plan, sizes = integration_plan(CASE, None, 1e-6), [jb.addresses(CASE)[name] for name in FREE]
     ends = np.cumsum([size.size for size in sizes])[:-1]
 
     def record(logs):

@@ -62,7 +62,7 @@ def test_it_never_gets_worse_and_says_what_the_saved_case_does(problem):
     ]
     cases = tuning.LoadCases(tuple(runs[:2]), tuple(runs[2:]))
     case = small(**problem)
-    found = tuning.control.tune(case, FREE, cases, steps=4, bounds=False, progress=False)
+    found = tuning.tune(case, FREE, cases, steps=4, least_peaks=False, progress=False)
     training, held_out = found.run_sets
     before, after = training.objective
     assert after <= before

@@ -13,7 +13,7 @@ from jaxbeam.control import KINDS
 from tests.differences import central
 from tuning.control.run_set import make_run_set
 
-RUNS = tuning.grid({"loads.0.mass": [0.3], "loads.0.speed": [1.5]})
+RUNS = tuning.full_grid({"loads.0.mass": [0.3], "loads.0.speed": [1.5]})
 REGULATOR = {"state_weight": [1e4, 1.0], "command_weight": [1e-3], "period": 0.01}
 LOOPS = {
     "feedback": (

@@ -11,7 +11,7 @@ import pytest
 import tuning
 from tests.tuning.small_rig import GAIN, rig
 from tests.tuning.stand_in import fit, search
-from tuning.fit.multi_start import coarse_search
+from tuning.fit.multi_start import multi_start
 from tuning.fit.uncertainty.posterior import sample
 
 # What a process does until, having written its first state, it is killed.
@@ -45,9 +45,9 @@ def killed(task, file):
 
 def tuned(file, **options):
     """A tuning in mini-batches, from two starts, that keeps its state in a file, or not."""
-    cases = tuning.LoadCases(tuning.grid({"loads.0.mass": [0.2, 0.3, 0.4]}))
-    return tuning.control.tune(
-        rig(), {GAIN: (500.0, 7500.0)}, cases, steps=12, starts=2, batch=2, bounds=False,
+    cases = tuning.LoadCases(tuning.full_grid({"loads.0.mass": [0.2, 0.3, 0.4]}))
+    return tuning.tune(
+        rig(), {GAIN: (500.0, 7500.0)}, cases, steps=12, starts=2, batch=2, least_peaks=False,
         progress=False, checkpoint=file, **options,
     )  # fmt: skip
 
@@ -64,8 +64,8 @@ def test_a_search_from_many_starts(tmp_path):
     killed(SCOUT, tmp_path / "search.npz")
     found = search()
     given = found, found.data.measured, 12, 1
-    resumed = coarse_search(*given, tmp_path / "search.npz", "it")
-    for one, other in zip(resumed, coarse_search(*given), strict=True):
+    resumed = multi_start(*given, tmp_path / "search.npz", "it")
+    for one, other in zip(resumed, multi_start(*given), strict=True):
         assert one.cost == other.cost and one.starts == other.starts
         np.testing.assert_array_equal(one.values, other.values)
 

@@ -16,9 +16,9 @@ from tuning.control.run_set import make_run_set
 from tuning.control.tuning_result import RunSetResult
 
 FREE = {GAIN: (500.0, 7500.0)}  # from 12000 on the loop is unstable, with minima of its own
-RUNS = tuning.grid({"loads.0.mass": [0.2, 0.3, 0.4, 0.5]})
+RUNS = tuning.full_grid({"loads.0.mass": [0.2, 0.3, 0.4, 0.5]})
 CASES = tuning.LoadCases(RUNS, ({"loads.0.mass": 0.35},))
-OPTIONS = {"steps": 40, "bounds": False, "progress": False}
+OPTIONS = {"steps": 40, "least_peaks": False, "progress": False}
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def swept():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["adam", "lbfgs", "bfgs"])
 def test_every_method_finds_what_a_sweep_finds(swept, method):
-    found = tuning.control.tune(rig(), FREE, CASES, method=method, starts=2, seed=3, **OPTIONS)
+    found = tuning.tune(rig(), FREE, CASES, method=method, starts=2, seed=3, **OPTIONS)
     assert found.run_sets[0].objective[1] <= swept["peak"].min() * 1.002
     assert found.history.shape == (40, 2) and np.isfinite(found.history).all()
     values = [minimum.value for minimum in found.minima]
@@ -46,7 +46,7 @@ def test_every_method_finds_what_a_sweep_finds(swept, method):
 @pytest.mark.slow
 def test_a_front(swept):
     limits = [0.15, 0.3, 0.22]
-    front = tuning.control.pareto(
+    front = tuning.pareto(
         rig(), FREE, CASES, tuning.Objective({"peak": 1.0}), "effort", limits, **OPTIONS
     )
     assert front.limits == (0.3, 0.22, 0.15)
@@ -76,10 +76,10 @@ def test_ranks(swept):
 def test_mini_batches(swept):
     """Steps on two of four runs come to the same, and the same again by the same seed."""
     options = OPTIONS | {"batch": 2}
-    found, again = (tuning.control.tune(rig(), FREE, CASES, seed=1, **options) for _ in range(2))
+    found, again = (tuning.tune(rig(), FREE, CASES, seed=1, **options) for _ in range(2))
     assert found.run_sets[0].objective[1] <= swept["peak"].min() * 1.01
     np.testing.assert_array_equal(found.history, again.history)
-    other = tuning.control.tune(rig(), FREE, CASES, seed=2, **options)
+    other = tuning.tune(rig(), FREE, CASES, seed=2, **options)
     assert not np.array_equal(found.history, other.history)
 
 
@@ -89,7 +89,7 @@ def test_limits_that_held_out_runs_exceed_are_told():
         "held out", ({},), *(np.full(1, x) for x in (1.0, 0.9, 0.8, 0.7)), np.ones((2, 1)),
         np.zeros(1), [1.0, 0.8], merits,
     )  # fmt: skip
-    found = tuning.Tuned(
+    found = tuning.TuningResult(
         rig(), [], np.zeros(0), tuning.Objective(limits={"effort": 0.2, "peak": 1.0}),
         np.zeros((1, 1)), 0, [outcome, outcome],
     )  # fmt: skip
@@ -108,13 +108,13 @@ def test_whole_numbers():
         with pytest.raises(ValueError, match=message):
             with_integers(rig(), {address: 2})
     with pytest.raises(ValueError, match="at least one whole number"):
-        tuning.tune_choices(rig(), {}, FREE, CASES)
+        tuning.tune_integers(rig(), {}, FREE, CASES)
 
 
 @pytest.mark.slow
 def test_the_best_of_whole_numbers_is_taken():
     """A power of 1 or 3 of the reading: of a cubic law so small a gain does nothing."""
-    found = tuning.tune_choices(
+    found = tuning.tune_integers(
         rig(), {"controller.power": [1, 3]}, FREE, CASES, **(OPTIONS | {"steps": 3})
     )
     ends = [each.run_sets[0].objective[1] for each in found.tuned]
@@ -135,20 +135,20 @@ BAD = [
 @pytest.mark.parametrize(("changes", "message"), BAD, ids=[words[:20] for _, words in BAD])
 def test_what_cannot_be_tuned_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
-        tuning.control.tune(**({"case": rig(), "free": FREE, "cases": CASES} | changes), **OPTIONS)
+        tuning.tune(**({"case": rig(), "free": FREE, "cases": CASES} | changes), **OPTIONS)
 
 
 def test_limits_are_checked():
     with pytest.raises(ValueError, match="limits of merits must be positive and finite"):
         tuning.Objective(limits={"effort": 0.0})
     with pytest.raises(ValueError, match="there is no merit 'costs'"):
-        tuning.control.pareto(rig(), FREE, CASES, tuning.Objective(), "costs", [1.0])
+        tuning.pareto(rig(), FREE, CASES, tuning.Objective(), "costs", [1.0])
     with pytest.raises(ValueError, match="each once, the most important first"):
         tuning.lexicographic(rig(), FREE, CASES, ["peak", "peak"])
 
 
 def test_draws_of_load_cases(tmp_path):
-    rows = tuning.draws({"a": (1.0, 2.0), "b": (0.0, 8.0)}, 8, seed=3)
+    rows = tuning.latin_hypercube({"a": (1.0, 2.0), "b": (0.0, 8.0)}, 8, seed=3)
     eighths = sorted(int((row["a"] - 1) * 8) for row in rows)  # a Latin hypercube: one in each
     assert eighths == list(range(8)) == sorted(int(row["b"]) for row in rows)
     file = tmp_path / "loads.toml"
@@ -168,5 +168,5 @@ def test_draws_of_load_cases(tmp_path):
 
 def test_cvar_is_the_mean_of_the_worst():
     values = jnp.array([3.0, 9.0, 1.0, 7.0])
-    assert float(tuning.Objective(over="cvar", share=0.5).aggregate(values)) == 8.0
-    assert dataclasses.replace(tuning.Objective(), over="mean").aggregate(values) == 5.0
+    assert float(tuning.Objective(aggregation="cvar", tail_share=0.5).aggregate(values)) == 8.0
+    assert dataclasses.replace(tuning.Objective(), aggregation="mean").aggregate(values) == 5.0

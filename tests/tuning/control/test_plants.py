@@ -78,7 +78,7 @@ def test_what_cannot_be_drawn_is_refused(found):
 
 def test_a_case_adopts_the_plant(found):
     other = dataclasses.replace(CASE, loads=(jb.MovingMass(mass=0.1, speed=2.0),))
-    adopted = tuning.adopt(other, found)
+    adopted = tuning.with_identified_plant(other, found)
     assert float(adopted.beam.flexural_rigidity) == found.values[0]
     assert float(adopted.sensors[0].offset) == found.values[2]
     assert float(adopted.loads[0].mass) == 0.1
@@ -110,7 +110,7 @@ def test_a_law_is_designed_for_the_plant_it_is_told_of():
     knowing = jb.simulate(jb.replace(rig(law), soft))
     assert np.abs(np.asarray(knowing.command) - told.command).max() > 1e-3
     case = rig(law)
-    assert with_fixed_design(case, {}, bench.plan.form.layout) is case
+    assert with_fixed_design(case, {}, bench.plan.shapes.layout) is case
 
 
 @pytest.mark.slow
@@ -120,9 +120,9 @@ def test_tuned_for_the_worst_of_the_plants():
         [RIGIDITY], np.linspace(11.0, 15.0, 9).reshape(1, 9, 1), np.ones(1), np.ones(1), 0
     )
     loads = tuning.LoadCases(({"loads.0.mass": 0.3},), ({"loads.0.mass": 0.4},))
-    tuned = tuning.control.tune(
+    tuned = tuning.tune(
         rig(), {GAIN: (500.0, 20000.0)}, loads,
-        plant=identified, plants=2, steps=8, bounds=False, progress=False,
+        plant=identified, plants=2, steps=8, least_peaks=False, progress=False,
     )  # fmt: skip
     training, held_out = tuned.run_sets
     assert float(tuned.case.beam.flexural_rigidity) == pytest.approx(13.0)

@@ -12,7 +12,7 @@ from tests.tuning.small_rig import rig
 
 FREE = {"controller.command_weight.0": (1e-5, 1e-1)}
 CASES = tuning.LoadCases(({"loads.0.mass": 0.3}, {"loads.0.mass": 0.5}))
-OPTIONS = {"steps": 30, "bounds": False, "progress": False}
+OPTIONS = {"steps": 30, "least_peaks": False, "progress": False}
 KEEP, STATES = 1, 4
 
 
@@ -31,7 +31,7 @@ def test_the_states_are_those_that_trying_every_choice_finds(regulated):
     for kept in itertools.combinations(range(STATES), KEEP):
         shares = np.isin(np.arange(STATES), kept).astype(float)
         law = dataclasses.replace(regulated.controller, feedback=shares)
-        one = tuning.control.tune(
+        one = tuning.tune(
             dataclasses.replace(regulated, controller=law), FREE, CASES, **OPTIONS
         )
         ends[kept] = one.run_sets[0].objective[1]

@@ -8,7 +8,7 @@ import pytest
 import jaxbeam as jb
 from tests.oracles import modal_equations
 from tests.oracles.loads import Load
-from tuning.fit.experiment_design import sharpen
+from tuning.fit.experiment_design import design_experiment
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=2, damping_ratio=0.03)
 CASE = jb.Case(
@@ -42,7 +42,9 @@ def errors_by_differences(places, noise):
 @pytest.mark.slow
 def test_where_a_sensor_tells_mass_best():
     bounds = (0.05, 0.55)
-    found = sharpen(CASE, FREE, {"sensors.0.position": bounds}, target=FREE[1], noise=2e-5)
+    found = design_experiment(
+        CASE, FREE, {"sensors.0.position": bounds}, target=FREE[1], noise=2e-5
+    )
     places = np.linspace(*bounds, 101)
     grid = errors_by_differences(places, 2e-5)
     np.testing.assert_allclose(
@@ -72,4 +74,6 @@ def test_where_a_sensor_tells_mass_best():
 )
 def test_faulty_designs(given, words):
     with pytest.raises(ValueError, match=words):
-        sharpen(**{"case": CASE, "free": FREE, "over": {"loads.0.speed": (1.0, 4.0)}} | given)
+        design_experiment(
+            **{"case": CASE, "free": FREE, "over": {"loads.0.speed": (1.0, 4.0)}} | given
+        )

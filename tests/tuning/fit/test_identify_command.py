@@ -9,7 +9,7 @@ import tuning
 from jaxbeam.cli import main
 from tests.cli.test_cli import CASE
 from tests.tuning import stand_in
-from tuning.parameters.prior import Belief
+from tuning.parameters.prior import Prior
 
 
 @pytest.fixture
@@ -53,8 +53,8 @@ def test_a_fit_with_all_options(call, tmp_path, monkeypatch):
     assert [log.source for log in asked["logs"]] == ["runs.csv:1", "runs.csv:2"]
     assert np.flatnonzero(~asked["logs"][0].valid[:, 1]).tolist() == [2]
     assert asked["free"] == {
-        "beam.flexural_rigidity": Belief(5.0, 20.0, scale="log"),
-        "beam.damping_ratio": Belief(mean=0.02, deviation=0.01),
+        "beam.flexural_rigidity": Prior(5.0, 20.0, scale="log"),
+        "beam.damping_ratio": Prior(mean=0.02, deviation=0.01),
     }
     assert asked["settings"]["stages"] == [["beam.flexural_rigidity"]]
     assert asked["settings"]["checkpoint"].name == "fit.search.npz"

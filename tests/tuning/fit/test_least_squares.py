@@ -10,9 +10,9 @@ import scipy.optimize
 from tests.tuning.stand_in import CASE, NOISE, PULLS, TRUTH, campaign, clean, fit, formula, search
 from tuning.fit.identify import _stage_mask, identify
 from tuning.fit.loss import HUBER_THRESHOLD, check_loss, robust_residual, variance_factor
-from tuning.fit.multi_start import coarse_search, draw_start_points
+from tuning.fit.multi_start import draw_start_points, multi_start
 from tuning.parameters.free import FreeParameter, free_parameters
-from tuning.parameters.prior import Belief
+from tuning.parameters.prior import Prior
 
 ADDRESSES = list(TRUTH)
 VALUES = np.array(list(TRUTH.values()))
@@ -92,14 +92,14 @@ def test_a_prior_counts_as_a_measurement(plain):
     """With a prior as certain as the data, the value lies midway and the error is smaller."""
     damping = ADDRESSES.index("beam.damping_ratio")
     error, value = plain.errors[damping], plain.values[damping]
-    known = Belief(mean=float(value + 2 * error), deviation=float(error))
+    known = Prior(mean=float(value + 2 * error), deviation=float(error))
     found = fit(search(free=dict.fromkeys(TRUTH) | {"beam.damping_ratio": known}))
     assert found.values[damping] == pytest.approx(value + error, abs=0.1 * error)
     assert found.errors[damping] == pytest.approx(error / np.sqrt(2), rel=0.05)
 
 
 def test_a_prior_tells_what_the_data_cannot():
-    known = {"beam.mass_per_length": Belief(mean=2.0, deviation=0.1)}
+    known = {"beam.mass_per_length": Prior(mean=2.0, deviation=0.1)}
     made = campaign()
     blind = search(free=dict.fromkeys(TRUTH))
     assert made.measured.shape == blind.data.measured.shape
@@ -109,7 +109,7 @@ def test_a_prior_tells_what_the_data_cannot():
 
 @pytest.mark.parametrize("scale", ["log", "logit"])
 def test_scales(scale):
-    number = FreeParameter("x", "m", 0.1, 0.01, 100.0, 99.99, Belief(0.01, 100.0, scale=scale))
+    number = FreeParameter("x", "m", 0.1, 0.01, 100.0, 99.99, Prior(0.01, 100.0, scale=scale))
     for value in (0.15, 1.0, 3.0, 99.0):
         assert float(
             number.from_unbounded(jnp.asarray(number.to_unbounded(value)))
@@ -132,7 +132,7 @@ def test_scales(scale):
 )
 def test_faulty_beliefs(given, words):
     with pytest.raises(ValueError, match=words):
-        Belief(**given)
+        Prior(**given)
 
 
 def test_numbers_of_every_log():
@@ -155,7 +155,7 @@ def test_stages_move_only_what_they_name(plain):
 
 BOUNDS = {
     "beam.flexural_rigidity": (4.0, 60.0),
-    "beam.damping_ratio": Belief(0.001, 0.2, scale="log"),
+    "beam.damping_ratio": Prior(0.001, 0.2, scale="log"),
     "sensors.0.offset": None,
 }
 
@@ -167,7 +167,7 @@ def wide():
 
 def test_many_starts_find_several_minima(wide):
     """An oscillation fitted to one of another frequency: between them the misfit has hills."""
-    minima = coarse_search(wide, wide.campaign.measured, 12, seed=1)
+    minima = multi_start(wide, wide.campaign.measured, 12, seed=1)
     assert len(minima) > 1 and sum(found.starts for found in minima) == 12
     costs = [found.cost for found in minima]
     assert costs == sorted(costs) and costs[1] > 2 * costs[0]
@@ -187,7 +187,7 @@ def test_starts_fill_the_bounds(wide):
 
 def test_a_search_that_was_killed_goes_on_to_the_same_end(wide, tmp_path, monkeypatch):
     file = tmp_path / "search.npz"
-    whole = coarse_search(wide, wide.campaign.measured, 12, seed=1)
+    whole = multi_start(wide, wide.campaign.measured, 12, seed=1)
 
     class Killed(Exception):
         pass
@@ -200,15 +200,13 @@ def test_a_search_that_was_killed_goes_on_to_the_same_end(wide, tmp_path, monkey
     minimise = wide.minimise
     monkeypatch.setattr(wide, "minimise", killing)
     with pytest.raises(Killed):
-        coarse_search(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="this")
+        multi_start(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="this")
     monkeypatch.undo()
-    resumed = coarse_search(
-        wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="this"
-    )
+    resumed = multi_start(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="this")
     assert [found.cost for found in resumed] == [found.cost for found in whole]
     np.testing.assert_array_equal(resumed[0].values, whole[0].values)
     with pytest.raises(ValueError, match="belongs to another search"):
-        coarse_search(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="that")
+        multi_start(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="that")
 
 
 def test_identify_takes_the_lowest_minimum_and_goes_on(tmp_path, monkeypatch):

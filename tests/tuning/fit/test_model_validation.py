@@ -33,7 +33,7 @@ from tuning.fit.model_validation import (
     whiteness_p_value,
 )
 from tuning.fit.uncertainty.covariance import t_quantile
-from tuning.fit.uncertainty.posterior import _log_density, sample, sample_nuts, with_diagnostics
+from tuning.fit.uncertainty.posterior import _log_density, draw_by_nuts, sample, with_diagnostics
 from tuning.fit.uncertainty.profile import profile
 
 VALUES = np.array(list(TRUTH.values()))
@@ -123,7 +123,7 @@ def test_logs_that_were_held_out(plain, monkeypatch):
     measured = clean() + NOISE * np.random.default_rng(9).normal(size=(3, 120, 1))
     measured[1] += 0.1
     monkeypatch.setattr(model_validation, "prepare", lambda case, logs: campaign(measured=measured))
-    good, bad, _ = model_validation.hold_out(plain, campaign(measured=measured).logs)
+    good, bad, _ = model_validation.predict_held_out(plain, campaign(measured=measured).logs)
     assert good.ratio[0] == pytest.approx(1.0, abs=0.25) and ": predicted; " in good.verdict
     assert bad.ratio[0] == pytest.approx(np.hypot(1, 0.1 / NOISE), rel=0.1)
     assert ": not predicted; " in bad.verdict
@@ -171,20 +171,20 @@ def test_the_sampler_draws_from_a_known_density(tmp_path):
         return -z @ inverse @ z / 2
 
     given = (density, 2, 400, 2, 100, 0)
-    draws, divergences = sample_nuts(*given)
+    draws, divergences = draw_by_nuts(*given)
     found = with_diagnostics(["a", "b"], draws, divergences)
     np.testing.assert_allclose(np.cov(draws.reshape(-1, 2).T), covariance, atol=0.25)
     np.testing.assert_allclose(found.means, 0.0, atol=0.2)
     assert found.verdict.startswith("mixed: R-hat up to ") and divergences == 0
     file = tmp_path / "draws.npz"
-    first, _ = sample_nuts(density, 2, 100, 2, 100, 0, file, "this")
+    first, _ = draw_by_nuts(density, 2, 100, 2, 100, 0, file, "this")
     np.testing.assert_array_equal(first, draws[:, :100])
     with pytest.raises(FileExistsError, match="resume that sampling, or delete it"):
-        sample_nuts(*given, file, "this")
-    resumed, _ = sample_nuts(*given, file, "this", resume=True)
+        draw_by_nuts(*given, file, "this")
+    resumed, _ = draw_by_nuts(*given, file, "this", resume=True)
     np.testing.assert_array_equal(resumed, draws)
     with pytest.raises(ValueError, match="belongs to another search"):
-        sample_nuts(*given, file, "that", resume=True)
+        draw_by_nuts(*given, file, "that", resume=True)
 
 
 def test_chains_that_do_not_mix_are_told():

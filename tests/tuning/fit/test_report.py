@@ -13,7 +13,7 @@ from tuning.fit.report import write_report
 from tuning.fit.summary import remarks
 from tuning.fit.uncertainty.posterior import with_diagnostics
 from tuning.fit.uncertainty.profile import Profile
-from tuning.parameters.prior import Belief
+from tuning.parameters.prior import Prior
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +35,8 @@ def test_the_whole_account(plain, tmp_path):
         told,
         profiles=[offset],
         posterior=with_diagnostics(plain.addresses, draws, 0),
-        unseen=cross_validate(plain),
-        rivals=compare_fits({"free": plain, "held & <fast>": worse}),
+        held_out=cross_validate(plain),
+        models=compare_fits({"free": plain, "held & <fast>": worse}),
     )
     text = (tmp_path / "report" / "report.md").read_text()
     page = (tmp_path / "report" / "report.html").read_text()
@@ -57,7 +57,7 @@ def test_the_whole_account(plain, tmp_path):
 def test_remarks_on_priors_and_on_logs():
     measured = clean() + NOISE * np.random.default_rng(0).normal(size=clean().shape)
     measured[1, 60] += 2.0
-    known = {"beam.damping_ratio": Belief(mean=0.03, deviation=1e-5)}
+    known = {"beam.damping_ratio": Prior(mean=0.03, deviation=1e-5)}
     found = fit(search(measured=measured, free=dict.fromkeys(TRUTH) | known))
     said = "\n".join(remarks(found))
     assert "beam.damping_ratio is told by its prior more than by the logs" in said

@@ -136,7 +136,7 @@ def sample(
         }
     )
     file = None if checkpoint is None else Path(checkpoint)
-    found, divergences = sample_nuts(
+    found, divergences = draw_by_nuts(
         density, start.size, draws, chains, warmup, seed, file, digest, resume
     )
     values = np.asarray(
@@ -202,7 +202,7 @@ def _log_density(fit: Fit, noise_model: str = "held"):
     return density, least_squares.from_unbounded, start, whitening
 
 
-def sample_nuts(
+def draw_by_nuts(
     density: Callable[[Float[Array, " size"]], Float[Array, ""]],
     size: int,
     draws: int,

@@ -1,0 +1,167 @@
+"""The regulators of chapter 5 on rig A, and runs under them, by interpretations of the shaker.
+
+Gains are designed for 4.6 N/V and 12000 N/m as printed, and q1, q2 and the rate of q1 are fed back.
+The shaker of the plant is interpreted in several ways, one of which is the thesis's own
+electromechanical model instead of the first-order one.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+
+import jaxbeam as jb
+from experiments.thesis.cases import data_physics_v4
+from experiments.thesis.chapter5.regulator_limits import TimeVaryingLoops
+from experiments.thesis.verdicts import LITERAL
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.control.design_model import DesignModel
+from jaxbeam.model.modes import lay_out
+from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.integration_plan import make_plan
+
+MASSES, SPEEDS = (0.261, 0.371, 0.509), (0.3, 0.55)  # kg, m/s
+STATE_WEIGHTS = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]  # of q, its rate, and the shaker
+COMMAND_WEIGHT = 9e-5  # R
+PRINTED_STATES = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]  # share of each state that is fed back
+ALL_STATES, FIRST_MODE = [1.0] * 7, [1.0, 0, 0, 0, 0, 0, 0]
+TOLERANCE = 1e-4  # relative, of peaks
+SENSOR = 1  # at 0.25 m
+NO_CONTROL = "no control"
+LAWS = {"time-invariant": jb.LQR, "time-varying": jb.FiniteLQR, "augmented": jb.AugmentedLQR}
+
+
+class RegulatorInterpretation(NamedTuple):
+    """How the printed regulator is interpreted: plant, command weight, and states fed back.
+
+    `force_per_volt` (N/V) and `stiffness` (N/m) are those of the plant's shaker.
+    """
+
+    force_per_volt: float
+    command_weight: float
+    stiffness: float
+    feedback: list[float]
+
+
+WEAK_SHAKER = "2.5 N/V reach the beam"
+INTERPRETATIONS = {
+    LITERAL: RegulatorInterpretation(4.6, COMMAND_WEIGHT, 12000.0, PRINTED_STATES),
+    WEAK_SHAKER: RegulatorInterpretation(2.5, COMMAND_WEIGHT, 12000.0, PRINTED_STATES),
+    "R = 5e-4, 3500 N/m, all states": RegulatorInterpretation(4.6, 5e-4, 3500.0, ALL_STATES),
+}
+FULL_SHAKER = "full model of the shaker, Table 2.3"
+REFITTED_SHAKER = "full model, 12000 N/m and 80 N s/m with its back-EMF"
+
+
+class PredesignedController(AbstractController):
+    """A control law with a memory designed for another plant: `init` returns that memory."""
+
+    law: AbstractController = eqx.field(kw_only=True)
+    memory: Any = eqx.field(kw_only=True)
+
+    @property
+    def stateless(self):
+        return self.law.stateless
+
+    def init(self, plant):
+        return self.memory
+
+    def step(self, memory, measurement, t):
+        return self.law.step(memory, measurement, t)
+
+
+def regulator(
+    kind: str, command_weight: float, feedback, damping: float | None = None
+) -> AbstractController:
+    """A regulator of chapter 5, designed for 4.6 N/V.
+
+    `kind` is a key of LAWS, `feedback` the share of each state that is fed back, and `damping`
+    (N s/m) that of the suspension in the design, as in the plant if left out.
+    """
+    return LAWS[kind](
+        state_weight=STATE_WEIGHTS,
+        command_weight=[command_weight],
+        feedback=feedback,
+        coordinates="sine",
+        design=DesignModel(force_per_volt=4.6, damping=damping),
+    )
+
+
+def interpreted_rigs(rig: jb.Case) -> dict[str, jb.Case]:
+    """Rig A with the shaker of each interpretation."""
+    return {
+        name: jb.replace(
+            rig,
+            {
+                "actuators.0.force_per_volt": one.force_per_volt,
+                "actuators.0.stiffness": one.stiffness,
+            },
+        )
+        for name, one in INTERPRETATIONS.items()
+    }
+
+
+def electromechanical_shakers(rig: jb.Case) -> dict[str, jb.Electrodynamic]:
+    """The electrodynamic shaker as in Table 2.3, and on the suspension fitted to rig A."""
+    shaker, passive = data_physics_v4(), rig.actuators[0]
+    back_emf_damping = shaker.force_constant * shaker.back_emf / shaker.resistance  # N s/m
+    damping = passive.damping - back_emf_damping
+    refitted = dataclasses.replace(shaker, stiffness=passive.stiffness, damping=damping)
+    return {FULL_SHAKER: shaker, REFITTED_SHAKER: refitted}
+
+
+def time_varying_loops(
+    case: jb.Case, command_weight: float, damping: float | None = None
+) -> TimeVaryingLoops:
+    """The loop under the time-varying regulator, with some states fed back and with all.
+
+    `damping` (N s/m) is that of the suspension in the design.
+    """
+    laws = (
+        regulator("time-varying", command_weight, feedback, damping)
+        for feedback in (PRINTED_STATES, ALL_STATES)
+    )
+    return TimeVaryingLoops(*(dataclasses.replace(case, controller=law) for law in laws))
+
+
+class RegulatorRuns:
+    """Runs under the regulators; the time step is chosen once for each law and kind of shaker.
+
+    `records` has those with the states that an interpretation feeds back, by interpretation, law,
+    speed (m/s) and mass (kg).
+    """
+
+    def __init__(self, rig: jb.Case):
+        self.layout, self.plans, self.records = lay_out(rig), {}, {}
+
+    def peak(
+        self, name, design, actuator, kind, speed, mass, feedback=None, design_mass=None
+    ) -> float:
+        """Largest deflection (m) at 0.25 m under a law designed for one case, on another shaker.
+
+        `name` is the interpretation, `kind` a key of LAWS or NO_CONTROL. `feedback` is the share of
+        each state that is fed back, and `design_mass` (kg) the load that the law is designed for.
+        """
+        design = jb.replace(design, {"loads.0.mass": mass, "loads.0.speed": speed})
+        plant = dataclasses.replace(design, actuators=(actuator,))
+        if kind in LAWS:
+            interpretation = INTERPRETATIONS.get(name, INTERPRETATIONS[LITERAL])
+            states = interpretation.feedback if feedback is None else feedback
+            law = regulator(kind, interpretation.command_weight, states)
+            changes = {} if design_mass is None else {"loads.0.mass": design_mass}
+            memory = _initial_memory(law, jb.replace(design, changes), self.layout)
+            controller = PredesignedController(law=law, memory=memory)
+            plant = dataclasses.replace(plant, controller=controller)
+        key = kind, type(actuator)
+        if key not in self.plans:
+            self.plans[key] = make_plan(plant, None, TOLERANCE)
+        record = jb.simulate(plant, plan=self.plans[key])
+        if feedback is None and design_mass is None:
+            self.records[name, kind, speed, mass] = record
+        return float(record.peak_deflection[SENSOR])
+
+
+@compiled
+def _initial_memory(law: AbstractController, case: jb.Case, layout):
+    """The memory of a law that is designed for a case."""
+    return law.init(jb.state_space(case, layout=layout))
