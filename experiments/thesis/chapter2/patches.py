@@ -15,7 +15,7 @@ PATCH_VOLTAGE = 1500.0  # V at the patch
 
 
 def run(load_rig) -> ExperimentResult:
-    """Constants of patch, section and shaker, from the numbers that the thesis derives them from."""
+    """Constants of patch, section and shaker, from the printed numbers behind them."""
     patch = jb.Patch(
         0.2575,
         0.3425,

@@ -145,8 +145,7 @@ def _partial_feedback_finding(runs: RegulatorRuns, plants, peaks, time_varying) 
     for name in list(INTERPRETATIONS)[:2]:
         uncontrolled = peaks[name][NO_CONTROL][1, 0]
         reductions[name] = [
-            100
-            - 100 * runs.peak(name, *plants[name], kind, *LIGHT_FAST, FIRST_MODE) / uncontrolled
+            100 - 100 * runs.peak(name, *plants[name], kind, *LIGHT_FAST, FIRST_MODE) / uncontrolled
             for kind in ("time-invariant", "time-varying")
         ]
         reductions[name].append(100 - float(time_varying[name][-1, 0]))
@@ -221,7 +220,7 @@ def _draw_interpretations(tables, ratios) -> Figure:
         axes.plot(places, printed, "_", color="k", markersize=14, label="printed")
         axes.set_xticks(places, [f"{mass:g}" for mass in 2 * MASSES], rotation=90)
         axes.set(title=kind, xlabel="mass (kg), at 0.3 and 0.55 m/s")
-    # By one interpretation the loop is unstable; its peak is in the table, not in the figure.
+    # By one interpretation the response grows without bound; the table has its peak.
     panels[0].set(ylabel="peak in percent of no control", ylim=(0, 110))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     set_title(figure, "Optimal control in several readings (Tables 5.1 to 5.4)")
