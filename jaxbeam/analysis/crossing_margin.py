@@ -54,7 +54,7 @@ def stability_margin(case: Case) -> StabilityMargin:
     within a crossing is for `stability.growth` to tell, a margin belongs to a loop that stays.
     """
     controller = case.controller
-    if controller is None or controller.blind:
+    if controller is None or controller.open_loop:
         return _no_margin("commands that do not depend on readings close no loop")
     if isinstance(controller, MPC) and controller.solver != "unconstrained":
         return _no_margin("a law that heeds limits bends at them: no linear loop stands for it")

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
-from jaxbeam.case.trajectory import NEVER, AbstractMotion
+from jaxbeam.case.trajectory import NEVER, AbstractTrajectory
 from jaxbeam.model.modal_model import rig_in_one
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensor_filters import sensed
@@ -35,7 +35,7 @@ class LoopTiming(NamedTuple):
     sensor_delays: tuple[float, ...]
 
 
-class FrozenTrajectory(AbstractMotion):
+class FrozenTrajectory(AbstractTrajectory):
     """A load stopped in mid-motion: it keeps position, speed and acceleration."""
 
     position: Float[Array, ""]

@@ -94,7 +94,7 @@ class Beam(eqx.Module):
         """End condition at x = length."""
         return self.ends.split("-")[1]
 
-    def fault(self, address: str) -> str | None:
+    def validate(self, address: str) -> str | None:
         """What does not go together in it, as a sentence, or None."""
         ends = self.ends.split("-")
         if len(ends) != 2:

@@ -43,7 +43,7 @@ class AbstractController(eqx.Module):
     With a sampling `period` (s) a controller acts at 0, period, 2 period, ...; its command begins
     `delay` (s) later and is held until the next one. Without a period it acts at every instant,
     the limit of ever faster sampling; its memory then stays as it was at the start, so it must be
-    `memoryless`, but for filters and states of its own, which join those of the plant. Commands are
+    `stateless`, but for filters and states of its own, which join those of the plant. Commands are
     rounded to `resolution` and kept within the actuators' limits by the loop. To add a controller,
     write a file with a subclass and name it in `jaxbeam.control.KINDS`.
     """
@@ -59,25 +59,25 @@ class AbstractController(eqx.Module):
     )
 
     @property
-    def memoryless(self) -> bool:
+    def stateless(self) -> bool:
         """Whether `step` leaves the memory as it is, so that it may act at every instant."""
         return False
 
     @property
-    def blind(self) -> bool:
+    def open_loop(self) -> bool:
         """Whether the command depends on time alone."""
         return False
 
     @property
-    def knows_loads(self) -> bool:
+    def design_depends_on_loads(self) -> bool:
         """Whether what `init` prepares depends on masses and weights of the loads."""
         return True
 
     @abc.abstractmethod
-    def init(self, model: Any) -> Any:
+    def init(self, plant: Any) -> Any:
         """Memory at the start of a run, of any structure; gains may be designed here.
 
-        `model` is the `statespace.LoadedBeam` of the case.
+        `plant` is the `statespace.LoadedBeam` of the case.
         """
 
     @abc.abstractmethod
@@ -108,7 +108,7 @@ class AbstractController(eqx.Module):
         """
         return limited(self.step(memory, measurement, t)[0]), own
 
-    def fault(self, case: Any) -> str | None:
+    def validate(self, case: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", before anything compiles; or None."""
         return None
 
@@ -116,6 +116,6 @@ class AbstractController(eqx.Module):
         """How many steps until now found no solution and fell back, for what solves at each."""
         return jnp.zeros(())
 
-    def knots(self, case: Any) -> Float[Array, " knot"] | None:
+    def breakpoints(self, case: Any) -> Float[Array, " knot"] | None:
         """Times (s) at which the command bends or jumps by itself in a run; steps end there."""
         return None

@@ -33,15 +33,15 @@ class AbstractEstimator(eqx.Module):
     """
 
     @property
-    def flows(self) -> bool:
+    def continuous_time(self) -> bool:
         """Whether it may act at every instant."""
         return False
 
     @abc.abstractmethod
-    def init(self, model: Any) -> Any:
+    def init(self, plant: Any) -> Any:
         """Memory at the start of a run, of any structure; gains may be designed here.
 
-        `model` is the `statespace.LoadedBeam` that the controller is designed for.
+        `plant` is the `statespace.LoadedBeam` that the controller is designed for.
         """
 
     @abc.abstractmethod
@@ -50,7 +50,7 @@ class AbstractEstimator(eqx.Module):
     ) -> tuple[Estimate, Any]:
         """The estimate at time t (s), and the memory after it; `measurement.state` is not used."""
 
-    def fault(self, case: Any, plant: Any) -> str | None:
+    def validate(self, case: Any, plant: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", before a run compiles; or None.
 
         Asked twice: with None for the plant, before that is computed; then, if its numbers are

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.declared_checks import either
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
-from jaxbeam.case.trajectory import AbstractPieces, Braking, Tabulated
+from jaxbeam.case.trajectory import AbstractPiecewiseTrajectory, Braking, Tabulated
 
 
 class AbstractLoad(eqx.Module):
@@ -33,7 +33,7 @@ class AbstractLoad(eqx.Module):
     def weight(self, gravity: Float[Array, ""]) -> Float[Array, ""]:
         """Force with which it presses on a beam at rest, in N, positive downwards."""
 
-    def fault(self, address: str) -> str | None:
+    def validate(self, address: str) -> str | None:
         """What does not go together in it, as a sentence, or None."""
         if (self.times is None) != (self.positions is None):
             lacking = "times" if self.times is None else "positions"
@@ -108,8 +108,8 @@ class MovingForce(AbstractLoad):
     def inertia(self):
         return jnp.zeros(())
 
-    def fault(self, address):
-        return either(address, self, "force", "mass") or super().fault(address)
+    def validate(self, address):
+        return either(address, self, "force", "mass") or super().validate(address)
 
     def weight(self, gravity):
         return self.force if self.force is not None else self.mass * gravity
@@ -118,7 +118,7 @@ class MovingForce(AbstractLoad):
 KINDS = {"mass": MovingMass, "force": MovingForce}
 
 
-def motion(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPieces:
+def motion(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewiseTrajectory:
     """How the load travels along a beam of the given length (m)."""
     if load.times is not None:
         return Tabulated(load.times, load.positions, length)

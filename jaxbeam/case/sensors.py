@@ -52,7 +52,7 @@ class Sensor(eqx.Module):
         """Variance of the noise of one reading, in the square of its unit; what filters call R."""
         return jnp.zeros(()) if self.noise is None else self.noise**2
 
-    def fault(self, address: str) -> str | None:
+    def validate(self, address: str) -> str | None:
         """What does not go together in it, as a sentence, or None."""
         if self.quantity == "strain" and self.fibre_distance is None:
             return (

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 NEVER = 1e30  # s, never reached; finite, in single precision too: its arithmetic has derivatives
 
 
-class AbstractMotion(eqx.Module):
+class AbstractTrajectory(eqx.Module):
     """A path x(t) over the beam, entered once and left at most once."""
 
     length: eqx.AbstractVar[Float[Array, ""]]
@@ -24,11 +24,11 @@ class AbstractMotion(eqx.Module):
         """Times of entry and exit in s; the exit is `NEVER` where the load stays on the beam."""
 
     @abc.abstractmethod
-    def arrivals(self, places: Float[Array, " place"]) -> Float[Array, " kink"]:
+    def passage_times(self, positions: Float[Array, " place"]) -> Float[Array, " kink"]:
         """Times in s at which the motion is not smooth, or passes one of the places (m)."""
 
 
-class AbstractPieces(AbstractMotion):
+class AbstractPiecewiseTrajectory(AbstractTrajectory):
     """A path that is made of cubic polynomials in time."""
 
     @abc.abstractmethod
@@ -39,7 +39,7 @@ class AbstractPieces(AbstractMotion):
         """
 
 
-class Braking(AbstractPieces):
+class Braking(AbstractPiecewiseTrajectory):
     """Constant deceleration from the speed at entry: x = v t - a t^2 / 2 until it stops.
 
     A negative speed enters at the right end and travels left. A negative deceleration speeds the
@@ -92,13 +92,13 @@ class Braking(AbstractPieces):
         reach = self._reach(self.length)
         return self.entry_time, jnp.where(reach < NEVER, self.entry_time + reach, NEVER)
 
-    def arrivals(self, places):
-        distance = jnp.where(self.speed < 0, self.length - places, places)
+    def passage_times(self, positions):
+        distance = jnp.where(self.speed < 0, self.length - positions, positions)
         kinks = jnp.append(self._reach(distance), self._stop())
         return jnp.where(kinks < NEVER, self.entry_time + kinks, NEVER)
 
 
-class Tabulated(AbstractPieces):
+class Tabulated(AbstractPiecewiseTrajectory):
     """A path through given positions at given times: a not-a-knot cubic spline.
 
     The load is put on the beam at the first time (or enters when it passes an end) and, when the
@@ -180,6 +180,6 @@ class Tabulated(AbstractPieces):
         leaves = jnp.where(left, self._pass(self.length - near), NEVER)
         return entry, jnp.where(last == self.length - near, self.times[-1], leaves)
 
-    def arrivals(self, places):
-        passes = jax.vmap(self._pass)(places)
+    def passage_times(self, positions):
+        passes = jax.vmap(self._pass)(positions)
         return jnp.append(passes, self.times[-1])

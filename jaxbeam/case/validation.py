@@ -42,7 +42,7 @@ def check(case: Case) -> None:
         _check_places(address, part, case.beam.length)
     for address, part, _ in _parts(case):
         # A method of a module takes longer to get than most of these take to run.
-        fault = type(part).fault(part, address) if isinstance(part, OUTSPOKEN) else None
+        fault = type(part).validate(part, address) if isinstance(part, OUTSPOKEN) else None
         if fault is not None:
             raise ValueError(fault)
     _check_supports(case.supports, case.beam.length)
@@ -107,7 +107,7 @@ def _check_clock(address: str, sensor: Sensor, case: Case) -> None:
             )
     elif case.controller is not None and case.controller.period is not None:
         period = case.controller.period
-    elif case.controller is None or case.controller.blind:
+    elif case.controller is None or case.controller.open_loop:
         period = 1 / known(run.sample_rate) if is_known(run.sample_rate) else None
     filter = sensor.filter
     if filter is None or filter.realisation != "digital" or period is None:
@@ -125,12 +125,12 @@ def _check_controller(case: Case) -> None:
     controller = case.controller
     if not case.actuators:
         raise ValueError("controller has nothing to command: add an actuator, or leave it out")
-    fault = controller.fault(case)
+    fault = controller.validate(case)
     if fault is not None:
         raise ValueError(f"controller.{fault}")
     for i, sensor in enumerate(case.sensors):
         smooth = sensor.filter is not None and sensor.filter.realisation == "analogue"
-        if smooth and sensor.quantity == "acceleration" and not controller.blind:
+        if smooth and sensor.quantity == "acceleration" and not controller.open_loop:
             raise ValueError(
                 f"sensors.{i}.filter cannot be analogue on an acceleration that a controller looks"
                 " at: make it digital"
@@ -147,11 +147,11 @@ def _check_controller(case: Case) -> None:
     sampled = {
         "controller.delay": controller.delay is not None,
         "controller.resolution": controller.resolution is not None,
-        "the controller's memory": not controller.memoryless,
+        "the controller's memory": not controller.stateless,
     }
     for i, actuator in enumerate(case.actuators):
         sampled[f"the rate limit of actuators.{i}"] = actuator.command_rate() is not None
-    if not controller.blind:
+    if not controller.open_loop:
         for i, sensor in enumerate(case.sensors):
             digital = sensor.filter is not None and sensor.filter.realisation == "digital"
             sampled |= {

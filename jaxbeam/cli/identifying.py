@@ -202,7 +202,7 @@ def _assess(fit, profile, draws, sampling, validate, output, resume) -> dict:
 
     assessment = {"profiles": [profile_of(fit, address) for address in profile]}
     if validate:
-        assessment["unseen"] = cross_validate(fit)
+        assessment["held_out"] = cross_validate(fit)
     if draws:
         checkpoint = _with_suffix(output, ".draws.npz")
         assessment["posterior"] = sample(
@@ -232,11 +232,11 @@ def _write_and_print(fit, assessment, report, output, picture, json_) -> None:
                             for p in assessment["profiles"]}  # fmt: skip
         if posterior:
             summary["posterior"] = posterior.to_dict()
-        summary["left_out"] = {u.log: u.ratio for u in assessment.get("unseen", ())}
+        summary["left_out"] = {u.log: u.residual_ratio for u in assessment.get("held_out", ())}
         print_json(summary)
         return
     print(fit)
-    for found in (*assessment["profiles"], *assessment.get("unseen", ())):
+    for found in (*assessment["profiles"], *assessment.get("held_out", ())):
         print(found.verdict)
     if posterior:
         print(posterior)

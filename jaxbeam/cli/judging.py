@@ -39,7 +39,7 @@ def judge(
         error_ratios = {
             name: {u.log: u.residual_ratio for u in found} for name, found in held_out.items()
         }
-        print_json({"rivals": [vars(rival) for rival in rivals], "unseen": error_ratios})
+        print_json({"rivals": [rival.to_dict() for rival in rivals], "unseen": error_ratios})
         return
     if rivals:
         width = max(map(len, names))

@@ -155,12 +155,10 @@ def tune(
     shared_options = {
         "stable": None if stable is None else tuning.StabilityConstraint(stable, reserve, shares),
         "method": method or ("lbfgs" if front_limits or rank else "adam"),
-        "steps": steps, "seed": seed, "bounds": bounds, "progress": not json_,
+        "steps": steps, "seed": seed, "least_peaks": bounds, "progress": not json_,
     }  # fmt: skip
     if front_limits:
-        tuning_result = tuning.pareto(
-            *problem, total_objective, *front_limits, **shared_options
-        )
+        tuning_result = tuning.pareto(*problem, total_objective, *front_limits, **shared_options)
         results = tuning_result.tuned
     elif rank:
         results = tuning.lexicographic(

@@ -61,7 +61,9 @@ class Passage(AbstractController):
         return None
 
     def init(self, plant: LoadedBeam):
-        gate_times = jnp.stack([path.arrivals(self.gates)[:2] for path in plant.traffic.motions])
+        gate_times = jnp.stack(
+            [path.passage_times(self.gates)[:2] for path in plant.traffic.motions]
+        )
         return gate_times, plant.case.beam.length
 
     def step(self, memory, measurement, t):
@@ -79,5 +81,5 @@ class Passage(AbstractController):
 
 def _gate_times(gates, loads, length) -> Float[np.ndarray, "load 2"]:
     """When loads pass the gates (s), NaN where they do not."""
-    found = np.stack([known(motion(load, length).arrivals(gates))[:2] for load in loads])
+    found = np.stack([known(motion(load, length).passage_times(gates))[:2] for load in loads])
     return np.where(found < NEVER, found, np.nan)

@@ -87,7 +87,7 @@ class Recognition(eqx.Module):
         if self.gates is None:
             settings = {"until": self.until, "threshold": self.threshold}
             return DeflectionIdentifier(sums=jnp.zeros(8), **settings, **common)
-        times = plant.traffic.motions[0].arrivals(self.gates)[:2]
+        times = plant.traffic.motions[0].passage_times(self.gates)[:2]
         return GateIdentifier(settings=self, gate_times=times, sums=jnp.zeros(2), **common)
 
 

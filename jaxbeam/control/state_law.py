@@ -35,7 +35,7 @@ class AbstractStateLaw(AbstractController):
 
     @property
     def stateless(self) -> bool:
-        return self.estimator is None or self.estimator.flows
+        return self.estimator is None or self.estimator.continuous_time
 
     @abc.abstractmethod
     def prepare(self, plant: LoadedBeam, design_plant: LoadedBeam) -> Any:
@@ -105,13 +105,13 @@ class AbstractStateLaw(AbstractController):
             return "period must be given: this estimator steps from sample to sample"
         if self.period is None and self.estimator is None:
             return None
-        error = None if self.estimator is None else self.estimator.fault(case, None)
+        error = None if self.estimator is None else self.estimator.validate(case, None)
         if error is None and all(is_known(leaf) for leaf in jax.tree.leaves((self, case))):
             law, concrete_case = jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), (self, case))
             system = _unloaded_design_plant(law, concrete_case, lay_out(concrete_case))
             if self.period is not None:
                 self.warn(system, case)
-            error = None if self.estimator is None else self.estimator.fault(case, system)
+            error = None if self.estimator is None else self.estimator.validate(case, system)
         return None if error is None else f"estimator.{error}"
 
     def warn(self, system: StateSpace, case: Any) -> None:

@@ -76,7 +76,7 @@ def simulate_adaptive(
 def _events(rig: Rig, loads: Traffic, end: float) -> tuple[np.ndarray, np.ndarray]:
     """Entry and exit of every load (load, 2), and the edges of legs without events, in s."""
     windows = np.array([path.window() for path in loads.motions]).reshape(-1, 2)
-    kinks = [np.asarray(path.arrivals(rig.modes.nodes)) for path in loads.motions]
+    kinks = [np.asarray(path.passage_times(rig.modes.nodes)) for path in loads.motions]
     found = np.concatenate([windows.ravel(), *kinks])
     edges = np.unique(np.concatenate([[0.0, end], found[(found > 0) & (found < end)]]))
     return windows, edges[np.append(True, np.diff(edges) > 10 * BREATH * end)]

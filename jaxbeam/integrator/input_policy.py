@@ -7,34 +7,34 @@ import equinox as eqx
 from jaxtyping import Array, Float, Int
 
 
-class Moment(eqx.Module):
+class StepInfo(eqx.Module):
     """A step, or several: start (s), length (s), and the edge of the schedule it starts at.
 
-    `edge` is -1 for a step that starts between two edges.
+    `event` is -1 for a step that starts between two edges.
     """
 
     start: Float[Array, " *step"]
     span: Float[Array, " *step"]
-    edge: Int[Array, " *step"]
+    event: Int[Array, " *step"]
 
 
-class AbstractDriver(eqx.Module):
+class AbstractInputPolicy(eqx.Module):
     """What commands the actuators of a run.
 
-    With `inner`, it is told the states at the nodes within a step, and not only at the start. A
-    run is given up where a state of the rig exceeds its `bound`.
+    With `implicit`, it is told the states at the nodes within a step, and not only at the start. A
+    run is given up where a state of the rig exceeds its `state_bound`.
     """
 
-    inner: eqx.AbstractVar[bool]
-    bound: eqx.AbstractVar[Float[Array, " state"]]
+    implicit: eqx.AbstractVar[bool]
+    state_bound: eqx.AbstractVar[Float[Array, " state"]]
 
     @abc.abstractmethod
-    def start(self, lanes: int) -> Any:
+    def start(self, batch_size: int) -> Any:
         """Its memory at the start of a run, of any structure."""
 
     @abc.abstractmethod
-    def drive(
-        self, memory, state: Float[Array, "state lane"], moment: Moment, states
+    def inputs(
+        self, memory, state: Float[Array, "state lane"], info: StepInfo, states
     ) -> tuple[Float[Array, "node actuator lane"], Any]:
         """Commands (node, actuator, lane) of a step from this state, and the memory after it.
 
@@ -42,5 +42,5 @@ class AbstractDriver(eqx.Module):
         """
 
     @abc.abstractmethod
-    def shows(self, memory, moment: Moment) -> Any:
+    def observe(self, memory, info: StepInfo) -> Any:
         """What is to be kept of the start of a step that starts at an edge, lanes last, or None."""

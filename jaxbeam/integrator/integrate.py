@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.loads import AbstractLoad, MovingMass
-from jaxbeam.integrator.input_policy import AbstractDriver, Moment
+from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS, LONGEST, NODES, norm
 from jaxbeam.integrator.running_peaks import Extremes, fold, nothing_seen
 from jaxbeam.integrator.step import KEPT, advance, contact, undriven
@@ -39,7 +39,7 @@ def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
     return jax.lax.stop_gradient(limit)
 
 
-def _driven(driver: AbstractDriver, carry, step):
+def _driven(driver: AbstractInputPolicy, carry, step):
     """One step of all lanes under the commands of a driver."""
     state, memory = carry
     tables, inertia, weight, moment = step
@@ -51,13 +51,13 @@ def _driven(driver: AbstractDriver, carry, step):
         flat = inner.drift @ state + inner.push @ forces + inner.command @ commands
         return flat.reshape(len(GAUSS), *state.shape)
 
-    given, memory = driver.drive(memory, state, moment, states)
+    given, memory = driver.inputs(memory, state, moment, states)
     commands = jax.lax.collapse(given, 0, 2)
     after, (state, forces) = advance(state, (tables, inertia, weight, commands))
     # A loop that diverges ends here, in its own lane, instead of running into overflow.
-    lost = jnp.any(~(jnp.abs(after) <= driver.bound[:, None]), axis=0)
+    lost = jnp.any(~(jnp.abs(after) <= driver.state_bound[:, None]), axis=0)
     after = jnp.where(lost, jnp.nan, after)
-    return (after, memory), (state, forces, commands, driver.shows(memory, moment))
+    return (after, memory), (state, forces, commands, driver.observe(memory, moment))
 
 
 def _rows(loads: Float[Array, "load lane"], path: Path) -> Float[Array, "step row lane"]:
@@ -66,7 +66,7 @@ def _rows(loads: Float[Array, "load lane"], path: Path) -> Float[Array, "step ro
     return jnp.repeat(chosen, len(GAUSS), axis=1)
 
 
-def _stepper(rigging: Rigging, traffic: Traffic, slots: int, driver: AbstractDriver | None):
+def _stepper(rigging: Rigging, traffic: Traffic, slots: int, driver: AbstractInputPolicy | None):
     """Function that takes state, memory and extremes through the chunk from a given step on.
 
     It returns them with the time (s) at its end, and with what may be kept of it.
@@ -81,7 +81,7 @@ def _stepper(rigging: Rigging, traffic: Traffic, slots: int, driver: AbstractDri
         if driver is None:
             state, states, forces = undriven(tables, *loads, state)
         else:
-            moments = Moment(path.start, path.span, rigging.grid.edge(index))
+            moments = StepInfo(path.start, path.span, rigging.grid.edge(index))
             (state, memory), (states, forces, commands, shown) = jax.lax.scan(
                 lambda carry, step: _driven(driver, carry, step),
                 (state, memory),
@@ -100,7 +100,7 @@ def trace(
     *,
     slots: int,
     steps: int,
-    driver: AbstractDriver | None = None,
+    driver: AbstractInputPolicy | None = None,
 ):
     """Integrate from rest over a grid: extremes, states, commands, what is shown, and memory.
 
@@ -136,7 +136,7 @@ def march(
     traffic: Traffic,
     *,
     slots: int,
-    driver: AbstractDriver | None = None,
+    driver: AbstractInputPolicy | None = None,
 ) -> tuple[Extremes, Any]:
     """Integrate from rest over a grid, keeping only extremes at the watched places.
 
@@ -185,7 +185,7 @@ def march(
 
 
 def at_edges(
-    rigging: Rigging, traffic: Traffic, *, slots: int, driver: AbstractDriver | None = None
+    rigging: Rigging, traffic: Traffic, *, slots: int, driver: AbstractInputPolicy | None = None
 ) -> Float[Array, "edge state lane"]:
     """Integrate from rest over a grid, keeping only the states at the edges of its schedule.
 

@@ -17,7 +17,7 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbeam.integrator.input_policy import AbstractDriver
+from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.propagators import GAUSS, LOOKED, Step, propagators
 from jaxbeam.integrator.time_grid import Grid
 from jaxbeam.model.contact import Traffic, contact_rows
@@ -86,11 +86,11 @@ def make_rigging(
     rig: Rig,
     grid: Grid,
     watched: Float[Array, " place"] | None,
-    driver: AbstractDriver | None = None,
+    driver: AbstractInputPolicy | None = None,
 ) -> Rigging:
     """Propagators for all step lengths of a grid; deflections are watched at some places (m)."""
     driven = driver is not None
-    inner = driver is not None and driver.inner
+    inner = driver is not None and driver.implicit
     step = propagators(rig, grid.lengths, driven)
     each = rig.modes_per_block
     commands = rig.command_matrix[1 : 2 * each : 2] if driven else None

@@ -77,7 +77,7 @@ def _events(case: Case, rig: Rig):
     if not motions:
         return jnp.zeros((0, 2)), jnp.zeros(0)
     windows = jnp.stack([jnp.stack(path.window()) for path in motions])
-    kinks = [path.arrivals(inner) for path in motions]
+    kinks = [path.passage_times(inner) for path in motions]
     return windows, jnp.concatenate([windows.ravel(), *kinks])
 
 

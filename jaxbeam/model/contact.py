@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads import motion
-from jaxbeam.case.trajectory import AbstractMotion
+from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.model.modal_model import Rig
 from jaxbeam.numerics.batched_linalg import solve_small
 
@@ -28,7 +28,7 @@ class Traffic(eqx.Module):
     Inertia (kg) and weight (N) may differ between lanes: runs that share everything else.
     """
 
-    motions: tuple[AbstractMotion, ...]
+    motions: tuple[AbstractTrajectory, ...]
     inertia: Float[Array, "load lane"]
     weight: Float[Array, "load lane"]
 

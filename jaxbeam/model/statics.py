@@ -133,7 +133,7 @@ def _peak(case: Case, layout: Layout, x):
     windows = jnp.stack([jnp.stack(path.window()) for path in motions])
     corners = jnp.concatenate([found.nodes, found.points.places])
     tables = [load.times for load in case.loads if load.times is not None]
-    events = [windows.ravel(), *(path.arrivals(corners * length) for path in motions), *tables]
+    events = [windows.ravel(), *(path.passage_times(corners * length) for path in motions), *tables]
     events = jnp.concatenate(events)
     edges = jnp.sort(jnp.where(events < NEVER, events, windows[0, 0]))
     low, high = edges[:-1], edges[1:]

@@ -83,7 +83,7 @@ class Compiled(Generic[P, R]):
             arrays, kept = entry.program(arrays)
         else:
             arrays, kept = self.jitted(arrays, tuple(rest))
-        return _combine(arrays, *kept.rest)
+        return _combine(arrays, *kept.static)
 
     def precompile(self, *args: P.args, **kwargs: P.kwargs) -> Callable[[], Any]:
         """Trace for arguments of the structure and shapes of these; what it returns compiles.
@@ -99,7 +99,7 @@ class Compiled(Generic[P, R]):
         if entry.compiled:
             return lambda: None
         if not entry.cached_code:
-            lowered = entry.quick.lower(arrays, tuple(rest))
+            lowered = entry.jitted.lower(arrays, tuple(rest))
             return lambda: self._compile(entry, lowered)
 
         def load_or_compile():
@@ -109,14 +109,14 @@ class Compiled(Generic[P, R]):
                 )
                 entry.compiled = True
             except jax.errors.JaxRuntimeError:
-                self._compile(entry, entry.quick.lower(arrays, tuple(rest)))
+                self._compile(entry, entry.jitted.lower(arrays, tuple(rest)))
 
         return load_or_compile
 
     def _compile(self, entry, lowered):
         program = lowered.compile()
-        if entry.place is not None:
-            compile_cache.save_program(entry.place, program, lowered.out_info)
+        if entry.cache_path is not None:
+            compile_cache.save_program(entry.cache_path, program, lowered.out_info)
             entry.program = program
         entry.compiled = True
 

@@ -18,7 +18,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.fields import known
 from jaxbeam.integrator.events import Schedule, merged
-from jaxbeam.integrator.input_policy import AbstractDriver, Moment
+from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS, NODES
 from jaxbeam.model.contact import Traffic, at_instant
 from jaxbeam.model.modal_model import Rig
@@ -35,7 +35,7 @@ NEWTON_ITERATIONS = (
 def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> Schedule:
     """When the controller of a case acts and its sensors are read, up to the last sample (s)."""
     controller, end = case.controller, samples[-1]
-    breakpoints = controller.knots(case)
+    breakpoints = controller.breakpoints(case)
     breakpoints = np.zeros(0) if breakpoints is None else known(breakpoints)
     if controller.period is None:
         return merged(samples, np.zeros(0), 0.0, [], [], breakpoints)
@@ -59,7 +59,7 @@ def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> Schedule:
     )
 
 
-class ClosedLoop(AbstractDriver):
+class ClosedLoop(AbstractInputPolicy):
     """The driver made of the controller of a case. Lanes share the controller, not its memory.
 
     `initial_memory` is that memory at the start, which holds what the controller works out beforehand.
@@ -104,11 +104,11 @@ class ClosedLoop(AbstractDriver):
         command_queue = jnp.zeros((self.schedule.waiting + 1, *commands.shape))
         return memory, commands, sensor_memory, reading_history, command_queue
 
-    def inputs(self, memory, state, step_info: Moment, states):
+    def inputs(self, memory, state, step_info: StepInfo, states):
         if self.plant.case.controller.period is None:
             return self._continuous_inputs(memory, state, step_info, states)
         memory = jax.lax.cond(
-            step_info.edge >= 0,
+            step_info.event >= 0,
             lambda memory: self._process_event(memory, state, step_info),
             lambda memory: memory,
             memory,
@@ -116,7 +116,7 @@ class ClosedLoop(AbstractDriver):
         command = memory[1]
         return jnp.broadcast_to(command, (NODES, *command.shape)), memory
 
-    def _continuous_inputs(self, memory, state, step_info: Moment, states):
+    def _continuous_inputs(self, memory, state, step_info: StepInfo, states):
         controller_memory, last_command = memory
         times = step_info.start + step_info.span * GAUSS
         if not self.implicit:
@@ -165,10 +165,10 @@ class ClosedLoop(AbstractDriver):
         batched_law = jax.vmap(law, in_axes=-1, out_axes=-1)
         return batched_law(controller_memory, controller_state, readings, plant_state, no_command)
 
-    def _process_event(self, memory, state, step_info: Moment):
+    def _process_event(self, memory, state, step_info: StepInfo):
         """All that is due at an edge: readings, a new command, and commands that begin."""
         controller_memory, command, sensor_memory, reading_history, command_queue = memory
-        case, schedule, event = self.plant.case, self.schedule, step_info.edge
+        case, schedule, event = self.plant.case, self.schedule, step_info.event
         signals = self._sensor_inputs(state, command, step_info.start)
         readings, states = [], []
         for i, sensor in enumerate(case.sensors):
@@ -189,8 +189,8 @@ class ClosedLoop(AbstractDriver):
             own, waiting = inputs
             arrived = self._available_readings(reading_history, event)
             wanted, own = self._controller_step(own, arrived, state, command, step_info.start)
-            command = self._limit_commands(wanted, waiting[0])
-            return own, jnp.roll(waiting, 1, axis=0).at[0].set(command)
+            limited = self._limit_commands(wanted, waiting[0])
+            return own, jnp.roll(waiting, 1, axis=0).at[0].set(limited)
 
         controller_memory, command_queue = jax.lax.cond(
             schedule.tick[event] >= 0,
@@ -204,12 +204,12 @@ class ClosedLoop(AbstractDriver):
         )
         return controller_memory, command, states, reading_history, command_queue
 
-    def observe(self, memory, step_info: Moment):
+    def observe(self, memory, step_info: StepInfo):
         """Readings (sensor, lane) that have arrived, and failures (lane) of the controller."""
         controller = self.plant.case.controller
         if controller.period is None:
             return None
-        return self._available_readings(memory[3], step_info.edge), self.failures(memory)
+        return self._available_readings(memory[3], step_info.event), self.failures(memory)
 
     def failures(self, memory) -> Float[Array, " lane"]:
         """How many steps of the controller found no solution until now, in every lane."""
@@ -310,7 +310,7 @@ def closed_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) 
         noise = None
         if any(sensor.noise is not None for sensor in case.sensors):
             noise = noise_samples(case.run.seed, len(case.sensors), schedule.most_reads)
-    implicit = controller.period is None and not controller.blind
+    implicit = controller.period is None and not controller.open_loop
     initial_memory = controller.init(plant)  # once: it may solve Riccati equations
     controller_states = controller.own_states(initial_memory) if implicit else 0
     augmented_model, output_rows = _with_controller_states(

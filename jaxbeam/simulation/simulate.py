@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import is_known, known
 from jaxbeam.integrator.events import sampled
-from jaxbeam.integrator.input_policy import AbstractDriver
+from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import trace
 from jaxbeam.integrator.propagators import NODES, at_ends
 from jaxbeam.integrator.running_peaks import Found
@@ -159,7 +159,7 @@ class IntegrationSetup(NamedTuple):
 
     model: Rigging
     loads: Traffic
-    policy: AbstractDriver | None
+    policy: AbstractInputPolicy | None
     sample_steps: Int[Array, " time"]
     steps: int
 
@@ -208,7 +208,7 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
         # A law at every instant is asked itself: its polynomials are less exact at their ends.
         commands = (
             policy.commands_at(states[..., 0], times)
-            if policy.inner
+            if policy.implicit
             else _commands_at_steps(case, commands, sample_steps)
         )
     *coordinates, commands = _modal_and_contact_outputs(model, loads, times, states, commands)

@@ -70,7 +70,9 @@ class SweepSpecification:
 
     def batches(self) -> Batches:
         """The runs, arranged into tasks."""
-        one_run_each = self.case.controller is not None and self.case.controller.knows_loads
+        one_run_each = (
+            self.case.controller is not None and self.case.controller.design_depends_on_loads
+        )
         return make_batches(list(self.axes), self.runs(), one_run_each)
 
     def runner(self) -> Runner:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.events import Schedule, merged
-from jaxbeam.integrator.input_policy import AbstractDriver
+from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import trace
 from jaxbeam.integrator.propagators import NODES
 from jaxbeam.integrator.step_matrices import make_rigging
@@ -53,7 +53,7 @@ class InputInfluence(eqx.Module):
         ) @ self.deflection_rows.T
 
 
-class _UnitCommands(AbstractDriver):
+class _UnitCommands(AbstractInputPolicy):
     """To each lane one unit command: to actuator `actuator_index`, during hold number `hold_index`."""
 
     schedule: Schedule

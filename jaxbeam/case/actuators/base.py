@@ -72,7 +72,7 @@ class AbstractActuator(eqx.Module):
         """Smallest and largest command it takes, in the unit of a command; None if any."""
         return self.limits
 
-    def fault(self, address: str) -> str | None:
+    def validate(self, address: str) -> str | None:
         """What does not go together in it, as a sentence naming its address, or None."""
         return None
 

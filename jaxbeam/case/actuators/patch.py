@@ -100,7 +100,7 @@ class Patch(AbstractActuator):
     def command_rate(self) -> Float[Array, ""] | None:
         return self.rate_limit
 
-    def fault(self, address: str) -> str | None:
+    def validate(self, address: str) -> str | None:
         if is_known(self.start) and is_known(self.end):
             start, end = known(self.start), known(self.end)
             if start >= end:
