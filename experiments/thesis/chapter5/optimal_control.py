@@ -42,7 +42,7 @@ from experiments.thesis.verdicts import (
 from jaxbeam.plot.style import colour, set_title, use_style
 
 SAMPLE_RATE = 200.0  # Hz
-LIGHT_FAST = SPEEDS[1], MASSES[0]
+
 # Published differences between two speeds count as scatter beyond this multiple of the computed.
 SCATTER_RATIO = 5.0
 UNDAMPED_DESIGN = "R = 3e-4, 2.5 N/V, 80 N s/m in the plant only"  # for stability alone
@@ -143,9 +143,10 @@ def _partial_feedback_finding(runs: RegulatorRuns, plants, peaks, time_varying) 
     """Reductions (%) with the first state fed back, and with the printed ones."""
     reductions = {}
     for name in list(INTERPRETATIONS)[:2]:
-        uncontrolled = peaks[name][NO_CONTROL][1, 0]
+        (design, shaker), uncontrolled = plants[name], peaks[name][NO_CONTROL][1, 0]
+        run = {"speed": SPEEDS[1], "mass": MASSES[0], "feedback": FIRST_MODE}
         reductions[name] = [
-            100 - 100 * runs.peak(name, *plants[name], kind, *LIGHT_FAST, FIRST_MODE) / uncontrolled
+            100 - 100 * runs.peak(name, design, shaker, kind, **run) / uncontrolled
             for kind in ("time-invariant", "time-varying")
         ]
         reductions[name].append(100 - float(time_varying[name][-1, 0]))

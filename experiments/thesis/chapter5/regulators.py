@@ -18,7 +18,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.model.modes import lay_out
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulation.integration_plan import make_plan
+from jaxbeam.simulation.integration_plan import integration_plan
 
 MASSES, SPEEDS = (0.261, 0.371, 0.509), (0.3, 0.55)  # kg, m/s
 STATE_WEIGHTS = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]  # of q, its rate, and the shaker
@@ -154,7 +154,7 @@ class RegulatorRuns:
             plant = dataclasses.replace(plant, controller=controller)
         key = kind, type(actuator)
         if key not in self.plans:
-            self.plans[key] = make_plan(plant, None, TOLERANCE)
+            self.plans[key] = integration_plan(plant, None, TOLERANCE)
         record = jb.simulate(plant, plan=self.plans[key])
         if feedback is None and design_mass is None:
             self.records[name, kind, speed, mass] = record

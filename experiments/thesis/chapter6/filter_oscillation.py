@@ -1,36 +1,32 @@
-"""What the low-pass filter does to cubic feedback of one span, and its gain margin: Fig. 6.4."""
-
-import dataclasses
-from collections.abc import Callable
+"""Oscillation of cubic feedback through a low-pass filter, and its gain margin: Fig. 6.4."""
 
 import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
+from experiments.thesis.cases import with_duration
 from experiments.thesis.chapter6 import published
+from experiments.thesis.chapter6.patch_rigs import simulate_changes
+from experiments.thesis.figures import plot_deflections
 from experiments.thesis.verdicts import Finding, make_finding
 from jaxbeam.model.statics import static_lift
-from jaxbeam.plot.style import colour, set_title, use_style
+from jaxbeam.plot.style import set_title, use_style
 
 SPEED, MASS = 0.28, 0.509  # m/s, kg
 CUTOFFS, DAMPING_RATIOS = (10.0, 5.0), (0.03, 0.01)  # Hz; 1, the second as in Fig. 6.10
-AVERAGING_PERIOD = (
-    0.1  # s, the period of the oscillation: what changes more slowly is the load passing
-)
-VISIBLE_AMPLITUDE = (
-    0.1  # mm from crest to trough: what the supports yield by, and is called visible
-)
-RATE = 500.0  # samples per second
+# s, the period of the oscillation: the mean over it is the quasi-static deflection by the load
+AVERAGING_PERIOD = 0.1
+# mm from crest to trough, by which the supports yield: called visible in the thesis
+VISIBLE_AMPLITUDE = 0.1
+SAMPLE_RATE = 500.0  # Hz
 
 
-def oscillation_findings(case: jb.Case, simulate_changes: Callable) -> tuple[list[Finding], Figure]:
-    """Whether a slow, heavy load makes the loop oscillate, and how fast, by cutoff and damping.
+def oscillation_findings(case: jb.Case) -> tuple[list[Finding], Figure]:
+    """Whether a slow, heavy load makes the loop oscillate, and the frequency of that (Hz).
 
-    `simulate_changes` runs the case under the cubic law with several changes of its numbers.
+    `case` is rig B under the cubic law; cutoff of the filter and damping are varied.
     """
-    duration = float(case.beam.length) / SPEED
-    run = dataclasses.replace(case.run, duration=np.asarray(duration), sample_rate=np.asarray(RATE))
-    case = dataclasses.replace(case, run=run)
+    case = with_duration(case, float(case.beam.length) / SPEED, SAMPLE_RATE)
     load = {"loads.0.mass": MASS, "loads.0.speed": SPEED}
     changes = [
         load | {"sensors.0.filter.cutoff": cutoff, "beam.damping_ratio": ratio}
@@ -38,64 +34,55 @@ def oscillation_findings(case: jb.Case, simulate_changes: Callable) -> tuple[lis
         for cutoff in CUTOFFS
     ]
     records = simulate_changes(case, changes)
-    sizes, rates = np.transpose([_oscillation(record) for record in records])
-    oscillates = (sizes > VISIBLE_AMPLITUDE).astype(float).reshape(len(DAMPING_RATIOS), -1)
-    words = [
-        f"damping {ratio:g}, {few:.2f} and {less:.2f} mm from crest to trough"
-        for ratio, (few, less) in zip(
-            DAMPING_RATIOS, sizes.reshape(len(DAMPING_RATIOS), -1), strict=True
-        )
-    ]
+    shape = len(DAMPING_RATIOS), len(CUTOFFS)
+    sizes, frequencies = np.transpose([_oscillation(one) for one in records]).reshape(2, *shape)
+    oscillates = (sizes > VISIBLE_AMPLITUDE).astype(float)
+    first, second = sizes[1]
+    low_damping = f"damping {DAMPING_RATIOS[1]:g}"
+    with_sizes = f"{low_damping}, {first:.2f} and {second:.2f} mm from crest to trough"
     findings = [
-        make_finding(published.OSCILLATES, oscillates[0], {words[1]: oscillates[1]}),
+        make_finding(published.OSCILLATES, oscillates[0], {with_sizes: oscillates[1]}),
         make_finding(
-            published.OSCILLATION_FREQUENCY,
-            rates[0],
-            {f"damping {DAMPING_RATIOS[1]:g}": rates[len(CUTOFFS), None]},
+            published.OSCILLATION_FREQUENCY, frequencies[0, 0], {low_damping: frequencies[1, 0]}
         ),
     ]
     return findings, _draw(records[-len(CUTOFFS) :])
 
 
 def _oscillation(record: jb.Record) -> tuple[float, float]:
-    """What oscillates at the middle while the load is on the beam: crest to trough (mm), and Hz."""
+    """Oscillation at midspan while loaded: crest to trough (mm) and frequency (Hz)."""
     history = 1e3 * np.asarray(record.deflection)[:, 0]
-    width = round(AVERAGING_PERIOD * RATE)
+    width = round(AVERAGING_PERIOD * SAMPLE_RATE)
     mean = np.convolve(history, np.ones(width) / width, "valid")
-    oscillating_part = history[width // 2 :][: mean.size] - mean
-    amplitude_spectrum = np.abs(
-        np.fft.rfft(
-            oscillating_part * np.hanning(oscillating_part.size), 16 * oscillating_part.size
-        )
-    )
-    windows = np.lib.stride_tricks.sliding_window_view(oscillating_part, width)
-    frequency = np.fft.rfftfreq(16 * oscillating_part.size, 1 / RATE)[np.argmax(amplitude_spectrum)]
+    oscillation = history[width // 2 :][: mean.size] - mean
+    count = 16 * oscillation.size  # zeros interpolate the spectrum
+    spectrum = np.abs(np.fft.rfft(oscillation * np.hanning(oscillation.size), count))
+    windows = np.lib.stride_tricks.sliding_window_view(oscillation, width)
+    frequency = np.fft.rfftfreq(count, 1 / SAMPLE_RATE)[np.argmax(spectrum)]
     return float(np.max(np.ptp(windows, axis=1))), float(frequency)
 
 
 def gain_margin_finding(case: jb.Case, corrections) -> Finding:
-    """The gain (V/m at the patch) at which static feedback alone has the pole at zero."""
+    """The gain (V/m at the patch) at which static feedback has a pole at zero, by c_p."""
     position, amplifier = case.sensors[0].position, float(case.actuators[0].amplifier_gain)
     margins = {
-        f"c_p {share:g}": amplifier
-        / static_lift(jb.replace(case, {"actuators.0.correction": share}), position)
-        for share in corrections
+        f"c_p {correction:g}": amplifier
+        / static_lift(jb.replace(case, {"actuators.0.correction": correction}), position)
+        for correction in corrections
     }
-    first, *others = margins.items()
-    return make_finding(
-        published.GAIN_MARGIN, first[1], {k: np.atleast_1d(v[0]) for k, v in others}
-    )
+    (_, literal), *others = margins.items()
+    return make_finding(published.GAIN_MARGIN, literal, dict(others))
 
 
 @use_style
 def _draw(records) -> Figure:
-    """Fig. 6.4: the deflection under both filters."""
+    """Fig. 6.4: the deflection with either filter."""
     figure = Figure(figsize=(7.2, 3.0))
     axes = figure.subplots()
-    for i, (record, cutoff) in enumerate(zip(records, CUTOFFS, strict=True)):
-        history = 1e3 * np.asarray(record.deflection)[:, 0]
-        axes.plot(record.times, history, color=colour(i), label=f"filter of {cutoff:g} Hz")
-    axes.set(xlabel="time (s)", ylabel="deflection at 0.3 m (mm)", xlim=(0, record.times[-1]))
+    labels = [f"filter of {cutoff:g} Hz" for cutoff in CUTOFFS]
+    plot_deflections(axes, dict(zip(labels, records, strict=True)))
+    last = float(records[-1].times[-1])
+    axes.set(xlabel="time (s)", ylabel="deflection at 0.3 m (mm)", xlim=(0, last))
     axes.legend(loc="lower right")
     set_title(figure, "One span, cubic law, 0.509 kg at 0.28 m/s, damping 0.01 (Fig. 6.4)")
     return figure

@@ -1,4 +1,4 @@
-"""What explains printed numbers, against the equations of the thesis written out with scipy."""
+"""Interpretations that explain printed numbers, against the equations of the thesis in scipy."""
 
 import dataclasses
 
@@ -8,13 +8,13 @@ from scipy.linalg import expm, solve_discrete_are
 from experiments.thesis.cases import one_span
 from experiments.thesis.chapter2 import frequencies, published, shaker
 from experiments.thesis.chapter5 import published as published_regulators
-from experiments.thesis.chapter5.optimal_control import WEIGHTS
 from experiments.thesis.chapter5.regulator_limits import (
     COMMAND_WEIGHT,
     optimal_gain,
     with_active_shaker,
     with_other_shaker,
 )
+from experiments.thesis.chapter5.regulators import STATE_WEIGHTS
 from jaxbeam import rigs
 
 LENGTH, RIGIDITY, DENSITY, DAMPING = 0.6, 11.68, 0.535, 0.03
@@ -39,7 +39,7 @@ def test_critical_speed_of_the_denser_beam():
 
 
 def mobility(s, mass):
-    """Eqs (2.29) and (2.30) at the shaker, with a mass parked at midspan."""
+    """Eqs (2.29) and (2.30) at the shaker, with a stationary mass at midspan."""
     waves, omega = sines(4)
     here, there = np.sin(0.5 * waves), np.sin(0.3 * waves)
     plain = np.diag(MODAL * (s**2 + 2 * DAMPING * omega * s + omega**2))
@@ -47,7 +47,7 @@ def mobility(s, mass):
 
 
 def force_per_volt(frequency, in_impedance, in_transmission):
-    """Eq. (2.34), with a parked mass (kg) in eq. (2.26) and another in (2.33)."""
+    """Eq. (2.34), with a stationary mass (kg) in eq. (2.26) and another in (2.33)."""
     s = 2j * np.pi * frequency
     own = s / (0.02 * s**2 + 0.55 * s + 9700)
     felt, beam = mobility(s, in_impedance), mobility(s, in_transmission)
@@ -77,10 +77,10 @@ def test_sampled_gain_of_the_other_shaker():
     A[3:6, 6], A[6, 6], B[6] = 3.25 * here / MODAL, -1000, 1000
     held = expm(5e-3 * np.vstack([np.hstack([A, B]), np.zeros((1, 8))]))
     A, B = held[:7, :7], held[:7, 7:]
-    cost = solve_discrete_are(A, B, np.diag(WEIGHTS), [[COMMAND_WEIGHT]])
+    cost = solve_discrete_are(A, B, np.diag(STATE_WEIGHTS), [[COMMAND_WEIGHT]])
     theirs = np.linalg.solve(COMMAND_WEIGHT + B.T @ cost @ B, B.T @ cost @ A)[0]
     ours = np.asarray(
-        optimal_gain(with_other_shaker(with_active_shaker(rigs.load("A"))), 5e-3, WEIGHTS)[0]
+        optimal_gain(with_other_shaker(with_active_shaker(rigs.load("A"))), 5e-3, STATE_WEIGHTS)[0]
     )[0]
     np.testing.assert_allclose(ours, theirs, rtol=1e-6)
     printed = published_regulators.SAMPLED_GAIN

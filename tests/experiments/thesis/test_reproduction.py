@@ -1,5 +1,6 @@
-"""The thesis reproduced: how verdicts come about, what reports hold, and the cheap experiments."""
+"""Verdicts on published numbers, reports of experiments, and the cheap experiments themselves."""
 
+import importlib
 import json
 import re
 from pathlib import Path
@@ -8,12 +9,13 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from experiments.thesis import published, report, reproduction
+from experiments.thesis import reproduction
 from experiments.thesis.verdicts import (
     EXPLAINED,
     IRREPRODUCIBLE,
     NOT_REPRODUCED,
     REPRODUCED,
+    VERDICTS,
     PublishedNumbers,
     Tolerance,
     assign_verdicts,
@@ -22,30 +24,42 @@ from experiments.thesis.verdicts import (
 from jaxbeam import rigs
 from jaxbeam.cli import main
 
+CHAPTERS = [
+    importlib.import_module(f"experiments.thesis.chapter{number}.published")
+    for number in (2, 5, 6, 7)
+]
+PUBLISHED = {
+    f"{chapter.__name__}.{name}": numbers
+    for chapter in CHAPTERS
+    for name, numbers in vars(chapter).items()
+    if isinstance(numbers, PublishedNumbers)
+}
 RELATIVE = Tolerance("for a test", relative=0.1)
 TWO = PublishedNumbers("here", "two numbers", "m", "computed", RELATIVE, "1.0 20", "a b")
 
 
-def words(*findings):
-    return [judged.verdicts for judged in assign_verdicts(findings)]
+def verdicts(*findings):
+    return [assigned.verdicts for assigned in assign_verdicts(findings)]
 
 
 def test_verdicts():
-    assert words(make_finding(TWO, [1.1, 22.1])) == [[REPRODUCED, NOT_REPRODUCED]]
-    assert words(make_finding(TWO, [1.1, 22.1], inconsistency="of that")) == [
+    assert verdicts(make_finding(TWO, [1.1, 22.1])) == [[REPRODUCED, NOT_REPRODUCED]]
+    assert verdicts(make_finding(TWO, [1.1, 22.1], inconsistency="of that")) == [
         [REPRODUCED, IRREPRODUCIBLE]
     ]
-    assert words(make_finding(TWO, [1.1, 0.0], {"else": [0.0, 20.0]})) == [[REPRODUCED, EXPLAINED]]
-    assert words(make_finding(TWO, [np.nan, np.inf])) == [[NOT_REPRODUCED, NOT_REPRODUCED]]
+    assert verdicts(make_finding(TWO, [1.1, 0.0], {"else": [0.0, 20.0]})) == [
+        [REPRODUCED, EXPLAINED]
+    ]
+    assert verdicts(make_finding(TWO, [np.nan, np.inf])) == [[NOT_REPRODUCED, NOT_REPRODUCED]]
     with pytest.raises(ValueError, match="2 numbers are printed"):
         make_finding(TWO, [1.0])
 
 
-def test_one_reading_serves_all():
-    """Two readings that each fit another number: the one that fits most is taken for all."""
+def test_one_interpretation_explains_all_numbers():
+    """Of two alternatives that each explain other numbers, the one that explains most is taken."""
     first = make_finding(TWO, [0, 0], {"p": [1.0, 20.0], "q": [0.0, 0.0]})
     second = make_finding(TWO, [0, 0], {"p": [0.0, 0.0], "q": [1.0, 0.0]})
-    assert words(first, second) == [[EXPLAINED, EXPLAINED], [NOT_REPRODUCED, NOT_REPRODUCED]]
+    assert verdicts(first, second) == [[EXPLAINED, EXPLAINED], [NOT_REPRODUCED, NOT_REPRODUCED]]
 
 
 @pytest.mark.parametrize(
@@ -62,18 +76,19 @@ def test_tolerances(tolerance, values, allowed):
 
 
 def test_published_numbers_are_complete():
-    found = [one for one in vars(published).values() if isinstance(one, PublishedNumbers)]
-    assert len(found) > 20
-    for one in found:
-        assert one.origin in ("measured", "computed"), one
-        assert len(one.value_labels) == one.numbers.size and np.all(one.allowed_error > 0), one
+    assert len(PUBLISHED) > 60
+    for name, one in PUBLISHED.items():
+        assert one.origin in ("measured", "computed"), name
+        assert len(one.value_labels) == one.numbers.size and np.all(one.allowed_error > 0), name
 
 
-def test_every_published_number_is_judged_in_an_experiment():
-    sources = Path(published.__file__).parents[1].rglob("*.py")
+@pytest.mark.parametrize("chapter", CHAPTERS, ids=lambda chapter: chapter.__package__[-8:])
+def test_every_published_number_has_a_finding_in_its_chapter(chapter):
+    sources = Path(chapter.__file__).parent.glob("*.py")
     used = set(re.findall(r"published\.([A-Z]\w+)", "".join(map(Path.read_text, sources))))
-    listed = {name for name, one in vars(published).items() if isinstance(one, PublishedNumbers)}
-    assert listed == used & listed
+    assert {
+        name for name, one in vars(chapter).items() if isinstance(one, PublishedNumbers)
+    } == used
 
 
 @pytest.mark.parametrize("name", rigs.NAMES)
@@ -86,28 +101,25 @@ def test_unknown_names_are_refused():
     with pytest.raises(ValueError, match="no published rig 'E'"):
         rigs.load("E")
     with pytest.raises(ValueError, match="no experiment 'x'; there are frequencies"):
-        reproduction.chosen(["x"])
+        reproduction.select_experiments(["x"])
 
 
-def tally(name, load=rigs.load):
-    run = reproduction.perform(reproduction.chosen([name])[0], load)
-    return {
-        word: report.count([run], word)
-        for word in (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED)
-    }
+def verdict_counts(name, load_rig=rigs.load):
+    run = reproduction.run_experiment(reproduction.select_experiments([name])[0], load_rig)
+    return {verdict: run.count(verdict) for verdict in VERDICTS}
 
 
 def test_a_wrong_model_gets_a_bad_verdict():
-    """With half the rigidity no frequency is right any more, nor is any speed."""
+    """With half the rigidity no frequency and no critical speed is reproduced."""
 
     def wrong(name):
         case = rigs.load(name)
         return jb.replace(case, {"beam.flexural_rigidity": float(case.beam.flexural_rigidity) / 2})
 
-    right, bad = tally("frequencies"), tally("frequencies", wrong)
+    right, bad = verdict_counts("frequencies"), verdict_counts("frequencies", wrong)
     assert right[REPRODUCED] + right[EXPLAINED] >= 30
-    # What does not depend on the rigidity stays: parameters, errors in percent, mass ratios, and
-    # the spurious frequency, which is that of a spring.
+    # Independent of the rigidity: frequency parameters, errors in percent, mass ratios, and the
+    # spurious frequency, which is that of a spring.
     assert bad[REPRODUCED] + bad[EXPLAINED] <= 8 + 3 + 2 + 1
     assert bad[NOT_REPRODUCED] >= right[NOT_REPRODUCED] + 15
 
@@ -138,13 +150,13 @@ def test_list(capsys):
 
 
 @pytest.mark.slow
-def test_experiments_side_by_side(tmp_path):
-    """Processes bring back, in order, what one alone finds; figures and report are written."""
+def test_experiments_in_two_processes(tmp_path):
+    """Results come in order and equal those of one process; figures and report are written."""
     names = ["patches", "frequencies"]
-    runs = reproduction.reproduce(names, tmp_path, processes=2, tell=lambda text: None)
+    runs = reproduction.reproduce(names, tmp_path, processes=2, report_progress=lambda text: None)
     assert [run.experiment.name for run in runs] == names
-    alone = reproduction.perform(reproduction.chosen(names[:1])[0])
-    assert [judged.words for judged in runs[0].judged] == [j.words for j in alone.judged]
+    alone = reproduction.run_experiment(reproduction.select_experiments(names[:1])[0])
+    assert runs[0].verdicts == alone.verdicts
     report = (tmp_path / "report.md").read_text(encoding="utf-8")
     for run in runs:
         for figure in run.outcome.figures:

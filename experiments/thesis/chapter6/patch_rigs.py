@@ -1,0 +1,41 @@
+"""Rigs B and C under displacement feedback through a low-pass filter, and runs of variants."""
+
+import dataclasses
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jaxbeam as jb
+from jaxbeam.simulation.integration_plan import integration_plan
+from jaxbeam.simulation.simulate import ContactLossWarning
+
+MASSES = (0.261, 0.322, 0.371, 0.509)  # kg
+GAIN, PERIOD = 2.0, 0.002  # V per mm or mm^3; s, not printed
+ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF = 10.0, 20.0  # Hz
+TOLERANCE = 1e-4  # relative, of peaks
+
+
+def with_feedback(
+    case: jb.Case, power: int, cutoff: float, gain: float = GAIN, delay: float | None = None
+) -> jb.Case:
+    """A patch rig under u = -gain w^power, w in mm, behind filters with a cutoff (Hz).
+
+    Power 0 is no control. `delay` is in s.
+    """
+    if not power:
+        return case
+    sensor_filter = jb.Filter(cutoff, order=10, realisation="analogue")
+    sensors = tuple(dataclasses.replace(one, filter=sensor_filter) for one in case.sensors)
+    gains = [gain * 1e3**power] * len(case.actuators)
+    law = jb.Feedback(gains=gains, power=power, period=PERIOD, delay=delay)
+    return dataclasses.replace(case, sensors=sensors, controller=law)
+
+
+def simulate_changes(case: jb.Case, changes: Sequence[Mapping[str, Any]]) -> list[jb.Record]:
+    """Records of a case with several changes of its numbers, by one integration plan."""
+    cases = [jb.replace(case, change) for change in changes]
+    plan = integration_plan(cases[-1], None, TOLERANCE)
+    with warnings.catch_warnings():
+        # Where gains are too high, loads would have to pull; the peaks show it.
+        warnings.simplefilter("ignore", ContactLossWarning)
+        return [jb.simulate(one, plan=plan) for one in cases]
