@@ -2,12 +2,13 @@
 
     python -m experiments.benchmarks.tuning_methods
 
-A table of commands (11 knots and the lead) on rig B is tuned for the worst peak of four loads. All
-start from the same trapezium and search within the same limits. Differential evolution (scipy's) is
-given as much time as Adam took (compiling apart on both sides), as many evaluations as the
-gradients took (one in reverse mode counted as four), and ten times as many. Worst peaks, relative
-to no control: 0.825 at the start, 0.7923 by 80 gradients of each method (2 s); 0.807 by evolution
-in the same 2 s, 0.815 by as many evaluations, 0.7924 by ten times as many (10 s).
+A table of commands (11 breakpoints and the lead) on rig B is tuned for the worst peak of four
+loads. All methods start from the same trapezium and search within the same limits. Differential
+evolution (scipy) is given the time that Adam takes (without compiling on both sides), the
+evaluations that the gradients are worth (one in reverse mode counted as four), and ten times as
+many. Worst peaks, relative to no control: 0.825 at the start, 0.7923 by 80 gradients of each method
+(2 s); 0.807 by evolution in the same 2 s, 0.815 by as many evaluations, 0.7924 by ten times as many
+(10 s).
 """
 
 import dataclasses
@@ -21,26 +22,21 @@ from scipy.optimize import differential_evolution
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.tune_feedforward import (
-    COMMAND_LIMITS,
-    ENTRY_TIME,
-    GATES,
-    INITIAL_TABLES,
-    LEAD,
-    PERIOD,
-)
+from experiments.studies.loads import ENTRY_TIME, PERIOD
+from experiments.studies.tune_feedforward import COMMAND_LIMITS, GATES, INITIAL_TABLES, LEAD
 from jaxbeam import rigs
 from jaxbeam.case.case import value_at
 from jaxbeam.runtime.compiling import compiled
 from tuning.control.optimisers import METHODS
 from tuning.control.run_set import make_run_set
 
-KNOTS, STEPS, GRADIENT_COST, EVALUATION_FACTOR, SEED = 11, 80, 4, 10, 0
+BREAKPOINTS, STEPS, SEED = 11, 80, 0
+GRADIENT_COST, EVALUATION_FACTOR = 4, 10  # evaluations of a gradient; factor of the longest search
 LOADS = tuning.full_grid({"loads.0.mass": [0.261, 0.509], "loads.0.speed": [0.5, 1.0]})
 
 
 class SearchResult(NamedTuple):
-    """The worst peak that a search came to, what it took, and how many evaluations that were."""
+    """Worst peak (relative to no control) at the end of a search, wall time (s), evaluations."""
 
     peak: float
     seconds: float
@@ -51,35 +47,34 @@ class SearchResult(NamedTuple):
 
 
 def tuning_problem() -> tuple[jb.Case, dict[str, tuple[float, float]]]:
-    """The case to tune, and what is free in it."""
-    shares = np.linspace(0.0, 1.0, KNOTS)
+    """The case to tune, and its free values with their bounds."""
+    shares = np.linspace(0.0, 1.0, BREAKPOINTS)
     values = [np.interp(shares, *table) for table in INITIAL_TABLES["B"]]
     law = jb.Passage(gates=GATES, shares=shares, values=values, period=PERIOD, lead=LEAD)
     case = jb.replace(rigs.load("B"), {"loads.0.entry_time": ENTRY_TIME})
     case = dataclasses.replace(case, controller=law, run=jb.Run(duration=1.4, sample_rate=200.0))
-    free = {f"controller.values.0.{k}": COMMAND_LIMITS for k in range(KNOTS)}
+    free = {f"controller.values.0.{k}": COMMAND_LIMITS for k in range(BREAKPOINTS)}
     return case, free | {"controller.lead": (0.0, 0.1)}
 
 
 def run_evolution(
     case: jb.Case, free: dict, evaluations: int, seconds: float = np.inf
 ) -> SearchResult:
-    """The worst peak (relative to no control) that differential evolution comes to.
+    """Search by differential evolution, of so many evaluations or seconds (without compiling).
 
-    It ends after so many evaluations, or after the generation in which the time is up; compiling
-    does not count.
+    It ends after the generation in which either is reached.
     """
     run_set = make_run_set(case, LOADS)
 
     @compiled
-    def worst(points, bench):
-        def one(point):
-            return jnp.max(bench.merits(dict(zip(free, point, strict=True)))["peak"])
+    def worst_peaks(points, run_set):
+        def worst_peak(point):
+            return jnp.max(run_set.merits(dict(zip(free, point, strict=True)))["peak"])
 
-        return jax.lax.map(one, points)
+        return jax.lax.map(worst_peak, points)
 
     def objective(points):
-        return np.nan_to_num(worst(jnp.asarray(points.T), run_set), nan=1e3)
+        return np.nan_to_num(worst_peaks(jnp.asarray(points.T), run_set), nan=1e3)
 
     population = 4 * len(free)
     objective(np.array(list(free.values())).mean(axis=1)[:, None] * np.ones(population))
@@ -101,7 +96,7 @@ def run_evolution(
 
 
 def run_gradients(case: jb.Case, free: dict, method: str) -> tuple[float, SearchResult]:
-    """Worst peaks at the start and where gradients lead; timed when all is compiled."""
+    """Worst peak at the start, and a search by gradients, timed after everything is compiled."""
     loads = tuning.LoadCases(LOADS)
     options = {"steps": STEPS, "method": method, "least_peaks": False, "progress": False}
     tuning.tune(case, free, loads, **options)
@@ -112,16 +107,18 @@ def run_gradients(case: jb.Case, free: dict, method: str) -> tuple[float, Search
 
 
 def main() -> None:
-    """Run all of them and print what they come to."""
+    """Run all searches and print their worst peaks."""
     case, free = tuning_problem()
     found = {method: run_gradients(case, free, method) for method in METHODS}
     print(f"worst peak, relative to no control: {found['adam'][0]:.4f} at the start")
-    for method, (_, one) in found.items():
-        print(f"{method}, {STEPS} gradients: {one}")
-    taken = found["adam"][1].seconds
-    print(f"differential evolution, as long as adam: {run_evolution(case, free, 10**6, taken)}")
-    for times in (1, EVALUATION_FACTOR):
-        print(f"differential evolution: {run_evolution(case, free, GRADIENT_COST * STEPS * times)}")
+    for method, (_, result) in found.items():
+        print(f"{method}, {STEPS} gradients: {result}")
+    seconds = found["adam"][1].seconds
+    result = run_evolution(case, free, 10**6, seconds)
+    print(f"differential evolution, as long as adam: {result}")
+    for factor in (1, EVALUATION_FACTOR):
+        result = run_evolution(case, free, GRADIENT_COST * STEPS * factor)
+        print(f"differential evolution: {result}")
 
 
 if __name__ == "__main__":

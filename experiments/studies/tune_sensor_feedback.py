@@ -1,16 +1,16 @@
-"""How the laws of `experiments.studies.sensor_feedback` are found, which know nothing but what their sensors read.
+"""Tune the tables of `experiments.studies.sensor_feedback` by gradients.
 
-    python -m experiments.studies.tune_sensor_feedback B      # or C; writes experiments/studies/controllers/sensor_feedback/B.toml
+    python -m experiments.studies.tune_sensor_feedback B    # or C
 
-On each patch rig one table of commands over the deflection under the load (kind "relief") serves
-all masses and speeds. All of the bench is in the loop that is differentiated: noise, a filter of
-tenth order, sampling, delay, rounding and limits. The knots follow the gradient of the worst
-shortfall behind the bound.
+writes controllers/sensor_feedback/B.toml. On each patch rig one table of commands over the
+deflection under the load (internal-model control) serves all masses and speeds. The closed loop of
+the bench is differentiated as a whole: noise, a filter of tenth order, sampling, delay, rounding
+and limits. The table follows the gradient of the worst shortfall from the least achievable peak.
 
-On two spans, where the filters let more of the beam's ringing through, every load also crosses
-beams that are 10 % stiffer and softer than the law believes, and poles along the crossings are
-kept to the left, 10 ms more delay included; the notches are free, too. A search that was stopped
-goes on.
+On two spans the filters pass more of the beam's vibration. There every load also crosses beams that
+are 10 % stiffer and softer than the design model, the largest real part of poles along the
+crossings is bounded, 10 ms more delay included, and the notches are free too. An interrupted search
+is resumed.
 """
 
 import dataclasses
@@ -21,58 +21,47 @@ import numpy as np
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.tune_feedforward import (
-    COMMAND_LIMITS,
-    COMMAND_RESOLUTION,
-    MASSES,
-    MODES,
-    PERIOD,
-)
+from experiments.studies.held_out import EXTRA_DELAY, RIGIDITY
+from experiments.studies.loads import MASSES, PERIOD, training_loads
+from experiments.studies.tune_feedforward import COMMAND_LIMITS, COMMAND_RESOLUTION, MODES
+from experiments.thesis.cases import with_modes
 from jaxbeam import rigs
 
 FOLDER = Path(__file__).parent / "controllers" / "sensor_feedback"
 DELAY = 0.02  # s
 NOISE_DEVIATION = 4e-6  # m: about the largest of section 5.1 of the thesis, (0.135e-10 m^2)^0.5
 CUTOFF, ORDER = {"B": 10.0, "C": 20.0}, 10  # Hz: the filters of sections 6.1 and 6.2
-# The filter of 20 Hz passes the lowest modes, between 15.5 and 18.5 Hz with a light load on the way
-# in and a beam that is 10 % off, and near 27 Hz: there the search for notches starts.
+# The filter of 20 Hz passes the lowest modes, between 15.5 and 18.5 Hz with a light load near the
+# entry and a beam that is 10 % off, and near 27 Hz: there the notches start.
 NOTCHES = {"B": None, "C": [16.2, 18.4, 27.0]}  # Hz
-READING_BREAKPOINTS = {  # m: flat where a load has gone far enough to lower the frequencies
+NOTCH_BOUNDS = (10.0, 35.0)  # Hz
+READING_BREAKPOINTS = {  # m: the table is flat where a heavy load has lowered the frequencies
     "B": 1e-3 * np.array([-1.2, -0.8, -0.55, -0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4]),
     "C": 1e-3 * np.array([-0.4, -0.3, -0.2, -0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.3]),
 }
 SPEEDS = np.linspace(0.3, 1.0, 8)  # m/s
-ENTRY = 0.05  # s
 INITIAL_TABLE = {"B": (0.45e-3, 7.2, 0.0), "C": (0.25e-3, 7.2, -1.8)}  # m, V below, V above
-RIGIDITY = "beam.flexural_rigidity"
-RIGIDITY_TOLERANCE = 0.1  # share by which the beam may be stiffer or softer than believed
+RIGIDITY_TOLERANCE = 0.1  # share by which the plant may be stiffer or softer than the design model
 RIGIDITY_FACTORS = (1.0, 1.0 - RIGIDITY_TOLERANCE, 1.0 + RIGIDITY_TOLERANCE)
-NOTCH_BOUNDS = (10.0, 35.0)  # Hz: where notches may go
-# For poles along crossings: the largest real part (1/s), delay on top (s), speed of the loads
-# (m/s), places along each, and how far beside the bend at rest (m) a table is looked at.
-MAX_REAL_PART, EXTRA_DELAY, CROSSING_SPEED, CROSSING_POSITIONS, READING_OFFSET = (
-    -0.3,
-    0.01,
-    0.6,
-    10,
-    1e-5,
-)
-STEPS, SAMPLE_RATE = 120, {"B": 200.0, "C": 100.0}  # Hz
+# Poles along crossings: largest real part (1/s), speed of the loads (m/s), number of positions, and
+# distance (m) from the table's breakpoint at rest, on either side of which the slope differs.
+MAX_REAL_PART, CROSSING_SPEED, CROSSING_POSITIONS, READING_OFFSET = -0.3, 0.6, 10, 1e-5
+STEPS, SAMPLE_RATE = 120, {"B": 200.0, "C": 100.0}  # -, Hz
 
 
 def with_noise_and_filters(rig: str, case: jb.Case, seed: int = 0) -> jb.Case:
-    """The rig as on the bench: noise and filters at all sensors."""
+    """The case with the noise and the filters of the bench at all sensors."""
     sensor_filter = jb.Filter(CUTOFF[rig], order=ORDER)
-    filtered_sensors = [
-        dataclasses.replace(s, filter=sensor_filter, noise=np.asarray(NOISE_DEVIATION))
-        for s in case.sensors
+    sensors = [
+        dataclasses.replace(sensor, filter=sensor_filter, noise=np.asarray(NOISE_DEVIATION))
+        for sensor in case.sensors
     ]
     run = dataclasses.replace(case.run, seed=seed)
-    return dataclasses.replace(case, sensors=tuple(filtered_sensors), run=run)
+    return dataclasses.replace(case, sensors=tuple(sensors), run=run)
 
 
 def initial_law(rig: str) -> jb.Relief:
-    """The law that the search starts from on rig B or C: steep, then flat."""
+    """The law that tuning starts from on rig B or C: a table that is steep, then flat."""
     saturation_reading, below, above = INITIAL_TABLE[rig]
     readings = READING_BREAKPOINTS[rig]
     row = np.interp(readings, [-saturation_reading, 0.0, saturation_reading], [below, 0.0, above])
@@ -87,80 +76,78 @@ def initial_law(rig: str) -> jb.Relief:
     )
 
 
-def training_loads(rig: str = "B") -> tuple[dict[str, float], ...]:
-    """The lightest and the heaviest load at all speeds, entering at ticks and between them.
-
-    On rig C also on beams that are stiffer or softer.
-    """
+def plant_changes(rig: str) -> list[dict[str, float]]:
+    """Changes of the plant in training: other rigidities on rig C, none on rig B."""
+    if rig == "B":
+        return [{}]
     rigidity = float(rigs.load(rig).beam.flexural_rigidity)
-    plants = [{RIGIDITY: factor * rigidity} for factor in RIGIDITY_FACTORS] if rig == "C" else [{}]
-    return tuple(
-        {
-            "loads.0.mass": mass,
-            "loads.0.speed": float(speed),
-            "loads.0.entry_time": ENTRY + PERIOD * ((2 * i + j) % 4) / 4,
-        }
-        | plant
-        for i, speed in enumerate(SPEEDS)
-        for j, mass in enumerate(MASSES)
-        for plant in plants
-    )
+    return [{RIGIDITY: factor * rigidity} for factor in RIGIDITY_FACTORS]
+
+
+def shifted_tables(readings: np.ndarray) -> list[dict[str, float]]:
+    """Changes that shift a table by READING_OFFSET to either side, so that rest is on one slope."""
+    return [
+        {f"controller.readings.{k}": x + offset for k, x in enumerate(readings)}
+        for offset in (-READING_OFFSET, READING_OFFSET)
+    ]
 
 
 def stability_constraint(law: jb.Relief) -> tuning.StabilityConstraint:
-    """Where poles may lie along crossings, for a table that bends where no load is: on both sides.
+    """Bound on the real parts of poles along crossings, with either slope of the table at rest.
 
-    The loads are slow: fast ones of half the beam's mass move poles to the right by themselves.
+    The loads are slow: fast ones of half the beam's mass move poles to the right without control.
     """
-    breakpoints = np.asarray(law.readings)
-    shifted_tables = [
-        {f"controller.readings.{k}": x + side for k, x in enumerate(breakpoints)}
-        for side in (-READING_OFFSET, READING_OFFSET)
-    ]
-    loads = tuning.full_grid(
-        {"loads.0.mass": (*MASSES, sum(MASSES) / 2), "loads.0.speed": [CROSSING_SPEED]}
-    )
+    masses = (*MASSES, sum(MASSES) / 2)
+    loads = tuning.full_grid({"loads.0.mass": masses, "loads.0.speed": [CROSSING_SPEED]})
+    tables = shifted_tables(np.asarray(law.readings))
     return tuning.StabilityConstraint(
         max_real_part=MAX_REAL_PART,
         extra_delay=EXTRA_DELAY,
         parameter_tolerance={RIGIDITY: RIGIDITY_TOLERANCE},
         instants=CROSSING_POSITIONS,
-        crossings=tuple(load | side for load in loads for side in shifted_tables),
+        crossings=tuple(load | table for load in loads for table in tables),
     )
+
+
+def free_parameters(rig: str, actuators: int) -> dict[str, tuple[float, float]]:
+    """Free values of the table and notches, with their bounds.
+
+    Without a load the command is zero. On one span commands for upward deflections are zero too:
+    there the beam is deflected upwards only when it vibrates.
+    """
+    breakpoints = [
+        k for k, x in enumerate(READING_BREAKPOINTS[rig]) if x < 0 or (x > 0 and actuators > 1)
+    ]
+    values = {
+        f"controller.values.{a}.{k}": COMMAND_LIMITS for a in range(actuators) for k in breakpoints
+    }
+    notches = {f"controller.notches.{k}": NOTCH_BOUNDS for k in range(len(NOTCHES[rig] or ()))}
+    return values | notches
 
 
 def tune_law(
-    rig: str, file: Path | None = None, steps: int = STEPS, progress: bool = True
+    rig: str, checkpoint: Path | None = None, steps: int = STEPS, progress: bool = True
 ) -> tuning.TuningResult:
-    """Tune the table for the worst of all loads on rig B or C; a file keeps the search."""
-    case = with_noise_and_filters(rig, rigs.load(rig))
+    """Tune the table for the worst of all training loads on rig B or C.
+
+    With a `checkpoint` file an interrupted search is resumed.
+    """
+    case = with_modes(with_noise_and_filters(rig, rigs.load(rig)), MODES)
     slowest = float(case.beam.length) / min(SPEEDS)
-    law, with_stability = initial_law(rig), rig == "C"
+    law = initial_law(rig)
     case = dataclasses.replace(
         case,
-        beam=dataclasses.replace(case.beam, modes=MODES),
         controller=law,
         run=jb.Run(duration=slowest + 0.15, sample_rate=SAMPLE_RATE[rig]),
     )
-    actuators = len(case.actuators)
-    # Without a load there is no command; upwards the beam of one span goes only when it rings.
-    active_breakpoints = [
-        k for k, x in enumerate(READING_BREAKPOINTS[rig]) if x < 0 or (x > 0 and actuators > 1)
-    ]
-    free = {
-        f"controller.values.{a}.{k}": COMMAND_LIMITS
-        for a in range(actuators)
-        for k in active_breakpoints
-    }
-    notches = {f"controller.notches.{k}": NOTCH_BOUNDS for k in range(len(NOTCHES[rig] or ()))}
     return tuning.tune(
         case,
-        free | notches,
-        tuning.LoadCases(training_loads(rig)),
+        free_parameters(rig, len(case.actuators)),
+        tuning.LoadCases(training_loads(SPEEDS, plant_changes(rig))),
         tuning.Objective({"shortfall": 1.0}),
-        stable=stability_constraint(law) if with_stability else None,
+        stable=stability_constraint(law) if rig == "C" else None,
         steps=steps,
-        checkpoint=file,
+        checkpoint=checkpoint,
         resume=True,
         progress=progress,
     )
@@ -169,8 +156,8 @@ def tune_law(
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
     for name in sys.argv[1:]:
-        kept = FOLDER / f"{name}.search.npz"
-        found = tune_law(name, kept)
-        print(found)
-        jb.save_case(found.case, FOLDER / f"{name}.toml", overwrite=True)
-        kept.unlink()
+        file = FOLDER / f"{name}.search.npz"
+        result = tune_law(name, file)
+        print(result)
+        jb.save_case(result.case, FOLDER / f"{name}.toml", overwrite=True)
+        file.unlink()

@@ -25,20 +25,22 @@ def plot_commands(
     axes,
     records: Mapping[str, jb.Record],
     actuators: Sequence[int] = (0,),
-    gains: Sequence[float] = (1.0,),
+    gains: Sequence[float] | None = None,
     held: bool = False,
     colours: Sequence[str] | None = None,
 ) -> None:
     """Draw commands (V) to some actuators over time (s), in the colour of each record.
 
-    Records without a controller are left out. Each command is multiplied by a gain; the second is
-    dashed. `held` draws steps, for commands that are held between samples.
+    Records without a controller are left out; the second command is dashed. `gains` has a factor
+    for each command. `held` draws steps, for commands that are held between samples.
     """
     drawstyle = "steps-post" if held else "default"
     for i, record in enumerate(records.values()):
         if record.case.controller is None:
             continue
         line_colour = colour(i) if colours is None else colours[i]
-        commands = np.asarray(record.command)[:, list(actuators)] * np.asarray(gains)
+        commands = np.asarray(record.command)[:, list(actuators)]
+        if gains is not None:
+            commands = commands * np.asarray(gains)
         for command, dashes in zip(commands.T, ("-", "--"), strict=False):
             axes.plot(record.times, command, dashes, color=line_colour, drawstyle=drawstyle)

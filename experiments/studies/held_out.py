@@ -1,0 +1,106 @@
+"""Performance of control laws on held-out loads, beside the least achievable peak."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import jaxbeam as jb
+from experiments.studies.loads import HELD_OUT_ENTRY_TIME
+from experiments.thesis.chapter6.patch_rigs import ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF
+from experiments.thesis.figures import plot_commands, plot_deflections
+from jaxbeam.plot.style import GREY, INK, colour, set_title, use_style
+from tuning.control.load_cases import AddressValues
+
+CUBIC_FEEDBACK = "hand-set, cubic"  # the law of chapter 6 that others are compared with
+CUBIC_CUTOFFS = {"B": ONE_SPAN_CUTOFF, "C": TWO_SPAN_CUTOFF}  # Hz
+EXTRA_DELAY, EXTRA_DELAY_LAW = 0.01, "10 ms later"  # s, unknown to the law
+RIGIDITY = "beam.flexural_rigidity"
+RIGIDITY_ERRORS = {"10 % stiffer": 1.1, "10 % softer": 0.9}  # of the plant over the design
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class HeldOutStudy:
+    """Reductions of the peak for the held-out loads of a rig, achievable and by law.
+
+    Reductions are shares of the peak without control, (run,). `records` has the record of the last
+    run of each law.
+    """
+
+    title: str
+    loads: tuple[AddressValues, ...]
+    achievable: np.ndarray
+    reductions: dict[str, np.ndarray]
+    records: dict[str, jb.Record]
+
+    def shares(self, law: str) -> np.ndarray:
+        """Reductions of a law over the achievable ones, (run,)."""
+        return self.reductions[law] / self.achievable
+
+    def remarks(self, laws: Sequence[str]) -> list[str]:
+        """Lines of text: reductions of some laws by load, and least and mean share of all laws."""
+        lines = [f"{self.title}, held-out loads: peaks below no control"]
+        for i, load in enumerate(self.loads):
+            reductions = ", ".join(f"{law} {self.reductions[law][i]:.1%}" for law in laws)
+            at_most = f"at most {self.achievable[i]:.1%}"
+            lines.append(f"{load_label(load, ' at')}: {reductions}; {at_most}")
+        for law in self.reductions:
+            shares = self.shares(law)
+            lines.append(
+                f"{law}: at least {shares.min():.1%} of the achievable, {shares.mean():.1%} in the"
+                " mean"
+            )
+        return lines
+
+
+def load_label(load: AddressValues, separator: str = ",") -> str:
+    """Mass and speed of a load."""
+    return f"{load['loads.0.mass']:g} kg{separator} {load['loads.0.speed']:g} m/s"
+
+
+def peaks(records: Sequence[jb.Record]) -> np.ndarray:
+    """The largest deflection (m) at any sensor, (run,)."""
+    return np.array([float(np.max(record.peak_deflection)) for record in records])
+
+
+@use_style
+def draw(studies: Sequence[HeldOutStudy], laws: Sequence[str], title: str) -> Figure:
+    """Shares of the achievable reduction by load, and one run; a column for each rig."""
+    figure = Figure(figsize=(5.2 * len(studies), 8.0))
+    grid = figure.subplots(3, len(studies), squeeze=False, height_ratios=[1.2, 1, 1])
+    for (top, middle, below), study in zip(grid.T, studies, strict=True):
+        _draw_shares(top, study, laws)
+        _draw_last_run(middle, below, study, laws)
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    set_title(figure, title)
+    return figure
+
+
+def _draw_shares(axes, study: HeldOutStudy, laws: Sequence[str]) -> None:
+    rows = np.arange(len(study.loads))
+    for i, law in enumerate(laws):
+        axes.plot(100 * study.shares(law), rows, "o", color=colour(i), label=law)
+    axes.axvline(100, color=INK, linewidth=1.0)
+    axes.set_yticks(rows, [load_label(load) for load in study.loads])
+    axes.invert_yaxis()
+    axes.set(xlabel="share of the achievable reduction (%)", xlim=(0, 105), title=study.title)
+
+
+def _draw_last_run(upper, lower, study: HeldOutStudy, laws: Sequence[str]) -> None:
+    """Deflection at the first sensor, and all commands, for the last of the loads."""
+    records = {law: study.records[law] for law in laws}
+    uncontrolled_case = dataclasses.replace(records[laws[-1]].case, controller=None)
+    uncontrolled = jb.simulate(uncontrolled_case, tolerance=1e-4)
+    plot_deflections(upper, {"no control": uncontrolled}, colours=[GREY])
+    plot_deflections(upper, records)
+    plot_commands(lower, records, range(len(uncontrolled_case.actuators)), held=True)
+    load = study.loads[-1]
+    crossing = float(uncontrolled_case.beam.length) / load["loads.0.speed"]
+    end = HELD_OUT_ENTRY_TIME + crossing + 0.1
+    upper.set(
+        title=f"{load_label(load, ' at')}; no control grey",
+        ylabel="deflection at first sensor (mm)",
+        xlim=(0, end),
+    )
+    lower.set(xlabel="time (s)", ylabel="command (V), second dashed", xlim=(0, end))
