@@ -26,7 +26,7 @@ def plan_of(
 ) -> IntegrationPlan:
     """A plan with a given number of steps a sample, which spares the search for it."""
     shape = static_shapes(case)
-    shape = dataclasses.replace(shape, slots=slots or shape.max_loads)
+    shape = dataclasses.replace(shape, max_loads=slots or shape.max_loads)
     return IntegrationPlan(shape, substeps, lead_samples=0, equally_spaced=even, error=0.0)
 
 

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.integrator.integrate import march
-from jaxbeam.integrator.step_matrices import both_sides
+from jaxbeam.integrator.integrate import integrate_peaks
+from jaxbeam.integrator.step_matrices import signed_both_ways
 from jaxbeam.model.statics import static_peak
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
@@ -34,14 +34,16 @@ def envelope(case: Case, x, tolerance: float = TOLERANCE) -> Envelope:
     x = jnp.asarray(x, float)
     plan = integration_plan(case, tolerance=tolerance)
     check_on_beam("x", x, case.beam.length)
-    return _envelope(case, dataclasses.replace(plan, error=0.0), sample_times(case), x)
+    return _compiled_envelope(case, dataclasses.replace(plan, error=0.0), sample_times(case), x)
 
 
 @compiled
-def _envelope(case, plan, times, x):
-    rigging, loads, driver, *_ = integration_setup(case, plan, times, x)
-    best, _ = march(both_sides(rigging), loads, slots=plan.shapes.slots, driver=driver)
-    highest, lowest = jnp.split(best.peak()[0][:, 0], 2)
+def _compiled_envelope(case, plan, times, x):
+    discrete, loads, policy, *_ = integration_setup(case, plan, times, x)
+    running_peaks, _ = integrate_peaks(
+        signed_both_ways(discrete), loads, max_loads=plan.shapes.max_loads, policy=policy
+    )
+    highest, lowest = jnp.split(running_peaks.refined_peak()[0][:, 0], 2)
     return Envelope(-lowest, highest)
 
 

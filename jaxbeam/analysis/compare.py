@@ -19,7 +19,7 @@ from jaxbeam.analysis.crossing_margin import StabilityMargin, stability_margin
 from jaxbeam.analysis.limit_cycles import CommandOscillation, command_oscillations
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.loads import motion
+from jaxbeam.case.loads import trajectory
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
@@ -155,7 +155,9 @@ def performance_metrics(
 ) -> PerformanceMetrics:
     """The merits of a run, held against the run without control and the bound of its case."""
     deflection, times = np.asarray(record.deflection), np.asarray(record.times)
-    exit_times = [motion(load, record.case.beam.length).window()[1] for load in record.case.loads]
+    exit_times = [
+        trajectory(load, record.case.beam.length).window()[1] for load in record.case.loads
+    ]
     after_exit = np.abs(deflection[times > max(float(end) for end in exit_times)])
     return PerformanceMetrics(
         peak=float(np.max(record.peak_deflection)),

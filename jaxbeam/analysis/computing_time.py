@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import AbstractController, Measurement
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.record import Record
@@ -55,7 +55,7 @@ def computing_times(record: Record) -> ComputingTimes:
     modal_states = jnp.concatenate([record.coordinates, record.rates], axis=1)
     plant = state_space(record.case)
     states = (
-        jnp.zeros((modal_states.shape[0], plant.rig.states))
+        jnp.zeros((modal_states.shape[0], plant.modal_model.state_count))
         .at[:, : modal_states.shape[1]]
         .set(modal_states)
     )
@@ -108,7 +108,7 @@ def _sample_indices(times: np.ndarray, period) -> np.ndarray:
     """The samples that are nearest to the ticks of a controller, or all; at most so many."""
     if period is None:
         return np.arange(min(times.size, MAX_STEPS))
-    ticks = np.arange(0.0, times[-1] * (1 + 1e-9), float(known(period)))[:MAX_STEPS]
+    ticks = np.arange(0.0, times[-1] * (1 + 1e-9), float(concrete(period)))[:MAX_STEPS]
     return np.clip(np.searchsorted(times, ticks - 1e-9), 0, times.size - 1)
 
 

@@ -11,10 +11,10 @@ from jaxbeam.analysis.frozen_loop import LoopDynamics, loop_dynamics
 from jaxbeam.analysis.linearised_loop import LinearisedLoop, linearise, loop_timing
 from jaxbeam.analysis.margins import margins
 from jaxbeam.case.case import Case, known_case
-from jaxbeam.case.fields import known
-from jaxbeam.case.loads import motion
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads import trajectory
 from jaxbeam.control import MPC
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 
 LOAD_POSITIONS = 13  # of the loads along a crossing, at which margins are looked for
 MIN_RATE = 1e-6  # 1/s: what moves at a smaller rate neither grows nor dies out
@@ -62,7 +62,7 @@ def stability_margin(case: Case) -> StabilityMargin:
         timing = loop_timing(case)
     except ValueError as error:
         return _no_margin(str(error))
-    loop = loop_dynamics(case, lay_out(known_case(case)))
+    loop = loop_dynamics(case, mesh_layout(known_case(case)))
     loops, unstable = [], []
     for t in _crossing_times(case):
         stationary = _without_constant_states(
@@ -97,9 +97,9 @@ def _with_stationary_loads(loop: LoopDynamics, t: float) -> LoopDynamics:
     loop, zero = loop.freeze_loads(jnp.asarray(t)), jnp.zeros(())
     stationary = tuple(
         dataclasses.replace(load, speed=zero, acceleration=zero)
-        for load in loop.augmented_plant.traffic.motions
+        for load in loop.augmented_plant.loads.trajectories
     )
-    return eqx.tree_at(lambda loop: loop.wide.traffic.motions, loop, stationary)
+    return eqx.tree_at(lambda loop: loop.wide.loads.trajectories, loop, stationary)
 
 
 def _without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:
@@ -118,6 +118,6 @@ def _crossing_times(case: Case) -> np.ndarray:
     """Instants (s) from the first entry to the last exit, or the end of the run."""
     if not case.loads:
         return np.zeros(1)
-    windows = [motion(load, case.beam.length).window() for load in case.loads]
-    entries, exits = known(jnp.array(windows)).T
-    return np.linspace(entries.min(), min(exits.max(), known(case.run.duration)), LOAD_POSITIONS)
+    windows = [trajectory(load, case.beam.length).window() for load in case.loads]
+    entries, exits = concrete(jnp.array(windows)).T
+    return np.linspace(entries.min(), min(exits.max(), concrete(case.run.duration)), LOAD_POSITIONS)

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 
 from jaxbeam.analysis.crossing_margin import stability_margin
 from jaxbeam.case.case import Case, replace
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.control import Feedback, Recognition, ScheduledFeedback
-from jaxbeam.model.statics import influence_line, static_lift
+from jaxbeam.model.statics import influence_line, static_deflection_per_command
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
@@ -59,7 +59,7 @@ def equivalent_gains(
     static_deflections = float(case.run.gravity) * -np.asarray(
         influence_line(case, sensor_positions, load_positions)
     ).min(axis=0)
-    static_lifts = np.diagonal(np.asarray(static_lift(case, sensor_positions)))
+    static_lifts = np.diagonal(np.asarray(static_deflection_per_command(case, sensor_positions)))
 
     def equivalent_gain(free, lift):
         def residual(w):
@@ -151,7 +151,7 @@ def _peak(case: Case, plan) -> float:
     """The largest deflection (m) at the sensors; infinite where the loop diverges."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)  # a gain to be left aside may cause it
-        peak = float(np.max(known(simulate(case, plan=plan).peak_deflection)))
+        peak = float(np.max(concrete(simulate(case, plan=plan).peak_deflection)))
     return peak if np.isfinite(peak) else np.inf
 
 

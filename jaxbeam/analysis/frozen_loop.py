@@ -17,11 +17,11 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.trajectory import NEVER, AbstractTrajectory
-from jaxbeam.model.modal_model import rig_in_one
+from jaxbeam.model.modal_model import compiled_modal_model
 from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensor_filters import sensed
-from jaxbeam.model.sensor_signals import design, init, read
-from jaxbeam.model.state_space import LoadedBeam, loaded_beam
+from jaxbeam.model.sensor_filters import with_sensor_filters
+from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state, sensor_sections
+from jaxbeam.model.state_space import Plant, build_plant
 from jaxbeam.runtime.compiling import compiled
 
 PERIOD_TOLERANCE = 1e-9  # of a period: shorter differences are none
@@ -63,19 +63,20 @@ class LoopDynamics(eqx.Module):
     `initial_memory` is the law's at the start, of which only the leaves that `changes` marks ever change.
     """
 
-    plant: LoadedBeam
-    augmented_plant: LoadedBeam
+    plant: Plant
+    augmented_plant: Plant
     output_rows: Float[Array, "sensor state"]
     initial_memory: Any
 
     def freeze_loads(self, t) -> "LoopDynamics":
         """The same with the loads stopped in mid-motion."""
-        loads, length = self.augmented_plant.traffic, self.plant.case.beam.length
+        loads, length = self.augmented_plant.loads, self.plant.case.beam.length
         on = loads.on_beam(t)
         motions = tuple(
-            FrozenTrajectory(*path.travel(t), on[i], length) for i, path in enumerate(loads.motions)
+            FrozenTrajectory(*path.travel(t), on[i], length)
+            for i, path in enumerate(loads.trajectories)
         )
-        return eqx.tree_at(lambda loop: loop.wide.traffic.motions, self, motions)
+        return eqx.tree_at(lambda loop: loop.wide.loads.trajectories, self, motions)
 
     def continuous_dynamics(self, t):
         """A, B, the rates that the weights cause, and commands as a function of the state.
@@ -117,7 +118,8 @@ class LoopDynamics(eqx.Module):
         """State of the sampled loop at rest as one vector, and the function that unpacks it."""
         case = self.plant.case
         filters = [
-            init(sensor, design(sensor, timing.period), jnp.zeros(())) for sensor in case.sensors
+            initial_filter_state(sensor, sensor_sections(sensor, timing.period), jnp.zeros(()))
+            for sensor in case.sensors
         ]
         signal_history = [
             jnp.zeros(_split_delay(lag / timing.period)[2]) for lag in timing.sensor_delays
@@ -125,7 +127,7 @@ class LoopDynamics(eqx.Module):
         command_queue = jnp.zeros(
             (_split_delay(timing.delay / timing.period)[0] + 1, len(case.actuators))
         )
-        state = jnp.zeros(self.augmented_plant.rig.states)
+        state = jnp.zeros(self.augmented_plant.modal_model.state_count)
         return ravel_pytree(
             (
                 state,
@@ -153,8 +155,8 @@ class LoopDynamics(eqx.Module):
                 delayed_samples.setdefault((1 - remainder) * timing.period, []).append(i)
             else:
                 signal_history[i] = jnp.concatenate([signals[i : i + 1], signal_history[i]])
-            sections = design(sensor, timing.period)
-            reading, after = read(
+            sections = sensor_sections(sensor, timing.period)
+            reading, after = filtered_reading(
                 _ideal_sensor(sensor), sections, filters[i], signal_history[i][whole]
             )
             readings.append(reading)
@@ -213,7 +215,7 @@ class LoopDynamics(eqx.Module):
 
     def _sensor_inputs(self, state, command, t):
         """What the sensors see of the plant with their analogue filters."""
-        signals = self.output_rows @ self.augmented_plant.to_rig(state)
+        signals = self.output_rows @ self.augmented_plant.to_modal(state)
         measures_acceleration = np.array(
             [s.quantity == "acceleration" for s in self.plant.case.sensors], bool
         )
@@ -230,13 +232,13 @@ class LoopDynamics(eqx.Module):
         return self.plant.case.controller.step(memory, measurement, t)
 
     def _measurement(self, readings, state, command):
-        model_state = self.augmented_plant.to_rig(state)[: self.plant.rig.states]
-        return Measurement(readings, self.plant.from_rig(model_state), command)
+        model_state = self.augmented_plant.to_modal(state)[: self.plant.modal_model.state_count]
+        return Measurement(readings, self.plant.from_modal(model_state), command)
 
     def _changing_leaves(self) -> list[bool]:
         """Which leaves of the law's memory its steps change; the others are its design."""
         case, leaves = self.plant.case, jax.tree.leaves(self.initial_memory)
-        state = jnp.zeros(self.augmented_plant.rig.states)
+        state = jnp.zeros(self.augmented_plant.modal_model.state_count)
         readings, command = jnp.zeros(len(case.sensors)), jnp.zeros(len(case.actuators))
 
         def after(leaves):
@@ -264,14 +266,14 @@ class LoopDynamics(eqx.Module):
 
 def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
     """The opened loop of a case with a controller. May be traced and batched."""
-    return _loop_dynamics(case, rig_in_one(case, layout))
+    return _loop_dynamics(case, compiled_modal_model(case, layout))
 
 
 @compiled
 def _loop_dynamics(case, model):
-    plant = loaded_beam(case, model)
-    augmented_model, output_rows = sensed(plant)
-    augmented_plant = eqx.tree_at(lambda m: m.rig, plant, augmented_model)
+    plant = build_plant(case, model)
+    augmented_model, output_rows = with_sensor_filters(plant)
+    augmented_plant = eqx.tree_at(lambda m: m.modal_model, plant, augmented_model)
     return LoopDynamics(plant, augmented_plant, output_rows, case.controller.init(plant))
 
 

@@ -16,9 +16,9 @@ from jaxtyping import Array, Float
 
 from jaxbeam.analysis.frozen_loop import PERIOD_TOLERANCE, LoopDynamics, LoopTiming, loop_dynamics
 from jaxbeam.case.case import Case, known_case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.compiling import compiled
 
 NEWTON_ITERATIONS = 8  # steps of Newton's method towards the state about which a law is made linear
@@ -68,7 +68,7 @@ class LinearisedLoop(eqx.Module):
 
         Those of a sampled loop are log(z) / period, with frequencies up to half the sampling's.
         """
-        poles = np.linalg.eigvals(known(self.closed_matrix)).astype(complex)
+        poles = np.linalg.eigvals(concrete(self.closed_matrix)).astype(complex)
         if self.period is not None:
             # What a delay lets vanish at once would be at minus infinity.
             tiny = np.finfo(float).tiny
@@ -84,7 +84,9 @@ def linearised_loop(case: Case, t: float) -> LinearisedLoop:
     controller, and one whose sensors are not read at the controller's own ticks.
     """
     timing = loop_timing(case)
-    return linearise(loop_dynamics(case, lay_out(known_case(case))), timing, jnp.asarray(float(t)))
+    return linearise(
+        loop_dynamics(case, mesh_layout(known_case(case))), timing, jnp.asarray(float(t))
+    )
 
 
 def loop_timing(case: Case) -> LoopTiming | None:
@@ -98,26 +100,28 @@ def loop_timing(case: Case) -> LoopTiming | None:
         raise ValueError("there is no loop: the case has no controller")
     if controller.period is None:
         return None
-    period = float(known(controller.period))
+    period = float(concrete(controller.period))
     for i, sensor in enumerate(case.sensors):
         sampling_period = sensor.sampling_period
         if (
             sampling_period is not None
-            and abs(float(known(sampling_period)) - period) > PERIOD_TOLERANCE * period
+            and abs(float(concrete(sampling_period)) - period) > PERIOD_TOLERANCE * period
         ):
             raise ValueError(
                 f"sensors.{i}.sampling_period must be the controller's, {period:g} s, for the loop"
-                f" to repeat itself from tick to tick; it is {float(known(sampling_period)):g} s"
+                f" to repeat itself from tick to tick; it is {float(concrete(sampling_period)):g} s"
             )
-    sensor_delays = tuple(0.0 if s.delay is None else float(known(s.delay)) for s in case.sensors)
-    delay = 0.0 if controller.delay is None else float(known(controller.delay))
+    sensor_delays = tuple(
+        0.0 if s.delay is None else float(concrete(s.delay)) for s in case.sensors
+    )
+    delay = 0.0 if controller.delay is None else float(concrete(controller.delay))
     return LoopTiming(period, delay, sensor_delays)
 
 
 @compiled
 def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoop:
     """A loop with its loads frozen at t (s), linear about the rest under their weights."""
-    loop, modal_states = loop.freeze_loads(t), 2 * loop.plant.scale.shape[0]
+    loop, modal_states = loop.freeze_loads(t), 2 * loop.plant.coordinate_scale.shape[0]
     if timing is None:
         A, input_matrix, weight_rates, command = loop.continuous_dynamics(t)
         equilibrium = _equilibrium(

@@ -13,7 +13,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from jaxbeam.analysis.linearised_loop import LinearisedLoop
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.model.state_space import StateSpace
 from jaxbeam.numerics.discretisation import balance
 
@@ -47,7 +47,7 @@ def margins(loop: LinearisedLoop, actuator: int = 0) -> Margins:
     """
     if np.any(loop.poles().real >= 0):
         raise ValueError("the loop is unstable as it is; margins belong to a stable one")
-    A, B, K = (np.asarray(known(part)) for part in (loop.A, loop.B, loop.K))
+    A, B, K = (np.asarray(concrete(part)) for part in (loop.A, loop.B, loop.K))
     others = np.arange(B.shape[1]) != actuator
     A = A + B[:, others] @ K[others]
     column, row = B[:, actuator], K[actuator]

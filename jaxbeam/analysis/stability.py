@@ -21,10 +21,10 @@ from jaxtyping import Complex, Float
 from jaxbeam.analysis.frozen_loop import LoopDynamics, LoopTiming, loop_dynamics, propagate
 from jaxbeam.analysis.linearised_loop import linearise, loop_timing
 from jaxbeam.case.case import Case, known_case
-from jaxbeam.case.fields import known
-from jaxbeam.case.loads import motion
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.compiling import compiled
 
 MAX_PHASE_PER_STEP = 0.15  # rad by which the fastest mode may turn in a step along a transition
@@ -88,7 +88,7 @@ def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) ->
     if times is None:
         times = np.linspace(*_crossing_interval(case), 101)[:-1] if case.loads else np.zeros(1)
     times = np.asarray(times, float)
-    loop = loop_dynamics(case, lay_out(known_case(case)))
+    loop = loop_dynamics(case, mesh_layout(known_case(case)))
     loops = _frozen_loops(loop, timing, jnp.asarray(times))
     poles = [jax.tree.map(lambda part, i=i: part[i], loops).poles() for i in range(times.size)]
     return FrozenPoles(times, _tracked_branches(np.stack(poles)))
@@ -107,7 +107,7 @@ def growth(case: Case, points: int = 100) -> Growth:
     """
     timing = loop_timing(case)
     start, end = _crossing_interval(case)
-    loop = loop_dynamics(case, lay_out(known_case(case)))
+    loop = loop_dynamics(case, mesh_layout(known_case(case)))
     if timing is None:
         times = np.linspace(start, end, points + 1)
     else:
@@ -135,7 +135,7 @@ def stream(case: Case, spacing: float) -> Stream:
     if len(case.loads) != 1:
         raise ValueError(f"a stream repeats the one load of a case; this has {len(case.loads)}")
     start, end = _crossing_interval(case)
-    if motion(case.loads[0], case.beam.length).window()[1] >= NEVER:
+    if trajectory(case.loads[0], case.beam.length).window()[1] >= NEVER:
         raise ValueError("the load of a stream must leave the beam; loads.0 stays on it")
     if not spacing > 0:
         raise ValueError(f"spacing must be positive, in s; it is {spacing:g}")
@@ -156,7 +156,7 @@ def stream(case: Case, spacing: float) -> Stream:
             eqx.tree_at(lambda x: x.times, load, load.times - i * spacing) for i in range(count)
         ]
     repeated = dataclasses.replace(case, loads=tuple(loads))
-    loop = loop_dynamics(repeated, lay_out(known_case(case)))
+    loop = loop_dynamics(repeated, mesh_layout(known_case(case)))
     intervals = 1 if timing is None else round(spacing / timing.period)
     times = start + np.linspace(0.0, spacing, max(intervals, 20 if timing is None else 1) + 1)
     steps = _substeps(loop, timing, times)
@@ -168,9 +168,9 @@ def _crossing_interval(case: Case) -> tuple[float, float]:
     """From the first entry to the last exit, in s; loads that stay end with the run."""
     if not case.loads:
         raise ValueError("there is no crossing: the case has no loads")
-    windows = [motion(load, case.beam.length).window() for load in case.loads]
-    entries, exits = known(jnp.array(windows)).T
-    last = min(float(exits.max()), float(known(case.run.duration)))
+    windows = [trajectory(load, case.beam.length).window() for load in case.loads]
+    entries, exits = concrete(jnp.array(windows)).T
+    last = min(float(exits.max()), float(concrete(case.run.duration)))
     if exits.max() < NEVER:
         last = float(exits.max())
     return float(entries.min()), last
@@ -178,7 +178,7 @@ def _crossing_interval(case: Case) -> tuple[float, float]:
 
 def _substeps(loop, timing, times) -> int:
     """Substeps between any two of the times in which the fastest mode turns a little only."""
-    fastest = float(jnp.max(loop.model.rig.modes.angular_frequencies))
+    fastest = float(jnp.max(loop.plant.modal_model.modes.angular_frequencies))
     longest = float(np.max(np.diff(times))) if timing is None else timing.period
     return max(1, math.ceil(fastest * longest / MAX_PHASE_PER_STEP))
 
@@ -186,9 +186,11 @@ def _substeps(loop, timing, times) -> int:
 @compiled
 def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, substeps: int):
     """Transition matrices from the first time to each, and the energy's matrix of q and q'."""
-    model, modes = loop.plant, loop.plant.scale.shape[0]
-    stiffness = model.rig.stiffness() / jnp.outer(model.scale, model.scale)
-    mass = jnp.diag(1 / model.scale**2)
+    model, modes = loop.plant, loop.plant.coordinate_scale.shape[0]
+    stiffness = model.modal_model.stiffness() / jnp.outer(
+        model.coordinate_scale, model.coordinate_scale
+    )
+    mass = jnp.diag(1 / model.coordinate_scale**2)
     zeros = jnp.zeros((modes, modes))
     energy = jnp.block([[stiffness, zeros], [zeros, mass]])
     if timing is None:
@@ -208,7 +210,7 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
         rest_state, rebuild = loop.rest_state(timing)
         # About rest: without the weights.
         unweighted = eqx.tree_at(
-            lambda loop: loop.wide.traffic.weight, loop, 0 * loop.augmented_plant.traffic.weight
+            lambda loop: loop.wide.loads.weight, loop, 0 * loop.augmented_plant.loads.weight
         )
 
         def advance_sample(whole, t):

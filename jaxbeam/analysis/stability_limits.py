@@ -8,7 +8,7 @@ import scipy
 
 from jaxbeam.analysis.stability import frozen_poles, stream
 from jaxbeam.case.case import Case, replace
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 
 # What is above zero for an unstable case.
 StabilityMeasure = Callable[[Case], float]
@@ -85,9 +85,9 @@ def load_stability_limits(
 
     def limit_of(name):
         value = getattr(case.loads[0], name)
-        if value is None or known(value) == 0:
+        if value is None or concrete(value) == 0:
             return None
-        value, address = float(known(value)), f"loads.0.{name}"
+        value, address = float(concrete(value)), f"loads.0.{name}"
         low, high = (value / factor, value) if unstable else (value, value * factor)
         if unstable and measure(replace(case, {address: low})) > 0:
             return 0.0

@@ -10,9 +10,9 @@ from jaxbeam.case.fields import (
     ON_BEAM,
     POSITIVE,
     choice,
+    concrete,
     count,
-    is_known,
-    known,
+    is_concrete,
     number,
 )
 
@@ -130,7 +130,7 @@ class Beam(eqx.Module):
                 f"{address}.damping_ratio lists {ratios[0]} values for {self.modes} modes;"
                 " give one for each mode, or a single number for all"
             )
-        doubly = self.rayleigh_damping is not None and is_known(self.damping_ratio)
-        if doubly and known(self.damping_ratio).any():
+        doubly = self.rayleigh_damping is not None and is_concrete(self.damping_ratio)
+        if doubly and concrete(self.damping_ratio).any():
             return f"{address} has both damping_ratio and rayleigh_damping; leave one out"
         return None

@@ -1,6 +1,7 @@
 """The case: everything that decides a run, as one immutable tree whose numbers have addresses."""
 
 import difflib
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,8 +13,8 @@ from jaxtyping import Array, Float
 from jaxbeam.case.actuators import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, count, known, number
-from jaxbeam.case.loads import AbstractLoad
+from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, number
+from jaxbeam.case.loads import AbstractLoad, trajectory
 from jaxbeam.case.sensors import Sensor
 
 
@@ -167,4 +168,20 @@ def known_case(case: Case) -> Case:
 
     Raises `jax.errors.ConcretizationTypeError` inside `jit` or `vmap`.
     """
-    return jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), case)
+    return jax.tree.map(lambda leaf: jnp.asarray(concrete(leaf)), case)
+
+
+def stack_cases(cases: Sequence[Case]) -> Case:
+    """One case with the numbers of several along a first axis; all must be alike in structure."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
+
+
+def crossing_times(case: Case) -> Float[np.ndarray, "load 2"]:
+    """Times (s) at which each load enters and leaves the beam; `NEVER` for one that stays on it.
+
+    The numbers of the case must be concrete.
+    """
+    windows = [trajectory(load, case.beam.length).window() for load in case.loads]
+    return np.array([[float(concrete(time)) for time in window] for window in windows]).reshape(
+        -1, 2
+    )

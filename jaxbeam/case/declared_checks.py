@@ -19,9 +19,9 @@ from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     ON_BEAM,
     POSITIVE,
+    concrete,
     fits,
-    is_known,
-    known,
+    is_concrete,
     shape_in_words,
 )
 
@@ -36,9 +36,9 @@ def check_on_beam(name: str, place: Any, length: Float[Array, ""]) -> None:
 
     Raises ValueError with the name of the positions.
     """
-    if not (is_known(place) and is_known(length)):
+    if not (is_concrete(place) and is_concrete(length)):
         return
-    end, numbers = float(known(length)), known(place)
+    end, numbers = float(concrete(length)), concrete(place)
     off = ~((numbers >= -ROUNDING * end) & (numbers <= (1 + ROUNDING) * end))
     if off.any():
         raise ValueError(
@@ -147,9 +147,9 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
         shape = np.shape(value)
         given = f"an array of shape {shape}" if shape else "one number"
         raise ValueError(f"{address} must be {shape_in_words(field)}, not {given}")
-    if not is_known(value):
+    if not is_concrete(value):
         return
-    numbers = np.atleast_1d(known(value))
+    numbers = np.atleast_1d(concrete(value))
     names = [f"{address}.{i}" for i in range(numbers.size)] if np.ndim(value) else [address]
     must, unit = field.metadata["must"], _unit(field)
     for name, x in zip(names, numbers.flat, strict=True):

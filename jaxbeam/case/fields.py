@@ -90,18 +90,18 @@ def shape_in_words(field) -> str:
     return f"a list of {axes[0]} numbers" if axes[0].isdigit() else "a list of numbers"
 
 
-def is_known(value) -> bool:
+def is_concrete(value) -> bool:
     """Tell whether `value` has numbers one can look at now (it is not an abstract tracer)."""
     if not isinstance(value, jax.core.Tracer):
         return True
     try:
-        np.asarray(known(value))
+        np.asarray(concrete(value))
     except jax.errors.ConcretizationTypeError:
         return False
     return True
 
 
-def known(value) -> np.ndarray:
+def concrete(value) -> np.ndarray:
     """Return the numbers behind `value`, also while it is being differentiated.
 
     Raises `jax.errors.ConcretizationTypeError` inside `jit` or `vmap`, where there are none yet.

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
-from jaxbeam.case.fields import POSITIVE, choice, count, is_known, known, number
+from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
 
 
 class Filter(eqx.Module):
@@ -48,12 +48,12 @@ def sections(filter: Filter, period: Float[Array, ""] | float) -> Float[Array, "
     section has gain one at rest. Raises ValueError if the cutoff is not below half the sampling
     frequency (where both are known).
     """
-    if is_known(filter.cutoff) and is_known(period):
-        nyquist = 0.5 / float(known(period))
-        if float(known(filter.cutoff)) >= nyquist:
+    if is_concrete(filter.cutoff) and is_concrete(period):
+        nyquist = 0.5 / float(concrete(period))
+        if float(concrete(filter.cutoff)) >= nyquist:
             raise ValueError(
                 f"the filter's cutoff must be below half the sampling frequency, {nyquist:g} Hz;"
-                f" it is {float(known(filter.cutoff)):g} Hz: lower it, or sample faster"
+                f" it is {float(concrete(filter.cutoff)):g} Hz: lower it, or sample faster"
             )
     ratios, odd = _prototype(filter.order)
     warped = jnp.tan(jnp.pi * filter.cutoff * period)

@@ -1,7 +1,7 @@
 """Loads that travel along the beam: what they weigh, and how they move.
 
 A load is a mass or a force; how it travels (constant deceleration or a table of positions) is a
-separate matter, see `motion`. Both kinds answer the same three questions: what inertia presses
+separate matter, see `trajectory`. Both kinds answer the same three questions: what inertia presses
 with the load, what it weighs, and how it moves.
 """
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.declared_checks import either
-from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.case.trajectory import AbstractPiecewiseTrajectory, Braking, Tabulated
 
 
@@ -42,7 +42,7 @@ class AbstractLoad(eqx.Module):
         if unclear is not None:
             return unclear
         if self.times is None or self.positions is None:
-            if is_known(self.speed) and known(self.speed) == 0:
+            if is_concrete(self.speed) and concrete(self.speed) == 0:
                 return (
                     f"{address}.speed must not be 0: the load would never enter; a load that"
                     " stands on the beam is a table of times and positions"
@@ -58,7 +58,7 @@ class AbstractLoad(eqx.Module):
             return f"{address}.times needs at least two points; it has {points}"
         for name in ("entry_time", "deceleration"):
             value = getattr(self, name)
-            if is_known(value) and known(value) != 0:
+            if is_concrete(value) and concrete(value) != 0:
                 return (
                     f"{address}.{name} would have no effect: the load follows its table; leave it"
                     " out"
@@ -118,7 +118,7 @@ class MovingForce(AbstractLoad):
 KINDS = {"mass": MovingMass, "force": MovingForce}
 
 
-def motion(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewiseTrajectory:
+def trajectory(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewiseTrajectory:
     """How the load travels along a beam of the given length (m)."""
     if load.times is not None:
         return Tabulated(load.times, load.positions, length)

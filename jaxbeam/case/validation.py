@@ -17,12 +17,12 @@ from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.declared_checks import ROUNDING, check_fields, check_on_beam, in_words
-from jaxbeam.case.fields import ON_BEAM, is_known, known
+from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.loads import AbstractLoad
 from jaxbeam.case.sensors import Sensor
 
 # Parts that say themselves what belongs together within them.
-OUTSPOKEN = Beam | AbstractActuator | Sensor | AbstractLoad
+SELF_VALIDATING = Beam | AbstractActuator | Sensor | AbstractLoad
 
 
 def check(case: Case) -> None:
@@ -42,7 +42,7 @@ def check(case: Case) -> None:
         _check_places(address, part, case.beam.length)
     for address, part, _ in _parts(case):
         # A method of a module takes longer to get than most of these take to run.
-        fault = type(part).validate(part, address) if isinstance(part, OUTSPOKEN) else None
+        fault = type(part).validate(part, address) if isinstance(part, SELF_VALIDATING) else None
         if fault is not None:
             raise ValueError(fault)
     _check_supports(case.supports, case.beam.length)
@@ -84,12 +84,12 @@ def _places(kind: type) -> list[str]:
 
 def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> None:
     rigid = [
-        (float(known(support.position)), i)
+        (float(concrete(support.position)), i)
         for i, support in enumerate(supports)
-        if support.stiffness is None and is_known(support.position)
+        if support.stiffness is None and is_concrete(support.position)
     ]
     for (left, i), (right, j) in itertools.pairwise(sorted(rigid)):
-        if is_known(length) and right - left <= ROUNDING * known(length):
+        if is_concrete(length) and right - left <= ROUNDING * concrete(length):
             raise ValueError(
                 f"supports.{min(i, j)} and supports.{max(i, j)} both hold the beam rigidly at"
                 f" {left:g} m; remove one"
@@ -100,24 +100,28 @@ def _check_clock(address: str, sensor: Sensor, case: Case) -> None:
     """The sensor samples within the run, and fast enough for its digital filter."""
     period, run = sensor.sampling_period, case.run
     if period is not None:
-        if is_known(period) and is_known(run.duration) and known(period) > known(run.duration):
+        if (
+            is_concrete(period)
+            and is_concrete(run.duration)
+            and concrete(period) > concrete(run.duration)
+        ):
             raise ValueError(
                 f"{address}.sampling_period must not exceed the run's duration,"
-                f" {known(run.duration):g} s; it is {known(period):g} s"
+                f" {concrete(run.duration):g} s; it is {concrete(period):g} s"
             )
     elif case.controller is not None and case.controller.period is not None:
         period = case.controller.period
     elif case.controller is None or case.controller.open_loop:
-        period = 1 / known(run.sample_rate) if is_known(run.sample_rate) else None
+        period = 1 / concrete(run.sample_rate) if is_concrete(run.sample_rate) else None
     filter = sensor.filter
     if filter is None or filter.realisation != "digital" or period is None:
         return
-    if is_known(filter.cutoff) and is_known(period):
-        highest = 0.5 / known(period)
-        if known(filter.cutoff) >= highest:
+    if is_concrete(filter.cutoff) and is_concrete(period):
+        highest = 0.5 / concrete(period)
+        if concrete(filter.cutoff) >= highest:
             raise ValueError(
                 f"{address}.filter.cutoff must be below half the sampling frequency,"
-                f" {highest:g} Hz; it is {known(filter.cutoff):g} Hz: lower it, or sample faster"
+                f" {highest:g} Hz; it is {concrete(filter.cutoff):g} Hz: lower it, or sample faster"
             )
 
 
@@ -137,10 +141,10 @@ def _check_controller(case: Case) -> None:
             )
     period, duration = controller.period, case.run.duration
     if period is not None:
-        if is_known(period) and is_known(duration) and known(period) > known(duration):
+        if is_concrete(period) and is_concrete(duration) and concrete(period) > concrete(duration):
             raise ValueError(
-                f"controller.period must not exceed the run's duration, {known(duration):g} s;"
-                f" it is {known(period):g} s"
+                f"controller.period must not exceed the run's duration, {concrete(duration):g} s;"
+                f" it is {concrete(period):g} s"
             )
         return
     # What acts at every instant can neither wait nor remember.

@@ -1,29 +1,117 @@
-"""The application, and the options that several of its commands have in common."""
+"""Application: the commands, the old words of renamed ones, and the process that runs them."""
 
+import atexit
+import gc
 import sys
-from pathlib import Path
-from typing import Annotated
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import NoReturn
 
-from cyclopts import App, Parameter
+from cyclopts import App, CycloptsError, Group, Parameter
+
+from jaxbeam.cli.compare import compare
+from jaxbeam.cli.export import export
+from jaxbeam.cli.frequency import frf, modes
+from jaxbeam.cli.identify import identify
+from jaxbeam.cli.models import compare_models, design_experiment
+from jaxbeam.cli.native import native
+from jaxbeam.cli.options import print_message
+from jaxbeam.cli.simulate import simulate
+from jaxbeam.cli.stability import stability
+from jaxbeam.cli.sweep import sweep
+from jaxbeam.cli.thesis import demo, reproduce
+from jaxbeam.cli.tune import tune
+from jaxbeam.cli.weigh import identify_responses, weigh
+
+COMMANDS = {
+    "Simulation": (modes, frf, simulate, sweep),
+    "Control": (compare, stability, tune, export),
+    "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
+    "Other": (demo, reproduce, native),
+}
+
+# Old words work for one release, with a warning that names the new one.
+RENAMED_COMMANDS = {"judge": "compare-models", "sharpen": "design-experiment"}
+RENAMED_OPTIONS = {  # by command, in its new word
+    "compare-models": {"--unseen": "--held-out"},
+    "design-experiment": {"--over": "--vary"},
+    "stability": {"--spacing": "--headway"},
+    "tune": {
+        "--over": "--aggregate",
+        "--front": "--pareto",
+        "--rank": "--lexicographic",
+        "--choose": "--integers",
+        "--keep": "--states",
+        "--plant": "--fit",
+        "--sampled": "--posterior",
+        "--stable": "--max-real-part",
+        "--reserve": "--extra-delay",
+        "--spread": "--parameter-tolerance",
+        "--bounds": "--least-peaks",
+        "--no-bounds": "--no-least-peaks",
+    },
+    "weigh": {"--most": "--max-loads"},
+}
 
 app = App(
     name="jaxbeam",
-    help="Beams under moving loads: simulate, sweep, and identify from measured logs.",
+    help="Beams under moving loads: simulation, control and identification from logs.",
     help_format="plaintext",
     result_action="return_value",
     default_parameter=Parameter(negative=(), show_default=False),
 )
-
-Settings = Annotated[
-    tuple[str, ...],
-    Parameter("--set", help="ADDRESS=VALUE: change an entry of the case."),
-]
-Json = Annotated[bool, Parameter("--json", help="Print JSON on standard output, for programs.")]
-Overwrite = Annotated[bool, Parameter("--overwrite", help="Replace output files that exist.")]
-
-Output = Annotated[Path | None, Parameter(("-o", "--output"))]
+for _title, _commands in COMMANDS.items():
+    _group = Group.create_ordered(_title)
+    for _command in _commands:
+        app.command(_command, group=_group)
 
 
-def print_message(message: str) -> None:
-    """Tell the user something that is no result, on standard error."""
-    print(f"jaxbeam: {message}", file=sys.stderr)
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run a command line (that of the process by default) and exit: status 0, or 1 for an error.
+
+    An error of the user is printed as one sentence on standard error, and so is each warning.
+    """
+    printed_warnings = set()
+
+    def print_warning(message, *_, **__):
+        if str(message) not in printed_warnings:
+            printed_warnings.add(str(message))
+            print_message(f"warning: {message}")
+
+    warnings.showwarning = print_warning
+    if arguments is None:
+        arguments = sys.argv[1:]
+        _relax_garbage_collection()
+    try:
+        app(list(current_words(arguments)), exit_on_error=False, print_error=False)
+    except MemoryError as error:
+        print_message(f"not enough memory: {error}")
+        sys.exit(1)
+    except (ValueError, OSError, RuntimeError, ImportError, CycloptsError) as error:
+        print_message(" ".join(str(error).split()))
+        sys.exit(1)
+    sys.exit(0)
+
+
+def current_words(arguments: Sequence[str]) -> Iterator[str]:
+    """Words of a command line, renamed commands and options in their new words; warns of each."""
+    command = None
+    for word in arguments:
+        name, equals, value = word.partition("=")
+        if command is None:
+            new = RENAMED_COMMANDS.get(name, name)
+            command = new
+        else:
+            new = RENAMED_OPTIONS.get(command, {}).get(name, name)
+        if new != name:
+            print_message(f"warning: {name} is called {new} now; the old word will be removed")
+        yield new + equals + value
+
+
+def _relax_garbage_collection() -> None:
+    """Raise the thresholds of garbage collection, and skip it when the process ends.
+
+    Tracing makes millions of objects that live on; this saves about a second a command.
+    """
+    gc.set_threshold(50_000, 20, 100)
+    atexit.register(gc.freeze)

@@ -1,43 +1,13 @@
-"""What the arguments of the command line mean, checked before any work is done."""
+"""Meaning of arguments, checked before any work; imports nothing heavy at the top."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from jaxbeam.case.case import Case
-from jaxbeam.case.controller import AbstractController
-from jaxbeam.files.case_file import load_case, load_controller, with_settings
-from jaxbeam.sweeps.batches import MAX_RUNS
-
-
-def read_case(path: Path, settings: Iterable[str]) -> Case:
-    """The case in a file, with the entries changed that the command line sets."""
-    changes = dict(assignment("--set", text) for text in settings)
-    return with_settings(load_case(path), {a: value_of(text) for a, text in changes.items()})
-
-
-def read_controllers(
-    path: Path, case: Case, files: Iterable[Path]
-) -> dict[str, AbstractController]:
-    """The controllers in some files, called after them, and first that of the case, if any.
-
-    Raises ValueError if two files are of one name, or if there are no controllers at all.
-    """
-    found = {} if case.controller is None else {path.stem: case.controller}
-    for file in files:
-        if file.stem in found:
-            raise ValueError(f"two controllers are called {file.stem}; rename a file")
-        found[file.stem] = load_controller(file)
-    if not found:
-        raise ValueError(f"{path} has no controller; name some with --controllers FILE ...")
-    return found
-
 
 def assignment(option: str, text: str) -> tuple[str, str]:
-    """The two sides of ADDRESS=VALUE. Raises ValueError if one is empty."""
+    """Address and value of ADDRESS=VALUE. Raises ValueError if one is empty."""
     address, equals, value = text.partition("=")
     if not (address and equals and value):
         raise ValueError(f"{option} takes ADDRESS=VALUE, such as loads.0.speed=0.5, not {text!r}")
@@ -45,7 +15,7 @@ def assignment(option: str, text: str) -> tuple[str, str]:
 
 
 def value_of(text: str) -> Any:
-    """A number, a list of numbers (with or without brackets), or else a word."""
+    """Value of a text: a number, a list of numbers (with or without brackets), or else a word."""
     for read in (int, float):
         try:
             return read(text)
@@ -57,32 +27,65 @@ def value_of(text: str) -> Any:
         return text
 
 
-def sweep_values(over: Iterable[str]) -> dict[str, list[float]]:
-    """The values by address of ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...
+def named_number(option: str, text: str, example: str) -> tuple[str, float]:
+    """Name and number of NAME=NUMBER. Raises ValueError, with the example, otherwise."""
+    name, numbers = named_numbers(option, text, "NAME=NUMBER", example)
+    if len(numbers) != 1:
+        raise ValueError(f"{option} takes NAME=NUMBER, such as {example}, not {text!r}")
+    return name, numbers[0]
 
-    Raises ValueError if they are no numbers, or if an address is named twice.
+
+def named_numbers(
+    option: str, text: str, form: str, example: str, number: Callable[[str], Any] = float
+) -> tuple[str, list[Any]]:
+    """Name and numbers of NAME=NUMBER,NUMBER,...
+
+    Raises ValueError, with the form and the example, if the name is empty or a number is none.
+    """
+    name, _, value = text.partition("=")
+    try:
+        if not name:
+            raise ValueError
+        return name, [number(entry) for entry in value.split(",")]
+    except ValueError:
+        raise ValueError(f"{option} takes {form}, such as {example}, not {text!r}") from None
+
+
+def sweep_values(over: Iterable[str]) -> dict[str, list[float]]:
+    """Values by address of ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...
+
+    Raises ValueError if they are no numbers, if a range has too many, or if an address is named
+    twice.
     """
     values = {}
     for text in over:
         address, value = assignment("--over", text)
         if address in values:
             raise ValueError(f"--over names {address} twice; give all its values at once")
-        if ":" not in value:
+        if ":" in value:
+            values[address] = _range_values(text, value)
+        else:
             values[address] = _numbers("--over", text, value.split(","))
-            continue
-        limits = _numbers("--over", text, value.split(":"))
-        if len(limits) == 3 and limits[2] > MAX_RUNS:
-            raise ValueError(f"--over {text}: a range may have {MAX_RUNS:.0e} values, no more")
-        if len(limits) != 3 or limits[2] < 1 or limits[2] % 1:
-            raise ValueError(
-                f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"
-            )
-        values[address] = np.linspace(limits[0], limits[1], int(limits[2])).tolist()
     return values
 
 
-def pair_of(text: str) -> tuple[str, str]:
-    """The two words of INPUT:OUTPUT. Raises ValueError if one is empty."""
+def _range_values(text: str, value: str) -> list[float]:
+    limits = _numbers("--over", text, value.split(":"))
+    if len(limits) != 3 or not (limits[2] >= 1 and limits[2] % 1 == 0):
+        raise ValueError(
+            f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"
+        )
+    import numpy as np
+
+    from jaxbeam.sweeps import MAX_RUNS
+
+    if limits[2] > MAX_RUNS:
+        raise ValueError(f"--over {text}: a range may have {MAX_RUNS:.0e} values, no more")
+    return np.linspace(limits[0], limits[1], int(limits[2])).tolist()
+
+
+def input_output_pair(text: str) -> tuple[str, str]:
+    """Input and output of INPUT:OUTPUT. Raises ValueError if one is empty."""
     source, colon, output = text.partition(":")
     if not (source and colon and output):
         raise ValueError(
@@ -92,8 +95,8 @@ def pair_of(text: str) -> tuple[str, str]:
     return source, output
 
 
-def parked_mass(text: str) -> tuple[float, float]:
-    """The position and mass of POSITION=MASS. Raises ValueError if they are no two numbers."""
+def stationary_mass(text: str) -> tuple[float, float]:
+    """Position (m) and mass (kg) of POSITION=MASS. Raises ValueError if they are no two numbers."""
     numbers = _numbers("--mass-at", text, text.split("="))
     if len(numbers) != 2:
         raise ValueError(f"--mass-at takes POSITION=MASS in m and kg, such as 0.3=0.5, not {text}")
@@ -101,7 +104,7 @@ def parked_mass(text: str) -> tuple[float, float]:
 
 
 def frequency_range(start: float, stop: float, points: int) -> list[float]:
-    """Frequencies from start to stop (Hz) at equal ratios.
+    """Frequencies (Hz) from start to stop, logarithmically spaced.
 
     Raises ValueError unless 0 < start < stop, and for fewer than two points.
     """
@@ -111,13 +114,15 @@ def frequency_range(start: float, stop: float, points: int) -> list[float]:
         )
     if points < 2:
         raise ValueError(f"--points must be 2 or more; it is {points}")
+    import numpy as np
+
     return np.geomspace(start, stop, points).tolist()
 
 
 def split_files(files: Iterable[Path], free: Sequence[str]) -> tuple[Path | None, list[Path]]:
-    """The case among the files (.toml), if there is one, and the logs.
+    """Case file (.toml), if there is one, and logs among the files.
 
-    Raises ValueError without a log, with several cases, or with no case whose numbers are free.
+    Raises ValueError without a log, for several cases, and for free parameters without a case.
     """
     cases = [path for path in files if path.suffix == ".toml"]
     logs = [path for path in files if path.suffix != ".toml"]
@@ -130,16 +135,8 @@ def split_files(files: Iterable[Path], free: Sequence[str]) -> tuple[Path | None
     return (cases[0] if cases else None), logs
 
 
-def _numbers(option: str, text: str, entries: Sequence[str]) -> list[float]:
-    try:
-        return [float(entry) for entry in entries]
-    except ValueError as error:
-        word = str(error).rsplit(": ", 1)[-1]
-        raise ValueError(f"{option} {text}: {word} is not a number") from None
-
-
 def bounds_of(text: str, option: str = "--free") -> tuple[str, tuple[float, float] | None]:
-    """The address and the bounds of ADDRESS or ADDRESS=LOW:HIGH.
+    """Address and bounds of ADDRESS or ADDRESS=LOW:HIGH; None without bounds.
 
     Raises ValueError if the bounds are no two increasing numbers.
     """
@@ -152,42 +149,37 @@ def bounds_of(text: str, option: str = "--free") -> tuple[str, tuple[float, floa
     return address, (bounds[0], bounds[1])
 
 
-def range_of(option: str, text: str, words: str) -> tuple[float, float]:
-    """The two numbers of LOW:HIGH, a range in the words given. Raises ValueError otherwise."""
+def range_of(option: str, text: str, unit_and_example: str) -> tuple[float, float]:
+    """Two numbers of LOW:HIGH. Raises ValueError, with unit and example, otherwise."""
     try:
         low, high = map(float, text.split(":"))
     except ValueError:
-        raise ValueError(f"{option} takes LOW:HIGH in {words}, not {text!r}") from None
+        raise ValueError(f"{option} takes LOW:HIGH in {unit_and_example}, not {text!r}") from None
     return low, high
 
 
+def _numbers(option: str, text: str, entries: Sequence[str]) -> list[float]:
+    try:
+        return [float(entry) for entry in entries]
+    except ValueError as error:
+        word = str(error).rsplit(": ", 1)[-1]
+        raise ValueError(f"{option} {text}: {word} is not a number") from None
+
+
 def picture_path(output: Path | None, source: Path) -> Path:
-    """Where a picture goes: beside the output, or named after the source in this folder."""
+    """File of a picture: beside the output, or named after the source in this folder."""
     return (output or Path(source.name)).with_suffix(".png")
 
 
 def check_suffix(path: Path | None, suffix: str, content: str) -> None:
-    """Raises ValueError if a file is not named as what will be in it."""
+    """Raise ValueError if a file has not the suffix of its content."""
     if path and path.suffix != suffix:
         raise ValueError(
             f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}"
         )
 
 
-def refuse(given: bool, why: str) -> None:
-    """Raises ValueError, saying why, if an option was given that cannot be followed."""
+def refuse(given: bool, reason: str) -> None:
+    """Raise ValueError with the reason if an option is given that does not apply."""
     if given:
-        raise ValueError(why)
-
-
-def check_outputs(overwrite: bool, *paths: Path | None) -> None:
-    """Refuse, before any work, what could not be written after it.
-
-    Raises FileNotFoundError without a folder to write to, FileExistsError for a file that exists
-    and may not be overwritten.
-    """
-    for path in filter(None, paths):
-        if not path.parent.is_dir():
-            raise FileNotFoundError(f"there is no folder {path.parent} to write {path.name} to")
-        if path.exists() and not overwrite:
-            raise FileExistsError(f"{path} exists; choose another name or add --overwrite")
+        raise ValueError(reason)

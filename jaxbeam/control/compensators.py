@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from numpy.polynomial import polynomial
 
 from jaxbeam.case.controller import AbstractController, OwnFilter
-from jaxbeam.case.fields import POSITIVE, dimensions, is_known, known, number
+from jaxbeam.case.fields import POSITIVE, concrete, dimensions, is_concrete, number
 from jaxbeam.case.filters import filter_step
 from jaxbeam.control.feedback import pairing_error
 
@@ -62,7 +62,9 @@ class AbstractCompensator(AbstractController):
         if self.period is not None:
             return None
         for i, sensor in enumerate(case.sensors[:loops]):
-            if sensor.range is not None or (is_known(sensor.offset) and known(sensor.offset) != 0):
+            if sensor.range is not None or (
+                is_concrete(sensor.offset) and concrete(sensor.offset) != 0
+            ):
                 return f"period must be given, as sensors.{i} has an offset or a range"
         return None
 
@@ -155,8 +157,8 @@ class PositivePositionFeedback(AbstractCompensator):
 
     def validate(self, case):
         frequency, period = self.frequency, self.period
-        if period is not None and is_known(frequency) and is_known(period):
-            highest, nyquist = float(known(frequency).max()), 0.5 / float(known(period))
+        if period is not None and is_concrete(frequency) and is_concrete(period):
+            highest, nyquist = float(concrete(frequency).max()), 0.5 / float(concrete(period))
             if highest >= nyquist:
                 return (
                     f"frequency must be below half the sampling frequency, {nyquist:g} Hz;"

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, count, number
-from jaxbeam.model.modal_model import assemble
-from jaxbeam.model.state_space import LoadedBeam, loaded_beam
+from jaxbeam.model.modal_model import assemble_modal_model
+from jaxbeam.model.state_space import Plant, build_plant
 
 ACTUATOR_FIELDS = ("force_per_volt", "stiffness", "damping", "correction")
 LOAD_FIELDS = ("mass", "speed", "entry_time")
@@ -59,15 +59,15 @@ class DesignModel(eqx.Module):
                     return f"{name} has no effect: no part of the case has a {name}"
         return None
 
-    def design_plant(self, plant: LoadedBeam, coordinates: str) -> LoadedBeam:
+    def design_plant(self, plant: Plant, coordinates: str) -> Plant:
         """The state space of the case as believed, on the same modes of the beam or the first."""
-        case, modes = plant.case, plant.rig.modes
+        case, modes = plant.case, plant.modal_model.modes
         if self.modes is not None:
             case = eqx.tree_at(lambda c: c.beam, case, _with_modes(case.beam, self.modes))
-            modes = modes.first(self.modes)
+            modes = modes.lowest(self.modes)
         parts = self._with_design_values(case.actuators, ACTUATOR_FIELDS), self.design_loads(case)
         case = eqx.tree_at(lambda c: (c.actuators, c.loads), case, parts)
-        return loaded_beam(case, assemble(case, modes), coordinates)
+        return build_plant(case, assemble_modal_model(case, modes), coordinates)
 
     def design_loads(self, case: Any) -> tuple:
         """The loads of a case as believed."""

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, is_known, known, number
-from jaxbeam.case.loads import motion
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
+from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.model.state_space import LoadedBeam
+from jaxbeam.model.state_space import Plant
 
 
 class Passage(AbstractController):
@@ -54,15 +54,15 @@ class Passage(AbstractController):
                 f"values must have for each of {len(case.actuators)} actuators as many entries as"
                 f" shares has, {self.shares.shape[0]}; they are of shape {self.values.shape}"
             )
-        if not all(is_known(leaf) for leaf in jax.tree.leaves((self.gates, case))):
+        if not all(is_concrete(leaf) for leaf in jax.tree.leaves((self.gates, case))):
             return None
         if np.any(~(np.diff(_gate_times(self.gates, case.loads, case.beam.length)) > 0)):
             return "gates must be two places that every load passes, the first before the other"
         return None
 
-    def init(self, plant: LoadedBeam):
+    def init(self, plant: Plant):
         gate_times = jnp.stack(
-            [path.passage_times(self.gates)[:2] for path in plant.traffic.motions]
+            [path.passage_times(self.gates)[:2] for path in plant.loads.trajectories]
         )
         return gate_times, plant.case.beam.length
 
@@ -81,5 +81,7 @@ class Passage(AbstractController):
 
 def _gate_times(gates, loads, length) -> Float[np.ndarray, "load 2"]:
     """When loads pass the gates (s), NaN where they do not."""
-    found = np.stack([known(motion(load, length).passage_times(gates))[:2] for load in loads])
+    found = np.stack(
+        [concrete(trajectory(load, length).passage_times(gates))[:2] for load in loads]
+    )
     return np.where(found < NEVER, found, np.nan)

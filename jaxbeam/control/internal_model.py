@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.fields import INCREASING, POSITIVE, is_known, known, number
+from jaxbeam.case.fields import INCREASING, POSITIVE, concrete, is_concrete, number
 from jaxbeam.case.filters import filter_step, initial, sections
-from jaxbeam.model.state_space import LoadedBeam
+from jaxbeam.model.state_space import Plant
 
 
 class InternalModelState(eqx.Module):
@@ -74,9 +74,9 @@ class Relief(AbstractController):
                 f"values must have for each of {actuators} actuators as many entries as readings"
                 f" has, {self.readings.shape[0]}; they are of shape {self.values.shape}"
             )
-        if self.notches is not None and is_known(self.notches) and is_known(self.period):
-            nyquist = 0.5 / float(known(self.period))
-            if known(self.notches).max(initial=0.0) >= nyquist:
+        if self.notches is not None and is_concrete(self.notches) and is_concrete(self.period):
+            nyquist = 0.5 / float(concrete(self.period))
+            if concrete(self.notches).max(initial=0.0) >= nyquist:
                 return (
                     f"notches must be below half the sampling frequency, {nyquist:g} Hz: lower"
                     " them, or sample faster"
@@ -91,7 +91,7 @@ class Relief(AbstractController):
             )
         return None
 
-    def init(self, plant: LoadedBeam):
+    def init(self, plant: Plant):
         system, sensors = plant.unloaded, plant.case.sensors[: self.values.shape[0]]
         static_response = jnp.linalg.solve(system.A.T, system.C[: len(sensors)].T).T
         filters = tuple(

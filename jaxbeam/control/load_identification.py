@@ -13,13 +13,13 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
-from jaxbeam.case.fields import POSITIVE, is_known, known, number
+from jaxbeam.case.fields import POSITIVE, concrete, is_concrete, number
 from jaxbeam.control.load_position import DeflectionIdentifier
 from jaxbeam.control.load_update import AbstractLoadIdentifier
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.observability import deflection_outputs
-from jaxbeam.model.modes import lay_out
-from jaxbeam.model.state_space import LoadedBeam, state_space
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.state_space import Plant, state_space
 from jaxbeam.runtime.compiling import compiled
 
 INFLUENCE_POSITIONS = 201  # at which influence lines are kept
@@ -58,9 +58,9 @@ class Recognition(eqx.Module):
                 return "threshold needs two sensors of deflection or more; add one, or give gates"
             return None
         numbers = (self.gates, self.until, case.beam.length, case.loads[0].speed)
-        if not all(is_known(value) for value in numbers):
+        if not all(is_concrete(value) for value in numbers):
             return None
-        gates, until, length, speed = (known(value) for value in numbers)
+        gates, until, length, speed = (concrete(value) for value in numbers)
         gate_shares = np.sign(speed) * (gates - (length if speed < 0 else 0.0)) / length
         if gate_shares[1] <= gate_shares[0]:
             return "gates must be two places, that which the load passes first before the other"
@@ -68,18 +68,20 @@ class Recognition(eqx.Module):
             return f"until must be beyond the second gate, at {gate_shares[1]:.3g} of the way, and at most 1"
         return None
 
-    def identifier(self, plant: LoadedBeam, design_plant: LoadedBeam) -> AbstractLoadIdentifier:
+    def identifier(self, plant: Plant, design_plant: Plant) -> AbstractLoadIdentifier:
         """The recogniser of the first load of a model; deflections are those of the design."""
-        system, modes = design_plant.unloaded, design_plant.scale.shape[0]
+        system, modes = design_plant.unloaded, design_plant.coordinate_scale.shape[0]
         length = plant.case.beam.length
         static_response = jnp.linalg.solve(system.A.T, system.C[deflection_outputs(system)].T).T
-        shapes = design_plant.rig.shapes(length * np.linspace(0, 1, INFLUENCE_POSITIONS), (0,))[0]
+        shapes = design_plant.modal_model.shapes(
+            length * np.linspace(0, 1, INFLUENCE_POSITIONS), (0,)
+        )[0]
         sensor_indices = deflection_outputs(system)
         common = {
             "length": length,
             "gravity": design_plant.case.run.gravity,
             "line": static_response[:, modes : 2 * modes]
-            @ (design_plant.scale[:, None] * shapes.T),
+            @ (design_plant.coordinate_scale[:, None] * shapes.T),
             "lift": -static_response @ system.B,
             "offset": sensor_offsets(design_plant)[sensor_indices],
             "seen": tuple(int(i) for i in sensor_indices),
@@ -87,7 +89,7 @@ class Recognition(eqx.Module):
         if self.gates is None:
             settings = {"until": self.until, "threshold": self.threshold}
             return DeflectionIdentifier(sums=jnp.zeros(8), **settings, **common)
-        times = plant.traffic.motions[0].passage_times(self.gates)[:2]
+        times = plant.loads.trajectories[0].passage_times(self.gates)[:2]
         return GateIdentifier(settings=self, gate_times=times, sums=jnp.zeros(2), **common)
 
 
@@ -153,7 +155,7 @@ def recognised(record: Any, settings: Recognition) -> Recognised:
     error = settings.validate(case)
     if error is not None:
         raise ValueError(f"recognition.{error}")
-    mass, speed = _replay(settings, case, lay_out(case), record)
+    mass, speed = _replay(settings, case, mesh_layout(case), record)
     truth = float(case.loads[0].mass), float(case.loads[0].speed)
     found = float(mass), float(speed)
     errors = [value / true - 1 for value, true in zip(found, truth, strict=True)]
@@ -164,7 +166,7 @@ def recognised(record: Any, settings: Recognition) -> Recognised:
 def _replay(settings: Recognition, case: Case, layout, record):
     plant = state_space(case, layout=layout)
     identifier = settings.identifier(plant, plant)
-    zero_state = jnp.zeros(plant.rig.states)
+    zero_state = jnp.zeros(plant.modal_model.state_count)
 
     def tick(fit, at):
         readings, command, t = at

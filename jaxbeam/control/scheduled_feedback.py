@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.fields import INCREASING, choice, count, is_known, known, number, part
+from jaxbeam.case.fields import INCREASING, choice, concrete, count, is_concrete, number, part
 from jaxbeam.control.feedback import Feedback, pairing_error
 from jaxbeam.control.load_identification import Recognition
 from jaxbeam.control.load_update import AbstractLoadIdentifier
@@ -50,7 +50,9 @@ class ScheduledFeedback(AbstractController):
     def validate(self, case):
         if len(case.loads) != 1 or case.loads[0].mass is None:
             return "kind needs a single load, with a mass; or take kind 'feedback'"
-        if self.masses.size == 0 or (is_known(self.masses) and np.any(known(self.masses) <= 0)):
+        if self.masses.size == 0 or (
+            is_concrete(self.masses) and np.any(concrete(self.masses) <= 0)
+        ):
             return "masses must list at least one, and positive ones"
         if self.gains.shape[1] != self.masses.shape[0]:
             return (

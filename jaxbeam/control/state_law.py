@@ -9,13 +9,13 @@ import numpy as np
 
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
-from jaxbeam.case.fields import choice, is_known, known, part
-from jaxbeam.case.loads import motion
+from jaxbeam.case.fields import choice, concrete, is_concrete, part
+from jaxbeam.case.loads import trajectory
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation import KINDS
 from jaxbeam.estimation.continuous import ContinuousEstimator
-from jaxbeam.model.modes import lay_out
-from jaxbeam.model.state_space import LoadedBeam, StateSpace, loaded_beam, state_space
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.state_space import Plant, StateSpace, build_plant, state_space
 from jaxbeam.runtime.compiling import compiled
 
 
@@ -38,17 +38,17 @@ class AbstractStateLaw(AbstractController):
         return self.estimator is None or self.estimator.continuous_time
 
     @abc.abstractmethod
-    def prepare(self, plant: LoadedBeam, design_plant: LoadedBeam) -> Any:
+    def prepare(self, plant: Plant, design_plant: Plant) -> Any:
         """Memory of the law at the start of a run on `plant`, designed for `design_plant`."""
 
     @abc.abstractmethod
     def command(self, memory: Any, estimate: Estimate, measurement, t) -> tuple[Any, Any]:
         """Commands at time t (s) for an estimate of the state, and the memory after it."""
 
-    def design_plant(self, plant: LoadedBeam) -> LoadedBeam:
+    def design_plant(self, plant: Plant) -> Plant:
         """The model that the law is designed for, in its coordinates."""
         if self.design is None:
-            return loaded_beam(plant.case, plant.rig, self.coordinates)
+            return build_plant(plant.case, plant.modal_model, self.coordinates)
         return self.design.design_plant(plant, self.coordinates)
 
     def init(self, plant):
@@ -87,7 +87,7 @@ class AbstractStateLaw(AbstractController):
         if self.period is not None or self.estimator is None:
             return None
         loads = case.loads if self.design is None else self.design.design_loads(case)
-        return np.ravel([known(motion(load, case.beam.length).window()) for load in loads])
+        return np.ravel([concrete(trajectory(load, case.beam.length).window()) for load in loads])
 
     def validate(self, case):
         stiffened = any(actuator.bonded() is not None for actuator in case.actuators)
@@ -106,9 +106,11 @@ class AbstractStateLaw(AbstractController):
         if self.period is None and self.estimator is None:
             return None
         error = None if self.estimator is None else self.estimator.validate(case, None)
-        if error is None and all(is_known(leaf) for leaf in jax.tree.leaves((self, case))):
-            law, concrete_case = jax.tree.map(lambda leaf: jnp.asarray(known(leaf)), (self, case))
-            system = _unloaded_design_plant(law, concrete_case, lay_out(concrete_case))
+        if error is None and all(is_concrete(leaf) for leaf in jax.tree.leaves((self, case))):
+            law, concrete_case = jax.tree.map(
+                lambda leaf: jnp.asarray(concrete(leaf)), (self, case)
+            )
+            system = _unloaded_design_plant(law, concrete_case, mesh_layout(concrete_case))
             if self.period is not None:
                 self.warn(system, case)
             error = None if self.estimator is None else self.estimator.validate(case, system)
@@ -136,9 +138,9 @@ def _unloaded_design_plant(law: AbstractStateLaw, case, layout) -> StateSpace:
     return law.design_plant(state_space(case, layout=layout)).unloaded
 
 
-def _design_state_map(plant: LoadedBeam, design_plant: LoadedBeam):
+def _design_state_map(plant: Plant, design_plant: Plant):
     """The states of the design for the states of the plant: all of them, or those it has."""
-    modal = 2 * plant.scale.shape[0]
-    kept = 2 * design_plant.scale.shape[0]
-    states = plant.to_rig(jnp.eye(plant.rig.states))
-    return design_plant.from_rig(jnp.concatenate([states[:kept], states[modal:]]))
+    modal = 2 * plant.coordinate_scale.shape[0]
+    kept = 2 * design_plant.coordinate_scale.shape[0]
+    states = plant.to_modal(jnp.eye(plant.modal_model.state_count))
+    return design_plant.from_modal(jnp.concatenate([states[:kept], states[modal:]]))

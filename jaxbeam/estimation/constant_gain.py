@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import Measurement
 from jaxbeam.estimation.sampled_plant import Transition
-from jaxbeam.model.state_space import LoadedBeam
+from jaxbeam.model.state_space import Plant
 
 
 class ConstantGainFilter(eqx.Module):
@@ -41,7 +41,7 @@ class ConstantGainFilter(eqx.Module):
 
 
 def constant_gain_filter(
-    plant: LoadedBeam,
+    plant: Plant,
     transition: Transition,
     C: Float[Array, "sensor state"],
     D: Float[Array, "sensor actuator"],
@@ -50,10 +50,10 @@ def constant_gain_filter(
     """The memory at the start of a run, from rest."""
     state, command = jnp.zeros(C.shape[1]), jnp.zeros(D.shape[1])
     return ConstantGainFilter(
-        transition, C, D, sensor_offsets(plant), gain, state, command, plant.rig.states
+        transition, C, D, sensor_offsets(plant), gain, state, command, plant.modal_model.state_count
     )
 
 
-def sensor_offsets(plant: LoadedBeam) -> Float[Array, " sensor"]:
+def sensor_offsets(plant: Plant) -> Float[Array, " sensor"]:
     """The constants that sensors add to what they read."""
     return jnp.array([sensor.offset for sensor in plant.case.sensors]).reshape(-1)

@@ -48,10 +48,8 @@ class ContinuousEstimator(eqx.Module):
         if not self.estimates_weights:
             return Estimate(state[: self.plant_states])
         plant = self.filtered_plant.plant
-        weights = state[plant.rig.states :]
-        return Estimate(
-            state[: self.plant_states], jnp.where(plant.traffic.on_beam(t), weights, 0.0)
-        )
+        weights = state[plant.modal_model.state_count :]
+        return Estimate(state[: self.plant_states], jnp.where(plant.loads.on_beam(t), weights, 0.0))
 
     def rates(
         self,

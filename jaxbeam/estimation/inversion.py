@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
-from jaxbeam.case.fields import POSITIVE, known, number
+from jaxbeam.case.fields import POSITIVE, concrete, number
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.observability import (
     UNOBSERVABLE,
@@ -77,17 +77,17 @@ class Inversion(AbstractEstimator):
             return "kind needs sensors of deflection; add one, or take kind 'kalman'"
         if system is None:
             return None
-        rows = known(deflection_mode_shapes(system))
+        rows = concrete(deflection_mode_shapes(system))
         column_norms = np.linalg.norm(rows, axis=0)
         if (
             np.any(column_norms < UNOBSERVABLE * column_norms.max())
-            or known(conditioning(system)) > 1 / UNOBSERVABLE
+            or concrete(conditioning(system)) > 1 / UNOBSERVABLE
         ):
             return (
                 f"kind needs sensors of deflection that tell all {column_norms.size} modes apart; move"
                 " one off the nodes of the modes, or design for fewer modes"
             )
-        condition_number = float(known(conditioning(system)))
+        condition_number = float(concrete(conditioning(system)))
         if condition_number > MAX_CONDITION_NUMBER:
             warnings.warn(
                 f"the sensors of deflection hardly tell some modes apart: errors of readings grow"

@@ -11,14 +11,14 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
-from jaxbeam.case.fields import POSITIVE, choice, count, is_known, known, number
+from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
 from jaxbeam.estimation.constant_gain import constant_gain_filter, sensor_offsets
 from jaxbeam.estimation.continuous import ContinuousEstimator
 from jaxbeam.estimation.gains import filter_gain, kalman_gain, sampled_kalman_gain
 from jaxbeam.estimation.observability import mode_count, observability_error
 from jaxbeam.estimation.sampled_plant import PERIOD_ROUNDING, sample_timing
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain, filtered_plant, sensor_chain
-from jaxbeam.model.state_space import LoadedBeam
+from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.finite_horizon import finite_horizon
 from jaxbeam.numerics.intervals import symmetric_part
@@ -95,7 +95,7 @@ class Kalman(AbstractEstimator):
         return CrossingFilter(
             filtered,
             sensors,
-            plant.rig.states,
+            plant.modal_model.states,
             jnp.append(scale, jnp.ones(loads)),
             jnp.pad(intensity, (0, loads)),
             weight_states.set(plant.weights),
@@ -103,13 +103,13 @@ class Kalman(AbstractEstimator):
             jnp.zeros(len(plant.case.actuators)),
         )
 
-    def _continuous(self, plant: LoadedBeam) -> ContinuousEstimator:
+    def _continuous(self, plant: Plant) -> ContinuousEstimator:
         """The filter at every instant."""
         filtered, count = filtered_plant(plant), len(plant.case.sensors)
         filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
         noise = jnp.diag(jnp.broadcast_to(self.measurement_intensity, (count,)))
         states, loads = intensity.shape[0], len(plant.case.loads)
-        offset, plant_states = sensor_offsets(plant), plant.rig.states
+        offset, plant_states = sensor_offsets(plant), plant.modal_model.state_count
         if self.loads == "ignored":
             system = filtered.with_filtered_outputs(filtered_model.unloaded)
             gain, _ = kalman_gain(system.A, system.C, intensity, noise)
@@ -127,7 +127,7 @@ class Kalman(AbstractEstimator):
             return plant.A.T, plant.C.T
 
         crossing_times = jnp.array(
-            [path.window() for path in filtered_model.traffic.motions]
+            [path.window() for path in filtered_model.loads.trajectories]
         ).reshape(-1)
         events = jnp.concatenate([jnp.zeros(1), jnp.clip(crossing_times, 0.0, end), end[None]])
         initial_covariance, Q = (
@@ -154,17 +154,17 @@ class Kalman(AbstractEstimator):
         memory = memory.corrected(measurement, t)
         if self.loads == "known":
             return Estimate(memory.plant_state), memory
-        on_beam = memory.view.model.traffic.on_beam(t)
+        on_beam = memory.view.model.loads.on_beam(t)
         return Estimate(memory.plant_state, jnp.where(on_beam, memory.weights, 0.0)), memory
 
-    def noise_intensity(self, plant: LoadedBeam) -> Square:
+    def noise_intensity(self, plant: Plant) -> Square:
         """Intensity of the white noise in the rates of the states."""
-        modes = plant.scale.shape[0]
-        force = self.process_noise * plant.scale**2
-        actuator_intensity = jnp.zeros(plant.rig.states - 2 * modes)
+        modes = plant.coordinate_scale.shape[0]
+        force = self.process_noise * plant.coordinate_scale**2
+        actuator_intensity = jnp.zeros(plant.modal_model.state_count - 2 * modes)
         return jnp.diag(jnp.concatenate([jnp.zeros(modes), force, actuator_intensity]))
 
-    def reading_variance(self, plant: LoadedBeam) -> Float[Array, " sensor"]:
+    def reading_variance(self, plant: Plant) -> Float[Array, " sensor"]:
         """Variance of the noise of each reading."""
         sensors = plant.case.sensors
         if self.measurement_noise is None:
@@ -181,12 +181,16 @@ class Kalman(AbstractEstimator):
             return "measurement_noise is that of samples; without a period leave it out"
         if period is not None and self.measurement_noise is None:
             for i, sensor in enumerate(case.sensors):
-                if sensor.noise is None or (is_known(sensor.noise) and known(sensor.noise) == 0):
+                if sensor.noise is None or (
+                    is_concrete(sensor.noise) and concrete(sensor.noise) == 0
+                ):
                     return f"measurement_noise must be given, as sensors.{i} has no noise"
         for i, sensor in enumerate(case.sensors):
             sampled = period is not None and sensor.delay is not None
-            if sampled and is_known(sensor.delay) and is_known(period):
-                delay_periods = math.ceil(known(sensor.delay) / known(period) - PERIOD_ROUNDING)
+            if sampled and is_concrete(sensor.delay) and is_concrete(period):
+                delay_periods = math.ceil(
+                    concrete(sensor.delay) / concrete(period) - PERIOD_ROUNDING
+                )
                 if delay_periods > self.reach:
                     return (
                         f"reach must be at least {delay_periods}, the periods of sensors.{i}.delay"
@@ -213,10 +217,10 @@ class Kalman(AbstractEstimator):
             return None
         modes = mode_count(system)
         fastest_frequency = np.max(
-            np.abs(np.linalg.eigvals(known(system.A)[: 2 * modes, : 2 * modes]))
+            np.abs(np.linalg.eigvals(concrete(system.A)[: 2 * modes, : 2 * modes]))
         )
         min_points = math.ceil(
-            fastest_frequency * known(case.run.duration) / MAX_PHASE_PER_INTERVAL
+            fastest_frequency * concrete(case.run.duration) / MAX_PHASE_PER_INTERVAL
         )
         if self.points >= min_points:
             return None
@@ -258,7 +262,9 @@ class CrossingFilter(eqx.Module):
     @property
     def weights(self) -> Float[Array, " load"]:
         """The weights of the loads (N)."""
-        return self.state[self.filtered.plant.rig.states : self.sensor_chain.plant_states]
+        return self.state[
+            self.filtered.plant.modal_model.state_count : self.sensor_chain.plant_states
+        ]
 
     def predict(self, command: Float[Array, " actuator"], t: Float[Array, ""]) -> OneStepPrediction:
         """What is expected at the tick at t (s), the given command having acted until then."""

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.model.state_space import StateSpace
 
 UNOBSERVABLE = 1e-9  # of what a sensor sees of the mode it sees best: less is nothing
@@ -48,7 +48,7 @@ def unobservable_mode(system: StateSpace) -> float | None:
     may leave all outputs zero.
     """
     modes = mode_count(system)
-    A, C = known(system.A)[: 2 * modes, : 2 * modes], known(system.C)[:, : 2 * modes]
+    A, C = concrete(system.A)[: 2 * modes, : 2 * modes], concrete(system.C)[:, : 2 * modes]
     stiffness = np.abs(A[modes:, :modes].diagonal())
     scale = np.concatenate([1 / np.sqrt(1 + stiffness), np.ones(modes)])
     A, C = A * scale / scale[:, None], C * scale

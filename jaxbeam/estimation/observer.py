@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.estimator import AbstractEstimator, Estimate
-from jaxbeam.case.fields import POSITIVE, known, number
+from jaxbeam.case.fields import POSITIVE, concrete, number
 from jaxbeam.estimation.constant_gain import (
     ConstantGainFilter,
     constant_gain_filter,
@@ -42,7 +42,7 @@ class Observer(AbstractEstimator):
 
     def init(self, plant):
         if plant.case.controller.period is None:
-            system, initial_state = plant.unloaded, jnp.zeros(plant.rig.states)
+            system, initial_state = plant.unloaded, jnp.zeros(plant.modal_model.states)
             gain = _modal_placed_gain(system.A, system.C, self.desired_matrix(system))
             return ContinuousEstimator(
                 sensor_offsets(plant), initial_state, initial_state.size, unloaded=system, gain=gain
@@ -87,12 +87,12 @@ class Observer(AbstractEstimator):
         modes = mode_count(system)
         if self.poles is not None and self.poles.shape[0] != modes:
             return f"poles must list a pair for each of {modes} modes, not {self.poles.shape[0]}"
-        if self.poles is not None and np.any(known(self.poles)[:, 0] >= 0):
+        if self.poles is not None and np.any(concrete(self.poles)[:, 0] >= 0):
             return "poles must have negative real parts, for the error to die away"
-        if self.speed is not None and known(self.speed) <= 1:
+        if self.speed is not None and concrete(self.speed) <= 1:
             return "speed must be above 1"
         if self.speed is not None:
-            poles = np.linalg.eigvals(known(system.A)[: 2 * modes, : 2 * modes])
+            poles = np.linalg.eigvals(concrete(system.A)[: 2 * modes, : 2 * modes])
             if np.max(poles.real) > -1e-9 * np.max(np.abs(poles)):
                 return "speed must not be used on a beam without damping; give poles instead"
         return observability_error(system)

@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.filters import filter_step
 from jaxbeam.estimation.sampled_plant import PERIOD_ROUNDING, SampleTiming, Transition
-from jaxbeam.model.sensor_filters import sensed
-from jaxbeam.model.sensor_signals import Sections, design
-from jaxbeam.model.state_space import LoadedBeam, StateSpace
+from jaxbeam.model.sensor_filters import with_sensor_filters
+from jaxbeam.model.sensor_signals import Sections, sensor_sections
+from jaxbeam.model.state_space import Plant, StateSpace
 
 # Of the noise of its samples, what a digital filter is taken to add to its output. Without it the
 # filter would be undone exactly, and what it all but stops be taken for known.
@@ -30,7 +30,7 @@ SystemAtTime = Callable[[Float[Array, ""]], StateSpace]
 class FilteredPlant(eqx.Module):
     """A loaded beam with its sensors' analogue filters: `output_rows` is what they make of its states."""
 
-    plant: LoadedBeam
+    plant: Plant
     output_rows: Float[Array, "sensor state"]
 
     def with_filtered_outputs(self, system: StateSpace) -> StateSpace:
@@ -39,7 +39,7 @@ class FilteredPlant(eqx.Module):
         analogue = np.array([f is not None and f.realisation == "analogue" for f in filters])
         if not analogue.any():
             return system
-        filtered_rows = self.output_rows @ self.plant.to_rig(jnp.eye(self.output_rows.shape[1]))
+        filtered_rows = self.output_rows @ self.plant.to_modal(jnp.eye(self.output_rows.shape[1]))
         filtered_rows = jnp.pad(
             filtered_rows, ((0, 0), (0, system.C.shape[1] - filtered_rows.shape[1]))
         )
@@ -48,10 +48,10 @@ class FilteredPlant(eqx.Module):
         return eqx.tree_at(lambda s: (s.C, s.D), system, (C, D))
 
 
-def filtered_plant(plant: LoadedBeam) -> FilteredPlant:
+def filtered_plant(plant: Plant) -> FilteredPlant:
     """A model with the analogue filters of its sensors."""
-    filtered_model, output_rows = sensed(plant)
-    return FilteredPlant(eqx.tree_at(lambda m: m.rig, plant, filtered_model), output_rows)
+    filtered_model, output_rows = with_sensor_filters(plant)
+    return FilteredPlant(eqx.tree_at(lambda m: m.modal_model, plant, filtered_model), output_rows)
 
 
 class SensorChain(eqx.Module):
@@ -199,7 +199,7 @@ class SensorChain(eqx.Module):
 
 
 def sensor_chain(
-    plant: LoadedBeam,
+    plant: Plant,
     variance: Float[Array, " sensor"],
     timing: SampleTiming,
     plant_states: int,
@@ -207,6 +207,6 @@ def sensor_chain(
 ) -> SensorChain:
     """The chain of a case's sensors behind so many states of a plant."""
     sensors = plant.case.sensors
-    sections = tuple(design(sensor, timing.period) for sensor in sensors)
+    sections = tuple(sensor_sections(sensor, timing.period) for sensor in sensors)
     delays = tuple(sensor.delay for sensor in sensors)
     return SensorChain(sections, delays, variance, timing, plant_states, max_delay_periods)

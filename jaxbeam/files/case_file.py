@@ -6,8 +6,6 @@ and nothing here.
 
 import dataclasses
 import os
-import tomllib
-from pathlib import Path
 from typing import Any
 
 import tomli_w
@@ -18,9 +16,10 @@ from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, Run, unknown_address
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.declared_checks import check_field, in_words, missing, suggestion
-from jaxbeam.case.fields import fits, known, shape_in_words
+from jaxbeam.case.fields import concrete, fits, shape_in_words
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check
+from jaxbeam.files.toml_file import read_toml
 
 Kind = type | dict[str, type]  # one class, or the registry in which a `kind` is looked up
 
@@ -40,7 +39,7 @@ def load_case(path: str | os.PathLike) -> Case:
     Raises ValueError, naming the file and the address or line, for invalid TOML, unknown keys or
     kinds, wrong types and whatever `check` refuses; OSError if the file cannot be read.
     """
-    content = _read_toml(path)
+    content = read_toml(path)
     try:
         case = case_from_dict(content)
         check(case)
@@ -55,7 +54,7 @@ def load_controller(path: str | os.PathLike) -> AbstractController:
     Whether it suits a case is not asked. Raises ValueError, naming the file and the address or
     line, for invalid TOML and unknown keys or kinds; OSError if the file cannot be read.
     """
-    content = _read_toml(path)
+    content = read_toml(path)
     try:
         if "controller" not in content:
             raise ValueError("has no controller; write a table [controller]")
@@ -68,18 +67,6 @@ def load_controller(path: str | os.PathLike) -> AbstractController:
         return read_part("controller", content["controller"], control.KINDS)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def _read_toml(path: str | os.PathLike) -> dict[str, Any]:
-    try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise type(error)(f"cannot read the case file {path}: {reason}") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: a case file is text in UTF-8, which this is not") from None
-    except (ValueError, RecursionError) as error:  # also of numbers and lists without end
-        raise ValueError(f"{path}: not valid TOML: {error}") from None
 
 
 def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> None:
@@ -248,7 +235,7 @@ def _write_part(address: str, part: Any, kind: Kind) -> dict[str, Any]:
         if value is None:
             continue
         if "unit" in field.metadata:
-            value = known(value).tolist()
+            value = concrete(value).tolist()
         elif "part" in field.metadata:
             value = _write_part(f"{address}.{field.name}", value, field.metadata["part"])
         table[field.name] = value

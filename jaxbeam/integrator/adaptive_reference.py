@@ -19,14 +19,16 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.validation import check
-from jaxbeam.model.contact import Traffic, traffic
-from jaxbeam.model.modal_model import Rig, rig_in_one
+from jaxbeam.model.contact import LoadSet, load_set
+from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.runtime.compiling import compiled
 
-BREATH = 1e-14  # of the run: motions are asked for so far from their kinks, on the leg's own side
+EVENT_MARGIN_SHARE = (
+    1e-14  # of the run: motions are asked for so far from their kinks, on the leg's own side
+)
 
 
-class AdaptiveRun(eqx.Module):
+class AdaptiveSolution(eqx.Module):
     """A run by the adaptive integrator: histories in SI units, deflection positive upwards.
 
     `contact_force` is positive where the load presses on the beam and zero off the beam. Samples
@@ -43,7 +45,7 @@ class AdaptiveRun(eqx.Module):
 
 def simulate_adaptive(
     case: Case, times: Float[Array, " time"], tolerance: float = 1e-12
-) -> AdaptiveRun:
+) -> AdaptiveSolution:
     """Simulate a case as `jaxbeam.simulate` does, from rest at t = 0, by adaptive steps.
 
     Samples at the ascending `times` (s); `tolerance` is the error allowed a step, relative to the
@@ -52,71 +54,85 @@ def simulate_adaptive(
     """
     check(case)
     case, times = known_case(case), jnp.asarray(times, float)
-    assembled, loads = rig_in_one(case), traffic(case)
-    windows, edges = _events(assembled, loads, float(times[-1]))
-    allowed = tolerance * _size(case, assembled, loads, float(times[-1]))
-    state, histories = jnp.zeros(assembled.states), []
-    for start, stop in itertools.pairwise(edges):
+    model, loads = compiled_modal_model(case), load_set(case)
+    windows, legs = _event_times(model, loads, float(times[-1]))
+    absolute_tolerance = tolerance * _state_scales(case, model, loads, float(times[-1]))
+    state, histories = jnp.zeros(model.state_count), []
+    for start, stop in itertools.pairwise(legs):
         middle = (start + stop) / 2
-        on = (windows[:, 0] < middle) & (middle < windows[:, 1])
+        on_beam = (windows[:, 0] < middle) & (middle < windows[:, 1])
         leg = np.array([start, stop])
-        state, found = _solve(assembled, loads, state, leg, on, times, allowed)
-        after = (times >= start)[:, None]
-        older = histories or found
-        histories = [jnp.where(after, new, old) for new, old in zip(found, older, strict=True)]
-    coordinates, rates, accelerations, force = histories
-    deflection = coordinates @ assembled.shapes(case.sensor_places, (0,))[0].T
-    if assembled.mixing is not None:
-        coordinates, rates, accelerations = (
-            part @ assembled.mixing.T for part in (coordinates, rates, accelerations)
+        state, leg_histories = _solve_leg(
+            model, loads, state, leg, on_beam, times, absolute_tolerance
         )
-    return AdaptiveRun(times, coordinates, rates, accelerations, force, deflection)
+        in_leg = (times >= start)[:, None]
+        previous = histories or leg_histories
+        histories = [
+            jnp.where(in_leg, new, old) for new, old in zip(leg_histories, previous, strict=True)
+        ]
+    coordinates, rates, accelerations, force = histories
+    deflection = coordinates @ model.shapes(case.sensor_places, (0,))[0].T
+    if model.mode_map is not None:
+        coordinates, rates, accelerations = (
+            part @ model.mode_map.T for part in (coordinates, rates, accelerations)
+        )
+    return AdaptiveSolution(times, coordinates, rates, accelerations, force, deflection)
 
 
-def _events(rig: Rig, loads: Traffic, end: float) -> tuple[np.ndarray, np.ndarray]:
+def _event_times(model: ModalModel, loads: LoadSet, end: float) -> tuple[np.ndarray, np.ndarray]:
     """Entry and exit of every load (load, 2), and the edges of legs without events, in s."""
-    windows = np.array([path.window() for path in loads.motions]).reshape(-1, 2)
-    kinks = [np.asarray(path.passage_times(rig.modes.nodes)) for path in loads.motions]
-    found = np.concatenate([windows.ravel(), *kinks])
-    edges = np.unique(np.concatenate([[0.0, end], found[(found > 0) & (found < end)]]))
-    return windows, edges[np.append(True, np.diff(edges) > 10 * BREATH * end)]
+    windows = np.array([path.window() for path in loads.trajectories]).reshape(-1, 2)
+    nonsmooth_times = [
+        np.asarray(path.passage_times(model.modes.nodes)) for path in loads.trajectories
+    ]
+    event_times = np.concatenate([windows.ravel(), *nonsmooth_times])
+    boundaries = np.unique(
+        np.concatenate([[0.0, end], event_times[(event_times > 0) & (event_times < end)]])
+    )
+    return windows, boundaries[np.append(True, np.diff(boundaries) > 10 * EVENT_MARGIN_SHARE * end)]
 
 
 @compiled
-def _solve(rig: Rig, loads: Traffic, state, leg, on, times, allowed):
+def _solve_leg(
+    model: ModalModel, loads: LoadSet, state, interval, on_beam, times, absolute_tolerance
+):
     """State at the end of a leg, and coordinates, rates, accelerations and forces at the times.
 
     What is returned for times outside the leg means nothing.
     """
     import diffrax
 
-    start, stop = leg
-    count = rig.modes.stiffness.shape[0]
-    place, rate = np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2)
-    matrix = rig.state_matrix[0]
-    mass = jnp.where(on, loads.inertia[:, 0], 0.0)
-    weight = jnp.where(on, loads.weight[:, 0], 0.0)
+    start, stop = interval
+    count = model.modes.stiffness.shape[0]
+    displacement_index, velocity_index = np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2)
+    matrix = model.state_matrix[0]
+    mass = jnp.where(on_beam, loads.inertia[:, 0], 0.0)
+    weight = jnp.where(on_beam, loads.weight[:, 0], 0.0)
 
     def accelerations(t, state):
         """Of the modes, and the forces with which the loads press."""
-        breath = BREATH * times[-1]
-        x, speed, braking = loads.travel(jnp.clip(t, start + breath, stop - breath))
-        shape, slope, curvature = rig.shapes(jnp.where(on, x, 0.0), (0, 1, 2))
-        q, u = state[place], state[rate]
-        follow = 2 * speed * (slope @ u) + speed**2 * (curvature @ q) + braking * (slope @ q)
-        push = weight + mass * follow
+        offset = EVENT_MARGIN_SHARE * times[-1]
+        x, speed, acceleration = loads.kinematics(jnp.clip(t, start + offset, stop - offset))
+        shape, slope, curvature = model.shapes(jnp.where(on_beam, x, 0.0), (0, 1, 2))
+        q, u = state[displacement_index], state[velocity_index]
+        convective = (
+            2 * speed * (slope @ u) + speed**2 * (curvature @ q) + acceleration * (slope @ q)
+        )
+        free_force = weight + mass * convective
         inertia = jnp.eye(count) + shape.T @ (mass[:, None] * shape)
-        second = jnp.linalg.solve(inertia, (matrix @ state)[rate] - shape.T @ push)
-        return second, push + mass * (shape @ second)
+        modal_acceleration = jnp.linalg.solve(
+            inertia, (matrix @ state)[velocity_index] - shape.T @ free_force
+        )
+        return modal_acceleration, free_force + mass * (shape @ modal_acceleration)
 
-    def motion(t, state, _):
-        return (matrix @ state).at[rate].set(accelerations(t, state)[0])
+    def state_rate(t, state, _):
+        return (matrix @ state).at[velocity_index].set(accelerations(t, state)[0])
 
     def save(t, state, _):
-        return state, state[place], state[rate], *accelerations(t, state)
+        return state, state[displacement_index], state[velocity_index], *accelerations(t, state)
 
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(motion),
+        diffrax.ODETerm(state_rate),
         diffrax.Dopri8(),
         t0=start,
         t1=stop,
@@ -124,7 +140,7 @@ def _solve(rig: Rig, loads: Traffic, state, leg, on, times, allowed):
         y0=state,
         saveat=diffrax.SaveAt(ts=jnp.append(jnp.clip(times, start, stop), stop), fn=save),
         stepsize_controller=diffrax.PIDController(
-            rtol=0.0, atol=1.0, norm=lambda error: jnp.max(jnp.abs(error / allowed))
+            rtol=0.0, atol=1.0, norm=lambda error: jnp.max(jnp.abs(error / absolute_tolerance))
         ),
         max_steps=None,
         adjoint=diffrax.ForwardMode(),
@@ -133,13 +149,19 @@ def _solve(rig: Rig, loads: Traffic, state, leg, on, times, allowed):
     return states[-1], [history[:-1] for history in histories]
 
 
-def _size(case: Case, rig: Rig, loads: Traffic, end: float) -> Float[Array, " state"]:
+def _state_scales(
+    case: Case, model: ModalModel, loads: LoadSet, end: float
+) -> Float[Array, " state"]:
     """What errors of the states are measured against: the slowest mode under all the weight.
 
     A rigid-body mode has all of the run to move away.
     """
-    stiffness = jnp.maximum(rig.modes.stiffness, 1 / end**2)
+    stiffness = jnp.maximum(model.modes.stiffness, 1 / end**2)
     weight = jnp.sum(jnp.abs(loads.weight)) + jnp.finfo(float).tiny
-    far = weight / jnp.sqrt(case.beam.linear_density * case.beam.length) / jnp.min(stiffness)
-    modal = far * jnp.stack([jnp.ones_like(stiffness), jnp.sqrt(stiffness)], axis=-1).ravel()
-    return jnp.ones(rig.states).at[: modal.shape[0]].set(modal)
+    displacement = (
+        weight / jnp.sqrt(case.beam.linear_density * case.beam.length) / jnp.min(stiffness)
+    )
+    modal_scale = (
+        displacement * jnp.stack([jnp.ones_like(stiffness), jnp.sqrt(stiffness)], axis=-1).ravel()
+    )
+    return jnp.ones(model.state_count).at[: modal_scale.shape[0]].set(modal_scale)

@@ -12,125 +12,156 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-SAME = 1e-9  # of the run: closer times are one
-DISTINCT = 64  # more different gaps than these are no longer told apart one by one
+SAME_TIME_SHARE = 1e-9  # of the run: closer times are one
+MAX_DISTINCT_GAPS = 64  # more different gaps than these are no longer told apart one by one
 
 
-class Schedule(eqx.Module):
+class EventSchedule(eqx.Module):
     """Edges in time, the gaps between them, and what is due at each.
 
-    `gaps` says which of the `lengths` (s) each gap has; `samples` are the edges at which the run
-    is sampled. For a run with a controller: `tick` numbers the edges at which it acts, `reads`
-    those at which each sensor is read, -1 elsewhere. `age` counts the readings of a sensor made
-    since the one that has arrived by a tick, `apply` the commands made since the one that begins
-    to act at an edge, -1 where none does. `newest` and `waiting` are their largest values.
+    `length_index` says which of the `lengths` (s) each gap has; `sample_events` are the edges at which the run
+    is sampled. For a run with a controller: `control_sample` numbers the edges at which it acts, `reading`
+    those at which each sensor is read, -1 elsewhere. `reading_age` counts the readings of a sensor made
+    since the one that has arrived by a tick, `command_age` the commands made since the one that begins
+    to act at an edge, -1 where none does. `max_age` and `max_waiting` are their largest values.
     """
 
     times: Float[Array, " edge"]
-    gaps: Int[Array, " gap"]
+    length_index: Int[Array, " gap"]
     lengths: Float[Array, " length"]
-    samples: Int[Array, " time"]
-    tick: Int[Array, " edge"] | None = None
-    apply: Int[Array, " edge"] | None = None
-    reads: Int[Array, "edge sensor"] | None = None
-    age: Int[Array, "edge sensor"] | None = None
-    newest: int = eqx.field(static=True, default=0)
-    waiting: int = eqx.field(static=True, default=0)
-    most_reads: int = eqx.field(static=True, default=0)
+    sample_events: Int[Array, " time"]
+    control_sample: Int[Array, " edge"] | None = None
+    command_age: Int[Array, " edge"] | None = None
+    reading: Int[Array, "edge sensor"] | None = None
+    reading_age: Int[Array, "edge sensor"] | None = None
+    max_age: int = eqx.field(static=True, default=0)
+    max_waiting: int = eqx.field(static=True, default=0)
+    max_readings: int = eqx.field(static=True, default=0)
 
 
-def sampled(times: Float[Array, " time"], even: bool, lead: int = 0) -> Schedule:
-    """The schedule of nothing but samples at ascending times (s); `even` if equally spaced.
+def sample_schedule(
+    times: Float[Array, " time"], equally_spaced: bool, lead_samples: int = 0
+) -> EventSchedule:
+    """The schedule of nothing but samples at ascending times (s); `equally_spaced` if equally spaced.
 
-    The first `lead` times are no samples. Also for times that are being traced.
+    The first `lead_samples` times are no samples. Also for times that are being traced.
     """
     count = times.shape[0]
-    samples = jnp.arange(lead, count)
-    if even:
+    sample_events = jnp.arange(lead_samples, count)
+    if equally_spaced:
         spacing = (times[-1] - times[0]) / (count - 1)
-        return Schedule(times, jnp.zeros(count - 1, int), spacing[None], samples)
-    return Schedule(times, jnp.arange(count - 1), jnp.diff(times), samples)
+        return EventSchedule(times, jnp.zeros(count - 1, int), spacing[None], sample_events)
+    return EventSchedule(times, jnp.arange(count - 1), jnp.diff(times), sample_events)
 
 
-def merged(
-    samples: Float[np.ndarray, " time"],
-    ticks: Float[np.ndarray, " tick"],
+def controller_schedule(
+    sample_times: Float[np.ndarray, " time"],
+    control_times: Float[np.ndarray, " tick"],
     delay: float,
-    clocks: list[Float[np.ndarray, "_"]],
-    late: list[float],
-    knots: Float[np.ndarray, " knot"],
-) -> Schedule:
+    arrival_times: list[Float[np.ndarray, "_"]],
+    sensor_delays: list[float],
+    breakpoints: Float[np.ndarray, " knot"],
+) -> EventSchedule:
     """The schedule of a run with a controller, from rest at zero to the last sample.
 
-    `ticks` (s) are when the controller acts, its commands begin `delay` (s) later; `clocks` (s)
-    are when readings of each sensor arrive, of what it saw `late` (s) before; `knots` (s) are
+    `control_times` (s) are when the controller acts, its commands begin `delay` (s) later; `arrival_times` (s)
+    are when readings of each sensor arrive, of what it saw `sensor_delays` (s) before; `breakpoints` (s) are
     where a prescribed command bends.
     """
-    end = float(samples[-1])
-    seen = [clock - lag for clock, lag in zip(clocks, late, strict=True)]
-    every = np.sort(np.concatenate([np.zeros(1), samples, ticks, ticks + delay, knots, *seen]))
-    every = every[(every >= 0) & (every <= end * (1 + SAME))]
-    times = every[np.diff(every, prepend=-np.inf) > SAME * end]
+    end = float(sample_times[-1])
+    signal_times = [clock - lag for clock, lag in zip(arrival_times, sensor_delays, strict=True)]
+    all_times = np.sort(
+        np.concatenate(
+            [
+                np.zeros(1),
+                sample_times,
+                control_times,
+                control_times + delay,
+                breakpoints,
+                *signal_times,
+            ]
+        )
+    )
+    all_times = all_times[(all_times >= 0) & (all_times <= end * (1 + SAME_TIME_SHARE))]
+    times = all_times[np.diff(all_times, prepend=-np.inf) > SAME_TIME_SHARE * end]
     # Samples are where they were asked for, to the last bit; others give way to them.
-    near = np.clip(np.searchsorted(samples, times - SAME * end), 0, samples.size - 1)
-    times = np.where(np.abs(samples[near] - times) <= SAME * end, samples[near], times)
+    nearest_sample = np.clip(
+        np.searchsorted(sample_times, times - SAME_TIME_SHARE * end), 0, sample_times.size - 1
+    )
+    times = np.where(
+        np.abs(sample_times[nearest_sample] - times) <= SAME_TIME_SHARE * end,
+        sample_times[nearest_sample],
+        times,
+    )
 
-    def edges(wanted):
-        return np.clip(np.searchsorted(times, wanted - SAME * end), 0, times.size - 1)
+    def event_indices(wanted_times):
+        return np.clip(
+            np.searchsorted(times, wanted_times - SAME_TIME_SHARE * end), 0, times.size - 1
+        )
 
-    def numbered(wanted):
-        due = np.full(times.size, -1)
-        during = np.flatnonzero((wanted >= -SAME * end) & (wanted <= end * (1 + SAME)))
-        due[edges(wanted[during])] = during
-        return due
+    def number_at_events(wanted_times):
+        numbers = np.full(times.size, -1)
+        in_run = np.flatnonzero(
+            (wanted_times >= -SAME_TIME_SHARE * end) & (wanted_times <= end * (1 + SAME_TIME_SHARE))
+        )
+        numbers[event_indices(wanted_times[in_run])] = in_run
+        return numbers
 
-    def so_far(due):
+    def latest_number(due):
         return np.maximum.accumulate(due)
 
-    tick, begins = numbered(ticks), numbered(ticks + delay)
-    apply = np.where(begins >= 0, so_far(tick) - begins, -1)
-    reads = [numbered(times) for times in seen]
-    arrived = [np.searchsorted(clock, times + SAME * end, side="right") - 1 for clock in clocks]
+    control_sample, command_start = (
+        number_at_events(control_times),
+        number_at_events(control_times + delay),
+    )
+    command_lag = np.where(command_start >= 0, latest_number(control_sample) - command_start, -1)
+    reading_index = [number_at_events(times) for times in signal_times]
+    latest_arrival = [
+        np.searchsorted(clock, times + SAME_TIME_SHARE * end, side="right") - 1
+        for clock in arrival_times
+    ]
     # What was seen before the run is what is seen at rest: the buffer holds nothing else then.
-    pairs = zip(reads, arrived, strict=True)
-    age = [np.maximum(so_far(made) - here, 0) for made, here in pairs]
+    pairs = zip(reading_index, latest_arrival, strict=True)
+    reading_lag = [np.maximum(latest_number(made) - here, 0) for made, here in pairs]
     gaps = np.diff(times)
-    lengths, kind = np.unique(np.round(gaps / (1e-2 * SAME * end)), return_inverse=True)
-    if lengths.size > DISTINCT:
-        kind = np.arange(gaps.size)
-    means = np.bincount(kind, gaps) / np.bincount(kind)
+    lengths, length_index = np.unique(
+        np.round(gaps / (1e-2 * SAME_TIME_SHARE * end)), return_inverse=True
+    )
+    if lengths.size > MAX_DISTINCT_GAPS:
+        length_index = np.arange(gaps.size)
+    mean_lengths = np.bincount(length_index, gaps) / np.bincount(length_index)
 
-    def columns(parts):
+    def stack_columns(parts):
         return jnp.asarray(np.array(parts).reshape(len(parts), times.size).T, int)
 
-    return Schedule(
+    return EventSchedule(
         jnp.asarray(times),
-        jnp.asarray(kind),
-        jnp.asarray(means),
-        jnp.asarray(edges(samples)),
-        tick=jnp.asarray(tick),
-        apply=jnp.asarray(apply),
-        reads=columns(reads),
-        age=columns(age),
-        newest=int(max((part.max() for part in age), default=0)),
-        waiting=int(apply.max(initial=0)),
-        most_reads=max((clock.size for clock in clocks), default=0),
+        jnp.asarray(length_index),
+        jnp.asarray(mean_lengths),
+        jnp.asarray(event_indices(sample_times)),
+        control_sample=jnp.asarray(control_sample),
+        command_age=jnp.asarray(command_lag),
+        reading=stack_columns(reading_index),
+        reading_age=stack_columns(reading_lag),
+        max_age=int(max((part.max() for part in reading_lag), default=0)),
+        max_waiting=int(command_lag.max(initial=0)),
+        max_readings=max((clock.size for clock in arrival_times), default=0),
     )
 
 
-def stacked(schedules: list[Schedule]) -> Schedule:
+def stack_schedules(schedules: list[EventSchedule]) -> EventSchedule:
     """Schedules of equally many edges and samples, along a new first axis.
 
     Raises ValueError if their numbers differ.
     """
-    if len({(s.times.shape, s.samples.shape) for s in schedules}) > 1:
+    if len({(s.times.shape, s.sample_events.shape) for s in schedules}) > 1:
         raise ValueError("the schedules differ in the number of their edges or samples")
-    most = max(s.lengths.shape[0] for s in schedules)
-    counts = ("newest", "waiting", "most_reads")
-    largest = {name: max(getattr(s, name) for s in schedules) for name in counts}
+    max_lengths = max(s.lengths.shape[0] for s in schedules)
+    maxima = ("newest", "waiting", "most_reads")
+    largest = {name: max(getattr(s, name) for s in schedules) for name in maxima}
 
-    def alike(schedule):
-        lengths = jnp.append(schedule.lengths, jnp.zeros(most - schedule.lengths.shape[0]))
+    def pad(schedule):
+        lengths = jnp.append(schedule.lengths, jnp.zeros(max_lengths - schedule.lengths.shape[0]))
         return dataclasses.replace(schedule, lengths=lengths, **largest)
 
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(alike, schedules))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(pad, schedules))

@@ -14,7 +14,7 @@ class StepInfo(eqx.Module):
     """
 
     start: Float[Array, " *step"]
-    span: Float[Array, " *step"]
+    length: Float[Array, " *step"]
     event: Int[Array, " *step"]
 
 

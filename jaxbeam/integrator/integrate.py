@@ -5,7 +5,7 @@ is the force it puts on each mode; the rig answers exactly (`exponentials`). Dem
 law at the nodes gives a small linear system a step. The free rig brings neither error nor
 stiffness at any step length; the order is twice the number of nodes. Steps are taken in chunks:
 what depends on the path alone is tabulated for a chunk at once and shared by all lanes
-(`tables`), a short loop then advances the states, and what is wanted of the chunk is reduced at
+(`matrices`), a short loop then advances the states, and what is wanted of the chunk is reduced at
 once again (`extremes`). Commands to the actuators are polynomials at the same nodes, given by a
 driver.
 """
@@ -18,194 +18,237 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.loads import AbstractLoad, MovingMass
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
-from jaxbeam.integrator.propagators import GAUSS, LONGEST, NODES, norm
-from jaxbeam.integrator.running_peaks import Extremes, fold, nothing_seen
-from jaxbeam.integrator.step import KEPT, advance, contact, undriven
-from jaxbeam.integrator.step_matrices import CHUNK, Path, Rigging, follow, tabulate
-from jaxbeam.model.contact import Traffic
-from jaxbeam.model.modal_model import Rig
+from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
+from jaxbeam.integrator.running_peaks import RunningPeaks, initial_peaks, update_peaks
+from jaxbeam.integrator.step import CHECKPOINT_NAME, advance, advance_unforced, contact_forces
+from jaxbeam.integrator.step_matrices import (
+    CHUNK_STEPS,
+    DiscreteModel,
+    LoadPath,
+    load_path,
+    step_matrices,
+)
+from jaxbeam.model.contact import LoadSet
+from jaxbeam.model.modal_model import ModalModel
 
 # Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
 # a polynomial in each step, misses that mode's oscillation and feeds it.
-RESOLVED = 1.9 * NODES
+MAX_PHASE_PER_STEP = 1.9 * NODE_COUNT
 
 
-def longest_step(rig: Rig, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
+def max_stable_step(model: ModalModel, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
     """Longest step (s) with which these loads on the rig can be integrated without blowing up."""
-    limit = LONGEST / norm(rig)
+    limit = MAX_STEP_NORM / state_matrix_norm(model)
     if any(isinstance(load, MovingMass) for load in loads):
-        fastest = jnp.sqrt(jnp.max(jnp.linalg.eigvalsh(rig.stiffness())))
-        limit = jnp.minimum(limit, RESOLVED / fastest)
+        highest_frequency = jnp.sqrt(jnp.max(jnp.linalg.eigvalsh(model.stiffness())))
+        limit = jnp.minimum(limit, MAX_PHASE_PER_STEP / highest_frequency)
     return jax.lax.stop_gradient(limit)
 
 
-def _driven(driver: AbstractInputPolicy, carry, step):
+def _step_with_inputs(policy: AbstractInputPolicy, carry, step):
     """One step of all lanes under the commands of a driver."""
     state, memory = carry
-    tables, inertia, weight, moment = step
+    matrices, inertia, weight, info = step
 
-    def states(commands):
+    def node_states(commands):
         commands = jax.lax.collapse(commands, 0, 2)
-        forces = contact(tables, inertia, weight, state, commands)
-        inner = tables.inner
-        flat = inner.drift @ state + inner.push @ forces + inner.command @ commands
-        return flat.reshape(len(GAUSS), *state.shape)
+        forces = contact_forces(matrices, inertia, weight, state, commands)
+        node_matrices = matrices.nodes
+        node_values = (
+            node_matrices.transition @ state
+            + node_matrices.force_response @ forces
+            + node_matrices.command_response @ commands
+        )
+        return node_values.reshape(len(GAUSS_NODES), *state.shape)
 
-    given, memory = driver.inputs(memory, state, moment, states)
-    commands = jax.lax.collapse(given, 0, 2)
-    after, (state, forces) = advance(state, (tables, inertia, weight, commands))
+    node_commands, memory = policy.inputs(memory, state, info, node_states)
+    commands = jax.lax.collapse(node_commands, 0, 2)
+    next_state, (state, forces) = advance(state, (matrices, inertia, weight, commands))
     # A loop that diverges ends here, in its own lane, instead of running into overflow.
-    lost = jnp.any(~(jnp.abs(after) <= driver.state_bound[:, None]), axis=0)
-    after = jnp.where(lost, jnp.nan, after)
-    return (after, memory), (state, forces, commands, driver.observe(memory, moment))
+    diverged = jnp.any(~(jnp.abs(next_state) <= policy.state_bound[:, None]), axis=0)
+    next_state = jnp.where(diverged, jnp.nan, next_state)
+    return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
 
 
-def _rows(loads: Float[Array, "load lane"], path: Path) -> Float[Array, "step row lane"]:
+def _values_by_row(
+    values: Float[Array, "load lane"], path: LoadPath
+) -> Float[Array, "step row lane"]:
     """A property of the loads for every row of the contact equations; zero for idle slots."""
-    chosen = jnp.where(path.active[..., None], loads[path.slots], 0.0)
-    return jnp.repeat(chosen, len(GAUSS), axis=1)
+    selected = jnp.where(path.on_beam[..., None], values[path.loads], 0.0)
+    return jnp.repeat(selected, len(GAUSS_NODES), axis=1)
 
 
-def _stepper(rigging: Rigging, traffic: Traffic, slots: int, driver: AbstractInputPolicy | None):
+def _chunk_function(
+    discrete: DiscreteModel, loads: LoadSet, max_loads: int, policy: AbstractInputPolicy | None
+):
     """Function that takes state, memory and extremes through the chunk from a given step on.
 
     It returns them with the time (s) at its end, and with what may be kept of it.
     """
 
-    def chunk(state, memory, best: Any, first):
-        index = first + jnp.arange(CHUNK)
-        path = follow(rigging, traffic, slots, index)
-        tables = tabulate(rigging, path)
-        loads = _rows(traffic.inertia, path), _rows(traffic.weight, path)
-        commands = shown = None
-        if driver is None:
-            state, states, forces = undriven(tables, *loads, state)
+    def chunk(state, memory, running_peaks: Any, first_step):
+        index = first_step + jnp.arange(CHUNK_STEPS)
+        chunk_path = load_path(discrete, loads, max_loads, index)
+        matrices = step_matrices(discrete, chunk_path)
+        inertia_and_weight = (
+            _values_by_row(loads.inertia, chunk_path),
+            _values_by_row(loads.weight, chunk_path),
+        )
+        commands = observed = None
+        if policy is None:
+            state, states, forces = advance_unforced(matrices, *inertia_and_weight, state)
         else:
-            moments = StepInfo(path.start, path.span, rigging.grid.edge(index))
-            (state, memory), (states, forces, commands, shown) = jax.lax.scan(
-                lambda carry, step: _driven(driver, carry, step),
-                (state, memory),
-                (tables, *loads, moments),
+            step_infos = StepInfo(
+                chunk_path.start, chunk_path.length, discrete.grid.event_at(index)
             )
-        if best is not None:
-            best = fold(best, tables, path, states, forces, commands)
-        return state, memory, best, path.start[-1] + path.span[-1], (states, commands, shown)
+            (state, memory), (states, forces, commands, observed) = jax.lax.scan(
+                lambda carry, step: _step_with_inputs(policy, carry, step),
+                (state, memory),
+                (matrices, *inertia_and_weight, step_infos),
+            )
+        if running_peaks is not None:
+            running_peaks = update_peaks(
+                running_peaks, matrices, chunk_path, states, forces, commands
+            )
+        return (
+            state,
+            memory,
+            running_peaks,
+            chunk_path.start[-1] + chunk_path.length[-1],
+            (states, commands, observed),
+        )
 
     return chunk
 
 
-def trace(
-    rigging: Rigging,
-    traffic: Traffic,
+def integrate_history(
+    discrete: DiscreteModel,
+    loads: LoadSet,
     *,
-    slots: int,
+    max_loads: int,
     steps: int,
-    driver: AbstractInputPolicy | None = None,
+    policy: AbstractInputPolicy | None = None,
 ):
     """Integrate from rest over a grid: extremes, states, commands, what is shown, and memory.
 
     States (edge, state, lane) are those at the start of every step and at the end, commands
-    (step, command, lane) those at the nodes of every step, None without a `driver`; what it shows
+    (step, command, lane) those at the nodes of every step, None without a `policy`; what it shows
     is kept for every step, its memory that at the end. Extremes are those at the watched places,
-    None if there are none. `slots` is how many loads may be on the beam at once. Reverse mode
+    None if there are none. `max_loads` is how many loads may be on the beam at once. Reverse mode
     keeps the state and the contact forces of every step, under a driver one state a chunk.
     """
-    chunk = _stepper(rigging, traffic, slots, driver)
-    lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
+    chunk = _chunk_function(discrete, loads, max_loads, policy)
+    batch_size, load_count = loads.inertia.shape[1], len(loads.trajectories)
 
-    def whole(carry, first):
+    def one_chunk(carry, first):
         state, memory, best = carry
         state, memory, best, _, history = chunk(state, memory, best, first)
         return (state, memory, best), history
 
-    best = (
-        None if rigging.watch is None else nothing_seen(rigging.places, loads, lanes, rigging.size)
+    running_peaks = (
+        None
+        if discrete.monitored_transition is None
+        else initial_peaks(discrete.position_count, load_count, batch_size, discrete.magnitude)
     )
-    memory = None if driver is None else driver.start(lanes)
-    rest = jnp.zeros((rigging.rig.states, lanes))
-    firsts = jnp.arange(0, steps, CHUNK)
-    again = jax.checkpoint(whole, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
-    (state, memory, best), history = jax.lax.scan(again, (rest, memory, best), firsts)
+    memory = None if policy is None else policy.start(batch_size)
+    initial_state = jnp.zeros((discrete.model.state_count, batch_size))
+    first_steps = jnp.arange(0, steps, CHUNK_STEPS)
+    checkpointed_chunk = jax.checkpoint(
+        one_chunk, policy=jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
+    )
+    (state, memory, running_peaks), history = jax.lax.scan(
+        checkpointed_chunk, (initial_state, memory, running_peaks), first_steps
+    )
     history = jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2)[:steps], history)
-    states, commands, shown = history
-    return best, jnp.concatenate([states, state[None]]), commands, shown, memory
+    states, commands, observed = history
+    return running_peaks, jnp.concatenate([states, state[None]]), commands, observed, memory
 
 
-def march(
-    rigging: Rigging,
-    traffic: Traffic,
+def integrate_peaks(
+    discrete: DiscreteModel,
+    loads: LoadSet,
     *,
-    slots: int,
-    driver: AbstractInputPolicy | None = None,
-) -> tuple[Extremes, Any]:
+    max_loads: int,
+    policy: AbstractInputPolicy | None = None,
+) -> tuple[RunningPeaks, Any]:
     """Integrate from rest over a grid, keeping only extremes at the watched places.
 
     They are returned with the memory of the driver at the end.
 
     The loop runs as long as it must: it ends early when all lanes are given up, and without a
-    driver when the energy left after the last exit cannot raise any peak. `slots` is how many
+    driver when the energy left after the last exit cannot raise any peak. `max_loads` is how many
     loads may be on the beam at once. Forward mode only.
     """
-    chunk = _stepper(rigging, traffic, slots, driver)
-    grid, stiffness = rigging.grid, rigging.rig.stiffness()
-    size = 2 * stiffness.shape[0]
+    chunk = _chunk_function(discrete, loads, max_loads, policy)
+    grid, stiffness = discrete.grid, discrete.model.stiffness()
+    modal_states = 2 * stiffness.shape[0]
 
-    def more(carry):
+    def unfinished(carry):
         *_, first, going = carry
-        return going & (first < grid.total)
+        return going & (first < grid.step_count)
 
-    def still(state, best, time):
-        left = time >= grid.last_exit
-        place, rate = state[0:size:2], state[1:size:2]
-        energy = jnp.sum(rate**2, axis=0) + jnp.sum(place * (stiffness @ place), axis=0)
-        reach = jnp.sqrt(rigging.flexibility[:, None] * energy)
+    def can_raise_peak(state, running_peaks, time):
+        all_loads_left = time >= grid.last_exit
+        coordinates, rates = state[0:modal_states:2], state[1:modal_states:2]
+        energy = jnp.sum(rates**2, axis=0) + jnp.sum(
+            coordinates * (stiffness @ coordinates), axis=0
+        )
+        deflection_bound = jnp.sqrt(discrete.flexibility[:, None] * energy)
         # A run that has blown up has nothing more to show.
-        over = jnp.all((reach < best.score) | ~jnp.isfinite(energy))
-        return ~(left & over)
+        settled = jnp.all((deflection_bound < running_peaks.estimate) | ~jnp.isfinite(energy))
+        return ~(all_loads_left & settled)
 
-    def go(carry):
-        state, memory, best, first, _ = carry
-        state, memory, best, time, _ = chunk(state, memory, best, first)
-        first = first + CHUNK
-        going = jnp.any(best.sound) if driver is not None else still(state, best, time)
-        return state, memory, best, first, going
+    def next_chunk(carry):
+        state, memory, best, first_step, _ = carry
+        state, memory, best, time, _ = chunk(state, memory, best, first_step)
+        first_step = first_step + CHUNK_STEPS
+        continues = (
+            jnp.any(best.finite) if policy is not None else can_raise_peak(state, best, time)
+        )
+        return state, memory, best, first_step, continues
 
-    lanes, loads = traffic.inertia.shape[1], len(traffic.motions)
-    best = nothing_seen(rigging.places, loads, lanes, rigging.size)
-    memory = None if driver is None else driver.start(lanes)
+    batch_size, load_count = loads.inertia.shape[1], len(loads.trajectories)
+    running_peaks = initial_peaks(
+        discrete.position_count, load_count, batch_size, discrete.magnitude
+    )
+    memory = None if policy is None else policy.start(batch_size)
     start = (
-        jnp.zeros((rigging.rig.states, lanes)),
+        jnp.zeros((discrete.model.state_count, batch_size)),
         memory,
-        best,
+        running_peaks,
         jnp.zeros((), int),
         jnp.ones((), bool),
     )
-    ended: Any = jax.lax.while_loop(more, go, start)
-    return ended[2], ended[1]
+    final: Any = jax.lax.while_loop(unfinished, next_chunk, start)
+    return final[2], final[1]
 
 
-def at_edges(
-    rigging: Rigging, traffic: Traffic, *, slots: int, driver: AbstractInputPolicy | None = None
+def integrate_at_events(
+    discrete: DiscreteModel,
+    loads: LoadSet,
+    *,
+    max_loads: int,
+    policy: AbstractInputPolicy | None = None,
 ) -> Float[Array, "edge state lane"]:
     """Integrate from rest over a grid, keeping only the states at the edges of its schedule.
 
     The number of steps between these need not be known when this is compiled. The state at the
     last edge is left out, zero, unless a driver acts there. Forward mode only.
     """
-    chunk = _stepper(rigging, traffic, slots, driver)
-    grid = rigging.grid
+    chunk = _chunk_function(discrete, loads, max_loads, policy)
+    grid = discrete.grid
 
-    def go(carry):
-        state, memory, kept, first = carry
-        edge = grid.edge(first + jnp.arange(CHUNK))
-        state, memory, _, _, (states, *_) = chunk(state, memory, None, first)
-        kept = kept.at[jnp.where(edge < 0, kept.shape[0], edge)].set(states, mode="drop")
-        return state, memory, kept, first + CHUNK
+    def next_chunk(carry):
+        state, memory, kept, first_step = carry
+        event = grid.event_at(first_step + jnp.arange(CHUNK_STEPS))
+        state, memory, _, _, (states, *_) = chunk(state, memory, None, first_step)
+        kept = kept.at[jnp.where(event < 0, kept.shape[0], event)].set(states, mode="drop")
+        return state, memory, kept, first_step + CHUNK_STEPS
 
-    lanes = traffic.inertia.shape[1]
-    rest = jnp.zeros((rigging.rig.states, lanes))
-    memory = None if driver is None else driver.start(lanes)
-    kept = jnp.zeros((grid.place.shape[0], *rest.shape))
-    start = rest, memory, kept, jnp.zeros((), int)
-    ended: Any = jax.lax.while_loop(lambda carry: carry[3] < grid.total, go, start)
-    return ended[2]
+    batch_size = loads.inertia.shape[1]
+    initial_state = jnp.zeros((discrete.model.state_count, batch_size))
+    memory = None if policy is None else policy.start(batch_size)
+    event_states = jnp.zeros((grid.event_panels.shape[0], *initial_state.shape))
+    start = initial_state, memory, event_states, jnp.zeros((), int)
+    final: Any = jax.lax.while_loop(lambda carry: carry[3] < grid.step_count, next_chunk, start)
+    return final[2]

@@ -17,13 +17,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.integrate import march as plain_march
-from jaxbeam.integrator.propagators import DOUBLINGS, GAUSS, LOOKED, NODES, TERMS, lagrange
-from jaxbeam.integrator.running_peaks import NEAR, Found
-from jaxbeam.integrator.step_matrices import CHUNK, make_rigging
-from jaxbeam.integrator.time_grid import Grid
-from jaxbeam.model.contact import Traffic
-from jaxbeam.model.modal_model import Rig
+from jaxbeam.integrator.integrate import integrate_peaks as plain_march
+from jaxbeam.integrator.propagators import (
+    DOUBLINGS,
+    GAUSS_NODES,
+    NODE_COUNT,
+    PEAK_NODES,
+    TAYLOR_TERMS,
+    lagrange_coefficients,
+)
+from jaxbeam.integrator.running_peaks import PEAK_MARGIN, Peaks
+from jaxbeam.integrator.step_matrices import CHUNK_STEPS, discrete_model
+from jaxbeam.integrator.time_grid import TimeGrid
+from jaxbeam.model.contact import LoadSet
+from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.peak_search import (
     ESTIMATE_ITERATIONS,
     NEWTON_ITERATIONS,
@@ -37,14 +44,15 @@ from jaxbeam.runtime.native_library import Library
 PADDING = 8  # numbers that fill whole vector registers of any machine
 C_CONSTANTS = {
     "FILL": PADDING,
-    "STEPS": CHUNK,
-    "NODES": NODES,
-    "TERMS": TERMS,
+    "STEPS": CHUNK_STEPS,
+    "NODES": NODE_COUNT,
+    "TERMS": TAYLOR_TERMS,
     "DOUBLINGS": DOUBLINGS,
-    "POINTS": len(LOOKED),
-    "NEAR": NEAR,
-    "BESIDE_END": (NEAR - 1) * float(np.diff(LOOKED)[0] / np.diff(LOOKED).max()) ** 2,
-    "REACH": newton_step_limit(LOOKED),
+    "POINTS": len(PEAK_NODES),
+    "NEAR": PEAK_MARGIN,
+    "BESIDE_END": (PEAK_MARGIN - 1)
+    * float(np.diff(PEAK_NODES)[0] / np.diff(PEAK_NODES).max()) ** 2,
+    "REACH": newton_step_limit(PEAK_NODES),
     "ROUNDS": ESTIMATE_ITERATIONS,
     "STARTS": START_POINTS,
     "CLIMBS": NEWTON_ITERATIONS,
@@ -94,11 +102,11 @@ def available() -> bool:
 def integrate_peaks(
     max_loads: int,
     mask: Bool[Array, " task"],
-    models: Rig,
-    grids: Grid,
+    models: ModalModel,
+    grids: TimeGrid,
     positions: Float[Array, "task place"],
-    loads: Traffic,
-) -> Found:
+    loads: LoadSet,
+) -> Peaks:
     """What is found of tasks that C integrates one after the other, if it is `available`.
 
     All have tasks as the first axis; a single rig is that of all. Grids are those of `even_grid`,
@@ -107,18 +115,24 @@ def integrate_peaks(
     wanted come out as at rest.
     """
     shapes = models.modes.series
-    if models.mixing is not None:
-        shapes = shapes @ models.mixing[:, None]
+    if models.mode_map is not None:
+        shapes = shapes @ models.mode_map[:, None]
     numbers = (
-        np.asarray(GAUSS),
-        lagrange(),
-        interpolation_matrix(LOOKED)[: len(LOOKED)].T,
-        np.asarray(LOOKED),
+        np.asarray(GAUSS_NODES),
+        lagrange_coefficients(),
+        interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T,
+        np.asarray(PEAK_NODES),
     )
     arguments = (
         *(mask, models.state_matrix, models.modes.nodes, shapes),
-        *(grids.edges, grids.counts, grids.lengths, grids.active, grids.windows),
-        *(*jax.vmap(Traffic.pieces)(loads), loads.inertia, loads.weight, positions),
+        *(
+            grids.boundaries,
+            grids.counts,
+            grids.lengths,
+            grids.loads_on_beam,
+            grids.on_beam_intervals,
+        ),
+        *(*jax.vmap(LoadSet.cubics)(loads), loads.inertia, loads.weight, positions),
         *(part[None] for part in numbers),
     )
     tasks, load_count, batch_size = loads.inertia.shape
@@ -137,7 +151,7 @@ def integrate_peaks(
         [jax.ShapeDtypeStruct(shape, float) for shape in (*results, (workspace_size(*sizes),))],
         vmap_method="sequential",
     )
-    return Found(*call(*arguments, slots=np.int64(max_loads))[:-1])
+    return Peaks(*call(*arguments, slots=np.int64(max_loads))[:-1])
 
 
 @integrate_peaks.defjvp
@@ -146,8 +160,8 @@ def _integrate_peaks_jvp(max_loads, primals, tangents):
 
     def jax_peaks(mask, models, *rest):
         def task(model, grid, positions, loads):
-            discrete_model = make_rigging(model, grid, positions)
-            return plain_march(discrete_model, loads, slots=max_loads)[0].found()
+            discrete = discrete_model(model, grid, positions)
+            return plain_march(discrete, loads, max_loads=max_loads)[0].peaks()
 
         tasks = mask.shape[0]
         models = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape[1:])), models)

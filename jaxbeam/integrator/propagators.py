@@ -20,45 +20,45 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.model.modal_model import Rig
+from jaxbeam.model.modal_model import ModalModel
 
-NODES = 6  # Gauss nodes a step; the integrator is of order 12
+NODE_COUNT = 6  # Gauss nodes a step; the integrator is of order 12
 DOUBLINGS = 7
-TERMS = 14
-LONGEST = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is right to rounding
+TAYLOR_TERMS = 14
+MAX_STEP_NORM = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is right to rounding
 
-GAUSS = (np.polynomial.legendre.leggauss(NODES)[0] + 1) / 2
+GAUSS_NODES = (np.polynomial.legendre.leggauss(NODE_COUNT)[0] + 1) / 2
 # Where in a step the deflection is looked at for its peak: the ends, and the nodes, of which the
 # propagators are needed anyway. Curves through these wiggle less than those through equal points.
-LOOKED = (0.0, *(float(node) for node in GAUSS), 1.0)
+PEAK_NODES = (0.0, *(float(node) for node in GAUSS_NODES), 1.0)
 
 
-class Step(eqx.Module):
+class Propagators(eqx.Module):
     """Propagators over steps of given lengths: at the Gauss nodes, and at the end.
 
     `drift_*` take the state at the start, `push_*` the inputs at the Gauss nodes; in the blocks of
     the rig.
     """
 
-    drift_nodes: Float[Array, "*length node block side side"]
-    push_nodes: Float[Array, "*length node force block side input"]
-    drift_end: Float[Array, "*length block side side"]
-    push_end: Float[Array, "*length force block side input"]
+    transition_nodes: Float[Array, "*length node block side side"]
+    input_nodes: Float[Array, "*length node force block side input"]
+    transition_end: Float[Array, "*length block side side"]
+    input_end: Float[Array, "*length force block side input"]
 
 
 @functools.cache
-def lagrange() -> np.ndarray:
+def lagrange_coefficients() -> np.ndarray:
     """Monomial coefficients (node, power) of the Lagrange polynomials through the Gauss nodes."""
     polynomials = []
-    for k, node in enumerate(GAUSS):
-        others = np.delete(GAUSS, k)
+    for k, node in enumerate(GAUSS_NODES):
+        others = np.delete(GAUSS_NODES, k)
         polynomials.append(np.polynomial.polynomial.polyfromroots(others) / np.prod(node - others))
     return np.array(polynomials)
 
 
-def at_ends() -> np.ndarray:
+def end_weights() -> np.ndarray:
     """Weights (node, end) of the values at the Gauss nodes for those at start and end of a step."""
-    coefficients = lagrange()
+    coefficients = lagrange_coefficients()
     return np.stack([coefficients[:, 0], coefficients.sum(axis=1)], axis=1)
 
 
@@ -69,93 +69,107 @@ def _multiply(a, b):
     return sum(a[:, i, None] * b[None, i] for i in range(a.shape[1]))
 
 
-def norm(rig: Rig) -> Float[Array, ""]:
-    """Norm of the balanced state matrix in 1/s: steps must be shorter than `LONGEST` over it."""
-    balance = _balance(rig)
-    matrix = rig.state_matrix * balance[:, :, None] / balance[:, None, :]
+def state_matrix_norm(model: ModalModel) -> Float[Array, ""]:
+    """Norm of the balanced state matrix in 1/s: steps must be shorter than `MAX_STEP_NORM` over it."""
+    balance = _state_scaling(model)
+    matrix = model.state_matrix * balance[:, :, None] / balance[:, None, :]
     return jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=-1)))
 
 
-def _balance(rig: Rig):
+def _state_scaling(model: ModalModel):
     """Scale of the states (block, side) that gives deflections and speeds of modes equal size."""
-    blocks, side, _ = rig.state_matrix.shape
-    each = rig.modes_per_block
-    modes = np.arange(each)
-    square = jnp.abs(rig.state_matrix[:, 2 * modes + 1, 2 * modes])
+    blocks, side, _ = model.state_matrix.shape
+    modes_per_block = model.modes_per_block
+    modes = np.arange(modes_per_block)
+    square = jnp.abs(model.state_matrix[:, 2 * modes + 1, 2 * modes])
     scale = jnp.ones((blocks, side)).at[:, 2 * modes].set(jnp.sqrt(1.0 + square))
     return jax.lax.stop_gradient(scale)
 
 
 @jax.named_scope("propagators")
-def propagators(rig: Rig, lengths: Float[Array, " *length"], driven: bool = False) -> Step:
+def propagators(
+    model: ModalModel, lengths: Float[Array, " *length"], with_commands: bool = False
+) -> Propagators:
     """Propagators of the rig over steps of the given lengths (s), zero included.
 
-    Inputs are the forces on the modes, and after them, if the rig is `driven`, the commands.
+    Inputs are the forces on the modes, and after them, if the rig is `with_commands`, the commands.
     """
-    balance = _balance(rig)
-    blocks, side, _ = rig.state_matrix.shape
-    each = rig.modes_per_block
-    matrix = rig.state_matrix * balance[:, :, None] / balance[:, None, :]
-    force = jnp.eye(side)[:, 1 : 2 * each : 2]
-    if driven:
-        force = jnp.concatenate([force, rig.command_matrix], axis=1)
-    fractions = np.append(GAUSS, 1.0)
-    spans = lengths[..., None] * fractions
+    state_scale = _state_scaling(model)
+    blocks, side, _ = model.state_matrix.shape
+    modes_per_block = model.modes_per_block
+    matrix = model.state_matrix * state_scale[:, :, None] / state_scale[:, None, :]
+    input_matrix = jnp.eye(side)[:, 1 : 2 * modes_per_block : 2]
+    if with_commands:
+        input_matrix = jnp.concatenate([input_matrix, model.command_matrix], axis=1)
+    fractions = np.append(GAUSS_NODES, 1.0)
+    durations = lengths[..., None] * fractions
     # Blocks and spans are the last axes, along which processors compute many at a time.
-    x = jnp.moveaxis(matrix, 0, -1)[..., None] * spans.ravel() / 2**DOUBLINGS
-    drift, pushes = _series(x, force)
-    (drift, pushes), _ = jax.lax.scan(_double, (drift, pushes), length=DOUBLINGS)
-    pushes = pushes * spans.ravel()
-    drift, pushes = (part.reshape(*part.shape[:-1], *spans.shape) for part in (drift, pushes))
-    powers = np.arange(NODES)
-    weights = lagrange() * np.array([math.factorial(p) for p in powers])  # force, power
+    x = jnp.moveaxis(matrix, 0, -1)[..., None] * durations.ravel() / 2**DOUBLINGS
+    transition, phi_functions = _taylor_series(x, input_matrix)
+    (transition, phi_functions), _ = jax.lax.scan(
+        _double_argument, (transition, phi_functions), length=DOUBLINGS
+    )
+    phi_functions = phi_functions * durations.ravel()
+    transition, phi_functions = (
+        part.reshape(*part.shape[:-1], *durations.shape) for part in (transition, phi_functions)
+    )
+    powers = np.arange(NODE_COUNT)
+    weights = lagrange_coefficients() * np.array(
+        [math.factorial(p) for p in powers]
+    )  # force, power
     weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
-    push = jnp.einsum("cfp,psmb...c->...cfbsm", weights, pushes)
-    drift = jnp.einsum("stb...c->...cbst", drift)
+    inputs = jnp.einsum("cfp,psmb...c->...cfbsm", weights, phi_functions)
+    transition = jnp.einsum("stb...c->...cbst", transition)
     # Inputs act on speeds and actuators' own states, which the balance leaves as they are.
-    push = push / balance[:, :, None]
-    drift = drift * balance[:, None, :] / balance[:, :, None]
-    return Step(
-        drift_nodes=drift[..., :NODES, :, :, :],
-        push_nodes=push[..., :NODES, :, :, :, :],
-        drift_end=drift[..., NODES, :, :, :],
-        push_end=push[..., NODES, :, :, :, :],
+    inputs = inputs / state_scale[:, :, None]
+    transition = transition * state_scale[:, None, :] / state_scale[:, :, None]
+    return Propagators(
+        transition_nodes=transition[..., :NODE_COUNT, :, :, :],
+        input_nodes=inputs[..., :NODE_COUNT, :, :, :, :],
+        transition_end=transition[..., NODE_COUNT, :, :, :],
+        input_end=inputs[..., NODE_COUNT, :, :, :, :],
     )
 
 
-def _series(x, force):
+def _taylor_series(x, input_matrix):
     """exp(x), and phi_1 ... phi_NODES of x times the force matrix (phi, ...), for small x."""
-    side, inputs = force.shape
+    side, inputs = input_matrix.shape
     rest = x.shape[2:]
     # Side by side, as they are summed alike; only what the terms are divided by differs.
-    both = jnp.concatenate([jnp.eye(side), force], axis=1).reshape(side, -1, *(1,) * len(rest))
-    both = jnp.broadcast_to(both, (side, side + inputs, *rest))
-    ahead = np.repeat([0, NODES], [side, inputs]).reshape(-1, *(1,) * len(rest))
+    starting_terms = jnp.concatenate([jnp.eye(side), input_matrix], axis=1).reshape(
+        side, -1, *(1,) * len(rest)
+    )
+    starting_terms = jnp.broadcast_to(starting_terms, (side, side + inputs, *rest))
+    divisor_offset = np.repeat([0, NODE_COUNT], [side, inputs]).reshape(-1, *(1,) * len(rest))
 
     def horner(sums, term):
-        return both + _multiply(x, sums) / (term + ahead), None
+        return starting_terms + _multiply(x, sums) / (term + divisor_offset), None
 
-    sums, _ = jax.lax.scan(horner, both, np.arange(TERMS, 0, -1.0))
-    drift, top, force = sums[:, :side], sums[:, side:], both[:, side:]
-    pushes = [top / math.factorial(NODES)]
-    for p in range(NODES - 1, 0, -1):
-        pushes.insert(0, force / math.factorial(p) + _multiply(x, pushes[0]))
-    return drift, jnp.stack(pushes)
+    sums, _ = jax.lax.scan(horner, starting_terms, np.arange(TAYLOR_TERMS, 0, -1.0))
+    transition, highest_phi, input_matrix = sums[:, :side], sums[:, side:], starting_terms[:, side:]
+    phi_functions = [highest_phi / math.factorial(NODE_COUNT)]
+    for p in range(NODE_COUNT - 1, 0, -1):
+        phi_functions.insert(0, input_matrix / math.factorial(p) + _multiply(x, phi_functions[0]))
+    return transition, jnp.stack(phi_functions)
 
 
-def _double(functions, _):
+def _double_argument(functions, _):
     """The same functions of twice the argument."""
-    drift, pushes = functions
-    ahead = jax.vmap(functools.partial(_multiply, drift))(pushes)
+    transition, phi_functions = functions
+    propagated = jax.vmap(functools.partial(_multiply, transition))(phi_functions)
     # Spelt out: as a product over the first axis it would be copied to and fro.
-    weights = _doubling().T.reshape(NODES, NODES, *(1,) * drift.ndim)
-    doubled = ahead + sum(weight * push for weight, push in zip(weights, pushes, strict=True))
-    halves = 0.5 ** np.arange(1, NODES + 1).reshape(NODES, *(1,) * drift.ndim)
-    return (_multiply(drift, drift), doubled * halves), None
+    weights = _doubling_weights().T.reshape(NODE_COUNT, NODE_COUNT, *(1,) * transition.ndim)
+    doubled = propagated + sum(
+        weight * push for weight, push in zip(weights, phi_functions, strict=True)
+    )
+    powers_of_half = 0.5 ** np.arange(1, NODE_COUNT + 1).reshape(
+        NODE_COUNT, *(1,) * transition.ndim
+    )
+    return (_multiply(transition, transition), doubled * powers_of_half), None
 
 
 @functools.cache
-def _doubling() -> np.ndarray:
+def _doubling_weights() -> np.ndarray:
     """Weights 1 / (p - l)! of phi_l in phi_p of the doubled argument."""
-    rows = range(1, NODES + 1)
+    rows = range(1, NODE_COUNT + 1)
     return np.array([[1 / math.factorial(p - q) if q <= p else 0.0 for q in rows] for p in rows])

@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.integrator.propagators import GAUSS, LOOKED
-from jaxbeam.integrator.step_matrices import Path, Tables
+from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
+from jaxbeam.integrator.step_matrices import LoadPath, StepMatrices
 from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
 
-NEAR = 1.1  # a peak between samples is less than this above the highest of them
+PEAK_MARGIN = 1.1  # a peak between samples is less than this above the highest of them
 
 
-class Found(NamedTuple):
+class Peaks(NamedTuple):
     """Results of runs: peaks (m) and when they are (s), contact forces (N) and their loss (s).
 
     NaN where a run failed, and for contact that is never lost.
@@ -29,95 +29,114 @@ class Found(NamedTuple):
     contact_lost_time: Float[Array, "*task lane load"]
 
 
-class Extremes(eqx.Module):
+class RunningPeaks(eqx.Module):
     """What is kept of a run.
 
-    `samples` are the deflections at the points looked at in the step with the largest `size` of
-    deflection of each watched place, `start` (s) and `span` (s) that step. Contact forces are those
-    with which a load presses on the beam; `lost` (s) is the first time it would have to pull.
+    `samples` are the deflections at the points looked at in the step with the largest `magnitude` of
+    deflection of each watched place, `step_start` (s) and `step_length` (s) that step. Contact forces are those
+    with which a load presses on the beam; `contact_lost_time` (s) is the first time it would have to pull.
     """
 
-    score: Float[Array, "sensor lane"]
+    estimate: Float[Array, "sensor lane"]
     samples: Float[Array, "point sensor lane"]
-    start: Float[Array, "sensor lane"]
-    span: Float[Array, "sensor lane"]
-    lowest: Float[Array, "load lane"]
-    lost: Float[Array, "load lane"]
-    sound: Bool[Array, " lane"]
-    size: Callable = eqx.field(static=True)
+    step_start: Float[Array, "sensor lane"]
+    step_length: Float[Array, "sensor lane"]
+    lowest_contact_force: Float[Array, "load lane"]
+    contact_lost_time: Float[Array, "load lane"]
+    finite: Bool[Array, " lane"]
+    magnitude: Callable = eqx.field(static=True)
 
-    def peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
+    def refined_peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
         """Largest size of deflection (m) of each watched place, and when (s); NaN if not sound."""
-        value, place = refine_peak(self.samples, LOOKED, self.size)
-        time = self.start + place * self.span
-        return jnp.where(self.sound, value, jnp.nan), jnp.where(self.sound, time, jnp.nan)
+        value, position = refine_peak(self.samples, PEAK_NODES, self.magnitude)
+        time = self.step_start + position * self.step_length
+        return jnp.where(self.finite, value, jnp.nan), jnp.where(self.finite, time, jnp.nan)
 
-    def found(self) -> Found:
+    def peaks(self) -> Peaks:
         """All that is known at the end, with lanes first."""
-        lost = jnp.where(self.lost < NEVER, self.lost, jnp.nan)
-        return Found(*(part.T for part in (*self.peak(), self.lowest, lost)))
+        lost = jnp.where(self.contact_lost_time < NEVER, self.contact_lost_time, jnp.nan)
+        return Peaks(*(part.T for part in (*self.refined_peak(), self.lowest_contact_force, lost)))
 
 
 @jax.named_scope("extremes")
-def fold(best: Extremes, tables: Tables, path: Path, states, forces, commands) -> Extremes:
+def update_peaks(
+    running_peaks: RunningPeaks, matrices: StepMatrices, path: LoadPath, states, forces, commands
+) -> RunningPeaks:
     """Extremes of the run so far, from those up to a chunk of steps and the chunk itself."""
-    steps, lanes = states.shape[0], states.shape[-1]
-    start, span = path.start, path.span
+    steps, batch_size = states.shape[0], states.shape[-1]
+    start, length = path.start, path.length
     parts = (states, forces) if commands is None else (states, forces, commands)
-    seen = tables.watch @ jnp.concatenate(parts, axis=1)
-    samples = jax.lax.optimization_barrier(seen.reshape(steps, len(LOOKED), -1, lanes))
+    deflections = matrices.monitored @ jnp.concatenate(parts, axis=1)
+    samples = jax.lax.optimization_barrier(
+        deflections.reshape(steps, len(PEAK_NODES), -1, batch_size)
+    )
 
-    def raised(best):
-        score = jax.lax.optimization_barrier(
-            jax.vmap(lambda step: estimate_peak(step, LOOKED, best.size))(samples)
+    def updated(best):
+        estimate = jax.lax.optimization_barrier(
+            jax.vmap(lambda step: estimate_peak(step, PEAK_NODES, best.magnitude))(samples)
         )
-        best_score, top = max_with_ties(score)
-        top = jnp.max(jnp.where(top, np.arange(steps)[:, None, None], 0), axis=0)
-        better = best_score > best.score
-        chosen = jnp.take_along_axis(samples, top[None, None], axis=0)[0]
-        return Extremes(
-            jnp.where(better, best_score, best.score),
+        best_estimate, peak_step = max_with_ties(estimate)
+        peak_step = jnp.max(jnp.where(peak_step, np.arange(steps)[:, None, None], 0), axis=0)
+        better = best_estimate > best.estimate
+        chosen = jnp.take_along_axis(samples, peak_step[None, None], axis=0)[0]
+        return RunningPeaks(
+            jnp.where(better, best_estimate, best.estimate),
             jnp.where(better, chosen, best.samples),
-            jnp.where(better, start[top], best.start),
-            jnp.where(better, span[top], best.span),
-            best.lowest,
-            best.lost,
-            best.sound,
-            best.size,
+            jnp.where(better, start[peak_step], best.step_start),
+            jnp.where(better, length[peak_step], best.step_length),
+            best.lowest_contact_force,
+            best.contact_lost_time,
+            best.finite,
+            best.magnitude,
         )
 
     # Most chunks come nowhere near the peak so far, or press all along: they end here.
     largest = jnp.max(jnp.abs(samples), axis=(0, 1))
-    best = jax.lax.cond(jnp.any(largest * NEAR > best.score), raised, lambda best: best, best)
-    pressing = jnp.min(-forces.reshape(steps, -1, len(GAUSS), lanes), axis=2)
+    running_peaks = jax.lax.cond(
+        jnp.any(largest * PEAK_MARGIN > running_peaks.estimate),
+        updated,
+        lambda best: best,
+        running_peaks,
+    )
+    least_of_step = jnp.min(-forces.reshape(steps, -1, len(GAUSS_NODES), batch_size), axis=2)
     # A load that is not on the beam, or has no slot, does not count.
-    here = (path.slots[:, :, None] == np.arange(best.lowest.shape[0])) & path.active[..., None]
-    least = jnp.where(here[..., None], pressing[:, :, None], jnp.inf)
-    lowest = jnp.minimum(best.lowest, jnp.min(least, axis=(0, 1), initial=jnp.inf))
+    is_load = (
+        path.loads[:, :, None] == np.arange(running_peaks.lowest_contact_force.shape[0])
+    ) & path.on_beam[..., None]
+    least_of_load = jnp.where(is_load[..., None], least_of_step[:, :, None], jnp.inf)
+    lowest_force = jnp.minimum(
+        running_peaks.lowest_contact_force, jnp.min(least_of_load, axis=(0, 1), initial=jnp.inf)
+    )
 
-    def lost(first):
-        pulls = -forces.reshape(steps, -1, 1, len(GAUSS), lanes) < 0
-        times = (start[:, None] + span[:, None] * jnp.asarray(GAUSS, span.dtype))[
+    def first_loss(earlier):
+        pulls = -forces.reshape(steps, -1, 1, len(GAUSS_NODES), batch_size) < 0
+        times = (start[:, None] + length[:, None] * jnp.asarray(GAUSS_NODES, length.dtype))[
             :, None, None, :, None
         ]
-        when = jnp.where(pulls & here[..., None, None], times, NEVER)
-        return jnp.minimum(first, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
+        when = jnp.where(pulls & is_load[..., None, None], times, NEVER)
+        return jnp.minimum(earlier, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
 
-    first = jax.lax.cond(jnp.any(lowest < 0), lost, lambda first: first, best.lost)
-    sound = best.sound & jnp.all(jnp.isfinite(largest), axis=0)
-    return eqx.tree_at(lambda b: (b.lowest, b.lost, b.sound), best, (lowest, first, sound))
+    contact_lost_time = jax.lax.cond(
+        jnp.any(lowest_force < 0), first_loss, lambda first: first, running_peaks.contact_lost_time
+    )
+    finite = running_peaks.finite & jnp.all(jnp.isfinite(largest), axis=0)
+    return eqx.tree_at(
+        lambda b: (b.lowest_contact_force, b.contact_lost_time, b.finite),
+        running_peaks,
+        (lowest_force, contact_lost_time, finite),
+    )
 
 
-def nothing_seen(places: int, loads: int, lanes: int, size: Callable) -> Extremes:
+def initial_peaks(positions: int, loads: int, batch_size: int, magnitude: Callable) -> RunningPeaks:
     """Extremes of a run that has not begun, by some size of deflection that is zero at rest."""
-    nothing = jnp.zeros((places, lanes))
-    return Extremes(
-        nothing,
-        jnp.zeros((len(LOOKED), places, lanes)),
-        nothing,
-        nothing,
-        jnp.full((loads, lanes), jnp.inf),
-        jnp.full((loads, lanes), NEVER),
-        jnp.ones(lanes, bool),
-        size,
+    zeros = jnp.zeros((positions, batch_size))
+    return RunningPeaks(
+        zeros,
+        jnp.zeros((len(PEAK_NODES), positions, batch_size)),
+        zeros,
+        zeros,
+        jnp.full((loads, batch_size), jnp.inf),
+        jnp.full((loads, batch_size), NEVER),
+        jnp.ones(batch_size, bool),
+        magnitude,
     )

@@ -18,260 +18,298 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
-from jaxbeam.integrator.propagators import GAUSS, LOOKED, Step, propagators
-from jaxbeam.integrator.time_grid import Grid
-from jaxbeam.model.contact import Traffic, contact_rows
-from jaxbeam.model.modal_model import Rig
+from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES, Propagators, propagators
+from jaxbeam.integrator.time_grid import TimeGrid
+from jaxbeam.model.contact import LoadSet, contact_rows
+from jaxbeam.model.modal_model import ModalModel
 
-CHUNK = 16  # steps that are tabulated at once
+CHUNK_STEPS = 16  # steps that are tabulated at once
 
 
-class CommandTables(eqx.Module):
+class CommandMatrices(eqx.Module):
     """How commands at the nodes act: on the contact law, and on the state at the end."""
 
-    respond: Float[Array, "step row command"]
-    push: Float[Array, "step state command"]
+    contact_response: Float[Array, "step row command"]
+    input_matrix: Float[Array, "step state command"]
 
 
-class InnerTables(eqx.Module):
+class NodeMatrices(eqx.Module):
     """The states at the nodes, from the state at the start, contact forces and commands."""
 
-    drift: Float[Array, "step inner state"]
-    push: Float[Array, "step inner row"]
-    command: Float[Array, "step inner command"]
+    transition: Float[Array, "step inner state"]
+    force_response: Float[Array, "step inner row"]
+    command_response: Float[Array, "step inner command"]
 
 
-class Tables(eqx.Module):
+class StepMatrices(eqx.Module):
     """Matrices of each step of a chunk. Rows are (slot, node), commands (node, actuator).
 
     What is watched follows from state at the start, contact forces and commands, one after the
     other. Steps are active with a load on the beam.
     """
 
-    respond: Float[Array, "step row state"]
-    gains: Float[Array, "step row row"]
-    drift: Float[Array, "step block side side"]
-    push: Float[Array, "step state row"]
-    watch: Float[Array, "step looked all"] | None
-    commands: CommandTables | None
-    inner: InnerTables | None
-    active: Bool[Array, " step"]
+    contact_response: Float[Array, "step row state"]
+    contact_compliance: Float[Array, "step row row"]
+    transition: Float[Array, "step block side side"]
+    force_response: Float[Array, "step state row"]
+    monitored: Float[Array, "step looked all"] | None
+    commands: CommandMatrices | None
+    nodes: NodeMatrices | None
+    loaded: Bool[Array, " step"]
 
 
-class Rigging(eqx.Module):
+class DiscreteModel(eqx.Module):
     """A rig on a grid: its propagators, and the rows that give the watched deflections.
 
     `flexibility` is the static deflection at each watched place under a unit force there, which
-    bounds the deflection by the energy. `inner` asks for the states at the nodes too. `size` is
-    what makes a watched deflection large; see `both_sides`.
+    bounds the deflection by the energy. `with_node_states` asks for the states at the nodes too. `magnitude` is
+    what makes a watched deflection large; see `signed_both_ways`.
     """
 
-    rig: Rig
-    grid: Grid
-    step: Step
-    watch: Float[Array, "length looked block side"] | None
-    watch_push: Float[Array, "length looked force block input"] | None
+    model: ModalModel
+    grid: TimeGrid
+    propagators: Propagators
+    monitored_transition: Float[Array, "length looked block side"] | None
+    monitored_input: Float[Array, "length looked force block input"] | None
     flexibility: Float[Array, " place"] | None
-    commands: Float[Array, "mode actuator"] | None
-    inner: bool = eqx.field(static=True)
-    size: Callable = eqx.field(static=True, default=abs)
+    modal_command_matrix: Float[Array, "mode actuator"] | None
+    with_node_states: bool = eqx.field(static=True)
+    magnitude: Callable = eqx.field(static=True, default=abs)
 
     @property
-    def places(self) -> int:
+    def position_count(self) -> int:
         """How many places are watched."""
         return 0 if self.flexibility is None else self.flexibility.shape[0]
 
 
-def make_rigging(
-    rig: Rig,
-    grid: Grid,
-    watched: Float[Array, " place"] | None,
-    driver: AbstractInputPolicy | None = None,
-) -> Rigging:
+def discrete_model(
+    model: ModalModel,
+    grid: TimeGrid,
+    positions: Float[Array, " place"] | None,
+    policy: AbstractInputPolicy | None = None,
+) -> DiscreteModel:
     """Propagators for all step lengths of a grid; deflections are watched at some places (m)."""
-    driven = driver is not None
-    inner = driver is not None and driver.implicit
-    step = propagators(rig, grid.lengths, driven)
-    each = rig.modes_per_block
-    commands = rig.command_matrix[1 : 2 * each : 2] if driven else None
-    if watched is None:
-        return Rigging(rig, grid, step, None, None, None, commands, inner)
-    blocks = rig.state_matrix.shape[0]
-    shapes = rig.shapes(watched, (0,))[0]
-    rows = shapes.reshape(-1, blocks, each)
-    drifts, pushes = _looked(step, np.arange(0, 2 * each, 2))
-    watch = jnp.einsum("wbm,lpbmj->lpwbj", rows, drifts)
-    push = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, pushes)
-    flat = (grid.lengths.shape[0], -1)
-    return Rigging(
-        rig,
+    with_commands = policy is not None
+    with_node_states = policy is not None and policy.implicit
+    step_propagators = propagators(model, grid.lengths, with_commands)
+    modes_per_block = model.modes_per_block
+    commands = model.command_matrix[1 : 2 * modes_per_block : 2] if with_commands else None
+    if positions is None:
+        return DiscreteModel(
+            model, grid, step_propagators, None, None, None, commands, with_node_states
+        )
+    blocks = model.state_matrix.shape[0]
+    shapes = model.shapes(positions, (0,))[0]
+    rows = shapes.reshape(-1, blocks, modes_per_block)
+    transitions, force_responses = _peak_node_rows(
+        step_propagators, np.arange(0, 2 * modes_per_block, 2)
+    )
+    deflection_transition = jnp.einsum("wbm,lpbmj->lpwbj", rows, transitions)
+    deflection_force_response = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, force_responses)
+    flat_shape = (grid.lengths.shape[0], -1)
+    return DiscreteModel(
+        model,
         grid,
-        step,
-        watch.reshape(*flat, *watch.shape[3:]),
-        push.reshape(*flat, *push.shape[3:]),
-        _flexibility(rig, shapes),
+        step_propagators,
+        deflection_transition.reshape(*flat_shape, *deflection_transition.shape[3:]),
+        deflection_force_response.reshape(*flat_shape, *deflection_force_response.shape[3:]),
+        _static_flexibility(model, shapes),
         commands,
-        inner,
+        with_node_states,
     )
 
 
-def _looked(step: Step, places):
+def _peak_node_rows(propagators: Propagators, rows):
     """Rows of the propagators, (length, point, ...), at the points looked at, start to end."""
-    start = jnp.broadcast_to(jnp.eye(step.drift_end.shape[-1]), step.drift_end.shape)
-    drifts = jnp.concatenate([start[:, None], step.drift_nodes, step.drift_end[:, None]], axis=1)
-    ends = jnp.zeros_like(step.push_end)[:, None], step.push_nodes, step.push_end[:, None]
-    return drifts[..., places, :], jnp.concatenate(ends, axis=1)[..., places, :]
+    identity = jnp.broadcast_to(
+        jnp.eye(propagators.transition_end.shape[-1]), propagators.transition_end.shape
+    )
+    transitions = jnp.concatenate(
+        [identity[:, None], propagators.transition_nodes, propagators.transition_end[:, None]],
+        axis=1,
+    )
+    force_responses = (
+        jnp.zeros_like(propagators.input_end)[:, None],
+        propagators.input_nodes,
+        propagators.input_end[:, None],
+    )
+    return transitions[..., rows, :], jnp.concatenate(force_responses, axis=1)[..., rows, :]
 
 
-def _flexibility(rig: Rig, shapes: Float[Array, "place mode"]) -> Float[Array, " place"]:
+def _static_flexibility(
+    model: ModalModel, shapes: Float[Array, "place mode"]
+) -> Float[Array, " place"]:
     """Static deflection at places under a unit force there; not finite if a mode has no stiffness.
 
     Modes that nothing couples need no factorisation, which takes longer than all the rest.
     """
-    if rig.modes_per_block == 1:
-        return jnp.sum(shapes**2 / -rig.state_matrix[:, 1, 0], axis=1)
-    bent = solve_triangular(jnp.linalg.cholesky(rig.stiffness()), shapes.T, lower=True)
-    return jnp.sum(bent**2, axis=0)
+    if model.modes_per_block == 1:
+        return jnp.sum(shapes**2 / -model.state_matrix[:, 1, 0], axis=1)
+    half_solved = solve_triangular(jnp.linalg.cholesky(model.stiffness()), shapes.T, lower=True)
+    return jnp.sum(half_solved**2, axis=0)
 
 
-def both_sides(rigging: Rigging) -> Rigging:
+def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
     """A rigging that watches every place twice: how far up the beam goes, then how far down."""
 
-    def twice(rows):
-        split = rows.reshape(rows.shape[0], len(LOOKED), rigging.places, *rows.shape[2:])
+    def both_signs(rows):
+        split = rows.reshape(
+            rows.shape[0], len(PEAK_NODES), discrete.position_count, *rows.shape[2:]
+        )
         both = jnp.concatenate([split, -split], axis=2)
         return both.reshape(rows.shape[0], -1, *rows.shape[2:])
 
     return dataclasses.replace(
-        rigging,
-        watch=twice(rigging.watch),
-        watch_push=twice(rigging.watch_push),
-        flexibility=jnp.tile(rigging.flexibility, 2),
+        discrete,
+        watch=both_signs(discrete.monitored_transition),
+        monitored_input=both_signs(discrete.monitored_input),
+        flexibility=jnp.tile(discrete.flexibility, 2),
         size=operator.pos,
     )
 
 
-class Path(eqx.Module):
+class LoadPath(eqx.Module):
     """Where the loads are in each step of a chunk, and what the contact law feels of the rig there.
 
-    `kind` says which of the grid's lengths a step has; the times of its start and its length are in
+    `length_index` says which of the grid's lengths a step has; the times of its start and its length are in
     s. Rows of idle slots are zero.
     """
 
-    kind: Int[Array, " step"]
+    length_index: Int[Array, " step"]
     start: Float[Array, " step"]
-    span: Float[Array, " step"]
-    slots: Int[Array, "step slot"]
-    active: Bool[Array, "step slot"]
-    shape: Float[Array, "step slot node block mode"]
-    rows: Float[Array, "step slot node block side"]
+    length: Float[Array, " step"]
+    loads: Int[Array, "step slot"]
+    on_beam: Bool[Array, "step slot"]
+    shape_rows: Float[Array, "step slot node block mode"]
+    contact_rows: Float[Array, "step slot node block side"]
 
 
 @jax.named_scope("path")
-def follow(rigging: Rigging, traffic: Traffic, slots: int, index: Int[Array, " step"]) -> Path:
+def load_path(
+    discrete: DiscreteModel, loads: LoadSet, max_loads: int, index: Int[Array, " step"]
+) -> LoadPath:
     """The path of the loads in the steps with the given indices."""
-    rig, grid = rigging.rig, rigging.grid
-    panel, start, kind = grid.steps(index)
-    span = grid.lengths[kind]
+    model, grid = discrete.model, discrete.grid
+    panel, start, length_index = grid.locate_steps(index)
+    length = grid.lengths[length_index]
     # As an array: JAX remembers a NumPy constant in the precision in which it met it first.
-    times = start[:, None] + span[:, None] * jnp.asarray(GAUSS, span.dtype)
-    position, speed, acceleration = (jnp.moveaxis(p, 0, 1) for p in traffic.travel(times))
-    active = grid.active[panel]  # step, load
-    if slots < len(traffic.motions):
+    times = start[:, None] + length[:, None] * jnp.asarray(GAUSS_NODES, length.dtype)
+    position, speed, acceleration = (jnp.moveaxis(p, 0, 1) for p in loads.kinematics(times))
+    on_beam = grid.loads_on_beam[panel]  # step, load
+    if max_loads < len(loads.trajectories):
         # Loads on the beam first; those that find no slot are off the beam.
-        chosen = jnp.argsort(~active, axis=1)[:, :slots]
-        pick = chosen[:, :, None]
+        load_index = jnp.argsort(~on_beam, axis=1)[:, :max_loads]
+        selection = load_index[:, :, None]
         position, speed, acceleration = (
-            jnp.take_along_axis(part, pick, axis=1) for part in (position, speed, acceleration)
+            jnp.take_along_axis(part, selection, axis=1) for part in (position, speed, acceleration)
         )
-        active = jnp.take_along_axis(active, chosen, axis=1)
+        on_beam = jnp.take_along_axis(on_beam, load_index, axis=1)
     else:
-        chosen = jnp.broadcast_to(jnp.arange(slots), active.shape)
-    on = jnp.broadcast_to(active[:, :, None], position.shape)
-    shape, rows = contact_rows(rig, position, speed, acceleration, on)
-    return Path(kind, start, span, chosen, active, shape, rows)
+        load_index = jnp.broadcast_to(jnp.arange(max_loads), on_beam.shape)
+    on_beam_at_nodes = jnp.broadcast_to(on_beam[:, :, None], position.shape)
+    shape, rows = contact_rows(model, position, speed, acceleration, on_beam_at_nodes)
+    return LoadPath(length_index, start, length, load_index, on_beam, shape, rows)
 
 
 @jax.named_scope("path")
-def tabulate(rigging: Rigging, path: Path) -> Tables:
+def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
     """Tables of the steps of a chunk."""
     # Chosen out here, because derivatives of what a branch chooses from go all the way into it.
-    first = _of_kind(rigging, path.kind[0])
+    first_propagators = _propagators_of(discrete, path.length_index[0])
 
-    def alike(_):
-        return _of_one_kind(rigging, first, path.shape, path.rows)
+    def equal_lengths(_):
+        return _matrices_of_one_length(
+            discrete, first_propagators, path.shape_rows, path.contact_rows
+        )
 
-    def one_by_one(_):
-        def single(step):
+    def mixed_lengths(_):
+        def single_step(step):
             kind, shape, rows = step
-            tables = _of_one_kind(rigging, _of_kind(rigging, kind), shape[None], rows[None])
+            tables = _matrices_of_one_length(
+                discrete, _propagators_of(discrete, kind), shape[None], rows[None]
+            )
             return jax.tree.map(lambda table: table[0], tables)
 
-        return jax.lax.map(single, (path.kind, path.shape, path.rows))
+        return jax.lax.map(single_step, (path.length_index, path.shape_rows, path.contact_rows))
 
     # Mostly all steps of a chunk are equally long, and then share their propagators.
-    tables: Any = jax.lax.cond(jnp.all(path.kind == path.kind[0]), alike, one_by_one, None)
-    return Tables(*tables, active=jnp.any(path.active, axis=1))
+    matrices: Any = jax.lax.cond(
+        jnp.all(path.length_index == path.length_index[0]), equal_lengths, mixed_lengths, None
+    )
+    return StepMatrices(*matrices, loaded=jnp.any(path.on_beam, axis=1))
 
 
-def _of_kind(rigging: Rigging, kind):
+def _propagators_of(discrete: DiscreteModel, length_index):
     """Propagators of steps of one length, and what they do to what is watched."""
     return jax.tree.map(
-        lambda table: jax.lax.dynamic_index_in_dim(table, kind, keepdims=False),
-        (rigging.step, rigging.watch, rigging.watch_push),
+        lambda table: jax.lax.dynamic_index_in_dim(table, length_index, keepdims=False),
+        (discrete.propagators, discrete.monitored_transition, discrete.monitored_input),
     )
 
 
-def _of_one_kind(rigging: Rigging, propagators, shape, rows):
+def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
     """Tables of steps of one length, from the shape and contact rows (step, slot, node, ...)."""
-    step, watch, watch_push = propagators
-    steps, slots, nodes, _, modes = shape.shape
-    size = slots * nodes
+    of_states, deflection_transition, deflection_force_response = propagators
+    steps, load_count, nodes, _, modes = shape.shape
+    size = load_count * nodes
     states = rows.shape[3] * rows.shape[4]
-    respond = jnp.einsum("tpcbi,cbij->tpcbj", rows, step.drift_nodes)
-    felt = jnp.einsum("tpcbi,cfbim->tpcfbm", rows, step.push_nodes[..., :modes])
-    gains = jnp.einsum("tpcfbm,tqfbm->tpcqf", felt, shape)
+    contact_response = jnp.einsum("tpcbi,cbij->tpcbj", rows, of_states.transition_nodes)
+    force_to_acceleration = jnp.einsum(
+        "tpcbi,cfbim->tpcfbm", rows, of_states.input_nodes[..., :modes]
+    )
+    force_coupling = jnp.einsum("tpcfbm,tqfbm->tpcqf", force_to_acceleration, shape)
     direct = jnp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
-    gains = gains + direct[..., None] * np.eye(nodes)[:, None, :]
-    push = jnp.einsum("tqfbm,fbim->tbiqf", shape, step.push_end[..., :modes])
+    force_coupling = force_coupling + direct[..., None] * np.eye(nodes)[:, None, :]
+    force_response = jnp.einsum("tqfbm,fbim->tbiqf", shape, of_states.input_end[..., :modes])
 
-    def each(table, *shape):
+    def for_all_steps(table, *shape):
         table = table.reshape(shape or table.shape)
         return jnp.broadcast_to(table, (steps, *table.shape))
 
-    tables = (
-        respond.reshape(steps, size, states),
-        gains.reshape(steps, size, size),
-        each(step.drift_end),
-        push.reshape(steps, states, size),
+    matrices = (
+        contact_response.reshape(steps, size, states),
+        force_coupling.reshape(steps, size, size),
+        for_all_steps(of_states.transition_end),
+        force_response.reshape(steps, states, size),
     )
-    if watch is None:
-        tables = (*tables, None)
+    if deflection_transition is None:
+        matrices = (*matrices, None)
     else:
-        looked = watch.shape[0]
-        seen = jnp.einsum("lfbm,tqfbm->tlqf", watch_push[..., :modes], shape)
-        parts = [each(watch, looked, states), seen.reshape(steps, looked, size)]
-        if rigging.commands is not None:
-            parts.append(each(watch_push[:, :, 0, modes:], looked, -1))
-        tables = (*tables, jnp.concatenate(parts, axis=2))
-    commands = inner = None
-    if rigging.commands is not None:
+        deflection_count = deflection_transition.shape[0]
+        force_to_deflection = jnp.einsum(
+            "lfbm,tqfbm->tlqf", deflection_force_response[..., :modes], shape
+        )
+        parts = [
+            for_all_steps(deflection_transition, deflection_count, states),
+            force_to_deflection.reshape(steps, deflection_count, size),
+        ]
+        if discrete.modal_command_matrix is not None:
+            parts.append(
+                for_all_steps(deflection_force_response[:, :, 0, modes:], deflection_count, -1)
+            )
+        matrices = (*matrices, jnp.concatenate(parts, axis=2))
+    commands = node_states = None
+    if discrete.modal_command_matrix is not None:
         # A rig that takes commands is a single block.
-        orders = nodes * rigging.commands.shape[1]
-        ordered = step.push_nodes[:, :, 0, :, modes:]
-        answer = jnp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], ordered)
-        at_once = jnp.einsum("tpcm,mu->tpcu", shape[..., 0, :], rigging.commands)
-        answer = answer + at_once[:, :, :, None] * np.eye(nodes)[:, :, None]
-        commands = CommandTables(
-            answer.reshape(steps, size, orders),
-            each(jnp.moveaxis(step.push_end[:, 0, :, modes:], 1, 0), states, orders),
+        command_count = nodes * discrete.modal_command_matrix.shape[1]
+        command_responses = of_states.input_nodes[:, :, 0, :, modes:]
+        command_to_acceleration = jnp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], command_responses)
+        feedthrough = jnp.einsum("tpcm,mu->tpcu", shape[..., 0, :], discrete.modal_command_matrix)
+        command_to_acceleration = (
+            command_to_acceleration + feedthrough[:, :, :, None] * np.eye(nodes)[:, :, None]
         )
-    if rigging.inner:
-        pressed = step.push_nodes[:, :, 0, :, :modes]
-        pushed = jnp.einsum("tqfm,cfim->tciqf", shape[..., 0, :], pressed)
-        inner = InnerTables(
-            each(step.drift_nodes, nodes * states, states),
-            pushed.reshape(steps, nodes * states, size),
-            each(jnp.moveaxis(ordered, 1, 2), nodes * states, orders),
+        commands = CommandMatrices(
+            command_to_acceleration.reshape(steps, size, command_count),
+            for_all_steps(
+                jnp.moveaxis(of_states.input_end[:, 0, :, modes:], 1, 0), states, command_count
+            ),
         )
-    return *tables, commands, inner
+    if discrete.with_node_states:
+        force_inputs = of_states.input_nodes[:, :, 0, :, :modes]
+        force_to_node_states = jnp.einsum("tqfm,cfim->tciqf", shape[..., 0, :], force_inputs)
+        node_states = NodeMatrices(
+            for_all_steps(of_states.transition_nodes, nodes * states, states),
+            force_to_node_states.reshape(steps, nodes * states, size),
+            for_all_steps(jnp.moveaxis(command_responses, 1, 2), nodes * states, command_count),
+        )
+    return *matrices, commands, node_states

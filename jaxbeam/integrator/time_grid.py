@@ -12,131 +12,154 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.loads import motion
-from jaxbeam.integrator.events import Schedule
-from jaxbeam.model.modal_model import Rig
+from jaxbeam.case.loads import trajectory
+from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.model.modal_model import ModalModel
 
 
-class Grid(eqx.Module):
+class TimeGrid(eqx.Module):
     """Panels, each with a number of equal steps; step lengths are shared among panels.
 
-    `counts` are the numbers of steps in the panels, `ends` those up to the end of each: added up
-    once, because a loop over many panels must not add them up in every turn. `kind` says which of
+    `counts` are the numbers of steps in the panels, `cumulative_counts` those up to the end of each: added up
+    once, because a loop over many panels must not add them up in every turn. `length_index` says which of
     `lengths` (s) the steps of a panel have. The last of the lengths is zero: it belongs to the
-    steps after the end, which fill up a chunk. `opens` is the edge of the schedule at which a panel
-    starts, -1 for an event; `place` is where edges of the schedule are.
+    steps after the end, which fill up a chunk. `event` is the edge of the schedule at which a panel
+    starts, -1 for an event; `event_panels` is where edges of the schedule are.
     """
 
-    edges: Float[Array, " edge"]
+    boundaries: Float[Array, " event_at"]
     counts: Int[Array, " panel"]
-    ends: Int[Array, " panel"]
-    kind: Int[Array, " panel"]
+    cumulative_counts: Int[Array, " panel"]
+    length_index: Int[Array, " panel"]
     lengths: Float[Array, " length"]
-    active: Bool[Array, "panel load"]
-    windows: Float[Array, "load 2"]
-    opens: Int[Array, " panel"] | None = None
-    place: Int[Array, " planned"] | None = None
+    loads_on_beam: Bool[Array, "panel load"]
+    on_beam_intervals: Float[Array, "load 2"]
+    event: Int[Array, " panel"] | None = None
+    event_panels: Int[Array, " planned"] | None = None
 
     @property
     def last_exit(self) -> Float[Array, ""]:
         """Time (s) after which no load is on the beam."""
-        return jnp.max(self.windows[:, 1], initial=0.0)
+        return jnp.max(self.on_beam_intervals[:, 1], initial=0.0)
 
     @property
-    def total(self) -> Int[Array, ""]:
+    def step_count(self) -> Int[Array, ""]:
         """Number of steps."""
-        return self.ends[-1]
+        return self.cumulative_counts[-1]
 
-    def steps(self, index: Int[Array, " step"]):
+    def locate_steps(self, index: Int[Array, " step"]):
         """Panel, start time (s) and kind of length of the steps with these indices."""
-        beyond = index >= self.total
-        if self.opens is None:
-            panel = jnp.searchsorted(self.ends, index, side="right", method="compare_all")
+        after_end = index >= self.step_count
+        if self.event is None:
+            panel = jnp.searchsorted(
+                self.cumulative_counts, index, side="right", method="compare_all"
+            )
         else:  # there may be many, all alike
             panel = index // self.counts[0]
         panel = jnp.minimum(panel, self.counts.shape[0] - 1)
-        kind = jnp.where(beyond, self.lengths.shape[0] - 1, self.kind[panel])
-        start = self.edges[panel] + (index - self._first(panel)) * self.lengths[self.kind[panel]]
-        return panel, jnp.where(beyond, self.edges[-1], start), kind
+        length_index = jnp.where(after_end, self.lengths.shape[0] - 1, self.length_index[panel])
+        start = (
+            self.boundaries[panel]
+            + (index - self._first_step(panel)) * self.lengths[self.length_index[panel]]
+        )
+        return panel, jnp.where(after_end, self.boundaries[-1], start), length_index
 
-    def edge(self, index: Int[Array, " step"]) -> Int[Array, " step"]:
+    def event_at(self, index: Int[Array, " step"]) -> Int[Array, " step"]:
         """Edge of the schedule at which each of some steps starts, -1 for none."""
-        panel, _, _ = self.steps(index)
-        starts = (index == self._first(panel)) & (index < self.total)
-        return jnp.where(starts, self.opens[panel], -1)
+        panel, _, _ = self.locate_steps(index)
+        starts = (index == self._first_step(panel)) & (index < self.step_count)
+        return jnp.where(starts, self.event[panel], -1)
 
-    def _first(self, panel):
+    def _first_step(self, panel):
         """The first step of a panel."""
-        return self.ends[panel] - self.counts[panel]
+        return self.cumulative_counts[panel] - self.counts[panel]
 
 
-def _events(case: Case, rig: Rig):
+def _load_events(case: Case, model: ModalModel):
     """Entry and exit of every load (load, 2), and all events (event,), in s."""
-    inner = rig.modes.nodes[1:-1]
-    motions = [motion(load, case.beam.length) for load in case.loads]
-    if not motions:
+    inner_nodes = model.modes.nodes[1:-1]
+    trajectories = [trajectory(load, case.beam.length) for load in case.loads]
+    if not trajectories:
         return jnp.zeros((0, 2)), jnp.zeros(0)
-    windows = jnp.stack([jnp.stack(path.window()) for path in motions])
-    kinks = [path.passage_times(inner) for path in motions]
-    return windows, jnp.concatenate([windows.ravel(), *kinks])
+    windows = jnp.stack([jnp.stack(path.window()) for path in trajectories])
+    nonsmooth_times = [path.passage_times(inner_nodes) for path in trajectories]
+    return windows, jnp.concatenate([windows.ravel(), *nonsmooth_times])
 
 
-def _activity(windows, edges):
+def _loads_on_beam(windows, boundaries):
     """Which loads are on the beam in each panel (panel, load)."""
-    middle = (edges[1:] + edges[:-1]) / 2
+    middle = (boundaries[1:] + boundaries[:-1]) / 2
     return (windows[:, 0] < middle[:, None]) & (middle[:, None] < windows[:, 1])
 
 
-def even_grid(
-    case: Case, rig: Rig, longest: Float[Array, ""], more: int | Int[Array, ""] = 0
-) -> Grid:
-    """Panels from event to event, with as many steps as keep them below `longest` (s), and `more`.
+def grid_by_step_length(
+    case: Case, model: ModalModel, max_step: Float[Array, ""], extra_steps: int | Int[Array, ""] = 0
+) -> TimeGrid:
+    """Panels from event to event, with as many steps as keep them below `max_step` (s), and `extra_steps`.
 
-    To see what finer steps change, `more` is one: a short panel has the same whole number of steps
+    To see what finer steps change, `extra_steps` is one: a short panel has the same whole number of steps
     of many lengths.
     """
-    windows, events = _events(case, rig)
+    windows, events = _load_events(case, model)
     end = case.run.duration
-    edges = jnp.concatenate([jnp.zeros(1), jnp.clip(jnp.sort(events), 0.0, end), end[None]])
-    spans = jnp.diff(edges)
-    counts = jnp.ceil(jax.lax.stop_gradient(spans / longest)).astype(int) + more * (spans > 0)
-    lengths = spans / jnp.maximum(counts, 1)
-    kind = jnp.arange(spans.shape[0])
+    boundaries = jnp.concatenate([jnp.zeros(1), jnp.clip(jnp.sort(events), 0.0, end), end[None]])
+    panel_lengths = jnp.diff(boundaries)
+    counts = jnp.ceil(jax.lax.stop_gradient(panel_lengths / max_step)).astype(int) + extra_steps * (
+        panel_lengths > 0
+    )
+    lengths = panel_lengths / jnp.maximum(counts, 1)
+    length_index = jnp.arange(panel_lengths.shape[0])
     lengths = jnp.append(lengths, 0.0)
-    active = _activity(windows, edges)
-    return Grid(edges, counts, jnp.cumsum(counts), kind, lengths, active, windows)
+    loads_on_beam = _loads_on_beam(windows, boundaries)
+    return TimeGrid(
+        boundaries, counts, jnp.cumsum(counts), length_index, lengths, loads_on_beam, windows
+    )
 
 
-def scheduled_grid(
-    case: Case, rig: Rig, schedule: Schedule, substeps: int | Int[Array, ""]
-) -> Grid:
+def grid_by_schedule(
+    case: Case, model: ModalModel, schedule: EventSchedule, substeps: int | Int[Array, ""]
+) -> TimeGrid:
     """Panels from edge to edge of a schedule (or event between), each of `substeps` steps.
 
     Nearly all panels then share a few step lengths, and with them their propagators.
     """
     times = schedule.times
-    windows, events = _events(case, rig)
-    if schedule.tick is not None:
+    windows, events = _load_events(case, model)
+    if schedule.control_sample is not None:
         # A step of no length after the end lets the controller act there once more.
         events = jnp.append(events, times[-1])
-    where = jnp.concatenate([times, jnp.clip(events, times[0], times[-1])])
-    order = jnp.argsort(where)
-    edges = where[order]
-    spans = jnp.diff(edges)
-    planned = order < times.shape[0]
+    boundary_times = jnp.concatenate([times, jnp.clip(events, times[0], times[-1])])
+    order = jnp.argsort(boundary_times)
+    boundaries = boundary_times[order]
+    panel_lengths = jnp.diff(boundaries)
+    is_scheduled = order < times.shape[0]
     # The others lie beside an event: at most two for each.
-    usual = planned[1:] & planned[:-1]
-    kinds = schedule.lengths.shape[0]
-    kind = jnp.where(
-        usual,
-        schedule.gaps[jnp.clip(jnp.cumsum(planned)[:-1] - 1, 0, schedule.gaps.shape[0] - 1)],
-        kinds - 1 + jnp.cumsum(~usual),
+    between_scheduled = is_scheduled[1:] & is_scheduled[:-1]
+    length_count = schedule.lengths.shape[0]
+    length_index = jnp.where(
+        between_scheduled,
+        schedule.length_index[
+            jnp.clip(jnp.cumsum(is_scheduled)[:-1] - 1, 0, schedule.length_index.shape[0] - 1)
+        ],
+        length_count - 1 + jnp.cumsum(~between_scheduled),
     )
     lengths = jnp.concatenate([schedule.lengths, jnp.zeros(2 * events.shape[0] + 1)])
-    lengths = lengths.at[jnp.where(usual, lengths.shape[0], kind)].set(spans, mode="drop")
-    counts = jnp.full(spans.shape, substeps)
-    active = _activity(windows, edges)
-    opens = jnp.where(planned[:-1], order[:-1], -1)
-    ends, lengths = jnp.cumsum(counts), lengths / substeps
-    place = jnp.argsort(order)
-    return Grid(edges, counts, ends, kind, lengths, active, windows, opens, place)
+    lengths = lengths.at[jnp.where(between_scheduled, lengths.shape[0], length_index)].set(
+        panel_lengths, mode="drop"
+    )
+    counts = jnp.full(panel_lengths.shape, substeps)
+    loads_on_beam = _loads_on_beam(windows, boundaries)
+    scheduled_event = jnp.where(is_scheduled[:-1], order[:-1], -1)
+    cumulative_counts, lengths = jnp.cumsum(counts), lengths / substeps
+    event_boundary = jnp.argsort(order)
+    return TimeGrid(
+        boundaries,
+        counts,
+        cumulative_counts,
+        length_index,
+        lengths,
+        loads_on_beam,
+        windows,
+        scheduled_event,
+        event_boundary,
+    )

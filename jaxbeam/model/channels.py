@@ -24,13 +24,13 @@ from jaxbeam.case.actuators import AbstractActuator, Electrodynamic
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.sensors import QUANTITIES
-from jaxbeam.model.modal_model import Rig
+from jaxbeam.model.modal_model import ModalModel
 
-AT_A_POINT = ("deflection", "velocity", "acceleration", "slope")  # strain also needs a fibre
-OF_ACTUATOR = ("current", "active_force", "transmitted_force")
+POINT_QUANTITIES = ("deflection", "velocity", "acceleration", "slope")  # strain also needs a fibre
+ACTUATOR_QUANTITIES = ("current", "active_force", "transmitted_force")
 
 
-class Pair(NamedTuple):
+class ChannelPair(NamedTuple):
     """An input, an output, and the unit of the output per input."""
 
     input: str
@@ -41,20 +41,25 @@ class Pair(NamedTuple):
         return f"{self.input} -> {self.output}"
 
     @property
-    def source(self) -> str:
+    def excitation(self) -> str:
         """The input that drives the rig: the command behind an active force."""
         return self.input.removesuffix(".active_force")
 
 
-def shaker_chain(index: int) -> tuple[tuple[str, str], ...]:
+def shaker_channels(index: int) -> tuple[tuple[str, str], ...]:
     """The chain of an electrodynamic shaker, eqs (2.26) to (2.34) of the thesis, as pairs.
 
     Voltage to current, voltage to coil force, coil force to transmitted force, and voltage to
     transmitted force, of the actuator of this number.
     """
-    volts = f"actuators.{index}"
-    coil, passed = f"{volts}.active_force", f"{volts}.transmitted_force"
-    return (volts, f"{volts}.current"), (volts, coil), (coil, passed), (volts, passed)
+    command = f"actuators.{index}"
+    coil_force, transmitted_force = f"{command}.active_force", f"{command}.transmitted_force"
+    return (
+        (command, f"{command}.current"),
+        (command, coil_force),
+        (coil_force, transmitted_force),
+        (command, transmitted_force),
+    )
 
 
 def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
@@ -65,13 +70,13 @@ def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
     """
     pairs = []
     for i, actuator in enumerate(case.actuators):
-        if takes_commands(actuator):
+        if accepts_commands(actuator):
             pairs += [(f"actuators.{i}", f"sensors.{j}") for j in range(len(case.sensors))]
         if isinstance(actuator, Electrodynamic):
-            pairs += shaker_chain(i)
+            pairs += shaker_channels(i)
     if not pairs:
-        places = [float(sensor.position) for sensor in case.sensors]
-        pairs = [(f"force@{place:g}", f"sensors.{j}") for j, place in enumerate(places)]
+        positions = [float(sensor.position) for sensor in case.sensors]
+        pairs = [(f"force@{place:g}", f"sensors.{j}") for j, place in enumerate(positions)]
     if not pairs:
         raise ValueError(
             "the case has neither sensors nor actuators; name an input and an output, such as"
@@ -80,132 +85,148 @@ def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
     return tuple(pairs)
 
 
-def check_pairs(case: Case, pairs: Iterable[Sequence[str]]) -> tuple[Pair, ...]:
+def check_pairs(case: Case, pairs: Iterable[Sequence[str]]) -> tuple[ChannelPair, ...]:
     """The pairs with their units. Raises ValueError for words that mean nothing in the case."""
     checked = []
     for source, output in pairs:
-        above, below = _output_unit(case, output), _input_unit(case, source)
-        above = f"({above})" if set(above) & set("/ ") else above
-        below = f"({below})" if " " in below else below
-        unit = "1" if above == below else f"{above}/{below}"
-        checked.append(Pair(source, output, unit))
+        output_unit, input_unit = _output_unit(case, output), _input_unit(case, source)
+        output_unit = f"({output_unit})" if set(output_unit) & set("/ ") else output_unit
+        input_unit = f"({input_unit})" if " " in input_unit else input_unit
+        unit = "1" if output_unit == input_unit else f"{output_unit}/{input_unit}"
+        checked.append(ChannelPair(source, output, unit))
     if not checked:
         raise ValueError("name at least one pair of an input and an output")
     return tuple(checked)
 
 
-def column(case: Case, model: Rig, source: str):
+def input_column(case: Case, model: ModalModel, input: str):
     """What an input does to the rates of the states, (state,), and to the commands (actuator,)."""
     commands = jnp.zeros(len(case.actuators))
-    if "@" in source:
-        place = float(source.partition("@")[2])
-        return _spread(model, model.shapes(place, (0,))[0], 1), commands
-    index = int(source.split(".")[1])
+    if "@" in input:
+        position = float(input.partition("@")[2])
+        return _row_on_states(model, model.shapes(position, (0,))[0], 1), commands
+    index = int(input.split(".")[1])
     return model.command_matrix[:, index], commands.at[index].set(1.0)
 
 
-def row(case: Case, model: Rig, output: str):
+def output_row(case: Case, model: ModalModel, output: str):
     """Rows that take the states, their rates (both (state,)) and the commands to an output."""
-    nothing, direct = jnp.zeros(model.states), jnp.zeros(len(case.actuators))
-    name, at, place = output.partition("@")
-    if at or name.startswith("sensors."):
-        if at:
-            quantity, place, fibre = name, float(place), None
+    zero_row, feedthrough = jnp.zeros(model.state_count), jnp.zeros(len(case.actuators))
+    name, at_point, position = output.partition("@")
+    if at_point or name.startswith("sensors."):
+        if at_point:
+            quantity, position, fibre_distance = name, float(position), None
         else:
             sensor = case.sensors[int(name.split(".")[1])]
-            quantity, place, fibre = sensor.quantity, sensor.position, sensor.fibre_distance
+            quantity, position, fibre_distance = (
+                sensor.quantity,
+                sensor.position,
+                sensor.fibre_distance,
+            )
         derivative = {"slope": 1, "strain": 2}.get(quantity, 0)
-        shape = model.shapes(place, (derivative,))[0]
-        shape = -fibre * shape if quantity == "strain" else shape
+        shape = model.shapes(position, (derivative,))[0]
+        shape = -fibre_distance * shape if quantity == "strain" else shape
         if quantity == "acceleration":
-            return nothing, _spread(model, shape, 1), direct
-        return _spread(model, shape, int(quantity == "velocity")), nothing, direct
-    _, index, what = name.split(".")
+            return zero_row, _row_on_states(model, shape, 1), feedthrough
+        return _row_on_states(model, shape, int(quantity == "velocity")), zero_row, feedthrough
+    _, index, actuator_output = name.split(".")
     index = int(index)
-    devices = [actuator.attachment() for actuator in case.actuators]
-    sizes = [device.state_matrix.shape[0] for device in devices]
+    attachments = [actuator.attachment() for actuator in case.actuators]
+    sizes = [device.state_matrix.shape[0] for device in attachments]
     start = 2 * model.modes.stiffness.shape[0] + sum(sizes[:index])
-    device, own = devices[index], np.arange(start, start + sizes[index])
-    if what == "current":
-        return nothing.at[own].set(1.0), nothing, direct
-    active = nothing.at[own].set(device.output_matrix)
-    direct = direct.at[index].set(device.feedthrough)
-    if what == "active_force":
-        return active, nothing, direct
-    stroke = model.strokes[index]
-    held = device.stiffness * _spread(model, stroke, 0) + device.damping * _spread(model, stroke, 1)
-    mass = 0.0 if device.mass is None else device.mass
-    return active - held, -mass * _spread(model, stroke, 1), direct
+    attachment, device_states = attachments[index], np.arange(start, start + sizes[index])
+    if actuator_output == "current":
+        return zero_row.at[device_states].set(1.0), zero_row, feedthrough
+    active_force = zero_row.at[device_states].set(attachment.output_matrix)
+    feedthrough = feedthrough.at[index].set(attachment.feedthrough)
+    if actuator_output == "active_force":
+        return active_force, zero_row, feedthrough
+    displacement = model.displacement_map[index]
+    suspension_force = attachment.stiffness * _row_on_states(
+        model, displacement, 0
+    ) + attachment.damping * _row_on_states(model, displacement, 1)
+    mass = 0.0 if attachment.mass is None else attachment.mass
+    return (
+        active_force - suspension_force,
+        -mass * _row_on_states(model, displacement, 1),
+        feedthrough,
+    )
 
 
-def _spread(model: Rig, shape, first: int):
+def _row_on_states(model: ModalModel, shape, first_state: int):
     """A row over the coordinates as one over the states: on q (first = 0) or on q' (1)."""
-    places = np.arange(first, 2 * model.modes.stiffness.shape[0], 2)
-    return jnp.zeros(model.states).at[places].set(shape)
+    states = np.arange(first_state, 2 * model.modes.stiffness.shape[0], 2)
+    return jnp.zeros(model.state_count).at[states].set(shape)
 
 
-def _input_unit(case: Case, word: str) -> str:
-    name, at, place = word.partition("@")
-    if at:
+def _input_unit(case: Case, channel: str) -> str:
+    name, at_point, position = channel.partition("@")
+    if at_point:
         if name != "force":
-            raise ValueError(f"the input {word!r} must be a force, as force@0.3")
-        _check_place(case, word, place)
+            raise ValueError(f"the input {channel!r} must be a force, as force@0.3")
+        _check_position(case, channel, position)
         return "N"
-    actuator, what = _actuator(case, word, "input")
-    if not takes_commands(actuator):
-        raise ValueError(f"the input {word!r} takes no command")
-    if what not in ("", "active_force"):
+    actuator, actuator_input = _parse_actuator(case, channel, "input")
+    if not accepts_commands(actuator):
+        raise ValueError(f"the input {channel!r} takes no command")
+    if actuator_input not in ("", "active_force"):
         raise ValueError(
-            f"the input {word!r} does not exist; an actuator is driven by its command, its address"
+            f"the input {channel!r} does not exist; an actuator is driven by its command, its address"
             " alone, or by its active_force"
         )
-    return _force_unit(actuator) if what else _command_unit(actuator)
+    return _force_unit(actuator) if actuator_input else _command_unit(actuator)
 
 
-def _output_unit(case: Case, word: str) -> str:
-    name, at, place = word.partition("@")
-    if at:
-        if name not in AT_A_POINT:
-            hint = suggestion(name, AT_A_POINT)
-            raise ValueError(f"the output {word!r} does not exist; {hint}, as deflection@0.3")
-        _check_place(case, word, place)
+def _output_unit(case: Case, channel: str) -> str:
+    name, at_point, position = channel.partition("@")
+    if at_point:
+        if name not in POINT_QUANTITIES:
+            hint = suggestion(name, POINT_QUANTITIES)
+            raise ValueError(f"the output {channel!r} does not exist; {hint}, as deflection@0.3")
+        _check_position(case, channel, position)
         return QUANTITIES[name]
     if name.startswith("sensors."):
-        return QUANTITIES[case.sensors[_index(word, "sensors", len(case.sensors))].quantity]
-    actuator, what = _actuator(case, word, "output")
-    if what not in OF_ACTUATOR:
-        raise ValueError(f"the output {word!r} does not exist; {suggestion(what, OF_ACTUATOR)}")
-    if what == "current" and not isinstance(actuator, Electrodynamic):
+        return QUANTITIES[
+            case.sensors[_parse_index(channel, "sensors", len(case.sensors))].quantity
+        ]
+    actuator, actuator_output = _parse_actuator(case, channel, "output")
+    if actuator_output not in ACTUATOR_QUANTITIES:
+        raise ValueError(
+            f"the output {channel!r} does not exist; {suggestion(actuator_output, ACTUATOR_QUANTITIES)}"
+        )
+    if actuator_output == "current" and not isinstance(actuator, Electrodynamic):
         kind = type(actuator).__name__
-        raise ValueError(f"the output {word!r} does not exist: a {kind} has no coil")
-    return "A" if what == "current" else _force_unit(actuator)
+        raise ValueError(f"the output {channel!r} does not exist: a {kind} has no coil")
+    return "A" if actuator_output == "current" else _force_unit(actuator)
 
 
-def _actuator(case: Case, word: str, role: str) -> tuple[AbstractActuator, str]:
+def _parse_actuator(case: Case, channel: str, role: str) -> tuple[AbstractActuator, str]:
     """The actuator that a word names, and what of it."""
-    if not word.startswith("actuators."):
-        known = "actuators.0 or force@0.3" if role == "input" else "sensors.0 or deflection@0.3"
-        raise ValueError(f"the {role} {word!r} does not exist; write, for example, {known}")
-    _, _, *what = word.split(".", 2)
-    return case.actuators[_index(word, "actuators", len(case.actuators))], "".join(what)
+    if not channel.startswith("actuators."):
+        examples = "actuators.0 or force@0.3" if role == "input" else "sensors.0 or deflection@0.3"
+        raise ValueError(f"the {role} {channel!r} does not exist; write, for example, {examples}")
+    _, _, *quantity = channel.split(".", 2)
+    return case.actuators[_parse_index(channel, "actuators", len(case.actuators))], "".join(
+        quantity
+    )
 
 
-def _index(word: str, family: str, count: int) -> int:
-    number = word.split(".")[1]
+def _parse_index(channel: str, family: str, count: int) -> int:
+    number = channel.split(".")[1]
     if not number.isdigit() or int(number) >= count:
-        raise ValueError(f"{word!r} does not exist; the case has {count} {family}, from 0")
+        raise ValueError(f"{channel!r} does not exist; the case has {count} {family}, from 0")
     return int(number)
 
 
-def _check_place(case: Case, word: str, place: str) -> None:
+def _check_position(case: Case, channel: str, position: str) -> None:
     try:
-        x = float(place)
+        x = float(position)
     except ValueError:
-        raise ValueError(f"{word!r}: {place!r} is not a number in m") from None
-    check_on_beam(repr(word), x, case.beam.length)
+        raise ValueError(f"{channel!r}: {position!r} is not a number in m") from None
+    check_on_beam(repr(channel), x, case.beam.length)
 
 
-def takes_commands(actuator: AbstractActuator) -> bool:
+def accepts_commands(actuator: AbstractActuator) -> bool:
     """Whether an actuator does something with a command, as a passive one does not."""
     return _command_unit(actuator) != "1"
 

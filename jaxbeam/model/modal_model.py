@@ -15,26 +15,26 @@ from jax.scipy.linalg import block_diag, solve_triangular
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.model.modes import Layout, Modes, lay_out, modes
+from jaxbeam.model.modes import Layout, Modes, mesh_layout, modes
 from jaxbeam.runtime.compiling import compiled
 
 
-class Rig(eqx.Module):
+class ModalModel(eqx.Module):
     """Linear model of beam, supports and actuators, without loads and control.
 
-    Its coordinates q are modal amplitudes with unit mass matrix; `mixing` (if any) maps them to
-    the amplitudes of `modes` where the moving mass of an actuator couples those. `strokes` are
+    Its coordinates q are modal amplitudes with unit mass matrix; `mode_map` (if any) maps them to
+    the amplitudes of `modes` where the moving mass of an actuator couples those. `displacement_map` are
     the rows that take q to the stroke of each actuator.
     """
 
     modes: Modes
-    mixing: Float[Array, "mode mode"] | None
+    mode_map: Float[Array, "mode mode"] | None
     state_matrix: Float[Array, "block side side"]
     command_matrix: Float[Array, "state actuator"]
-    strokes: Float[Array, "actuator mode"]
+    displacement_map: Float[Array, "actuator mode"]
 
     @property
-    def states(self) -> int:
+    def state_count(self) -> int:
         """Number of states."""
         return self.state_matrix.shape[0] * self.state_matrix.shape[1]
 
@@ -48,99 +48,108 @@ class Rig(eqx.Module):
 
         Transposed, they take a force at x to forces on q.
         """
-        rows = self.modes.shapes_together(x, derivatives)
-        return rows if self.mixing is None else rows @ self.mixing
+        rows = self.modes.shape_derivatives(x, derivatives)
+        return rows if self.mode_map is None else rows @ self.mode_map
 
     def stiffness(self) -> Float[Array, "mode mode"]:
         """Stiffness matrix of the coordinates q, suspensions included, in 1/s^2."""
-        full = -block_diag(*self.state_matrix)
+        negative_state_matrix = -block_diag(*self.state_matrix)
         size = 2 * self.modes.stiffness.shape[0]
-        return full[1:size:2, 0:size:2]
+        return negative_state_matrix[1:size:2, 0:size:2]
 
 
-def couples(case: Case) -> bool:
+def has_coupling(case: Case) -> bool:
     """Tell whether any part of the case couples the modes: an actuator, a damper at a support."""
     return bool(case.actuators) or any(support.damping is not None for support in case.supports)
 
 
-def rig(case: Case, layout: Layout | None = None, coupled: bool = True) -> Rig:
+def modal_model(case: Case, layout: Layout | None = None, full_matrix: bool = True) -> ModalModel:
     """Assemble the rig of a case, eqs (2.31) to (2.36) of the thesis in mass-normalised modes.
 
     Actuators' suspensions and support dampers act on the modes, coupled and exact; non-classical
-    damping is not dropped. Without `coupled` the modes stay single blocks, which is right only
-    where nothing couples them (see `couples`) and none are repeated. `layout` (from `lay_out`) is
+    damping is not dropped. Without `full_matrix` the modes stay single blocks, which is right only
+    where nothing couples them (see `has_coupling`) and none are repeated. `layout` (from `mesh_layout`) is
     needed inside `jit`, where the numbers that decide it are not known.
     """
-    layout = lay_out(case) if layout is None else layout
-    return assemble(case, modes(case, layout), coupled)
+    layout = mesh_layout(case) if layout is None else layout
+    return assemble_modal_model(case, modes(case, layout), full_matrix)
 
 
-_in_one = compiled(rig)
+_compiled = compiled(modal_model)
 
 
-def rig_in_one(case: Case, layout: Layout | None = None) -> Rig:
+def compiled_modal_model(case: Case, layout: Layout | None = None) -> ModalModel:
     """The same rig by one program: step by step, the many small ones take seconds to compile.
 
     Cases that differ in their controllers share it.
     """
-    layout = lay_out(case) if layout is None else layout
-    bare = eqx.tree_at(lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None)
-    return _in_one(bare, layout)
+    layout = mesh_layout(case) if layout is None else layout
+    uncontrolled_case = eqx.tree_at(
+        lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None
+    )
+    return _compiled(uncontrolled_case, layout)
 
 
 @jax.named_scope("rig")
-def assemble(case: Case, found: Modes, coupled: bool = True) -> Rig:
+def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> ModalModel:
     """The rig of a case whose modes are known already; see `rig`."""
     count = case.beam.modes
     if not coupled:
         zero, one = jnp.zeros(count), jnp.ones(count)
-        blocks = jnp.stack([zero, one, -found.stiffness, -found.damping], axis=-1)
-        nothing = jnp.zeros((2 * count, 0)), jnp.zeros((0, count))
-        return Rig(found, None, blocks.reshape(count, 2, 2), *nothing)
-    stiffness = jnp.diag(found.stiffness) + found.coupling
-    damping = jnp.diag(found.damping) + found.damping_coupling
+        blocks = jnp.stack([zero, one, -modes.stiffness, -modes.damping], axis=-1)
+        no_actuators = jnp.zeros((2 * count, 0)), jnp.zeros((0, count))
+        return ModalModel(modes, None, blocks.reshape(count, 2, 2), *no_actuators)
+    stiffness = jnp.diag(modes.stiffness) + modes.coupling
+    damping = jnp.diag(modes.damping) + modes.damping_coupling
     for support in case.supports:
         if support.damping is not None:
-            shape = found.shapes(support.position)
+            shape = modes.shapes(support.position)
             damping = damping + support.damping * jnp.outer(shape, shape)
-    attached = [actuator.attachment() for actuator in case.actuators]
-    strokes = jnp.zeros((len(attached), count))
+    attachments = [actuator.attachment() for actuator in case.actuators]
+    displacement_map = jnp.zeros((len(attachments), count))
     mass = jnp.eye(count)
-    for i, (actuator, device) in enumerate(zip(case.actuators, attached, strict=True)):
-        terms = (factor * found.shapes(x, order) for x, order, factor in actuator.stroke())
+    for i, (actuator, attachment) in enumerate(zip(case.actuators, attachments, strict=True)):
+        terms = (factor * modes.shapes(x, order) for x, order, factor in actuator.stroke())
         shape = sum(terms, jnp.zeros(count))
-        strokes = strokes.at[i].set(shape)
-        stiffness = stiffness + device.stiffness * jnp.outer(shape, shape)
-        damping = damping + device.damping * jnp.outer(shape, shape)
-        if device.mass is not None:
-            mass = mass + device.mass * jnp.outer(shape, shape)
-    mixing = None
-    if any(device.mass is not None for device in attached):
-        half = jnp.linalg.cholesky(mass)
-        mixing = solve_triangular(half.T, jnp.eye(count), lower=False)
-        stiffness, damping = mixing.T @ stiffness @ mixing, mixing.T @ damping @ mixing
-        strokes = strokes @ mixing
-    matrix, command = _state_space(stiffness, damping, strokes, attached)
-    return Rig(found, mixing, matrix[None], command, strokes)
+        displacement_map = displacement_map.at[i].set(shape)
+        stiffness = stiffness + attachment.stiffness * jnp.outer(shape, shape)
+        damping = damping + attachment.damping * jnp.outer(shape, shape)
+        if attachment.mass is not None:
+            mass = mass + attachment.mass * jnp.outer(shape, shape)
+    transformation = None
+    if any(device.mass is not None for device in attachments):
+        cholesky_factor = jnp.linalg.cholesky(mass)
+        transformation = solve_triangular(cholesky_factor.T, jnp.eye(count), lower=False)
+        stiffness, damping = (
+            transformation.T @ stiffness @ transformation,
+            transformation.T @ damping @ transformation,
+        )
+        displacement_map = displacement_map @ transformation
+    matrix, command = _state_space_matrices(stiffness, damping, displacement_map, attachments)
+    return ModalModel(modes, transformation, matrix[None], command, displacement_map)
 
 
-def _state_space(stiffness, damping, strokes, attached):
+def _state_space_matrices(stiffness, damping, displacement_map, attachments):
     """State and command matrices of the modes and the actuators' own states together."""
     count = stiffness.shape[0]
-    sizes = [device.state_matrix.shape[0] for device in attached]
-    total = 2 * count + sum(sizes)
-    place, rate = np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2)
-    matrix = jnp.zeros((total, total)).at[place, rate].set(1.0)
-    matrix = matrix.at[np.ix_(rate, place)].set(-stiffness)
-    matrix = matrix.at[np.ix_(rate, rate)].set(-damping)
-    command = jnp.zeros((total, len(attached)))
+    device_sizes = [device.state_matrix.shape[0] for device in attachments]
+    total = 2 * count + sum(device_sizes)
+    displacement, velocity_index = np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2)
+    matrix = jnp.zeros((total, total)).at[displacement, velocity_index].set(1.0)
+    matrix = matrix.at[np.ix_(velocity_index, displacement)].set(-stiffness)
+    matrix = matrix.at[np.ix_(velocity_index, velocity_index)].set(-damping)
+    command = jnp.zeros((total, len(attachments)))
     start = 2 * count
-    for i, (device, size) in enumerate(zip(attached, sizes, strict=True)):
-        own = np.arange(start, start + size)
+    for i, (device, size) in enumerate(zip(attachments, device_sizes, strict=True)):
+        device_index = np.arange(start, start + size)
         start += size
-        matrix = matrix.at[np.ix_(own, own)].set(device.state_matrix)
-        matrix = matrix.at[np.ix_(own, rate)].set(jnp.outer(device.stroke_matrix, strokes[i]))
-        matrix = matrix.at[np.ix_(rate, own)].set(jnp.outer(strokes[i], device.output_matrix))
-        command = command.at[own, i].set(device.input_matrix)
-        command = command.at[rate, i].set(device.feedthrough * strokes[i])
+        matrix = matrix.at[np.ix_(device_index, device_index)].set(device.state_matrix)
+        matrix = matrix.at[np.ix_(device_index, velocity_index)].set(
+            jnp.outer(device.stroke_matrix, displacement_map[i])
+        )
+        matrix = matrix.at[np.ix_(velocity_index, device_index)].set(
+            jnp.outer(displacement_map[i], device.output_matrix)
+        )
+        command = command.at[device_index, i].set(device.input_matrix)
+        command = command.at[velocity_index, i].set(device.feedthrough * displacement_map[i])
     return matrix, command

@@ -20,12 +20,12 @@ from jaxtyping import Array, Bool, Float
 from numpy.polynomial import legendre
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
 
-SAME_PLACE = 1e-9  # of the length: closer nodes are one node
-HELD = {  # deflection, rotation
+NODE_TOLERANCE = 1e-9  # of the length: closer nodes are one node
+END_CONDITIONS = {  # deflection, rotation
     "pinned": (True, False),
     "clamped": (True, True),
     "free": (False, False),
@@ -43,62 +43,64 @@ class Layout:
     """
 
     nodes: tuple[tuple[int, ...], ...]
-    held: tuple[tuple[bool, bool], ...]
-    bonded: tuple[tuple[int, ...], ...]
+    constrained: tuple[tuple[bool, bool], ...]
+    patches: tuple[tuple[int, ...], ...]
     degrees: tuple[int, ...]
 
 
-def _places(case: Case) -> list:
+def _node_positions(case: Case) -> list:
     """Positions (m) where segments may end: both ends, every support, both edges of patches."""
-    edges = [edge for _, patch in _bonded(case) for edge in (patch.start, patch.end)]
-    return [0.0, case.beam.length, *(s.position for s in case.supports), *edges]
+    patch_ends = [
+        edge for _, patch in _stiffened_sections(case) for edge in (patch.start, patch.end)
+    ]
+    return [0.0, case.beam.length, *(s.position for s in case.supports), *patch_ends]
 
 
-def _bonded(case: Case) -> list:
+def _stiffened_sections(case: Case) -> list:
     """What the actuators add to the section of the beam, with the index of the actuator."""
     pairs = ((i, actuator.bonded()) for i, actuator in enumerate(case.actuators))
     return [(i, bonded) for i, bonded in pairs if bonded is not None]
 
 
-def lay_out(case: Case) -> Layout:
+def mesh_layout(case: Case) -> Layout:
     """Order the places along the beam, from the numbers known now (not inside `jit`)."""
-    length = float(known(case.beam.length))
-    places = np.array([float(known(place)) / length for place in _places(case)])
+    length = float(concrete(case.beam.length))
+    positions = np.array([float(concrete(place)) / length for place in _node_positions(case)])
     nodes: list[list[int]] = []
-    for index in np.argsort(places, kind="stable"):
-        if nodes and places[index] - places[nodes[-1][0]] < SAME_PLACE:
+    for index in np.argsort(positions, kind="stable"):
+        if nodes and positions[index] - positions[nodes[-1][0]] < NODE_TOLERANCE:
             nodes[-1].append(int(index))
         else:
             nodes.append([int(index)])
     # An end stays exactly where it is, whatever else sits there.
     nodes = [sorted(node) for node in nodes]
 
-    def holds(node):
+    def node_conditions(node):
         ends = (case.beam.left_end, case.beam.right_end)
-        ways = [HELD[ends[i]] for i in node if i < 2]
-        rigid = any(case.supports[i - 2].stiffness is None for i in node if 1 < i < first_edge)
-        return (rigid or any(w[0] for w in ways), any(w[1] for w in ways))
+        end_constraints = [END_CONDITIONS[ends[i]] for i in node if i < 2]
+        rigid = any(case.supports[i - 2].stiffness is None for i in node if 1 < i < first_patch_end)
+        return (rigid or any(w[0] for w in end_constraints), any(w[1] for w in end_constraints))
 
-    first_edge = 2 + len(case.supports)
-    spots = np.array([places[node[0]] for node in nodes])
-    middles = (spots[1:] + spots[:-1]) / 2
-    covers = tuple(
+    first_patch_end = 2 + len(case.supports)
+    node_positions = np.array([positions[node[0]] for node in nodes])
+    midpoints = (node_positions[1:] + node_positions[:-1]) / 2
+    patches = tuple(
         tuple(
             i
-            for n, (i, _) in enumerate(_bonded(case))
-            if places[first_edge + 2 * n] < middle < places[first_edge + 2 * n + 1]
+            for n, (i, _) in enumerate(_stiffened_sections(case))
+            if positions[first_patch_end + 2 * n] < middle < positions[first_patch_end + 2 * n + 1]
         )
-        for middle in middles
+        for middle in midpoints
     )
     # A wave of wavenumber k over a length l needs a little more than k l / 2 terms.
-    waves = np.pi / 2 * (case.beam.modes + len(nodes)) * np.diff(spots)
-    degrees = tuple(int(np.ceil(z + 4 * z ** (1 / 3) + 9)) for z in waves)
-    held = tuple(holds(node) for node in nodes)
-    return Layout(tuple(map(tuple, nodes)), held, covers, degrees)
+    phases = np.pi / 2 * (case.beam.modes + len(nodes)) * np.diff(node_positions)
+    degrees = tuple(int(np.ceil(z + 4 * z ** (1 / 3) + 9)) for z in phases)
+    constrained = tuple(node_conditions(node) for node in nodes)
+    return Layout(tuple(map(tuple, nodes)), constrained, patches, degrees)
 
 
 @functools.cache
-def _element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _reference_element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Basis on t in [-1, 1] as Chebyshev series, with its mass and bending matrices.
 
     The four Hermite cubics (deflection and slope at both ends), then functions that vanish with
@@ -109,8 +111,8 @@ def _element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for i, cubic in enumerate(hermite):
         basis[:4, i] = legendre.poly2leg(cubic)
     for n in range(4, degree + 1):
-        bump = legendre.legint(np.eye(n - 1)[n - 2] * np.sqrt((2 * n - 3) / 2), 2, lbnd=-1)
-        basis[: bump.size, n] = bump
+        bubble = legendre.legint(np.eye(n - 1)[n - 2] * np.sqrt((2 * n - 3) / 2), 2, lbnd=-1)
+        basis[: bubble.size, n] = bubble
     weights = 2 / (2 * np.arange(degree + 1) + 1)
     mass = basis.T @ (weights[:, None] * basis)
     curvature = legendre.legder(basis, 2)
@@ -122,7 +124,7 @@ class Modes(eqx.Module):
     """Modes of the supported beam: q_j'' + damping_j q_j' + stiffness_j q_j = psi_j(x) . force.
 
     `coupling` is the off-diagonal stiffness between repeated modes, zero in value but not in
-    derivative (see `eigen`). `unit` is E I / (m L^4), in which stiffness is of order one for the
+    derivative (see `eigen`). `stiffness_unit` is E I / (m L^4), in which stiffness is of order one for the
     lowest mode. Shapes are mass-normalised, in kg^-1/2, positive near the left end.
     """
 
@@ -132,25 +134,25 @@ class Modes(eqx.Module):
     damping_coupling: Float[Array, "mode mode"]
     nodes: Float[Array, " node"]
     series: Float[Array, "segment degree mode"]
-    unit: Float[Array, ""]
+    stiffness_unit: Float[Array, ""]
 
-    def first(self, count: int) -> "Modes":
+    def lowest(self, count: int) -> "Modes":
         """The lowest modes alone."""
-        kept = slice(0, count)
+        selection = slice(0, count)
         return Modes(
-            stiffness=self.stiffness[kept],
-            damping=self.damping[kept],
-            coupling=self.coupling[kept, kept],
-            damping_coupling=self.damping_coupling[kept, kept],
+            stiffness=self.stiffness[selection],
+            damping=self.damping[selection],
+            coupling=self.coupling[selection, selection],
+            damping_coupling=self.damping_coupling[selection, selection],
             nodes=self.nodes,
-            series=self.series[..., kept],
-            unit=self.unit,
+            series=self.series[..., selection],
+            stiffness_unit=self.stiffness_unit,
         )
 
     @property
     def angular_frequencies(self) -> Float[Array, " mode"]:
         """Natural angular frequencies in rad/s, ascending; zero for rigid-body modes."""
-        return _root(self.stiffness)
+        return _safe_sqrt(self.stiffness)
 
     @property
     def frequencies(self) -> Float[Array, " mode"]:
@@ -158,17 +160,19 @@ class Modes(eqx.Module):
         return self.angular_frequencies / (2 * jnp.pi)
 
     @property
-    def repeated(self) -> Bool[Array, ""]:
+    def has_repeated(self) -> Bool[Array, ""]:
         """Whether any two of the modes have (nearly) the same frequency."""
         low, high = self.stiffness[:-1], self.stiffness[1:]
-        return jnp.any(high - low <= REPEATED_EIGENVALUE_TOLERANCE * (self.unit + low + high))
+        return jnp.any(
+            high - low <= REPEATED_EIGENVALUE_TOLERANCE * (self.stiffness_unit + low + high)
+        )
 
     @property
     def damping_ratios(self) -> Float[Array, " mode"]:
         """Modal damping ratios; zero for rigid-body modes."""
-        moving = self.stiffness > 0
+        elastic = self.stiffness > 0
         return jnp.where(
-            moving, self.damping / (2 * jnp.where(moving, _root(self.stiffness), 1)), 0
+            elastic, self.damping / (2 * jnp.where(elastic, _safe_sqrt(self.stiffness), 1)), 0
         )
 
     def shapes(self, x, derivative: int = 0) -> Float[Array, "*place mode"]:
@@ -176,14 +180,16 @@ class Modes(eqx.Module):
 
         In kg^-1/2 m^-derivative. Positions off the beam continue the nearest segment's polynomial.
         """
-        return self.shapes_together(x, (derivative,))[0]
+        return self.shape_derivatives(x, (derivative,))[0]
 
-    def shapes_together(self, x, derivatives: tuple[int, ...]) -> Float[Array, "order *place mode"]:
+    def shape_derivatives(
+        self, x, derivatives: tuple[int, ...]
+    ) -> Float[Array, "order *place mode"]:
         """Several derivatives of the mode shapes at once, which costs little more than one."""
         return piecewise_chebyshev(self.nodes, self.series, x, derivatives)
 
 
-def _root(square):
+def _safe_sqrt(square):
     """Square root whose derivative at zero is zero."""
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
@@ -197,94 +203,103 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     in every number, at repeated frequencies too. Inside `jit`, give the `layout` found outside by
     `lay_out(case)`.
     """
-    layout = lay_out(case) if layout is None else layout
+    layout = mesh_layout(case) if layout is None else layout
     beam = case.beam
-    spots, stiffness, mass, expand = assemble(case, layout)
+    nodes, stiffness, mass, to_series = assemble_matrices(case, layout)
     values, vectors, coupling = eigen(stiffness, mass)
-    keep = slice(beam.modes)
-    values, coupling = values[keep] * _unit(beam), coupling[keep, keep] * _unit(beam)
-    series = jnp.einsum("std,dm->stm", expand, vectors[:, keep])
+    lowest = slice(beam.modes)
+    values, coupling = (
+        values[lowest] * _stiffness_unit(beam),
+        coupling[lowest, lowest] * _stiffness_unit(beam),
+    )
+    series = jnp.einsum("std,dm->stm", to_series, vectors[:, lowest])
     series = series / jnp.sqrt(beam.linear_density * beam.length)
-    return oriented(beam, values, coupling, spots * beam.length, series)
+    return normalised_modes(beam, values, coupling, nodes * beam.length, series)
 
 
-def oriented(beam, values, coupling, nodes, series) -> Modes:
+def normalised_modes(beam, values, coupling, nodes, series) -> Modes:
     """Modes of given stiffness (1/s^2), damped as the beam says, positive near the left end."""
     damping, damping_coupling = _damping(beam, values, coupling)
-    near_left = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
-    signs = jax.lax.stop_gradient(jnp.where(near_left < 0, -1.0, 1.0))
-    swap = signs[:, None] * signs[None, :]
+    left_values = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
+    signs = jax.lax.stop_gradient(jnp.where(left_values < 0, -1.0, 1.0))
+    sign_products = signs[:, None] * signs[None, :]
     return Modes(
         values,
         damping,
-        coupling * swap,
-        damping_coupling * swap,
+        coupling * sign_products,
+        damping_coupling * sign_products,
         nodes,
         series * signs,
-        _unit(beam),
+        _stiffness_unit(beam),
     )
 
 
-def _unit(beam):
+def _stiffness_unit(beam):
     """E I / (m L^4) in 1/s^2."""
     return beam.rigidity / (beam.linear_density * beam.length**4)
 
 
-def assemble(case: Case, layout: Layout):
+def assemble_matrices(case: Case, layout: Layout):
     """Nodes, stiffness and mass in beam units, and the map from unknowns to Chebyshev series."""
     beam, degrees = case.beam, layout.degrees
-    places = jnp.stack([place / beam.length for place in _places(case)])
-    spots = places[np.array([node[0] for node in layout.nodes])]
-    nodal = [[-1, -1] for _ in layout.nodes]
+    positions = jnp.stack([place / beam.length for place in _node_positions(case)])
+    nodes = positions[np.array([node[0] for node in layout.nodes])]
+    nodal_unknowns = [[-1, -1] for _ in layout.nodes]
     size = 0
-    for i, held in enumerate(layout.held):
+    for i, constrained in enumerate(layout.constrained):
         for j in range(2):
-            if not held[j]:
-                nodal[i][j], size = size, size + 1
-    terms = max(degrees) + 1
+            if not constrained[j]:
+                nodal_unknowns[i][j], size = size, size + 1
+    series_terms = max(degrees) + 1
     total = size + sum(degree - 3 for degree in degrees)
     stiffness, mass = jnp.zeros((total, total)), jnp.zeros((total, total))
-    expand = []
+    to_series = []
     for i, degree in enumerate(degrees):
-        half = (spots[i + 1] - spots[i]) / 2
-        rigidity, density = section(case, layout, i)
-        index = np.array([*nodal[i], *nodal[i + 1], *range(size, size + degree - 3)])
+        half_length = (nodes[i + 1] - nodes[i]) / 2
+        rigidity, density = section_properties(case, layout, i)
+        index = np.array(
+            [*nodal_unknowns[i], *nodal_unknowns[i + 1], *range(size, size + degree - 3)]
+        )
         size += degree - 3
         free = np.flatnonzero(index >= 0)
-        basis, mass_element, bending_element = _element(degree)
-        one = jnp.ones(())
-        bumps = jnp.broadcast_to(half**1.5 / jnp.sqrt(rigidity), (degree - 3,))
-        scale = jnp.concatenate([jnp.stack([one, half, one, half]), bumps])[free]
-        where = np.ix_(index[free], index[free])
+        basis, mass_element, bending_element = _reference_element(degree)
+        unity = jnp.ones(())
+        bubble_scale = jnp.broadcast_to(half_length**1.5 / jnp.sqrt(rigidity), (degree - 3,))
+        scale = jnp.concatenate(
+            [jnp.stack([unity, half_length, unity, half_length]), bubble_scale]
+        )[free]
+        free_unknowns = np.ix_(index[free], index[free])
         scales = scale[:, None] * scale[None, :]
         block = bending_element[np.ix_(free, free)] * scales
-        stiffness = stiffness.at[where].add(block * rigidity / half**3)
-        mass = mass.at[where].add(mass_element[np.ix_(free, free)] * scales * density * half)
-        piece = jnp.zeros((terms, total))
+        stiffness = stiffness.at[free_unknowns].add(block * rigidity / half_length**3)
+        mass = mass.at[free_unknowns].add(
+            mass_element[np.ix_(free, free)] * scales * density * half_length
+        )
+        segment_series = jnp.zeros((series_terms, total))
         rows = np.ix_(np.arange(degree + 1), index[free])
-        expand.append(piece.at[rows].set(basis[:, free] * scale))
+        to_series.append(segment_series.at[rows].set(basis[:, free] * scale))
     spring_unit = beam.length**3 / beam.rigidity
-    for support, node in supported(case, layout):
-        deflection, rotation = nodal[node]
+    for support, node in supported_matrices(case, layout):
+        deflection, rotation = nodal_unknowns[node]
         if support.stiffness is not None and deflection >= 0:
             stiffness = stiffness.at[deflection, deflection].add(support.stiffness * spring_unit)
         if rotation >= 0:
-            turn = support.rotational_stiffness * beam.length / beam.rigidity
-            stiffness = stiffness.at[rotation, rotation].add(turn)
-    return spots, stiffness, mass, jnp.stack(expand)
+            rotational_spring = support.rotational_stiffness * beam.length / beam.rigidity
+            stiffness = stiffness.at[rotation, rotation].add(rotational_spring)
+    return nodes, stiffness, mass, jnp.stack(to_series)
 
 
-def section(case: Case, layout: Layout, segment: int):
+def section_properties(case: Case, layout: Layout, segment: int):
     """Bending stiffness and mass per length of a segment, in those of the beam without patches."""
     rigidity, density = jnp.ones(()), jnp.ones(())
-    for actuator in layout.bonded[segment]:
+    for actuator in layout.patches[segment]:
         patch = case.actuators[actuator].bonded()
         rigidity = rigidity + patch.rigidity / case.beam.rigidity
         density = density + patch.mass / case.beam.linear_density
     return rigidity, density
 
 
-def supported(case: Case, layout: Layout):
+def supported_matrices(case: Case, layout: Layout):
     """Every support with its node."""
     for i, node in enumerate(layout.nodes):
         for index in node:
@@ -299,10 +314,12 @@ def _damping(beam, values, coupling):
     modes is that of the matrix square root.
     """
     if beam.rayleigh_damping is not None:
-        of_mass, of_stiffness = beam.rayleigh_damping
-        return of_mass + of_stiffness * values, of_stiffness * coupling
+        mass_factor, stiffness_factor = beam.rayleigh_damping
+        return mass_factor + stiffness_factor * values, stiffness_factor * coupling
     ratios = jnp.broadcast_to(beam.damping_ratio, values.shape)
-    omega = _root(values)
+    omega = _safe_sqrt(values)
     sums = omega[:, None] + omega[None, :]
-    share = jnp.where(sums > 0, (ratios[:, None] + ratios) / jnp.where(sums > 0, sums, 1.0), 0.0)
-    return 2 * ratios * omega, share * coupling
+    coupling_factor = jnp.where(
+        sums > 0, (ratios[:, None] + ratios) / jnp.where(sums > 0, sums, 1.0), 0.0
+    )
+    return 2 * ratios * omega, coupling_factor * coupling

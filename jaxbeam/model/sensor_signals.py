@@ -3,7 +3,7 @@
 In this order: an analogue filter smooths the signal; it is sampled, `delay` after the fact; offset
 and noise are added; the reading is clipped to the range and rounded to the resolution; a digital
 filter takes the samples. The signal, its clock and the analogue filter are continuous and belong
-to the plant: `read` is what happens at one sample, `sense` all of it for a whole history.
+to the plant: `filtered_reading` is what happens at one sample, `sampled_readings` all of it for a whole history.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.fields import is_known, known
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.filters import (
     Filter,
     analogue,
@@ -26,13 +26,15 @@ from jaxbeam.case.filters import (
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
 
-ROUNDING = 1e-6  # of a period: a sample this much before a tick of the clock is at the tick
+CLOCK_TOLERANCE_PERIODS = (
+    1e-6  # of a period: a sample this much before a tick of the clock is at the tick
+)
 
 Sections = Float[Array, "section 6 ..."] | None  # None: no digital filter
-Memory = Float[Array, "section 2 *lane"] | None
+FilterState = Float[Array, "section 2 *lane"] | None
 
 
-def design(sensor: Sensor, period: Float[Array, ""] | float) -> Sections:
+def sensor_sections(sensor: Sensor, period: Float[Array, ""] | float) -> Sections:
     """Sections of the sensor's digital filter, None if it has none.
 
     They are for its own sampling period if it has one, else for the given one (s). Raises
@@ -44,24 +46,24 @@ def design(sensor: Sensor, period: Float[Array, ""] | float) -> Sections:
     return filter_sections(sensor.filter, period if own is None else own)
 
 
-def init(sensor: Sensor, sections: Sections, value) -> Memory:
+def initial_filter_state(sensor: Sensor, sections: Sections, value) -> FilterState:
     """Memory of a sensor that has long seen a constant value (SI unit of its quantity)."""
-    return None if sections is None else filter_initial(sections, convert(sensor, value))
+    return None if sections is None else filter_initial(sections, to_reading(sensor, value))
 
 
-def read(
-    sensor: Sensor, sections: Sections, memory: Memory, value, noise=None
-) -> tuple[Float[Array, " *lane"], Memory]:
+def filtered_reading(
+    sensor: Sensor, sections: Sections, filter_state: FilterState, value, noise=None
+) -> tuple[Float[Array, " *lane"], FilterState]:
     """One reading of a true value (both in the SI unit of the quantity), and the memory after it.
 
     `noise` is a standard normal sample (see `noise_samples`), None for no noise. Values may have
     lanes, which share the sensor or have numbers of their own in it along their last axis.
     """
-    reading = convert(sensor, value, noise)
-    return (reading, None) if sections is None else filter_step(sections, memory, reading)
+    reading = to_reading(sensor, value, noise)
+    return (reading, None) if sections is None else filter_step(sections, filter_state, reading)
 
 
-def convert(sensor: Sensor, value, noise=None) -> Float[Array, "..."]:
+def to_reading(sensor: Sensor, value, noise=None) -> Float[Array, "..."]:
     """The reading before the digital filter: offset, noise, range and resolution.
 
     Clipped readings have no derivative. Rounding is passed over by derivatives, which are those
@@ -90,7 +92,7 @@ def needs_times(sensor: Sensor) -> bool:
     return not (sensor.filter is None and sensor.sampling_period is None and sensor.delay is None)
 
 
-def sense(
+def sampled_readings(
     sensor: Sensor,
     times: Float[Array, " time"],
     values: Float[Array, " time"],
@@ -111,54 +113,62 @@ def sense(
     _check_times(sensor, times)
     spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
     if sensor.filter is not None and sensor.filter.realisation == "analogue":
-        values, rates = _smooth(sensor.filter, times, spacing, values, rates)
-    ticks, fresh = times, None
+        values, rates = _apply_filter(sensor.filter, times, spacing, values, rates)
+    sample_times, new_reading = times, None
     if sensor.sampling_period is not None:
-        number = jnp.floor((times - times[0]) / sensor.sampling_period + ROUNDING)
-        ticks = times[0] + sensor.sampling_period * number
-        fresh = jnp.concatenate([jnp.ones(1, bool), jnp.diff(number) > 0])
-        noise = None if noise is None else noise[jnp.cumsum(fresh) - 1]
-    seen = values
+        sample_index = jnp.floor(
+            (times - times[0]) / sensor.sampling_period + CLOCK_TOLERANCE_PERIODS
+        )
+        sample_times = times[0] + sensor.sampling_period * sample_index
+        new_reading = jnp.concatenate([jnp.ones(1, bool), jnp.diff(sample_index) > 0])
+        noise = None if noise is None else noise[jnp.cumsum(new_reading) - 1]
+    sampled = values
     if sensor.sampling_period is not None or sensor.delay is not None:
-        late = ticks if sensor.delay is None else ticks - sensor.delay
-        seen = evaluate_cubics(times, hermite_cubics(times, values, rates), late)
-    readings = convert(sensor, seen, noise)
-    sections = design(sensor, spacing)
+        signal_times = sample_times if sensor.delay is None else sample_times - sensor.delay
+        sampled = evaluate_cubics(times, hermite_cubics(times, values, rates), signal_times)
+    readings = to_reading(sensor, sampled, noise)
+    sections = sensor_sections(sensor, spacing)
     if sections is None:
         return readings
-    return filter_history(sections, init(sensor, sections, values[0]), readings, fresh)
+    return filter_history(
+        sections, initial_filter_state(sensor, sections, values[0]), readings, new_reading
+    )
 
 
-def _smooth(filter: Filter, times, spacing, values, rates):
+def _apply_filter(filter: Filter, times, spacing, values, rates):
     """Output of an analogue filter and its rate, at equally spaced times."""
     matrix, column, row, _ = analogue(filter)
-    drift, push = c2d(matrix, column[:, None], spacing, degree=3)
-    driven = hermite_cubics(times, values, rates) @ push[..., 0]
+    transition, input_matrix = c2d(matrix, column[:, None], spacing, degree=3)
+    forced_response = hermite_cubics(times, values, rates) @ input_matrix[..., 0]
 
-    def step(state, drive) -> Any:
-        after = drift @ state + drive
+    def step(state, forced) -> Any:
+        after = transition @ state + forced
         return after, after
 
     start = analogue_initial(filter, values[0])
-    states = jnp.concatenate([start[None], jax.lax.scan(step, start, driven)[1]])
+    states = jnp.concatenate([start[None], jax.lax.scan(step, start, forced_response)[1]])
     return states @ row, states @ (row @ matrix) + values * (row @ column)
 
 
 def _check_times(sensor: Sensor, times) -> None:
-    if sensor.filter is None or not is_known(times):
+    if sensor.filter is None or not is_concrete(times):
         return
-    steps = np.diff(known(times))
-    even = np.ptp(steps) <= ROUNDING * np.mean(steps)
-    own = sensor.sampling_period
-    if not even and (own is None or sensor.filter.realisation == "analogue"):
+    steps = np.diff(concrete(times))
+    equally_spaced = np.ptp(steps) <= CLOCK_TOLERANCE_PERIODS * np.mean(steps)
+    sampling_period = sensor.sampling_period
+    if not equally_spaced and (sampling_period is None or sensor.filter.realisation == "analogue"):
         raise ValueError(
             f"a filter of {sensor.filter.realisation} kind needs times at equal spacing; give it"
             " such times, or leave it out"
         )
-    if sensor.filter.realisation == "digital" and own is not None and is_known(own):
-        longest = float(np.max(steps))
-        if float(known(own)) < (1 - ROUNDING) * longest:
+    if (
+        sensor.filter.realisation == "digital"
+        and sampling_period is not None
+        and is_concrete(sampling_period)
+    ):
+        max_spacing = float(np.max(steps))
+        if float(concrete(sampling_period)) < (1 - CLOCK_TOLERANCE_PERIODS) * max_spacing:
             raise ValueError(
-                f"its filter takes a reading every {float(known(own)):g} s, but samples of the run"
-                f" are {longest:g} s apart: save samples as often (run.sample_rate)"
+                f"its filter takes a reading every {float(concrete(sampling_period)):g} s, but samples of the run"
+                f" are {max_spacing:g} s apart: save samples as often (run.sample_rate)"
             )

@@ -10,13 +10,15 @@ import dataclasses
 import jax.numpy as jnp
 
 from jaxbeam.case.case import Case
-from jaxbeam.model.modes import Modes, modes, oriented
+from jaxbeam.model.modes import Modes, modes, normalised_modes
 from jaxbeam.numerics.eigen import eigen
 
-RIGID = 3.21e10  # N/m; with it Table 2.2 of the thesis is reproduced to all printed digits
+RIGID_SUPPORT_STIFFNESS = (
+    3.21e10  # N/m; with it Table 2.2 of the thesis is reproduced to all printed digits
+)
 
 
-def sine_basis_modes(case: Case, rigid_stiffness: float = RIGID) -> Modes:
+def sine_basis_modes(case: Case, rigid_stiffness: float = RIGID_SUPPORT_STIFFNESS) -> Modes:
     """Modes of a supported beam in the first m modes of the same beam without its supports.
 
     [diag(w_1^2 ... w_m^2) + sum_i k_i psi(x_i) psi(x_i)^T - w^2] p = 0, shapes sum_k psi_k p_k,
@@ -25,13 +27,21 @@ def sine_basis_modes(case: Case, rigid_stiffness: float = RIGID) -> Modes:
     enter alike, with slopes. Frequencies (Hz) and mass-normalised shapes are those of the result.
     """
     beam = case.beam
-    bare = modes(dataclasses.replace(case, supports=()))
-    stiffness = jnp.diag(bare.stiffness) + bare.coupling
+    unsupported = modes(dataclasses.replace(case, supports=()))
+    stiffness = jnp.diag(unsupported.stiffness) + unsupported.coupling
     for support in case.supports:
         spring = rigid_stiffness if support.stiffness is None else support.stiffness
-        shape, slope = bare.shapes_together(support.position, (0, 1))
+        shape, slope = unsupported.shape_derivatives(support.position, (0, 1))
         stiffness = stiffness + spring * jnp.outer(shape, shape)
         stiffness = stiffness + support.rotational_stiffness * jnp.outer(slope, slope)
-    values, mix, coupling = eigen(stiffness / bare.unit, jnp.eye(beam.modes))
-    series = bare.series @ mix
-    return oriented(beam, values * bare.unit, coupling * bare.unit, bare.nodes, series)
+    values, eigenvectors, coupling = eigen(
+        stiffness / unsupported.stiffness_unit, jnp.eye(beam.modes)
+    )
+    series = unsupported.series @ eigenvectors
+    return normalised_modes(
+        beam,
+        values * unsupported.stiffness_unit,
+        coupling * unsupported.stiffness_unit,
+        unsupported.nodes,
+        series,
+    )

@@ -18,10 +18,10 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import is_known, known
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.sensors import QUANTITIES
-from jaxbeam.model.contact import Traffic, contact_rows, traffic
-from jaxbeam.model.modal_model import Rig, rig_in_one
+from jaxbeam.model.contact import LoadSet, contact_rows, load_set
+from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.numerics.discretisation import c2d
@@ -57,9 +57,11 @@ class StateSpace(eqx.Module):
         """
         if self.period is not None:
             raise ValueError("the system is in discrete time already; take the continuous one")
-        drift, push = c2d(self.A, self.B, period)
+        transition, input_matrix = c2d(self.A, self.B, period)
         parts = self.states, self.inputs, self.outputs
-        return StateSpace(drift, push[0], self.C, self.D, *parts, jnp.asarray(period, float))
+        return StateSpace(
+            transition, input_matrix[0], self.C, self.D, *parts, jnp.asarray(period, float)
+        )
 
     def to_control(self) -> Any:
         """A `control.StateSpace` of the package python-control, with the same signal names.
@@ -102,50 +104,54 @@ class StateSpace(eqx.Module):
             ) from None
 
 
-class LoadedBeam(eqx.Module):
+class Plant(eqx.Module):
     """State space of a rig crossed by loads, at any time t (s).
 
-    `scale` times the rig's coordinates are the coordinates q of the states (see `state_space`).
+    `coordinate_scale` times the rig's coordinates are the coordinates q of the states (see `state_space`).
     Outputs are what the sensors would read if they were ideal.
     """
 
     case: Case
-    rig: Rig
-    traffic: Traffic
-    scale: Float[Array, " mode"]
+    modal_model: ModalModel
+    loads: LoadSet
+    coordinate_scale: Float[Array, " mode"]
     coordinate: Signal = eqx.field(static=True)
 
     @property
     def states(self) -> tuple[Signal, ...]:
         """Names and units of the states: coordinates, their rates, states of the actuators."""
-        modes = range(1, self.scale.shape[0] + 1)
+        modes = range(1, self.coordinate_scale.shape[0] + 1)
         name, unit = self.coordinate
-        places = [Signal(f"{name}_{n}", unit) for n in modes]
+        coordinates = [Signal(f"{name}_{n}", unit) for n in modes]
         rates = [Signal(f"{name}_{n}_rate", f"{unit}/s") for n in modes]
-        own = range(1, self.rig.states - 2 * len(modes) + 1)
-        return (*places, *rates, *(Signal(f"actuator_state_{n}", "own") for n in own))
+        actuator_states = range(1, self.modal_model.state_count - 2 * len(modes) + 1)
+        return (
+            *coordinates,
+            *rates,
+            *(Signal(f"actuator_state_{n}", "own") for n in actuator_states),
+        )
 
     @property
     def weights(self) -> Float[Array, " load"]:
         """Weights W of the loads in N, on the beam or off it."""
-        return self.traffic.weight[:, 0]
+        return self.loads.weight[:, 0]
 
-    def from_rig(self, states: Float[Array, "state *lane"]) -> Float[Array, "state *lane"]:
+    def from_modal(self, states: Float[Array, "state *lane"]) -> Float[Array, "state *lane"]:
         """The states z of given states of the rig, which keeps (q_1, q_1', q_2, ...)."""
-        ordered = states[self._order]
-        return ordered * self._scales.reshape(-1, *(1,) * (states.ndim - 1))
+        ordered = states[self._state_order]
+        return ordered * self._state_scales.reshape(-1, *(1,) * (states.ndim - 1))
 
-    def to_rig(self, states: Float[Array, "state *lane"]) -> Float[Array, "state *lane"]:
+    def to_modal(self, states: Float[Array, "state *lane"]) -> Float[Array, "state *lane"]:
         """The states of the rig for given states z."""
-        scaled = states / self._scales.reshape(-1, *(1,) * (states.ndim - 1))
-        return scaled[np.argsort(self._order)]
+        scaled = states / self._state_scales.reshape(-1, *(1,) * (states.ndim - 1))
+        return scaled[np.argsort(self._state_order)]
 
     def at(self, t: Float[Array, ""] | float) -> StateSpace:
         """The system frozen at a time (s); its inputs are the commands, then the weights W.
 
         At the time at which a load enters or leaves it is that just after.
         """
-        return _at(self, jnp.asarray(t, float))
+        return _plant_at(self, jnp.asarray(t, float))
 
     def A(self, t: Float[Array, ""] | float) -> Float[Array, "state state"]:
         """State matrix A(t) with the masses on the beam."""
@@ -162,116 +168,129 @@ class LoadedBeam(eqx.Module):
     @property
     def unloaded(self) -> StateSpace:
         """The time-invariant system without loads; its inputs are the commands."""
-        return _unloaded(self)
+        return _unloaded_plant(self)
 
     def augmented(self, t: Float[Array, ""] | float) -> StateSpace:
         """The system with the weights as further, constant states, eq. (5.8) of the thesis.
 
         Its inputs are the commands alone; the states of the loads start at `weights`.
         """
-        frozen, commands = self.at(t), len(self.case.actuators)
-        loads = frozen.inputs[commands:]
-        none = np.zeros((len(loads), len(frozen.states)))
+        frozen_system, commands = self.at(t), len(self.case.actuators)
+        loads = frozen_system.inputs[commands:]
+        zero_rows = np.zeros((len(loads), len(frozen_system.states)))
         return StateSpace(
-            A=jnp.block([[frozen.A, frozen.B[:, commands:]], [none, np.zeros((len(loads),) * 2)]]),
-            B=jnp.concatenate([frozen.B[:, :commands], np.zeros((len(loads), commands))]),
-            C=jnp.concatenate([frozen.C, frozen.D[:, commands:]], axis=1),
-            D=frozen.D[:, :commands],
-            states=frozen.states + loads,
-            inputs=frozen.inputs[:commands],
-            outputs=frozen.outputs,
+            A=jnp.block(
+                [
+                    [frozen_system.A, frozen_system.B[:, commands:]],
+                    [zero_rows, np.zeros((len(loads),) * 2)],
+                ]
+            ),
+            B=jnp.concatenate([frozen_system.B[:, :commands], np.zeros((len(loads), commands))]),
+            C=jnp.concatenate([frozen_system.C, frozen_system.D[:, commands:]], axis=1),
+            D=frozen_system.D[:, :commands],
+            states=frozen_system.states + loads,
+            inputs=frozen_system.inputs[:commands],
+            outputs=frozen_system.outputs,
         )
 
     @property
-    def _order(self) -> np.ndarray:
+    def _state_order(self) -> np.ndarray:
         """Where the states z are among those of the rig."""
-        modal = 2 * self.scale.shape[0]
-        own = np.arange(modal, self.rig.states)
-        return np.concatenate([np.arange(0, modal, 2), np.arange(1, modal, 2), own])
+        modal = 2 * self.coordinate_scale.shape[0]
+        actuator_states = np.arange(modal, self.modal_model.state_count)
+        return np.concatenate([np.arange(0, modal, 2), np.arange(1, modal, 2), actuator_states])
 
     @property
-    def _scales(self) -> Float[Array, " state"]:
+    def _state_scales(self) -> Float[Array, " state"]:
         """What the rig's states, in the order of z, are multiplied by."""
-        own = jnp.ones(self.rig.states - 2 * self.scale.shape[0])
-        return jnp.concatenate([self.scale, self.scale, own])
+        actuator_scales = jnp.ones(
+            self.modal_model.state_count - 2 * self.coordinate_scale.shape[0]
+        )
+        return jnp.concatenate([self.coordinate_scale, self.coordinate_scale, actuator_scales])
 
-    def _contact(self, t):
+    def _contact_matrices(self, t):
         """Shape rows (load, mode), contact rows (load, state of the rig) and masses (kg) at t."""
-        loads = self.traffic
-        position, speed, acceleration = loads.travel(t)
-        windows = [path.window() for path in loads.motions]
+        loads = self.loads
+        position, speed, acceleration = loads.kinematics(t)
+        windows = [path.window() for path in loads.trajectories]
         active = jnp.array([(entry <= t) & (t < leave) for entry, leave in windows], bool)
-        shape, rows = contact_rows(self.rig, position, speed, acceleration, active)
-        count = len(loads.motions)
+        shape, contact = contact_rows(self.modal_model, position, speed, acceleration, active)
+        count = len(loads.trajectories)
         mass = jnp.where(active, loads.inertia[:, 0], 0.0)
-        return shape.reshape(count, self.scale.size), rows.reshape(count, self.rig.states), mass
+        return (
+            shape.reshape(count, self.coordinate_scale.size),
+            contact.reshape(count, self.modal_model.state_count),
+            mass,
+        )
 
-    def _frozen(self, shape, rows, mass) -> StateSpace:
+    def _system_with_loads(self, shape_rows, contact_rows, mass) -> StateSpace:
         """The system while loads of these masses, shape and contact rows are on the beam."""
-        model, modes = self.rig, self.scale.shape[0]
+        model, modes = self.modal_model, self.coordinate_scale.shape[0]
         rates = np.arange(1, 2 * modes, 2)
         matrix, command = block_diag(*model.state_matrix), model.command_matrix
         # The contact forces: (1 + m S S') r = -W - m (rows z + S forces of the commands).
-        push = jnp.zeros((model.states, shape.shape[0])).at[rates].set(shape.T)
-        held = jnp.eye(len(mass)) + mass * (shape @ shape.T)
-        push = solve_small(held[:, :, None], push.T[:, :, None])[:, :, 0].T
-        matrix = matrix - push @ (mass[:, None] * rows)
-        command = command - push @ (mass[:, None] * (shape @ command[rates]))
-        inputs = jnp.concatenate([command, -push], axis=1)
-        row, direct = self._outputs(matrix, inputs)
-        order, scales = self._order, self._scales
+        force_input = (
+            jnp.zeros((model.state_count, shape_rows.shape[0])).at[rates].set(shape_rows.T)
+        )
+        contact_matrix = jnp.eye(len(mass)) + mass * (shape_rows @ shape_rows.T)
+        force_input = solve_small(contact_matrix[:, :, None], force_input.T[:, :, None])[:, :, 0].T
+        matrix = matrix - force_input @ (mass[:, None] * contact_rows)
+        command = command - force_input @ (mass[:, None] * (shape_rows @ command[rates]))
+        inputs = jnp.concatenate([command, -force_input], axis=1)
+        C, D = self._sensor_rows(matrix, inputs)
+        order, scales = self._state_order, self._state_scales
         loads = tuple(Signal(f"load_{i}", "N") for i in range(len(mass)))
         return StateSpace(
             A=matrix[np.ix_(order, order)] * scales[:, None] / scales,
             B=inputs[order] * scales[:, None],
-            C=row[:, order] / scales,
-            D=direct,
+            C=C[:, order] / scales,
+            D=D,
             states=self.states,
-            inputs=_commands(self.case) + loads,
+            inputs=_command_signals(self.case) + loads,
             outputs=tuple(
                 Signal(f"sensor_{i}_{s.quantity}", QUANTITIES[s.quantity])
                 for i, s in enumerate(self.case.sensors)
             ),
         )
 
-    def _outputs(self, matrix, inputs):
+    def _sensor_rows(self, A, B):
         """Rows that take the rig's states, and the inputs, to what the sensors measure."""
-        states, modal = self.rig.states, 2 * self.scale.shape[0]
-        rows = jnp.zeros((len(self.case.sensors), states))
-        direct = jnp.zeros((len(self.case.sensors), inputs.shape[1]))
+        states, modal = self.modal_model.state_count, 2 * self.coordinate_scale.shape[0]
+        C = jnp.zeros((len(self.case.sensors), states))
+        D = jnp.zeros((len(self.case.sensors), B.shape[1]))
         for i, sensor in enumerate(self.case.sensors):
             derivative = {"slope": 1, "strain": 2}.get(sensor.quantity, 0)
-            shape = self.rig.shapes(sensor.position, (derivative,))[0]
+            shape = self.modal_model.shapes(sensor.position, (derivative,))[0]
             if sensor.quantity == "strain":
                 shape = -sensor.fibre_distance * shape
             if sensor.quantity == "acceleration":
-                rows = rows.at[i].set(shape @ matrix[1:modal:2])
-                direct = direct.at[i].set(shape @ inputs[1:modal:2])
+                C = C.at[i].set(shape @ A[1:modal:2])
+                D = D.at[i].set(shape @ B[1:modal:2])
             else:
-                first = 1 if sensor.quantity == "velocity" else 0
-                rows = rows.at[i, first:modal:2].set(shape)
-        return rows, direct
+                first_state = 1 if sensor.quantity == "velocity" else 0
+                C = C.at[i, first_state:modal:2].set(shape)
+        return C, D
 
 
 # One program each: done one by one, all these small operations would take seconds to compile.
 @compiled
-def _at(model: LoadedBeam, t) -> StateSpace:
-    return model._frozen(*model._contact(t))
+def _plant_at(plant: Plant, t) -> StateSpace:
+    return plant._system_with_loads(*plant._contact_matrices(t))
 
 
 @compiled
-def _unloaded(model: LoadedBeam) -> StateSpace:
-    modes, states = model.scale.shape[0], model.rig.states
-    return model._frozen(jnp.zeros((0, modes)), jnp.zeros((0, states)), jnp.zeros(0))
+def _unloaded_plant(plant: Plant) -> StateSpace:
+    modes, states = plant.coordinate_scale.shape[0], plant.modal_model.state_count
+    return plant._system_with_loads(jnp.zeros((0, modes)), jnp.zeros((0, states)), jnp.zeros(0))
 
 
-def _commands(case: Case) -> tuple[Signal, ...]:
+def _command_signals(case: Case) -> tuple[Signal, ...]:
     """The commands, in the unit in which the actuators' limits are given."""
     units = [type(a).__dataclass_fields__["limits"].metadata["unit"] for a in case.actuators]
     return tuple(Signal(f"command_{i}", unit) for i, unit in enumerate(units))
 
 
-def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = None) -> LoadedBeam:
+def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = None) -> Plant:
     """The state space of a case: beam, supports, actuators and loads; without its controller.
 
     The coordinates q are those of the rig ("modal"), mass-normalised, in m kg^0.5; or ("sine")
@@ -281,10 +300,10 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
 
     Raises ValueError for other coordinates, and if the modes are no sines.
     """
-    return loaded_beam(case, rig_in_one(case, layout), coordinates)
+    return build_plant(case, compiled_modal_model(case, layout), coordinates)
 
 
-def loaded_beam(case: Case, model: Rig, coordinates: str = "modal") -> LoadedBeam:
+def build_plant(case: Case, model: ModalModel, coordinates: str = "modal") -> Plant:
     """The state space of a case whose rig is assembled already; see `state_space`.
 
     Raises ValueError as that does.
@@ -292,20 +311,22 @@ def loaded_beam(case: Case, model: Rig, coordinates: str = "modal") -> LoadedBea
     if coordinates == "modal":
         scale, coordinate = jnp.ones(case.beam.modes), Signal("q", "m kg^0.5")
     elif coordinates == "sine":
-        scale, coordinate = _sine_amplitudes(case, model), Signal("a", "m")
+        scale, coordinate = _sine_scale(case, model), Signal("a", "m")
     else:
         raise ValueError(f"coordinates may be 'modal' or 'sine', not {coordinates!r}")
-    return LoadedBeam(case, model, traffic(case), scale, coordinate)
+    return Plant(case, model, load_set(case), scale, coordinate)
 
 
-def _sine_amplitudes(case: Case, model: Rig) -> Float[Array, " mode"]:
+def _sine_scale(case: Case, model: ModalModel) -> Float[Array, " mode"]:
     """What the coordinates of the rig are to be multiplied by to give amplitudes of sines."""
-    shares = (np.arange(64) + 0.5) / 64
-    shapes = model.shapes(case.beam.length * shares, (0,))[0]
-    sines = np.sin(np.pi * np.outer(shares, np.arange(1, case.beam.modes + 1)))
+    relative_positions = (np.arange(64) + 0.5) / 64
+    shapes = model.shapes(case.beam.length * relative_positions, (0,))[0]
+    sines = np.sin(np.pi * np.outer(relative_positions, np.arange(1, case.beam.modes + 1)))
     scale = jnp.sum(shapes * sines, axis=0) / np.sum(sines**2, axis=0)
-    rest = shapes - scale * sines
-    if is_known(rest) and np.max(np.abs(known(rest))) > 1e-6 * np.max(np.abs(known(scale))):
+    residual = shapes - scale * sines
+    if is_concrete(residual) and np.max(np.abs(concrete(residual))) > 1e-6 * np.max(
+        np.abs(concrete(scale))
+    ):
         raise ValueError(
             "the modes of this beam are not sin(n pi x / L); use coordinates='modal', or a"
             " pinned-pinned beam without supports in between"

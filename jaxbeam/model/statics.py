@@ -1,5 +1,5 @@
 """Exact static solutions: deflections, influence lines, lifts of actuators, and peaks while loads
-travel slowly. No modes here; see `compliance`.
+travel slowly. No modes here; see `flexibility`.
 """
 
 import jax
@@ -9,34 +9,34 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case, known_case
 from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.case.fields import is_known
-from jaxbeam.case.loads import motion
+from jaxbeam.case.fields import is_concrete
+from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check
-from jaxbeam.model.flexibility import check_held, compliance
-from jaxbeam.model.modes import Layout, lay_out
+from jaxbeam.model.flexibility import check_supported, flexibility
+from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.numerics.peak_search import refine_peak
 from jaxbeam.runtime.compiling import compiled
 
 # On a stretch of a crossing: a cubic of a cubic is known exactly by ten.
-POINTS = tuple(float(share) for share in np.linspace(0, 1, 10))
+PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 10))
 
 
 @compiled
-def _influence(case: Case, layout: Layout, x, positions, order: int):
-    found = compliance(case, layout, x.reshape(-1), order)
+def _influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
+    greens = flexibility(case, layout, x.reshape(-1), derivative)
     length = case.beam.length
-    line = -found(positions / length) * length ** (3 - order) / case.beam.rigidity
-    return line.reshape(*positions.shape, *x.shape)
+    line = -greens(load_positions / length) * length ** (3 - derivative) / case.beam.rigidity
+    return line.reshape(*load_positions.shape, *x.shape)
 
 
 def influence_line(
-    case: Case, x, positions, derivative: int = 0, layout: Layout | None = None
+    case: Case, x, load_positions, derivative: int = 0, layout: Layout | None = None
 ) -> Float[Array, "..."]:
     """Static deflection at x per newton that presses at each position, in m/N.
 
     Exact for E I w'''' = p with the case's supports, bonded patches and suspensions, commands
-    zero. `x` and `positions` are in m from the left end and may have any shapes; the result is
+    zero. `x` and `load_positions` are in m from the left end and may have any shapes; the result is
     (position..., place...). `derivative` (up to 3)
     gives that x-derivative instead, in m^(1-derivative)/N. By reciprocity the line of deflections
     is also the deflected shape under 1 N at x. Differentiable in every number. Inside `jit`, give
@@ -45,9 +45,9 @@ def influence_line(
     Raises ValueError for a faulty case, a place off the beam, or a beam that can move as a rigid
     body.
     """
-    x, positions = jnp.asarray(x, float), jnp.asarray(positions, float)
-    layout = _checked(case, layout, x=x, positions=positions)
-    return _influence(case, layout, x, positions, derivative)
+    x, load_positions = jnp.asarray(x, float), jnp.asarray(load_positions, float)
+    layout = _validated_layout(case, layout, x=x, positions=load_positions)
+    return _influence_line(case, layout, x, load_positions, derivative)
 
 
 def static_deflection(
@@ -68,19 +68,19 @@ def static_deflection(
     positions = jnp.atleast_1d(jnp.asarray(load_positions, float))
     if forces is None:
         forces = jnp.array([load.weight(case.run.gravity) for load in case.loads]).reshape(-1)
-        whose = "loads of the case"
+        described = "loads of the case"
     else:
         forces = jnp.atleast_1d(jnp.asarray(forces, float))
-        whose = "forces"
+        described = "forces"
     if forces.shape != positions.shape or forces.ndim != 1:
         raise ValueError(
-            f"load_positions must be one for each of the {forces.size} {whose};"
+            f"load_positions must be one for each of the {forces.size} {described};"
             f" their shape is {positions.shape}"
         )
     return jnp.tensordot(forces, influence_line(case, x, positions, derivative, layout), axes=1)
 
 
-def static_lift(
+def static_deflection_per_command(
     case: Case, x, derivative: int = 0, layout: Layout | None = None
 ) -> Float[Array, "actuator *place"]:
     """Static deflection at x (m) per unit of each actuator's steady command, in m/V or m/N.
@@ -90,20 +90,20 @@ def static_lift(
     Inside `jit`, give the `layout`. Raises ValueError as `influence_line` does.
     """
     x = jnp.asarray(x, float)
-    layout = _checked(case, layout, x=x)
-    return _lift(case, layout, x, derivative)
+    layout = _validated_layout(case, layout, x=x)
+    return _deflection_per_command(case, layout, x, derivative)
 
 
 @compiled
-def _lift(case: Case, layout: Layout, x, order: int):
+def _deflection_per_command(case: Case, layout: Layout, x, derivative: int):
     length = case.beam.length
-    found = compliance(case, layout, x.reshape(-1), order)  # by reciprocity, forces at x
-    lifts = jnp.zeros((len(case.actuators), x.size))
+    greens = flexibility(case, layout, x.reshape(-1), derivative)  # by reciprocity, forces at x
+    gains = jnp.zeros((len(case.actuators), x.size))
     for i, actuator in enumerate(case.actuators):
         terms = actuator.stroke()
-        stroke = sum(f / length**d * found(place / length, d) for place, d, f in terms)
-        lifts = lifts.at[i].set(actuator.attachment().steady * stroke)
-    return (lifts * length ** (3 - order) / case.beam.rigidity).reshape(-1, *x.shape)
+        displacement = sum(f / length**d * greens(position / length, d) for position, d, f in terms)
+        gains = gains.at[i].set(actuator.attachment().steady * displacement)
+    return (gains * length ** (3 - derivative) / case.beam.rigidity).reshape(-1, *x.shape)
 
 
 def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*place"]:
@@ -119,43 +119,49 @@ def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*p
     `influence_line` does.
     """
     x = jnp.asarray(x, float)
-    layout = _checked(case, layout, x=x)
+    layout = _validated_layout(case, layout, x=x)
     if not case.loads:
         return jnp.zeros(x.shape)
-    return _peak(case, layout, x)
+    return _static_peak(case, layout, x)
 
 
 @compiled
-def _peak(case: Case, layout: Layout, x):
+def _static_peak(case: Case, layout: Layout, x):
     length = case.beam.length
-    found = compliance(case, layout, x.reshape(-1), 0)
-    motions = [motion(load, length) for load in case.loads]
-    windows = jnp.stack([jnp.stack(path.window()) for path in motions])
-    corners = jnp.concatenate([found.nodes, found.points.places])
-    tables = [load.times for load in case.loads if load.times is not None]
-    events = [windows.ravel(), *(path.passage_times(corners * length) for path in motions), *tables]
+    greens = flexibility(case, layout, x.reshape(-1), 0)
+    trajectories = [trajectory(load, length) for load in case.loads]
+    windows = jnp.stack([jnp.stack(path.window()) for path in trajectories])
+    nodes = jnp.concatenate([greens.nodes, greens.sources.positions])
+    table_times = [load.times for load in case.loads if load.times is not None]
+    events = [
+        windows.ravel(),
+        *(path.passage_times(nodes * length) for path in trajectories),
+        *table_times,
+    ]
     events = jnp.concatenate(events)
-    edges = jnp.sort(jnp.where(events < NEVER, events, windows[0, 0]))
-    low, high = edges[:-1], edges[1:]
-    middle = (low + high) / 2
-    times = low + (high - low) * np.array(POINTS)[:, None]
+    event_times = jnp.sort(jnp.where(events < NEVER, events, windows[0, 0]))
+    starts, ends = event_times[:-1], event_times[1:]
+    middle = (starts + ends) / 2
+    times = starts + (ends - starts) * np.array(PEAK_POSITIONS)[:, None]
     total = jnp.zeros((*times.shape, x.size))
-    for load, path, window in zip(case.loads, motions, windows, strict=True):
+    for load, path, window in zip(case.loads, trajectories, windows, strict=True):
         active = (window[0] < middle) & (middle < window[1])
-        place = jnp.clip(path.travel(times)[0] / length, 0.0, 1.0)
-        pressed = load.weight(case.run.gravity) * active[:, None] * found(place)
-        total = total + pressed
-    highest = jnp.max(refine_peak(total, POINTS)[0], axis=0)
+        relative_position = jnp.clip(path.travel(times)[0] / length, 0.0, 1.0)
+        load_deflection = (
+            load.weight(case.run.gravity) * active[:, None] * greens(relative_position)
+        )
+        total = total + load_deflection
+    highest = jnp.max(refine_peak(total, PEAK_POSITIONS)[0], axis=0)
     return (highest * length**3 / case.beam.rigidity).reshape(x.shape)
 
 
-def _checked(case: Case, layout: Layout | None, **places) -> Layout:
+def _validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:
     """The layout of a case that is fit for statics, as far as its numbers are known."""
     check(case)
-    for name, place in places.items():
-        check_on_beam(name, place, case.beam.length)
-    layout = lay_out(case) if layout is None else layout
-    resting = Case(case.beam, case.supports, case.actuators)
-    if all(is_known(leaf) for leaf in jax.tree.leaves(resting)):
-        check_held(known_case(resting), layout)
+    for name, position in positions.items():
+        check_on_beam(name, position, case.beam.length)
+    layout = mesh_layout(case) if layout is None else layout
+    unloaded_case = Case(case.beam, case.supports, case.actuators)
+    if all(is_concrete(leaf) for leaf in jax.tree.leaves(unloaded_case)):
+        check_supported(known_case(unloaded_case), layout)
     return layout

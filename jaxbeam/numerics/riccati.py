@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.fields import is_known, known
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.intervals import (
     InputMatrix,
@@ -188,7 +188,7 @@ def _doubled_to_infinity(interval: Interval) -> Square:
 
     def unconverged(state):
         part, count = state
-        return (jnp.max(jnp.abs(part.drift)) > TRANSITION_TOLERANCE) & (count < MAX_DOUBLINGS)
+        return (jnp.max(jnp.abs(part.transition)) > TRANSITION_TOLERANCE) & (count < MAX_DOUBLINGS)
 
     part, _ = jax.lax.while_loop(
         unconverged, lambda s: (s[0].compose(s[0]), s[1] + 1), (interval, 0)
@@ -240,9 +240,9 @@ def _check_weights(A, B, Q, R, N):
                 f"{name} must be {expected_shapes[name]} for a B of {B.shape}, not {matrix.shape}"
             )
     for name, weight in {"Q": Q, "R": R}.items():
-        if not is_known(weight):
+        if not is_concrete(weight):
             continue
-        weight = known(weight)
+        weight = concrete(weight)
         size = np.max(np.abs(weight), initial=0.0)
         if np.max(np.abs(weight - weight.T), initial=0.0) > 1e-12 * size:
             raise ValueError(f"{name} must be symmetric; take the mean of it and its transpose")
@@ -258,7 +258,7 @@ def _check_weights(A, B, Q, R, N):
 
 
 def _require_finite(cost):
-    if is_known(cost) and not np.all(np.isfinite(known(cost))):
+    if is_concrete(cost) and not np.all(np.isfinite(concrete(cost))):
         raise ValueError(
             "there is no stabilising solution: some undamped or growing mode is out of the reach"
             " of the commands, or undamped and not weighted by Q"

@@ -58,10 +58,10 @@ def collocated_stages(
         return _collocated_stage(matrix, column, length, Q * scale * scale[:, None], R)
 
     scaled_stages = jax.lax.map(collocate, (scaled_A, scaled_B, lengths), batch_size=16)
-    scale_with_inputs = jnp.concatenate([scale, jnp.ones(scaled_stages.push.shape[-1])])
+    scale_with_inputs = jnp.concatenate([scale, jnp.ones(scaled_stages.input_matrix.shape[-1])])
     return Stage(
-        transition=scaled_stages.drift * scale[:, None] / scale,
-        input_matrix=scaled_stages.push * scale[:, None],
+        transition=scaled_stages.transition * scale[:, None] / scale,
+        input_matrix=scaled_stages.input_matrix * scale[:, None],
         cost=scaled_stages.toll / scale_with_inputs / scale_with_inputs[:, None],
     )
 

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.plot.record import shade_crossings
 from jaxbeam.plot.schematic import ACTUATOR_MARKER, LOAD_MARKER, draw_supports
 from jaxbeam.plot.style import (
@@ -45,7 +45,7 @@ def animate(
     """
     if not overwrite and os.path.exists(path):
         raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
-    if np.isfinite(float(known(record.diverged_time))):
+    if np.isfinite(float(concrete(record.diverged_time))):
         raise ValueError(f"there is nothing to show: {record.verdict}")
     controlled = record.case.controller is not None
     heights = [2.2] + [1.3] * (bool(record.case.sensors) + controlled)
@@ -87,16 +87,16 @@ def animate(
 def _beam_axes(axes, record):
     """Draw the rig; return what moves it to a sample."""
     case = record.case
-    length = float(known(case.beam.length))
+    length = float(concrete(case.beam.length))
     x = np.linspace(0, length, 201)
-    sensor_positions = np.array([float(known(sensor.position)) for sensor in case.sensors])
+    sensor_positions = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
     load_positions = np.asarray(record.load_position)
     beam = np.asarray(record.at(jnp.asarray(x)))
     factor, unit = unit_scale(beam, "m")
     beam = beam / factor
     lowest_deflection = np.minimum.accumulate(beam)
     actuator_positions = [
-        [float(known(p)) for p, _, _ in actuator.stroke()] for actuator in case.actuators
+        [float(concrete(p)) for p, _, _ in actuator.stroke()] for actuator in case.actuators
     ]
     point_actuators = np.array([places[0] for places in actuator_positions if len(places) == 1])
     patches = [

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxbeam.analysis.compare import Comparison
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.plot.record import label_loads, shade_crossings
 from jaxbeam.plot.style import (
     GREY,
@@ -75,7 +75,7 @@ def _draw_deflection(axes, comparison):
     for bound in (-comparison.bound.peak / factor, comparison.bound.peak / factor):
         if low <= bound <= high:
             axes.axhline(bound, color=INK, linewidth=0.7)
-    position = float(known(comparison.case.sensors[sensor].position))
+    position = float(concrete(comparison.case.sensors[sensor].position))
     axes.set_ylabel(f"deflection at {position:.4g} m ({unit})")
     label_loads(axes, comparison.free)
     margin_labels(axes, peaks, labels, [look["color"] for _, _, look in runs])
@@ -95,7 +95,7 @@ def _draw_commands(axes, comparison, actuator):
     axes.set_ylabel(f"command{number} ({unit})")
     limits = case.command_limits()
     if limits is not None:
-        limit_values = np.asarray(known(limits)).tolist()
+        limit_values = np.asarray(concrete(limits)).tolist()
         for limit in limit_values:
             axes.axhline(limit, color=GREY, linewidth=0.9, linestyle=":")
         margin_labels(

@@ -5,7 +5,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.model.modes import Modes, modes as find_modes
 from jaxbeam.plot.schematic import draw_supports
 from jaxbeam.plot.style import (
@@ -28,7 +28,7 @@ def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
     case if left out.
     """
     modes = find_modes(case) if modes is None else modes
-    length = float(known(case.beam.length))
+    length = float(concrete(case.beam.length))
     x = np.linspace(0, length, 401)
     shapes = np.asarray(modes.shapes(jnp.asarray(x)))
     shapes = 0.36 * shapes / np.max(np.abs(shapes), axis=0)

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxbeam.case.fields import known
-from jaxbeam.case.loads import motion
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads import trajectory
 from jaxbeam.plot.schematic import draw_schematic
 from jaxbeam.plot.style import (
     ALARM,
@@ -58,9 +58,9 @@ def plot_record(record: Record) -> Figure:
 def load_windows(record: Record) -> list[tuple[int, float, float]]:
     """Each load seen in the record, by number, with its entry and exit (s), cut to the record."""
     times = np.asarray(record.times)
-    trajectories = [motion(load, record.case.beam.length) for load in record.case.loads]
+    trajectories = [trajectory(load, record.case.beam.length) for load in record.case.loads]
     windows = np.array(
-        [[float(known(t)) for t in trajectory.window()] for trajectory in trajectories]
+        [[float(concrete(t)) for t in trajectory.window()] for trajectory in trajectories]
     ).reshape(-1, 2)
     cut = np.clip(windows, times[0], times[-1]).tolist()
     return [(i, entry, leaves) for i, (entry, leaves) in enumerate(cut) if entry < leaves]
@@ -101,7 +101,7 @@ def _load_label(load) -> str:
     """The numbers of a load that tell it from others, with units: "0.5 kg, 1.2 m/s"."""
     numbers = [(field, getattr(load, field.name)) for field in dataclasses.fields(load)]
     return ", ".join(
-        f"{float(known(value)):.4g} {field.metadata['unit']}"
+        f"{float(concrete(value)):.4g} {field.metadata['unit']}"
         for field, value in numbers
         if field.name in ("mass", "force", "speed") and value is not None
     )
@@ -136,7 +136,7 @@ def _draw_forces(axes, record):
     for i, load in enumerate(record.case.loads):
         contact_force = np.where(on[:, i], force[:, i], np.nan) / factor
         axes.plot(times, contact_force, color=load_colour(i), linewidth=1.1)
-        weight = float(known(load.weight(record.case.run.gravity))) / factor
+        weight = float(concrete(load.weight(record.case.run.gravity))) / factor
         weights.setdefault(weight, load_colour(i))
     lost = np.asarray(record.contact_lost_time)
     lost = lost[np.isfinite(lost)]
@@ -174,7 +174,7 @@ def _draw_commands(axes, record):
         limits = actuator.command_limits()
         if limits is None or not np.any(np.asarray(record.saturated)[:, i]):
             continue
-        for limit in np.asarray(known(limits)):
+        for limit in np.asarray(concrete(limits)):
             if np.any(np.isclose(command[:, i], limit)):
                 axes.axhline(limit, color=load_colour(i), linewidth=0.9, linestyle=":")
                 limit_values.append(limit)

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.path import Path
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.plot.style import COLOURS, GREY, INK, colour, separate_labels
 
 # Markers hang below the point of the beam that they hold, whatever the scale of the axes.
@@ -39,7 +39,7 @@ def _draw_marker(axes, x, y, marker, size, **style):
 
 def draw_supports(axes, case: Case, y: int | float = 0, size: int | float = 22) -> None:
     """Draw ends and supports of a case at height y; `size` is in points."""
-    length = float(known(case.beam.length))
+    length = float(concrete(case.beam.length))
     for x, end, side in ((0.0, case.beam.left_end, 1), (length, case.beam.right_end, -1)):
         if end == "pinned":
             _draw_marker(axes, x, y, PIN_MARKER, size)
@@ -50,22 +50,22 @@ def draw_supports(axes, case: Case, y: int | float = 0, size: int | float = 22) 
         marker_path = PIN_MARKER if support.stiffness is None else SPRING_MARKER
         fill = "white" if support.stiffness is None else "none"
         _draw_marker(
-            axes, float(known(support.position)), y, marker_path, size, markerfacecolor=fill
+            axes, float(concrete(support.position)), y, marker_path, size, markerfacecolor=fill
         )
 
 
 def draw_schematic(axes, case: Case) -> None:
     """Draw the whole rig at height zero: sensors in their colours, named by their positions."""
-    length = float(known(case.beam.length))
+    length = float(concrete(case.beam.length))
     axes.plot([0, length], [0, 0], color=INK, linewidth=3, zorder=2)
     draw_supports(axes, case)
     for actuator in case.actuators:
-        actuator_positions = [float(known(x)) for x, _, _ in actuator.stroke()]
+        actuator_positions = [float(concrete(x)) for x, _, _ in actuator.stroke()]
         if len(actuator_positions) == 1:
             _draw_marker(axes, actuator_positions[0], 0, ACTUATOR_MARKER, 22, markeredgecolor=GREY)
         else:
             axes.plot(actuator_positions, [0, 0], color=COLOURS[4], linewidth=6, zorder=2.5)
-    sensor_positions = np.array([float(known(sensor.position)) for sensor in case.sensors])
+    sensor_positions = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
     for i, (x, label_position) in enumerate(
         zip(sensor_positions, separate_labels(sensor_positions, 0.08 * length), strict=True)
     ):

@@ -9,7 +9,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.plot.style import (
     ALARM,
@@ -89,7 +89,7 @@ def _sensor_names(peaks, case):
     numbers = [int(str(label).split(":")[0]) for label in peaks["sensor"].values]
     swept = any(str(address).startswith("sensors.") for address in peaks.coords)
     return [
-        f"sensor {i}" if swept else f"at {float(known(case.sensors[i].position)):.4g} m"
+        f"sensor {i}" if swept else f"at {float(concrete(case.sensors[i].position)):.4g} m"
         for i in numbers
     ]
 

@@ -16,40 +16,45 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
-from jaxbeam.case.fields import known
-from jaxbeam.integrator.events import Schedule, merged
+from jaxbeam.case.fields import concrete
+from jaxbeam.integrator.events import EventSchedule, controller_schedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
-from jaxbeam.integrator.propagators import GAUSS, NODES
-from jaxbeam.model.contact import Traffic, at_instant
-from jaxbeam.model.modal_model import Rig
+from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
+from jaxbeam.model.contact import LoadSet, contact_at
+from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensor_filters import sensed
-from jaxbeam.model.sensor_signals import design, init, noise_samples, read
-from jaxbeam.model.state_space import LoadedBeam, state_space
+from jaxbeam.model.sensor_filters import with_sensor_filters
+from jaxbeam.model.sensor_signals import (
+    filtered_reading,
+    initial_filter_state,
+    noise_samples,
+    sensor_sections,
+)
+from jaxbeam.model.state_space import Plant, state_space
 
 NEWTON_ITERATIONS = (
     4  # of Newton's method for a law at every instant; one would do for a linear law
 )
 
 
-def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> Schedule:
+def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> EventSchedule:
     """When the controller of a case acts and its sensors are read, up to the last sample (s)."""
     controller, end = case.controller, samples[-1]
     breakpoints = controller.breakpoints(case)
-    breakpoints = np.zeros(0) if breakpoints is None else known(breakpoints)
+    breakpoints = np.zeros(0) if breakpoints is None else concrete(breakpoints)
     if controller.period is None:
-        return merged(samples, np.zeros(0), 0.0, [], [], breakpoints)
+        return controller_schedule(samples, np.zeros(0), 0.0, [], [], breakpoints)
 
     def clock(period):
         return np.arange(int(np.floor(end / period * (1 + 1e-12))) + 1) * period
 
-    period = float(known(controller.period))
+    period = float(concrete(controller.period))
     sampling_periods = [
-        period if s.sampling_period is None else known(s.sampling_period) for s in case.sensors
+        period if s.sampling_period is None else concrete(s.sampling_period) for s in case.sensors
     ]
-    delays = [0.0 if s.delay is None else float(known(s.delay)) for s in case.sensors]
-    delay = 0.0 if controller.delay is None else float(known(controller.delay))
-    return merged(
+    delays = [0.0 if s.delay is None else float(concrete(s.delay)) for s in case.sensors]
+    delay = 0.0 if controller.delay is None else float(concrete(controller.delay))
+    return controller_schedule(
         samples,
         clock(period),
         delay,
@@ -67,12 +72,12 @@ class ClosedLoop(AbstractInputPolicy):
     rig's, and their rates the last of the commands.
     """
 
-    plant: LoadedBeam
+    plant: Plant
     initial_memory: Any
-    model: Rig
+    model: ModalModel
     output_rows: Float[Array, "sensor state"]
-    loads: Traffic
-    schedule: Schedule
+    loads: LoadSet
+    schedule: EventSchedule
     filter_sections: tuple
     noise: Float[Array, "read sensor"] | None
     state_bound: Float[Array, " state"]
@@ -87,10 +92,11 @@ class ClosedLoop(AbstractInputPolicy):
         commands = jnp.zeros((len(case.actuators), batch_size))
         pairs = zip(case.sensors, self.filter_sections, strict=True)
         sensor_memory = [
-            init(sensor, sections, jnp.zeros(batch_size)) for sensor, sections in pairs
+            initial_filter_state(sensor, sections, jnp.zeros(batch_size))
+            for sensor, sections in pairs
         ]
         readings_at_rest = [
-            read(sensor, sections, state, jnp.zeros(batch_size))[0]
+            filtered_reading(sensor, sections, state, jnp.zeros(batch_size))[0]
             for sensor, sections, state in zip(
                 case.sensors, self.filter_sections, sensor_memory, strict=True
             )
@@ -99,9 +105,9 @@ class ClosedLoop(AbstractInputPolicy):
             jnp.stack(readings_at_rest) if readings_at_rest else jnp.zeros((0, batch_size))
         )
         reading_history = jnp.broadcast_to(
-            readings_at_rest, (self.schedule.newest + 1, *readings_at_rest.shape)
+            readings_at_rest, (self.schedule.max_age + 1, *readings_at_rest.shape)
         )
-        command_queue = jnp.zeros((self.schedule.waiting + 1, *commands.shape))
+        command_queue = jnp.zeros((self.schedule.max_waiting + 1, *commands.shape))
         return memory, commands, sensor_memory, reading_history, command_queue
 
     def inputs(self, memory, state, step_info: StepInfo, states):
@@ -114,11 +120,11 @@ class ClosedLoop(AbstractInputPolicy):
             memory,
         )
         command = memory[1]
-        return jnp.broadcast_to(command, (NODES, *command.shape)), memory
+        return jnp.broadcast_to(command, (NODE_COUNT, *command.shape)), memory
 
     def _continuous_inputs(self, memory, state, step_info: StepInfo, states):
         controller_memory, last_command = memory
-        times = step_info.start + step_info.span * GAUSS
+        times = step_info.start + step_info.length * GAUSS_NODES
         if not self.implicit:
             commands = jax.vmap(lambda time: self._control_law(controller_memory, state, time))(
                 times
@@ -130,7 +136,7 @@ class ClosedLoop(AbstractInputPolicy):
                 states(commands), times
             )
 
-        guess = jnp.broadcast_to(last_command, (NODES, *last_command.shape))
+        guess = jnp.broadcast_to(last_command, (NODE_COUNT, *last_command.shape))
         commands = newton_fixed_point(commands_for, guess, NEWTON_ITERATIONS)
         return commands, (controller_memory, commands[-1])
 
@@ -148,7 +154,7 @@ class ClosedLoop(AbstractInputPolicy):
         """Commands (actuator, lane) of a law at every instant to a state; rates of own states."""
         case, outputs = self.plant.case, self.output_rows @ state
         pairs = zip(case.sensors, outputs[: len(case.sensors)], strict=True)
-        readings = [read(sensor, None, None, value)[0] for sensor, value in pairs]
+        readings = [filtered_reading(sensor, None, None, value)[0] for sensor, value in pairs]
         # What filters of the law's own give follows.
         readings = (
             jnp.stack([*readings, *outputs[len(case.sensors) :]]) if outputs.shape[0] else outputs
@@ -161,7 +167,7 @@ class ClosedLoop(AbstractInputPolicy):
                 case.controller.flow(own, moving, Measurement(*seen), time, self._limit_commands)
             )
 
-        plant_state = self.plant.from_rig(state[: self.plant.rig.states])
+        plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
         batched_law = jax.vmap(law, in_axes=-1, out_axes=-1)
         return batched_law(controller_memory, controller_state, readings, plant_state, no_command)
 
@@ -172,9 +178,9 @@ class ClosedLoop(AbstractInputPolicy):
         signals = self._sensor_inputs(state, command, step_info.start)
         readings, states = [], []
         for i, sensor in enumerate(case.sensors):
-            number = schedule.reads[event, i]
+            number = schedule.reading[event, i]
             noise = None if self.noise is None else self.noise[number, i]
-            reading, after = read(
+            reading, after = filtered_reading(
                 sensor, self.filter_sections[i], sensor_memory[i], signals[i], noise
             )
             due = number >= 0
@@ -193,12 +199,12 @@ class ClosedLoop(AbstractInputPolicy):
             return own, jnp.roll(waiting, 1, axis=0).at[0].set(limited)
 
         controller_memory, command_queue = jax.lax.cond(
-            schedule.tick[event] >= 0,
+            schedule.control_sample[event] >= 0,
             sampling_step,
             lambda inputs: inputs,
             (controller_memory, command_queue),
         )
-        command_index = schedule.apply[event]
+        command_index = schedule.command_age[event]
         command = jnp.where(
             command_index >= 0, command_queue[jnp.maximum(command_index, 0)], command
         )
@@ -222,7 +228,8 @@ class ClosedLoop(AbstractInputPolicy):
     def _available_readings(self, reading_history, event):
         """The newest readings (sensor, lane) that have arrived by an edge."""
         newest = [
-            reading_history[self.schedule.age[event, i], i] for i in range(reading_history.shape[1])
+            reading_history[self.schedule.reading_age[event, i], i]
+            for i in range(reading_history.shape[1])
         ]
         return jnp.stack(newest) if newest else reading_history[0]
 
@@ -232,7 +239,7 @@ class ClosedLoop(AbstractInputPolicy):
         sensors = self.plant.case.sensors
         if not any(sensor.quantity == "acceleration" for sensor in sensors):
             return signals
-        _, accelerations = at_instant(self.model, self.loads, time, state, command)
+        _, accelerations = contact_at(self.model, self.loads, time, state, command)
         for i, sensor in enumerate(sensors):
             if sensor.quantity == "acceleration":
                 shape = self.model.shapes(sensor.position, (0,))[0]
@@ -245,7 +252,7 @@ class ClosedLoop(AbstractInputPolicy):
         def step(own, *seen):
             return self.plant.case.controller.step(own, Measurement(*seen), time)
 
-        plant_state = self.plant.from_rig(state[: self.plant.rig.states])
+        plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
         return jax.vmap(step, in_axes=-1, out_axes=-1)(
             controller_memory, readings, plant_state, command
         )
@@ -298,18 +305,20 @@ def _tree_where(condition, new, old):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def closed_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) -> ClosedLoop:
+def closed_loop(case: Case, layout: Layout, loads: LoadSet, schedule: EventSchedule) -> ClosedLoop:
     """The driver for a case that has a controller; its `rig` is the plant to integrate."""
     plant = state_space(case, layout=layout)
-    augmented_model, output_rows = sensed(plant)
+    augmented_model, output_rows = with_sensor_filters(plant)
     controller = case.controller
     if controller.period is None:
         filter_sections, noise = (None,) * len(case.sensors), None
     else:
-        filter_sections = tuple(design(sensor, controller.period) for sensor in case.sensors)
+        filter_sections = tuple(
+            sensor_sections(sensor, controller.period) for sensor in case.sensors
+        )
         noise = None
         if any(sensor.noise is not None for sensor in case.sensors):
-            noise = noise_samples(case.run.seed, len(case.sensors), schedule.most_reads)
+            noise = noise_samples(case.run.seed, len(case.sensors), schedule.max_readings)
     implicit = controller.period is None and not controller.open_loop
     initial_memory = controller.init(plant)  # once: it may solve Riccati equations
     controller_states = controller.own_states(initial_memory) if implicit else 0
@@ -320,7 +329,9 @@ def closed_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) 
     beam = case.beam
     max_deflection = beam.length * jnp.sqrt(beam.linear_density * beam.length / 2)
     state_bound = (
-        jnp.full(augmented_model.states, jnp.inf).at[0 : 2 * beam.modes : 2].set(max_deflection)
+        jnp.full(augmented_model.state_count, jnp.inf)
+        .at[0 : 2 * beam.modes : 2]
+        .set(max_deflection)
     )
     return ClosedLoop(
         plant,
@@ -338,8 +349,8 @@ def closed_loop(case: Case, layout: Layout, loads: Traffic, schedule: Schedule) 
 
 
 def _with_controller_states(
-    model: Rig, output_rows: Float[Array, "sensor state"], count: int
-) -> tuple[Rig, Float[Array, "sensor all"]]:
+    model: ModalModel, output_rows: Float[Array, "sensor state"], count: int
+) -> tuple[ModalModel, Float[Array, "sensor all"]]:
     """A rig with so many more states, whose rates are its last commands; no sensor sees them."""
     if count == 0:
         return model, output_rows

@@ -6,7 +6,7 @@ code then works for any numbers for which the decisions hold.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,17 +14,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case, known_case
-from jaxbeam.case.fields import known
-from jaxbeam.case.loads import motion
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads import trajectory
 from jaxbeam.case.validation import check
-from jaxbeam.integrator.events import Schedule
-from jaxbeam.integrator.integrate import at_edges, longest_step, march
-from jaxbeam.integrator.running_peaks import Extremes
-from jaxbeam.integrator.step_matrices import make_rigging
-from jaxbeam.integrator.time_grid import even_grid, scheduled_grid
-from jaxbeam.model.contact import Traffic, traffic
-from jaxbeam.model.modal_model import couples, rig
-from jaxbeam.model.modes import Layout, lay_out
+from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.integrator.integrate import integrate_at_events, integrate_peaks, max_stable_step
+from jaxbeam.integrator.running_peaks import RunningPeaks
+from jaxbeam.integrator.step_matrices import discrete_model
+from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
+from jaxbeam.model.contact import LoadSet, load_set
+from jaxbeam.model.modal_model import has_coupling, modal_model
+from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 
@@ -52,20 +52,20 @@ class StaticShapes:
 def static_shapes(case: Case) -> StaticShapes:
     """The form of a case, from the numbers known now (not inside `jit`)."""
     case = known_case(case)
-    layout = lay_out(case)
+    layout = mesh_layout(case)
     _, repeated, windows = _model_limits(case, layout)
     return StaticShapes(
-        layout, couples(case) or bool(repeated), max_concurrent_loads(np.asarray(windows))
+        layout, has_coupling(case) or bool(repeated), max_concurrent_loads(np.asarray(windows))
     )
 
 
 @compiled
 def _model_limits(case: Case, layout: Layout):
     """Longest step (s), whether modes are repeated, and when loads enter and leave."""
-    model = rig(case, layout)
-    trajectories = [motion(load, case.beam.length) for load in case.loads]
+    model = modal_model(case, layout)
+    trajectories = [trajectory(load, case.beam.length) for load in case.loads]
     windows = jnp.array([path.window() for path in trajectories]).reshape(-1, 2)
-    return longest_step(model, case.loads), model.modes.repeated, windows
+    return max_stable_step(model, case.loads), model.modes.has_repeated, windows
 
 
 def max_concurrent_loads(windows: np.ndarray) -> int:
@@ -81,16 +81,18 @@ def run_peaks(
     shapes: StaticShapes,
     max_step: Float[Array, ""],
     positions: Float[Array, " sensor"],
-    load_batch: Traffic | None = None,
-) -> Extremes:
+    load_batch: LoadSet | None = None,
+) -> RunningPeaks:
     """Peaks and contact forces of a run, with steps no longer than `max_step` (s).
 
     `load_batch` gives the loads of several runs that differ in nothing else; without, the case's own.
     """
-    model = rig(case, shapes.layout, shapes.coupled)
-    grid = even_grid(case, model, max_step)
-    loads = traffic(case) if load_batch is None else load_batch
-    return march(make_rigging(model, grid, positions), loads, slots=shapes.max_loads)[0]
+    model = modal_model(case, shapes.layout, shapes.coupled)
+    grid = grid_by_step_length(case, model, max_step)
+    loads = load_set(case) if load_batch is None else load_batch
+    return integrate_peaks(
+        discrete_model(model, grid, positions), loads, max_loads=shapes.max_loads
+    )[0]
 
 
 class IntegrationPlan(eqx.Module):
@@ -107,7 +109,7 @@ class IntegrationPlan(eqx.Module):
     lead_samples: int = eqx.field(static=True)
     equally_spaced: bool = eqx.field(static=True)
     error: float = eqx.field(static=True)
-    schedule: Schedule | None = None
+    schedule: EventSchedule | None = None
 
 
 def integration_plan(
@@ -122,7 +124,7 @@ def integration_plan(
     check(case)
     case = known_case(case)
     shapes = static_shapes(case)
-    samples = np.asarray(sample_times(case) if times is None else known(times))
+    samples = np.asarray(sample_times(case) if times is None else concrete(times))
     if case.controller is not None:
         schedule = loop_schedule(case, samples)
         substeps, error = _choose_substeps(case, shapes, schedule, tolerance)
@@ -138,12 +140,38 @@ def integration_plan(
     return IntegrationPlan(shapes, substeps, lead_samples, equally_spaced, error)
 
 
+def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> IntegrationPlan:
+    """Plan for several cases that differ in numbers only: as many loads and steps as any needs.
+
+    Its error is the largest of all; the schedule is that of the first. Raises ValueError, which
+    says `what` is planned, if they differ in the order of positions along the beam.
+    """
+    first = plans[0]
+    if any(plan.shapes.layout != first.shapes.layout for plan in plans):
+        raise ValueError(
+            f"the {what} differ in the order of positions along the beam; treat them separately"
+        )
+    shapes = dataclasses.replace(
+        first.shapes,
+        coupled=any(plan.shapes.coupled for plan in plans),
+        max_loads=max(plan.shapes.max_loads for plan in plans),
+    )
+    return dataclasses.replace(
+        first,
+        shapes=shapes,
+        substeps=max(plan.substeps for plan in plans),
+        lead_samples=max(plan.lead_samples for plan in plans),
+        equally_spaced=all(plan.equally_spaced for plan in plans),
+        error=max(plan.error for plan in plans),
+    )
+
+
 def sample_times(case: Case) -> Float[Array, " time"]:
     """Times (s) at which a run saves samples: from 0 to its duration at its sample rate.
 
     Raises ValueError if these are more than can be kept.
     """
-    duration, rate = float(known(case.run.duration)), float(known(case.run.sample_rate))
+    duration, rate = float(concrete(case.run.duration)), float(concrete(case.run.sample_rate))
     if duration * rate > MAX_STEPS:
         raise ValueError(
             f"run.duration ({duration:g} s) and run.sample_rate ({rate:g} Hz) make"
@@ -155,7 +183,7 @@ def sample_times(case: Case) -> Float[Array, " time"]:
 @compiled
 def _trial_run(case, shapes, max_step, load_batch):
     positions = case.beam.length * jnp.array(TRIAL_POSITIONS)
-    return run_peaks(case, shapes, max_step, positions, load_batch).peak()[0]
+    return run_peaks(case, shapes, max_step, positions, load_batch).refined_peak()[0]
 
 
 def _check_step_count(count: float, step: float) -> None:
@@ -170,11 +198,11 @@ def _check_step_count(count: float, step: float) -> None:
 
 def _max_step(case: Case, shapes: StaticShapes) -> float:
     """The longest step (s) that may be tried."""
-    return min(float(_model_limits(case, shapes.layout)[0]), float(known(case.run.duration)))
+    return min(float(_model_limits(case, shapes.layout)[0]), float(concrete(case.run.duration)))
 
 
 def choose_step_size(
-    case: Case, shapes: StaticShapes, tolerance: float, load_batch: Traffic | None = None
+    case: Case, shapes: StaticShapes, tolerance: float, load_batch: LoadSet | None = None
 ) -> tuple[float, float]:
     """Longest step (s) whose peaks at some places are right to `tolerance`, and their error.
 
@@ -184,7 +212,7 @@ def choose_step_size(
     """
     case = known_case(case)
     step = _max_step(case, shapes)
-    _check_step_count(float(known(case.run.duration)) / step, step)
+    _check_step_count(float(concrete(case.run.duration)) / step, step)
 
     def peaks(halvings):
         return np.asarray(_trial_run(case, shapes, jnp.asarray(step / 2**halvings), load_batch))
@@ -193,7 +221,7 @@ def choose_step_size(
     return step / 2**halvings, error
 
 
-def _choose_substeps(case: Case, shapes: StaticShapes, schedule: Schedule, tolerance: float):
+def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, tolerance: float):
     """How many steps to take from edge to edge of a schedule, and the error of the deflection."""
     step, interval = _max_step(case, shapes), float(schedule.lengths.max())
     if interval / step > MAX_STEPS_PER_SAMPLE:
@@ -228,11 +256,11 @@ def _closed_loop_trial_run(case, shapes, schedule, substeps):
     shows everywhere but at a peak, which is flat.
     """
     positions = case.beam.length * jnp.array(TRIAL_POSITIONS)
-    loads = traffic(case)
+    loads = load_set(case)
     policy = closed_loop(case, shapes.layout, loads, schedule)
-    grid = scheduled_grid(case, policy.model, schedule, substeps)
-    discrete = make_rigging(policy.model, grid, None, policy)
-    states = at_edges(discrete, loads, slots=shapes.slots, driver=policy)
+    grid = grid_by_schedule(case, policy.model, schedule, substeps)
+    discrete = discrete_model(policy.model, grid, None, policy)
+    states = integrate_at_events(discrete, loads, max_loads=shapes.max_loads, policy=policy)
     rows = policy.model.shapes(positions, (0,))[0]
     deflections = rows @ states[:, 0 : 2 * case.beam.modes : 2]
     return deflections.reshape(-1, deflections.shape[-1])

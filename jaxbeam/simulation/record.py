@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.model.measurement import history, measure
+from jaxbeam.model.measurement import quantity_history, sensor_readings
 from jaxbeam.model.modes import Modes
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Record(eqx.Module):
         ValueError for an unknown quantity, or strain without a fibre.
         """
         coordinates = self.coordinates, self.rates, self.accelerations
-        return history(self.modes, coordinates, x, quantity, fibre_distance)
+        return quantity_history(self.modes, coordinates, x, quantity, fibre_distance)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
         return self.at(self.case.sensor_places, quantity)
@@ -107,7 +107,7 @@ class Record(eqx.Module):
         if self.controller_readings is not None:
             return self.controller_readings
         coordinates = self.coordinates, self.rates, self.accelerations
-        return measure(self.case, self.modes, *coordinates, self.times, noisy=True)
+        return sensor_readings(self.case, self.modes, *coordinates, self.times, noisy=True)
 
     @property
     def saturated(self) -> Bool[Array, "time actuator"]:
@@ -139,15 +139,15 @@ class Record(eqx.Module):
     @property
     def verdict(self) -> str:
         """In words: whether the loop holds, contact, steps without a solution, the error."""
-        diverged = float(known(self.diverged_time))
+        diverged = float(concrete(self.diverged_time))
         if np.isfinite(diverged):
             return (
                 f"the control loop diverges: the deflection has grown beyond all bounds by"
                 f" t = {diverged:.4g} s; lower the gains, or shorten period and delay"
             )
-        lost = np.asarray(known(self.contact_lost_time))
-        where = np.asarray(known(self.contact_lost_position))
-        lowest_force = np.asarray(known(self.lowest_contact_force))
+        lost = np.asarray(concrete(self.contact_lost_time))
+        where = np.asarray(concrete(self.contact_lost_position))
+        lowest_force = np.asarray(concrete(self.lowest_contact_force))
         contact_losses = [
             f"load {i} would have to pull, first at t = {lost[i]:.4g} s, x = {where[i]:.4g} m "
             f"(smallest contact force {lowest_force[i]:.4g} N)"
@@ -158,10 +158,10 @@ class Record(eqx.Module):
             if contact_losses
             else "every load presses on the beam throughout"
         ]
-        failures = int(known(self.failures)[-1])
+        failures = int(concrete(self.failures)[-1])
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")
-        parts.append(f"estimated error {float(known(self.error_estimate)):.1e} of the peak")
+        parts.append(f"estimated error {float(concrete(self.error_estimate)):.1e} of the peak")
         return "; ".join(parts)
 
     def to_xarray(self) -> "xarray.Dataset":

@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import is_known, known
-from jaxbeam.integrator.events import sampled
+from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
-from jaxbeam.integrator.integrate import trace
-from jaxbeam.integrator.propagators import NODES, at_ends
-from jaxbeam.integrator.running_peaks import Found
-from jaxbeam.integrator.step_matrices import Rigging, make_rigging
-from jaxbeam.integrator.time_grid import scheduled_grid
-from jaxbeam.model.contact import Traffic, at_instant, traffic
-from jaxbeam.model.measurement import measure
-from jaxbeam.model.modal_model import Rig, rig
+from jaxbeam.integrator.integrate import integrate_history
+from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
+from jaxbeam.integrator.running_peaks import Peaks
+from jaxbeam.integrator.step_matrices import DiscreteModel, discrete_model
+from jaxbeam.integrator.time_grid import grid_by_schedule
+from jaxbeam.model.contact import LoadSet, contact_at, load_set
+from jaxbeam.model.measurement import sensor_readings
+from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.integration_plan import (
@@ -62,17 +62,17 @@ def simulate(
     record = _simulate_record(
         case, dataclasses.replace(plan, error=0.0), times, jnp.asarray(plan.error)
     )
-    if is_known(record.contact_lost_time):
-        lost = np.isfinite(known(record.contact_lost_time))
-        if lost.any() and np.isnan(known(record.diverged_time)):
+    if is_concrete(record.contact_lost_time):
+        lost = np.isfinite(concrete(record.contact_lost_time))
+        if lost.any() and np.isnan(concrete(record.diverged_time)):
             warnings.warn(record.verdict, ContactLossWarning, stacklevel=2)
     return record
 
 
 def _check_times(times) -> None:
-    if not is_known(times):
+    if not is_concrete(times):
         return
-    times = known(times)
+    times = concrete(times)
     if times.ndim != 1 or times.size < 2:
         raise ValueError(
             f"times must be a list of at least two numbers, not of shape {times.shape}"
@@ -89,10 +89,10 @@ def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
         commands = jnp.zeros((times.shape[0], len(case.actuators)))
     if failures is None:
         failures = jnp.zeros(times.shape)
-    peaks = Found(*(part[0] for part in running_peaks.found()))
-    loads, lost_times = traffic(case), peaks.contact_lost_time
+    peaks = Peaks(*(part[0] for part in running_peaks.peaks()))
+    loads, lost_times = load_set(case), peaks.contact_lost_time
     lost_positions = jnp.array(
-        [path.travel(time)[0] for path, time in zip(loads.motions, lost_times, strict=True)]
+        [path.travel(time)[0] for path, time in zip(loads.trajectories, lost_times, strict=True)]
     ).reshape(-1)
     return Record(
         case=case,
@@ -126,7 +126,7 @@ def simulate_readings(
     coordinates, rates, accelerations, *_, controller_readings, _ = outputs
     if controller_readings is not None:
         return controller_readings
-    return measure(case, modal, coordinates, rates, accelerations, times)
+    return sensor_readings(case, modal, coordinates, rates, accelerations, times)
 
 
 class Histories(NamedTuple):
@@ -157,8 +157,8 @@ class IntegrationSetup(NamedTuple):
     `sample_steps` are the steps with which the samples begin, `steps` is how many steps there are.
     """
 
-    model: Rigging
-    loads: Traffic
+    model: DiscreteModel
+    loads: LoadSet
     policy: AbstractInputPolicy | None
     sample_steps: Int[Array, " time"]
     steps: int
@@ -168,13 +168,13 @@ def integration_setup(
     case: Case, plan: IntegrationPlan, times, positions, noisy: bool = True
 ) -> IntegrationSetup:
     """A case made ready to be integrated as planned, watching deflections at some places (m)."""
-    loads, layout = traffic(case), plan.shapes.layout
+    loads, layout = load_set(case), plan.shapes.layout
     if case.controller is None:
-        model, policy = rig(case, layout, plan.shapes.coupled), None
+        model, policy = modal_model(case, layout, plan.shapes.coupled), None
         # From rest at the start to the first sample in steps like those between samples.
         spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
         lead_times = times[0] - spacing * jnp.arange(plan.lead_samples, 0, -1)
-        schedule = sampled(
+        schedule = sample_schedule(
             jnp.concatenate([lead_times, times]), plan.equally_spaced, plan.lead_samples
         )
     else:
@@ -183,9 +183,9 @@ def integration_setup(
         if not noisy:
             policy = dataclasses.replace(policy, noise=None)
         model = policy.model
-    grid = scheduled_grid(case, model, schedule, plan.substeps)
-    discrete = make_rigging(model, grid, positions, policy)
-    sample_steps = plan.substeps * grid.place[schedule.samples]
+    grid = grid_by_schedule(case, model, schedule, plan.substeps)
+    discrete = discrete_model(model, grid, positions, policy)
+    sample_steps = plan.substeps * grid.event_panels[schedule.sample_events]
     return IntegrationSetup(
         discrete, loads, policy, sample_steps, grid.counts.shape[0] * plan.substeps
     )
@@ -196,9 +196,9 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
     discrete, loads, policy, sample_steps, steps = integration_setup(
         case, plan, times, positions, noisy
     )
-    model = discrete.rig
-    running_peaks, states, commands, observed, _ = trace(
-        discrete, loads, slots=plan.shapes.max_loads, steps=steps, driver=policy
+    model = discrete.model
+    running_peaks, states, commands, observed, _ = integrate_history(
+        discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy
     )
     states = states[sample_steps]
     observed, failures = (
@@ -219,26 +219,26 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
 
 def _commands_at_steps(case: Case, commands, steps):
     """Commands (time, actuator) with which the steps at some edges begin, as they took effect."""
-    histories = commands[..., 0].reshape(commands.shape[0], NODES, -1)
-    commands_at_start = jnp.tensordot(histories, at_ends()[:, 0], axes=[1, 0])[steps]
+    histories = commands[..., 0].reshape(commands.shape[0], NODE_COUNT, -1)
+    commands_at_start = jnp.tensordot(histories, end_weights()[:, 0], axes=[1, 0])[steps]
     limits = [actuator.command_limits() for actuator in case.actuators]
     low = jnp.array([-jnp.inf if pair is None else pair[0] for pair in limits])
     high = jnp.array([jnp.inf if pair is None else pair[1] for pair in limits])
     return jnp.clip(commands_at_start, low, high)
 
 
-def _modal_and_contact_outputs(model: Rig, loads: Traffic, times, states, commands):
+def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states, commands):
     """Modal coordinates, rates and accelerations, loads' places and contact forces, commands."""
 
     def outputs_at(time, state, command):
         column = None if command is None else command[:, None]
-        force, pushed = at_instant(model, loads, time, state, column)
+        force, pushed = contact_at(model, loads, time, state, column)
         return force[:, 0], pushed[:, 0]
 
     force, accelerations = jax.vmap(outputs_at)(times, states, commands)
     states_count = 2 * accelerations.shape[1]
     coordinates = (states[:, 0:states_count:2, 0], states[:, 1:states_count:2, 0], accelerations)
-    if model.mixing is not None:
-        coordinates = tuple(part @ model.mixing.T for part in coordinates)
-    position = loads.travel(times)[0].T
+    if model.mode_map is not None:
+        coordinates = tuple(part @ model.mode_map.T for part in coordinates)
+    position = loads.kinematics(times)[0].T
     return *coordinates, jnp.where(loads.on_beam(times).T, position, jnp.nan), -force, commands

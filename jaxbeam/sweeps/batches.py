@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 BATCHED_ADDRESS = re.compile(r"loads\.\d+\.(mass|force)|run\.gravity")
-MAX_RUNS = 10**9  # of a sweep: more would not fit into any memory
 MAX_BATCH_SIZE = 256  # more lanes in one task fall out of the cache
 
 

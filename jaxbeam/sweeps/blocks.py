@@ -14,9 +14,9 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.integrator import native_peaks
-from jaxbeam.integrator.events import sampled
-from jaxbeam.model.modal_model import couples
-from jaxbeam.model.modes import Layout, lay_out
+from jaxbeam.integrator.events import sample_schedule
+from jaxbeam.model.modal_model import has_coupling
+from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import StaticShapes, max_concurrent_loads, sample_times
 from jaxbeam.sweeps import programs
@@ -57,7 +57,7 @@ class Runner:
         if case.controller is not None:
             self.schedule = loop_schedule(case, np.asarray(sample_times(case)))
         elif histories:
-            self.schedule = sampled(sample_times(case), True)
+            self.schedule = sample_schedule(sample_times(case), True)
         count, batch_size = batches.run_index.shape
         # Twice as many threads as cores: some hand over work while others wait for theirs.
         self.pool = ThreadPoolExecutor(2 * (os.cpu_count() or 1))
@@ -96,7 +96,7 @@ class Runner:
         if max_loads > 1:
             max_loads = max(max_concurrent_loads(window) for window in windows())
         self.shapes = StaticShapes(
-            layout, couples(case), max_loads, native_peaks.supports(case) and not single
+            layout, has_coupling(case), max_loads, native_peaks.supports(case) and not single
         )
         # C puts rigs on their steps itself.
         self.discretise_separately = case.controller is None and not self.shapes.native
@@ -109,8 +109,8 @@ class Runner:
             )
         ]
         entries, exits = np.moveaxis(windows(), 2, 0)
-        for program in compilations:
-            program.result()  # raises what went wrong
+        for compilation in compilations:
+            compilation.result()  # raises what went wrong
         model_groups = [
             programs.modal_models(program, batches.shared_values[part]) for part in parts
         ]
@@ -287,10 +287,10 @@ def _common_layout(case: Case, batches: Batches) -> Layout:
         i for i, name in enumerate(batches.shared_addresses) if POSITION_ADDRESS.fullmatch(name)
     ]
     if not varying_positions:
-        return lay_out(case)
+        return mesh_layout(case)
     values = np.unique(batches.shared_values[:, varying_positions], axis=0)
     names = [batches.shared_addresses[i] for i in varying_positions]
-    layouts = [lay_out(replace(case, dict(zip(names, row, strict=True)))) for row in values]
+    layouts = [mesh_layout(replace(case, dict(zip(names, row, strict=True)))) for row in values]
     degrees = (
         np.max([layout.degrees for layout in layouts], axis=0)
         if len({len(layout.degrees) for layout in layouts}) == 1

@@ -15,14 +15,14 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.case.loads import motion
+from jaxbeam.case.loads import trajectory
 from jaxbeam.integrator import native_peaks
-from jaxbeam.integrator.events import Schedule
-from jaxbeam.integrator.integrate import longest_step, march, trace
-from jaxbeam.integrator.step_matrices import make_rigging
-from jaxbeam.integrator.time_grid import even_grid, scheduled_grid
-from jaxbeam.model.contact import Traffic, traffic
-from jaxbeam.model.modal_model import Rig, rig
+from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.integrator.integrate import integrate_history, integrate_peaks, max_stable_step
+from jaxbeam.integrator.step_matrices import discrete_model
+from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
+from jaxbeam.model.contact import LoadSet, load_set
+from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
@@ -44,37 +44,37 @@ class Program(NamedTuple):
     shapes: StaticShapes
     shared_addresses: tuple[str, ...]
     batched_addresses: tuple[str, ...]
-    schedule: Schedule | None = None
+    schedule: EventSchedule | None = None
     substeps: int | None = None
 
     def case_with(self, shared_values) -> Case:
         """The case of a task."""
         return replace(self.case, dict(zip(self.shared_addresses, shared_values, strict=True)))
 
-    def loads(self, shared_values, batched_values) -> Traffic:
+    def loads(self, shared_values, batched_values) -> LoadSet:
         """The loads of a task, in all its lanes."""
         varied = self.case_with(shared_values)
 
         def load_parameters(values):
             pairs = zip(self.batched_addresses, values, strict=True)
-            loads = traffic(replace(varied, dict(pairs)))
+            loads = load_set(replace(varied, dict(pairs)))
             return loads.inertia[:, 0], loads.weight[:, 0]
 
         inertia, weight = jax.vmap(load_parameters, out_axes=1)(batched_values)
-        return Traffic(traffic(varied).motions, inertia, weight)
+        return LoadSet(load_set(varied).trajectories, inertia, weight)
 
     def grid(self, model, shared_values, step_size):
         """The steps of a task. Its pace: the longest (s), and how many more between events."""
         varied, (max_step, extra_steps) = self.case_with(shared_values), step_size
         if self.schedule is None:
-            return even_grid(varied, model, max_step, extra_steps)
+            return grid_by_step_length(varied, model, max_step, extra_steps)
         substeps = jnp.ceil(jnp.max(self.schedule.lengths) / max_step).astype(int) + extra_steps
-        return scheduled_grid(varied, model, self.schedule, self.substeps or substeps)
+        return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps)
 
     def discretise(self, model, shared_values, step_size, policy=None):
         """The rig of a task on its steps."""
         positions = self.case_with(shared_values).sensor_places
-        return make_rigging(model, self.grid(model, shared_values, step_size), positions, policy)
+        return discrete_model(model, self.grid(model, shared_values, step_size), positions, policy)
 
 
 @compiled_with(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
@@ -83,8 +83,8 @@ def modal_models(program: Program, shared_values):
 
     def model_and_limit(values):
         varied = program.case_with(values)
-        model = rig(varied, program.shapes.layout, program.shapes.coupled)
-        return model, longest_step(model, varied.loads)
+        model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
+        return model, max_stable_step(model, varied.loads)
 
     return jax.lax.map(model_and_limit, shared_values)  # traced in less time than side by side
 
@@ -95,7 +95,7 @@ def entry_exit_times(case, addresses, shared_values):
 
     def entry_exit_times_of(values):
         varied = replace(case, dict(zip(addresses, values, strict=True)))
-        trajectories = [motion(load, varied.beam.length) for load in varied.loads]
+        trajectories = [trajectory(load, varied.beam.length) for load in varied.loads]
         return jnp.array([path.window() for path in trajectories]).reshape(-1, 2)
 
     return jax.vmap(entry_exit_times_of)(shared_values)
@@ -132,7 +132,7 @@ def integrate_block(
         integrate = functools.partial(_native_results, program)
     else:
         integrate = functools.partial(_compiled_results, program)
-        if isinstance(models, Rig):
+        if isinstance(models, ModalModel):
             models = discrete_models(program, mask, models, shared_values, step_size)
     if devices > 1:
         mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
@@ -162,7 +162,7 @@ def _compiled_results(program: Program, mask, discrete, shared_values, batched_v
             mask,
             (shared_values, batched_values, step_size),
         )
-    shared_model, own_models = _split_shared_model(discrete.rig)
+    shared_model, own_models = _split_shared_model(discrete.model)
 
     def task(values):
         rigging, own, heavy, light = values
@@ -187,24 +187,24 @@ def _closed_loop_results(program: Program, shared_values, batched_values, step_s
     )
 
 
-def _results(program: Program, discrete, varied: Case, loads: Traffic, policy=None):
+def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=None):
     """What is found of a task, by name."""
     max_loads, substeps, history = program.shapes.max_loads, program.substeps, {}
     if substeps is None:
-        running_peaks, memory = march(discrete, loads, slots=max_loads, driver=policy)
+        running_peaks, memory = integrate_peaks(discrete, loads, max_loads=max_loads, policy=policy)
     else:
         grid = discrete.grid
         steps = grid.counts.shape[0] * substeps
-        running_peaks, states, *_, memory = trace(
-            discrete, loads, slots=max_loads, steps=steps, driver=policy
+        running_peaks, states, *_, memory = integrate_history(
+            discrete, loads, max_loads=max_loads, steps=steps, policy=policy
         )
-        samples = states[substeps * grid.place[program.schedule.samples]]
-        rows = discrete.rig.shapes(varied.sensor_places, (0,))[0]
+        samples = states[substeps * grid.place[program.schedule.sample_events]]
+        rows = discrete.model.shapes(varied.sensor_places, (0,))[0]
         modal = samples[:, 0 : 2 * varied.beam.modes : 2]
         history["deflection"] = jnp.einsum("sm,tml->lts", rows, modal)
     if policy is not None:
         history["controller_failures"] = policy.failures(memory)
-    return running_peaks.found()._asdict() | history
+    return running_peaks.peaks()._asdict() | history
 
 
 def _map_masked(function, mask, values):
@@ -220,7 +220,7 @@ def _map_masked(function, mask, values):
     )
 
 
-def _split_shared_model(models: Rig):
+def _split_shared_model(models: ModalModel):
     """The rig that all tasks share, if they do, and what each has of its own."""
     if models.state_matrix.shape[0] > 1:
         return None, models
@@ -228,10 +228,10 @@ def _split_shared_model(models: Rig):
 
 
 def _without_model(discrete):
-    return eqx.tree_at(lambda rigging: rigging.rig, discrete, None)
+    return eqx.tree_at(lambda rigging: rigging.model, discrete, None)
 
 
 def _with_model(discrete, model):
     return eqx.tree_at(
-        lambda rigging: rigging.rig, discrete, model, is_leaf=lambda leaf: leaf is None
+        lambda rigging: rigging.model, discrete, model, is_leaf=lambda leaf: leaf is None
     )

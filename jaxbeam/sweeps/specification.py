@@ -18,7 +18,8 @@ from jaxbeam.case.declared_checks import in_words
 from jaxbeam.case.validation import check
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
-from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, MAX_RUNS, Batches, make_batches
+from jaxbeam.sweeps import MAX_RUNS
+from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
 
 # Whether these are right depends on each other: places, and entries of a list.

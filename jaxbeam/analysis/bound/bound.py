@@ -26,7 +26,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check
 from jaxbeam.control.prescribed import Prescribed
-from jaxbeam.model.channels import takes_commands
+from jaxbeam.model.channels import accepts_commands
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import choose_step_size, run_peaks, static_shapes
 from jaxbeam.simulation.record import Record
@@ -137,7 +137,7 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
     positions = _checked_positions(case, positions)
     if not case.actuators:
         raise ValueError("without actuators there is nothing to command; add one for a bound")
-    if not any(map(takes_commands, case.actuators)):
+    if not any(map(accepts_commands, case.actuators)):
         raise ValueError(
             f"actuators: none of the {len(case.actuators)} takes commands; add one that does"
         )
@@ -187,7 +187,7 @@ def _uncontrolled_peak(case: Case, positions) -> float:
     shapes = static_shapes(uncontrolled_case)
     step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
     running_peaks = _run_peaks(uncontrolled_case, shapes, jnp.asarray(step), jnp.asarray(positions))
-    return float(jnp.max(running_peaks.peak()[0]))
+    return float(jnp.max(running_peaks.refined_peak()[0]))
 
 
 def _command_limits(case: Case, period: float):

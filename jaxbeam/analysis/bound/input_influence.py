@@ -14,14 +14,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.events import Schedule, merged
+from jaxbeam.integrator.events import EventSchedule, controller_schedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
-from jaxbeam.integrator.integrate import trace
-from jaxbeam.integrator.propagators import NODES
-from jaxbeam.integrator.step_matrices import make_rigging
-from jaxbeam.integrator.time_grid import scheduled_grid
-from jaxbeam.model.contact import Traffic, traffic
-from jaxbeam.model.modal_model import rig
+from jaxbeam.integrator.integrate import integrate_history
+from jaxbeam.integrator.propagators import NODE_COUNT
+from jaxbeam.integrator.step_matrices import discrete_model
+from jaxbeam.integrator.time_grid import grid_by_schedule
+from jaxbeam.model.contact import LoadSet, load_set
+from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import StaticShapes, choose_step_size, static_shapes
 
@@ -56,7 +56,7 @@ class InputInfluence(eqx.Module):
 class _UnitCommands(AbstractInputPolicy):
     """To each lane one unit command: to actuator `actuator_index`, during hold number `hold_index`."""
 
-    schedule: Schedule
+    schedule: EventSchedule
     hold_index: Int[Array, " lane"]
     actuator_index: Int[Array, " lane"]
     state_bound: Float[Array, " state"]
@@ -67,11 +67,11 @@ class _UnitCommands(AbstractInputPolicy):
         return jnp.zeros((), int)
 
     def inputs(self, memory, state, step_info, states):
-        hold_started = self.schedule.tick[step_info.edge]
-        current_hold = jnp.where((step_info.edge >= 0) & (hold_started >= 0), hold_started, memory)
+        hold_started = self.schedule.control_sample[step_info.event]
+        current_hold = jnp.where((step_info.event >= 0) & (hold_started >= 0), hold_started, memory)
         is_commanded = self.actuator_index == np.arange(self.actuators)[:, None]
         given = jnp.where(is_commanded & (self.hold_index == current_hold), 1.0, 0.0)
-        return jnp.broadcast_to(given, (NODES, *given.shape)), current_hold
+        return jnp.broadcast_to(given, (NODE_COUNT, *given.shape)), current_hold
 
     def observe(self, memory, step_info):
         return None
@@ -106,7 +106,7 @@ def input_influence(
     )
     shapes = static_shapes(uncontrolled_case)
     step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
-    schedule = merged(times, hold_times, 0.0, [], [], np.zeros(0))
+    schedule = controller_schedule(times, hold_times, 0.0, [], [], np.zeros(0))
     substeps = max(1, int(np.ceil(float(np.diff(times).max()) / step)))
     # A lane that waits for hold -1 or for one after the end is given no command.
     hold_index = np.append(-1, np.repeat(np.arange(count), actuators))
@@ -140,22 +140,27 @@ def input_influence(
 
 @compiled
 def _deflection_rows(case: Case, shapes: StaticShapes, positions):
-    return rig(case, shapes.layout).shapes(positions, (0,))[0]
+    return modal_model(case, shapes.layout).shapes(positions, (0,))[0]
 
 
 @compiled
 def _unit_responses(
-    case: Case, shapes: StaticShapes, schedule: Schedule, substeps: int, hold_index, actuator_index
+    case: Case,
+    shapes: StaticShapes,
+    schedule: EventSchedule,
+    substeps: int,
+    hold_index,
+    actuator_index,
 ):
     """Coordinates (instant, mode, lane) under the weights where `hold_index` is -1, else under a unit."""
-    model, weights_of_case = rig(case, shapes.layout), traffic(case)
-    size = (len(weights_of_case.motions), hold_index.shape[0])
-    loads = Traffic(
-        weights_of_case.motions,
+    model, weights_of_case = modal_model(case, shapes.layout), load_set(case)
+    size = (len(weights_of_case.trajectories), hold_index.shape[0])
+    loads = LoadSet(
+        weights_of_case.trajectories,
         jnp.broadcast_to(weights_of_case.inertia, size),
         jnp.where(hold_index == -1, jnp.broadcast_to(weights_of_case.weight, size), 0.0),
     )
-    state_bound = jnp.full(model.states, jnp.inf)
+    state_bound = jnp.full(model.state_count, jnp.inf)
     policy = _UnitCommands(
         schedule=schedule,
         hold_index=hold_index,
@@ -163,9 +168,11 @@ def _unit_responses(
         state_bound=state_bound,
         actuators=len(case.actuators),
     )
-    grid = scheduled_grid(case, model, schedule, substeps)
+    grid = grid_by_schedule(case, model, schedule, substeps)
     steps = grid.counts.shape[0] * substeps
-    discrete = make_rigging(model, grid, None, policy)
-    _, states, *_ = trace(discrete, loads, slots=shapes.max_loads, steps=steps, driver=policy)
-    sample_steps = substeps * grid.place[schedule.samples]
+    discrete = discrete_model(model, grid, None, policy)
+    _, states, *_ = integrate_history(
+        discrete, loads, max_loads=shapes.max_loads, steps=steps, policy=policy
+    )
+    sample_steps = substeps * grid.event_panels[schedule.sample_events]
     return states[sample_steps][:, : 2 * case.beam.modes : 2]

@@ -5,7 +5,15 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment, Bonded
 from jaxbeam.case.declared_checks import described
-from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, is_known, known, number
+from jaxbeam.case.fields import (
+    INCREASING,
+    NOT_NEGATIVE,
+    ON_BEAM,
+    POSITIVE,
+    concrete,
+    is_concrete,
+    number,
+)
 
 # What the moment per volt follows from, where it is not given itself.
 MATERIAL = ("d33", "modulus", "electrode_spacing", "beam_height", "patch_height", "patch_width")
@@ -80,8 +88,8 @@ class Patch(AbstractActuator):
 
     def attachment(self) -> Attachment:
         none, zero = jnp.zeros(0), jnp.zeros(())
-        moment = self.moment * self.correction * self.amplifier_gain
-        return Attachment(jnp.zeros((0, 0)), none, none, none, moment, zero, zero)
+        info = self.moment * self.correction * self.amplifier_gain
+        return Attachment(jnp.zeros((0, 0)), none, none, none, info, zero, zero)
 
     def bonded(self) -> Bonded | None:
         if self.added_mass is None and self.added_rigidity is None:
@@ -101,16 +109,16 @@ class Patch(AbstractActuator):
         return self.rate_limit
 
     def validate(self, address: str) -> str | None:
-        if is_known(self.start) and is_known(self.end):
-            start, end = known(self.start), known(self.end)
+        if is_concrete(self.start) and is_concrete(self.end):
+            start, end = concrete(self.start), concrete(self.end)
             if start >= end:
                 return (
                     f"{address}.end must lie to the right of {address}.start;"
                     f" {end:g} m is not beyond {start:g} m"
                 )
         limits = self.command_limits()
-        if is_known(limits) and known(limits)[0] >= known(limits)[1]:
-            low, high = known(self.depolarisation / self.amplifier_gain)
+        if is_concrete(limits) and concrete(limits)[0] >= concrete(limits)[1]:
+            low, high = concrete(self.depolarisation / self.amplifier_gain)
             return (
                 f"{address}.limits leave no command that the patch takes: its depolarisation limits"
                 f" over its amplifier_gain allow {low:g} to {high:g} V"

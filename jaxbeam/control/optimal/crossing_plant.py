@@ -4,32 +4,32 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.model.contact import contact_rows
-from jaxbeam.model.state_space import LoadedBeam
+from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.coupled_stages import ConstantPlant, Coupling
 from jaxbeam.numerics.finite_horizon import CouplingFunction
 
 
-def crossing_plant(plant: LoadedBeam, with_weights: bool) -> tuple[ConstantPlant, CouplingFunction]:
+def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, CouplingFunction]:
     """The rig of a model, and its contact forces r at given times (s), both in its states.
 
     With `with_weights`, those of the loads are further, constant states, as in `LoadedBeam.augmented`.
     The contact law is r = -W - m (rows z + S (S' r + forces of the commands)), S being the shapes.
     """
-    modal_model, load_count = plant.rig, plant.weights.shape[0]
-    modes, states = plant.scale.shape[0], modal_model.states
+    modal_model, load_count = plant.modal_model, plant.weights.shape[0]
+    modes, states = plant.coordinate_scale.shape[0], modal_model.state_count
     rates = np.arange(1, 2 * modes, 2)
     unloaded, weight_states = plant.unloaded, load_count if with_weights else 0
     unloaded_plant = ConstantPlant(
         jnp.pad(unloaded.A, (0, weight_states)),
         jnp.pad(unloaded.B, ((0, weight_states), (0, 0))),
-        jnp.pad(plant.from_rig(jnp.eye(states)[:, rates]), ((0, weight_states), (0, 0))),
+        jnp.pad(plant.from_modal(jnp.eye(states)[:, rates]), ((0, weight_states), (0, 0))),
     )
-    to_modal, command_rows = plant.to_rig(jnp.eye(states)), modal_model.command_matrix[rates]
-    mass = plant.traffic.inertia
+    to_modal, command_rows = plant.to_modal(jnp.eye(states)), modal_model.command_matrix[rates]
+    mass = plant.loads.inertia
 
     def contact_coupling(times):
-        position, speed, acceleration = plant.traffic.travel(times)
-        active = plant.traffic.on_beam(times)
+        position, speed, acceleration = plant.loads.kinematics(times)
+        active = plant.loads.on_beam(times)
         shape, rows = (
             jnp.moveaxis(part.reshape(*active.shape, -1), 0, -2)
             for part in contact_rows(modal_model, position, speed, acceleration, active)

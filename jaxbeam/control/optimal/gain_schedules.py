@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.model.state_space import LoadedBeam
+from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.gain_table import GainTable
 
 
@@ -33,9 +33,9 @@ class GainSchedule(eqx.Module):
         return jnp.where(t < self.start, 0.0, gain)
 
 
-def crossing_events(plant: LoadedBeam) -> Float[Array, " event"]:
+def crossing_events(plant: Plant) -> Float[Array, " event"]:
     """Times (s) at which loads enter and leave, ascending; the run's end for loads that stay."""
-    windows = [path.window() for path in plant.traffic.motions]
+    windows = [path.window() for path in plant.loads.trajectories]
     events = jnp.sort(jnp.array(windows).reshape(-1))
     last_event = jnp.max(jnp.where(events < NEVER, events, plant.case.run.duration))
     return jnp.minimum(events, last_event)

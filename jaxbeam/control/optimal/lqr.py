@@ -18,17 +18,17 @@ from jaxbeam.case.fields import (
     ON_BEAM,
     POSITIVE,
     choice,
+    concrete,
     count,
-    is_known,
-    known,
+    is_concrete,
     number,
 )
-from jaxbeam.case.loads import motion
+from jaxbeam.case.loads import trajectory
 from jaxbeam.control.optimal.crossing_plant import crossing_plant
 from jaxbeam.control.optimal.gain_schedules import GainSchedule, crossing_events
 from jaxbeam.control.optimal.sampling_loss import warn_slow_sampling
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.model.state_space import LoadedBeam
+from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.finite_horizon import boundary_layer, finite_horizon, finite_horizon_coupled
 from jaxbeam.numerics.gain_table import (
     GainTable,
@@ -66,7 +66,7 @@ class AbstractRegulator(AbstractStateLaw):
     )
 
     @abc.abstractmethod
-    def gains(self, plant: LoadedBeam) -> Any:
+    def gains(self, plant: Plant) -> Any:
         """The gains designed for a model, in the states of that model."""
 
     def validate(self, case):
@@ -88,13 +88,13 @@ class AbstractRegulator(AbstractStateLaw):
         return super().validate(case)
 
     def warn(self, system, case):
-        warn_slow_sampling(system, float(known(self.period)), float(known(case.run.duration)))
+        warn_slow_sampling(system, float(concrete(self.period)), float(concrete(case.run.duration)))
 
-    def weights(self, plant: LoadedBeam) -> tuple[Array, Array]:
+    def weights(self, plant: Plant) -> tuple[Array, Array]:
         """Q and R for the states of a model."""
         Q = jnp.diag(self.state_weight)
         if self.places is not None:
-            shape = plant.rig.shapes(self.places, (0,))[0] / plant.scale
+            shape = plant.modal_model.shapes(self.places, (0,))[0] / plant.coordinate_scale
             deflection_rows = (
                 jnp.zeros((shape.shape[0], Q.shape[0])).at[:, : shape.shape[1]].set(shape)
             )
@@ -176,7 +176,7 @@ class AbstractScheduledRegulator(AbstractRegulator):
                 gain_at_exit[:, : self.feedback_shares.shape[0]]
             )
         shares = jnp.concatenate([self.feedback_shares, jnp.ones_like(load_weights)])
-        table = GainTable(table.edges, table.pieces * shares)
+        table = GainTable(table.boundaries, table.pieces * shares)
         events = crossing_events(design_plant if self.entries == "predicted" else plant)
         return GainSchedule(
             table, final_gain * shares, load_weights, events[0], events[-1], self.fade_time
@@ -185,7 +185,7 @@ class AbstractScheduledRegulator(AbstractRegulator):
     def events(self, case: Any) -> Float[np.ndarray, " event"]:
         """Times (s) of entry and exit by which the table runs, ascending."""
         loads = design_loads(self, case) if self.entries == "predicted" else case.loads
-        windows = [known(motion(load, case.beam.length).window()) for load in loads]
+        windows = [concrete(trajectory(load, case.beam.length).window()) for load in loads]
         return np.sort(np.ravel(windows))
 
     def breakpoints(self, case):
@@ -229,7 +229,7 @@ class AbstractFiniteHorizonRegulator(AbstractScheduledRegulator):
         if self.period is not None:
             return None
         events, estimator_breakpoints = self.events(case), super().breakpoints(case)
-        crossing_intervals = np.diff(events[events < known(case.run.duration)])
+        crossing_intervals = np.diff(events[events < concrete(case.run.duration)])
         boundary_layers = events[1 : crossing_intervals.size + 1, None] - crossing_intervals[
             :, None
         ] * boundary_layer(self.points)
@@ -269,7 +269,7 @@ class AugmentedLQR(AbstractFiniteHorizonRegulator):
 
 
 def finite_horizon_gains(
-    regulator: AbstractFiniteHorizonRegulator, plant: LoadedBeam
+    regulator: AbstractFiniteHorizonRegulator, plant: Plant
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """Table of optimal gains for a model, and P at its edges, load states included."""
     Q, R = regulator.weights(plant)
@@ -278,7 +278,7 @@ def finite_horizon_gains(
 
     Q, F = (jnp.pad(weight, (0, load_count)) for weight in (Q, F))
     problem = crossing_events(plant), regulator.points, Q, R, F
-    if plant.rig.states == 2 * plant.scale.shape[0]:
+    if plant.modal_model.state_count == 2 * plant.coordinate_scale.shape[0]:
         return finite_horizon_coupled(*crossing_plant(plant, load_count > 0), *problem)
 
     # Commands to a lag much faster than a stretch are no polynomials, as they are taken for there.
@@ -305,9 +305,9 @@ def points_error(
     loads = design_loads(regulator, case)
     speeds = [load.speed for load in loads] if slowest_speed is None else [slowest_speed]
     numbers = (beam.length, beam.rigidity, beam.linear_density, *speeds)
-    if not all(value is not None and is_known(value) for value in numbers):
+    if not all(value is not None and is_concrete(value) for value in numbers):
         return None
-    length, rigidity, density, *speeds = (float(known(value)) for value in numbers)
+    length, rigidity, density, *speeds = (float(concrete(value)) for value in numbers)
     modes = regulator.mode_count(case)
     fastest_frequency = (modes * math.pi / length) ** 2 * (rigidity / density) ** 0.5
     crossing_time = length / max(min(abs(speed) for speed in speeds), 1e-300)

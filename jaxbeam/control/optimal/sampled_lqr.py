@@ -5,7 +5,7 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
-from jaxbeam.case.fields import NOT_NEGATIVE, is_known, known, number
+from jaxbeam.case.fields import NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.control.optimal.lqr import AbstractRegulator
 from jaxbeam.estimation.sampled_plant import exponential_and_gramian, sample_timing
 from jaxbeam.numerics.discretisation import balance
@@ -72,8 +72,10 @@ class DiscreteLQR(AbstractRegulator):
     def validate(self, case):
         if self.period is None:
             return "period must be given: kind 'dlqr' designs for commands that are held so long"
-        concrete_delay = self.delay is not None and is_known(self.delay) and is_known(self.period)
-        if concrete_delay and known(self.delay) >= known(self.period):
+        concrete_delay = (
+            self.delay is not None and is_concrete(self.delay) and is_concrete(self.period)
+        )
+        if concrete_delay and concrete(self.delay) >= concrete(self.period):
             return "delay must be less than the period: one command may be under way, not more"
         rate = self.input_rate_weight
         if rate is not None and rate.shape[0] != len(case.actuators):

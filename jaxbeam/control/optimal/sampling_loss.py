@@ -12,7 +12,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check
 from jaxbeam.model.state_space import StateSpace, state_space
 
@@ -68,8 +68,8 @@ def sampled_reachability(
     coordinates of the mode both Gramians are known in closed form.
     """
     poles, rows = _oscillatory_modes(system)
-    modal_inputs = rows @ known(system.B)
-    max_input = np.linalg.norm(rows, axis=1) * np.linalg.norm(known(system.B))
+    modal_inputs = rows @ concrete(system.B)
+    max_input = np.linalg.norm(rows, axis=1) * np.linalg.norm(concrete(system.B))
     controllable = np.linalg.norm(modal_inputs, axis=1) > UNCONTROLLABLE * max_input
     shares = [
         _mode_reachability(*at, period, memory_time)
@@ -99,7 +99,7 @@ def _mode_reachability(
 
 def _oscillatory_modes(system: StateSpace) -> tuple[np.ndarray, np.ndarray]:
     """Oscillating poles (1/s, those with positive imaginary part) and their left eigenvectors."""
-    found = scipy.linalg.eig(known(system.A), left=True, right=False)
+    found = scipy.linalg.eig(concrete(system.A), left=True, right=False)
     poles, left_vectors = found[0], found[1]
     oscillatory = np.flatnonzero(poles.imag > 1e-6 * np.abs(poles))
     oscillatory = oscillatory[np.argsort(poles[oscillatory].imag)]

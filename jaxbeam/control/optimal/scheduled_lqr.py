@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.fields import INCREASING, choice, is_known, known, number, part
+from jaxbeam.case.fields import INCREASING, choice, concrete, is_concrete, number, part
 from jaxbeam.control.load_identification import Recognition
 from jaxbeam.control.load_update import AbstractLoadIdentifier
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.control.optimal.lqr import FiniteLQR, points_error
-from jaxbeam.model.contact import traffic
-from jaxbeam.model.state_space import LoadedBeam
+from jaxbeam.model.contact import load_set
+from jaxbeam.model.state_space import Plant
 
 
 class GainScheduleGrid(eqx.Module):
@@ -140,10 +140,10 @@ class ScheduledLQR(FiniteLQR):
 
 
 def _not_positive(values) -> bool:
-    return is_known(values) and bool(np.any(known(values) <= 0))
+    return is_concrete(values) and bool(np.any(concrete(values) <= 0))
 
 
-def _with_crossing_load(plant: LoadedBeam, mass, speed) -> LoadedBeam:
+def _with_crossing_load(plant: Plant, mass, speed) -> Plant:
     """The model with another mass, which keeps another speed, in the direction of its load."""
     load = plant.case.loads[0]
     changed = eqx.tree_at(
@@ -152,4 +152,4 @@ def _with_crossing_load(plant: LoadedBeam, mass, speed) -> LoadedBeam:
         (mass, jnp.sign(load.speed) * speed, jnp.zeros(())),
     )
     case = eqx.tree_at(lambda c: c.loads, plant.case, (changed,))
-    return dataclasses.replace(plant, case=case, traffic=traffic(case))
+    return dataclasses.replace(plant, case=case, loads=load_set(case))

@@ -16,9 +16,9 @@ from jaxbeam.case.fields import (
     ON_BEAM,
     POSITIVE,
     choice,
+    concrete,
     count,
-    is_known,
-    known,
+    is_concrete,
     number,
 )
 from jaxbeam.control.predictive.by_qpax import is_installed
@@ -33,7 +33,7 @@ from jaxbeam.control.predictive.prediction import (
 )
 from jaxbeam.control.predictive.qp import METHODS, solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.model.state_space import LoadedBeam
+from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.riccati import dare
 
 
@@ -53,7 +53,7 @@ class MPCDesign(eqx.Module):
     limits: Float[Array, " row"]
     limit_command_rows: Float[Array, "row actuator"]
     terminal_cost: Float[Array, "both both"] | None
-    plant: LoadedBeam | None
+    plant: Plant | None
 
 
 class MPCState(eqx.Module):
@@ -129,7 +129,7 @@ class MPC(AbstractStateLaw):
         if self.period is None:
             return "period must be given: predictive control acts at samples"
         excess_delay = None if self.delay is None else self.delay - self.period
-        if excess_delay is not None and is_known(excess_delay) and known(excess_delay) >= 0:
+        if excess_delay is not None and is_concrete(excess_delay) and concrete(excess_delay) >= 0:
             return "delay must be less than the period: no longer one is predicted"
         if self.moves > self.horizon:
             return f"moves must be at most the horizon, {self.horizon}, not {self.moves}"
@@ -141,8 +141,8 @@ class MPC(AbstractStateLaw):
                 what = " or ".join("one number" if not s else f"{s[0]} entries" for s in allowed)
                 return f"{name} must have {what}, not {value.size}"
         pole = self.laguerre_pole
-        if pole is not None and is_known(pole) and known(pole) >= 1:
-            return f"laguerre_pole must be below 1, not {known(pole):g}"
+        if pole is not None and is_concrete(pole) and concrete(pole) >= 1:
+            return f"laguerre_pole must be below 1, not {concrete(pole):g}"
         if self.solver == "qpax" and not is_installed():
             return "solver must be another: qpax is not installed (pip install 'qpax>=0.1.4')"
         if self.loads == "known" and not case.loads:
@@ -196,20 +196,20 @@ class MPC(AbstractStateLaw):
         places = self.places
         if places is None:
             places = design_plant.case.sensor_places
-        shape = design_plant.rig.shapes(places, (0,))[0] / design_plant.scale
+        shape = design_plant.modal_model.shapes(places, (0,))[0] / design_plant.scale
         return jnp.zeros((shape.shape[0], state_count)).at[:, : shape.shape[1]].set(shape)
 
     def _sampled_plant(self, system, load_count) -> SampledPlant:
         B, B_f = jnp.split(system.B, [system.B.shape[1] - load_count], axis=1)
         return sampled_plant(system.A, B, B_f, self.period, self.delay)
 
-    def _prediction_plant(self, design_plant) -> LoadedBeam | None:
+    def _prediction_plant(self, design_plant) -> Plant | None:
         """The model from which the future is read at each tick, if it changes."""
         if self.prediction == "time-varying":
             return design_plant
         if self.loads == "ignored":
             return None
-        return eqx.tree_at(lambda m: m.traffic.inertia, design_plant, replace_fn=jnp.zeros_like)
+        return eqx.tree_at(lambda m: m.loads.inertia, design_plant, replace_fn=jnp.zeros_like)
 
     def _predict(self, design, t, estimate):
         """The plant over the last period, the prediction, and the weights of the loads in it."""

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check
 from jaxbeam.control import DiscreteLQR, StateFeedback
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
@@ -13,8 +13,8 @@ from jaxbeam.control.optimal.lqr import LQR, AbstractScheduledRegulator
 from jaxbeam.control.optimal.scheduled_lqr import GainScheduleGrid, ScheduledLQR
 from jaxbeam.estimation import Observer
 from jaxbeam.files.export.gains import Gains
-from jaxbeam.model.modes import lay_out
-from jaxbeam.model.sensor_signals import design
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.sensor_signals import sensor_sections
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
 
@@ -48,7 +48,7 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
     if points < 2:
         raise ValueError(f"a table needs at least two points, not {points}")
     shares = np.linspace(0, 1, points) if tabled else np.zeros(1)
-    (plant, grid, table, rest, crossing), estimator = _designed(case, lay_out(case), shares)
+    (plant, grid, table, rest, crossing), estimator = _designed(case, mesh_layout(case), shares)
     columns, commands = plant.states, plant.inputs
     more = table.shape[-1] - len(columns)
     if more and tabled:
@@ -63,9 +63,9 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
         np.asarray(table),
         np.asarray(rest),
         _filters(case),
-        float(known(law.period)),
+        float(concrete(law.period)),
         float(crossing),
-        np.inf if fade is None else float(known(fade)),
+        np.inf if fade is None else float(concrete(fade)),
         law.between if isinstance(law, ScheduledLQR) else "interpolated",
         tuple(tuple(column) for column in columns),
         tuple(tuple(command) for command in commands),
@@ -78,7 +78,7 @@ def _filters(case: Case) -> np.ndarray:
     """The digital filters of the sensors: rows of a sensor's index and one of its sections."""
     rows = np.zeros((0, 7))
     for i, sensor in enumerate(case.sensors):
-        sections = design(sensor, case.controller.period)
+        sections = sensor_sections(sensor, case.controller.period)
         if sections is not None:
             rows = np.concatenate([rows, np.insert(np.asarray(sections), 0, i, axis=1)])
     return rows

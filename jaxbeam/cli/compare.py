@@ -1,0 +1,231 @@
+"""Command `compare`: controllers on a case, beside the least achievable peak."""
+
+import itertools
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+import jaxbeam as jb
+from jaxbeam.cli.arguments import check_suffix, refuse, sweep_values
+from jaxbeam.cli.options import CaseOptions, Output, Over, table
+
+if TYPE_CHECKING:
+    from jaxbeam.analysis.compare import Comparison, MetricsOverCases, PerformanceMetrics
+
+
+def compare(
+    case: Path,
+    /,
+    *,
+    controllers: Annotated[tuple[Path, ...], Parameter(consume_multiple=True)] = (),
+    over: Over = (),
+    period: float | None = None,
+    output: Output = None,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Compare controllers on a case, beside the least peak that any controller can achieve.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML; its own controller, if any, is compared too.
+    controllers
+        Files with a table [controller], or case files whose controllers are taken. Controllers
+        are named after their files.
+    period
+        Time (s) for which commands are held in the least achievable peak; if left out, the
+        shortest period of the controllers, or 0.01.
+    output
+        Draw deflections and commands to this file, OUT.png.
+    """
+    values = sweep_values(over)
+    check_suffix(output, ".png", "a comparison")
+    refuse(bool(output and over), "a picture shows one load case: leave out -o or --over")
+    options.check_outputs(output)
+    parsed_case = options.read(case)
+
+    from jaxbeam.analysis.compare import compare, metrics_over_cases
+    from jaxbeam.case.validation import check
+
+    laws = _read_controllers(case, parsed_case, controllers)
+    runs = [dict(zip(values, row, strict=True)) for row in itertools.product(*values.values())]
+    load_cases = [jb.replace(parsed_case, run) for run in runs]
+    for load_case in load_cases:
+        check(load_case)
+    comparisons = [compare(load_case, laws, period) for load_case in load_cases]
+    if output:
+        from jaxbeam.plot import plot_comparison
+
+        plot_comparison(comparisons[0]).savefig(output)
+    if not over:
+        options.report(_to_dict(comparisons[0]), _lines(comparisons[0]), output)
+        return
+    overall = metrics_over_cases(comparisons)
+    lines = []
+    for run, comparison in zip(runs, comparisons, strict=True):
+        lines.append("; ".join(f"{address} = {value:g}" for address, value in run.items()))
+        lines += _lines(comparison)
+    options.report(
+        {
+            "cases": [
+                {"values": run} | _to_dict(comparison)
+                for run, comparison in zip(runs, comparisons, strict=True)
+            ],
+            "over_all": {name: _overall_to_dict(metrics) for name, metrics in overall.items()},
+        },
+        [*lines, f"over all {len(comparisons)} load cases:", *_overall_table(overall)],
+        output,
+    )
+
+
+def _read_controllers(path: Path, case: "jb.Case", files: tuple[Path, ...]) -> dict:
+    """Controllers by name: that of the case, if any, and those of the files.
+
+    Raises ValueError if two have the same name, or if there is none.
+    """
+    from jaxbeam.files.case_file import load_controller
+
+    found = {} if case.controller is None else {path.stem: case.controller}
+    for file in files:
+        if file.stem in found:
+            raise ValueError(f"two controllers are called {file.stem}; rename a file")
+        found[file.stem] = load_controller(file)
+    if not found:
+        raise ValueError(f"{path} has no controller; name some with --controllers FILE ...")
+    return found
+
+
+def _to_dict(comparison: "Comparison") -> dict:
+    """Numbers of a comparison by their names in JSON (SI units)."""
+    bound = comparison.bound
+    return {
+        "uncontrolled_peak": bound.uncontrolled,
+        "least_peak": bound.peak,
+        "held_for": bound.period,
+        "controllers": {
+            name: _metrics_to_dict(metrics)
+            | {
+                "loop": comparison.loop_summary(name),
+                "verdict": comparison.records[name].verdict,
+            }
+            for name, metrics in comparison.metrics.items()
+        },
+    }
+
+
+def _metrics_to_dict(metrics: "PerformanceMetrics") -> dict:
+    margin = metrics.reserve
+    unstable = margin.unstable
+    stability_margin = {
+        "gain": margin.gain,
+        "delay": margin.delay,
+        "obstacle": margin.obstacle,
+        "unstable": unstable
+        and {
+            "start": unstable.start,
+            "end": unstable.end,
+            "rate": unstable.rate,
+            "frequency": unstable.frequency,
+        },
+    }
+    limit_cycles = [
+        {"extra": one.extra, "frequency": one.frequency, "at_limits": one.at_limits}
+        for one in metrics.swings
+    ]
+    return {
+        "peak": metrics.peak,
+        "rms": metrics.rms,
+        "after_exit": metrics.after_exit,
+        "effort": metrics.effort,
+        "saturated": metrics.saturated,
+        "share": metrics.share,
+        "stability_margin": stability_margin,
+        "limit_cycles": limit_cycles,
+        # Old names of the two, for one release.
+        "reserve": stability_margin,
+        "swings": limit_cycles,
+    }
+
+
+def _lines(comparison: "Comparison") -> list[str]:
+    bound = comparison.bound
+    lines = [
+        f"no control: peak {bound.uncontrolled:.6g} m; no controller that holds its commands for "
+        f"{bound.period:g} s gets below {bound.peak:.6g} m, {bound.reduction:.1%} less"
+    ]
+    lines += table(
+        (
+            "controller",
+            "peak (m)",
+            "share of attainable reduction",
+            "RMS (m)",
+            "after exit (m)",
+            "effort (command^2 s)",
+            "time at limit",
+            "gain margin",
+            "delay margin (s)",
+        ),
+        [
+            (
+                name,
+                f"{metrics.peak:.6g}",
+                f"{metrics.share:.1%}",
+                f"{metrics.rms:.4g}",
+                f"{metrics.after_exit:.4g}",
+                " ".join(f"{effort:.4g}" for effort in metrics.effort),
+                " ".join(f"{share:.1%}" for share in metrics.saturated),
+                _margin_text(metrics, metrics.reserve.gain),
+                _margin_text(metrics, metrics.reserve.delay),
+            )
+            for name, metrics in comparison.metrics.items()
+        ],
+    )
+    obstacles = {name: metrics.reserve.obstacle for name, metrics in comparison.metrics.items()}
+    for obstacle in dict.fromkeys(filter(None, obstacles.values())):
+        names = [name for name, found in obstacles.items() if found == obstacle]
+        lines.append(f"no margin of {', '.join(names)}: {obstacle}")
+    for name, record in comparison.records.items():
+        verdicts = filter(None, (comparison.loop_summary(name), record.verdict))
+        lines.append(f"{name}: {'; '.join(verdicts)}")
+    return lines
+
+
+def _margin_text(metrics: "PerformanceMetrics", number: float) -> str:
+    if metrics.reserve.obstacle:
+        return "-"
+    return "unstable" if metrics.reserve.gain == 0 else f"{number:.3g}"
+
+
+def _overall_to_dict(metrics: "MetricsOverCases") -> dict:
+    return {
+        "peak": metrics.peak,
+        "worst_share": metrics.worst_share,
+        "mean_share": metrics.mean_share,
+        "after_exit": metrics.after_exit,
+        "saturated": metrics.saturated,
+    }
+
+
+def _overall_table(overall: "dict[str, MetricsOverCases]") -> list[str]:
+    return table(
+        (
+            "controller",
+            "largest peak (m)",
+            "worst share of attainable reduction",
+            "mean share",
+            "largest after exit (m)",
+            "most time at limit",
+        ),
+        [
+            (
+                name,
+                f"{metrics.peak:.6g}",
+                f"{metrics.worst_share:.1%}",
+                f"{metrics.mean_share:.1%}",
+                f"{metrics.after_exit:.4g}",
+                f"{metrics.saturated:.1%}",
+            )
+            for name, metrics in overall.items()
+        ],
+    )

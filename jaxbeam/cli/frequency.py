@@ -1,0 +1,129 @@
+"""Commands in the frequency domain: natural frequencies, frequency responses."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+import jaxbeam as jb
+from jaxbeam.cli.arguments import (
+    check_suffix,
+    frequency_range,
+    input_output_pair,
+    picture_path,
+    stationary_mass,
+)
+from jaxbeam.cli.options import CaseOptions, Output, table
+
+
+def modes(case: Path, /, *, plot: bool = False, options: CaseOptions = CaseOptions()) -> None:
+    """Compute natural frequencies and damping ratios.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    plot
+        Draw the mode shapes to CASE_modes.png in this folder.
+    """
+    picture = picture_path(None, case.with_stem(f"{case.stem}_modes")) if plot else None
+    options.check_outputs(picture)
+    parsed_case = options.read(case)
+    found = jb.modes(parsed_case)
+    if picture:
+        from jaxbeam.plot import plot_modes
+
+        plot_modes(parsed_case, found).savefig(picture)
+    rows = zip(found.frequencies, found.damping_ratios, strict=True)
+    options.report(
+        {"frequencies_hz": found.frequencies, "damping_ratios": found.damping_ratios},
+        table(
+            ("mode", "frequency (Hz)", "damping ratio"),
+            [
+                (i, f"{frequency:.6g}", f"{ratio:.4g}")
+                for i, (frequency, ratio) in enumerate(rows, 1)
+            ],
+        ),
+        picture,
+    )
+
+
+def frf(
+    case: Path,
+    /,
+    *,
+    pair: tuple[str, ...] = (),
+    mass_at: tuple[str, ...] = (),
+    from_: Annotated[float, Parameter("--from")] = 1.0,
+    to: float = 1000.0,
+    points: int = 2000,
+    output: Output = None,
+    plot: bool = False,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Compute frequency responses without the loads; print resonances and antiresonances.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    pair
+        INPUT:OUTPUT; repeat it for more. All commands to all sensors if left out. Inputs:
+        actuators.0, actuators.0.active_force, force@0.3. Outputs: sensors.0, deflection@0.3,
+        velocity@0.3, acceleration@0.3, slope@0.3, actuators.0.current, actuators.0.active_force,
+        actuators.0.transmitted_force. Positions are in m.
+    mass_at
+        POSITION=MASS: a mass (kg) that stands on the beam at a position (m); repeat it for more.
+    from_
+        Lowest frequency (Hz), 1 if left out.
+    to
+        Highest frequency (Hz), 1000 if left out.
+    points
+        Number of frequencies, logarithmically spaced; 2000 if left out.
+    output
+        Write the responses to this netCDF file, OUT.nc.
+    plot
+        Draw magnitude and phase to a PNG beside the output, or to CASE_frf.png in this folder.
+    """
+    check_suffix(output, ".nc", "a frequency response")
+    picture = picture_path(output, case.with_stem(f"{case.stem}_frf")) if plot else None
+    options.check_outputs(output, picture)
+    frequencies = frequency_range(from_, to, points)
+    pairs = [input_output_pair(text) for text in pair] or None
+    masses = [stationary_mass(text) for text in mass_at]
+    parsed_case = options.read(case)
+
+    from jaxbeam.model.frequency_response import extremes, frequency_response
+
+    response = frequency_response(parsed_case, frequencies, pairs, masses)
+    if output:
+        response.to_netcdf(output, options.overwrite)
+    if picture:
+        from jaxbeam.plot import plot_frequency_response
+
+        plot_frequency_response(response).savefig(picture)
+    columns = zip(response.pairs, response.magnitude.T, response.phase.T, strict=True)
+    lines = []
+    for i, channel_pair in enumerate(response.pairs):
+        unit = channel_pair.unit
+        lines.append(str(channel_pair) if unit == "1" else f"{channel_pair}, in {unit}")
+        rows = [(word, f"{f:.5g}", f"{size:.5g}") for word, f, size in extremes(response, i)]
+        lines += table(("", "frequency (Hz)", "magnitude"), rows)
+    options.report(
+        {
+            "frequencies_hz": response.frequencies,
+            "responses": [
+                {
+                    "input": channel_pair.input,
+                    "output": channel_pair.output,
+                    "unit": channel_pair.unit,
+                    "magnitude": magnitude,
+                    "phase_deg": phase,
+                }
+                for channel_pair, magnitude, phase in columns
+            ],
+        },
+        lines,
+        output,
+        picture,
+    )

@@ -1,0 +1,241 @@
+"""Command `identify`: parameters of a case from logs, or modes of a free decay."""
+
+from pathlib import Path
+
+from jaxbeam.cli.arguments import assignment, bounds_of, picture_path, refuse, split_files
+from jaxbeam.cli.options import (
+    CaseOptions,
+    Free,
+    Output,
+    Resume,
+    Seed,
+    Starts,
+    enable_compile_cache,
+    print_message,
+)
+from jaxbeam.files.report import check_report_folder
+
+
+def identify(
+    *files: Path,
+    free: Free = (),
+    prior: tuple[str, ...] = (),
+    scale: tuple[str, ...] = (),
+    loss: str = "squares",
+    stage: tuple[str, ...] = (),
+    starts: Starts = 1,
+    seed: Seed = 0,
+    mask: tuple[str, ...] = (),
+    profile: tuple[str, ...] = (),
+    draws: int = 0,
+    noise: str = "held",
+    validate: bool = False,
+    report: Path | None = None,
+    output: Output = None,
+    plot: bool = False,
+    resume: Resume = False,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Identify parameters of a case from logs; without --free, the modes of a free decay.
+
+    A parameter with a value in every log, such as the speed of its load, is free at the address
+    logs.*.loads.0.speed.
+
+    Parameters
+    ----------
+    files
+        [CASE.toml] LOG...: the case to fit, if any, and the logs, with all the runs they hold.
+    prior
+        ADDRESS=MEAN:DEVIATION: normal prior of a free parameter; repeat it for more.
+    scale
+        ADDRESS=log or ADDRESS=logit: scale on which a parameter is searched between its bounds.
+    loss
+        squares, or soft-l1 or huber, which give outliers less weight.
+    stage
+        ADDRESS,ADDRESS,...: free parameters to fit first, the others fixed; repeat it for more
+        stages.
+    mask
+        missing, spikes, saturation or stuck: samples to leave out; repeat it for more.
+    profile
+        ADDRESS: free parameter whose profile likelihood to compute; repeat it for more.
+    draws
+        Number of draws from the posterior in each of four chains (extra bayes).
+    noise
+        held at the levels of the fit, or estimated with each draw.
+    validate
+        Predict each log from a fit to the others (cross-validation).
+    report
+        Write a report with tables and figures to this folder: report.md and report.html.
+    output
+        Write the fitted case to this file, FIT.toml, and the whole fit beside it, FIT.npz.
+    plot
+        Draw measured and fitted signals to a PNG beside the output, or named after the log.
+    """
+    case, logs = split_files(files, free)
+    if case and free:
+        refuse(resume and not output, "--resume goes on with what is kept beside the output: -o")
+        picture = picture_path(output, logs[0]) if plot else None
+        options.check_outputs(output, _with_suffix(output, ".npz"), picture)
+        if report:
+            check_report_folder(report, options.overwrite)
+        arguments = _prior_arguments(free, prior, scale)
+        options.check_case(case)
+
+        import tuning  # sets XLA's threads, therefore before the case is read
+
+        priors = _priors(*arguments)
+        parsed_case = options.read(case)
+        if options.overwrite and not resume:
+            _remove_checkpoints(output)
+        fit = tuning.identify(
+            parsed_case,
+            _read_logs(logs, mask),
+            priors,
+            loss=loss,
+            starts=starts,
+            seed=seed,
+            stages=[text.split(",") for text in stage],
+            checkpoint=_with_suffix(output, ".search.npz") if starts > 1 else None,
+            resume=resume,
+        )
+        assessment = _assess(
+            fit, profile, draws, {"seed": seed, "noise": noise}, validate, output, resume
+        )
+        _write_and_print(fit, assessment, report, output, picture, options)
+        return
+    refuse(
+        bool(output or options.set_),
+        "-o and --set are for fitting a case; name what is free with --free ADDRESS",
+    )
+    given = (prior, scale, stage, profile, draws, validate, report, resume, mask, starts > 1)
+    refuse(
+        any(given),
+        "the options of fits are for fitting a case; name what is free with --free ADDRESS",
+    )
+    if case:
+        print_message(
+            f"nothing is named with --free, so {case} is not used; modes of the free decay:"
+        )
+    pictures = [picture_path(None, log) if plot else None for log in logs]
+    options.check_outputs(*pictures)
+    _identify_modes(logs, pictures, options)
+
+
+def _with_suffix(output: Path | None, suffix: str) -> Path | None:
+    return None if output is None else output.with_suffix(suffix)
+
+
+def _remove_checkpoints(output: Path | None) -> None:
+    """Remove the checkpoints of searches and draws beside the output."""
+    for suffix in (".search.npz", ".draws.npz") if output else ():
+        output.with_suffix(suffix).unlink(missing_ok=True)
+
+
+def _read_logs(files, fault_kinds) -> list:
+    """Logs of the files without the samples that have faults of the given kinds."""
+    import tuning
+
+    missing = "mask" if "missing" in fault_kinds else "refuse"
+    logs = [log for path in files for log in tuning.read_logs(path, missing=missing)]
+    masked_kinds = [kind for kind in fault_kinds if kind != "missing"]
+    return [tuning.mask(log, masked_kinds) for log in logs] if masked_kinds else logs
+
+
+def _prior_arguments(free, prior, scale) -> tuple[dict, dict, dict]:
+    """Bounds, means with deviations, and scales by address, of the options that name them.
+
+    Raises ValueError for malformed options, and for priors and scales of fixed parameters.
+    """
+    bounds = dict(bounds_of(text) for text in free)
+    scales = dict(assignment("--scale", text) for text in scale)
+    normals = {}
+    for text in prior:
+        address, value = assignment("--prior", text)
+        try:
+            mean, deviation = map(float, value.split(":"))
+        except ValueError:
+            raise ValueError(
+                f"--prior takes ADDRESS=MEAN:DEVIATION, such as beam.damping_ratio=0.02:0.005, not "
+                f"{text!r}"
+            ) from None
+        normals[address] = mean, deviation
+    for address in (*scales, *normals):
+        refuse(address not in bounds, f"{address} has a prior or a scale, but is not free: --free")
+    return bounds, normals, scales
+
+
+def _priors(bounds, normals, scales) -> dict:
+    """Priors by address. Raises ValueError, naming the address, for one that is impossible."""
+    from tuning.parameters.prior import Prior
+
+    priors = {}
+    for address, pair in bounds.items():
+        low, high = pair or (None, None)
+        mean, deviation = normals.get(address, (None, None))
+        try:
+            priors[address] = Prior(low, high, mean, deviation, scale=scales.get(address, "linear"))
+        except ValueError as error:
+            raise ValueError(f"{address}: {error}") from None
+    return priors
+
+
+def _assess(fit, profile, draws, sampling, validate, output, resume) -> dict:
+    """Profiles, posterior and cross-validation of a fit, as far as they are asked for."""
+    from tuning.fit.model_validation import cross_validate
+    from tuning.fit.uncertainty.posterior import sample
+    from tuning.fit.uncertainty.profile import profile as profile_of
+
+    assessment = {"profiles": [profile_of(fit, address) for address in profile]}
+    if validate:
+        assessment["held_out"] = cross_validate(fit)
+    if draws:
+        checkpoint = _with_suffix(output, ".draws.npz")
+        assessment["posterior"] = sample(
+            fit, draws, checkpoint=checkpoint, resume=resume, **sampling
+        )
+    return assessment
+
+
+def _write_and_print(fit, assessment, report, output, picture, options: CaseOptions) -> None:
+    """Write case, fit, picture and report, print the result, and remove the checkpoints."""
+    from jaxbeam.files.case_file import save_case
+    from tuning.fit.report import write_report
+    from tuning.fit.storage import save_fit
+
+    if output:
+        save_case(fit.case, output, overwrite=True)  # checked before the work
+        save_fit(fit, output.with_suffix(".npz"), overwrite=True)
+    if picture:
+        fit.plot().savefig(picture)
+    if report:
+        write_report(report, fit, overwrite=True, **assessment)
+    _remove_checkpoints(output)
+    profiles, held_out = assessment["profiles"], assessment.get("held_out", ())
+    posterior = assessment.get("posterior")
+    content = fit.to_dict() | {
+        "profiles": {p.address: {"interval": p.interval, "verdict": p.verdict} for p in profiles}
+    }
+    if posterior:
+        content["posterior"] = posterior.to_dict()
+    content["left_out"] = {found.log: found.residual_ratio for found in held_out}
+    lines = [str(fit), *(found.verdict for found in (*profiles, *held_out))]
+    if posterior:
+        lines.append(str(posterior))
+    page = report and report / "report.html"
+    options.report(content, lines, output, _with_suffix(output, ".npz"), picture, page)
+
+
+def _identify_modes(logs, pictures, options: CaseOptions) -> None:
+    enable_compile_cache()
+    import tuning
+
+    content = {}
+    for log, picture in zip(logs, pictures, strict=True):
+        fit = tuning.identify_modes(tuning.read_log(log))
+        content[str(log)] = fit.to_dict()
+        if picture:
+            fit.plot().savefig(picture)
+        if not options.json_:
+            options.report({}, [f"{log}\n{fit}"], picture)
+    if options.json_:
+        options.report(content, [])

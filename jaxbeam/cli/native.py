@@ -1,0 +1,25 @@
+"""Command `native`: the optional C code, compiled for this machine."""
+
+from jaxbeam.cli.options import PrintOptions
+
+
+def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:
+    """Compile the C code for this machine, once; sweeps of peaks use it from then on.
+
+    Needs a C compiler.
+
+    Parameters
+    ----------
+    remove
+        Remove the compiled code; sweeps use XLA again.
+    """
+    from jaxbeam.integrator import native_peaks
+
+    path = native_peaks.library_path()
+    if remove:
+        native_peaks.remove()
+        line = f"removed {path}: sweeps use XLA"
+    else:
+        native_peaks.build()
+        line = f"compiled {path}: sweeps on this machine use it from now on"
+    options.report({"path": str(path), "compiled": not remove}, [line])

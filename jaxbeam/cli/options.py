@@ -1,0 +1,148 @@
+"""Options that several commands share, and what they do: read the case, print the result.
+
+Nothing here imports JAX or NumPy before a case is read, so that help and errors in arguments are
+printed within a few tenths of a second; a test checks it.
+"""
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+import jaxbeam as jb
+from jaxbeam.cli.arguments import assignment, value_of
+from jaxbeam.files.report import text_table
+from jaxbeam.files.toml_file import read_toml
+
+Output = Annotated[Path | None, Parameter(("-o", "--output"))]
+Free = Annotated[
+    tuple[str, ...],
+    Parameter(help="ADDRESS[=LOW:HIGH]: a free parameter and its bounds; repeat it for more."),
+]
+Over = Annotated[
+    tuple[str, ...],
+    Parameter(
+        help="ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: values of a parameter; all"
+        " combinations are computed if it is repeated for more."
+    ),
+]
+Starts = Annotated[
+    int, Parameter(help="Number of starting points of the search; the first is the case itself.")
+]
+Seed = Annotated[int, Parameter(help="Seed of random starting points and draws.")]
+Resume = Annotated[bool, Parameter(help="Continue what was interrupted, from its output files.")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class PrintOptions:
+    """Options of a command that prints a result."""
+
+    json_: Annotated[bool, Parameter("--json", help="Print the result as JSON.")] = False
+
+    def report(self, content: dict[str, Any], lines: Iterable[str], *written: Path | None) -> None:
+        """Print the content as JSON, or else the lines and the names of the files written."""
+        if self.json_:
+            print(json.dumps(plain(content), indent=2, allow_nan=False))
+            return
+        for line in lines:
+            print(line)
+        for path in filter(None, written):
+            print(f"written: {path}")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class OutputOptions(PrintOptions):
+    """Options of a command that writes files."""
+
+    overwrite: Annotated[bool, Parameter("--overwrite", help="Replace existing files.")] = False
+
+    def check_outputs(self, *paths: Path | None) -> None:
+        """Check, before any work, that files can be written.
+
+        Raises FileNotFoundError if the folder does not exist, FileExistsError if the file exists
+        and `--overwrite` is not given.
+        """
+        for path in filter(None, paths):
+            if not path.parent.is_dir():
+                raise FileNotFoundError(f"there is no folder {path.parent} to write {path.name} to")
+            if path.exists() and not self.overwrite:
+                raise FileExistsError(f"{path} exists; choose another name or add --overwrite")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class CaseOptions(OutputOptions):
+    """Options of a command that reads a case."""
+
+    set_: Annotated[
+        tuple[str, ...],
+        Parameter("--set", help="ADDRESS=VALUE: change an entry of the case; repeat it for more."),
+    ] = ()
+
+    def check_case(self, path: Path) -> None:
+        """Check, before JAX is imported, that a file is TOML and that `--set` has addresses.
+
+        Raises OSError if the file cannot be read, ValueError otherwise.
+        """
+        for text in self.set_:
+            assignment("--set", text)
+        read_toml(path)
+
+    def read(self, path: Path) -> "jb.Case":
+        """Case of a file with the entries of `--set`.
+
+        Raises OSError if the file cannot be read, ValueError for whatever is wrong in it.
+        """
+        self.check_case(path)
+        changes = {a: value_of(v) for a, v in (assignment("--set", text) for text in self.set_)}
+        enable_compile_cache()
+        from jaxbeam.files.case_file import with_settings
+
+        return with_settings(jb.load_case(path), changes)
+
+
+def enable_compile_cache() -> None:
+    """Keep compiled programs of this command for later ones, in the user's cache folder.
+
+    JAX_COMPILATION_CACHE_DIR names another folder, or none if it is empty. Imports JAX (half a
+    second), so that commands call it after their checks.
+    """
+    import os
+
+    import jax
+
+    from jaxbeam.runtime.compile_cache import cache_folder
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
+    """Lines of a table, columns flush right; none if there are no rows."""
+    cells = [[str(entry) for entry in row] for row in rows]
+    return text_table(header, cells, ">" * len(header)) if cells else []
+
+
+def print_message(message: str) -> None:
+    """Print an error, a warning or a remark on standard error."""
+    print(f"jaxbeam: {message}", file=sys.stderr)
+
+
+def plain(value: Any) -> Any:
+    """Value of JSON types: arrays as lists, keys as strings, None for infinite and NaN."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

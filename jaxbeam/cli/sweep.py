@@ -1,0 +1,86 @@
+"""Command `sweep`: many runs of a case."""
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+import jaxbeam as jb
+from jaxbeam.cli.arguments import check_suffix, refuse, sweep_values
+from jaxbeam.cli.options import CaseOptions, Output, Over, table
+
+
+def sweep(
+    case: Path,
+    /,
+    *,
+    over: Annotated[Over, Parameter(required=True)],
+    output: Output = None,
+    paired: bool = False,
+    resume: bool = False,
+    scheduler: str | None = None,
+    precision: str = "double",
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Simulate a case for many values of some of its parameters.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    output
+        Write the results to this zarr store, OUT.zarr, block by block.
+    paired
+        Pair the values of all parameters one by one instead of computing all combinations.
+    resume
+        Continue an interrupted sweep in the same store.
+    scheduler
+        Compute on the workers of a Dask cluster: address of its scheduler, tcp://HOST:PORT. The
+        store must be in a folder that all workers see.
+    precision
+        double, or single: half the bits, errors of a few parts in a million.
+    """
+    values = sweep_values(over)
+    refuse(resume and not output, "--resume needs the store to continue; name it with -o OUT.zarr")
+    refuse(bool(scheduler) and not output, "--scheduler needs a store for the results: -o OUT.zarr")
+    check_suffix(output, ".zarr", "a sweep")
+    if not resume:
+        options.check_outputs(output)
+    parsed_case = options.read(case)
+
+    from jaxbeam.sweeps.cluster import connect
+
+    with connect(scheduler) if scheduler else nullcontext() as client:
+        results = jb.sweep(
+            parsed_case,
+            values,
+            store=output,
+            resume=resume,
+            overwrite=options.overwrite,
+            paired=paired,
+            progress=not options.json_,
+            precision=precision,
+            client=client,
+        )
+    peaks = results["peak_deflection"]
+    options.report(
+        {"values": values, "dimensions": peaks.dims, "peak_deflection": peaks.to_numpy()},
+        _lines(peaks, values),
+        output,
+    )
+
+
+def _lines(peaks, values) -> list[str]:
+    """Number of runs, and the largest peak at each sensor with the parameters of its run."""
+    rows = []
+    for i in range(peaks.sizes["sensor"]):
+        at_sensor = peaks.isel(sensor=i)
+        largest = at_sensor.isel(at_sensor.fillna(-1.0).argmax(...))
+        parameters = [f"{float(largest[address]):.6g}" for address in values]
+        rows.append((i, f"{float(largest):.6g}", *parameters))
+    failed = peaks.isnull().any("sensor")
+    return [
+        f"{failed.size} runs, {int(failed.sum())} failed; the largest peak at each sensor:",
+        *table(("sensor", "peak deflection (m)", *(f"at {name}" for name in values)), rows),
+    ]

@@ -1,0 +1,256 @@
+"""Command `tune`: parameters of a controller by gradient descent through the closed loop."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from jaxbeam.cli.arguments import (
+    bounds_of,
+    check_suffix,
+    named_number,
+    named_numbers,
+    picture_path,
+    refuse,
+)
+from jaxbeam.cli.options import CaseOptions, Free, Output, Resume, Seed, Starts
+
+
+def tune(
+    case: Path,
+    /,
+    *,
+    free: Free = (),
+    cases: Path,
+    objective: tuple[str, ...] = (),
+    aggregate: str = "worst",
+    limit: tuple[str, ...] = (),
+    lexicographic: str = "",
+    pareto: str = "",
+    integers: tuple[str, ...] = (),
+    states: int | None = None,
+    fit: Path | None = None,
+    plants: int = 4,
+    posterior: bool = False,
+    max_real_part: float | None = None,
+    extra_delay: float = 0.0,
+    parameter_tolerance: tuple[str, ...] = (),
+    method: str | None = None,
+    steps: int = 80,
+    batch: int | None = None,
+    starts: Starts = 1,
+    seed: Seed = 0,
+    least_peaks: Annotated[bool, Parameter(negative="--no-least-peaks")] = True,
+    output: Output = None,
+    plot: bool = False,
+    resume: Resume = False,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Tune controller parameters by gradient descent; report performance on held-out runs.
+
+    Metrics are peak, shortfall, rms, after_exit, effort and contact.
+
+    Parameters
+    ----------
+    case
+        Case file with a controller, TOML.
+    cases
+        Load cases, TOML: tables [training] and [held_out] with lists of values by address.
+    objective
+        METRIC=WEIGHT: a term of the objective; repeat it for more. The peak if left out.
+    aggregate
+        Aggregation over runs: worst, mean or cvar (mean of the worst quarter).
+    limit
+        METRIC=NUMBER: upper limit of a metric; repeat it for more.
+    lexicographic
+        METRIC,METRIC,...: metrics in order of priority, in place of an objective: each is
+        minimised subject to those before it.
+    pareto
+        METRIC=NUMBER,NUMBER,...: tune under each of these limits and print the Pareto front.
+    integers
+        ADDRESS=NUMBER,NUMBER,...: integers to try, such as controller.horizon=4,6,8; all
+        combinations are tried if it is repeated for more.
+    states
+        Number of states fed back by a regulator, such as kind lqr; the states are selected too.
+    fit
+        FIT.npz, or the FIT.toml beside it, of `jaxbeam identify`: tune for the identified plant.
+    plants
+        With --fit: number of plants drawn from the covariance of the fit for training, and as
+        many for held-out runs.
+    posterior
+        With --fit: draw plants from the posterior (extra bayes) instead of the covariance.
+    max_real_part
+        Largest real part (1/s) allowed for poles with loads frozen along the crossings.
+    extra_delay
+        With --max-real-part: delay (s) beyond the controller's own for which it must hold.
+    parameter_tolerance
+        With --max-real-part: ADDRESS=SHARE, relative error of a parameter for which it must hold,
+        such as beam.flexural_rigidity=0.1; repeat it for more.
+    method
+        adam, lbfgs (optax) or bfgs (optimistix). If left out, lbfgs with --pareto and
+        --lexicographic, else adam.
+    steps
+        Number of steps of the optimiser.
+    batch
+        Number of training runs drawn at random for each step of adam; all if left out.
+    least_peaks
+        Compute the least achievable peak of every run.
+    output
+        Write the tuned case to this file, TUNED.toml (those of a Pareto front to TUNED-1.toml,
+        TUNED-2.toml, ...), and checkpoints beside it.
+    plot
+        Draw peaks before and after to a PNG beside the output.
+    """
+    weights = dict(named_number("--objective", text, "peak=1") for text in objective)
+    limits = dict(named_number("--limit", text, "effort=0.3") for text in limit)
+    tolerances = dict(
+        named_number("--parameter-tolerance", text, "beam.flexural_rigidity=0.1")
+        for text in parameter_tolerance
+    )
+    _check_combination(
+        {
+            "--lexicographic": bool(lexicographic),
+            "--pareto": bool(pareto),
+            "--integers": bool(integers),
+            "--states": states is not None,
+        },
+        searches=batch is not None or starts > 1,
+        resume=resume,
+    )
+    refuse(
+        max_real_part is None and bool(extra_delay or tolerances),
+        "--extra-delay and --parameter-tolerance need --max-real-part",
+    )
+    refuse(fit is None and posterior, "--posterior draws plants from a fit: it needs --fit")
+    refuse(
+        bool(lexicographic and (weights or limits)),
+        "--lexicographic takes the place of --objective and --limit",
+    )
+    picture = picture_path(output, case.with_suffix(".tuned")) if plot else None
+    check_suffix(output, ".toml", "a tuned case")
+    pareto_limits = _pareto_limits(pareto) if pareto else None
+    integer_choices = dict(_integer_choices(text) for text in integers)
+    bounds = dict(bounds_of(text) for text in free)
+    files = _output_files(output, len(pareto_limits[1]) if pareto_limits else 0)
+    options.check_outputs(*files, picture)
+    options.check_case(case)
+
+    import tuning  # sets XLA's threads, therefore before the case is read
+
+    parsed_case = options.read(case)
+    loads = tuning.read_load_cases(cases)
+    if fit is not None:
+        parsed_case, loads = _with_identified_plant(
+            parsed_case, loads, fit, plants, posterior, seed
+        )
+    total_objective = tuning.Objective(weights or {"peak": 1.0}, aggregate, limits=limits)
+    search_options = {
+        "stable": None
+        if max_real_part is None
+        else tuning.StabilityConstraint(max_real_part, extra_delay, tolerances),
+        "method": method or ("lbfgs" if pareto or lexicographic else "adam"),
+        "steps": steps,
+        "seed": seed,
+        "least_peaks": least_peaks,
+        "progress": not options.json_,
+    }
+    start_options = {"batch": batch, "starts": starts}
+    if pareto_limits:
+        result = tuning.pareto(
+            parsed_case, bounds, loads, total_objective, *pareto_limits, **search_options
+        )
+        tuned = result.tuned
+    elif lexicographic:
+        metrics = lexicographic.split(",")
+        results = tuning.lexicographic(
+            parsed_case, bounds, loads, metrics, aggregation=aggregate, **search_options
+        )
+        result = results[-1]
+        tuned = (result,)
+    elif integers:
+        result = tuning.tune_integers(
+            parsed_case, integer_choices, bounds, loads, total_objective,
+            **start_options, **search_options,
+        )  # fmt: skip
+        tuned = (result.best,)
+    elif states is not None:
+        result = tuning.tune_reduced(
+            parsed_case, states, bounds, loads, total_objective, **start_options, **search_options
+        )
+        tuned = (result.tuned,)
+    else:
+        checkpoint = _checkpoint(output)
+        if checkpoint and options.overwrite and not resume:
+            checkpoint.unlink(missing_ok=True)
+        result = tuning.tune(
+            parsed_case, bounds, loads, total_objective, checkpoint=checkpoint, resume=resume,
+            **start_options, **search_options,
+        )  # fmt: skip
+        tuned = (result,)
+    _write_and_print(result, tuned, files, picture, options)
+    if output:
+        output.with_suffix(".search.npz").unlink(missing_ok=True)
+
+
+def _check_combination(kinds: dict[str, bool], searches: bool, resume: bool) -> None:
+    """Raise ValueError for kinds of searches that exclude each other or the options of one.
+
+    `kinds` tells by option whether it is given; `searches`, whether --batch or --starts are.
+    """
+    given = [option for option, is_given in kinds.items() if is_given]
+    refuse(len(given) > 1, f"{' and '.join(given)} are mutually exclusive; give one of them")
+    several = bool(given) and given[0] in ("--lexicographic", "--pareto")
+    refuse(
+        (several and searches) or (bool(given) and resume),
+        f"--batch, --starts and --resume are for a single search, not for {''.join(given)}",
+    )
+
+
+def _checkpoint(output: Path | None) -> Path | None:
+    return None if output is None else output.with_suffix(".search.npz")
+
+
+def _write_and_print(result, tuned, files, picture, options: CaseOptions) -> None:
+    """Write the tuned cases and the picture, and print the result."""
+    from jaxbeam.files.case_file import save_case
+
+    for one, file in zip(tuned, files, strict=False):
+        save_case(one.case, file, overwrite=True)  # checked before the work
+    if picture:
+        drawn = result if hasattr(result, "plot") else tuned[0]
+        drawn.plot().savefig(picture)
+    summaries = [one.to_dict() for one in tuned]
+    options.report(
+        summaries[0] if len(summaries) == 1 else {"front": summaries},
+        [str(result)],
+        *files,
+        picture,
+    )
+
+
+def _with_identified_plant(case, loads, file: Path, count: int, posterior: bool, seed: int):
+    """Case with the identified plant, and load cases on plants drawn from the fit."""
+    import tuning
+
+    fit = tuning.load_fit(file.with_suffix(".npz"))
+    source = tuning.sample(fit, seed=seed) if posterior else fit
+    drawn = tuning.draw_plants(source, 2 * count, seed)
+    return tuning.with_identified_plant(case, fit), loads.across(drawn[:count], drawn[count:])
+
+
+def _output_files(output: Path | None, count: int) -> list[Path]:
+    """Files of the tuned cases: one, or one for each limit of a Pareto front."""
+    if output is None:
+        return []
+    if not count:
+        return [output]
+    return [output.with_stem(f"{output.stem}-{i + 1}") for i in range(count)]
+
+
+def _pareto_limits(text: str) -> tuple[str, list[float]]:
+    return named_numbers("--pareto", text, "METRIC=NUMBER,NUMBER,...", "effort=0.1,0.2,0.4")
+
+
+def _integer_choices(text: str) -> tuple[str, list[int]]:
+    form, example = "ADDRESS=NUMBER,NUMBER,...", "controller.horizon=4,6,8"
+    return named_numbers("--integers", text, form, example, int)

@@ -1,0 +1,89 @@
+"""Commands `weigh` (weigh-in-motion) and `identify-responses` (fit in the frequency domain)."""
+
+from pathlib import Path
+
+from jaxbeam.cli.arguments import bounds_of, range_of, refuse
+from jaxbeam.cli.options import CaseOptions, Free, Output
+
+
+def weigh(
+    case: Path,
+    log: Path,
+    /,
+    *,
+    speeds: str,
+    max_loads: int = 3,
+    one_way: bool = False,
+    output: Output = None,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Identify the loads that crossed a known beam: their number, masses, speeds, entry times.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML, with sensors of deflection; its loads are ignored.
+    log
+        Log of the sensors during the crossing.
+    speeds
+        LOW:HIGH: range of speeds (m/s) to search.
+    max_loads
+        Largest number of loads to try.
+    one_way
+        Search loads from the left only.
+    output
+        Write the case with the identified loads to this file, TOML.
+    """
+    options.check_outputs(output)
+    speed_range = range_of("--speeds", speeds, "m/s, such as 0.5:3")
+    options.check_case(case)
+
+    import tuning  # sets XLA's threads, therefore before the case is read
+    from jaxbeam.files.case_file import save_case
+
+    parsed_case = options.read(case)
+    weighing = tuning.weigh(
+        parsed_case, tuning.read_log(log), speed_range, max_loads, both_ways=not one_way
+    )
+    if output:
+        save_case(weighing.fit.case, output, overwrite=True)  # checked before the work
+    options.report(weighing.to_dict(), [str(weighing)], output)
+
+
+def identify_responses(
+    case: Path,
+    log: Path,
+    /,
+    *,
+    free: Free = (),
+    segment: float | None = None,
+    output: Output = None,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Identify parameters of a case, without its loads, from frequency responses in a log.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    log
+        Log of the sensors and of one command to an actuator.
+    segment
+        Length (s) of the averaged segments of the log; an eighth of it if left out.
+    output
+        Write the fitted case to this file, TOML.
+    """
+    options.check_outputs(output)
+    refuse(not free, "name what to identify with --free ADDRESS")
+    bounds = dict(map(bounds_of, free))
+    options.check_case(case)
+
+    import tuning  # sets XLA's threads, therefore before the case is read
+    from jaxbeam.files.case_file import save_case
+
+    parsed_case = options.read(case)
+    measured = tuning.responses_of(tuning.read_log(log), segment)
+    fit = tuning.identify_responses(parsed_case, measured, bounds)
+    if output:
+        save_case(fit.case, output, overwrite=True)  # checked before the work
+    options.report(fit.to_dict(), [str(fit)], output)
