@@ -93,7 +93,7 @@ def frf(
     masses = [stationary_mass(text) for text in mass_at]
     parsed_case = options.read(case)
 
-    from jaxbeam.model.frequency_response import extremes, frequency_response
+    from jaxbeam.model.frequency_response import frequency_response, resonances_and_antiresonances
 
     response = frequency_response(parsed_case, frequencies, pairs, masses)
     if output:
@@ -107,7 +107,10 @@ def frf(
     for i, channel_pair in enumerate(response.pairs):
         unit = channel_pair.unit
         lines.append(str(channel_pair) if unit == "1" else f"{channel_pair}, in {unit}")
-        rows = [(word, f"{f:.5g}", f"{size:.5g}") for word, f, size in extremes(response, i)]
+        rows = [
+            (word, f"{f:.5g}", f"{size:.5g}")
+            for word, f, size in resonances_and_antiresonances(response, i)
+        ]
         lines += table(("", "frequency (Hz)", "magnitude"), rows)
     options.report(
         {

@@ -35,7 +35,7 @@ def stability(
     options.check_outputs(picture)
     parsed_case = options.read(case)
 
-    from jaxbeam.analysis.linearised_loop import linear_loop
+    from jaxbeam.analysis.linearised_loop import linearised_loop
     from jaxbeam.analysis.margins import margins
     from jaxbeam.analysis.stability import frozen_poles, growth, stream
     from jaxbeam.analysis.stability_limits import (
@@ -45,7 +45,7 @@ def stability(
     )
 
     # Before the first load: loads off the beam leave the loop as it is.
-    unloaded = linear_loop(parsed_case, -1.0)
+    unloaded = linearised_loop(parsed_case, -1.0)
     stable = bool(unloaded.poles().real.max() < 0)
     loop_margins = (
         [margins(unloaded, i) for i in range(len(parsed_case.actuators))] if stable else []

@@ -206,7 +206,7 @@ def test_the_command_prints_and_draws(found, folder, monkeypatch, capsys):
     assert answer["held_for"] == 0.02
     assert answer["least_peak"] >= found.bound.peak * (1 - 1e-6)
     assert answer["controllers"]["weak"]["peak"] == found.merits["weak"].peak
-    assert answer["controllers"]["wild"]["reserve"]["gain"] is None  # any: it is infinite
+    assert answer["controllers"]["wild"]["stability_margin"]["gain"] is None  # any: it is infinite
 
 
 @pytest.mark.slow

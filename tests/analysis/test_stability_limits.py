@@ -162,7 +162,7 @@ def test_the_command_tells_limits_and_multipliers(tmp_path, capsys):
     jb.save_case(case, tmp_path / "case.toml")
 
     with pytest.raises(SystemExit) as ended:
-        main(["stability", str(tmp_path / "case.toml"), "--limits", "--spacing", "0.15"])
+        main(["stability", str(tmp_path / "case.toml"), "--limits", "--headway", "0.15"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
     assert (

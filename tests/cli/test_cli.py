@@ -86,7 +86,7 @@ REFUSED = [
     ("simulate case.toml -o out.txt", "a record is written to a .nc file; call it out.nc"),
     ("simulate case.toml -o none/out.nc", "there is no folder none to write out.nc to"),
     ("simulate case.toml -o old.nc", "old.nc exists; choose another name or add --overwrite"),
-    ("simulate case.toml --animate out.mp4", "a moving picture is written to a .gif file"),
+    ("simulate case.toml --animate out.mp4", "an animation is written to a .gif file"),
     ("simulate case.toml --set loads.0.speed", "--set takes ADDRESS=VALUE, such as"),
     ("simulate case.toml --set loads.0.sped=1", "loads.0 has no key 'sped'; did you mean 'speed'?"),
     ("simulate case.toml --set loads.1.speed=1", "no number at address 'loads.1.speed'; did you"),

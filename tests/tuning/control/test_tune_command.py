@@ -13,7 +13,7 @@ from tests.tuning.stand_in import campaign, fit, search
 from tuning.fit import storage
 
 LOADS = '[training]\n"loads.0.mass" = [0.3, 0.5]\n[held_out]\n"loads.0.mass" = [0.4]\n'
-TUNE = f"tune case.toml --cases loads.toml --free {GAIN}=500:7500 --no-bounds --steps 2"
+TUNE = f"tune case.toml --cases loads.toml --free {GAIN}=500:7500 --no-least-peaks --steps 2"
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_from_a_fit_to_a_tuned_case(call, tmp_path, monkeypatch):
     monkeypatch.setattr(storage, "prepare", lambda case, logs: campaign())
     found = fit(search(free={RIGIDITY: None, "beam.damping_ratio": None}))
     tuning.save_fit(found, tmp_path / "fit.npz")
-    code, out, err = call(f"{TUNE} --plant fit.toml --plants 2 --over cvar -o tuned.toml --json")
+    code, out, err = call(f"{TUNE} --fit fit.toml --plants 2 --aggregate cvar -o tuned.toml --json")
     assert code == 0, err
     told = json.loads(out)
     assert len(told["runs"]["training"]["cases"]) == 4
@@ -67,7 +67,7 @@ def test_what_is_asked_of_a_front(call, tmp_path, monkeypatch):
         return Front()
 
     monkeypatch.setattr(tuning, "pareto", pareto)
-    code, out, err = call(f"{TUNE} --front effort=0.1,0.2 --limit after_exit=0.5 --over mean")
+    code, out, err = call(f"{TUNE} --pareto effort=0.1,0.2 --limit after_exit=0.5 --aggregate mean")
     assert code == 0 and "a front" in out, err
     case, free, cases, objective, merit, limits = asked["given"]
     assert free == {GAIN: (500.0, 7500.0)} and len(cases.training) == 2
@@ -104,9 +104,9 @@ def test_ranks_and_choices_are_handed_on(call, monkeypatch):
     monkeypatch.setattr(tuning, "lexicographic", lexicographic)
     monkeypatch.setattr(tuning, "tune_reduced", tune_reduced)
     monkeypatch.setattr(tuning, "tune_choices", tune_choices)
-    assert json.loads(call(f"{TUNE} --rank peak,effort --json")[1]) == {"verdict": "fine"}
-    assert json.loads(call(f"{TUNE} --choose controller.power=1,3 --json")[1])
-    assert json.loads(call(f"{TUNE} --keep 1 --starts 2 --json")[1]) == {"verdict": "fine"}
+    assert json.loads(call(f"{TUNE} --lexicographic peak,effort --json")[1]) == {"verdict": "fine"}
+    assert json.loads(call(f"{TUNE} --integers controller.power=1,3 --json")[1])
+    assert json.loads(call(f"{TUNE} --states 1 --starts 2 --json")[1]) == {"verdict": "fine"}
     assert asked == {
         "keep": (1, [GAIN], 2),
         "rank": (["peak", "effort"], "worst"),
@@ -115,18 +115,18 @@ def test_ranks_and_choices_are_handed_on(call, monkeypatch):
 
 
 REFUSED = {
-    "--front effort": "--front takes MERIT=NUMBER",
-    "--front effort=0.1 --rank peak": "--rank and --front do not go together",
-    "--rank peak --objective rms=1": "--rank takes the place of --objective",
-    "--front effort=0.1 --starts 3": "are for a single search, not for --front",
-    "--choose controller.power=1 --resume": "are for a single search, not for --choose",
-    "--keep 1": "only regulators, such as kind 'lqr', have states to leave out",
-    "--choose controller.power=one": "--choose takes ADDRESS=NUMBER",
-    "--sampled": "it needs --plant",
-    "--reserve 0.01": "--reserve and --spread need --stable",
-    "--plant none.npz": "there is no such fit",
+    "--pareto effort": "--pareto takes METRIC=NUMBER",
+    "--pareto effort=0.1 --lexicographic peak": "--lexicographic and --pareto are mutually exclusive",
+    "--lexicographic peak --objective rms=1": "--lexicographic takes the place of --objective",
+    "--pareto effort=0.1 --starts 3": "are for a single search, not for --pareto",
+    "--integers controller.power=1 --resume": "are for a single search, not for --integers",
+    "--states 1": "only regulators, such as kind 'lqr', have states to leave out",
+    "--integers controller.power=one": "--integers takes ADDRESS=NUMBER",
+    "--posterior": "it needs --fit",
+    "--extra-delay 0.01": "--extra-delay and --parameter-tolerance need --max-real-part",
+    "--fit none.npz": "there is no such fit",
     "--method newton": "a method is one of adam, lbfgs, bfgs",
-    "--limit effort": "a name and a number are needed",
+    "--limit effort": "--limit takes NAME=NUMBER, such as effort=0.3",
     "-o tuned.txt": "a tuned case is written to a .toml file",
 }
 

@@ -51,21 +51,21 @@ def test_rivals_and_unseen_logs(call, tmp_path, monkeypatch):
         "hold_out",
         lambda fit, logs: [tuning.fit.model_validation.Unseen("new", np.array([1.1]))],
     )
-    code, out, err = call("judge three.npz one.npz --unseen runs.csv")
+    code, out, err = call("compare-models three.npz one.npz --held-out runs.csv")
     assert code == 1 and "the cell is empty" in err
-    code, out, err = call("judge three.npz one.npz")
+    code, out, err = call("compare-models three.npz one.npz")
     assert code == 0, err
     header, first, second = out.splitlines()
-    assert header.split() == ["numbers", "log", "likelihood", "AIC", "BIC", "weight"]
+    assert header.split() == ["model", "parameters", "log", "likelihood", "AIC", "BIC", "weight"]
     assert first.split()[:2] == ["one", "1"] and second.split()[:2] == ["three", "3"]
     assert float(first.split()[4]) == pytest.approx(tuning.compare_fits(fits)[0].bic, rel=1e-5)
     (tmp_path / "new.csv").write_text("t [s],a [mm],b [mm]\n0,1,1\n1,2,2\n2,1,1\n")
-    code, out, _ = call("judge one.npz --unseen new.csv")
+    code, out, _ = call("compare-models one.npz --held-out new.csv")
     assert out == "one: new: predicted; residuals are 1.1 times the noise at most\n"
-    told = json.loads(call("judge three.npz one.npz --unseen new.csv --json")[1])
-    assert [rival["name"] for rival in told["rivals"]] == ["one", "three"]
-    assert told["unseen"]["one"] == {"new": [1.1]}
-    assert "one fit alone: give a rival" in call("judge one.npz")[2]
+    told = json.loads(call("compare-models three.npz one.npz --held-out new.csv --json")[1])
+    assert [rival["name"] for rival in told["models"]] == ["one", "three"]
+    assert told["held_out"]["one"] == {"new": [1.1]}
+    assert "one fit alone: give another" in call("compare-models one.npz")[2]
 
 
 def test_an_experiment_is_planned(call, monkeypatch):
@@ -79,7 +79,7 @@ def test_an_experiment_is_planned(call, monkeypatch):
         )  # fmt: skip
 
     monkeypatch.setattr(tuning, "sharpen", sharpen)
-    line = "sharpen case.toml --free beam.length --over sensors.0.position=0.1:0.5 --noise 1e-6"
+    line = "design-experiment case.toml --free beam.length --vary sensors.0.position=0.1:0.5 --noise 1e-6"
     code, out, err = call(f"{line} -o better.toml")
     assert code == 0, err
     assert asked["over"] == {"sensors.0.position": (0.1, 0.5)}
@@ -87,8 +87,11 @@ def test_an_experiment_is_planned(call, monkeypatch):
     assert "standard error of beam.length: 2 -> 1" in out and "written: better.toml" in out
     told = json.loads(call(f"{line} --json")[1])
     assert told["standard_errors"]["beam.length"] == {"before": 2.0, "after": 1.0}
-    assert "name what can be chosen with --over" in call("sharpen case.toml --free beam.length")[2]
-    assert "--over takes ADDRESS=VALUE" in call(f"{line} --over loads.0.speed")[2]
+    assert (
+        "name what can be chosen with --vary"
+        in call("design-experiment case.toml --free beam.length")[2]
+    )
+    assert "--vary takes ADDRESS=VALUE" in call(f"{line} --vary loads.0.speed")[2]
 
 
 def test_responses_are_fitted(call, monkeypatch):
