@@ -1,7 +1,7 @@
 """Several controllers on the same case, beside no control and the best that is possible.
 
 To add a figure of merit, give `PerformanceMetrics` a field, `performance_metrics` its value and the table of
-`jaxbeam compare` (in `cli.comparing`) a column.
+`jaxbeam compare` (in `cli.compare`) a column.
 """
 
 import dataclasses
@@ -156,7 +156,8 @@ def performance_metrics(
     """The merits of a run, held against the run without control and the bound of its case."""
     deflection, times = np.asarray(record.deflection), np.asarray(record.times)
     exit_times = [
-        trajectory(load, record.case.beam.length).window()[1] for load in record.case.loads
+        trajectory(load, record.case.beam.length).entry_exit_times()[1]
+        for load in record.case.loads
     ]
     after_exit = np.abs(deflection[times > max(float(end) for end in exit_times)])
     return PerformanceMetrics(

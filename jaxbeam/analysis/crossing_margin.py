@@ -10,7 +10,7 @@ import numpy as np
 from jaxbeam.analysis.frozen_loop import LoopDynamics, loop_dynamics
 from jaxbeam.analysis.linearised_loop import LinearisedLoop, linearise, loop_timing
 from jaxbeam.analysis.margins import margins
-from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads import trajectory
 from jaxbeam.control import MPC
@@ -62,7 +62,7 @@ def stability_margin(case: Case) -> StabilityMargin:
         timing = loop_timing(case)
     except ValueError as error:
         return _no_margin(str(error))
-    loop = loop_dynamics(case, mesh_layout(known_case(case)))
+    loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
     loops, unstable = [], []
     for t in _crossing_times(case):
         stationary = _without_constant_states(
@@ -99,7 +99,7 @@ def _with_stationary_loads(loop: LoopDynamics, t: float) -> LoopDynamics:
         dataclasses.replace(load, speed=zero, acceleration=zero)
         for load in loop.augmented_plant.loads.trajectories
     )
-    return eqx.tree_at(lambda loop: loop.wide.loads.trajectories, loop, stationary)
+    return eqx.tree_at(lambda loop: loop.augmented_plant.loads.trajectories, loop, stationary)
 
 
 def _without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:
@@ -118,6 +118,6 @@ def _crossing_times(case: Case) -> np.ndarray:
     """Instants (s) from the first entry to the last exit, or the end of the run."""
     if not case.loads:
         return np.zeros(1)
-    windows = [trajectory(load, case.beam.length).window() for load in case.loads]
+    windows = [trajectory(load, case.beam.length).entry_exit_times() for load in case.loads]
     entries, exits = concrete(jnp.array(windows)).T
     return np.linspace(entries.min(), min(exits.max(), concrete(case.run.duration)), LOAD_POSITIONS)

@@ -54,7 +54,7 @@ def equivalent_gains(
         raise ValueError(
             f"there are only {len(case.sensors)} sensors for {actuators} actuators; add some"
         )
-    sensor_positions = np.asarray(case.sensor_places)[:actuators]
+    sensor_positions = np.asarray(case.sensor_positions)[:actuators]
     load_positions = np.linspace(0, float(case.beam.length), LOAD_POSITIONS)
     static_deflections = float(case.run.gravity) * -np.asarray(
         influence_line(case, sensor_positions, load_positions)

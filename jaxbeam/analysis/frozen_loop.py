@@ -44,12 +44,12 @@ class FrozenTrajectory(AbstractTrajectory):
     on_beam: Any
     length: Float[Array, ""]
 
-    def travel(self, t):
+    def kinematics(self, t):
         shape = jnp.shape(t)
         parts = self.position, self.speed, self.acceleration
         return tuple(jnp.broadcast_to(part, shape) for part in parts)
 
-    def window(self):
+    def entry_exit_times(self):
         return jnp.where(self.on_beam, -NEVER, NEVER), jnp.asarray(NEVER)
 
     def passage_times(self, positions):
@@ -73,10 +73,10 @@ class LoopDynamics(eqx.Module):
         loads, length = self.augmented_plant.loads, self.plant.case.beam.length
         on = loads.on_beam(t)
         motions = tuple(
-            FrozenTrajectory(*path.travel(t), on[i], length)
+            FrozenTrajectory(*path.kinematics(t), on[i], length)
             for i, path in enumerate(loads.trajectories)
         )
-        return eqx.tree_at(lambda loop: loop.wide.loads.trajectories, self, motions)
+        return eqx.tree_at(lambda loop: loop.augmented_plant.loads.trajectories, self, motions)
 
     def continuous_dynamics(self, t):
         """A, B, the rates that the weights cause, and commands as a function of the state.

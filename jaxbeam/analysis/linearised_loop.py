@@ -15,9 +15,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxbeam.analysis.frozen_loop import PERIOD_TOLERANCE, LoopDynamics, LoopTiming, loop_dynamics
-from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.compiling import compiled
 
@@ -85,7 +85,7 @@ def linearised_loop(case: Case, t: float) -> LinearisedLoop:
     """
     timing = loop_timing(case)
     return linearise(
-        loop_dynamics(case, mesh_layout(known_case(case))), timing, jnp.asarray(float(t))
+        loop_dynamics(case, mesh_layout(concrete_case(case))), timing, jnp.asarray(float(t))
     )
 
 
@@ -94,7 +94,7 @@ def loop_timing(case: Case) -> LoopTiming | None:
 
     Raises ValueError as `linearised_loop` does.
     """
-    check(case)
+    check_case(case)
     controller = case.controller
     if controller is None:
         raise ValueError("there is no loop: the case has no controller")

@@ -20,7 +20,7 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.analysis.frozen_loop import LoopDynamics, LoopTiming, loop_dynamics, propagate
 from jaxbeam.analysis.linearised_loop import linearise, loop_timing
-from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
@@ -88,7 +88,7 @@ def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) ->
     if times is None:
         times = np.linspace(*_crossing_interval(case), 101)[:-1] if case.loads else np.zeros(1)
     times = np.asarray(times, float)
-    loop = loop_dynamics(case, mesh_layout(known_case(case)))
+    loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
     loops = _frozen_loops(loop, timing, jnp.asarray(times))
     poles = [jax.tree.map(lambda part, i=i: part[i], loops).poles() for i in range(times.size)]
     return FrozenPoles(times, _tracked_branches(np.stack(poles)))
@@ -107,7 +107,7 @@ def growth(case: Case, points: int = 100) -> Growth:
     """
     timing = loop_timing(case)
     start, end = _crossing_interval(case)
-    loop = loop_dynamics(case, mesh_layout(known_case(case)))
+    loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
     if timing is None:
         times = np.linspace(start, end, points + 1)
     else:
@@ -135,7 +135,7 @@ def stream(case: Case, spacing: float) -> Stream:
     if len(case.loads) != 1:
         raise ValueError(f"a stream repeats the one load of a case; this has {len(case.loads)}")
     start, end = _crossing_interval(case)
-    if trajectory(case.loads[0], case.beam.length).window()[1] >= NEVER:
+    if trajectory(case.loads[0], case.beam.length).entry_exit_times()[1] >= NEVER:
         raise ValueError("the load of a stream must leave the beam; loads.0 stays on it")
     if not spacing > 0:
         raise ValueError(f"spacing must be positive, in s; it is {spacing:g}")
@@ -156,7 +156,7 @@ def stream(case: Case, spacing: float) -> Stream:
             eqx.tree_at(lambda x: x.times, load, load.times - i * spacing) for i in range(count)
         ]
     repeated = dataclasses.replace(case, loads=tuple(loads))
-    loop = loop_dynamics(repeated, mesh_layout(known_case(case)))
+    loop = loop_dynamics(repeated, mesh_layout(concrete_case(case)))
     intervals = 1 if timing is None else round(spacing / timing.period)
     times = start + np.linspace(0.0, spacing, max(intervals, 20 if timing is None else 1) + 1)
     steps = _substeps(loop, timing, times)
@@ -168,7 +168,7 @@ def _crossing_interval(case: Case) -> tuple[float, float]:
     """From the first entry to the last exit, in s; loads that stay end with the run."""
     if not case.loads:
         raise ValueError("there is no crossing: the case has no loads")
-    windows = [trajectory(load, case.beam.length).window() for load in case.loads]
+    windows = [trajectory(load, case.beam.length).entry_exit_times() for load in case.loads]
     entries, exits = concrete(jnp.array(windows)).T
     last = min(float(exits.max()), float(concrete(case.run.duration)))
     if exits.max() < NEVER:
@@ -210,7 +210,9 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
         rest_state, rebuild = loop.rest_state(timing)
         # About rest: without the weights.
         unweighted = eqx.tree_at(
-            lambda loop: loop.wide.loads.weight, loop, 0 * loop.augmented_plant.loads.weight
+            lambda loop: loop.augmented_plant.loads.weight,
+            loop,
+            0 * loop.augmented_plant.loads.weight,
         )
 
         def advance_sample(whole, t):

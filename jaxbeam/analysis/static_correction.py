@@ -33,7 +33,7 @@ def residual_actuator_gain(
 @compiled
 def _modal_actuator_gain(case: Case, layout: Layout, x, derivative: int):
     model = modal_model(case, layout)
-    steady_forces = jnp.array([a.attachment().steady for a in case.actuators]).reshape(-1)
+    steady_forces = jnp.array([a.attachment().static_gain for a in case.actuators]).reshape(-1)
     amplitudes = jnp.linalg.solve(model.stiffness(), model.displacement_map.T * steady_forces)
     return jnp.moveaxis(model.shapes(x, (derivative,))[0] @ amplitudes, -1, 0)
 
@@ -99,9 +99,11 @@ def bending_moment(case: Case, x, curvature, commands=None) -> Float[Array, "...
     info = _bending_stiffness(case, x) * curvature
     for i, actuator in enumerate(case.actuators if commands is not None else ()):
         # Couples come in opposite pairs, and the section between them carries them.
-        couples = [(place, factor) for place, order, factor in actuator.stroke() if order == 1]
+        couples = [
+            (place, factor) for place, order, factor in actuator.displacement_map() if order == 1
+        ]
         inside = sum((f * _unit_step(case, x, place) for place, f in couples), jnp.zeros(x.shape))
-        couple = actuator.attachment().steady * jnp.asarray(commands, float)[..., i]
+        couple = actuator.attachment().static_gain * jnp.asarray(commands, float)[..., i]
         info = info + jnp.tensordot(couple, inside, axes=0)
     return info
 
@@ -117,10 +119,10 @@ def shear_force(case: Case, x, third_derivative) -> Float[Array, "..."]:
 
 def _bending_stiffness(case: Case, x):
     """Bending stiffness E I at x in N m^2, patches included."""
-    rigidity = jnp.full(x.shape, case.beam.rigidity)
-    for patch in filter(None, (actuator.bonded() for actuator in case.actuators)):
+    rigidity = jnp.full(x.shape, case.beam.bending_stiffness)
+    for patch in filter(None, (actuator.section_stiffening() for actuator in case.actuators)):
         inside = _unit_step(case, x, patch.start) - _unit_step(case, x, patch.end)
-        rigidity = rigidity + patch.rigidity * inside
+        rigidity = rigidity + patch.bending_stiffness * inside
     return rigidity
 
 

@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.declared_checks import described, suggestion
+from jaxbeam.case.declared_checks import suggestion, validate_direct_or_derived
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     ON_BEAM,
@@ -16,9 +16,9 @@ from jaxbeam.case.fields import (
     number,
 )
 
-MOST_MODES = 1000  # of a beam; finding more would take minutes
+MAX_MODES = 1000  # of a beam; finding more would take minutes
 
-ENDS = ("pinned", "clamped", "free", "guided")
+END_CONDITIONS = ("pinned", "clamped", "free", "guided")
 
 
 class Support(eqx.Module):
@@ -71,7 +71,7 @@ class Beam(eqx.Module):
     )
 
     @property
-    def rigidity(self) -> Float[Array, ""]:
+    def bending_stiffness(self) -> Float[Array, ""]:
         """Bending stiffness E I in N m^2, given or from the rectangular section."""
         if self.flexural_rigidity is not None:
             return self.flexural_rigidity
@@ -103,12 +103,14 @@ class Beam(eqx.Module):
                 f" it is {self.ends!r}"
             )
         for end in ends:
-            if end not in ENDS:
-                return f"{address}.ends: no end is called {end!r}; {suggestion(end, ENDS)}"
+            if end not in END_CONDITIONS:
+                return (
+                    f"{address}.ends: no end is called {end!r}; {suggestion(end, END_CONDITIONS)}"
+                )
         section = ("width", "height")
-        unclear = described(
+        unclear = validate_direct_or_derived(
             address, self, "flexural_rigidity", ("youngs_modulus",), section
-        ) or described(address, self, "mass_per_length", ("density",), section)
+        ) or validate_direct_or_derived(address, self, "mass_per_length", ("density",), section)
         if unclear is not None:
             return unclear
         if self.youngs_modulus is None and self.density is None:
@@ -119,18 +121,18 @@ class Beam(eqx.Module):
                         " youngs_modulus and density instead of flexural_rigidity and"
                         " mass_per_length"
                     )
-        if self.modes > MOST_MODES:
-            return f"{address}.modes must not exceed {MOST_MODES}; it is {self.modes}"
-        return self._damping_fault(address)
+        if self.modes > MAX_MODES:
+            return f"{address}.modes must not exceed {MAX_MODES}; it is {self.modes}"
+        return self._validate_damping(address)
 
-    def _damping_fault(self, address: str) -> str | None:
-        ratios = np.shape(self.damping_ratio)
-        if ratios and ratios != (self.modes,):
+    def _validate_damping(self, address: str) -> str | None:
+        ratio_shape = np.shape(self.damping_ratio)
+        if ratio_shape and ratio_shape != (self.modes,):
             return (
-                f"{address}.damping_ratio lists {ratios[0]} values for {self.modes} modes;"
+                f"{address}.damping_ratio lists {ratio_shape[0]} values for {self.modes} modes;"
                 " give one for each mode, or a single number for all"
             )
-        doubly = self.rayleigh_damping is not None and is_concrete(self.damping_ratio)
-        if doubly and concrete(self.damping_ratio).any():
+        both_given = self.rayleigh_damping is not None and is_concrete(self.damping_ratio)
+        if both_given and concrete(self.damping_ratio).any():
             return f"{address} has both damping_ratio and rayleigh_damping; leave one out"
         return None

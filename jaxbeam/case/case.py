@@ -28,7 +28,7 @@ class Run(eqx.Module):
     gravity: Float[Array, ""] = number(
         "m/s^2", "acceleration of gravity", NOT_NEGATIVE, default=9.81
     )
-    seed: int = count("which noise the sensors draw", least=0, default=0)
+    seed: int = count("which noise the sensors draw", minimum=0, default=0)
 
 
 class Case(eqx.Module):
@@ -68,19 +68,19 @@ class Case(eqx.Module):
         self.title = title
 
     @property
-    def sensor_places(self) -> Float[Array, " sensor"]:
+    def sensor_positions(self) -> Float[Array, " sensor"]:
         """Where the sensors are along the beam (m)."""
         return jnp.array([sensor.position for sensor in self.sensors]).reshape(-1)
 
 
-def _name(key) -> str:
+def _key_name(key) -> str:
     """The word or number in one step of a tree path."""
     return str(getattr(key, "name", getattr(key, "idx", getattr(key, "key", key))))
 
 
-def _leaves(case: Case) -> dict[str, Any]:
+def _leaves_by_address(case: Case) -> dict[str, Any]:
     paths, _ = jax.tree_util.tree_flatten_with_path(case)
-    return {".".join(_name(key) for key in path): leaf for path, leaf in paths}
+    return {".".join(_key_name(key) for key in path): leaf for path, leaf in paths}
 
 
 def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
@@ -90,20 +90,20 @@ def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
     an entry of a matrix by row and column, `controller.gain.0.2`.
     Values are in the SI unit of the field.
     """
-    found = {}
-    for address, leaf in _leaves(case).items():
-        found[address] = leaf
+    numbers = {}
+    for address, leaf in _leaves_by_address(case).items():
+        numbers[address] = leaf
         if jnp.ndim(leaf):
             entries = np.ndindex(jnp.shape(leaf))
-            found |= {".".join([address, *map(str, entry)]): leaf[entry] for entry in entries}
-    return found
+            numbers |= {".".join([address, *map(str, entry)]): leaf[entry] for entry in entries}
+    return numbers
 
 
-def unknown_address(case: Case, address: str) -> ValueError:
+def unknown_address_error(case: Case, address: str) -> ValueError:
     """The error for an address that the case does not have, with the nearest one it has."""
     names = list(addresses(case))
-    near = difflib.get_close_matches(address, names, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]!r}?" if near else f"; it has {', '.join(names)}"
+    nearest = difflib.get_close_matches(address, names, n=1, cutoff=0.5)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it has {', '.join(names)}"
     return ValueError(f"the case has no number at address {address!r}{hint}")
 
 
@@ -112,11 +112,11 @@ def value_at(case: Case, address: str) -> Float[Array, "..."]:
 
     Raises ValueError, with the nearest known address, if there is none there.
     """
-    found = _leaves(case)
-    parent, entry = _entry(address, found)
-    if parent is None or (entry and not _holds(found[parent], entry)):
-        raise unknown_address(case, address)
-    return found[parent][entry] if entry else found[parent]
+    leaves = _leaves_by_address(case)
+    parent, entry = _parent_and_entry(address, leaves)
+    if parent is None or (entry and not _has_entry(leaves[parent], entry)):
+        raise unknown_address_error(case, address)
+    return leaves[parent][entry] if entry else leaves[parent]
 
 
 def replace(case: Case, values: dict[str, Any]) -> Case:
@@ -126,30 +126,30 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     """
     paths, structure = jax.tree_util.tree_flatten_with_path(case)
     leaves = [leaf for _, leaf in paths]
-    index = {".".join(_name(key) for key in path): i for i, (path, _) in enumerate(paths)}
+    index = {".".join(_key_name(key) for key in path): i for i, (path, _) in enumerate(paths)}
     for address, value in values.items():
         value = jnp.asarray(value, float)
-        parent, entry = _entry(address, index)
+        parent, entry = _parent_and_entry(address, index)
         if address in index:
-            old = leaves[index[address]]
-            if jnp.shape(value) != jnp.shape(old):
+            current = leaves[index[address]]
+            if jnp.shape(value) != jnp.shape(current):
                 raise ValueError(
-                    f"{address} takes a value of shape {jnp.shape(old)}, not {jnp.shape(value)}"
+                    f"{address} takes a value of shape {jnp.shape(current)}, not {jnp.shape(value)}"
                 )
             leaves[index[address]] = value
-        elif parent is not None and _holds(leaves[index[parent]], entry):
+        elif parent is not None and _has_entry(leaves[index[parent]], entry):
             if value.shape:
                 raise ValueError(f"{address} takes one number, not {value.shape}")
             leaves[index[parent]] = leaves[index[parent]].at[entry].set(value)
         else:
-            raise unknown_address(case, address)
+            raise unknown_address_error(case, address)
     return jax.tree_util.tree_unflatten(structure, leaves)
 
 
-def _entry(address: str, index: dict[str, Any]) -> tuple[str | None, tuple[int, ...]]:
+def _parent_and_entry(address: str, leaves: dict[str, Any]) -> tuple[str | None, tuple[int, ...]]:
     """The address of the list or matrix in which an entry is, and its place there."""
     parent, entry = address, ()
-    while parent not in index:
+    while parent not in leaves:
         parent, _, last = parent.rpartition(".")
         if not last.isdigit():
             return None, ()
@@ -157,13 +157,13 @@ def _entry(address: str, index: dict[str, Any]) -> tuple[str | None, tuple[int, 
     return parent, entry
 
 
-def _holds(leaf, entry: tuple[int, ...]) -> bool:
+def _has_entry(leaf, entry: tuple[int, ...]) -> bool:
     """Tell whether a list or matrix has an entry at a place."""
     shape = jnp.shape(leaf)
     return len(entry) == len(shape) and all(i < n for i, n in zip(entry, shape, strict=True))
 
 
-def known_case(case: Case) -> Case:
+def concrete_case(case: Case) -> Case:
     """The same case with plain numbers, also while it is being differentiated.
 
     Raises `jax.errors.ConcretizationTypeError` inside `jit` or `vmap`.
@@ -181,7 +181,7 @@ def crossing_times(case: Case) -> Float[np.ndarray, "load 2"]:
 
     The numbers of the case must be concrete.
     """
-    windows = [trajectory(load, case.beam.length).window() for load in case.loads]
+    windows = [trajectory(load, case.beam.length).entry_exit_times() for load in case.loads]
     return np.array([[float(concrete(time)) for time in window] for window in windows]).reshape(
         -1, 2
     )

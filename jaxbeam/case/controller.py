@@ -27,7 +27,7 @@ class Measurement(eqx.Module):
     command: Float[Array, " actuator"]
 
 
-class OwnFilter(NamedTuple):
+class ControllerFilter(NamedTuple):
     """A filter of the readings y of one sensor: x' = A x + B y, output C x + D y."""
 
     sensor: int
@@ -86,7 +86,7 @@ class AbstractController(eqx.Module):
     ) -> tuple[Float[Array, " actuator"], Any]:
         """Commands, in the units of the actuators, at time t (s), and the memory after it."""
 
-    def own_filters(self) -> tuple[OwnFilter, ...]:
+    def own_filters(self) -> tuple[ControllerFilter, ...]:
         """Its filters where it acts at every instant; their outputs follow the readings."""
         return ()
 
@@ -97,16 +97,16 @@ class AbstractController(eqx.Module):
     def flow(
         self,
         memory: Any,
-        own: Float[Array, " own"],
+        states: Float[Array, " own"],
         measurement: Measurement,
         t: Float[Array, ""],
-        limited: Callable[[Array], Array],
+        saturate: Callable[[Array], Array],
     ) -> tuple[Float[Array, " actuator"], Float[Array, " own"]]:
         """Commands at every instant, and the rates of the states of its own.
 
-        `limited` takes the commands that are wanted to those that the actuators are given.
+        `saturate` takes the commands that are wanted to those that the actuators are given.
         """
-        return limited(self.step(memory, measurement, t)[0]), own
+        return saturate(self.step(memory, measurement, t)[0]), states
 
     def validate(self, case: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", before anything compiles; or None."""

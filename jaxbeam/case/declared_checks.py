@@ -20,42 +20,46 @@ from jaxbeam.case.fields import (
     ON_BEAM,
     POSITIVE,
     concrete,
-    fits,
+    describe_shape,
+    fits_shape,
     is_concrete,
-    shape_in_words,
 )
 
-SHORT = reprlib.Repr()  # what is wrong is quoted, but not without end
-SHORT.maxstring, SHORT.maxlist, SHORT.maxdict = 80, 10, 10
+SHORT_REPR = reprlib.Repr()  # what is wrong is quoted, but not without end
+SHORT_REPR.maxstring, SHORT_REPR.maxlist, SHORT_REPR.maxdict = 80, 10, 10
 
-ROUNDING = 1e-9  # of the length: 3 * 0.2 is still on a beam of 0.6 m
+POSITION_TOLERANCE = 1e-9  # of the length: 3 * 0.2 is still on a beam of 0.6 m
 
 
-def check_on_beam(name: str, place: Any, length: Float[Array, ""]) -> None:
+def check_on_beam(name: str, positions: Any, length: Float[Array, ""]) -> None:
     """Check that positions lie on a beam of a length, all in m, as far as they are known.
 
     Raises ValueError with the name of the positions.
     """
-    if not (is_concrete(place) and is_concrete(length)):
+    if not (is_concrete(positions) and is_concrete(length)):
         return
-    end, numbers = float(concrete(length)), concrete(place)
-    off = ~((numbers >= -ROUNDING * end) & (numbers <= (1 + ROUNDING) * end))
-    if off.any():
+    end, numbers = float(concrete(length)), concrete(positions)
+    outside = ~(
+        (numbers >= -POSITION_TOLERANCE * end) & (numbers <= (1 + POSITION_TOLERANCE) * end)
+    )
+    if outside.any():
         raise ValueError(
-            f"{name} must {ON_BEAM}, between 0 and {end:g} m; it is {numbers[off].flat[0]:g} m"
+            f"{name} must {ON_BEAM}, between 0 and {end:g} m; it is {numbers[outside].flat[0]:g} m"
         )
 
 
-def suggestion(word: str, known_words: Iterable[str]) -> str:
+def suggestion(word: str, allowed: Iterable[str]) -> str:
     """The end of a sentence about an unknown word: the nearest known one, or all of them."""
-    known_words = list(known_words)
-    near = difflib.get_close_matches(word, known_words, n=1)
-    return f"did you mean {near[0]!r}?" if near else f"it may be {', '.join(known_words)}"
+    allowed = list(allowed)
+    nearest = difflib.get_close_matches(word, allowed, n=1)
+    return f"did you mean {nearest[0]!r}?" if nearest else f"it may be {', '.join(allowed)}"
 
 
-def missing(address: str, field: dataclasses.Field) -> ValueError:
+def missing_error(address: str, field: dataclasses.Field) -> ValueError:
     """The error for a field that was not given and has no default."""
-    return ValueError(f"{address} is missing; give the {field.metadata['meaning']}{_in(field)}")
+    return ValueError(
+        f"{address} is missing; give the {field.metadata['meaning']}{_in_unit(field)}"
+    )
 
 
 def check_fields(address: str, part: Any) -> None:
@@ -76,12 +80,12 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
     if "unit" in field.metadata:
         _check_number(address, value, field)
     elif "least" in field.metadata:
-        least = field.metadata["least"]
+        minimum = field.metadata["least"]
         if value is None and field.default is None:
             return
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        if not isinstance(value, int) or isinstance(value, bool) or value < minimum:
             raise ValueError(
-                f"{address} must be a whole number, {least} or more; it is {in_words(value)}"
+                f"{address} must be a whole number, {minimum} or more; it is {describe_value(value)}"
             )
     elif "part" in field.metadata:
         kind = field.metadata["part"]
@@ -89,34 +93,40 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
         if value is not None and not isinstance(value, kinds):
             names = " or ".join(made.__name__ for made in kinds)
             raise ValueError(
-                f"{address} holds {in_words(value)}; it takes a table of its own, in Python a"
+                f"{address} holds {describe_value(value)}; it takes a table of its own, in Python a"
                 f" {names}"
             )
         if value is not None:
             check_fields(address, value)
     elif "meaning" in field.metadata:
         if not isinstance(value, str):
-            raise ValueError(f"{address} must be a word in quotes, not {in_words(value)}")
+            raise ValueError(f"{address} must be a word in quotes, not {describe_value(value)}")
         allowed = field.metadata["allowed"]
         if allowed and value not in allowed:
-            raise ValueError(f"{address} cannot be {in_words(value)}; {suggestion(value, allowed)}")
+            raise ValueError(
+                f"{address} cannot be {describe_value(value)}; {suggestion(value, allowed)}"
+            )
 
 
-def described(
-    address: str, part: Any, direct: str, own: tuple[str, ...], shared: tuple[str, ...] = ()
+def validate_direct_or_derived(
+    address: str,
+    part: Any,
+    direct: str,
+    exclusive_sources: tuple[str, ...],
+    shared_sources: tuple[str, ...] = (),
 ) -> str | None:
     """The fault of a property given neither directly nor by all that it follows from, or by both.
 
-    What is `shared` serves other properties too, so it may stand beside the direct number.
+    What is `shared_sources` serves other properties too, so it may stand beside the direct number.
     """
     if getattr(part, direct) is not None:
-        for name in own:
+        for name in exclusive_sources:
             if getattr(part, name) is not None:
                 return (
                     f"{address}.{direct} and {address}.{name} contradict each other; leave one out"
                 )
         return None
-    sources = (*shared, *own)
+    sources = (*shared_sources, *exclusive_sources)
     absent = [name for name in sources if getattr(part, name) is None]
     if not absent:
         return None
@@ -126,7 +136,7 @@ def described(
     )
 
 
-def either(address: str, part: Any, first: str, second: str) -> str | None:
+def validate_exactly_one(address: str, part: Any, first: str, second: str) -> str | None:
     """The fault of two fields of which both are given, or none."""
     given = [name for name in (first, second) if getattr(part, name) is not None]
     if len(given) == 1:
@@ -139,50 +149,50 @@ def either(address: str, part: Any, first: str, second: str) -> str | None:
 def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
     if value is None:
         if field.default is not None:
-            raise missing(address, field)
+            raise missing_error(address, field)
         return
     if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
-        raise ValueError(f"{address} must be {shape_in_words(field)}, not {in_words(value)}")
-    if not fits(field, np.shape(value)):
+        raise ValueError(f"{address} must be {describe_shape(field)}, not {describe_value(value)}")
+    if not fits_shape(field, np.shape(value)):
         shape = np.shape(value)
         given = f"an array of shape {shape}" if shape else "one number"
-        raise ValueError(f"{address} must be {shape_in_words(field)}, not {given}")
+        raise ValueError(f"{address} must be {describe_shape(field)}, not {given}")
     if not is_concrete(value):
         return
     numbers = np.atleast_1d(concrete(value))
     names = [f"{address}.{i}" for i in range(numbers.size)] if np.ndim(value) else [address]
-    must, unit = field.metadata["must"], _unit(field)
+    constraint, unit = field.metadata["must"], _unit_suffix(field)
     for name, x in zip(names, numbers.flat, strict=True):
         if not np.isfinite(x):
             raise ValueError(f"{name} must be a finite number; it is {x}")
-        if (must == POSITIVE and x <= 0) or (must == NOT_NEGATIVE and x < 0):
-            raise ValueError(f"{name} must {must}; it is {x:g}{unit}")
-    if must == INCREASING:
+        if (constraint == POSITIVE and x <= 0) or (constraint == NOT_NEGATIVE and x < 0):
+            raise ValueError(f"{name} must {constraint}; it is {x:g}{unit}")
+    if constraint == INCREASING:
         _check_increasing(names, numbers, unit)
 
 
 def _check_increasing(names: list[str], numbers: np.ndarray, unit: str) -> None:
-    back = np.flatnonzero(np.diff(numbers) <= 0)
-    if back.size:
-        i = back[0] + 1
+    not_increasing = np.flatnonzero(np.diff(numbers) <= 0)
+    if not_increasing.size:
+        i = not_increasing[0] + 1
         raise ValueError(
             f"{names[i]} must be above the entry before it;"
             f" {numbers[i]:g}{unit} follows {numbers[i - 1]:g}{unit}"
         )
 
 
-def _unit(field: dataclasses.Field) -> str:
+def _unit_suffix(field: dataclasses.Field) -> str:
     """The unit to put after a number."""
     unit = field.metadata.get("unit", "1")
     return "" if unit in ("1", "unit of quantity") else f" {unit}"
 
 
-def _in(field: dataclasses.Field) -> str:
-    return f" in{_unit(field)}" if _unit(field) else ""
+def _in_unit(field: dataclasses.Field) -> str:
+    return f" in{_unit_suffix(field)}" if _unit_suffix(field) else ""
 
 
-def in_words(value: Any) -> str:
+def describe_value(value: Any) -> str:
     """A wrong value in the words of an error message."""
     if isinstance(value, str | bool | int | float | list | dict):
-        return SHORT.repr(value)
+        return SHORT_REPR.repr(value)
     return f"a {type(value).__name__}"

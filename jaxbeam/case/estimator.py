@@ -50,7 +50,7 @@ class AbstractEstimator(eqx.Module):
     ) -> tuple[Estimate, Any]:
         """The estimate at time t (s), and the memory after it; `measurement.state` is not used."""
 
-    def validate(self, case: Any, plant: Any) -> str | None:
+    def validate(self, case: Any, system: Any) -> str | None:
         """What is wrong with it in a case, as "key must ...", before a run compiles; or None.
 
         Asked twice: with None for the plant, before that is computed; then, if its numbers are

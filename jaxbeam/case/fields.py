@@ -33,14 +33,14 @@ ON_BEAM = "lie on the beam"
 INCREASING = "increase"
 
 
-def number(unit: str, meaning: str, must: str = "", **options):
+def number(unit: str, meaning: str, constraint: str = "", **options):
     """Declare a number of a case: a differentiable leaf with its SI unit and its meaning.
 
-    With `default=None` the number may be left out; its absence is part of the structure. `must`
+    With `default=None` the number may be left out; its absence is part of the structure. `constraint`
     is one of the rules above (none: any finite value).
     """
     converter = _as_optional_array if options.get("default", 0.0) is None else _as_array
-    metadata = {"unit": unit, "meaning": meaning, "must": must}
+    metadata = {"unit": unit, "meaning": meaning, "must": constraint}
     return eqx.field(converter=converter, metadata=metadata, **options)
 
 
@@ -50,37 +50,39 @@ def choice(meaning: str, *allowed: str, **options):
     return eqx.field(static=True, metadata=metadata, **options)
 
 
-def count(meaning: str, least: int = 1, **options):
-    """Declare a whole number of a case, `least` or more; static, for it may decide shapes."""
-    return eqx.field(static=True, metadata={"meaning": meaning, "least": least}, **options)
+def count(meaning: str, minimum: int = 1, **options):
+    """Declare a whole number of a case, `minimum` or more; static, for it may decide shapes."""
+    return eqx.field(static=True, metadata={"meaning": meaning, "least": minimum}, **options)
 
 
-def part(meaning: str, kind: type | dict[str, type], **options):
+def part(meaning: str, class_or_registry: type | dict[str, type], **options):
     """Declare a part within a part of a case, a table of its own that may be left out.
 
-    `kind` is its class, or the registry in which its key `kind` is looked up.
+    `class_or_registry` is its class, or the registry in which its key `class_or_registry` is looked up.
     """
-    return eqx.field(metadata={"meaning": meaning, "part": kind}, default=None, **options)
+    return eqx.field(
+        metadata={"meaning": meaning, "part": class_or_registry}, default=None, **options
+    )
 
 
-def dimensions(field) -> str:
+def axis_names(field) -> str:
     """The axes in the annotation of a number: "" for one number, "2", "point", "*modes"."""
     return next(iter(typing.get_args(field.type)), field.type).dim_str
 
 
 @functools.cache
-def fits(field, shape: tuple[int, ...]) -> bool:
+def fits_shape(field, shape: tuple[int, ...]) -> bool:
     """Tell whether a number declared by this field may have this shape."""
-    axes = dimensions(field).split()
+    axes = axis_names(field).split()
     if axes and axes[0].startswith("*"):
         return len(shape) <= 1
     sizes = zip(axes, shape, strict=False)
     return len(axes) == len(shape) and all(not a.isdigit() or int(a) == n for a, n in sizes)
 
 
-def shape_in_words(field) -> str:
+def describe_shape(field) -> str:
     """What a number declared by this field consists of, for error messages."""
-    axes = dimensions(field).split()
+    axes = axis_names(field).split()
     if not axes:
         return "one number"
     if axes[0].startswith("*"):

@@ -31,7 +31,7 @@ class Filter(eqx.Module):
 
 
 @functools.cache
-def _prototype(order: int) -> tuple[np.ndarray, bool]:
+def _prototype_damping_ratios(order: int) -> tuple[np.ndarray, bool]:
     """Damping ratios of the second-order sections at 1 rad/s, and whether one of first order."""
     from scipy.signal import buttap  # here, as it takes half a second and most cases have no filter
 
@@ -40,7 +40,9 @@ def _prototype(order: int) -> tuple[np.ndarray, bool]:
     return np.sort(-poles[poles.imag > 1e-9].real)[::-1], order % 2 == 1
 
 
-def sections(filter: Filter, period: Float[Array, ""] | float) -> Float[Array, "section 6"]:
+def second_order_sections(
+    filter: Filter, period: Float[Array, ""] | float
+) -> Float[Array, "section 6"]:
     """Second-order sections (b0, b1, b2, 1, a1, a2) of a digital filter at a sampling period (s).
 
     The bilinear transform of the analogue filter, warped to meet it at the cutoff: what
@@ -55,21 +57,26 @@ def sections(filter: Filter, period: Float[Array, ""] | float) -> Float[Array, "
                 f"the filter's cutoff must be below half the sampling frequency, {nyquist:g} Hz;"
                 f" it is {float(concrete(filter.cutoff)):g} Hz: lower it, or sample faster"
             )
-    ratios, odd = _prototype(filter.order)
+    ratios, odd = _prototype_damping_ratios(filter.order)
     warped = jnp.tan(jnp.pi * filter.cutoff * period)
     rows = []
     if odd:
         gain = warped / (1 + warped)
         rows.append([gain, gain, 0.0, 1.0, (warped - 1) / (warped + 1), 0.0])
     for ratio in ratios:
-        whole = 1 + 2 * ratio * warped + warped**2
-        gain = warped**2 / whole
-        first, second = 2 * (warped**2 - 1) / whole, (1 - 2 * ratio * warped + warped**2) / whole
-        rows.append([gain, 2 * gain, gain, 1.0, first, second])
+        denominator = 1 + 2 * ratio * warped + warped**2
+        gain = warped**2 / denominator
+        a1, a2 = (
+            2 * (warped**2 - 1) / denominator,
+            (1 - 2 * ratio * warped + warped**2) / denominator,
+        )
+        rows.append([gain, 2 * gain, gain, 1.0, a1, a2])
     return jnp.stack([jnp.stack([jnp.asarray(x, float) for x in row]) for row in rows])
 
 
-def initial(sections: Float[Array, "section 6 ..."], value) -> Float[Array, "section 2 *lane"]:
+def steady_filter_state(
+    sections: Float[Array, "section 6 ..."], value
+) -> Float[Array, "section 2 *lane"]:
     """Memory of a digital filter that has long been fed a constant value, which it gives back."""
     value = jnp.asarray(value, float)
     rows = [jnp.stack([(1 - s[0]) * value, (s[2] - s[5]) * value]) for s in sections]
@@ -78,7 +85,7 @@ def initial(sections: Float[Array, "section 6 ..."], value) -> Float[Array, "sec
 
 def filter_step(
     sections: Float[Array, "section 6 ..."],
-    memory: Float[Array, "section 2 *lane"],
+    filter_state: Float[Array, "section 2 *lane"],
     sample: Float[Array, " *lane"],
 ) -> tuple[Float[Array, " *lane"], Float[Array, "section 2 *lane"]]:
     """Put one sample through a digital filter; return its output and its memory afterwards.
@@ -86,25 +93,25 @@ def filter_step(
     Direct form II transposed, as in `scipy.signal.sosfilt`. Sections may be shared by all lanes
     or have lanes of their own.
     """
-    after = []
-    for s, (first, second) in zip(sections, memory, strict=True):
+    next_state = []
+    for s, (first, second) in zip(sections, filter_state, strict=True):
         output = s[0] * sample + first
-        after.append(
+        next_state.append(
             jnp.stack([s[1] * sample - s[4] * output + second, s[2] * sample - s[5] * output])
         )
         sample = output
-    return sample, jnp.stack(after)
+    return sample, jnp.stack(next_state)
 
 
 def filter_history(
     sections: Float[Array, "section 6 ..."],
-    memory: Float[Array, "section 2 *lane"],
+    filter_state: Float[Array, "section 2 *lane"],
     samples: Float[Array, "time *lane"],
-    fresh: Bool[Array, " time"] | None = None,
+    new_samples: Bool[Array, " time"] | None = None,
 ) -> Float[Array, "time *lane"]:
     """Output of a digital filter for a whole history, from a given memory.
 
-    With `fresh`, only the samples so marked enter the filter; in between its output is held. The
+    With `new_samples`, only the samples so marked enter the filter; in between its output is held. The
     first one must be.
     """
 
@@ -116,11 +123,11 @@ def filter_history(
             output, after = jnp.where(new, output, held), jnp.where(new, after, memory)
         return (output, after), output
 
-    start = (jnp.zeros(samples.shape[1:]), memory)
-    return jax.lax.scan(step, start, (samples, fresh))[1]
+    start = (jnp.zeros(samples.shape[1:]), filter_state)
+    return jax.lax.scan(step, start, (samples, new_samples))[1]
 
 
-def analogue(
+def analogue_state_space(
     filter: Filter,
 ) -> tuple[
     Float[Array, "state state"], Float[Array, " state"], Float[Array, " state"], Float[Array, ""]
@@ -130,20 +137,20 @@ def analogue(
     D is zero. Each section has its output as a state, and the rate of that over the cutoff
     frequency as another if it is of second order: all states are of the size of the signal.
     """
-    matrix, column, row, _ = _realisation(filter.order)
+    matrix, column, row, _ = _prototype_state_space(filter.order)
     cutoff = 2 * jnp.pi * filter.cutoff
     return cutoff * matrix, cutoff * column, jnp.asarray(row), jnp.zeros(())
 
 
-def analogue_initial(filter: Filter, value) -> Float[Array, "state *lane"]:
+def analogue_steady_state(filter: Filter, value) -> Float[Array, "state *lane"]:
     """State of an analogue filter that has long been fed a constant value."""
-    return jnp.multiply.outer(_realisation(filter.order)[3], jnp.asarray(value, float))
+    return jnp.multiply.outer(_prototype_state_space(filter.order)[3], jnp.asarray(value, float))
 
 
 @functools.cache
-def _realisation(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _prototype_state_space(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """A, B and C of the analogue filter with a cutoff of 1 rad/s, and its state at rest under 1."""
-    ratios, odd = _prototype(order)
+    ratios, odd = _prototype_damping_ratios(order)
     first = [np.array([[-1.0]])] if odd else []
     blocks = first + [np.array([[0.0, 1.0], [-1.0, -2 * ratio]]) for ratio in ratios]
     bounds = np.cumsum([0, *map(len, blocks)])

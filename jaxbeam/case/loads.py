@@ -11,9 +11,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.case.declared_checks import either
+from jaxbeam.case.declared_checks import validate_exactly_one
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
-from jaxbeam.case.trajectory import AbstractPiecewiseTrajectory, Braking, Tabulated
+from jaxbeam.case.trajectory import (
+    AbstractPiecewiseTrajectory,
+    BrakingTrajectory,
+    TabulatedTrajectory,
+)
 
 
 class AbstractLoad(eqx.Module):
@@ -36,11 +40,11 @@ class AbstractLoad(eqx.Module):
     def validate(self, address: str) -> str | None:
         """What does not go together in it, as a sentence, or None."""
         if (self.times is None) != (self.positions is None):
-            lacking = "times" if self.times is None else "positions"
-            return f"{address}.{lacking} is missing; a table has both times and positions"
-        unclear = either(address, self, "speed", "times")
-        if unclear is not None:
-            return unclear
+            absent = "times" if self.times is None else "positions"
+            return f"{address}.{absent} is missing; a table has both times and positions"
+        error = validate_exactly_one(address, self, "speed", "times")
+        if error is not None:
+            return error
         if self.times is None or self.positions is None:
             if is_concrete(self.speed) and concrete(self.speed) == 0:
                 return (
@@ -48,14 +52,14 @@ class AbstractLoad(eqx.Module):
                     " stands on the beam is a table of times and positions"
                 )
             return None
-        points, places = self.times.shape[0], self.positions.shape[0]
-        if points != places:
+        time_count, position_count = self.times.shape[0], self.positions.shape[0]
+        if time_count != position_count:
             return (
-                f"{address} has {points} times and {places} positions;"
+                f"{address} has {time_count} times and {position_count} positions;"
                 " a table needs one position for each time"
             )
-        if points < 2:
-            return f"{address}.times needs at least two points; it has {points}"
+        if time_count < 2:
+            return f"{address}.times needs at least two points; it has {time_count}"
         for name in ("entry_time", "deceleration"):
             value = getattr(self, name)
             if is_concrete(value) and concrete(value) != 0:
@@ -109,7 +113,7 @@ class MovingForce(AbstractLoad):
         return jnp.zeros(())
 
     def validate(self, address):
-        return either(address, self, "force", "mass") or super().validate(address)
+        return validate_exactly_one(address, self, "force", "mass") or super().validate(address)
 
     def weight(self, gravity):
         return self.force if self.force is not None else self.mass * gravity
@@ -121,5 +125,5 @@ KINDS = {"mass": MovingMass, "force": MovingForce}
 def trajectory(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewiseTrajectory:
     """How the load travels along a beam of the given length (m)."""
     if load.times is not None:
-        return Tabulated(load.times, load.positions, length)
-    return Braking(load.speed, load.entry_time, load.deceleration, length)
+        return TabulatedTrajectory(load.times, load.positions, length)
+    return BrakingTrajectory(load.speed, load.entry_time, load.deceleration, length)

@@ -48,7 +48,7 @@ class Sensor(eqx.Module):
     )
 
     @property
-    def noise_covariance(self) -> Float[Array, ""]:
+    def noise_variance(self) -> Float[Array, ""]:
         """Variance of the noise of one reading, in the square of its unit; what filters call R."""
         return jnp.zeros(()) if self.noise is None else self.noise**2
 

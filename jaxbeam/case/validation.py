@@ -16,7 +16,12 @@ from jaxbeam.case.actuators import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.declared_checks import ROUNDING, check_fields, check_on_beam, in_words
+from jaxbeam.case.declared_checks import (
+    POSITION_TOLERANCE,
+    check_fields,
+    check_on_beam,
+    describe_value,
+)
 from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.loads import AbstractLoad
 from jaxbeam.case.sensors import Sensor
@@ -25,7 +30,7 @@ from jaxbeam.case.sensors import Sensor
 SELF_VALIDATING = Beam | AbstractActuator | Sensor | AbstractLoad
 
 
-def check(case: Case) -> None:
+def check_case(case: Case) -> None:
     """Check a case; units as declared by its fields, addresses as in `case.addresses`.
 
     Raises ValueError at the first fault: a number that is missing, not finite, of the wrong shape
@@ -36,18 +41,18 @@ def check(case: Case) -> None:
     for address, part, kind in _parts(case):
         if not isinstance(part, kind):
             raise ValueError(
-                f"{address} holds {in_words(part)}; it takes objects of type {kind.__name__}"
+                f"{address} holds {describe_value(part)}; it takes objects of type {kind.__name__}"
             )
         check_fields(address, part)
-        _check_places(address, part, case.beam.length)
+        _check_positions(address, part, case.beam.length)
     for address, part, _ in _parts(case):
         # A method of a module takes longer to get than most of these take to run.
-        fault = type(part).validate(part, address) if isinstance(part, SELF_VALIDATING) else None
-        if fault is not None:
-            raise ValueError(fault)
+        error = type(part).validate(part, address) if isinstance(part, SELF_VALIDATING) else None
+        if error is not None:
+            raise ValueError(error)
     _check_supports(case.supports, case.beam.length)
     for i, sensor in enumerate(case.sensors):
-        _check_clock(f"sensors.{i}", sensor, case)
+        _check_sampling(f"sensors.{i}", sensor, case)
     if case.controller is not None:
         _check_controller(case)
 
@@ -69,15 +74,15 @@ def _parts(case: Case) -> Iterator[tuple[str, Any, type]]:
             yield f"{name}.{i}", part, kind
 
 
-def _check_places(address: str, part: Any, length: Float[Array, ""]) -> None:
-    for name in _places(type(part)):
+def _check_positions(address: str, part: Any, length: Float[Array, ""]) -> None:
+    for name in _position_fields(type(part)):
         value = getattr(part, name)
         if value is not None:
             check_on_beam(f"{address}.{name}", value, length)
 
 
 @functools.cache
-def _places(kind: type) -> list[str]:
+def _position_fields(kind: type) -> list[str]:
     """Fields that must lie on the beam."""
     return [f.name for f in dataclasses.fields(kind) if f.metadata.get("must") == ON_BEAM]
 
@@ -89,14 +94,14 @@ def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> 
         if support.stiffness is None and is_concrete(support.position)
     ]
     for (left, i), (right, j) in itertools.pairwise(sorted(rigid)):
-        if is_concrete(length) and right - left <= ROUNDING * concrete(length):
+        if is_concrete(length) and right - left <= POSITION_TOLERANCE * concrete(length):
             raise ValueError(
                 f"supports.{min(i, j)} and supports.{max(i, j)} both hold the beam rigidly at"
                 f" {left:g} m; remove one"
             )
 
 
-def _check_clock(address: str, sensor: Sensor, case: Case) -> None:
+def _check_sampling(address: str, sensor: Sensor, case: Case) -> None:
     """The sensor samples within the run, and fast enough for its digital filter."""
     period, run = sensor.sampling_period, case.run
     if period is not None:
@@ -117,11 +122,11 @@ def _check_clock(address: str, sensor: Sensor, case: Case) -> None:
     if filter is None or filter.realisation != "digital" or period is None:
         return
     if is_concrete(filter.cutoff) and is_concrete(period):
-        highest = 0.5 / concrete(period)
-        if concrete(filter.cutoff) >= highest:
+        nyquist = 0.5 / concrete(period)
+        if concrete(filter.cutoff) >= nyquist:
             raise ValueError(
                 f"{address}.filter.cutoff must be below half the sampling frequency,"
-                f" {highest:g} Hz; it is {concrete(filter.cutoff):g} Hz: lower it, or sample faster"
+                f" {nyquist:g} Hz; it is {concrete(filter.cutoff):g} Hz: lower it, or sample faster"
             )
 
 
@@ -129,12 +134,12 @@ def _check_controller(case: Case) -> None:
     controller = case.controller
     if not case.actuators:
         raise ValueError("controller has nothing to command: add an actuator, or leave it out")
-    fault = controller.validate(case)
-    if fault is not None:
-        raise ValueError(f"controller.{fault}")
+    error = controller.validate(case)
+    if error is not None:
+        raise ValueError(f"controller.{error}")
     for i, sensor in enumerate(case.sensors):
-        smooth = sensor.filter is not None and sensor.filter.realisation == "analogue"
-        if smooth and sensor.quantity == "acceleration" and not controller.open_loop:
+        analogue = sensor.filter is not None and sensor.filter.realisation == "analogue"
+        if analogue and sensor.quantity == "acceleration" and not controller.open_loop:
             raise ValueError(
                 f"sensors.{i}.filter cannot be analogue on an acceleration that a controller looks"
                 " at: make it digital"
@@ -148,17 +153,19 @@ def _check_controller(case: Case) -> None:
             )
         return
     # What acts at every instant can neither wait nor remember.
-    sampled = {
+    needs_sampling = {
         "controller.delay": controller.delay is not None,
         "controller.resolution": controller.resolution is not None,
         "the controller's memory": not controller.stateless,
     }
     for i, actuator in enumerate(case.actuators):
-        sampled[f"the rate limit of actuators.{i}"] = actuator.command_rate() is not None
+        needs_sampling[f"the rate limit of actuators.{i}"] = (
+            actuator.command_rate_limit() is not None
+        )
     if not controller.open_loop:
         for i, sensor in enumerate(case.sensors):
             digital = sensor.filter is not None and sensor.filter.realisation == "digital"
-            sampled |= {
+            needs_sampling |= {
                 f"sensors.{i}.filter, which is digital,": digital,
                 f"sensors.{i}.sampling_period": sensor.sampling_period is not None,
                 f"sensors.{i}.delay": sensor.delay is not None,
@@ -166,6 +173,6 @@ def _check_controller(case: Case) -> None:
                 f"sensors.{i}.resolution": sensor.resolution is not None,
                 f"the acceleration of sensors.{i}": sensor.quantity == "acceleration",
             }
-    for name, given in sampled.items():
+    for name, given in needs_sampling.items():
         if given:
             raise ValueError(f"{name} needs a controller that samples: give controller.period")

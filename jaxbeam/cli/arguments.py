@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 
-def assignment(option: str, text: str) -> tuple[str, str]:
+def parse_assignment(option: str, text: str) -> tuple[str, str]:
     """Address and value of ADDRESS=VALUE. Raises ValueError if one is empty."""
     address, equals, value = text.partition("=")
     if not (address and equals and value):
@@ -14,7 +14,7 @@ def assignment(option: str, text: str) -> tuple[str, str]:
     return address, value
 
 
-def value_of(text: str) -> Any:
+def parse_value(text: str) -> Any:
     """Value of a text: a number, a list of numbers (with or without brackets), or else a word."""
     for read in (int, float):
         try:
@@ -51,26 +51,26 @@ def named_numbers(
         raise ValueError(f"{option} takes {form}, such as {example}, not {text!r}") from None
 
 
-def sweep_values(over: Iterable[str]) -> dict[str, list[float]]:
+def parse_sweep_values(texts: Iterable[str]) -> dict[str, list[float]]:
     """Values by address of ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...
 
     Raises ValueError if they are no numbers, if a range has too many, or if an address is named
     twice.
     """
     values = {}
-    for text in over:
-        address, value = assignment("--over", text)
+    for text in texts:
+        address, value = parse_assignment("--over", text)
         if address in values:
             raise ValueError(f"--over names {address} twice; give all its values at once")
         if ":" in value:
             values[address] = _range_values(text, value)
         else:
-            values[address] = _numbers("--over", text, value.split(","))
+            values[address] = _parse_numbers("--over", text, value.split(","))
     return values
 
 
 def _range_values(text: str, value: str) -> list[float]:
-    limits = _numbers("--over", text, value.split(":"))
+    limits = _parse_numbers("--over", text, value.split(":"))
     if len(limits) != 3 or not (limits[2] >= 1 and limits[2] % 1 == 0):
         raise ValueError(
             f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"
@@ -97,13 +97,13 @@ def input_output_pair(text: str) -> tuple[str, str]:
 
 def stationary_mass(text: str) -> tuple[float, float]:
     """Position (m) and mass (kg) of POSITION=MASS. Raises ValueError if they are no two numbers."""
-    numbers = _numbers("--mass-at", text, text.split("="))
+    numbers = _parse_numbers("--mass-at", text, text.split("="))
     if len(numbers) != 2:
         raise ValueError(f"--mass-at takes POSITION=MASS in m and kg, such as 0.3=0.5, not {text}")
     return numbers[0], numbers[1]
 
 
-def frequency_range(start: float, stop: float, points: int) -> list[float]:
+def frequency_grid(start: float, stop: float, points: int) -> list[float]:
     """Frequencies (Hz) from start to stop, logarithmically spaced.
 
     Raises ValueError unless 0 < start < stop, and for fewer than two points.
@@ -119,7 +119,9 @@ def frequency_range(start: float, stop: float, points: int) -> list[float]:
     return np.geomspace(start, stop, points).tolist()
 
 
-def split_files(files: Iterable[Path], free: Sequence[str]) -> tuple[Path | None, list[Path]]:
+def split_case_and_logs(
+    files: Iterable[Path], free_addresses: Sequence[str]
+) -> tuple[Path | None, list[Path]]:
     """Case file (.toml), if there is one, and logs among the files.
 
     Raises ValueError without a log, for several cases, and for free parameters without a case.
@@ -130,12 +132,12 @@ def split_files(files: Iterable[Path], free: Sequence[str]) -> tuple[Path | None
         raise ValueError("identify needs at least one log: jaxbeam identify [CASE.toml] LOG...")
     if len(cases) > 1:
         raise ValueError(f"identify fits one case, not {len(cases)}: {', '.join(map(str, cases))}")
-    if free and not cases:
+    if free_addresses and not cases:
         raise ValueError("--free needs the case whose numbers it names: identify CASE.toml LOG...")
     return (cases[0] if cases else None), logs
 
 
-def bounds_of(text: str, option: str = "--free") -> tuple[str, tuple[float, float] | None]:
+def parse_bounds(text: str, option: str = "--free") -> tuple[str, tuple[float, float] | None]:
     """Address and bounds of ADDRESS or ADDRESS=LOW:HIGH; None without bounds.
 
     Raises ValueError if the bounds are no two increasing numbers.
@@ -143,13 +145,13 @@ def bounds_of(text: str, option: str = "--free") -> tuple[str, tuple[float, floa
     address, equals, value = text.partition("=")
     if not equals:
         return address, None
-    bounds = _numbers(option, text, value.split(":"))
+    bounds = _parse_numbers(option, text, value.split(":"))
     if len(bounds) != 2 or bounds[0] >= bounds[1]:
         raise ValueError(f"{option} {text}: bounds are LOW:HIGH, such as 5:20")
     return address, (bounds[0], bounds[1])
 
 
-def range_of(option: str, text: str, unit_and_example: str) -> tuple[float, float]:
+def parse_range(option: str, text: str, unit_and_example: str) -> tuple[float, float]:
     """Two numbers of LOW:HIGH. Raises ValueError, with unit and example, otherwise."""
     try:
         low, high = map(float, text.split(":"))
@@ -158,7 +160,7 @@ def range_of(option: str, text: str, unit_and_example: str) -> tuple[float, floa
     return low, high
 
 
-def _numbers(option: str, text: str, entries: Sequence[str]) -> list[float]:
+def _parse_numbers(option: str, text: str, entries: Sequence[str]) -> list[float]:
     try:
         return [float(entry) for entry in entries]
     except ValueError as error:
@@ -166,7 +168,7 @@ def _numbers(option: str, text: str, entries: Sequence[str]) -> list[float]:
         raise ValueError(f"{option} {text}: {word} is not a number") from None
 
 
-def picture_path(output: Path | None, source: Path) -> Path:
+def figure_path(output: Path | None, source: Path) -> Path:
     """File of a picture: beside the output, or named after the source in this folder."""
     return (output or Path(source.name)).with_suffix(".png")
 
@@ -179,7 +181,7 @@ def check_suffix(path: Path | None, suffix: str, content: str) -> None:
         )
 
 
-def refuse(given: bool, reason: str) -> None:
+def refuse_option(is_given: bool, reason: str) -> None:
     """Raise ValueError with the reason if an option is given that does not apply."""
-    if given:
+    if is_given:
         raise ValueError(reason)

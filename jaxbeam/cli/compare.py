@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import check_suffix, refuse, sweep_values
+from jaxbeam.cli.arguments import check_suffix, parse_sweep_values, refuse_option
 from jaxbeam.cli.options import CaseOptions, Output, Over, table
 
 if TYPE_CHECKING:
@@ -39,20 +39,20 @@ def compare(
     output
         Draw deflections and commands to this file, OUT.png.
     """
-    values = sweep_values(over)
+    values = parse_sweep_values(over)
     check_suffix(output, ".png", "a comparison")
-    refuse(bool(output and over), "a picture shows one load case: leave out -o or --over")
+    refuse_option(bool(output and over), "a picture shows one load case: leave out -o or --over")
     options.check_outputs(output)
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.compare import compare, metrics_over_cases
-    from jaxbeam.case.validation import check
+    from jaxbeam.case.validation import check_case
 
     laws = _read_controllers(case, parsed_case, controllers)
     runs = [dict(zip(values, row, strict=True)) for row in itertools.product(*values.values())]
     load_cases = [jb.replace(parsed_case, run) for run in runs]
     for load_case in load_cases:
-        check(load_case)
+        check_case(load_case)
     comparisons = [compare(load_case, laws, period) for load_case in load_cases]
     if output:
         from jaxbeam.plot import plot_comparison

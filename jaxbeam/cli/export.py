@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.cli.arguments import refuse
+from jaxbeam.cli.arguments import refuse_option
 from jaxbeam.cli.options import CaseOptions
 
 # Those of jaxbeam.files.export.WRITERS (a test compares), known before JAX is imported.
@@ -32,7 +32,9 @@ def export(
         Number of points of the gain table over the crossing; 1001 if left out.
     """
     endings = ", ".join(GAIN_FILES)
-    refuse(output.suffix not in GAIN_FILES, f"gains are written to {endings}, not to {output}")
+    refuse_option(
+        output.suffix not in GAIN_FILES, f"gains are written to {endings}, not to {output}"
+    )
     options.check_outputs(output)
     parsed_case = options.read(case)
 

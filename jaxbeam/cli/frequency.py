@@ -8,9 +8,9 @@ from cyclopts import Parameter
 import jaxbeam as jb
 from jaxbeam.cli.arguments import (
     check_suffix,
-    frequency_range,
+    figure_path,
+    frequency_grid,
     input_output_pair,
-    picture_path,
     stationary_mass,
 )
 from jaxbeam.cli.options import CaseOptions, Output, table
@@ -26,7 +26,7 @@ def modes(case: Path, /, *, plot: bool = False, options: CaseOptions = CaseOptio
     plot
         Draw the mode shapes to CASE_modes.png in this folder.
     """
-    picture = picture_path(None, case.with_stem(f"{case.stem}_modes")) if plot else None
+    picture = figure_path(None, case.with_stem(f"{case.stem}_modes")) if plot else None
     options.check_outputs(picture)
     parsed_case = options.read(case)
     found = jb.modes(parsed_case)
@@ -86,9 +86,9 @@ def frf(
         Draw magnitude and phase to a PNG beside the output, or to CASE_frf.png in this folder.
     """
     check_suffix(output, ".nc", "a frequency response")
-    picture = picture_path(output, case.with_stem(f"{case.stem}_frf")) if plot else None
+    picture = figure_path(output, case.with_stem(f"{case.stem}_frf")) if plot else None
     options.check_outputs(output, picture)
-    frequencies = frequency_range(from_, to, points)
+    frequencies = frequency_grid(from_, to, points)
     pairs = [input_output_pair(text) for text in pair] or None
     masses = [stationary_mass(text) for text in mass_at]
     parsed_case = options.read(case)

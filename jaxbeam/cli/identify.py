@@ -2,7 +2,13 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import assignment, bounds_of, picture_path, refuse, split_files
+from jaxbeam.cli.arguments import (
+    figure_path,
+    parse_assignment,
+    parse_bounds,
+    refuse_option,
+    split_case_and_logs,
+)
 from jaxbeam.cli.options import (
     CaseOptions,
     Free,
@@ -71,10 +77,12 @@ def identify(
     plot
         Draw measured and fitted signals to a PNG beside the output, or named after the log.
     """
-    case, logs = split_files(files, free)
+    case, logs = split_case_and_logs(files, free)
     if case and free:
-        refuse(resume and not output, "--resume goes on with what is kept beside the output: -o")
-        picture = picture_path(output, logs[0]) if plot else None
+        refuse_option(
+            resume and not output, "--resume goes on with what is kept beside the output: -o"
+        )
+        picture = figure_path(output, logs[0]) if plot else None
         options.check_outputs(output, _with_suffix(output, ".npz"), picture)
         if report:
             check_report_folder(report, options.overwrite)
@@ -103,12 +111,12 @@ def identify(
         )
         _write_and_print(fit, assessment, report, output, picture, options)
         return
-    refuse(
+    refuse_option(
         bool(output or options.set_),
         "-o and --set are for fitting a case; name what is free with --free ADDRESS",
     )
     given = (prior, scale, stage, profile, draws, validate, report, resume, mask, starts > 1)
-    refuse(
+    refuse_option(
         any(given),
         "the options of fits are for fitting a case; name what is free with --free ADDRESS",
     )
@@ -116,7 +124,7 @@ def identify(
         print_message(
             f"nothing is named with --free, so {case} is not used; modes of the free decay:"
         )
-    pictures = [picture_path(None, log) if plot else None for log in logs]
+    pictures = [figure_path(None, log) if plot else None for log in logs]
     options.check_outputs(*pictures)
     _identify_modes(logs, pictures, options)
 
@@ -146,11 +154,11 @@ def _prior_arguments(free, prior, scale) -> tuple[dict, dict, dict]:
 
     Raises ValueError for malformed options, and for priors and scales of fixed parameters.
     """
-    bounds = dict(bounds_of(text) for text in free)
-    scales = dict(assignment("--scale", text) for text in scale)
+    bounds = dict(parse_bounds(text) for text in free)
+    scales = dict(parse_assignment("--scale", text) for text in scale)
     normals = {}
     for text in prior:
-        address, value = assignment("--prior", text)
+        address, value = parse_assignment("--prior", text)
         try:
             mean, deviation = map(float, value.split(":"))
         except ValueError:
@@ -160,7 +168,9 @@ def _prior_arguments(free, prior, scale) -> tuple[dict, dict, dict]:
             ) from None
         normals[address] = mean, deviation
     for address in (*scales, *normals):
-        refuse(address not in bounds, f"{address} has a prior or a scale, but is not free: --free")
+        refuse_option(
+            address not in bounds, f"{address} has a prior or a scale, but is not free: --free"
+        )
     return bounds, normals, scales
 
 

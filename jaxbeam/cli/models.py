@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import assignment, bounds_of, refuse
+from jaxbeam.cli.arguments import parse_assignment, parse_bounds, refuse_option
 from jaxbeam.cli.options import (
     CaseOptions,
     Free,
@@ -27,13 +27,15 @@ def compare_models(
     held_out
         A log that no fit used, to be predicted by each; repeat it for more.
     """
-    refuse(not fits, "give at least one fit: jaxbeam compare-models FIT.npz... [--held-out LOG]")
-    refuse(
+    refuse_option(
+        not fits, "give at least one fit: jaxbeam compare-models FIT.npz... [--held-out LOG]"
+    )
+    refuse_option(
         len(fits) < 2 and not held_out,
         "one fit alone: give another, or a log with --held-out LOG",
     )
     names = [path.stem for path in fits]
-    refuse(len(set(names)) < len(names), "two fits have the same name; rename one")
+    refuse_option(len(set(names)) < len(names), "two fits have the same name; rename one")
     enable_compile_cache()
     import tuning
 
@@ -103,11 +105,11 @@ def design_experiment(
         Write the case with the chosen experiment to this file, TOML.
     """
     options.check_outputs(output)
-    refuse(not free, "name what will be identified with --free ADDRESS")
-    refuse(not vary, "name what can be chosen with --vary ADDRESS=LOW:HIGH")
+    refuse_option(not free, "name what will be identified with --free ADDRESS")
+    refuse_option(not vary, "name what can be chosen with --vary ADDRESS=LOW:HIGH")
     for text in vary:
-        assignment("--vary", text)
-    bounds = dict(bounds_of(text, "--vary") for text in vary)
+        parse_assignment("--vary", text)
+    bounds = dict(parse_bounds(text, "--vary") for text in vary)
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import assignment, value_of
+from jaxbeam.cli.arguments import parse_assignment, parse_value
 from jaxbeam.files.report import text_table
 from jaxbeam.files.toml_file import read_toml
 
@@ -92,7 +92,7 @@ class CaseOptions(OutputOptions):
         Raises OSError if the file cannot be read, ValueError otherwise.
         """
         for text in self.set_:
-            assignment("--set", text)
+            parse_assignment("--set", text)
         read_toml(path)
 
     def read(self, path: Path) -> "jb.Case":
@@ -101,7 +101,9 @@ class CaseOptions(OutputOptions):
         Raises OSError if the file cannot be read, ValueError for whatever is wrong in it.
         """
         self.check_case(path)
-        changes = {a: value_of(v) for a, v in (assignment("--set", text) for text in self.set_)}
+        changes = {
+            a: parse_value(v) for a, v in (parse_assignment("--set", text) for text in self.set_)
+        }
         enable_compile_cache()
         from jaxbeam.files.case_file import with_settings
 

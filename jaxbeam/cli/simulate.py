@@ -4,7 +4,7 @@ import warnings
 from pathlib import Path
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import check_suffix, picture_path
+from jaxbeam.cli.arguments import check_suffix, figure_path
 from jaxbeam.cli.options import CaseOptions, Output, table
 
 
@@ -32,7 +32,7 @@ def simulate(
     """
     check_suffix(output, ".nc", "a record")
     check_suffix(animate, ".gif", "an animation")
-    picture = picture_path(output, case) if plot else None
+    picture = figure_path(output, case) if plot else None
     options.check_outputs(output, picture, animate)
     parsed_case = options.read(case)
 

@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from jaxbeam.cli.arguments import picture_path
+from jaxbeam.cli.arguments import figure_path
 from jaxbeam.cli.options import CaseOptions, table
 
 
@@ -31,7 +31,7 @@ def stability(
     plot
         Draw the poles along the crossing to CASE_poles.png in this folder.
     """
-    picture = picture_path(None, case.with_stem(f"{case.stem}_poles")) if plot else None
+    picture = figure_path(None, case.with_stem(f"{case.stem}_poles")) if plot else None
     options.check_outputs(picture)
     parsed_case = options.read(case)
 

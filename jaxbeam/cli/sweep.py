@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import check_suffix, refuse, sweep_values
+from jaxbeam.cli.arguments import check_suffix, parse_sweep_values, refuse_option
 from jaxbeam.cli.options import CaseOptions, Output, Over, table
 
 
@@ -41,9 +41,13 @@ def sweep(
     precision
         double, or single: half the bits, errors of a few parts in a million.
     """
-    values = sweep_values(over)
-    refuse(resume and not output, "--resume needs the store to continue; name it with -o OUT.zarr")
-    refuse(bool(scheduler) and not output, "--scheduler needs a store for the results: -o OUT.zarr")
+    values = parse_sweep_values(over)
+    refuse_option(
+        resume and not output, "--resume needs the store to continue; name it with -o OUT.zarr"
+    )
+    refuse_option(
+        bool(scheduler) and not output, "--scheduler needs a store for the results: -o OUT.zarr"
+    )
     check_suffix(output, ".zarr", "a sweep")
     if not resume:
         options.check_outputs(output)

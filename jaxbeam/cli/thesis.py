@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.cli.arguments import refuse
+from jaxbeam.cli.arguments import refuse_option
 from jaxbeam.cli.options import (
     Output,
     OutputOptions,
@@ -52,8 +52,10 @@ def reproduce(
     output
         Folder for the report and the figures; out/reproduce if left out.
     """
-    refuse(not (names or all_ or list_), "name an experiment, or take --all; --list names them")
-    refuse(bool(names and all_), "give names or --all, not both")
+    refuse_option(
+        not (names or all_ or list_), "name an experiment, or take --all; --list names them"
+    )
+    refuse_option(bool(names and all_), "give names or --all, not both")
     enable_compile_cache()
     from experiments.thesis import reproduction
 

@@ -6,12 +6,12 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from jaxbeam.cli.arguments import (
-    bounds_of,
     check_suffix,
+    figure_path,
     named_number,
     named_numbers,
-    picture_path,
-    refuse,
+    parse_bounds,
+    refuse_option,
 )
 from jaxbeam.cli.options import CaseOptions, Free, Output, Resume, Seed, Starts
 
@@ -117,20 +117,20 @@ def tune(
         searches=batch is not None or starts > 1,
         resume=resume,
     )
-    refuse(
+    refuse_option(
         max_real_part is None and bool(extra_delay or tolerances),
         "--extra-delay and --parameter-tolerance need --max-real-part",
     )
-    refuse(fit is None and posterior, "--posterior draws plants from a fit: it needs --fit")
-    refuse(
+    refuse_option(fit is None and posterior, "--posterior draws plants from a fit: it needs --fit")
+    refuse_option(
         bool(lexicographic and (weights or limits)),
         "--lexicographic takes the place of --objective and --limit",
     )
-    picture = picture_path(output, case.with_suffix(".tuned")) if plot else None
+    picture = figure_path(output, case.with_suffix(".tuned")) if plot else None
     check_suffix(output, ".toml", "a tuned case")
     pareto_limits = _pareto_limits(pareto) if pareto else None
     integer_choices = dict(_integer_choices(text) for text in integers)
-    bounds = dict(bounds_of(text) for text in free)
+    bounds = dict(parse_bounds(text) for text in free)
     files = _output_files(output, len(pareto_limits[1]) if pareto_limits else 0)
     options.check_outputs(*files, picture)
     options.check_case(case)
@@ -198,9 +198,9 @@ def _check_combination(kinds: dict[str, bool], searches: bool, resume: bool) -> 
     `kinds` tells by option whether it is given; `searches`, whether --batch or --starts are.
     """
     given = [option for option, is_given in kinds.items() if is_given]
-    refuse(len(given) > 1, f"{' and '.join(given)} are mutually exclusive; give one of them")
+    refuse_option(len(given) > 1, f"{' and '.join(given)} are mutually exclusive; give one of them")
     several = bool(given) and given[0] in ("--lexicographic", "--pareto")
-    refuse(
+    refuse_option(
         (several and searches) or (bool(given) and resume),
         f"--batch, --starts and --resume are for a single search, not for {''.join(given)}",
     )

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import bounds_of, range_of, refuse
+from jaxbeam.cli.arguments import parse_bounds, parse_range, refuse_option
 from jaxbeam.cli.options import CaseOptions, Free, Output
 
 
@@ -35,7 +35,7 @@ def weigh(
         Write the case with the identified loads to this file, TOML.
     """
     options.check_outputs(output)
-    speed_range = range_of("--speeds", speeds, "m/s, such as 0.5:3")
+    speed_range = parse_range("--speeds", speeds, "m/s, such as 0.5:3")
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read
@@ -74,8 +74,8 @@ def identify_responses(
         Write the fitted case to this file, TOML.
     """
     options.check_outputs(output)
-    refuse(not free, "name what to identify with --free ADDRESS")
-    bounds = dict(map(bounds_of, free))
+    refuse_option(not free, "name what to identify with --free ADDRESS")
+    bounds = dict(map(parse_bounds, free))
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import polynomial
 
-from jaxbeam.case.controller import AbstractController, OwnFilter
-from jaxbeam.case.fields import POSITIVE, concrete, dimensions, is_concrete, number
+from jaxbeam.case.controller import AbstractController, ControllerFilter
+from jaxbeam.case.fields import POSITIVE, axis_names, concrete, is_concrete, number
 from jaxbeam.case.filters import filter_step
 from jaxbeam.control.feedback import pairing_error
 
@@ -52,7 +52,7 @@ class AbstractCompensator(AbstractController):
             return error
         loops = self.gains.shape[0]
         for field in dataclasses.fields(self):
-            if "unit" in field.metadata and dimensions(field) == "*actuator":
+            if "unit" in field.metadata and axis_names(field) == "*actuator":
                 shape = jnp.shape(getattr(self, field.name))
                 if shape not in ((), (loops,)):
                     return (
@@ -169,7 +169,7 @@ class PositivePositionFeedback(AbstractCompensator):
 
 def _reading_filter(
     sensor: int, numerator: Float[Array, " power"], denominator: Float[Array, " power"]
-) -> OwnFilter:
+) -> ControllerFilter:
     """States of a transfer function: x1 follows the reading, x2 is its rate over a frequency.
 
     At rest x1 is the reading; denominators are of degree 1 or 2.
@@ -178,7 +178,7 @@ def _reading_filter(
     output_row = (numerator - feedthrough * denominator)[:-1] / denominator[0]
     if denominator.shape[0] == 2:
         rate = (denominator[0] / denominator[1])[None]
-        return OwnFilter(sensor, -rate[None], rate, output_row, feedthrough)
+        return ControllerFilter(sensor, -rate[None], rate, output_row, feedthrough)
     angular_frequency, damping_rate = (
         jnp.sqrt(denominator[0] / denominator[2]),
         denominator[1] / denominator[2],
@@ -187,7 +187,7 @@ def _reading_filter(
     matrix = jnp.stack(
         [jnp.stack([zero, angular_frequency]), jnp.stack([-angular_frequency, -damping_rate])]
     )
-    return OwnFilter(
+    return ControllerFilter(
         sensor,
         matrix,
         jnp.stack([zero, angular_frequency]),

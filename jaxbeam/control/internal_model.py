@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import INCREASING, POSITIVE, concrete, is_concrete, number
-from jaxbeam.case.filters import filter_step, initial, sections
+from jaxbeam.case.filters import filter_step, second_order_sections, steady_filter_state
 from jaxbeam.model.state_space import Plant
 
 
@@ -95,12 +95,16 @@ class Relief(AbstractController):
         system, sensors = plant.unloaded, plant.case.sensors[: self.values.shape[0]]
         static_response = jnp.linalg.solve(system.A.T, system.C[: len(sensors)].T).T
         filters = tuple(
-            None if sensor.filter is None else sections(sensor.filter, self.period)
+            None if sensor.filter is None else second_order_sections(sensor.filter, self.period)
             for sensor in sensors
         )
-        filter_states = tuple(None if part is None else initial(part, 0.0) for part in filters)
+        filter_states = tuple(
+            None if part is None else steady_filter_state(part, 0.0) for part in filters
+        )
         notches = None if self.notches is None else self._notch_sections()
-        notch_states = None if notches is None else initial(notches, jnp.zeros(len(sensors)))
+        notch_states = (
+            None if notches is None else steady_filter_state(notches, jnp.zeros(len(sensors)))
+        )
         return InternalModelState(
             -static_response @ system.B, filters, notches, filter_states, notch_states
         )

@@ -75,11 +75,11 @@ class AbstractStateLaw(AbstractController):
             else 0
         )
 
-    def flow(self, memory, states, measurement, t, limited):
+    def flow(self, memory, states, measurement, t, saturate):
         law, estimator = memory
         if not isinstance(estimator, ContinuousEstimator):
-            return super().flow(memory, states, measurement, t, limited)
-        command = limited(self.command(law, estimator.estimate(states, t), measurement, t)[0])
+            return super().flow(memory, states, measurement, t, saturate)
+        command = saturate(self.command(law, estimator.estimate(states, t), measurement, t)[0])
         return command, estimator.rates(states, measurement.readings, command, t)
 
     def breakpoints(self, case):
@@ -87,10 +87,12 @@ class AbstractStateLaw(AbstractController):
         if self.period is not None or self.estimator is None:
             return None
         loads = case.loads if self.design is None else self.design.design_loads(case)
-        return np.ravel([concrete(trajectory(load, case.beam.length).window()) for load in loads])
+        return np.ravel(
+            [concrete(trajectory(load, case.beam.length).entry_exit_times()) for load in loads]
+        )
 
     def validate(self, case):
-        stiffened = any(actuator.bonded() is not None for actuator in case.actuators)
+        stiffened = any(actuator.section_stiffening() is not None for actuator in case.actuators)
         if self.coordinates == "sine" and (
             case.beam.ends != "pinned-pinned" or case.supports or stiffened
         ):

@@ -127,7 +127,7 @@ class Kalman(AbstractEstimator):
             return plant.A.T, plant.C.T
 
         crossing_times = jnp.array(
-            [path.window() for path in filtered_model.loads.trajectories]
+            [path.entry_exit_times() for path in filtered_model.loads.trajectories]
         ).reshape(-1)
         events = jnp.concatenate([jnp.zeros(1), jnp.clip(crossing_times, 0.0, end), end[None]])
         initial_covariance, Q = (
@@ -168,7 +168,7 @@ class Kalman(AbstractEstimator):
         """Variance of the noise of each reading."""
         sensors = plant.case.sensors
         if self.measurement_noise is None:
-            return jnp.stack([sensor.noise_covariance for sensor in sensors])
+            return jnp.stack([sensor.noise_variance for sensor in sensors])
         return jnp.broadcast_to(self.measurement_noise**2, (len(sensors),))
 
     def validate(self, case, system):

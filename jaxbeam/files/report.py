@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 Row = Sequence[str]
 
-STYLE = """
+PAGE_STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
        color: #22282e }
 table { border-collapse: collapse; font-size: 0.85rem; margin: 1rem 0 }
@@ -67,7 +67,7 @@ def write_report(
 ) -> None:
     """Write report.md, report.html and the figures to a folder, which is made if need be.
 
-    `style` (CSS) is added to `STYLE`. Raises FileExistsError if the folder is not empty and
+    `style` (CSS) is added to `PAGE_STYLE`. Raises FileExistsError if the folder is not empty and
     `overwrite` is not set.
     """
     check_report_folder(folder, overwrite)
@@ -111,7 +111,7 @@ def html(title: str, sections: Sequence[ReportSection], style: str = "") -> str:
                 body.append(f'<img src="{safe(part.name)}.png" alt="{safe(part.name)}">')
             else:
                 body.append(f"<p>{safe(part)}</p>")
-    head = f'<meta charset="utf-8"><title>{safe(title)}</title><style>{STYLE}{style}</style>'
+    head = f'<meta charset="utf-8"><title>{safe(title)}</title><style>{PAGE_STYLE}{style}</style>'
     return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>'
 
 

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.case import Case, known_case
-from jaxbeam.case.validation import check
+from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.validation import check_case
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.runtime.compiling import compiled
@@ -52,8 +52,8 @@ def simulate_adaptive(
     size the slowest mode is likely to reach. Neither differentiable nor for use inside `jit`.
     Raises ValueError for a faulty case.
     """
-    check(case)
-    case, times = known_case(case), jnp.asarray(times, float)
+    check_case(case)
+    case, times = concrete_case(case), jnp.asarray(times, float)
     model, loads = compiled_modal_model(case), load_set(case)
     windows, legs = _event_times(model, loads, float(times[-1]))
     absolute_tolerance = tolerance * _state_scales(case, model, loads, float(times[-1]))
@@ -71,7 +71,7 @@ def simulate_adaptive(
             jnp.where(in_leg, new, old) for new, old in zip(leg_histories, previous, strict=True)
         ]
     coordinates, rates, accelerations, force = histories
-    deflection = coordinates @ model.shapes(case.sensor_places, (0,))[0].T
+    deflection = coordinates @ model.shapes(case.sensor_positions, (0,))[0].T
     if model.mode_map is not None:
         coordinates, rates, accelerations = (
             part @ model.mode_map.T for part in (coordinates, rates, accelerations)
@@ -81,7 +81,7 @@ def simulate_adaptive(
 
 def _event_times(model: ModalModel, loads: LoadSet, end: float) -> tuple[np.ndarray, np.ndarray]:
     """Entry and exit of every load (load, 2), and the edges of legs without events, in s."""
-    windows = np.array([path.window() for path in loads.trajectories]).reshape(-1, 2)
+    windows = np.array([path.entry_exit_times() for path in loads.trajectories]).reshape(-1, 2)
     nonsmooth_times = [
         np.asarray(path.passage_times(model.modes.nodes)) for path in loads.trajectories
     ]

@@ -58,7 +58,7 @@ class RunningPeaks(eqx.Module):
         return Peaks(*(part.T for part in (*self.refined_peak(), self.lowest_contact_force, lost)))
 
 
-@jax.named_scope("extremes")
+@jax.named_scope("running_peaks")
 def update_peaks(
     running_peaks: RunningPeaks, matrices: StepMatrices, path: LoadPath, states, forces, commands
 ) -> RunningPeaks:

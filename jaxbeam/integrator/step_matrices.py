@@ -184,7 +184,7 @@ class LoadPath(eqx.Module):
     contact_rows: Float[Array, "step slot node block side"]
 
 
-@jax.named_scope("path")
+@jax.named_scope("load_path")
 def load_path(
     discrete: DiscreteModel, loads: LoadSet, max_loads: int, index: Int[Array, " step"]
 ) -> LoadPath:
@@ -211,7 +211,7 @@ def load_path(
     return LoadPath(length_index, start, length, load_index, on_beam, shape, rows)
 
 
-@jax.named_scope("path")
+@jax.named_scope("load_path")
 def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
     """Tables of the steps of a chunk."""
     # Chosen out here, because derivatives of what a branch chooses from go all the way into it.

@@ -81,7 +81,7 @@ def _load_events(case: Case, model: ModalModel):
     trajectories = [trajectory(load, case.beam.length) for load in case.loads]
     if not trajectories:
         return jnp.zeros((0, 2)), jnp.zeros(0)
-    windows = jnp.stack([jnp.stack(path.window()) for path in trajectories])
+    windows = jnp.stack([jnp.stack(path.entry_exit_times()) for path in trajectories])
     nonsmooth_times = [path.passage_times(inner_nodes) for path in trajectories]
     return windows, jnp.concatenate([windows.ravel(), *nonsmooth_times])
 

@@ -237,4 +237,4 @@ def _command_unit(actuator: AbstractActuator) -> str:
 
 
 def _force_unit(actuator: AbstractActuator) -> str:
-    return "N m" if any(order == 1 for _, order, _ in actuator.stroke()) else "N"
+    return "N m" if any(order == 1 for _, order, _ in actuator.displacement_map()) else "N"

@@ -36,7 +36,7 @@ class LoadSet(eqx.Module):
         """Positions (m), speeds (m/s) and accelerations (m/s^2) at given times (s)."""
         if not self.trajectories:
             return (jnp.zeros((0, *times.shape)),) * 3
-        paths = zip(*(path.travel(times) for path in self.trajectories), strict=True)
+        paths = zip(*(path.kinematics(times) for path in self.trajectories), strict=True)
         position, speed, acceleration = (jnp.stack(parts) for parts in paths)
         return position, speed, acceleration
 
@@ -57,7 +57,7 @@ class LoadSet(eqx.Module):
 
     def on_beam(self, times: Float[Array, "*time"]) -> Bool[Array, "load *time"]:
         """Which loads are on the beam at given times (s): from entry until just before exit."""
-        windows = [path.window() for path in self.trajectories]
+        windows = [path.entry_exit_times() for path in self.trajectories]
         on = [(entry <= times) & (times < leave) for entry, leave in windows]
         return jnp.array(on, bool).reshape(len(on), *jnp.shape(times))
 

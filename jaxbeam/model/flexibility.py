@@ -176,7 +176,7 @@ def _suspensions(case: Case):
     In beam units, in which a stroke of derivative d counts L^-d deflections.
     """
     length = case.beam.length
-    displacements = [actuator.stroke() for actuator in case.actuators]
+    displacements = [actuator.displacement_map() for actuator in case.actuators]
     terms = [(i, *term) for i, stroke in enumerate(displacements) for term in stroke]
     points = FlexibilityPoints(
         jnp.array([place for _, place, _, _ in terms]).reshape(-1) / length,
@@ -186,7 +186,7 @@ def _suspensions(case: Case):
     for column, (i, _, derivative, factor) in enumerate(terms):
         factors = factors.at[i, column].set(factor / length**derivative)
     stiffness = jnp.array([actuator.attachment().stiffness for actuator in case.actuators])
-    return points, factors, stiffness.reshape(-1, 1) * length**3 / case.beam.rigidity
+    return points, factors, stiffness.reshape(-1, 1) * length**3 / case.beam.bending_stiffness
 
 
 def _cubic_layout(layout: Layout) -> Layout:
@@ -204,7 +204,7 @@ def check_supported(case: Case, layout: Layout) -> None:
 
     Raises ValueError.
     """
-    length, unit = case.beam.length, case.beam.length**3 / case.beam.rigidity
+    length, unit = case.beam.length, case.beam.length**3 / case.beam.bending_stiffness
     nodes, suspension_points, factors, suspension_stiffness = _support_conditions(case, layout)
     translation, rotation = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     restraints = [

@@ -21,7 +21,7 @@ from jaxtyping import Array, Complex, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
@@ -113,7 +113,7 @@ def frequency_response(
     Raises ValueError for a faulty case, negative frequencies, an unknown input or output, or a
     parked mass that is negative or off the beam.
     """
-    check(case)
+    check_case(case)
     frequencies, masses = (
         _checked_frequencies(frequencies),
         _stationary_masses(case, stationary_masses),
@@ -181,7 +181,7 @@ def receptance(
     Positions x and y are in m and may have any shapes. Unlike `frequency_response` it is
     differentiable in them. The rest is as there, the errors too.
     """
-    check(case)
+    check_case(case)
     frequencies, masses = (
         _checked_frequencies(frequencies),
         _stationary_masses(case, stationary_masses),
@@ -264,7 +264,7 @@ def poles(case: Case, stationary_masses: StationaryMasses = ()) -> Complex[np.nd
 
     Plain numbers, not differentiable. Raises ValueError as `frequency_response` does.
     """
-    check(case)
+    check_case(case)
     A, E = _descriptor_matrices(
         compiled_modal_model(case), _stationary_masses(case, stationary_masses)
     )
@@ -279,7 +279,7 @@ def zeros(
     For `actuators.I.active_force` as input they are those of the response to the command, which
     has the same. Plain numbers, not differentiable. Raises ValueError as `frequency_response` does.
     """
-    check(case)
+    check_case(case)
     (checked_pair,) = check_pairs(case, [pair])
     model = compiled_modal_model(case)
     A, E = _descriptor_matrices(model, _stationary_masses(case, stationary_masses))

@@ -90,7 +90,7 @@ def compiled_modal_model(case: Case, layout: Layout | None = None) -> ModalModel
     return _compiled(uncontrolled_case, layout)
 
 
-@jax.named_scope("rig")
+@jax.named_scope("modal_model")
 def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> ModalModel:
     """The rig of a case whose modes are known already; see `rig`."""
     count = case.beam.modes
@@ -109,7 +109,9 @@ def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> Moda
     displacement_map = jnp.zeros((len(attachments), count))
     mass = jnp.eye(count)
     for i, (actuator, attachment) in enumerate(zip(case.actuators, attachments, strict=True)):
-        terms = (factor * modes.shapes(x, order) for x, order, factor in actuator.stroke())
+        terms = (
+            factor * modes.shapes(x, order) for x, order, factor in actuator.displacement_map()
+        )
         shape = sum(terms, jnp.zeros(count))
         displacement_map = displacement_map.at[i].set(shape)
         stiffness = stiffness + attachment.stiffness * jnp.outer(shape, shape)
@@ -145,7 +147,7 @@ def _state_space_matrices(stiffness, damping, displacement_map, attachments):
         start += size
         matrix = matrix.at[np.ix_(device_index, device_index)].set(device.state_matrix)
         matrix = matrix.at[np.ix_(device_index, velocity_index)].set(
-            jnp.outer(device.stroke_matrix, displacement_map[i])
+            jnp.outer(device.velocity_matrix, displacement_map[i])
         )
         matrix = matrix.at[np.ix_(velocity_index, device_index)].set(
             jnp.outer(displacement_map[i], device.output_matrix)

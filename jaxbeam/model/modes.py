@@ -58,7 +58,7 @@ def _node_positions(case: Case) -> list:
 
 def _stiffened_sections(case: Case) -> list:
     """What the actuators add to the section of the beam, with the index of the actuator."""
-    pairs = ((i, actuator.bonded()) for i, actuator in enumerate(case.actuators))
+    pairs = ((i, actuator.section_stiffening()) for i, actuator in enumerate(case.actuators))
     return [(i, bonded) for i, bonded in pairs if bonded is not None]
 
 
@@ -236,7 +236,7 @@ def normalised_modes(beam, values, coupling, nodes, series) -> Modes:
 
 def _stiffness_unit(beam):
     """E I / (m L^4) in 1/s^2."""
-    return beam.rigidity / (beam.linear_density * beam.length**4)
+    return beam.bending_stiffness / (beam.linear_density * beam.length**4)
 
 
 def assemble_matrices(case: Case, layout: Layout):
@@ -278,13 +278,13 @@ def assemble_matrices(case: Case, layout: Layout):
         segment_series = jnp.zeros((series_terms, total))
         rows = np.ix_(np.arange(degree + 1), index[free])
         to_series.append(segment_series.at[rows].set(basis[:, free] * scale))
-    spring_unit = beam.length**3 / beam.rigidity
+    spring_unit = beam.length**3 / beam.bending_stiffness
     for support, node in supported_matrices(case, layout):
         deflection, rotation = nodal_unknowns[node]
         if support.stiffness is not None and deflection >= 0:
             stiffness = stiffness.at[deflection, deflection].add(support.stiffness * spring_unit)
         if rotation >= 0:
-            rotational_spring = support.rotational_stiffness * beam.length / beam.rigidity
+            rotational_spring = support.rotational_stiffness * beam.length / beam.bending_stiffness
             stiffness = stiffness.at[rotation, rotation].add(rotational_spring)
     return nodes, stiffness, mass, jnp.stack(to_series)
 
@@ -293,9 +293,9 @@ def section_properties(case: Case, layout: Layout, segment: int):
     """Bending stiffness and mass per length of a segment, in those of the beam without patches."""
     rigidity, density = jnp.ones(()), jnp.ones(())
     for actuator in layout.patches[segment]:
-        patch = case.actuators[actuator].bonded()
-        rigidity = rigidity + patch.rigidity / case.beam.rigidity
-        density = density + patch.mass / case.beam.linear_density
+        patch = case.actuators[actuator].section_stiffening()
+        rigidity = rigidity + patch.bending_stiffness / case.beam.bending_stiffness
+        density = density + patch.mass_per_length / case.beam.linear_density
     return rigidity, density
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
-from jaxbeam.case.filters import analogue
+from jaxbeam.case.filters import analogue_state_space
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.state_space import Plant
 
@@ -32,7 +32,7 @@ def with_sensor_filters(plant: Plant) -> tuple[ModalModel, Float[Array, "sensor 
         if sensor.filter is None or sensor.filter.realisation != "analogue":
             rows.append({0: row})
             continue
-        matrix, column, output, _ = analogue(sensor.filter)
+        matrix, column, output, _ = analogue_state_space(sensor.filter)
         filter_inputs.append((len(state_matrices), column, {0: row}))
         rows.append({len(state_matrices): output})
         state_matrices.append(matrix)

@@ -16,12 +16,12 @@ from jaxtyping import Array, Float
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.filters import (
     Filter,
-    analogue,
-    analogue_initial,
+    analogue_state_space,
+    analogue_steady_state,
     filter_history,
     filter_step,
-    initial as filter_initial,
-    sections as filter_sections,
+    second_order_sections as filter_sections,
+    steady_filter_state as filter_initial,
 )
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
@@ -137,7 +137,7 @@ def sampled_readings(
 
 def _apply_filter(filter: Filter, times, spacing, values, rates):
     """Output of an analogue filter and its rate, at equally spaced times."""
-    matrix, column, row, _ = analogue(filter)
+    matrix, column, row, _ = analogue_state_space(filter)
     transition, input_matrix = c2d(matrix, column[:, None], spacing, degree=3)
     forced_response = hermite_cubics(times, values, rates) @ input_matrix[..., 0]
 
@@ -145,7 +145,7 @@ def _apply_filter(filter: Filter, times, spacing, values, rates):
         after = transition @ state + forced
         return after, after
 
-    start = analogue_initial(filter, values[0])
+    start = analogue_steady_state(filter, values[0])
     states = jnp.concatenate([start[None], jax.lax.scan(step, start, forced_response)[1]])
     return states @ row, states @ (row @ matrix) + values * (row @ column)
 

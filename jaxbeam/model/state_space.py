@@ -212,7 +212,7 @@ class Plant(eqx.Module):
         """Shape rows (load, mode), contact rows (load, state of the rig) and masses (kg) at t."""
         loads = self.loads
         position, speed, acceleration = loads.kinematics(t)
-        windows = [path.window() for path in loads.trajectories]
+        windows = [path.entry_exit_times() for path in loads.trajectories]
         active = jnp.array([(entry <= t) & (t < leave) for entry, leave in windows], bool)
         shape, contact = contact_rows(self.modal_model, position, speed, acceleration, active)
         count = len(loads.trajectories)

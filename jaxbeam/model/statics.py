@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import is_concrete
 from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.model.flexibility import check_supported, flexibility
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.numerics.peak_search import refine_peak
@@ -26,7 +26,9 @@ PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 10))
 def _influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
     greens = flexibility(case, layout, x.reshape(-1), derivative)
     length = case.beam.length
-    line = -greens(load_positions / length) * length ** (3 - derivative) / case.beam.rigidity
+    line = (
+        -greens(load_positions / length) * length ** (3 - derivative) / case.beam.bending_stiffness
+    )
     return line.reshape(*load_positions.shape, *x.shape)
 
 
@@ -100,10 +102,10 @@ def _deflection_per_command(case: Case, layout: Layout, x, derivative: int):
     greens = flexibility(case, layout, x.reshape(-1), derivative)  # by reciprocity, forces at x
     gains = jnp.zeros((len(case.actuators), x.size))
     for i, actuator in enumerate(case.actuators):
-        terms = actuator.stroke()
+        terms = actuator.displacement_map()
         displacement = sum(f / length**d * greens(position / length, d) for position, d, f in terms)
-        gains = gains.at[i].set(actuator.attachment().steady * displacement)
-    return (gains * length ** (3 - derivative) / case.beam.rigidity).reshape(-1, *x.shape)
+        gains = gains.at[i].set(actuator.attachment().static_gain * displacement)
+    return (gains * length ** (3 - derivative) / case.beam.bending_stiffness).reshape(-1, *x.shape)
 
 
 def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*place"]:
@@ -130,7 +132,7 @@ def _static_peak(case: Case, layout: Layout, x):
     length = case.beam.length
     greens = flexibility(case, layout, x.reshape(-1), 0)
     trajectories = [trajectory(load, length) for load in case.loads]
-    windows = jnp.stack([jnp.stack(path.window()) for path in trajectories])
+    windows = jnp.stack([jnp.stack(path.entry_exit_times()) for path in trajectories])
     nodes = jnp.concatenate([greens.nodes, greens.sources.positions])
     table_times = [load.times for load in case.loads if load.times is not None]
     events = [
@@ -146,22 +148,22 @@ def _static_peak(case: Case, layout: Layout, x):
     total = jnp.zeros((*times.shape, x.size))
     for load, path, window in zip(case.loads, trajectories, windows, strict=True):
         active = (window[0] < middle) & (middle < window[1])
-        relative_position = jnp.clip(path.travel(times)[0] / length, 0.0, 1.0)
+        relative_position = jnp.clip(path.kinematics(times)[0] / length, 0.0, 1.0)
         load_deflection = (
             load.weight(case.run.gravity) * active[:, None] * greens(relative_position)
         )
         total = total + load_deflection
     highest = jnp.max(refine_peak(total, PEAK_POSITIONS)[0], axis=0)
-    return (highest * length**3 / case.beam.rigidity).reshape(x.shape)
+    return (highest * length**3 / case.beam.bending_stiffness).reshape(x.shape)
 
 
 def _validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:
     """The layout of a case that is fit for statics, as far as its numbers are known."""
-    check(case)
+    check_case(case)
     for name, position in positions.items():
         check_on_beam(name, position, case.beam.length)
     layout = mesh_layout(case) if layout is None else layout
     unloaded_case = Case(case.beam, case.supports, case.actuators)
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(unloaded_case)):
-        check_supported(known_case(unloaded_case), layout)
+        check_supported(concrete_case(unloaded_case), layout)
     return layout

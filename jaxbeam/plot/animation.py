@@ -96,7 +96,8 @@ def _beam_axes(axes, record):
     beam = beam / factor
     lowest_deflection = np.minimum.accumulate(beam)
     actuator_positions = [
-        [float(concrete(p)) for p, _, _ in actuator.stroke()] for actuator in case.actuators
+        [float(concrete(p)) for p, _, _ in actuator.displacement_map()]
+        for actuator in case.actuators
     ]
     point_actuators = np.array([places[0] for places in actuator_positions if len(places) == 1])
     patches = [

@@ -60,7 +60,7 @@ def load_windows(record: Record) -> list[tuple[int, float, float]]:
     times = np.asarray(record.times)
     trajectories = [trajectory(load, record.case.beam.length) for load in record.case.loads]
     windows = np.array(
-        [[float(concrete(t)) for t in trajectory.window()] for trajectory in trajectories]
+        [[float(concrete(t)) for t in trajectory.entry_exit_times()] for trajectory in trajectories]
     ).reshape(-1, 2)
     cut = np.clip(windows, times[0], times[-1]).tolist()
     return [(i, entry, leaves) for i, (entry, leaves) in enumerate(cut) if entry < leaves]

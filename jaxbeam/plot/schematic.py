@@ -60,7 +60,7 @@ def draw_schematic(axes, case: Case) -> None:
     axes.plot([0, length], [0, 0], color=INK, linewidth=3, zorder=2)
     draw_supports(axes, case)
     for actuator in case.actuators:
-        actuator_positions = [float(concrete(x)) for x, _, _ in actuator.stroke()]
+        actuator_positions = [float(concrete(x)) for x, _, _ in actuator.displacement_map()]
         if len(actuator_positions) == 1:
             _draw_marker(axes, actuator_positions[0], 0, ACTUATOR_MARKER, 22, markeredgecolor=GREY)
         else:

@@ -10,12 +10,12 @@ from importlib import resources
 from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import load_case
 
-NAMES = ("A", "B", "C", "D")
+RIG_NAMES = ("A", "B", "C", "D")
 
 
 def load(name: str) -> Case:
     """The case of a published rig, "A", "B", "C" or "D". Raises ValueError for other names."""
-    if name not in NAMES:
-        raise ValueError(f"there is no published rig {name!r}; there are {', '.join(NAMES)}")
+    if name not in RIG_NAMES:
+        raise ValueError(f"there is no published rig {name!r}; there are {', '.join(RIG_NAMES)}")
     with resources.as_file(resources.files(__name__) / f"{name}.toml") as path:
         return load_case(path)

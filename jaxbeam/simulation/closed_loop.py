@@ -265,7 +265,11 @@ class ClosedLoop(AbstractInputPolicy):
             commands = commands + jax.lax.stop_gradient(rounded - commands)
         rows = []
         for i, actuator in enumerate(case.actuators):
-            command, limits, rate = commands[i], actuator.command_limits(), actuator.command_rate()
+            command, limits, rate = (
+                commands[i],
+                actuator.command_limits(),
+                actuator.command_rate_limit(),
+            )
             if limits is not None:
                 command = jnp.clip(command, limits[0], limits[1])
             if rate is not None and previous is not None:

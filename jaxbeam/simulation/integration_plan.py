@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.case import Case, known_case
+from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads import trajectory
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.integrate import integrate_at_events, integrate_peaks, max_stable_step
 from jaxbeam.integrator.running_peaks import RunningPeaks
@@ -51,7 +51,7 @@ class StaticShapes:
 
 def static_shapes(case: Case) -> StaticShapes:
     """The form of a case, from the numbers known now (not inside `jit`)."""
-    case = known_case(case)
+    case = concrete_case(case)
     layout = mesh_layout(case)
     _, repeated, windows = _model_limits(case, layout)
     return StaticShapes(
@@ -64,7 +64,7 @@ def _model_limits(case: Case, layout: Layout):
     """Longest step (s), whether modes are repeated, and when loads enter and leave."""
     model = modal_model(case, layout)
     trajectories = [trajectory(load, case.beam.length) for load in case.loads]
-    windows = jnp.array([path.window() for path in trajectories]).reshape(-1, 2)
+    windows = jnp.array([path.entry_exit_times() for path in trajectories]).reshape(-1, 2)
     return max_stable_step(model, case.loads), model.modes.has_repeated, windows
 
 
@@ -121,8 +121,8 @@ def integration_plan(
     error allowed, relative to the largest deflection. Raises ValueError for a faulty case, and
     RuntimeError if no time step meets the tolerance.
     """
-    check(case)
-    case = known_case(case)
+    check_case(case)
+    case = concrete_case(case)
     shapes = static_shapes(case)
     samples = np.asarray(sample_times(case) if times is None else concrete(times))
     if case.controller is not None:
@@ -210,7 +210,7 @@ def choose_step_size(
     tolerance, relative to the largest peak; the error is that change. Raises RuntimeError if no
     step down to a millionth of the run will do.
     """
-    case = known_case(case)
+    case = concrete_case(case)
     step = _max_step(case, shapes)
     _check_step_count(float(concrete(case.run.duration)) / step, step)
 

@@ -64,7 +64,7 @@ class Record(eqx.Module):
         return quantity_history(self.modes, coordinates, x, quantity, fibre_distance)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
-        return self.at(self.case.sensor_places, quantity)
+        return self.at(self.case.sensor_positions, quantity)
 
     @property
     def deflection(self) -> Float[Array, "time sensor"]:

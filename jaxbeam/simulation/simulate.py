@@ -83,7 +83,7 @@ def _check_times(times) -> None:
 
 @compiled
 def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
-    running_peaks, outputs, modal, steps = _integrate(case, plan, times, case.sensor_places)
+    running_peaks, outputs, modal, steps = _integrate(case, plan, times, case.sensor_positions)
     coordinates, rates, accelerations, position, force, commands, readings, failures = outputs
     if commands is None:
         commands = jnp.zeros((times.shape[0], len(case.actuators)))
@@ -92,7 +92,10 @@ def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
     peaks = Peaks(*(part[0] for part in running_peaks.peaks()))
     loads, lost_times = load_set(case), peaks.contact_lost_time
     lost_positions = jnp.array(
-        [path.travel(time)[0] for path, time in zip(loads.trajectories, lost_times, strict=True)]
+        [
+            path.kinematics(time)[0]
+            for path, time in zip(loads.trajectories, lost_times, strict=True)
+        ]
     ).reshape(-1)
     return Record(
         case=case,

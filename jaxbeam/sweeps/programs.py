@@ -73,7 +73,7 @@ class Program(NamedTuple):
 
     def discretise(self, model, shared_values, step_size, policy=None):
         """The rig of a task on its steps."""
-        positions = self.case_with(shared_values).sensor_places
+        positions = self.case_with(shared_values).sensor_positions
         return discrete_model(model, self.grid(model, shared_values, step_size), positions, policy)
 
 
@@ -96,7 +96,7 @@ def entry_exit_times(case, addresses, shared_values):
     def entry_exit_times_of(values):
         varied = replace(case, dict(zip(addresses, values, strict=True)))
         trajectories = [trajectory(load, varied.beam.length) for load in varied.loads]
-        return jnp.array([path.window() for path in trajectories]).reshape(-1, 2)
+        return jnp.array([path.entry_exit_times() for path in trajectories]).reshape(-1, 2)
 
     return jax.vmap(entry_exit_times_of)(shared_values)
 
@@ -148,7 +148,7 @@ def _native_results(program: Program, mask, models, shared_values, batched_value
 
     def integration_inputs(own, heavy, light, pace):
         grid = program.grid(shared_model or own, heavy, pace)
-        return grid, program.case_with(heavy).sensor_places, program.loads(heavy, light)
+        return grid, program.case_with(heavy).sensor_positions, program.loads(heavy, light)
 
     inputs = jax.vmap(integration_inputs)(own_models, shared_values, batched_values, step_size)
     return native_peaks.integrate_peaks(program.shapes.max_loads, mask, models, *inputs)._asdict()
@@ -199,7 +199,7 @@ def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=No
             discrete, loads, max_loads=max_loads, steps=steps, policy=policy
         )
         samples = states[substeps * grid.place[program.schedule.sample_events]]
-        rows = discrete.model.shapes(varied.sensor_places, (0,))[0]
+        rows = discrete.model.shapes(varied.sensor_positions, (0,))[0]
         modal = samples[:, 0 : 2 * varied.beam.modes : 2]
         history["deflection"] = jnp.einsum("sm,tml->lts", rows, modal)
     if policy is not None:

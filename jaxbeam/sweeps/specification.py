@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.case.declared_checks import in_words
-from jaxbeam.case.validation import check
+from jaxbeam.case.declared_checks import describe_value
+from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
 from jaxbeam.sweeps import MAX_RUNS
@@ -130,9 +130,11 @@ def sweep_specification(
     Raises ValueError for an unknown address, faulty or too many values, a case without sensors, or
     a precision that there is not.
     """
-    check(case)
+    check_case(case)
     if precision not in PRECISIONS:
-        raise ValueError(f"precision must be {' or '.join(PRECISIONS)}, not {in_words(precision)}")
+        raise ValueError(
+            f"precision must be {' or '.join(PRECISIONS)}, not {describe_value(precision)}"
+        )
     single = precision == "single"
     if single and case.controller is not None:
         raise ValueError(
@@ -175,7 +177,7 @@ def sweep_specification(
             for row in np.unique(specification.runs()[:, columns], axis=0)
         ]
     for row in rows:
-        check(replace(case, row))
+        check_case(replace(case, row))
     return specification
 
 
@@ -187,7 +189,7 @@ def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.nda
         values = np.atleast_1d(np.asarray(values_given, float))
     except (TypeError, ValueError, OverflowError):
         raise ValueError(
-            f"{address} takes a list of numbers, not {in_words(values_given)}"
+            f"{address} takes a list of numbers, not {describe_value(values_given)}"
         ) from None
     if values.ndim != 1 or values.size == 0:
         raise ValueError(f"{address} takes a list of values, not one of shape {values.shape}")
@@ -199,5 +201,5 @@ def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.nda
     if not JOINTLY_CHECKED.fullmatch(address):
         # Zero may be left out of what is allowed.
         for value in values[~np.isfinite(values) | (values == 0)][:1]:
-            check(replace(case, {address: value}))
+            check_case(replace(case, {address: value}))
     return values

@@ -12,15 +12,15 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.static_correction import (
     bending_moment,
-    corrected,
-    residual_lift,
-    residual_line,
+    corrected_deflection,
+    residual_actuator_gain,
+    residual_flexibility,
     shear_force,
 )
 from jaxbeam.case.case import replace
-from jaxbeam.model.modal_model import rig
-from jaxbeam.model.modes import lay_out
-from jaxbeam.model.statics import influence_line, static_lift
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.statics import influence_line, static_deflection_per_command
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import finite_elements
@@ -65,7 +65,7 @@ def test_a_patch_lifts_a_pinned_beam_as_the_closed_form_says():
     ramp = ((length - a) ** 2 - (length - b) ** 2) / 2
     bent = np.maximum(x - a, 0) ** 2 / 2 - np.maximum(x - b, 0) ** 2 / 2
     expected = 1e-3 / 13.211 * (ramp * x / length - bent)
-    found = static_lift(PLAIN, x)[0]
+    found = static_deflection_per_command(PLAIN, x)[0]
     assert_allclose(found, expected, rtol=1e-12, atol=1e-20)
     assert found[6] > 0
 
@@ -73,15 +73,15 @@ def test_a_patch_lifts_a_pinned_beam_as_the_closed_form_says():
 def test_slope_curvature_and_third_derivative_of_a_pinned_beam():
     x = np.array([0.1, 0.2, 0.3, 0.35, 0.5])
     over = np.array([0, 1, 1, 0, 0])  # at the edges, what lies to the right
-    assert_allclose(static_lift(PLAIN, x, 2)[0], -1e-3 / 13.211 * over, rtol=1e-12, atol=1e-18)
-    assert_allclose(static_lift(PLAIN, x, 3)[0], 0.0, atol=1e-15)
-    slopes = central(lambda y: static_lift(PLAIN, y[0])[0], [0.3], 1e-3)
-    assert_allclose(static_lift(PLAIN, 0.3, 1)[0], slopes[0], rtol=1e-9)
+    assert_allclose(static_deflection_per_command(PLAIN, x, 2)[0], -1e-3 / 13.211 * over, rtol=1e-12, atol=1e-18)
+    assert_allclose(static_deflection_per_command(PLAIN, x, 3)[0], 0.0, atol=1e-15)
+    slopes = central(lambda y: static_deflection_per_command(PLAIN, y[0])[0], [0.3], 1e-3)
+    assert_allclose(static_deflection_per_command(PLAIN, 0.3, 1)[0], slopes[0], rtol=1e-9)
 
 
 def test_lifts_of_all_kinds_as_finite_elements_have_them():
     expected = oracle_lifts(GENERAL, X)
-    found = static_lift(GENERAL, X)
+    found = static_deflection_per_command(GENERAL, X)
     assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
     assert_allclose(found[-1], 0.0, atol=0)
 
@@ -93,7 +93,7 @@ def test_lift_of_a_patch_for_other_ends_and_spans(ends, supports):
     case = jb.Case(jb.Beam(1.0, 12.0, 0.8, ends=ends), supports, [patch])
     x, beam = np.linspace(0, 1, 9), as_oracle(case, elements=1)
     expected = finite_elements.static_deflection(beam, x, patch_moments=[(0.25, 0.55, 1.0)])
-    found = static_lift(case, x)[0]
+    found = static_deflection_per_command(case, x)[0]
     assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
@@ -101,8 +101,8 @@ def test_many_modes_approach_the_exact_lift():
     errors = []
     for count in (4, 12, 36):
         case = jb.Case(dataclasses.replace(PLAIN.beam, modes=count), actuators=PLAIN.actuators)
-        errors.append(float(jnp.abs(residual_lift(case, X[2:4])).max()))
-    largest = float(static_lift(PLAIN, 0.3)[0])
+        errors.append(float(jnp.abs(residual_actuator_gain(case, X[2:4])).max()))
+    largest = float(static_deflection_per_command(PLAIN, 0.3)[0])
     assert errors[0] < 0.05 * largest
     assert errors[1] < errors[0] / 5
     assert errors[2] < errors[1] / 5
@@ -113,7 +113,7 @@ def test_many_modes_approach_the_exact_lift():
 
 @pytest.fixture(scope="module")
 def model():
-    return eqx.filter_jit(rig)(GENERAL, lay_out(GENERAL))
+    return eqx.filter_jit(modal_model)(GENERAL, mesh_layout(GENERAL))
 
 
 @pytest.mark.parametrize("derivative", [0, 3])  # the moments below are of the second
@@ -124,24 +124,24 @@ def test_modes_and_residual_make_the_exact_response(model, derivative):
     shapes = np.asarray(model.shapes(X, (derivative,))[0])
     states = -np.linalg.solve(matrix, np.asarray(model.command_matrix))
     modal = (shapes @ states[: 2 * modes : 2]).T
-    exact = np.asarray(static_lift(GENERAL, X, derivative))
-    found = modal + residual_lift(GENERAL, X, derivative)
+    exact = np.asarray(static_deflection_per_command(GENERAL, X, derivative))
+    found = modal + residual_actuator_gain(GENERAL, X, derivative)
     assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
     pressed = np.zeros((len(matrix), y.size))
     pressed[1 : 2 * modes : 2] = -np.asarray(model.shapes(y, (0,))[0]).T
     modal = (shapes @ -np.linalg.solve(matrix, pressed)[: 2 * modes : 2]).T
     exact = influence_line(GENERAL, X, y, derivative)
-    found = modal + residual_line(GENERAL, X, y, derivative)
+    found = modal + residual_flexibility(GENERAL, X, y, derivative)
     assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
 
 
 def test_residuals_differentiate():
-    layout, scale = lay_out(PLAIN), np.array([1.0, 100.0])
+    layout, scale = mesh_layout(PLAIN), np.array([1.0, 100.0])
 
     def missed(values):
         names = ("actuators.0.start", "beam.flexural_rigidity")
         changed = replace(PLAIN, dict(zip(names, values * scale, strict=True)))
-        return residual_lift(changed, X[3:5], 2, layout)[0]
+        return residual_actuator_gain(changed, X[3:5], 2, layout)[0]
 
     point = np.array([0.2, 0.13])
     found = jax.jacobian(missed)(jnp.asarray(point))
@@ -158,7 +158,7 @@ def test_a_patch_leaves_no_moment_in_a_determinate_beam():
     for ends in ("pinned-pinned", "clamped-free"):
         beam = dataclasses.replace(PLAIN.beam, ends=ends)
         case, x = jb.Case(beam, actuators=[patch]), np.linspace(0.0, 0.6, 13)
-        curvature, third = static_lift(case, x, 2)[0], static_lift(case, x, 3)[0]
+        curvature, third = static_deflection_per_command(case, x, 2)[0], static_deflection_per_command(case, x, 3)[0]
         assert_allclose(bending_moment(case, x, curvature, [1.0]), 0.0, atol=1e-14)
         assert_allclose(shear_force(case, x, third), 0.0, atol=1e-12)
 
@@ -171,9 +171,9 @@ def test_moment_of_a_patch_on_a_beam_clamped_at_both_ends():
     # The integrals over the beam of the curvature, E I w'' = M - own, and of x w'' are zero.
     system = np.array([[length, length**2 / 2], [length**2 / 2, length**3 / 3]])
     p, q = np.linalg.solve(system, own * np.array([b - a, (b**2 - a**2) / 2]))
-    found = bending_moment(case, x, static_lift(case, x, 2)[0], [1.0])
+    found = bending_moment(case, x, static_deflection_per_command(case, x, 2)[0], [1.0])
     assert_allclose(found, p + q * x, rtol=1e-11)
-    assert_allclose(shear_force(case, x, static_lift(case, x, 3)[0]), q, rtol=1e-10)
+    assert_allclose(shear_force(case, x, static_deflection_per_command(case, x, 3)[0]), q, rtol=1e-10)
 
 
 @pytest.mark.parametrize("x", [0.0, 0.12, 0.6])
@@ -200,7 +200,7 @@ def test_moment_under_a_slow_load_while_a_patch_pushes():
     )
     record = jb.simulate(case)
     x = np.array([0.15, 0.3, 0.41])
-    found = bending_moment(case, x, corrected(record, x, 2))
+    found = bending_moment(case, x, corrected_deflection(record, x, 2))
     at = 0.05 * np.asarray(record.times)[1:-1, None]
     expected = 5.0 * np.minimum(at, x) * (0.6 - np.maximum(at, x)) / 0.6
     assert_allclose(found[1:-1], expected, atol=2e-3)
@@ -211,6 +211,6 @@ def test_moment_under_a_slow_load_while_a_patch_pushes():
     steady = dataclasses.replace(
         record, case=driven, command=jnp.full((record.times.size, 1), 100.0)
     )
-    missed = residual_lift(case, x, 2)[0] * 100.0
-    difference = corrected(steady, x, 2) - corrected(record, x, 2)
+    missed = residual_actuator_gain(case, x, 2)[0] * 100.0
+    difference = corrected_deflection(steady, x, 2) - corrected_deflection(record, x, 2)
     assert_allclose(difference, np.tile(missed, (121, 1)), atol=1e-15)

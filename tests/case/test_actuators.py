@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case.case import addresses, replace
-from jaxbeam.model.modal_model import rig
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.modes import mesh_layout
 
 # Smart Material M8557-P1 on rig B of the thesis: sections 2.4.1 and 2.4.2.
 MATERIAL = {
@@ -26,10 +26,10 @@ V4 = jb.Electrodynamic(0.5, 0.82, 5e-5, 4.2, mass=0.02, stiffness=9700.0, dampin
 
 def test_moment_per_volt_of_a_material():
     patch = jb.Patch(0.2575, 0.3425, correction=0.32, amplifier_gain=200.0, **MATERIAL)
-    assert_allclose(patch.moment, 8.2924e-4, rtol=1e-5)
-    direct = jb.Patch(0.2575, 0.3425, patch.moment, correction=0.32, amplifier_gain=200.0)
-    assert_allclose(patch.attachment().steady, direct.attachment().steady, rtol=1e-15)
-    assert_allclose(patch.attachment().steady, 8.2924e-4 * 0.32 * 200, rtol=1e-5)
+    assert_allclose(patch.moment_constant, 8.2924e-4, rtol=1e-5)
+    direct = jb.Patch(0.2575, 0.3425, patch.moment_constant, correction=0.32, amplifier_gain=200.0)
+    assert_allclose(patch.attachment().static_gain, direct.attachment().static_gain, rtol=1e-15)
+    assert_allclose(patch.attachment().static_gain, 8.2924e-4 * 0.32 * 200, rtol=1e-5)
 
 
 def test_every_number_of_a_material_has_an_address():
@@ -38,7 +38,7 @@ def test_every_number_of_a_material_has_an_address():
     for name, value in MATERIAL.items():
         assert_allclose(found[f"actuators.0.{name}"], value)
     changed = replace(case, {"actuators.0.d33": 230e-12})
-    assert_allclose(changed.actuators[0].moment, case.actuators[0].moment / 2)
+    assert_allclose(changed.actuators[0].moment_constant, case.actuators[0].moment_constant / 2)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_commands_spare_the_polarisation_of_a_patch(given, gain, expected):
         start=0.2, end=0.3, moment_per_volt=1e-3, amplifier_gain=gain, limits=given, rate_limit=50.0
     )
     assert_allclose(patch.command_limits(), expected)
-    assert patch.command_rate() == 50.0
+    assert patch.command_rate_limit() == 50.0
 
 
 def test_other_actuators_say_their_limits_in_the_same_way():
@@ -65,8 +65,8 @@ def test_other_actuators_say_their_limits_in_the_same_way():
         assert_allclose(actuator.command_limits(), [-1, 2])
     for actuator in (jb.PointForce(0.1), jb.Shaker(0.1), V4, jb.SpringDamper(0.1)):
         assert actuator.command_limits() is None
-        assert actuator.command_rate() is None
-    assert jb.Patch(0.1, 0.2, 1e-3).command_rate() is None
+        assert actuator.command_rate_limit() is None
+    assert jb.Patch(0.1, 0.2, 1e-3).command_rate_limit() is None
 
 
 @pytest.mark.parametrize("back_emf", [None, 4.2, 3.0])
@@ -74,7 +74,7 @@ def test_energy_into_a_coil_heats_it_moves_the_beam_or_stays(back_emf):
     """u I = R I^2 + damping + d/dt of the stored energy, of any state, where K_v is K_f."""
     shaker = jb.Electrodynamic(0.5, 0.82, 5e-5, 4.2, back_emf, 0.02, 9700.0, 0.55)
     case = jb.Case(jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03), actuators=[shaker])
-    model = eqx.filter_jit(rig)(case, lay_out(case))
+    model = eqx.filter_jit(modal_model)(case, mesh_layout(case))
     matrix = np.asarray(model.state_matrix[0])
     state = np.random.default_rng(1).standard_normal(7)
     volts, current, rates = 3.0, state[6], state[1:6:2]
@@ -84,7 +84,7 @@ def test_energy_into_a_coil_heats_it_moves_the_beam_or_stays(back_emf):
     lost = -rates @ matrix[1:6:2, 1:6:2] @ rates + 0.82 * current**2
     assert lost > 0
     created = ((4.2 - (4.2 if back_emf is None else back_emf)) * current) * float(
-        model.strokes[0] @ rates
+        model.displacement_map[0] @ rates
     )
     assert_allclose(volts * current + created, stored + lost, rtol=1e-10)
 
@@ -134,6 +134,6 @@ def test_a_ball_crosses_a_beam_with_a_shorted_coil():
 
 
 def test_a_steady_voltage_makes_a_steady_force():
-    assert_allclose(V4.attachment().steady, 4.2 / 0.82, rtol=1e-15)
-    assert_allclose(jb.Shaker(0.1, force_per_volt=4.6).attachment().steady, 4.6, rtol=1e-15)
-    assert jnp.ndim(jb.PointForce(0.1).attachment().steady) == 0
+    assert_allclose(V4.attachment().static_gain, 4.2 / 0.82, rtol=1e-15)
+    assert_allclose(jb.Shaker(0.1, force_per_volt=4.6).attachment().static_gain, 4.6, rtol=1e-15)
+    assert jnp.ndim(jb.PointForce(0.1).attachment().static_gain) == 0

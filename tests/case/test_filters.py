@@ -9,12 +9,12 @@ from numpy.testing import assert_allclose
 
 from jaxbeam.case.filters import (
     Filter,
-    analogue,
-    analogue_initial,
+    analogue_state_space,
+    analogue_steady_state,
     filter_history,
     filter_step,
-    initial,
-    sections,
+    steady_filter_state,
+    second_order_sections,
 )
 from jaxbeam.numerics.discretisation import c2d
 from tests.differences import central
@@ -33,7 +33,7 @@ def designed(order, cutoff):
 @pytest.mark.parametrize("cutoff", [10.0, 120.0, 480.0])
 def test_sections_respond_as_those_of_scipy(order, cutoff):
     frequencies = np.linspace(0.01, 499.0, 200)
-    ours = np.asarray(sections(Filter(cutoff, order), PERIOD))
+    ours = np.asarray(second_order_sections(Filter(cutoff, order), PERIOD))
     found = scipy.signal.sosfreqz(ours, frequencies, fs=1 / PERIOD)[1]
     expected = scipy.signal.sosfreqz(designed(order, cutoff), frequencies, fs=1 / PERIOD)[1]
     seen = np.abs(expected) > 1e-12
@@ -45,16 +45,16 @@ def test_sections_respond_as_those_of_scipy(order, cutoff):
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("cutoff", [10.0, 120.0])
 def test_a_history_is_that_of_sosfilt(order, cutoff):
-    rows = sections(Filter(cutoff, order), PERIOD)
-    rest = initial(rows, np.zeros(3))
+    rows = second_order_sections(Filter(cutoff, order), PERIOD)
+    rest = steady_filter_state(rows, np.zeros(3))
     expected = scipy.signal.sosfilt(designed(order, cutoff), SIGNAL, axis=0)
     found = filter_history(rows, rest, jnp.asarray(SIGNAL))
     assert_allclose(found, expected, rtol=0, atol=1e-10 * np.max(np.abs(SIGNAL)))
 
 
 def test_steps_add_up_to_the_history():
-    rows = sections(Filter(40.0, 5), PERIOD)
-    memory = initial(rows, np.ones(3))
+    rows = second_order_sections(Filter(40.0, 5), PERIOD)
+    memory = steady_filter_state(rows, np.ones(3))
     expected = filter_history(rows, memory, jnp.asarray(SIGNAL[:20]))
     for sample, output in zip(SIGNAL[:20], expected, strict=True):
         found, memory = filter_step(rows, memory, jnp.asarray(sample))
@@ -63,38 +63,38 @@ def test_steps_add_up_to_the_history():
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_a_filter_at_rest_stays_there(order):
-    rows = sections(Filter(20.0, order), PERIOD)
+    rows = second_order_sections(Filter(20.0, order), PERIOD)
     level = np.array([2.0, -3.0, 0.5])
-    found = filter_history(rows, initial(rows, level), jnp.broadcast_to(level, (50, 3)))
+    found = filter_history(rows, steady_filter_state(rows, level), jnp.broadcast_to(level, (50, 3)))
     assert_allclose(found, np.broadcast_to(level, (50, 3)), rtol=1e-9)
 
 
 def test_lanes_may_have_filters_of_their_own():
     cutoffs = jnp.array([10.0, 50.0, 200.0])
-    rows = jax.vmap(lambda c: sections(Filter(c, 3), PERIOD), out_axes=-1)(cutoffs)
-    found = filter_history(rows, initial(rows, np.zeros(3)), jnp.asarray(SIGNAL))
+    rows = jax.vmap(lambda c: second_order_sections(Filter(c, 3), PERIOD), out_axes=-1)(cutoffs)
+    found = filter_history(rows, steady_filter_state(rows, np.zeros(3)), jnp.asarray(SIGNAL))
     for i, cutoff in enumerate(cutoffs):
         expected = scipy.signal.sosfilt(designed(3, float(cutoff)), SIGNAL[:, i])
         assert_allclose(found[:, i], expected, rtol=0, atol=1e-11 * np.max(np.abs(SIGNAL)))
 
 
 def test_between_fresh_samples_the_output_is_held():
-    rows = sections(Filter(50.0, 4), 5 * PERIOD)
+    rows = second_order_sections(Filter(50.0, 4), 5 * PERIOD)
     fresh = np.arange(400) % 5 == 0
-    found = filter_history(rows, initial(rows, np.zeros(3)), jnp.asarray(SIGNAL), jnp.array(fresh))
-    slow = filter_history(rows, initial(rows, np.zeros(3)), jnp.asarray(SIGNAL[::5]))
+    found = filter_history(rows, steady_filter_state(rows, np.zeros(3)), jnp.asarray(SIGNAL), jnp.array(fresh))
+    slow = filter_history(rows, steady_filter_state(rows, np.zeros(3)), jnp.asarray(SIGNAL[::5]))
     assert_allclose(found, np.repeat(slow, 5, axis=0), rtol=0, atol=0)
 
 
 def test_a_cutoff_above_half_the_sampling_frequency_is_refused():
     with pytest.raises(ValueError, match="below half the sampling frequency, 500 Hz; it is 500 Hz"):
-        sections(Filter(500.0, 2), PERIOD)
+        second_order_sections(Filter(500.0, 2), PERIOD)
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_an_analogue_filter_responds_as_that_of_scipy(order):
     cutoff = 30.0
-    matrix, column, row, direct = analogue(Filter(cutoff, order, realisation="analogue"))
+    matrix, column, row, direct = analogue_state_space(Filter(cutoff, order, realisation="analogue"))
     omega = 2 * np.pi * np.logspace(-1, 3, 60)
     inverse = np.linalg.inv(1j * omega[:, None, None] * np.eye(order) - np.asarray(matrix))
     found = np.einsum("i,wij,j->w", row, inverse, column) + direct
@@ -102,7 +102,7 @@ def test_an_analogue_filter_responds_as_that_of_scipy(order):
     poles, gain = 2 * np.pi * cutoff * poles, gain * (2 * np.pi * cutoff) ** order
     expected = scipy.signal.freqs_zpk(zeros, poles, gain, omega)[1]
     assert_allclose(found, expected, rtol=1e-8, atol=1e-14)
-    rest = analogue_initial(Filter(cutoff, order), 2.0)
+    rest = analogue_steady_state(Filter(cutoff, order), 2.0)
     assert_allclose(matrix @ rest + column * 2.0, 0.0, atol=1e-12)
     assert_allclose(row @ rest, 2.0, rtol=1e-15)
 
@@ -110,7 +110,7 @@ def test_an_analogue_filter_responds_as_that_of_scipy(order):
 @pytest.mark.parametrize("order", [1, 4, 7])
 def test_holds_are_exact(order):
     """Zero order against cont2discrete, first order against lsim, cubics against both halves."""
-    matrix, column, row, direct = analogue(Filter(30.0, order))
+    matrix, column, row, direct = analogue_state_space(Filter(30.0, order))
     system = matrix, column[:, None], row[None], direct[None, None]
     drift, push = c2d(matrix, column[:, None], PERIOD)
     discrete = scipy.signal.cont2discrete([np.asarray(x) for x in system], PERIOD)
@@ -138,11 +138,11 @@ def test_holds_are_exact(order):
 @pytest.mark.parametrize("order", [3, 10])
 def test_derivatives_by_the_cutoff(order):
     def digital(cutoff):
-        rows = sections(Filter(cutoff[0], order), PERIOD)
-        return filter_history(rows, initial(rows, 0.3), jnp.asarray(SIGNAL[:80, 0]))
+        rows = second_order_sections(Filter(cutoff[0], order), PERIOD)
+        return filter_history(rows, steady_filter_state(rows, 0.3), jnp.asarray(SIGNAL[:80, 0]))
 
     def continuous(cutoff):
-        matrix, column, _, _ = analogue(Filter(cutoff[0], order))
+        matrix, column, _, _ = analogue_state_space(Filter(cutoff[0], order))
         return jnp.concatenate([part.ravel() for part in c2d(matrix, column[:, None], 0.01)])
 
     at = jnp.array([60.0])

@@ -7,8 +7,8 @@ from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 
-from jaxbeam.case.trajectory import Braking, Tabulated
-from jaxbeam.model.contact import Traffic
+from jaxbeam.case.trajectory import BrakingTrajectory, TabulatedTrajectory
+from jaxbeam.model.contact import LoadSet
 
 LENGTH = jnp.asarray(2.0)
 KNOTS = np.array([0.0, 0.3, 0.7, 0.8, 1.5])
@@ -38,15 +38,15 @@ def agree(motion, times):
 def test_pieces_of_braking_loads_are_their_path(speed, way, entry, braking):
     """To a halt on the beam, over it, or ever faster."""
     numbers = (jnp.asarray(x) for x in (way * speed, entry, braking))
-    motion = Braking(*numbers, LENGTH)
-    leaves = float(motion.window()[1])
+    motion = BrakingTrajectory(*numbers, LENGTH)
+    leaves = float(motion.entry_exit_times()[1])
     agree(motion, entry + np.linspace(0.0, min(leaves - entry, 5.0), 23)[1:-1])
 
 
 @pytest.mark.parametrize("points", [2, 3, 5])
 def test_pieces_of_tables_are_splines(points):
     knots, places = KNOTS[:points], PLACES[:points]
-    motion = Tabulated(jnp.asarray(knots), jnp.asarray(places), LENGTH)
+    motion = TabulatedTrajectory(jnp.asarray(knots), jnp.asarray(places), LENGTH)
     times = np.linspace(knots[0], knots[-1], 40)[1:-1]
     agree(motion, times)
     spline = CubicSpline(knots, places)  # not-a-knot, with few points a parabola or a line
@@ -56,12 +56,12 @@ def test_pieces_of_tables_are_splines(points):
 
 def test_loads_of_different_kinds_have_equally_many_pieces():
     motions = (
-        Braking(jnp.asarray(1.0), jnp.asarray(0.2), jnp.asarray(0.5), LENGTH),
-        Tabulated(jnp.asarray(KNOTS), jnp.asarray(PLACES), LENGTH),
+        BrakingTrajectory(jnp.asarray(1.0), jnp.asarray(0.2), jnp.asarray(0.5), LENGTH),
+        TabulatedTrajectory(jnp.asarray(KNOTS), jnp.asarray(PLACES), LENGTH),
     )
     nothing = jnp.zeros((2, 1))
-    since, cubics = Traffic(motions, nothing, nothing).pieces()
+    since, cubics = LoadSet(motions, nothing, nothing).cubics()
     assert since.shape == (2, 5) and cubics.shape == (2, 5, 4)
     assert_allclose(since[0], [0.2, 2.2, np.inf, np.inf, np.inf])
-    assert_allclose(cubics[1], motions[1].pieces()[1])
-    assert Traffic((), nothing[:0], nothing[:0]).pieces()[1].shape == (0, 1, 4)
+    assert_allclose(cubics[1], motions[1].cubics()[1])
+    assert LoadSet((), nothing[:0], nothing[:0]).cubics()[1].shape == (0, 1, 4)

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 
 from jaxbeam.case.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
-from jaxbeam.case.beam import ENDS, Beam, Support
+from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run, replace
 from jaxbeam.case.loads import MovingForce, MovingMass
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from tests.strategies import cases
 
 RIG = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}
@@ -39,17 +39,17 @@ CASE = Case(
 
 @given(cases())
 def test_valid_cases_pass(case):
-    check(case)
+    check_case(case)
 
 
 def test_our_own_case_passes():
-    check(CASE)
+    check_case(CASE)
 
 
-@pytest.mark.parametrize("left", ENDS)
-@pytest.mark.parametrize("right", ENDS)
+@pytest.mark.parametrize("left", END_CONDITIONS)
+@pytest.mark.parametrize("right", END_CONDITIONS)
 def test_all_ends_pass(left, right):
-    check(Case(Beam(**RIG, ends=f"{left}-{right}")))
+    check_case(Case(Beam(**RIG, ends=f"{left}-{right}")))
 
 
 # Replaced numbers, and what the message must say.
@@ -186,8 +186,8 @@ def test_wrong_shapes_and_types_are_refused():
 
 
 def test_negative_speed_and_rounded_places_pass():
-    check(replace(CASE, {"loads.0.speed": -0.5, "sensors.0.position": 3 * 0.2}))
-    check(Case(BEAM, actuators=[SpringDamper(0.0, 1.0)], supports=[Support(0.6)]))
+    check_case(replace(CASE, {"loads.0.speed": -0.5, "sensors.0.position": 3 * 0.2}))
+    check_case(Case(BEAM, actuators=[SpringDamper(0.0, 1.0)], supports=[Support(0.6)]))
 
 
 def test_unknown_numbers_are_passed_over():
@@ -195,7 +195,7 @@ def test_unknown_numbers_are_passed_over():
 
     def length(value):
         case = replace(CASE, {"beam.length": value, "loads.0.speed": 0 * value})
-        check(case)
+        check_case(case)
         return case.beam.length
 
     assert jax.jit(length)(-1.0) == -1.0
@@ -205,15 +205,15 @@ def test_unknown_numbers_are_passed_over():
 
 
 def test_a_check_takes_milliseconds():
-    check(CASE)
+    check_case(CASE)
     start = time.perf_counter()
     for _ in range(10):
-        check(CASE)
+        check_case(CASE)
     assert time.perf_counter() - start < 0.5, "ten checks should take far less than 50 ms"
 
 
 def refuses(case, message):
     """The case is refused with one sentence that contains the message."""
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
-        check(case)
+        check_case(case)
     assert "\n" not in str(caught.value)

@@ -10,20 +10,20 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.static_correction import residual_lift
+from jaxbeam.analysis.static_correction import residual_actuator_gain
 from jaxbeam.case.case import replace
-from jaxbeam.model.channels import common_pairs, shaker_chain
+from jaxbeam.model.channels import common_pairs, shaker_channels
 from jaxbeam.model.frequency_response import (
     accelerance,
-    extremes,
     frequency_response,
     mobility,
     poles,
     receptance,
+    resonances_and_antiresonances,
     zeros,
 )
-from jaxbeam.model.modal_model import rig
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.modes import mesh_layout
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import finite_elements
@@ -89,14 +89,14 @@ def turns(frequencies, size):
 
 @pytest.mark.parametrize("parked", [[], HALF_KILO, [(0.1, 0.2), (0.45, 0.7)]])
 def test_the_chain_of_the_thesis(parked):
-    found = frequency_response(RIG_A, F[1:], shaker_chain(0), parked)
+    found = frequency_response(RIG_A, F[1:], shaker_channels(0), parked)
     assert_allclose(found.values, formulas(F[1:], parked=parked), rtol=1e-9)
     assert [pair.unit for pair in found.pairs] == ["A/V", "N/V", "1", "N/V"]
 
 
 def test_figures_2_15_and_2_18_without_a_mass():
     f = np.linspace(0.5, 400.0, 40001)
-    found = frequency_response(RIG_A, f, shaker_chain(0))
+    found = frequency_response(RIG_A, f, shaker_channels(0))
     current, _, passed, total = np.asarray(found.magnitude).T
     assert_allclose(total[0], 2.38, atol=0.005)
     assert np.ptp(total[f < 5]) < 0.1 * total[0]
@@ -110,13 +110,13 @@ def test_figures_2_15_and_2_18_without_a_mass():
 
 def test_figure_2_16_with_half_a_kilogram_in_the_middle():
     f = np.linspace(0.5, 40.0, 8001)
-    total = np.asarray(frequency_response(RIG_A, f, shaker_chain(0)[3:], HALF_KILO).magnitude)[:, 0]
+    total = np.asarray(frequency_response(RIG_A, f, shaker_channels(0)[3:], HALF_KILO).magnitude)[:, 0]
     dips, peaks = turns(f, total)
     assert_allclose(peaks, [[13.1, 20.2]], atol=0.05)
     # Force drops where the beam alone, with the mass, would ring: finite elements.
     assert_allclose(dips[:, 0], loaded_frequency(), rtol=5e-3)
     undamped = replace(RIG_A, {"beam.damping_ratio": 0.0})
-    total = np.asarray(frequency_response(undamped, f, shaker_chain(0)[3:], HALF_KILO).magnitude)
+    total = np.asarray(frequency_response(undamped, f, shaker_channels(0)[3:], HALF_KILO).magnitude)
     assert_allclose(turns(f, total[:, 0])[1], [[13.05, 27.6]], atol=0.05)
 
 
@@ -141,7 +141,7 @@ def test_figure_2_20_a_beam_less_mobile_than_the_shaker():
     """Coil force reaches it whole, and voltage to force is a first-order lag, R / L."""
     stiff = jb.Case(jb.Beam(0.6, 1.022e5, 11.016, damping_ratio=0.03, modes=4), actuators=[V4])
     f = np.array([1.0, 10.0, 30.0, 100.0])
-    *_, passed, total = np.asarray(frequency_response(stiff, f, shaker_chain(0)).values).T
+    *_, passed, total = np.asarray(frequency_response(stiff, f, shaker_channels(0)).values).T
     assert_allclose(passed, 1.0, atol=2e-3)
     assert_allclose(total, 4.2 / (0.82 + 5e-5 * 2j * np.pi * f), rtol=5e-3)
 
@@ -149,9 +149,9 @@ def test_figure_2_20_a_beam_less_mobile_than_the_shaker():
 def test_poles_and_zeros_of_the_shaker():
     """Force drops where the bare beam is free to ring; the coil adds one fast pole."""
     bare = jb.Case(RIG_A.beam)
-    found = zeros(RIG_A, shaker_chain(0)[3])
+    found = zeros(RIG_A, shaker_channels(0)[3])
     assert_allclose(found, poles(bare), rtol=1e-7)
-    assert_allclose(zeros(RIG_A, shaker_chain(0)[3], HALF_KILO), poles(bare, HALF_KILO), rtol=1e-7)
+    assert_allclose(zeros(RIG_A, shaker_channels(0)[3], HALF_KILO), poles(bare, HALF_KILO), rtol=1e-7)
     natural = (np.arange(1, 5) * np.pi / 0.6) ** 2 * np.sqrt(11.68 / 0.535)
     assert_allclose(np.abs(poles(bare)), np.repeat(natural, 2), rtol=1e-9)
     ringing = poles(RIG_A)
@@ -165,7 +165,7 @@ def test_poles_and_zeros_of_the_shaker():
 
 def test_python_control_has_the_same_responses_of_the_state_space():
     """Deflection, velocity, slope and strain are rows of the states; acceleration needs B too."""
-    model = eqx.filter_jit(rig)(GENERAL, lay_out(GENERAL))
+    model = eqx.filter_jit(modal_model)(GENERAL, mesh_layout(GENERAL))
     A, B = np.asarray(model.state_matrix[0]), np.asarray(model.command_matrix)
     rows, direct = np.zeros((5, len(A))), np.zeros((5, 4))
     rows[0, 0:8:2] = model.shapes(1.1, (0,))[0]
@@ -229,7 +229,7 @@ def test_finite_elements_with_patch_coil_and_parked_masses():
     errors = np.abs(np.asarray(found.values) - expected)
     assert np.all(errors < 1e-3 * np.abs(expected).max(axis=0))
     # What the other modes add to the slowly converging patch hardly depends on the frequency.
-    corrected = np.asarray(found.values)[:, 0] + float(residual_lift(case, 0.45)[0])
+    corrected = np.asarray(found.values)[:, 0] + float(residual_actuator_gain(case, 0.45)[0])
     assert np.abs(corrected - np.array(expected)[:, 0]).max() < errors[:, 0].max() / 5
 
 
@@ -249,7 +249,7 @@ def test_reciprocity():
 
 def test_responses_differentiate_inside_jit():
     names = ("beam.flexural_rigidity", "actuators.0.resistance", "sensors.0.position")
-    layout, pairs = lay_out(RIG_A), common_pairs(RIG_A)
+    layout, pairs = mesh_layout(RIG_A), common_pairs(RIG_A)
     point = np.array([11.68, 0.82, 0.25])
 
     @jax.jit
@@ -297,8 +297,8 @@ def test_record_has_labels_and_units(tmp_path):
 
 def test_extremes_lie_between_the_samples():
     f = np.geomspace(5.0, 50.0, 200)
-    response = frequency_response(RIG_A, f, shaker_chain(0)[3:])
-    first, dip, peak = extremes(response, 0)
+    response = frequency_response(RIG_A, f, shaker_channels(0)[3:])
+    first, dip, peak = resonances_and_antiresonances(response, 0)
     assert [word for word, *_ in (first, dip, peak)] == ["first", "dip", "peak"]
     assert_allclose(first[1:], [5.0, float(response.magnitude[0, 0])])
     assert_allclose(dip[1:], [20.325, 0.32133], rtol=2e-3)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from jaxbeam.case.actuators import Patch
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.model.modes import Modes, lay_out, modes
+from jaxbeam.model.modes import Modes, mesh_layout, modes
 from tests.differences import central
 from tests.solved_modes import STUFF, solve
 
@@ -67,14 +67,14 @@ def assert_derivatives(function, size: int, ways=REVERSE, floor: float = 0.0) ->
     ids=["section", "rigidity"],
 )
 def test_derivatives_of_frequencies_and_shapes_in_every_number(case, numbers, ways):
-    layout, x = lay_out(case), jnp.array([0.1, 0.62, 1.0])
+    layout, x = mesh_layout(case), jnp.array([0.1, 0.62, 1.0])
     start = np.array([float(value_at(case, address)) for address in numbers])
 
     @jax.jit
     def quantities(change):
         changed = replace(case, dict(zip(numbers, start * (1 + change), strict=True)))
         found = modes(changed, layout)
-        shapes = found.shapes_together(x, (0, 1, 2))
+        shapes = found.shape_derivatives(x, (0, 1, 2))
         return jnp.concatenate([found.stiffness, found.damping, shapes.ravel()])
 
     assert_derivatives(quantities, len(numbers), ways)
@@ -82,7 +82,7 @@ def test_derivatives_of_frequencies_and_shapes_in_every_number(case, numbers, wa
 
 def flexibility(found: Modes, x) -> jax.Array:
     """psi(x)' (s^2 + s D + K)^-1 psi(x), what the response is made of, free of how modes mix."""
-    s = jnp.sqrt(found.unit)
+    s = jnp.sqrt(found.stiffness_unit)
     stiffness = jnp.diag(found.stiffness) + found.coupling
     damping = jnp.diag(found.damping) + found.damping_coupling
     dynamic = s**2 * jnp.eye(stiffness.shape[0]) + s * damping + stiffness
@@ -126,7 +126,7 @@ REPEATED = {
 
 def response(case: Case, numbers: list[str]):
     """The flexibility as a function of relative changes of some numbers."""
-    layout, x = lay_out(case), jnp.array([0.13, 0.45, 0.8])
+    layout, x = mesh_layout(case), jnp.array([0.13, 0.45, 0.8])
     start = np.array([float(value_at(case, address)) for address in numbers])
 
     @jax.jit
@@ -141,7 +141,7 @@ def response(case: Case, numbers: list[str]):
 @pytest.mark.parametrize("name", REPEATED)
 def test_responses_have_derivatives_where_frequencies_are_repeated(name):
     case, numbers = REPEATED[name]
-    assert bool(solve(case).repeated)
+    assert bool(solve(case).has_repeated)
     # Spans that a stiff spring keeps apart answer each other with 1e-11 of their own response.
     assert_derivatives(response(case, numbers), len(numbers), floor=1e-4)
 
@@ -162,7 +162,7 @@ def test_second_derivatives_where_frequencies_are_repeated(case):
 def test_a_free_beam_feels_the_first_newton_per_metre_that_holds_it():
     """Rigid-body modes at zero: one-sided differences, for a stiffness cannot be negative."""
     case = Case(Beam(1.2, **STUFF, ends="free-free", modes=5), [Support(0.3, 0.0, 0.0, 0.0)])
-    layout, x = lay_out(case), jnp.array([0.13, 0.8])
+    layout, x = mesh_layout(case), jnp.array([0.13, 0.8])
 
     @jax.jit
     def function(stiffness):

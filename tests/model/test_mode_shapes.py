@@ -48,7 +48,7 @@ def test_shapes_are_orthonormal_and_join(case):
     found = solve(case)
     assert_allclose(products(case), np.eye(case.beam.modes), atol=1e-11)
     for node in found.nodes[1:-1]:
-        before, after = (found.shapes_together(node + d, (0, 1)) for d in (-1e-9, 1e-9))
+        before, after = (found.shape_derivatives(node + d, (0, 1)) for d in (-1e-9, 1e-9))
         # A shape changes by its slope times 2e-9 m, far below the tolerance.
         assert_allclose(before, after, rtol=0, atol=1e-6 * np.abs(after).max())
     for support in case.supports:

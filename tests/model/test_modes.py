@@ -126,5 +126,5 @@ def random_beams(draw) -> Case:
 def test_random_beams_have_exact_frequencies(case):
     # What is softer than a thousandth of the beam is zero to the oracle.
     expected = exact_frequencies(as_oracle(case), 5)
-    unit = np.sqrt(float(solve(case).unit))
+    unit = np.sqrt(float(solve(case).stiffness_unit))
     assert_allclose(solve(case).angular_frequencies, expected, rtol=1e-9, atol=1e-3 * unit)

@@ -13,10 +13,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.model.measurement import measure
-from jaxbeam.model.sensor_signals import convert, design, init, noise_samples, read, sense
+from jaxbeam.model.measurement import sensor_readings
+from jaxbeam.model.sensor_signals import (
+    to_reading,
+    filter_sections,
+    filtered_reading,
+    initial_filter_state,
+    noise_samples,
+    sampled_readings,
+)
 from tests.differences import central
 
 TIMES = jnp.arange(201) / 1000.0
@@ -36,14 +43,14 @@ VALUES, RATES = jnp.asarray(wave(TIMES)), jnp.asarray(wave(TIMES, 1))
 
 def test_offset_noise_range_and_resolution_in_this_order():
     sensor = Sensor(0.3, offset=0.5, noise=0.1, range=[-2.0, 2.0], resolution=0.25)
-    found = convert(sensor, jnp.array([0.0, 0.0, 1.4, -9.0]), jnp.array([0.0, 2.0, 1.0, 1.0]))
+    found = to_reading(sensor, jnp.array([0.0, 0.0, 1.4, -9.0]), jnp.array([0.0, 2.0, 1.0, 1.0]))
     assert_allclose(found, [0.5, 0.75, 2.0, -2.0], rtol=0, atol=0)
-    assert_allclose(convert(sensor, 0.3), 0.75)  # without noise
+    assert_allclose(to_reading(sensor, 0.3), 0.75)  # without noise
 
 
 def test_derivatives_pass_through_rounding_and_stop_at_the_range():
     sensor = Sensor(0.3, range=[-2.0, 2.0], resolution=0.25)
-    slope = jax.vmap(jax.grad(lambda v: convert(sensor, v)))(jnp.array([0.3, 1.9, 2.1, -5.0]))
+    slope = jax.vmap(jax.grad(lambda v: to_reading(sensor, v)))(jnp.array([0.3, 1.9, 2.1, -5.0]))
     assert_allclose(slope, [1.0, 1.0, 0.0, 0.0], rtol=0, atol=0)
 
 
@@ -52,7 +59,7 @@ def test_noise_is_that_of_the_seed_and_of_the_stated_size():
     assert_array_equal(drawn, noise_samples(3, 2, 20000))
     assert_array_equal(drawn[:, 0], noise_samples(3, 1, 20000)[:, 0])
     assert np.max(np.abs(drawn - noise_samples(4, 2, 20000))) > 1
-    assert Sensor(0.3, noise=0.1).noise_covariance == 0.1**2 and Sensor(0.3).noise_covariance == 0
+    assert Sensor(0.3, noise=0.1).noise_variance == 0.1**2 and Sensor(0.3).noise_variance == 0
     assert_allclose(np.std(drawn, axis=0), 1.0, atol=0.02)
     assert_allclose(np.corrcoef(drawn.T)[0, 1], 0.0, atol=0.03)
 
@@ -60,17 +67,17 @@ def test_noise_is_that_of_the_seed_and_of_the_stated_size():
 def test_reading_sample_by_sample_is_reading_at_once():
     sensor = Sensor(0.3, offset=0.2, noise=0.01, resolution=1e-3, filter=Filter(20.0, 3))
     noise = noise_samples(0, 1, 201)[:, 0]
-    sections = design(sensor, 1e-3)
-    memory = init(sensor, sections, jnp.zeros(()))
-    step = jax.jit(read)
+    sections = filter_sections(sensor, 1e-3)
+    memory = initial_filter_state(sensor, sections, jnp.zeros(()))
+    step = jax.jit(filtered_reading)
     found = []
     for value, drawn in zip(VALUES, noise, strict=True):
         reading, memory = step(sensor, sections, memory, value, drawn)
         found.append(reading)
-    assert_allclose(found, sense(sensor, TIMES, VALUES, RATES, noise), rtol=0, atol=1e-13)
-    lanes = init(sensor, sections, jnp.zeros(4))
-    together, _ = read(sensor, sections, lanes, jnp.linspace(0, 1, 4), None)
-    alone, _ = read(sensor, sections, lanes[..., 2], jnp.array(2 / 3), None)
+    assert_allclose(found, sampled_readings(sensor, TIMES, VALUES, RATES, noise), rtol=0, atol=1e-13)
+    lanes = initial_filter_state(sensor, sections, jnp.zeros(4))
+    together, _ = filtered_reading(sensor, sections, lanes, jnp.linspace(0, 1, 4), None)
+    alone, _ = filtered_reading(sensor, sections, lanes[..., 2], jnp.array(2 / 3), None)
     assert_allclose(together[2], alone, rtol=1e-14)
 
 
@@ -79,7 +86,7 @@ def test_a_digital_filter_is_that_of_scipy_from_rest():
     sos = scipy.signal.butter(6, 15.0, fs=1000.0, output="sos")
     rest = scipy.signal.sosfilt_zi(sos) * 0.7
     expected = scipy.signal.sosfilt(sos, np.asarray(VALUES) + 0.7, zi=rest)[0]
-    assert_allclose(sense(sensor, TIMES, VALUES, RATES), expected, rtol=0, atol=1e-11)
+    assert_allclose(sampled_readings(sensor, TIMES, VALUES, RATES), expected, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("order", [1, 4])
@@ -88,15 +95,15 @@ def test_an_analogue_filter_is_that_of_scipy(order):
     fine = np.linspace(0.0, 0.2, 20001)  # lsim takes the signal to be straight in between
     system = scipy.signal.butter(order, 2 * np.pi * 15.0, analog=True)
     expected = scipy.signal.lsim(system, wave(fine), fine)[1][::100]
-    found = sense(sensor, TIMES, VALUES, RATES)
+    found = sampled_readings(sensor, TIMES, VALUES, RATES)
     assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
 def test_a_delay_shows_the_past():
-    whole = sense(Sensor(0.3, delay=0.01), TIMES, VALUES, RATES)
+    whole = sampled_readings(Sensor(0.3, delay=0.01), TIMES, VALUES, RATES)
     assert_allclose(whole[10:], VALUES[:-10], rtol=0, atol=1e-13)
     assert_allclose(whole[:10], 0.0, atol=1e-15)
-    between = sense(Sensor(0.3, delay=0.00437), TIMES, VALUES, RATES)
+    between = sampled_readings(Sensor(0.3, delay=0.00437), TIMES, VALUES, RATES)
     # Cubics are right to (omega h)^4 / 384.
     assert_allclose(between[5:], wave(TIMES - 0.00437)[5:], rtol=0, atol=5e-8)
 
@@ -104,11 +111,11 @@ def test_a_delay_shows_the_past():
 def test_a_clock_holds_its_readings():
     sensor = Sensor(0.3, sampling_period=0.004, noise=0.1)
     noise = noise_samples(0, 1, 201)[:, 0]
-    found = sense(sensor, TIMES, VALUES, RATES, noise)
+    found = sampled_readings(sensor, TIMES, VALUES, RATES, noise)
     expected = np.repeat(VALUES[::4] + 0.1 * noise[: len(VALUES[::4])], 4)[:201]
     assert_allclose(found, expected, rtol=0, atol=1e-13)
     # Not a multiple of the time between samples: the readings are those at its own times.
-    odd = sense(Sensor(0.3, sampling_period=0.0033), TIMES, VALUES, RATES)
+    odd = sampled_readings(Sensor(0.3, sampling_period=0.0033), TIMES, VALUES, RATES)
     ticks = 0.0033 * np.floor(np.asarray(TIMES) / 0.0033 + 1e-9)
     assert_allclose(odd, wave(ticks), rtol=0, atol=5e-8)
 
@@ -117,7 +124,7 @@ def test_a_clock_drives_its_filter():
     sensor = Sensor(0.3, sampling_period=0.004, filter=Filter(20.0, 3))
     sos = scipy.signal.butter(3, 20.0, fs=250.0, output="sos")
     expected = np.repeat(scipy.signal.sosfilt(sos, VALUES[::4]), 4)[:201]
-    assert_allclose(sense(sensor, TIMES, VALUES, RATES), expected, rtol=0, atol=1e-12)
+    assert_allclose(sampled_readings(sensor, TIMES, VALUES, RATES), expected, rtol=0, atol=1e-12)
 
 
 def test_unsuitable_times_are_refused():
@@ -125,10 +132,10 @@ def test_unsuitable_times_are_refused():
     for realisation in ("digital", "analogue"):
         sensor = Sensor(0.3, filter=Filter(20.0, 3, realisation=realisation))
         with pytest.raises(ValueError, match="equal spacing"):
-            sense(sensor, uneven, VALUES, RATES)
+            sampled_readings(sensor, uneven, VALUES, RATES)
     fast = Sensor(0.3, sampling_period=1e-4, filter=Filter(20.0, 3))
     with pytest.raises(ValueError, match="a reading every 0.0001 s, but .* 0.001 s apart"):
-        sense(fast, TIMES, VALUES, RATES)
+        sampled_readings(fast, TIMES, VALUES, RATES)
 
 
 @pytest.mark.parametrize("realisation", ["digital", "analogue"])
@@ -144,7 +151,7 @@ def test_derivatives_of_readings(realisation):
             sampling_period=2e-3,
             delay=0.01 * delay,
         )
-        return sense(sensor, TIMES, VALUES, RATES)
+        return sampled_readings(sensor, TIMES, VALUES, RATES)
 
     at = jnp.array([0.1, 1.0, 0.53])
     readings = jax.jit(readings)
@@ -199,14 +206,14 @@ def test_noise_is_in_the_record_but_not_in_predictions(record):
     assert_allclose(difference, 1e-3 * noise_samples(11, 4, 801), rtol=0, atol=1e-12)
     assert_array_equal(noisy.measured, noisy.measured)
     motion = noisy.coordinates, noisy.rates, noisy.accelerations
-    assert_array_equal(measure(noisy.case, noisy.modes, *motion), record.measured)
+    assert_array_equal(sensor_readings(noisy.case, noisy.modes, *motion), record.measured)
 
 
 def test_readings_that_need_times_ask_for_them(record):
     delayed = fitted_with(record, delay=0.1)
     motion = delayed.coordinates, delayed.rates, delayed.accelerations
     with pytest.raises(ValueError, match=r"sensors.0 .* its readings need times"):
-        measure(delayed.case, delayed.modes, *motion)
+        sensor_readings(delayed.case, delayed.modes, *motion)
     fast = fitted_with(record, filter=Filter(100.0), sampling_period=1e-4)
     with pytest.raises(ValueError, match=r"sensors.0: its filter takes a reading every 0.0001 s"):
         _ = fast.measured
@@ -250,7 +257,7 @@ FAULTS = [
 @pytest.mark.parametrize(("changes", "message"), FAULTS)
 def test_faulty_sensors_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
-        check(dataclasses.replace(CASE, sensors=(Sensor(0.25, **changes),)))
+        check_case(dataclasses.replace(CASE, sensors=(Sensor(0.25, **changes),)))
 
 
 @pytest.mark.parametrize(
@@ -271,9 +278,9 @@ def test_faulty_tables_of_a_filter_are_refused(filter, message):
 def test_a_filter_may_be_slower_than_it_seems():
     """An analogue filter, and one whose controller decides the sampling, know no such bound."""
     analogue = Filter(5000.0, realisation="analogue")
-    check(dataclasses.replace(CASE, sensors=(Sensor(0.25, filter=analogue),)))
+    check_case(dataclasses.replace(CASE, sensors=(Sensor(0.25, filter=analogue),)))
 
 
 def test_seeds_are_whole_numbers():
     with pytest.raises(ValueError, match="run.seed must be a whole number, 0 or more; it is -1"):
-        check(dataclasses.replace(CASE, run=jb.Run(0.4, seed=-1)))
+        check_case(dataclasses.replace(CASE, run=jb.Run(0.4, seed=-1)))

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import state_space
 from tests.differences import central
 from tests.oracles.loads import GRAVITY, Load
@@ -110,7 +110,7 @@ def _direct(system, t):
 def test_free_vibration_is_that_of_python_control(system, record):
     left = np.flatnonzero(np.asarray(record.times) > 0.3)[0]
     modal = np.stack([record.coordinates, record.rates], axis=2).reshape(-1, 6)
-    start = system.from_rig(jnp.append(modal[left], 0.0))  # the shaker is not driven
+    start = system.from_modal(jnp.append(modal[left], 0.0))  # the shaker is not driven
     model = system.unloaded.to_control()
     times = np.asarray(record.times[left:]) - float(record.times[left])
     found = control.initial_response(model, times, np.asarray(start)).outputs.T
@@ -118,7 +118,7 @@ def test_free_vibration_is_that_of_python_control(system, record):
     for i in range(len(SENSORS)):
         size = np.max(np.abs(np.asarray(record.measured[:, i])))
         assert_allclose(found[:, i], expected[:, i], rtol=0, atol=1e-9 * size)
-    assert_allclose(system.to_rig(start), jnp.append(modal[left], 0.0), rtol=1e-15)
+    assert_allclose(system.to_modal(start), jnp.append(modal[left], 0.0), rtol=1e-15)
 
 
 def test_frequency_response_is_that_of_the_physics():
@@ -234,7 +234,7 @@ def test_sine_amplitudes_are_refused_where_modes_are_no_sines():
 
 
 def test_derivatives_by_mass_speed_and_rigidity():
-    layout = lay_out(RIG)
+    layout = mesh_layout(RIG)
 
     def discrete(point):
         names = ["loads.0.mass", "loads.0.speed", "beam.flexural_rigidity"]

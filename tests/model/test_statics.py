@@ -10,10 +10,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from jaxbeam.case.actuators import Patch, Shaker, SpringDamper
-from jaxbeam.case.beam import ENDS, Beam, Support
+from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.case.loads import MovingForce, MovingMass, motion
-from jaxbeam.model.modes import lay_out
+from jaxbeam.case.loads import MovingForce, MovingMass, trajectory
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.statics import influence_line, static_deflection, static_peak
 from tests.as_oracle import as_oracle
 from tests.differences import central
@@ -42,7 +42,7 @@ def oracle_line(case: Case, x, positions) -> np.ndarray:
     return np.array([finite_elements.static_deflection(beam, x, [(p, -1.0)]) for p in positions])
 
 
-@pytest.mark.parametrize("ends", [f"{a}-{b}" for a in ENDS for b in ENDS])
+@pytest.mark.parametrize("ends", [f"{a}-{b}" for a in END_CONDITIONS for b in END_CONDITIONS])
 def test_one_span_has_the_line_of_macaulays_method(ends):
     case, positions = Case(Beam(1.7, **STUFF, ends=ends)), np.linspace(0.0, 1.7, 8)
     if ends in UNSTABLE:
@@ -126,9 +126,9 @@ def sampled_peak(case: Case, x, until: float) -> np.ndarray:
     times, total = np.linspace(0.0, until, 40001), 0.0
     length = float(case.beam.length)
     for load in case.loads:
-        path = motion(load, case.beam.length)
-        position = np.clip(np.asarray(path.travel(times)[0]), 0.0, length)
-        entry, leave = (float(t) for t in path.window())
+        path = trajectory(load, case.beam.length)
+        position = np.clip(np.asarray(path.kinematics(times)[0]), 0.0, length)
+        entry, leave = (float(t) for t in path.entry_exit_times())
         line = np.asarray(influence_line(case, x, position))
         on = ((times >= entry) & (times <= leave))[:, None]
         total = total + float(load.weight(case.run.gravity)) * on * line
@@ -193,7 +193,7 @@ def test_gradients_of_lines_and_peaks():
     """
     # A support at the very end cannot follow when the length changes alone.
     case = replace(GENERAL, {"supports.2.position": 1.2, "actuators.2.end": 0.75})
-    layout = lay_out(case)
+    layout = mesh_layout(case)
     start = np.array([float(value_at(case, address)) for address in NUMBERS])
     x = jnp.array([0.25, 0.6])
 

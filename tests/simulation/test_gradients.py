@@ -12,7 +12,7 @@ from jaxbeam.simulation.integration_plan import integration_plan
 # A load that enters over the free end loses contact; the model is bilateral, and smooth in it.
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning"),
+    pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning"),
 ]
 
 TIMES = jnp.linspace(0.0, 0.4, 101)  # loads enter and leave within it

@@ -19,7 +19,7 @@ from tests.runs import assert_close, load_of, plan_of
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.filterwarnings(  # the model is bilateral, the oracles too
-        "ignore::jaxbeam.simulate.ContactLossWarning"
+        "ignore::jaxbeam.simulation.simulate.ContactLossWarning"
     ),
 ]
 

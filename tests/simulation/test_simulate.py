@@ -13,11 +13,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.integrate import trace
-from jaxbeam.integrator.step_matrices import make_rigging
-from jaxbeam.integrator.time_grid import even_grid
-from jaxbeam.model.contact import traffic
-from jaxbeam.model.modal_model import rig
+from jaxbeam.integrator.integrate import integrate_history
+from jaxbeam.integrator.step_matrices import discrete_model
+from jaxbeam.integrator.time_grid import grid_by_step_length
+from jaxbeam.model.contact import load_set
+from jaxbeam.model.modal_model import modal_model
 from jaxbeam.simulation.integration_plan import static_shapes
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations
@@ -32,7 +32,7 @@ from tests.oracles.modal_equations import Span
 from tests.runs import assert_close, load_of, plan_of
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::jaxbeam.simulate.ContactLossWarning"  # the model is bilateral, the oracles too
+    "ignore::jaxbeam.simulation.simulate.ContactLossWarning"  # the model is bilateral, the oracles too
 )
 
 SPAN = Span(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, modes=4, damping_ratio=0.02)
@@ -322,10 +322,10 @@ def test_the_integrator_converges_with_twice_the_order_of_its_nodes():
 
     @eqx.filter_jit
     def end(longest):
-        assembled = rig(case, shape.layout, shape.coupled)
-        grid = even_grid(case, assembled, longest)
-        rigging = make_rigging(assembled, grid, None)
-        return trace(rigging, traffic(case), slots=1, steps=64)[1][-1, :, 0]
+        assembled = modal_model(case, shape.layout, shape.coupled)
+        grid = grid_by_step_length(case, assembled, longest)
+        rigging = discrete_model(assembled, grid, None)
+        return integrate_history(rigging, load_set(case), max_loads=1, steps=64)[1][-1, :, 0]
 
     counts = np.array([24, 32, 48, 64])
     expected = modal_equations.respond(span, [load], SENSORS, np.array([0.0, 0.32])).modal[1]

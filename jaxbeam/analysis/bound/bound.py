@@ -24,7 +24,7 @@ from jaxbeam.analysis.bound.input_influence import TOLERANCE, input_influence
 from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.model.channels import accepts_commands
 from jaxbeam.runtime.compiling import compiled
@@ -126,7 +126,7 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
     """The bound of a case, but for the peak without commands."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(case)):
         raise ValueError("a bound cannot be differentiated or compiled; call it on plain numbers")
-    check(case)
+    check_case(case)
     own_period = None if case.controller is None else case.controller.period
     period = (
         float(DEFAULT_PERIOD if own_period is None else own_period)
@@ -170,7 +170,7 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
 
 def _checked_positions(case: Case, positions) -> Float[np.ndarray, " place"]:
     if positions is None:
-        positions = case.sensor_places
+        positions = case.sensor_positions
     positions = np.asarray(positions, float).ravel()
     if positions.size == 0:
         raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")
@@ -193,7 +193,7 @@ def _uncontrolled_peak(case: Case, positions) -> float:
 def _command_limits(case: Case, period: float):
     """Smallest and largest command to each actuator, and its largest change between holds."""
     limits = [actuator.command_limits() for actuator in case.actuators]
-    rates = [actuator.command_rate() for actuator in case.actuators]
+    rates = [actuator.command_rate_limit() for actuator in case.actuators]
     pairs = [(-np.inf, np.inf) if pair is None else np.asarray(pair) for pair in limits]
     low, high = np.array(pairs).T
     return low, high, np.array([np.inf if r is None else float(r) * period for r in rates])

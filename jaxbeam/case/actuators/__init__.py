@@ -1,6 +1,6 @@
 """Actuators, one kind a file, behind the interface in `base`."""
 
-from jaxbeam.case.actuators.base import AbstractActuator, Attachment, Bonded
+from jaxbeam.case.actuators.base import AbstractActuator, Attachment, SectionStiffening
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
 from jaxbeam.case.actuators.patch import Patch
 from jaxbeam.case.actuators.point import PointForce
@@ -19,7 +19,7 @@ __all__ = [
     "KINDS",
     "AbstractActuator",
     "Attachment",
-    "Bonded",
+    "SectionStiffening",
     "Electrodynamic",
     "Patch",
     "PointForce",

@@ -21,7 +21,7 @@ class Attachment(eqx.Module):
 
     state_matrix: Float[Array, "state state"]
     input_matrix: Float[Array, " state"]
-    stroke_matrix: Float[Array, " state"]
+    velocity_matrix: Float[Array, " state"]
     output_matrix: Float[Array, " state"]
     feedthrough: Float[Array, ""]
     stiffness: Float[Array, ""]
@@ -29,19 +29,19 @@ class Attachment(eqx.Module):
     mass: Float[Array, ""] | None = None
 
     @property
-    def steady(self) -> Float[Array, ""]:
+    def static_gain(self) -> Float[Array, ""]:
         """Generalised force per unit of a steady command, the stroke at rest."""
-        held = jnp.linalg.solve(self.state_matrix, self.input_matrix)
-        return self.feedthrough - self.output_matrix @ held
+        steady_states = jnp.linalg.solve(self.state_matrix, self.input_matrix)
+        return self.feedthrough - self.output_matrix @ steady_states
 
 
-class Bonded(eqx.Module):
+class SectionStiffening(eqx.Module):
     """What a bonded actuator adds to the section of the beam between two positions (m)."""
 
     start: Float[Array, ""]
     end: Float[Array, ""]
-    rigidity: Float[Array, ""]
-    mass: Float[Array, ""]
+    bending_stiffness: Float[Array, ""]
+    mass_per_length: Float[Array, ""]
 
 
 class AbstractActuator(eqx.Module):
@@ -53,7 +53,7 @@ class AbstractActuator(eqx.Module):
     limits: eqx.AbstractVar[Float[Array, "2"] | None]
 
     @abc.abstractmethod
-    def stroke(self) -> tuple[tuple[Float[Array, ""], int, float], ...]:
+    def displacement_map(self) -> tuple[tuple[Float[Array, ""], int, float], ...]:
         """Where it acts: terms (position in m, derivative of the deflection, factor).
 
         A point force acts on the deflection at its position: ((x, 0, 1.0),); a patch on the
@@ -64,7 +64,7 @@ class AbstractActuator(eqx.Module):
     def attachment(self) -> Attachment:
         """Its linear model, from command (V or N) to generalised force."""
 
-    def bonded(self) -> Bonded | None:
+    def section_stiffening(self) -> SectionStiffening | None:
         """Bending stiffness (N m^2) and mass per length (kg/m) added; they shape the modes."""
         return None
 
@@ -76,6 +76,6 @@ class AbstractActuator(eqx.Module):
         """What does not go together in it, as a sentence naming its address, or None."""
         return None
 
-    def command_rate(self) -> Float[Array, ""] | None:
+    def command_rate_limit(self) -> Float[Array, ""] | None:
         """Fastest change of the command it can follow, per second; None if any."""
         return None

@@ -29,7 +29,7 @@ class Electrodynamic(AbstractActuator):
         "V", "smallest and largest voltage", INCREASING, default=None
     )
 
-    def stroke(self):
+    def displacement_map(self):
         return ((self.position, 0, 1.0),)
 
     def attachment(self) -> Attachment:
@@ -37,7 +37,7 @@ class Electrodynamic(AbstractActuator):
         return Attachment(
             state_matrix=-(self.resistance / self.inductance)[None, None],
             input_matrix=1 / self.inductance[None],
-            stroke_matrix=-(back_emf / self.inductance)[None],
+            velocity_matrix=-(back_emf / self.inductance)[None],
             output_matrix=self.force_constant[None],
             feedthrough=jnp.zeros(()),
             stiffness=self.stiffness,

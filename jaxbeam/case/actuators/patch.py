@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.case.actuators.base import AbstractActuator, Attachment, Bonded
-from jaxbeam.case.declared_checks import described
+from jaxbeam.case.actuators.base import AbstractActuator, Attachment, SectionStiffening
+from jaxbeam.case.declared_checks import validate_direct_or_derived
 from jaxbeam.case.fields import (
     INCREASING,
     NOT_NEGATIVE,
@@ -16,7 +16,14 @@ from jaxbeam.case.fields import (
 )
 
 # What the moment per volt follows from, where it is not given itself.
-MATERIAL = ("d33", "modulus", "electrode_spacing", "beam_height", "patch_height", "patch_width")
+MOMENT_SOURCES = (
+    "d33",
+    "modulus",
+    "electrode_spacing",
+    "beam_height",
+    "patch_height",
+    "patch_width",
+)
 
 
 class Patch(AbstractActuator):
@@ -24,7 +31,7 @@ class Patch(AbstractActuator):
 
     The moment is `moment_per_volt` x `correction` x patch voltage, and the patch voltage is
     `amplifier_gain` x command, eqs (2.43) and (2.46) of the thesis. Positive voltage lifts the
-    beam. Give either `moment_per_volt` or all that it follows from (see `moment`).
+    beam. Give either `moment_per_volt` or all that it follows from (see `moment_constant`).
     `added_mass` and `added_rigidity` act over its length and shape the modes.
 
     Commands stay within `limits` and within what the patch takes without losing its
@@ -73,7 +80,7 @@ class Patch(AbstractActuator):
     )
 
     @property
-    def moment(self) -> Float[Array, ""]:
+    def moment_constant(self) -> Float[Array, ""]:
         """Moment per volt at the patch in N m/V, given or C_0 of eq. (2.43) of the thesis.
 
         C_0 = d33 E_p / L_e x h / 2 x h_p b_p, for a thin patch: h_p much smaller than h.
@@ -83,29 +90,32 @@ class Patch(AbstractActuator):
         stress = self.d33 * self.modulus / self.electrode_spacing
         return stress * self.beam_height / 2 * self.patch_height * self.patch_width
 
-    def stroke(self):
+    def displacement_map(self):
         return ((self.start, 1, 1.0), (self.end, 1, -1.0))
 
     def attachment(self) -> Attachment:
-        none, zero = jnp.zeros(0), jnp.zeros(())
-        info = self.moment * self.correction * self.amplifier_gain
-        return Attachment(jnp.zeros((0, 0)), none, none, none, info, zero, zero)
+        no_states, zero = jnp.zeros(0), jnp.zeros(())
+        info = self.moment_constant * self.correction * self.amplifier_gain
+        return Attachment(jnp.zeros((0, 0)), no_states, no_states, no_states, info, zero, zero)
 
-    def bonded(self) -> Bonded | None:
+    def section_stiffening(self) -> SectionStiffening | None:
         if self.added_mass is None and self.added_rigidity is None:
             return None
         mass = jnp.zeros(()) if self.added_mass is None else self.added_mass
         rigidity = jnp.zeros(()) if self.added_rigidity is None else self.added_rigidity
-        return Bonded(self.start, self.end, rigidity, mass)
+        return SectionStiffening(self.start, self.end, rigidity, mass)
 
     def command_limits(self) -> Float[Array, "2"]:
-        own = self.depolarisation / self.amplifier_gain
+        depolarisation_limits = self.depolarisation / self.amplifier_gain
         if self.limits is None:
-            return own
-        lowest, highest = jnp.maximum(own[0], self.limits[0]), jnp.minimum(own[1], self.limits[1])
+            return depolarisation_limits
+        lowest, highest = (
+            jnp.maximum(depolarisation_limits[0], self.limits[0]),
+            jnp.minimum(depolarisation_limits[1], self.limits[1]),
+        )
         return jnp.stack([lowest, highest])
 
-    def command_rate(self) -> Float[Array, ""] | None:
+    def command_rate_limit(self) -> Float[Array, ""] | None:
         return self.rate_limit
 
     def validate(self, address: str) -> str | None:
@@ -123,4 +133,4 @@ class Patch(AbstractActuator):
                 f"{address}.limits leave no command that the patch takes: its depolarisation limits"
                 f" over its amplifier_gain allow {low:g} to {high:g} V"
             )
-        return described(address, self, "moment_per_volt", MATERIAL)
+        return validate_direct_or_derived(address, self, "moment_per_volt", MOMENT_SOURCES)

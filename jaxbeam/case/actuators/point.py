@@ -15,9 +15,11 @@ class PointForce(AbstractActuator):
         "N", "smallest and largest command", INCREASING, default=None
     )
 
-    def stroke(self):
+    def displacement_map(self):
         return ((self.position, 0, 1.0),)
 
     def attachment(self) -> Attachment:
-        none, zero = jnp.zeros(0), jnp.zeros(())
-        return Attachment(jnp.zeros((0, 0)), none, none, none, jnp.ones(()), zero, zero)
+        no_states, zero = jnp.zeros(0), jnp.zeros(())
+        return Attachment(
+            jnp.zeros((0, 0)), no_states, no_states, no_states, jnp.ones(()), zero, zero
+        )

@@ -24,14 +24,14 @@ class Shaker(AbstractActuator):
         "V", "smallest and largest voltage", INCREASING, default=None
     )
 
-    def stroke(self):
+    def displacement_map(self):
         return ((self.position, 0, 1.0),)
 
     def attachment(self) -> Attachment:
         return Attachment(
             state_matrix=-self.bandwidth[None, None],
             input_matrix=self.bandwidth[None],
-            stroke_matrix=jnp.zeros(1),
+            velocity_matrix=jnp.zeros(1),
             output_matrix=self.force_per_volt[None],
             feedthrough=jnp.zeros(()),
             stiffness=self.stiffness,

@@ -21,10 +21,12 @@ class SpringDamper(AbstractActuator):
         "1", "unused: takes no command", INCREASING, default=None
     )
 
-    def stroke(self):
+    def displacement_map(self):
         return ((self.position, 0, 1.0),)
 
     def attachment(self) -> Attachment:
-        none, zero = jnp.zeros(0), jnp.zeros(())
+        no_states, zero = jnp.zeros(0), jnp.zeros(())
         square = jnp.zeros((0, 0))
-        return Attachment(square, none, none, none, zero, self.stiffness, self.damping)
+        return Attachment(
+            square, no_states, no_states, no_states, zero, self.stiffness, self.damping
+        )

@@ -35,7 +35,7 @@ class GainSchedule(eqx.Module):
 
 def crossing_events(plant: Plant) -> Float[Array, " event"]:
     """Times (s) at which loads enter and leave, ascending; the run's end for loads that stay."""
-    windows = [path.window() for path in plant.loads.trajectories]
+    windows = [path.entry_exit_times() for path in plant.loads.trajectories]
     events = jnp.sort(jnp.array(windows).reshape(-1))
     last_event = jnp.max(jnp.where(events < NEVER, events, plant.case.run.duration))
     return jnp.minimum(events, last_event)

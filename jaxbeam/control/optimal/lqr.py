@@ -185,7 +185,9 @@ class AbstractScheduledRegulator(AbstractRegulator):
     def events(self, case: Any) -> Float[np.ndarray, " event"]:
         """Times (s) of entry and exit by which the table runs, ascending."""
         loads = design_loads(self, case) if self.entries == "predicted" else case.loads
-        windows = [concrete(trajectory(load, case.beam.length).window()) for load in loads]
+        windows = [
+            concrete(trajectory(load, case.beam.length).entry_exit_times()) for load in loads
+        ]
         return np.sort(np.ravel(windows))
 
     def breakpoints(self, case):
@@ -304,7 +306,7 @@ def points_error(
     beam = case.beam
     loads = design_loads(regulator, case)
     speeds = [load.speed for load in loads] if slowest_speed is None else [slowest_speed]
-    numbers = (beam.length, beam.rigidity, beam.linear_density, *speeds)
+    numbers = (beam.length, beam.bending_stiffness, beam.linear_density, *speeds)
     if not all(value is not None and is_concrete(value) for value in numbers):
         return None
     length, rigidity, density, *speeds = (float(concrete(value)) for value in numbers)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.model.state_space import StateSpace, state_space
 
 MIN_REACHABILITY = (
@@ -34,7 +34,7 @@ def sampling_limit(case: Case) -> Float[Array, " mode"]:
     lost at the multiples of the limit too, and poor near it and in between. Not for use inside
     `jit`. Raises ValueError for a faulty case.
     """
-    check(case)
+    check_case(case)
     return jnp.asarray(np.pi / _oscillatory_modes(state_space(case).unloaded)[0].imag)
 
 

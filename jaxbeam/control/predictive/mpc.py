@@ -195,7 +195,7 @@ class MPC(AbstractStateLaw):
         """Rows that take the states to the deflections that are controlled."""
         places = self.places
         if places is None:
-            places = design_plant.case.sensor_places
+            places = design_plant.case.sensor_positions
         shape = design_plant.modal_model.shapes(places, (0,))[0] / design_plant.scale
         return jnp.zeros((shape.shape[0], state_count)).at[:, : shape.shape[1]].set(shape)
 
@@ -319,7 +319,7 @@ def _command_limits(actuators, move_maps, period):
     )
     cumulative_moves = jnp.cumsum(move_maps, axis=0)
     for i, actuator in enumerate(actuators):
-        limits, rate = actuator.command_limits(), actuator.command_rate()
+        limits, rate = actuator.command_limits(), actuator.command_rate_limit()
         bounds = []
         if limits is not None:
             bounds += [

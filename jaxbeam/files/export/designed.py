@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.control import DiscreteLQR, StateFeedback
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.control.optimal.lqr import LQR, AbstractScheduledRegulator
@@ -29,43 +29,49 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
     runs, the filters do. Raises ValueError for a faulty case, a controller without a period, one
     that is no table of gains, and another estimator.
     """
-    check(case)
+    check_case(case)
     law = case.controller
-    tabled = isinstance(law, AbstractScheduledRegulator)
-    if not (tabled or isinstance(law, LQR | DiscreteLQR | StateFeedback)):
+    is_scheduled = isinstance(law, AbstractScheduledRegulator)
+    if not (is_scheduled or isinstance(law, LQR | DiscreteLQR | StateFeedback)):
         raise ValueError(
             "controller.kind cannot be exported: tables are made of 'state', 'lqr', 'dlqr',"
             " 'lqr-finite', 'lqr-step', 'lqr-augmented' and 'lqr-scheduled'"
         )
     if law.period is None:
         raise ValueError("controller.period is missing: a real controller samples; give its period")
-    own = law.estimator
-    if not (own is None or isinstance(own, Observer) or getattr(own, "loads", "") == "ignored"):
+    estimator_settings = law.estimator
+    if not (
+        estimator_settings is None
+        or isinstance(estimator_settings, Observer)
+        or getattr(estimator_settings, "loads", "") == "ignored"
+    ):
         raise ValueError(
             "controller.estimator cannot be exported: its gain must not change; take 'observer', or"
             " 'kalman' with loads = 'ignored', or leave it out to write the gains alone"
         )
     if points < 2:
         raise ValueError(f"a table needs at least two points, not {points}")
-    shares = np.linspace(0, 1, points) if tabled else np.zeros(1)
-    (plant, grid, table, rest, crossing), estimator = _designed(case, mesh_layout(case), shares)
-    columns, commands = plant.states, plant.inputs
-    more = table.shape[-1] - len(columns)
-    if more and tabled:
-        columns += tuple((f"load_{i}", "N") for i in range(more))
-    elif more:
+    shares = np.linspace(0, 1, points) if is_scheduled else np.zeros(1)
+    (system, grid, table, rest, crossing), estimator = _design_gains(
+        case, mesh_layout(case), shares
+    )
+    columns, commands = system.states, system.inputs
+    extra_columns = table.shape[-1] - len(columns)
+    if extra_columns and is_scheduled:
+        columns += tuple((f"load_{i}", "N") for i in range(extra_columns))
+    elif extra_columns:
         columns += tuple((f"last_{name}", unit) for name, unit in commands)
-    fade, (masses, speeds) = getattr(law, "fade_time", None), grid
+    decay_time, (masses, speeds) = getattr(law, "fade_time", None), grid
     return Gains(
         np.asarray(masses),
         np.asarray(speeds),
         shares,
         np.asarray(table),
         np.asarray(rest),
-        _filters(case),
+        _digital_filters(case),
         float(concrete(law.period)),
         float(crossing),
-        np.inf if fade is None else float(concrete(fade)),
+        np.inf if decay_time is None else float(concrete(decay_time)),
         law.between if isinstance(law, ScheduledLQR) else "interpolated",
         tuple(tuple(column) for column in columns),
         tuple(tuple(command) for command in commands),
@@ -74,7 +80,7 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
     )
 
 
-def _filters(case: Case) -> np.ndarray:
+def _digital_filters(case: Case) -> np.ndarray:
     """The digital filters of the sensors: rows of a sensor's index and one of its sections."""
     rows = np.zeros((0, 7))
     for i, sensor in enumerate(case.sensors):
@@ -85,35 +91,41 @@ def _filters(case: Case) -> np.ndarray:
 
 
 @compiled
-def _designed(case: Case, layout, shares):
-    """What gains are made of, see `_tabulated`, and the estimator (see `Gains`)."""
-    model, law = state_space(case, layout=layout), case.controller
-    designed = law.design_plant(model)
+def _design_gains(case: Case, layout, shares):
+    """What gains are made of, see `_tabulate_gains`, and the estimator (see `Gains`)."""
+    plant, law = state_space(case, layout=layout), case.controller
+    design_plant = law.design_plant(plant)
     estimator = jnp.zeros((0, 0))
     if law.estimator is not None:
-        made = law.estimator.init(designed)
-        step, sensors = made.transition, made.C.shape[0]
-        offset = jnp.zeros((sensors, sensors)).at[:, 0].set(made.offset)
+        filter_design = law.estimator.init(design_plant)
+        transition, sensor_count = filter_design.transition, filter_design.C.shape[0]
+        offset = jnp.zeros((sensor_count, sensor_count)).at[:, 0].set(filter_design.offset)
         estimator = jnp.block([
-            [step.drift, step.before, step.after, made.gain],
-            [made.C, jnp.zeros_like(made.D), made.D, offset],
+            [transition.drift, transition.before, transition.after, filter_design.gain],
+            [filter_design.C, jnp.zeros_like(filter_design.D), filter_design.D, offset],
         ])  # fmt: skip
-    return _tabulated(law, model, designed, shares), estimator
+    return _tabulate_gains(law, plant, design_plant, shares), estimator
 
 
-def _tabulated(law, model, designed, shares):
+def _tabulate_gains(law, plant, design_plant, shares):
     """The plant designed for; masses and speeds; gains over a crossing and after it; its time (s).
 
     Tables and gains have a mass and a speed as their first axes.
     """
-    memory = law.gain if isinstance(law, StateFeedback) else law.prepare(model, designed)
-    one = jnp.zeros(1), jnp.zeros(1)
+    memory = law.gain if isinstance(law, StateFeedback) else law.prepare(plant, design_plant)
+    no_grid = jnp.zeros(1), jnp.zeros(1)
     if isinstance(memory, GainScheduleGrid):
         tables = jax.vmap(jax.vmap(lambda each: jax.vmap(each.table)(shares)))(memory.schedules)
         crossing = memory.length / memory.given[1]
         grid = memory.masses, memory.speeds
-        return designed.unloaded, grid, tables, memory.schedules.final_gain, crossing
+        return design_plant.unloaded, grid, tables, memory.schedules.final_gain, crossing
     if isinstance(memory, GainSchedule):
         table, crossing = jax.vmap(memory.table)(shares), memory.end - memory.start
-        return designed.unloaded, one, table[None, None], memory.final_gain[None, None], crossing
-    return designed.unloaded, one, memory[None, None, None], memory[None, None], 0.0
+        return (
+            design_plant.unloaded,
+            no_grid,
+            table[None, None],
+            memory.final_gain[None, None],
+            crossing,
+        )
+    return design_plant.unloaded, no_grid, memory[None, None, None], memory[None, None], 0.0

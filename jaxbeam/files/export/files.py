@@ -16,10 +16,10 @@ import numpy as np
 import scipy
 
 from jaxbeam.files.export.gains import ARRAYS, Gains
-from jaxbeam.files.export.header import header
+from jaxbeam.files.export.header import c_header
 
 FORMAT = "jaxbeam gains 3"
-COEFFICIENTS = ("b0", "b1", "b2", "a0", "a1", "a2")
+SECTION_COEFFICIENTS = ("b0", "b1", "b2", "a0", "a1", "a2")
 
 
 def write_gains(gains: Gains, path: str | os.PathLike, overwrite: bool = False) -> None:
@@ -51,19 +51,19 @@ def read_gains(path: str | os.PathLike) -> Gains:
     if path.suffix not in READERS:
         raise ValueError(f"{path}: gains are read from {', '.join(READERS)}")
     try:
-        gains, checks = _restored(*READERS[path.suffix](path))
+        gains, check_values = _gains_from_file(*READERS[path.suffix](path))
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{path}: this is no file of gains that jaxbeam wrote") from None
-    found = gains.checksum, gains.test_command.tolist(), gains.test_estimate.tolist()
-    if found != checks:
+    computed = gains.checksum, gains.test_command.tolist(), gains.test_estimate.tolist()
+    if computed != check_values:
         raise ValueError(f"{path}: the numbers do not give the check values; the file was changed")
     return gains
 
 
-def _restored(about: dict[str, Any], arrays: dict[str, Any]) -> tuple[Gains, tuple]:
+def _gains_from_file(metadata: dict[str, Any], arrays: dict[str, Any]) -> tuple[Gains, tuple]:
     """The gains of a file, and the check values in it."""
     columns, commands = (
-        tuple((signal, unit) for signal, unit in about[name]) for name in ("columns", "commands")
+        tuple((signal, unit) for signal, unit in metadata[name]) for name in ("columns", "commands")
     )
     masses, speeds, shares = (np.ravel(arrays[name]) for name in ARRAYS[:3])
     grid, gain = (masses.size, speeds.size), (len(commands), len(columns))
@@ -74,43 +74,43 @@ def _restored(about: dict[str, Any], arrays: dict[str, Any]) -> tuple[Gains, tup
         np.reshape(arrays["table"], (*grid, shares.size, *gain)),
         np.reshape(arrays["rest"], (*grid, *gain)),
         np.reshape(arrays["filters"], (-1, 7)),
-        about["period_s"],
-        about["crossing_s"],
-        math.inf if about["fade_s"] is None else about["fade_s"],
-        about["between"],
+        metadata["period_s"],
+        metadata["crossing_s"],
+        math.inf if metadata["fade_s"] is None else metadata["fade_s"],
+        metadata["between"],
         columns,
         commands,
-        np.reshape(arrays["estimator"], about["estimator_shape"]),
-        about["readings"],
+        np.reshape(arrays["estimator"], metadata["estimator_shape"]),
+        metadata["readings"],
     )
-    return gains, (about["crc32"], about["test_command"], about["test_estimate"])
+    return gains, (metadata["crc32"], metadata["test_command"], metadata["test_estimate"])
 
 
-def _about(gains: Gains) -> dict[str, Any]:
+def _metadata(gains: Gains) -> dict[str, Any]:
     """What a file says beside the numbers."""
     return {
         "format": FORMAT,
         "law": "u = -K(mass, speed, share) z",
         "period_s": gains.period,
-        "crossing_s": gains.crossing,
-        "fade_s": gains.fade if math.isfinite(gains.fade) else None,
-        "between": gains.between,
+        "crossing_s": gains.crossing_time,
+        "fade_s": gains.decay_time if math.isfinite(gains.decay_time) else None,
+        "between": gains.interpolation,
         "masses_kg": gains.masses.tolist(),
         "speeds_m_per_s": gains.speeds.tolist(),
         "columns": gains.columns,
         "commands": gains.commands,
-        "filters": ["sensor", *COEFFICIENTS],
+        "filters": ["sensor", *SECTION_COEFFICIENTS],
         "test_input": gains.test_input,
         "test_command": gains.test_command.tolist(),
         "estimator": "[[A, B, B', L], [C, 0, D, o]]: x = A x + B u + B' u'; x += L (y-C x-D u'-o)",
-        "readings": gains.readings,
+        "readings": gains.reading_count,
         "estimator_shape": gains.estimator.shape,
         "test_estimate": gains.test_estimate.tolist(),
         "crc32": gains.checksum,
     }
 
 
-def _csv(gains: Gains) -> bytes:
+def _to_csv(gains: Gains) -> bytes:
     """A comment with all that is said, then rows: what it is, mass and speed, share, and numbers.
 
     In a row of a filter the sensor is in the place of the share.
@@ -119,43 +119,45 @@ def _csv(gains: Gains) -> bytes:
     rows = [["row", "mass [kg]", "speed [m/s]", "share or sensor", *pairs]]
     for i, mass in enumerate(gains.masses):
         for j, speed in enumerate(gains.speeds):
-            whole = zip(gains.shares, gains.table[i, j], strict=True)
-            rows += [["gain", mass, speed, share, *gain.ravel()] for share, gain in whole]
+            gains_by_share = zip(gains.shares, gains.table[i, j], strict=True)
+            rows += [["gain", mass, speed, share, *gain.ravel()] for share, gain in gains_by_share]
             rows += [["rest", mass, speed, "", *gains.rest[i, j].ravel()]]
     rows += [["filter", "", "", *row] for row in gains.filters]
     rows += [["estimator", "", "", "", *row] for row in gains.estimator]
-    lines = [f"# {json.dumps(_about(gains))}"]
-    lines += [",".join(map(_text, row)) for row in rows]
+    lines = [f"# {json.dumps(_metadata(gains))}"]
+    lines += [",".join(map(_csv_cell, row)) for row in rows]
     return ("\n".join(lines) + "\n").encode()
 
 
-def _text(entry: Any) -> str:
+def _csv_cell(entry: Any) -> str:
     return entry if isinstance(entry, str) else repr(float(entry))
 
 
 def _from_csv(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     first, _, *lines = path.read_text(encoding="utf-8").splitlines()
-    about = json.loads(first.removeprefix("# "))
-    found = {"gain": [], "rest": [], "filter": [], "estimator": []}
+    metadata = json.loads(first.removeprefix("# "))
+    rows_by_name = {"gain": [], "rest": [], "filter": [], "estimator": []}
     for kind, _, _, *entries in csv.reader(lines):
-        found[kind].append([float(entry) for entry in entries if entry])
-    designs = len(about["masses_kg"]) * len(about["speeds_m_per_s"])
+        rows_by_name[kind].append([float(entry) for entry in entries if entry])
+    designs = len(metadata["masses_kg"]) * len(metadata["speeds_m_per_s"])
     arrays = {
-        "masses": about["masses_kg"],
-        "speeds": about["speeds_m_per_s"],
-        "shares": [row[0] for row in found["gain"][: len(found["gain"]) // designs]],
-        "table": [row[1:] for row in found["gain"]],
-        "rest": found["rest"],
-        "filters": found["filter"],
-        "estimator": found["estimator"],
+        "masses": metadata["masses_kg"],
+        "speeds": metadata["speeds_m_per_s"],
+        "shares": [row[0] for row in rows_by_name["gain"][: len(rows_by_name["gain"]) // designs]],
+        "table": [row[1:] for row in rows_by_name["gain"]],
+        "rest": rows_by_name["rest"],
+        "filters": rows_by_name["filter"],
+        "estimator": rows_by_name["estimator"],
     }
-    return about, arrays
+    return metadata, arrays
 
 
-def _mat(gains: Gains) -> bytes:
+def _to_mat(gains: Gains) -> bytes:
     content = {name: getattr(gains, name) for name in ARRAYS}
     file = io.BytesIO()
-    scipy.io.savemat(file, content | {"period": gains.period, "about": json.dumps(_about(gains))})
+    scipy.io.savemat(
+        file, content | {"period": gains.period, "about": json.dumps(_metadata(gains))}
+    )
     return file.getvalue()
 
 
@@ -164,11 +166,11 @@ def _from_mat(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return json.loads(content["about"].item()), content
 
 
-def _tdms(gains: Gains) -> bytes:
+def _to_tdms(gains: Gains) -> bytes:
     """The group "gains" with a channel for each array, row after row."""
     nptdms = _nptdms()
     file = io.BytesIO()
-    root = nptdms.RootObject({"about": json.dumps(_about(gains)), "period_s": gains.period})
+    root = nptdms.RootObject({"about": json.dumps(_metadata(gains)), "period_s": gains.period})
     channels = [nptdms.ChannelObject("gains", n, np.ravel(getattr(gains, n))) for n in ARRAYS]
     with nptdms.TdmsWriter(file) as writer:
         writer.write_segment([root, *channels])
@@ -192,9 +194,9 @@ def _nptdms():
     return nptdms
 
 
-def _header(gains: Gains) -> bytes:
-    return header(gains, _about(gains)).encode()
+def _to_header(gains: Gains) -> bytes:
+    return c_header(gains, _metadata(gains)).encode()
 
 
-WRITERS = {".csv": _csv, ".mat": _mat, ".tdms": _tdms, ".h": _header}
+WRITERS = {".csv": _to_csv, ".mat": _to_mat, ".tdms": _to_tdms, ".h": _to_header}
 READERS = {".csv": _from_csv, ".mat": _from_mat, ".tdms": _from_tdms}

@@ -9,36 +9,36 @@ import numpy as np
 from jaxbeam.files.export.gains import ARRAYS, Gains
 
 
-def header(gains: Gains, about: dict[str, Any]) -> str:
-    """The text of a C header with the gains; `about` stands in a comment at its top."""
-    said = json.dumps(about, indent=1).replace("*/", "* /")
+def c_header(gains: Gains, metadata: dict[str, Any]) -> str:
+    """The text of a C header with the gains; `metadata` stands in a comment at its top."""
+    comment = json.dumps(metadata, indent=1).replace("*/", "* /")
     masses, speeds, points, actuators, columns = gains.table.shape
     test = gains.test_input
-    sizes = {"MASSES": masses, "SPEEDS": speeds, "POINTS": points}
-    sizes |= {"ACTUATORS": actuators, "COLUMNS": columns}
-    sizes |= {"NEAREST": int(gains.between == "nearest")}
-    sizes |= {"FILTERS": len(gains.filters), "CHECK_CRC32": f"{gains.checksum}u"}
-    if gains.estimated:
-        sizes |= {"ESTIMATED": gains.estimated, "READINGS": gains.readings}
-    sizes |= {"PERIOD": repr(gains.period), "CROSSING": repr(gains.crossing)}
-    sizes |= {"FADE": repr(gains.fade)} if math.isfinite(gains.fade) else {}
-    sizes |= {f"TEST_{name.upper()}": repr(test[name]) for name in ("share", "mass", "speed")}
-    defines = [f"#define JAXBEAM_{name} {value}" for name, value in sizes.items()]
+    macros = {"MASSES": masses, "SPEEDS": speeds, "POINTS": points}
+    macros |= {"ACTUATORS": actuators, "COLUMNS": columns}
+    macros |= {"NEAREST": int(gains.interpolation == "nearest")}
+    macros |= {"FILTERS": len(gains.filters), "CHECK_CRC32": f"{gains.checksum}u"}
+    if gains.estimator_size:
+        macros |= {"ESTIMATED": gains.estimator_size, "READINGS": gains.reading_count}
+    macros |= {"PERIOD": repr(gains.period), "CROSSING": repr(gains.crossing_time)}
+    macros |= {"FADE": repr(gains.decay_time)} if math.isfinite(gains.decay_time) else {}
+    macros |= {f"TEST_{name.upper()}": repr(test[name]) for name in ("share", "mass", "speed")}
+    defines = [f"#define JAXBEAM_{name} {value}" for name, value in macros.items()]
     arrays = {name: getattr(gains, name) for name in ARRAYS}
     arrays |= {"test_command": gains.test_command, "test_estimate": gains.test_estimate}
     texts = [
-        f"static const double jaxbeam_{name}[] = {{{', '.join(map(_number, np.ravel(numbers)))}}};"
+        f"static const double jaxbeam_{name}[] = {{{', '.join(map(_c_number, np.ravel(numbers)))}}};"
         for name, numbers in arrays.items()
         if numbers.size
     ]
-    return "\n".join([f"/* {said} */", *defines, *texts, FUNCTIONS])
+    return "\n".join([f"/* {comment} */", *defines, *texts, C_FUNCTIONS])
 
 
-def _number(value: float) -> str:
+def _c_number(value: float) -> str:
     return repr(float(value))
 
 
-FUNCTIONS = """
+C_FUNCTIONS = """
 #ifdef JAXBEAM_FADE
 #include <math.h>
 #endif

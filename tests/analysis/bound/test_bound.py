@@ -125,7 +125,7 @@ def test_another_solver_finds_the_same(best, numbers):
     assert_allclose(best.peak, solver.solve().x[-1] / scale, rtol=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_a_run_attains_it(best):
     case = dataclasses.replace(patched(), controller=best.controller())
     record = jb.simulate(case, tolerance=1e-9)
@@ -160,7 +160,7 @@ def rivals_plan():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 @settings(max_examples=8)
 @given(
     mass=st.floats(0.1, 1.0),

@@ -36,7 +36,7 @@ def plan():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 @settings(max_examples=6)
 @given(
     masses=st.tuples(st.floats(0.05, 0.8), st.floats(0.05, 0.8)),
@@ -64,7 +64,7 @@ def test_no_controller_beats_it(plan, masses, speed, gap, strength, everywhere, 
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_its_commands_attain_it_on_the_whole_beam():
     """To what deflections change between the instants that are looked at."""
     least = bound(CASE, WHOLE)

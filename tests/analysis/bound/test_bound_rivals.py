@@ -37,7 +37,7 @@ def plans():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 @settings(max_examples=12)
 @given(
     mass=st.floats(0.05, 0.8),
