@@ -11,7 +11,7 @@ from hypothesis import example, given, settings, strategies as st
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import case_from_dict, case_to_dict, load_case
 from tests import mutations
-from tests.cli.test_cli import CASE as SMALL
+from tests.cli.example import CASE as SMALL
 from tests.files.test_case_file import FULL
 from tests.tuning.logs import test_readers as readers
 from tuning import read_logs

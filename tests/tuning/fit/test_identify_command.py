@@ -7,7 +7,7 @@ import pytest
 
 import tuning
 from jaxbeam.cli import main
-from tests.cli.test_cli import CASE
+from tests.cli.example import CASE
 from tests.tuning import stand_in
 from tuning.parameters.prior import Prior
 
