@@ -1,5 +1,6 @@
 """The case: everything that decides a run, as one immutable tree whose numbers have addresses."""
 
+import dataclasses
 import difflib
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +16,7 @@ from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, number
 from jaxbeam.case.loads import AbstractLoad, trajectory
-from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.sensors import QUANTITIES, Sensor
 
 
 class Run(eqx.Module):
@@ -117,6 +118,20 @@ def value_at(case: Case, address: str) -> Float[Array, "..."]:
     if parent is None or (entry and not _has_entry(leaves[parent], entry)):
         raise unknown_address_error(case, address)
     return leaves[parent][entry] if entry else leaves[parent]
+
+
+def unit_at(case: Case, address: str) -> str:
+    """SI unit of the number at an address; "" or "1" if it has none."""
+    unit, part = "", case
+    for name in address.split("."):
+        if isinstance(part, tuple):
+            part = part[int(name)]
+        elif dataclasses.is_dataclass(part):
+            unit = type(part).__dataclass_fields__[name].metadata.get("unit", "")
+            if isinstance(part, Sensor) and unit == "unit of quantity":
+                unit = QUANTITIES[part.quantity]
+            part = getattr(part, name)
+    return unit
 
 
 def replace(case: Case, values: dict[str, Any]) -> Case:

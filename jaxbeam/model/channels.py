@@ -174,7 +174,7 @@ def _input_unit(case: Case, channel: str) -> str:
             f"the input {channel!r} does not exist; an actuator is driven by its command, its address"
             " alone, or by its active_force"
         )
-    return _force_unit(actuator) if actuator_input else _command_unit(actuator)
+    return _force_unit(actuator) if actuator_input else actuator.command_unit
 
 
 def _output_unit(case: Case, channel: str) -> str:
@@ -228,12 +228,7 @@ def _check_position(case: Case, channel: str, position: str) -> None:
 
 def accepts_commands(actuator: AbstractActuator) -> bool:
     """Whether an actuator does something with a command, as a passive one does not."""
-    return _command_unit(actuator) != "1"
-
-
-def _command_unit(actuator: AbstractActuator) -> str:
-    """The unit of the limits is that of the command; "1" if there is none."""
-    return type(actuator).__dataclass_fields__["limits"].metadata["unit"]
+    return actuator.command_unit != "1"
 
 
 def _force_unit(actuator: AbstractActuator) -> str:

@@ -286,7 +286,7 @@ def _unloaded_plant(plant: Plant) -> StateSpace:
 
 def _command_signals(case: Case) -> tuple[Signal, ...]:
     """The commands, in the unit in which the actuators' limits are given."""
-    units = [type(a).__dataclass_fields__["limits"].metadata["unit"] for a in case.actuators]
+    units = [actuator.command_unit for actuator in case.actuators]
     return tuple(Signal(f"command_{i}", unit) for i, unit in enumerate(units))
 
 

@@ -1,7 +1,7 @@
-"""Design of experiments: where to put a sensor, or how fast to cross, to know a number better.
+"""Experiment design: positions of sensors, speeds of loads and the like, for small errors of a fit.
 
-found = sharpen(case, free=["beam.damping_ratio"], over={"sensors.0.position": (0.05, 0.55)})
-print(found)
+ranges = {"sensors.0.position": (0.05, 0.55)}
+print(design_experiment(case, free=["beam.damping_ratio"], over=ranges))
 """
 
 import dataclasses
@@ -13,24 +13,24 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.case.fields import known
-from jaxbeam.case.validation import check
+from jaxbeam.case.case import Case, replace, unit_at, value_at
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.validation import check_case
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan, sample_times
 from jaxbeam.simulation.simulate import simulate_readings
-from tuning.parameters.free import unit_at
+from tuning.fit.dataset import SIMULATION_TOLERANCE
 
-SIMULATION_TOLERANCE = 1e-5  # of the simulation, relative to the largest deflection
-START_COUNT = 5  # of the search, spread between the bounds: there may be several best places
+START_COUNT = 5  # of the search, as there may be several local minima
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExperimentDesign:
-    """A better experiment: what to choose, and the standard errors before and after (SI units).
+    """Values of the chosen numbers, and standard errors of the free parameters (SI units).
 
-    `error_sensitivities` (free, choice) say by which share an error changes per unit of each choice, before;
-    an infinite error is of a number that the experiment cannot tell.
+    Both are given before and after; `error_sensitivities` (parameter, choice) are derivatives of
+    the logarithm of each error with respect to each choice, before. Errors are infinite for
+    parameters that are not identifiable. `case` has the chosen values.
     """
 
     choices: list[str]
@@ -38,13 +38,13 @@ class ExperimentDesign:
     before: Float[np.ndarray, " choice"]
     after: Float[np.ndarray, " choice"]
     addresses: list[str]
-    errors_before: Float[np.ndarray, " free"]
-    errors_after: Float[np.ndarray, " free"]
-    error_sensitivities: Float[np.ndarray, "free choice"]
+    errors_before: Float[np.ndarray, " parameter"]
+    errors_after: Float[np.ndarray, " parameter"]
+    error_sensitivities: Float[np.ndarray, "parameter choice"]
     case: Case
 
     def to_dict(self) -> dict:
-        """Choices and standard errors, each before and after (SI units), as plain data."""
+        """Choices and standard errors, each before and after (SI units), for JSON."""
         choices = zip(self.choices, self.before, self.after, strict=True)
         errors = zip(self.addresses, self.errors_before, self.errors_after, strict=True)
         return {
@@ -68,28 +68,28 @@ def design_experiment(
     target: str | None = None,
     noise: float = 1e-5,
 ) -> ExperimentDesign:
-    """Choose numbers of an experiment, within bounds, such that a fit tells the most.
+    """Choose numbers of an experiment within bounds, for the smallest errors of a fit.
 
-    `free` are the addresses that will be fitted; the case has their likely values. The standard
-    error of `target` is made as small as can be or, without one, the volume of the confidence
-    region of all (D-optimality). Errors are those of the linearised fit, from the Fisher
-    information J' J / noise^2 with exact derivatives J of the readings; its derivatives with
-    respect to the choices are exact, too, and followed from several starts. `noise` is the standard
-    deviation of a sample (SI) of sensors that do not say theirs.
+    `free` are the addresses to be fitted, at their likely values in the case; `over` gives the
+    bounds of the numbers to choose. Minimised is the standard error of the `target` or, without
+    one, the volume of the confidence region of all (D-optimality). Errors are those of the
+    linearised fit, from the Fisher information J' J / noise^2 with exact derivatives J of the
+    readings; the search has exact gradients, too, and several starts. `noise` is the standard
+    deviation (SI) of a sample of sensors without a noise of their own.
 
-    Raises ValueError for unknown addresses, a choice that is free as well, and bounds that do not
-    hold what the case has.
+    Raises ValueError for unknown addresses, a choice that is free as well, and bounds that exclude
+    the value in the case.
     """
     free = list(free)
-    check(case)
+    check_case(case)
     _check_arguments(case, free, over, target)
     low, high = np.array(list(over.values()), float).T
-    nominal = jnp.array([float(known(value_at(case, address))) for address in free])
-    before = np.array([float(known(value_at(case, address))) for address in over])
+    nominal = jnp.array([float(concrete(value_at(case, address))) for address in free])
+    before = np.array([float(concrete(value_at(case, address))) for address in over])
     noise_levels = jnp.array([noise if s.noise is None else s.noise for s in case.sensors])
 
     def cramer_rao(choice, plan):
-        """Log standard errors, and half the log of the volume."""
+        """Cramer-Rao bound: logarithms of standard errors, and half that of the volume."""
         times = sample_times(case)
         chosen = replace(case, dict(zip(over, choice, strict=True)))
 
@@ -106,35 +106,34 @@ def design_experiment(
         return errors, -jnp.linalg.slogdet(information)[1] / 2
 
     @compiled
-    def look(choice, plan):
+    def bound_with_gradient(choice, plan):
         return cramer_rao(choice, plan), jax.jacfwd(cramer_rao)(choice, plan)
 
-    def least(share, plan):
-        (errors, volume), (slopes, volume_slope) = look(
-            jnp.asarray(low + (high - low) * share), plan
-        )
+    def objective(share):
+        choice = jnp.asarray(low + (high - low) * share)
+        (errors, volume), (slopes, volume_slope) = bound_with_gradient(choice, plan)
         if target is None:
             return float(volume), np.asarray(volume_slope) * (high - low)
         index = free.index(target)
         return float(errors[index]), np.asarray(slopes[index]) * (high - low)
 
     plan = _integration_plan(case)
-    (errors, _), (slopes, _) = look(jnp.asarray(before), plan)
-    best = _minimise(lambda share: least(share, plan), (before - low) / (high - low))
+    (errors, _), (slopes, _) = bound_with_gradient(jnp.asarray(before), plan)
+    best = _minimise(objective, (before - low) / (high - low))
     after = low + (high - low) * best
     chosen = replace(case, dict(zip(over, after, strict=True)))
     sizes = np.where(nominal == 0, 1.0, np.abs(nominal))
-    (improved, _), _ = look(jnp.asarray(after), _integration_plan(chosen))
+    (improved, _), _ = bound_with_gradient(jnp.asarray(after), _integration_plan(chosen))
     return ExperimentDesign(
-        list(over),
-        [unit_at(case, address) for address in over],
-        before,
-        after,
-        free,
-        np.exp(np.asarray(errors)) * sizes,
-        np.exp(np.asarray(improved)) * sizes,
-        np.asarray(slopes),
-        chosen,
+        choices=list(over),
+        units=[unit_at(case, address) for address in over],
+        before=before,
+        after=after,
+        addresses=free,
+        errors_before=np.exp(np.asarray(errors)) * sizes,
+        errors_after=np.exp(np.asarray(improved)) * sizes,
+        error_sensitivities=np.asarray(slopes),
+        case=chosen,
     )
 
 
@@ -143,7 +142,7 @@ def _integration_plan(case: Case) -> IntegrationPlan:
 
 
 def _minimise(objective, start: Float[np.ndarray, " choice"]) -> Float[np.ndarray, " choice"]:
-    """The best of some searches, of which one begins at the start (shares of the bounds)."""
+    """Best of several searches, one of them from `start` (shares of the distance of the bounds)."""
     others = np.random.default_rng(0).random((START_COUNT - 1, start.size))
     if start.size == 1:
         others = (np.arange(START_COUNT - 1)[:, None] + 0.5) / (START_COUNT - 1)
@@ -156,15 +155,15 @@ def _minimise(objective, start: Float[np.ndarray, " choice"]) -> Float[np.ndarra
 
 def _check_arguments(case: Case, free, over, target) -> None:
     if not over:
-        raise ValueError("name at least one number that may be chosen")
+        raise ValueError("name at least one number to choose")
     if target is not None and target not in free:
-        raise ValueError(f"{target} is to be sharpened but is not free; free are {', '.join(free)}")
+        raise ValueError(f"the target {target} is not free; free are {', '.join(free)}")
     for address in (*free, *over):
-        if known(value_at(case, address)).ndim:
+        if concrete(value_at(case, address)).ndim:
             raise ValueError(f"{address} is a list; name its entries, {address}.0 and so on")
     for address, (low, high) in over.items():
-        value = float(known(value_at(case, address)))
+        value = float(concrete(value_at(case, address)))
         if address in free:
             raise ValueError(f"{address} cannot be both fitted and chosen")
         if not low <= value <= high or not low < high:
-            raise ValueError(f"{address} is {value:g}, outside of its bounds {low:g} to {high:g}")
+            raise ValueError(f"{address} is {value:g}, outside its bounds {low:g} to {high:g}")

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.case.fields import known
-from jaxbeam.case.loads import AbstractLoad, motion
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads import AbstractLoad, trajectory
 from jaxbeam.control import Prescribed
 from tuning.logs.log import Log
 
@@ -79,14 +79,14 @@ def _check_command(case: Case, log: Log, channel: int, actuator: int) -> None:
             " leave one out"
         )
     device = case.actuators[actuator]
-    unit = type(device).__dataclass_fields__["limits"].metadata["unit"]
+    unit = device.command_unit
     if COMMAND_UNITS.get(log.quantities[channel]) != unit:
         raise ValueError(
             f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in"
             f" {log.units[channel]}, but the command to actuators.{actuator} is in {unit}"
         )
     limits = device.command_limits()
-    low, high = (-np.inf, np.inf) if limits is None else known(limits)
+    low, high = (-np.inf, np.inf) if limits is None else concrete(limits)
     least, most = log.values[:, channel].min(), log.values[:, channel].max()
     if least < low or most > high:
         raise ValueError(
@@ -159,8 +159,10 @@ def check_loads(log: Log, case: Case) -> None:
             f"{log.source}: no load is known, neither in the case nor in the TOML file beside the "
             "log; without loads, only modes can be identified (leave out --free)"
         )
-    exits = [float(motion(load, case.beam.length).window()[1]) for load in case.loads]
-    entries = [float(motion(load, case.beam.length).window()[0]) for load in case.loads]
+    exits = [float(trajectory(load, case.beam.length).entry_exit_times()[1]) for load in case.loads]
+    entries = [
+        float(trajectory(load, case.beam.length).entry_exit_times()[0]) for load in case.loads
+    ]
     end = float(log.times[-1])
     if end < min(entries):
         raise ValueError(

@@ -1,7 +1,8 @@
-"""Which numbers are free in a fit, and how each is mapped to a variable without bounds."""
+"""Free parameters of a fit or tuning, and their map to search variables without bounds."""
 
 import dataclasses
 import re
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -9,22 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.case.fields import known
-from jaxbeam.case.sensors import QUANTITIES, Sensor
+from jaxbeam.case.case import Case, replace, unit_at, value_at
+from jaxbeam.case.fields import concrete
 from tuning.parameters.prior import Prior, as_prior
 
 LOG_ADDRESS = re.compile(r"logs\.(\d+)\.(.+)")
-BOUND_MARGIN = 1e-3  # of the distance between bounds: a start on a bound is moved in by so much
+BOUND_MARGIN = 1e-3  # of the typical size: how far a start on a bound is moved in
 
 
 @dataclasses.dataclass(frozen=True)
 class FreeParameter:
-    """A free number: its address, unit, start, bounds (either may be infinite), and typical size.
+    """A free parameter: address, unit, start, bounds (either may be infinite) and typical size.
 
-    With two bounds the number is low + (high - low) (1 + sin y) / 2 in the search variable y,
-    which can reach both; with one it is the bound plus or minus an exponential; else y itself.
-    The scales "log" and "logit" of a `prior` change the first of these.
+    With two bounds the value is low + (high - low) (1 + sin y) / 2 of the search variable y, which
+    reaches both; with one bound it is that bound plus or minus an exponential of y; else y itself.
+    The scales "log" and "logit" of the `prior` change the first of these.
     """
 
     address: str
@@ -36,7 +36,7 @@ class FreeParameter:
     prior: Prior = Prior()
 
     def to_unbounded(self, value: float) -> float:
-        """Search variable of a value; one on a bound is moved in a little."""
+        """Search variable of a value; a value on a bound is moved inwards by `BOUND_MARGIN`."""
         least = BOUND_MARGIN * self.typical_size
         if np.isfinite(self.high - self.low):
             if self.prior.scale == "log":
@@ -50,28 +50,28 @@ class FreeParameter:
         return value
 
     def unbounded_at_share(self, share: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-        """Search variable at a share (0 to 1) of the way between two bounds, on the scale."""
+        """Search variable at a share (0 to 1) of the distance between two bounds, on the scale."""
         if self.prior.scale == "logit":
             return np.asarray(np.log(share / (1 - share)))
         return np.asarray(np.arcsin(2 * share - 1))
 
     def _share_between_bounds(self, value: float) -> float:
-        """How far between its two bounds a value is; on the log scale, its logarithm."""
+        """Share of the distance between both bounds (of logarithms, on the scale "log")."""
         if self.prior.scale == "log":
             return np.log(value / self.low) / np.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)
 
     def at_bound(self, value: float) -> bool:
-        """Whether a value lies on a bound, as good as."""
+        """Whether a value lies within `BOUND_MARGIN` of a bound."""
         return bool(min(value - self.low, self.high - value) <= BOUND_MARGIN * self.typical_size)
 
     @property
     def unbounded_size(self) -> float:
-        """A large change of the search variable: one, or the typical size where it is the value."""
+        """A large change of the search variable: 1, or the typical size without any bounds."""
         return self.typical_size if np.isinf(self.low) and np.isinf(self.high) else 1.0
 
     def typical_size_at(self, value: float) -> float:
-        """Typical size once a value is fitted: one that came close to zero is itself small."""
+        """Typical size at a value: smaller close to the only bound of a parameter."""
         one_sided = np.isfinite(self.low) != np.isfinite(self.high)
         distance = min(value - self.low, self.high - value)
         return (
@@ -96,21 +96,29 @@ class FreeParameter:
         return unbounded
 
 
+def to_unbounded(
+    parameters: Sequence[FreeParameter], values: Iterable[float]
+) -> Float[np.ndarray, " parameter"]:
+    """Search variables of values."""
+    pairs = zip(parameters, values, strict=True)
+    return np.array([parameter.to_unbounded(float(value)) for parameter, value in pairs])
+
+
 def free_parameters(
     cases: list[Case],
     bounds: dict[str, tuple[float, float] | Prior | None],
     largest_reading: float,
 ) -> list[FreeParameter]:
-    """Look up the free numbers in the cases of the logs.
+    """Free parameters at addresses in the cases of some logs.
 
-    An address is that of the case, shared by all logs, or `logs.1.loads.0.speed` for a number of
+    An address is that of the case, shared by all logs, or `logs.1.loads.0.speed` for a parameter of
     one log, or `logs.*.loads.0.speed` for one of each log. Each has bounds, None or a `Prior`.
-    Without bounds a number stays on its side of zero, but for offsets and entry times.
-    The typical size of a number is the distance of its bounds, or else itself; that of an offset
-    is the largest `largest_reading`, that of an entry time the duration.
+    Without bounds a parameter keeps its sign, but for offsets and entry times. The typical size is
+    the distance of the bounds, or else the start itself; that of an offset is the
+    `largest_reading`, that of an entry time the duration.
 
-    Raises ValueError for an unknown address, a list, a number that is free twice, bounds that do
-    not hold the start, or a start of zero that says nothing about the size.
+    Raises ValueError for an unknown address, a list, an address that is free twice, bounds that
+    exclude the start, or a start of zero without bounds.
     """
     if not bounds:
         raise ValueError("name at least one address as free")
@@ -122,7 +130,7 @@ def free_parameters(
 
 
 def _expand_log_addresses(bounds: dict[str, Any], logs: int) -> dict[str, Any]:
-    """Addresses with `logs.*` in front, written out for each log."""
+    """Bounds by address, with `logs.*` in front written out for each log."""
     expanded = {}
     for address, pair in bounds.items():
         rest = address.removeprefix("logs.*.")
@@ -134,7 +142,7 @@ def _expand_log_addresses(bounds: dict[str, Any], logs: int) -> dict[str, Any]:
 
 
 def _check_unique(addresses: list[str]) -> None:
-    """A number cannot be shared by all logs and be that of one log as well."""
+    """Refuse an address that is free for all logs and for one log as well."""
     for address in addresses:
         own = LOG_ADDRESS.fullmatch(address)
         if own and own[2] in addresses:
@@ -148,7 +156,7 @@ def _free_parameter(
     cases: list[Case], address: str, bounds, largest_reading: float
 ) -> FreeParameter:
     case, local_address = _locate(cases, address)
-    value = known(value_at(case, local_address))
+    value = concrete(value_at(case, local_address))
     if value.ndim:
         raise ValueError(f"{address} is a list; free its entries, {address}.0 and so on")
     start = float(value)
@@ -173,7 +181,7 @@ def _free_parameter(
     elif local_address.endswith(".offset"):
         size = largest_reading
     elif local_address.endswith(".entry_time"):
-        size = float(known(case.run.duration))
+        size = float(concrete(case.run.duration))
     else:
         size = abs(start)
     if size == 0.0:
@@ -185,7 +193,7 @@ def _free_parameter(
 
 
 def _locate(cases: list[Case], address: str) -> tuple[Case, str]:
-    """The case of the log that an address is about, and the address within it."""
+    """The case of the log that an address belongs to, and the address within it."""
     match = LOG_ADDRESS.fullmatch(address)
     if match:
         if int(match[1]) >= len(cases):
@@ -193,7 +201,7 @@ def _locate(cases: list[Case], address: str) -> tuple[Case, str]:
             existing = "the only log is logs.0" if last == 0 else f"the last log is logs.{last}"
             raise ValueError(f"{address}: there is no such log; {existing}")
         return cases[int(match[1])], match[2]
-    values = [known(value_at(case, address)) for case in cases]
+    values = [concrete(value_at(case, address)) for case in cases]
     if any(np.any(value != values[0]) for value in values):
         raise ValueError(
             f"{address} differs between the logs; say which one, as in logs.0.{address}"
@@ -201,22 +209,8 @@ def _locate(cases: list[Case], address: str) -> tuple[Case, str]:
     return cases[0], address
 
 
-def unit_at(case: Case, address: str) -> str:
-    """The SI unit of the number at an address; "" or "1" if it has none."""
-    unit, part = "", case
-    for name in address.split("."):
-        if isinstance(part, tuple):
-            part = part[int(name)]
-        elif dataclasses.is_dataclass(part):
-            unit = type(part).__dataclass_fields__[name].metadata.get("unit", "")
-            if isinstance(part, Sensor) and unit == "unit of quantity":
-                unit = QUANTITIES[part.quantity]
-            part = getattr(part, name)
-    return unit
-
-
 def with_values(case: Case, log_index: int, values: dict[str, Any]) -> Case:
-    """The case of one log with values at the addresses that concern it."""
+    """The case of one log with the values at the addresses that belong to it."""
     own = {}
     for address, value in values.items():
         match = LOG_ADDRESS.fullmatch(address)

@@ -68,6 +68,11 @@ class AbstractActuator(eqx.Module):
         """Bending stiffness (N m^2) and mass per length (kg/m) added; they shape the modes."""
         return None
 
+    @property
+    def command_unit(self) -> str:
+        """SI unit of a command, V or N; "1" for a passive device, which takes none."""
+        return type(self).__dataclass_fields__["limits"].metadata["unit"]
+
     def command_limits(self) -> Float[Array, "2"] | None:
         """Smallest and largest command it takes, in the unit of a command; None if any."""
         return self.limits

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case.case import replace
-from tuning.parameters.free import FreeParameter, free_parameters, unit_at, with_values
+from jaxbeam.case.case import replace, unit_at
+from tuning.parameters.free import FreeParameter, free_parameters, with_values
 
 CASE = jb.Case(
     beam=jb.Beam(length=1.0, flexural_rigidity=20.0, mass_per_length=2.0, damping_ratio=[0.01] * 3,
