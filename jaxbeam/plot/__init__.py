@@ -1,8 +1,10 @@
-"""Pictures of records, comparisons, modes, sweeps, fits, tunings and frequency responses.
+"""Figures of records, comparisons, modes, sweeps, fits, tunings and frequency responses.
 
-Each function returns a figure, which the caller saves. The figures do not belong to pyplot:
-nothing is shown, and nothing has to be closed.
+Each function returns a matplotlib figure, which the caller saves. Figures are not registered with
+pyplot: none is shown, and none needs to be closed.
 """
+
+import warnings
 
 from jaxbeam.plot.animation import animate
 from jaxbeam.plot.compare import plot_comparison
@@ -22,10 +24,21 @@ __all__ = [
     "plot_comparison",
     "plot_fit",
     "plot_frequency_response",
-    "plot_pareto_front",
     "plot_modes",
+    "plot_pareto_front",
     "plot_poles",
     "plot_record",
     "plot_sweep",
     "plot_tuning",
 ]
+
+OLD_NAMES = {"plot_frequency": "plot_frequency_response", "plot_front": "plot_pareto_front"}
+
+
+def __getattr__(name: str):
+    if name not in OLD_NAMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warnings.warn(
+        f"jaxbeam.plot.{name} is called {OLD_NAMES[name]} now", DeprecationWarning, stacklevel=2
+    )
+    return globals()[OLD_NAMES[name]]

@@ -1,4 +1,4 @@
-"""A run as a moving picture: the beam with its loads and actuators, and what happened so far."""
+"""Animation of a run: beam with loads and actuators, deflections and commands so far."""
 
 import os
 
@@ -10,12 +10,18 @@ from PIL import Image
 
 from jaxbeam.case.fields import concrete
 from jaxbeam.plot.record import shade_crossings
-from jaxbeam.plot.schematic import ACTUATOR_MARKER, LOAD_MARKER, draw_supports
+from jaxbeam.plot.schematic import (
+    ACTUATOR_MARKER,
+    LOAD_MARKER,
+    actuator_positions,
+    draw_supports,
+)
 from jaxbeam.plot.style import (
     COLOURS,
     GREY,
     INK,
     colour,
+    command_drawstyle,
     load_colour,
     set_title,
     unit_scale,
@@ -23,7 +29,7 @@ from jaxbeam.plot.style import (
 )
 from jaxbeam.simulation.record import Record
 
-PALETTE_SIZE = 96  # colours of the GIF: few, so that it stays small
+PALETTE_SIZE = 96  # colours of the GIF; few keep the file small
 
 
 @use_style
@@ -35,16 +41,16 @@ def animate(
     rate: int | float = 24,
     overwrite: bool = False,
 ) -> None:
-    """Write a GIF of the beam (deflection enlarged) with the loads that cross it.
+    """Write a GIF of the beam, its deflection enlarged, and the loads that cross it.
 
-    Actuators hang below the beam, or are drawn on it if bonded, the thin line is how low the beam
-    has been; sensors are dots, and below are their deflections so far, and the commands if there
-    is a controller. The run is shown in so many `frames`, `rate` of them a second, whatever it
-    took; a clock tells the time. Raises FileExistsError if the file exists and `overwrite` is not
-    set, and ValueError for a loop that diverges.
+    Actuators hang below the beam, patches are drawn on it, sensors are dots; the thin line is the
+    envelope of the downward deflection. Below are the deflections at the sensors so far, and the
+    commands if there is a controller. The whole run takes `frames` frames, `rate` of them a second;
+    a clock shows its time (s). Raises FileExistsError if the file exists and `overwrite` is not
+    set, ValueError for a run that diverges.
     """
     if not overwrite and os.path.exists(path):
-        raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
+        raise FileExistsError(f"{path} exists; choose another name, or overwrite it")
     if np.isfinite(float(concrete(record.diverged_time))):
         raise ValueError(f"there is nothing to show: {record.verdict}")
     controlled = record.case.controller is not None
@@ -69,9 +75,9 @@ def animate(
             update(frame)
         canvas.draw()
         if not images:
-            figure.set_layout_engine("none")  # found once; a moving layout would tremble
+            figure.set_layout_engine("none")  # keep the layout of the first frame
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    # One palette for all, from the fullest picture: what stays the same is stored once.
+    # One palette for all frames, of the last and fullest: GIF stores only what changes.
     palette = images[-1].quantize(PALETTE_SIZE)
     first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in images)
     first.save(
@@ -85,7 +91,7 @@ def animate(
 
 
 def _beam_axes(axes, record):
-    """Draw the rig; return what moves it to a sample."""
+    """Draw the beam; returns a function that draws it at a sample."""
     case = record.case
     length = float(concrete(case.beam.length))
     x = np.linspace(0, length, 201)
@@ -95,14 +101,9 @@ def _beam_axes(axes, record):
     factor, unit = unit_scale(beam, "m")
     beam = beam / factor
     lowest_deflection = np.minimum.accumulate(beam)
-    actuator_positions = [
-        [float(concrete(p)) for p, _, _ in actuator.displacement_map()]
-        for actuator in case.actuators
-    ]
-    point_actuators = np.array([places[0] for places in actuator_positions if len(places) == 1])
-    patches = [
-        np.linspace(places[0], places[1], 20) for places in actuator_positions if len(places) == 2
-    ]
+    acting_at = [actuator_positions(actuator) for actuator in case.actuators]
+    point_actuators = np.array([positions[0] for positions in acting_at if len(positions) == 1])
+    patches = [np.linspace(*positions, 20) for positions in acting_at if len(positions) == 2]
 
     draw_supports(axes, case)
     axes.axhline(0, color=GREY, linewidth=0.7, linestyle=":")
@@ -121,7 +122,7 @@ def _beam_axes(axes, record):
     )
     load_markers.set(markeredgecolor=INK, clip_on=False, zorder=3)
     for moving in (actuator_markers, load_markers):
-        moving.set_in_layout(False)  # what is not there yet has no place
+        moving.set_in_layout(False)  # no points yet in the first frame
     clock = axes.text(1, 1, "", transform=axes.transAxes, ha="right", va="top", family="monospace")
     low, high = min(beam.min(), 0.0), max(beam.max(), 0.0)
     height_range = (high - low) or 1.0
@@ -132,8 +133,8 @@ def _beam_axes(axes, record):
     axes.set(xlabel="position (m)", ylabel=f"deflection ({unit})")
 
     def update(frame):
-        def height(places):
-            return np.interp(places, x, beam[frame])
+        def height(positions):
+            return np.interp(positions, x, beam[frame])
 
         line.set_data(x, beam[frame])
         lowest.set_data(x, lowest_deflection[frame])
@@ -149,16 +150,14 @@ def _beam_axes(axes, record):
 
 
 def _history_axes(axes, record, values, quantity):
-    """Prepare axes for the columns of some values over time; return what draws them so far."""
+    """Axes of values over time, a line a column; returns a function that draws them to a sample."""
     times = np.asarray(record.times)
     unit, factor, line_colour, style = "", 1.0, load_colour, "default"
     if quantity == "deflection":
         (factor, unit), line_colour = unit_scale(values, "m"), colour
     else:
-        actuator = record.case.actuators[0]
-        unit = type(actuator).__dataclass_fields__["limits"].metadata["unit"]
-        if record.case.controller.period is not None:
-            style = "steps-post"
+        unit = record.case.actuators[0].command_unit
+        style = command_drawstyle(record.case.controller)
     values = values / factor
     shade_crossings(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.7)

@@ -1,4 +1,4 @@
-"""A fit: what was measured, what the model says, and what is left between them."""
+"""Fit of a model to logs: measured and fitted signals, and residuals."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,12 +7,21 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from jaxbeam.plot.style import GREY, INK, colour, format_number, set_title, unit_scale, use_style
+from jaxbeam.plot.style import (
+    GREY,
+    INK,
+    annotate,
+    colour,
+    format_number,
+    set_title,
+    unit_scale,
+    use_style,
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class FitPanel:
-    """One log in a picture of a fit: its samples and the fitted ones, in the SI `unit`."""
+    """One log in the figure of a fit: measured and fitted samples in the SI `unit`."""
 
     title: str
     times: Float[np.ndarray, " time"]
@@ -24,10 +33,10 @@ class FitPanel:
 
 @use_style
 def plot_fit(panels: Sequence[FitPanel], title: str = "") -> Figure:
-    """One column a log: measured (dots) and fitted (line), and the residual of each channel.
+    """Measured (dots) and fitted signals (lines) and residuals, a column a log.
 
-    Residuals of a log share one scale; each says its standard deviation.
-    Raises ValueError without panels.
+    Residuals of a log share one scale, and are labelled with their standard deviations. Raises
+    ValueError without panels.
     """
     if not panels:
         raise ValueError("there is nothing to draw: give at least one log")
@@ -49,7 +58,7 @@ def plot_fit(panels: Sequence[FitPanel], title: str = "") -> Figure:
 
 
 def _draw(column, panel):
-    """Fill one column: the channels together, then the residual of each in its colour."""
+    """Draw the signals of a log in the top axes, and the residual of each channel below."""
     top, *residual_axes = column
     residual = panel.measured - panel.fitted
     deviation = np.std(residual, axis=0)
@@ -67,12 +76,12 @@ def _draw(column, panel):
         strip.axhline(0, color=INK, linewidth=0.7)
         strip.set(ylim=(-residual_limit, residual_limit))
         strip.set_ylabel(panel.names[i], color=colour(i))
-        strip.annotate(
+        annotate(
+            strip,
             f"residual sd {format_number(deviation[i] / residual_factor)} {residual_unit}",
             (1.0, 1.0),
+            (-2, 0),
             xycoords="axes fraction",
-            xytext=(-2, 0),
-            textcoords="offset points",
             ha="right",
             va="bottom",
             color=GREY,

@@ -10,9 +10,9 @@ from jaxbeam.plot.style import FAINT, colour, set_title, use_style
 
 @use_style
 def plot_frequency_response(response: FrequencyResponse) -> Figure:
-    """Magnitude and phase over frequency: one column for each unit, one curve for each pair.
+    """Magnitude and phase over frequency, a column a unit, a curve an input-output pair.
 
-    Frequencies of zero have no place on the logarithmic axis and are left out.
+    A frequency of zero, which a logarithmic axis lacks, is left out.
     """
     positive = np.asarray(response.frequencies) > 0
     frequencies = np.asarray(response.frequencies)[positive]
@@ -28,7 +28,7 @@ def plot_frequency_response(response: FrequencyResponse) -> Figure:
             bottom.semilogx(frequencies, phase[:, i], color=colour(number))
         top.set_ylabel("magnitude" if unit == "1" else f"magnitude ({unit.replace('^2', '²')})")
         top.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2)
-        # Within one decade the powers of ten alone would leave the axis without numbers.
+        # Powers of ten alone would leave an axis of less than a decade without numbers.
         least, most = top.get_ylim()
         within_a_decade = most < 20 * least
         top.yaxis.set_minor_formatter(

@@ -1,4 +1,4 @@
-"""A Pareto front: what one figure of merit costs in another."""
+"""Pareto front of a tuning: the objective over the limit of a metric."""
 
 from collections.abc import Mapping
 
@@ -13,7 +13,7 @@ from jaxbeam.plot.style import colour, set_title, use_style
 def plot_pareto_front(
     fronts: Mapping[str, Float[ndarray, "limit 2"]], metric: str, title: str = ""
 ) -> Figure:
-    """The objective over a merit that was limited, one line for each kind of runs.
+    """Objective over the limited metric, a line for training and for held-out runs.
 
     Raises ValueError without lines.
     """

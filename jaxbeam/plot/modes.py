@@ -1,4 +1,4 @@
-"""Mode shapes along the beam."""
+"""Mode shapes of a beam."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +12,7 @@ from jaxbeam.plot.style import (
     FAINT,
     GREY,
     INK,
+    annotate,
     colour,
     format_number,
     set_title,
@@ -22,10 +23,9 @@ from jaxbeam.plot.style import (
 
 @use_style
 def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
-    """Shapes of the modes of a case, one above the other, with frequencies and damping ratios.
+    """Mode shapes of a case, one above the other, with frequencies (Hz) and damping ratios.
 
-    All are drawn to the same height: their size has no meaning. `modes` are computed from the
-    case if left out.
+    Shapes are scaled to the same height. `modes` are computed from the case if left out.
     """
     modes = find_modes(case) if modes is None else modes
     length = float(concrete(case.beam.length))
@@ -43,12 +43,12 @@ def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
         axes.fill_between(x, -i, shape, color=colour(0), alpha=0.12, linewidth=0)
         axes.plot(x, shape, color=colour(0), linewidth=1.8)
         draw_supports(axes, case, y=-i, size=17)
-        axes.annotate(
+        annotate(
+            axes,
             f"{_frequency_text(float(frequency))}\ndamping {100 * float(ratio):.3g} %",
             (1.0, -i),
+            (12, 0),
             xycoords=axes.get_yaxis_transform(),
-            xytext=(12, 0),
-            textcoords="offset points",
             va="center",
             color=INK,
         )

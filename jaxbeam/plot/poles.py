@@ -6,17 +6,18 @@ from matplotlib.figure import Figure
 from jaxbeam.analysis.stability import FrozenPoles, Growth
 from jaxbeam.plot.style import ALARM, GREY, INK, colour, set_title, use_style
 
-MAX_DECAY_RATIO = 3.0  # times as far left as the fastest pole is high: faster decay is left out
+# Branches with decay rates above this, relative to the largest frequency, are left out.
+MAX_DECAY_RATIO = 3.0
 
 
 @use_style
 def plot_poles(
     poles_along_crossing: FrozenPoles, growth: Growth | None = None, title: str = ""
 ) -> Figure:
-    """Branches of the frozen poles in the complex plane, and their largest real part over time.
+    """Poles with frozen loads in the complex plane, and their largest real part over time.
 
-    A dot marks where each branch starts, shading where the frozen loop is unstable. With `growth`,
-    how much deviations have grown by each time is drawn below.
+    Dots mark the start of the crossing, shading instability of the frozen loop. With `growth`, the
+    growth of deviations since the start is drawn below.
     """
     rows = 2 if growth is None else 3
     figure = Figure(figsize=(8.0, 4.6))

@@ -1,4 +1,4 @@
-"""One run: deflection at the sensors, contact forces and commands over time."""
+"""Figure of one run: deflections at the sensors, contact forces and commands over time."""
 
 import dataclasses
 
@@ -12,7 +12,10 @@ from jaxbeam.plot.style import (
     ALARM,
     GREY,
     SHADE,
+    annotate,
     colour,
+    command_drawstyle,
+    draw_limits,
     format_number,
     load_colour,
     margin_labels,
@@ -25,16 +28,16 @@ from jaxbeam.simulation.record import Record
 
 @use_style
 def plot_record(record: Record) -> Figure:
-    """Deflection at the sensors (dots: peaks), below it contact forces, and commands if any.
+    """Schematic of the case, deflections at the sensors, contact forces, and commands if any.
 
-    The times with loads on the beam are shaded. On top, the rig shows where the sensors are.
-    Raises ValueError if the record has neither sensors nor loads.
+    Dots mark peaks, shading the times with loads on the beam. Raises ValueError if the case has
+    neither sensors nor loads.
     """
     case = record.case
     panels = [
         (height, draw)
         for height, draw, shown in (
-            (0.7, _draw_schematic, True),
+            (0.7, lambda axes, record: draw_schematic(axes, record.case), True),
             (3.2, _draw_deflection, case.sensors),
             (1.7, _draw_forces, case.loads),
             (1.7, _draw_commands, case.controller is not None),
@@ -56,7 +59,7 @@ def plot_record(record: Record) -> Figure:
 
 
 def load_windows(record: Record) -> list[tuple[int, float, float]]:
-    """Each load seen in the record, by number, with its entry and exit (s), cut to the record."""
+    """Number, entry and exit (s) of each load on the beam during the record, clipped to it."""
     times = np.asarray(record.times)
     trajectories = [trajectory(load, record.case.beam.length) for load in record.case.loads]
     windows = np.array(
@@ -66,12 +69,15 @@ def load_windows(record: Record) -> list[tuple[int, float, float]]:
     return [(i, entry, leaves) for i, (entry, leaves) in enumerate(cut) if entry < leaves]
 
 
-def _draw_schematic(axes, record):
-    draw_schematic(axes, record.case)
+def signed_peak(record: Record, sensor: int) -> float:
+    """Peak deflection (m) at a sensor with its sign, which the record's own lacks."""
+    times, history = np.asarray(record.times), np.asarray(record.deflection)[:, sensor]
+    sign = np.sign(np.interp(float(record.peak_time[sensor]), times, history))
+    return float(sign * record.peak_deflection[sensor])
 
 
 def shade_crossings(axes, record: Record) -> None:
-    """Shade the times at which loads are on the beam, in axes over the time of a record."""
+    """Set the limits of a time axis to those of a record; shade times with loads on the beam."""
     times = np.asarray(record.times)
     axes.set_xlim(times[0], times[-1])
     for _, entry, exit_time in load_windows(record):
@@ -81,16 +87,16 @@ def shade_crossings(axes, record: Record) -> None:
 
 
 def label_loads(axes, record: Record) -> None:
-    """Write at its entry what a load is; several are numbered."""
+    """Label each load at its entry: its mass or force and speed, or its number among several."""
     loads = record.case.loads
     for i, entry, _ in load_windows(record):
         label = f"load {i}" if len(loads) > 1 else _load_label(loads[i])
-        axes.annotate(
+        annotate(
+            axes,
             label,
             (entry, 1.0),
+            (4, -4),
             xycoords=axes.get_xaxis_transform(),
-            xytext=(4, -4),
-            textcoords="offset points",
             va="top",
             color=load_colour(i),
             fontsize=8,
@@ -98,7 +104,7 @@ def label_loads(axes, record: Record) -> None:
 
 
 def _load_label(load) -> str:
-    """The numbers of a load that tell it from others, with units: "0.5 kg, 1.2 m/s"."""
+    """Mass or force, and speed of a load, with units: "0.5 kg, 1.2 m/s"."""
     numbers = [(field, getattr(load, field.name)) for field in dataclasses.fields(load)]
     return ", ".join(
         f"{float(concrete(value)):.4g} {field.metadata['unit']}"
@@ -115,9 +121,7 @@ def _draw_deflection(axes, record):
     peaks = []
     for i, when in enumerate(np.asarray(record.peak_time)):
         axes.plot(times, deflection[:, i] / factor, color=colour(i))
-        # A record keeps the size of a peak; its sign is that of the history there.
-        sign = np.sign(np.interp(when, times, deflection[:, i]))
-        peaks.append(sign * float(record.peak_deflection[i]) / factor)
+        peaks.append(signed_peak(record, i) / factor)
         axes.plot([when], peaks[-1:], "o", color=colour(i), markeredgecolor="white", zorder=3)
     axes.set_ylabel(f"deflection ({unit})")
     low, high = axes.get_ylim()
@@ -143,11 +147,11 @@ def _draw_forces(axes, record):
     if lost.size:
         axes.axhline(0, color=GREY, linewidth=0.8)
         axes.plot(lost, 0 * lost, "X", color=ALARM, markersize=7, zorder=3)
-        axes.annotate(
+        annotate(
+            axes,
             "has to pull",
             (lost.min(), 0),
-            xytext=(-6, -6),
-            textcoords="offset points",
+            (-6, -6),
             ha="right",
             va="top",
             color=ALARM,
@@ -162,23 +166,19 @@ def _draw_forces(axes, record):
 def _draw_commands(axes, record):
     times, command = np.asarray(record.times), np.asarray(record.command)
     actuators = record.case.actuators
-    units = {type(a).__dataclass_fields__["limits"].metadata["unit"] for a in actuators}
+    units = {actuator.command_unit for actuator in actuators}
+    style = command_drawstyle(record.case.controller)
     shade_crossings(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.8)
-    limit_values, names, tints = [], [], []
+    reached, tints = [], []
     for i, actuator in enumerate(actuators):
-        # Commands of a sampled controller are held, not joined.
-        sampled = record.case.controller.period is not None
-        style = "steps-post" if sampled else "default"
         axes.plot(times, command[:, i], color=load_colour(i), linewidth=1.1, drawstyle=style)
         limits = actuator.command_limits()
         if limits is None or not np.any(np.asarray(record.saturated)[:, i]):
             continue
         for limit in np.asarray(concrete(limits)):
             if np.any(np.isclose(command[:, i], limit)):
-                axes.axhline(limit, color=load_colour(i), linewidth=0.9, linestyle=":")
-                limit_values.append(limit)
-                names.append(f"limit {format_number(limit)}")
+                reached.append(limit)
                 tints.append(load_colour(i))
     axes.set_ylabel(f"command ({', '.join(sorted(units))})")
-    margin_labels(axes, limit_values, names, tints)
+    draw_limits(axes, reached, tints)

@@ -1,19 +1,20 @@
-"""The rig as a sketch: beam, ends, supports, actuators and sensors where they are."""
+"""Schematic of a case: beam, ends, supports, actuators and sensors at their positions."""
 
 import numpy as np
 from matplotlib.path import Path
 
+from jaxbeam.case.actuators import AbstractActuator
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.plot.style import COLOURS, GREY, INK, colour, separate_labels
+from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, colour, separate_labels
 
-# Markers hang below the point of the beam that they hold, whatever the scale of the axes.
+# Markers in points, below the point of the beam they support.
 _HATCH_LINES = [p for y in (-0.9, -0.5, -0.1, 0.3, 0.7) for p in ((0.0, y + 0.2), (-0.4, y))]
 _WALL_LINES = [(0.0, -1.0), (0.0, 1.0), *_HATCH_LINES]
 
 
 def _line_segments(points) -> Path:
-    """Separate strokes, each between two consecutive points."""
+    """Line segments between each two consecutive points."""
     return Path(points, [Path.MOVETO, Path.LINETO] * (len(points) // 2))
 
 
@@ -38,7 +39,7 @@ def _draw_marker(axes, x, y, marker, size, **style):
 
 
 def draw_supports(axes, case: Case, y: int | float = 0, size: int | float = 22) -> None:
-    """Draw ends and supports of a case at height y; `size` is in points."""
+    """Draw the ends and supports of a case at height y (data units); `size` is in points."""
     length = float(concrete(case.beam.length))
     for x, end, side in ((0.0, case.beam.left_end, 1), (length, case.beam.right_end, -1)):
         if end == "pinned":
@@ -54,29 +55,27 @@ def draw_supports(axes, case: Case, y: int | float = 0, size: int | float = 22) 
         )
 
 
+def actuator_positions(actuator: AbstractActuator) -> list[float]:
+    """Positions (m) at which an actuator acts: one for a point actuator, two for a patch."""
+    return [float(concrete(position)) for position, _, _ in actuator.displacement_map()]
+
+
 def draw_schematic(axes, case: Case) -> None:
-    """Draw the whole rig at height zero: sensors in their colours, named by their positions."""
+    """Draw beam, supports, actuators, and sensors in their colours with their positions (m)."""
     length = float(concrete(case.beam.length))
     axes.plot([0, length], [0, 0], color=INK, linewidth=3, zorder=2)
     draw_supports(axes, case)
     for actuator in case.actuators:
-        actuator_positions = [float(concrete(x)) for x, _, _ in actuator.displacement_map()]
-        if len(actuator_positions) == 1:
-            _draw_marker(axes, actuator_positions[0], 0, ACTUATOR_MARKER, 22, markeredgecolor=GREY)
+        positions = actuator_positions(actuator)
+        if len(positions) == 1:
+            _draw_marker(axes, positions[0], 0, ACTUATOR_MARKER, 22, markeredgecolor=GREY)
         else:
-            axes.plot(actuator_positions, [0, 0], color=COLOURS[4], linewidth=6, zorder=2.5)
+            axes.plot(positions, [0, 0], color=COLOURS[4], linewidth=6, zorder=2.5)
     sensor_positions = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
     for i, (x, label_position) in enumerate(
         zip(sensor_positions, separate_labels(sensor_positions, 0.08 * length), strict=True)
     ):
         axes.plot([x], [0], "o", color=colour(i), markersize=8, markeredgecolor="white", zorder=4)
-        axes.annotate(
-            f"{x:.4g} m",
-            (label_position, 0),
-            xytext=(0, 9),
-            textcoords="offset points",
-            ha="center",
-            color=colour(i),
-        )
+        annotate(axes, f"{x:.4g} m", (label_position, 0), (0, 9), ha="center", color=colour(i))
     axes.set(xlim=(-0.02 * length, 1.02 * length), ylim=(-1, 1))
     axes.axis("off")

@@ -1,4 +1,4 @@
-"""What all pictures have in common: colours, type, units with prefixes, labels that keep apart."""
+"""Shared style of all figures: colours, fonts, unit prefixes, labels that do not overlap."""
 
 from typing import NamedTuple
 
@@ -9,10 +9,10 @@ from jaxtyping import Float
 from matplotlib import rc_context
 
 INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
-# Okabe and Ito's colours, which can be told apart with any kind of colour vision.
+# Okabe and Ito's colours, distinct with any kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 ALARM = COLOURS[1]
-LOAD_COLOURS = (INK, "#A6611A", "#7B3294", "#7A868F")  # as far from those as from each other
+LOAD_COLOURS = (INK, "#A6611A", "#7B3294", "#7A868F")  # distinct from COLOURS too
 
 STYLE = {
     "figure.dpi": 150,
@@ -45,7 +45,7 @@ STYLE = {
 }
 
 use_style = rc_context(STYLE)
-"""Decorator: what the function draws has the style; nothing outside of it changes."""
+"""Decorator of functions that draw: the style holds inside them only."""
 
 
 class UnitScale(NamedTuple):
@@ -59,9 +59,9 @@ _PREFIXES = ((1e6, 1e6, "M"), (1e3, 1e3, "k"), (0.1, 1.0, ""), (1e-4, 1e-3, "m")
 
 
 def unit_scale(values, unit: str) -> UnitScale:
-    """The prefix with which values in an SI unit read best: 0.0014 m as 1.4 mm.
+    """Prefixed unit for the largest of some values in an SI unit: mm for 0.0014 m.
 
-    A number without unit ("1") gets a power of ten instead.
+    Values without unit ("1") get a power of ten instead.
     """
     sizes = np.abs(np.asarray(values, float))
     largest = np.max(sizes[np.isfinite(sizes)], initial=0.0)
@@ -73,33 +73,43 @@ def unit_scale(values, unit: str) -> UnitScale:
 
 
 def colour(index: int) -> str:
-    """Colour of a sensor or channel by its number; they repeat after six."""
+    """Colour of a sensor or channel by its number; colours repeat after six."""
     return COLOURS[index % len(COLOURS)]
 
 
 def load_colour(index: int) -> str:
-    """Colour of a load by its number; they repeat after four."""
+    """Colour of a load or actuator by its number; colours repeat after four."""
     return LOAD_COLOURS[index % len(LOAD_COLOURS)]
 
 
 def format_number(value: float, count: int = 3) -> str:
-    """A number rounded to so many digits, zeros at its end kept, with a proper minus sign."""
+    """Number rounded to `count` significant digits, zeros at its end kept, with a minus sign."""
     return f"{value:#.{count}g}".rstrip(".").replace("-", "\N{MINUS SIGN}")
 
 
+def command_drawstyle(controller) -> str:
+    """Matplotlib's drawstyle for commands: steps if sampled and held, lines if continuous."""
+    return "default" if controller.period is None else "steps-post"
+
+
 def set_title(figure, title: str) -> None:
-    """Write a title over a figure, at the left."""
+    """Set the title of a figure, flush left; nothing for an empty one."""
     if title:
         figure.suptitle(title, x=0.01, ha="left")
 
 
+def annotate(axes, text: str, point, offset, **options) -> None:
+    """Text at an offset (points) from a point of the axes; options are those of matplotlib."""
+    axes.annotate(text, point, xytext=offset, textcoords="offset points", **options)
+
+
 def separate_labels(positions, gap: float) -> Float[np.ndarray, " label"]:
-    """Places at least `gap` apart, in the order of those wanted and as near to them as can be."""
+    """Positions at least `gap` apart, order kept, nearest to the wanted ones in least squares."""
     positions = np.asarray(positions, float)
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(positions.size)
     separated = np.empty_like(positions)
-    # The gaps taken away, "at least a gap apart" means "not falling": a monotone regression.
+    # With the gaps subtracted, positions must not decrease: isotonic regression.
     separated[order] = scipy.optimize.isotonic_regression(positions[order] - steps).x + steps
     return separated
 
@@ -109,14 +119,21 @@ def margin_labels(axes, heights, labels, colours) -> None:
     low, high = axes.get_ylim()
     inches = axes.get_figure().get_figheight() * axes.get_position().height
     label_heights = separate_labels(heights, 0.17 * (high - low) / inches)
-    for place, label, tint in zip(label_heights, labels, colours, strict=True):
-        axes.annotate(
+    for height, label, tint in zip(label_heights, labels, colours, strict=True):
+        annotate(
+            axes,
             label,
-            (1.0, place),
+            (1.0, height),
+            (5, 0),
             xycoords=axes.get_yaxis_transform(),
-            xytext=(5, 0),
-            textcoords="offset points",
             va="center",
             color=tint,
             annotation_clip=False,
         )
+
+
+def draw_limits(axes, limits, colours) -> None:
+    """Draw limits of commands as dotted lines, with their values in the right margin."""
+    for limit, tint in zip(limits, colours, strict=True):
+        axes.axhline(limit, color=tint, linewidth=0.9, linestyle=":")
+    margin_labels(axes, limits, [f"limit {format_number(limit)}" for limit in limits], colours)

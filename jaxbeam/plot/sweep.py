@@ -1,4 +1,4 @@
-"""A sweep: peak deflection over one or two of its addresses, for each sensor."""
+"""Figure of a sweep: peak deflection at each sensor over one or two addresses."""
 
 import json
 
@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.plot.style import (
@@ -23,18 +23,18 @@ from jaxbeam.plot.style import (
     use_style,
 )
 
-LABEL_MARGIN = 0.06  # of a map, where the number of a line might stick out
-MAX_MARKED_RUNS = 40  # runs; each is a dot on a curve of so few
+LABEL_MARGIN = 0.06  # share of a map at its edges where contour labels would be cut off
+MAX_MARKED_RUNS = 40  # largest number of runs of a curve that are marked with dots
 
 
 @use_style
 def plot_sweep(dataset: xarray.Dataset) -> Figure:
     """Peak deflection over the swept addresses: curves for one, a map per sensor for two.
 
-    The largest peak is marked with a dot, and failed runs are left out. Of a sweep over more
-    addresses, draw a slice: `plot_sweep(dataset.isel({"loads.0.mass": 0}))`. Paired runs are
-    drawn over their number. Raises ValueError for more than two addresses, or for a dataset that
-    was not made by a sweep.
+    A dot marks the largest peak; failed runs are left out; paired runs are drawn over their number.
+    A sweep over more addresses is drawn in slices: `plot_sweep(dataset.isel({"loads.0.mass": 0}))`.
+    Raises ValueError for more than two addresses, for a single run, and for a dataset without
+    `peak_deflection` and the attribute `case`.
     """
     if "peak_deflection" not in dataset or "case" not in dataset.attrs:
         raise ValueError("not a sweep of jaxbeam: the dataset lacks peak_deflection or its case")
@@ -65,15 +65,8 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
 
 
 def _unit(case: Case, address: str) -> str:
-    """The unit of the number at an address; empty if it has none."""
-    part, unit = case, ""
-    for step in address.split("."):
-        if step.isdigit():
-            part = part[int(step)]
-        else:
-            field = type(part).__dataclass_fields__.get(step)
-            unit = field.metadata.get("unit", "") if field else ""
-            part = getattr(part, step, None)
+    """SI unit of the number at an address; empty if it has none."""
+    unit = unit_at(case, address)
     return "" if unit == "1" else unit
 
 
@@ -83,7 +76,7 @@ def _axis_label(case: Case, address: str) -> str:
 
 
 def _sensor_names(peaks, case):
-    """Sensors by position, or by number where the position is swept too."""
+    """Names of the sensors: their positions (m), or their numbers if positions are swept."""
     if "sensor" not in peaks.coords:
         return [f"sensor {i}" for i in range(peaks.sizes["sensor"])]
     numbers = [int(str(label).split(":")[0]) for label in peaks["sensor"].values]
@@ -125,20 +118,20 @@ def _maps(peaks, swept, unit, case):
     for axes in grid.flat[count:]:
         axes.set_visible(False)
     y, x = (peaks[address].values for address in swept)
-    # One scale for all sensors, so that equal colours and lines are equal deflections.
+    # One scale for all sensors: equal colours and lines mean equal deflections.
     highest = np.max(peaks.values, initial=0.0, where=np.isfinite(peaks.values)) or 1.0
     contour_levels = MaxNLocator(8).tick_values(0, highest)
     fill_levels = np.linspace(0, contour_levels[-1], 8 * (contour_levels.size - 1) + 1)
     names = _sensor_names(peaks, case)
     filled = None
     for axes, values, title in zip(grid.flat, peaks.values, names, strict=False):
-        axes.set_facecolor(FAINT)  # seen where runs failed
+        axes.set_facecolor(FAINT)  # visible where runs failed
         filled = axes.contourf(x, y, values, levels=fill_levels, cmap="YlGnBu")
         drawn = axes.contour(x, y, values, levels=contour_levels[1:-1], colors=INK, linewidths=0.5)
         texts = axes.clabel(drawn, inline=False, fontsize=7, fmt="%.4g")
         corner, size = np.array([x[0], y[0]]), np.array([np.ptp(x), np.ptp(y)])
         for text in texts:
-            # Cut off at an edge a number would be another one.
+            # A number cut off at an edge would read as another one.
             inside = (np.array(text.get_position()) - corner) / size
             text.set_visible(bool(np.all((inside > LABEL_MARGIN) & (inside < 1 - LABEL_MARGIN))))
             text.set_path_effects([withStroke(linewidth=3, foreground="white")])

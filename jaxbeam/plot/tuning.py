@@ -1,4 +1,4 @@
-"""A tuning: peaks of all runs before and after, beside no control and the bound, and the search."""
+"""Figure of a tuning: peaks of all runs before and after, and the objective over the search."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from jaxbeam.plot.style import GREY, INK, colour, set_title, use_style
+from jaxbeam.plot.style import GREY, INK, SHADE, colour, set_title, use_style
 
 
 @dataclasses.dataclass(frozen=True)
 class TuningPanel:
-    """Runs in a picture of a tuning, each with its label and its peaks (m); `least_peak` may be NaN."""
+    """Set of runs in the figure of a tuning, with labels and peaks (m); `least_peak` may be NaN."""
 
     title: str
     labels: Sequence[str]
@@ -26,9 +26,9 @@ class TuningPanel:
 def plot_tuning(
     panels: Sequence[TuningPanel], history: Float[np.ndarray, "step start"], title: str = ""
 ) -> Figure:
-    """Peaks of every run relative to no control, and below them the objective step by step.
+    """Peaks of every run relative to no control, and the objective over the steps of the search.
 
-    The shaded part is out of reach: no controller gets below the bound. Raises ValueError without
+    Shading: below the least achievable peak, the bound on any controller. Raises ValueError without
     panels.
     """
     if not panels:
@@ -56,7 +56,7 @@ def plot_tuning(
 
 
 def _draw(axes, panel):
-    """One line a run: from before to after, with what is out of reach shaded."""
+    """Draw a line a run, from its peak before to that after, over the least achievable peak."""
     rows = np.arange(len(panel.labels))
     percent_factor = 100 / panel.uncontrolled
     axes.hlines(
@@ -66,17 +66,17 @@ def _draw(axes, panel):
         panel.before * percent_factor, rows, "o", color=colour(1), label="before", markersize=5
     )
     axes.plot(panel.after * percent_factor, rows, "o", color=colour(0), label="after", markersize=5)
-    if np.isfinite(panel.least).all():
+    if np.isfinite(panel.least_peak).all():
         axes.plot(
-            panel.least * percent_factor,
+            panel.least_peak * percent_factor,
             rows,
             "|",
             color=INK,
-            label="least possible",
+            label="least achievable",
             markersize=10,
         )
-        axes.barh(rows, panel.least * percent_factor, height=0.9, color="#eef2f5", zorder=0)
-    lowest = np.nanmin([panel.least, panel.after, panel.before], axis=0) * percent_factor
+        axes.barh(rows, panel.least_peak * percent_factor, height=0.9, color=SHADE, zorder=0)
+    lowest = np.nanmin([panel.least_peak, panel.after, panel.before], axis=0) * percent_factor
     axes.set_xlim(
         max(0.0, 0.9 * np.nanmin(lowest)), 1.02 * max(100.0, (panel.before * percent_factor).max())
     )

@@ -18,7 +18,7 @@ from jaxbeam.cli import main
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.plot import plot_comparison
 from tests.loop_as_oracle import span_of
-from tests.plot.test_plot import words
+from tests.plot.figures import words
 
 CASE = """
 title = "one span, one patch"

@@ -1,20 +1,17 @@
-"""Pictures hold the right data under the right labels; how they look is for the eye."""
+"""Data and labels of figures."""
 
 import dataclasses
-import json
 
 import jax.numpy as jnp
 import matplotlib.pyplot
 import numpy as np
 import pytest
-import xarray
 from matplotlib.colors import to_hex
-from matplotlib.text import Text
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageSequence
 
 import jaxbeam as jb
-from jaxbeam.files.case_file import case_to_dict
+import jaxbeam.plot
 from jaxbeam.model.frequency_response import frequency_response
 from jaxbeam.plot import (
     FitPanel,
@@ -23,50 +20,15 @@ from jaxbeam.plot import (
     plot_frequency_response,
     plot_modes,
     plot_record,
-    plot_sweep,
 )
 from jaxbeam.plot.style import INK, format_number, separate_labels, unit_scale
-
-CASE = jb.Case(
-    jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=2),
-    sensors=[jb.Sensor(0.15), jb.Sensor(0.3)],
-    loads=[jb.MovingMass(mass=0.5, speed=2.0, entry_time=0.1)],
-    run=jb.Run(duration=0.5, sample_rate=400.0),
-    title="one ball",
-)
-MANY = dataclasses.replace(
-    CASE,
-    supports=[jb.Support(0.4, stiffness=1e4), jb.Support(0.5)],
-    actuators=[jb.Patch(0.1, 0.2, 1e-3), jb.Shaker(0.3)],
-    loads=[
-        jb.MovingMass(mass=3.0, speed=6.0),
-        jb.MovingForce(force=2.0, speed=-1.0, entry_time=0.2, deceleration=1.0),
-        jb.MovingMass(mass=1.0, speed=1.0, entry_time=9.0),
-    ],
-)
+from tests.plot.figures import CASE, MANY, data, lines_of, words
 
 
 @pytest.fixture(scope="module")
 def record():
-    """One ball over one span."""
+    """Record of one mass on one span."""
     return jb.simulate(CASE)
-
-
-def words(figure) -> str:
-    """All that is written in a figure, a line each."""
-    figure.draw_without_rendering()
-    texts = figure.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible())
-    return "\n".join(text.get_text() for text in texts)
-
-
-def data(line) -> np.ndarray:
-    """Positions and heights of the points of a curve, (2, point)."""
-    return np.asarray(line.get_xydata(), float).T
-
-
-def lines_of(axes, size: int):
-    """The curves of an axes with so many points."""
-    return [line for line in axes.lines if np.size(data(line)[0]) == size]
 
 
 def test_record(record):
@@ -147,99 +109,6 @@ def test_supports_are_drawn_at_every_mode(record, ends, held):
     assert {data(mark)[0][0] for mark in marks} >= {0.4, 0.5}
 
 
-def swept(paired=False, **axes):
-    """A dataset such as a sweep returns, with peaks that are known."""
-    over = {name.replace("_", ".", 2): np.asarray(values) for name, values in axes.items()}
-    dims = ("run",) if paired else tuple(over)
-    grid = list(over.values()) if paired else np.meshgrid(*over.values(), indexing="ij")
-    first = 1e-3 * np.sum(grid, axis=0)
-    coordinates = {name: ("run" if paired else name, values) for name, values in over.items()}
-    coordinates["sensor"] = ("sensor", ["0: deflection", "1: deflection"])
-    return xarray.Dataset(
-        {"peak_deflection": ((*dims, "sensor"), np.stack([first, 2 * first], axis=-1))},
-        coordinates,
-        {"case": json.dumps(case_to_dict(CASE))},
-    )
-
-
-def test_sweep_over_one_address():
-    speeds = [3.0, 1.0, 2.0]
-    dataset = swept(loads_0_speed=speeds)
-    dataset["peak_deflection"][0] = np.nan
-    figure = plot_sweep(dataset)
-    curves = lines_of(figure.axes[0], 3)
-    assert_allclose(data(curves[0])[0], [1, 2, 3])
-    assert_allclose([data(curve)[1] for curve in curves], [[1, 2, np.nan], [2, 4, np.nan]])
-    said = words(figure)
-    for text in ("loads.0.speed (m/s)", "peak deflection (mm)", "at 0.15 m", "at 0.3 m"):
-        assert text in said
-
-
-def test_sweep_over_two_addresses():
-    dataset = swept(loads_0_mass=[0.1, 0.2, 0.3], loads_0_speed=[1.0, 2.0, 4.0, 5.0])
-    dataset["peak_deflection"][0, 0] = np.nan
-    figure = plot_sweep(dataset)
-    first, second, bar = figure.axes
-    for axes in (first, second):
-        (dot,) = axes.lines
-        assert_allclose([data(dot)[0][0], data(dot)[1][0]], [5.0, 0.3])
-    said = words(figure)
-    for text in ("loads.0.speed (m/s)", "loads.0.mass (kg)", "at 0.3 m, largest 10.6 mm"):
-        assert text in said
-    assert bar.get_ylabel() == "peak deflection (mm)"
-
-
-def test_no_number_of_a_line_is_cut_off_at_an_edge():
-    """A "1.2" of which only the "2" is seen would be another number."""
-    masses, speeds = np.linspace(0.1, 0.6, 12), np.linspace(1.0, 6.0, 9)
-    dataset = swept(loads_0_mass=masses.tolist(), loads_0_speed=speeds.tolist())
-    flat = 1e-3 * masses[:, None] * (1 + 0.02 * np.sin(2 * speeds))
-    dataset["peak_deflection"][...] = np.stack([flat, flat * np.sqrt(speeds)], axis=-1)
-    figure = plot_sweep(dataset)
-    figure.canvas.draw()
-    shown = 0
-    for axes in figure.axes[:2]:
-        frame = axes.get_window_extent()
-        for text in filter(Text.get_visible, axes.texts):
-            shown += 1
-            extent = text.get_window_extent()
-            assert frame.x0 < extent.x0 < extent.x1 < frame.x1
-            assert frame.y0 < extent.y0 < extent.y1 < frame.y1
-    assert shown
-
-
-def test_sweep_held_at_a_value():
-    dataset = swept(loads_0_mass=[0.1, 0.2], loads_0_speed=[1.0, 2.0], run_duration=[1.0])
-    assert len(plot_sweep(dataset).axes) == 3
-    figure = plot_sweep(dataset.isel({"loads.0.mass": 1, "sensor": 1}))
-    (curve,) = lines_of(figure.axes[0], 2)
-    assert_allclose(data(curve)[1], [4.4, 6.4])
-    assert "loads.0.mass = 0.2 kg" in words(figure)
-
-
-def test_paired_sweep():
-    dataset = swept(paired=True, loads_0_mass=[0.1, 0.2], loads_0_speed=[1.0, 2.0])
-    (axes,) = plot_sweep(dataset).axes
-    assert_allclose(data(lines_of(axes, 2)[0])[0], [0, 1])
-    assert axes.get_xlabel() == "run"
-
-
-@pytest.mark.parametrize(
-    ("dataset", "message"),
-    [
-        (
-            swept(loads_0_mass=[0.1, 0.2], loads_0_speed=[1.0, 2.0], run_duration=[1.0, 2.0]),
-            r"one or two addresses, not 3 .*isel\(\{'loads.0.mass': 0\}\)",
-        ),
-        (swept(loads_0_mass=[0.1]), "a single run"),
-        (xarray.Dataset(), "not a sweep of jaxbeam"),
-    ],
-)
-def test_what_is_no_drawable_sweep_is_refused(dataset, message):
-    with pytest.raises(ValueError, match=message):
-        plot_sweep(dataset)
-
-
 def test_fit():
     times = np.arange(50) / 10.0
     fitted = np.stack([np.sin(times), np.cos(times)], axis=1) * 1e-3
@@ -254,9 +123,18 @@ def test_fit():
     assert_allclose(data(line)[1], 1e3 * fitted[:, 0])
     assert_allclose(data(grid[2, 0].lines[0])[1], 1e6 * noise[:, 1])
     said = words(figure)
-    for text in ("two logs", "first.csv", "second.csv", "d1", "d2", "measured and fitted (mm)",
-                 "measured and fitted (mm/s\N{SUPERSCRIPT TWO})", "fitted",
-                 f"residual sd {format_number(np.std(noise[:, 1]) * 1e6)} \N{MICRO SIGN}m"):  # fmt: skip
+    deviation = format_number(np.std(noise[:, 1]) * 1e6)
+    for text in (
+        "two logs",
+        "first.csv",
+        "second.csv",
+        "d1",
+        "d2",
+        "measured and fitted (mm)",
+        "measured and fitted (mm/s\N{SUPERSCRIPT TWO})",
+        "fitted",
+        f"residual sd {deviation} \N{MICRO SIGN}m",
+    ):
         assert text in said
     with pytest.raises(ValueError, match="at least one log"):
         plot_fit([])
@@ -269,7 +147,7 @@ def test_a_perfect_fit():
 
 
 def test_frequency_responses():
-    """A column a unit; the curve of each pair, without a frequency of zero."""
+    """A column a unit, a curve a pair; a frequency of zero is left out."""
     pairs = [("force@0.3", "sensors.0"), ("force@0.3", "velocity@0.1"), ("force@0.2", "sensors.1")]
     response = frequency_response(CASE, [0.0, 2.0, 20.0, 200.0], pairs)
     figure = plot_frequency_response(response)
@@ -299,8 +177,8 @@ def test_animation(record, tmp_path):
     assert path.read_bytes() != before
 
 
-def test_animation_of_a_controlled_rig(tmp_path):
-    """Shaker and patch, commands, supports of both kinds: a picture as high as its rows."""
+def test_animation_of_a_controlled_beam(tmp_path):
+    """Shaker and patch, commands, rigid and elastic supports; higher by the row of commands."""
     loop = jb.Feedback(gains=[1e3, 1e3], period=0.005)
     case = dataclasses.replace(MANY, controller=loop, loads=CASE.loads)
     record = jb.simulate(case)
@@ -318,9 +196,9 @@ def test_animation_of_a_controlled_rig(tmp_path):
     assert not (tmp_path / "diverged.gif").exists()
 
 
-def test_style_stays_in_the_figure():
+def test_style_does_not_leak():
     before = dict(matplotlib.rcParams)
-    figure = plot_sweep(swept(loads_0_speed=[1.0, 2.0]))
+    figure = plot_modes(CASE)
     assert dict(matplotlib.rcParams) == before
     figure.draw_without_rendering()  # ticks are made as late as this
     assert {to_hex(text.get_color()) for text in figure.axes[0].get_xticklabels()} == {INK}
@@ -347,7 +225,13 @@ def test_prefixes(values, unit, expected):
     assert unit_scale(values, unit) == expected
 
 
-def test_labels_keep_apart():
+def test_labels_do_not_overlap():
     assert_allclose(separate_labels([3.0, 1.0, 2.0], 0.5), [3, 1, 2])
     assert_allclose(separate_labels([1.0, 1.0, 5.0], 0.5), [0.75, 1.25, 5.0])
     assert separate_labels([], 1.0).shape == (0,)
+
+
+@pytest.mark.parametrize(("old", "new"), jaxbeam.plot.OLD_NAMES.items())
+def test_old_names_warn(old, new):
+    with pytest.warns(DeprecationWarning, match=f"{old} is called {new} now"):
+        assert getattr(jaxbeam.plot, old) is getattr(jaxbeam.plot, new)
