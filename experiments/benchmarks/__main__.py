@@ -1,19 +1,20 @@
-"""All benchmarks, or those named, one after the other, each in a process of its own.
+"""All benchmarks, or those named, one after the other, each in its own process.
 
     python -m experiments.benchmarks [NAME ...] [--quick] [--list]
 
-Each prints its table; one that fails is named at the end, and the others still run. What a single
-one takes as options, `python -m experiments.benchmarks.NAME --help` says.
+Each prints its table; those that fail are named at the end, and the others still run. `python -m
+experiments.benchmarks.NAME --help` prints the options of one benchmark.
 """
 
-import argparse
 import subprocess
 import sys
 from typing import NamedTuple
 
+from experiments.benchmarks.common import parser
+
 
 class Benchmark(NamedTuple):
-    """What a benchmark compares, and the options that make it short."""
+    """What a benchmark compares, and the options for a short run."""
 
     about: str
     quick: str = ""
@@ -24,32 +25,42 @@ BENCHMARKS = {
     "cases": Benchmark("one and two spans, loops, histories: scipy and diffrax", "--quick"),
     "kernel": Benchmark("sweeps: the same method by hand in C", "--modes 3"),
     "growth": Benchmark("time and peak memory of growing sweeps; compiling", "--runs 4096 40000"),
-    "identify": Benchmark("identification: scipy's least squares"),
-    "riccati": Benchmark("designs of regulators, many at once"),
-    "quadratic": Benchmark("programs of predictive control: OSQP"),
-    "steps": Benchmark("steps of controllers", "--only feedback"),
-    "tuners": Benchmark("tuning by gradients, beside differential evolution"),
+    "identification": Benchmark("identification: scipy's least squares"),
+    "regulator_designs": Benchmark("designs of regulators, many at once"),
+    "quadratic_programs": Benchmark("programs of predictive control: OSQP"),
+    "controller_steps": Benchmark("steps of controllers", "--only feedback"),
+    "tuning_methods": Benchmark("tuning by gradients, beside differential evolution"),
     "profile": Benchmark("where the time of a sweep goes"),
     "cluster": Benchmark("a sweep of a million runs on workers", "--runs 40000"),
+}
+RENAMED = {
+    "identify": "identification",
+    "quadratic": "quadratic_programs",
+    "riccati": "regulator_designs",
+    "steps": "controller_steps",
+    "tuners": "tuning_methods",
 }
 
 
 def main() -> None:
-    """Run benchmarks. Raises SystemExit if one fails, or has no such name."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(BENCHMARKS)}; or all")
-    parser.add_argument("--quick", action="store_true", help="in short, to see that all work")
-    parser.add_argument("--list", action="store_true", help="only say which there are")
-    given = parser.parse_args()
-    unknown = set(given.names) - set(BENCHMARKS)
+    """Run benchmarks. Raises SystemExit if one fails, or for an unknown name."""
+    options = parser(__doc__)
+    options.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"{', '.join(BENCHMARKS)}; or all"
+    )
+    options.add_argument("--quick", action="store_true", help="short runs, to check that all work")
+    options.add_argument("--list", action="store_true", help="only list the benchmarks")
+    given = options.parse_args()
+    names = [_current_name(name) for name in given.names]
+    unknown = set(names) - set(BENCHMARKS)
     if unknown:
-        some = f"{', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}"
-        parser.error(f"no benchmark {some}")
+        message = f"{', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}"
+        options.error(f"no benchmark {message}")
     failed = []
-    for name in given.names or BENCHMARKS:
+    for name in names or BENCHMARKS:
         about, quick = BENCHMARKS[name]
         if given.list:
-            print(f"{name:10} {about}")
+            print(f"{name:18} {about}")
             continue
         print(f"\n## {name}: {about}\n", flush=True)
         command = [sys.executable, "-m", f"experiments.benchmarks.{name}"]
@@ -57,6 +68,13 @@ def main() -> None:
             failed.append(name)
     if failed:
         raise SystemExit(f"failed: {', '.join(failed)}")
+
+
+def _current_name(name: str) -> str:
+    """The name of a benchmark today, with a warning for an old one."""
+    if name in RENAMED:
+        print(f"warning: {name} is now called {RENAMED[name]}", file=sys.stderr)
+    return RENAMED.get(name, name)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,12 @@
-"""A sweep of a million runs on a Dask cluster of this machine's cores, each worker writing its own.
+"""A sweep of a million runs on a Dask cluster of this machine's cores, stored by the workers.
 
     python -m experiments.benchmarks.cluster [--runs 1000000] [--workers 2]
 
-Masses by speeds of the one-span rig with three modes, peaks at three sensors to one part in ten
-million. A tenth of the grid is swept first, so that all workers have compiled. Printed are the
-time, the rate, and what a billion runs would take at that rate.
+Masses by speeds on one span with three modes, peaks at three sensors to one part in ten million. A
+tenth of the grid is swept first, so that all workers have compiled. The table has the time, the
+rate, and the core hours of a billion runs at that rate.
 """
 
-import argparse
-import resource
 import tempfile
 import time
 from pathlib import Path
@@ -16,22 +14,30 @@ from pathlib import Path
 import numpy as np
 
 import jaxbeam as jb
-from experiments.benchmarks.sweep import one_span_case
+from experiments.benchmarks.common import (
+    FASTEST,
+    SLOWEST,
+    one_span_case,
+    parser,
+    peak_memory,
+    print_row,
+    print_table,
+)
 
 
 def grid(runs: int) -> dict[str, np.ndarray]:
-    """About so many pairs of mass (kg) and speed (m/s)."""
+    """A square grid of about so many runs over mass (kg) and speed (m/s)."""
     side = round(runs**0.5)
     return {
         "loads.0.mass": np.linspace(0.1, 1.0, side),
-        "loads.0.speed": np.linspace(0.3, 10.0, side),
+        "loads.0.speed": np.linspace(SLOWEST, FASTEST, side),
     }
 
 
 def time_sweep(runs: int, client, store: Path) -> tuple[int, float]:
-    """How many runs were swept into a store, and how long it took (s).
+    """Number of runs swept into a store, and the wall time (s).
 
-    Raises RuntimeError if one failed.
+    Raises RuntimeError if a run fails.
     """
     start = time.perf_counter()
     found = jb.sweep(one_span_case(3), grid(runs), store=store, progress=False, client=client)
@@ -45,12 +51,12 @@ def main() -> None:
     """Sweep and print the table."""
     from distributed import Client, LocalCluster
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=1_000_000)
-    parser.add_argument("--workers", type=int, default=2)
-    given = parser.parse_args()
-    print("| runs | seconds | runs a second | peak memory here | a billion runs |")
-    print("| ---: | ---: | ---: | ---: | ---: |")
+    options = parser(__doc__)
+    options.add_argument("--runs", type=int, default=1_000_000)
+    options.add_argument("--workers", type=int, default=2)
+    given = options.parse_args()
+    header = "runs", "seconds", "runs a second", "peak memory here", "a billion runs"
+    print_table(header, right_from=0)
     with (
         tempfile.TemporaryDirectory() as folder,
         LocalCluster(
@@ -61,13 +67,10 @@ def main() -> None:
         for runs in (given.runs // 10, given.runs):
             count, took = time_sweep(runs, client, Path(folder) / f"{runs}.zarr")
             rate = count / took
-            memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             hours = 1e9 / rate * given.workers / 3600
-            print(
-                f"| {count} | {took:.1f} | {rate:.0f} | {memory:.0f} MiB |"
-                f" {hours:.0f} core hours |",
-                flush=True,
-            )
+            memory = f"{peak_memory():.0f} MiB"
+            cells = str(count), f"{took:.1f}", f"{rate:.0f}", memory, f"{hours:.0f} core hours"
+            print_row(cells)
 
 
 if __name__ == "__main__":

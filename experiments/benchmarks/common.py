@@ -1,19 +1,32 @@
-"""How long calls take: compiling apart, several in turn, and what the operating system knows."""
+"""Parts of several benchmarks: timing, memory, subprocesses, and command lines."""
 
+import argparse
+import importlib
+import json
+import os
 import resource
 import statistics
+import subprocess
+import sys
 import time
+from collections.abc import Mapping, Sequence
+from types import ModuleType
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
+import jaxbeam as jb
+
+SLOWEST, FASTEST = 0.3, 10.0  # m/s, of the crossings of sweeps
+
 
 class Timing(NamedTuple):
-    """Seconds of wall time: the median of warm calls, and what the first took beyond that.
+    """Wall times (s) of a call, and its ratio to a reference call.
 
-    And the median of how many times as long as another function they took; the shortest times of
-    both, which the machine disturbed least.
+    `run` is the median of warm calls, `compile` the excess of the first call over that, `ratio` the
+    median of warm calls over the reference calls next to them. `shortest` and `reference_shortest`
+    are the shortest times of either, which other processes disturb least.
     """
 
     run: float
@@ -24,52 +37,116 @@ class Timing(NamedTuple):
 
     @property
     def ratio_of_shortest(self) -> float:
-        """How many times as long as the other function it takes, both undisturbed."""
+        """Shortest time over the shortest time of the reference."""
         return self.shortest / self.reference_shortest
 
 
-def time_call(function, *args, repeat=5, reference=None):
+def time_call(function, *args, repeat=5, reference=None) -> Timing:
     """Time `function(*args)` until its results are ready: once cold, then `repeat` times warm.
 
-    With a function `reference` it is compared with that, which is called before and after each: a
-    machine that is faster at one moment than at another is so for both.
+    A function `reference` is called before and after each warm call, so that changes of the
+    machine's speed cancel in the ratio.
     """
-
-    def seconds(function, *args):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*args))
-        return time.perf_counter() - start
-
-    cold, times = seconds(function, *args), []
-    others = [seconds(reference or _no_operation)]
+    cold, times = _seconds(function, *args), []
+    reference_times = [_seconds(reference or _no_operation)]
     for _ in range(repeat):
-        times.append(seconds(function, *args))
-        others.append(seconds(reference or _no_operation))
+        times.append(_seconds(function, *args))
+        reference_times.append(_seconds(reference or _no_operation))
     run = statistics.median(times)
-    around = np.add(others[:-1], others[1:]) / 2
-    compiling, ratio, other = max(cold - run, 0.0), float("nan"), float("nan")
+    around = np.add(reference_times[:-1], reference_times[1:]) / 2
+    ratio = reference_shortest = float("nan")
     if reference is not None:
-        ratio, other = float(np.median(np.divide(times, around))), min(others)
-    return Timing(run, compiling, ratio, min(times), other)
+        ratio = float(np.median(np.divide(times, around)))
+        reference_shortest = min(reference_times)
+    return Timing(run, max(cold - run, 0.0), ratio, min(times), reference_shortest)
+
+
+def _seconds(function, *args) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(function(*args))
+    return time.perf_counter() - start
 
 
 def _no_operation() -> None:
     pass
 
 
-def interleaved_best(functions, *args, rounds=40):
-    """Shortest times of several functions, called in turn: disturbances meet them all alike."""
-    times = []
+def interleaved_best(functions, *args, rounds=40) -> np.ndarray:
+    """Shortest wall times (s) of several functions, (function,), called in turn.
+
+    Disturbances by other processes then affect all functions alike.
+    """
     for function in functions:
         jax.block_until_ready(function(*args))
-    for _ in range(rounds):
-        for function in functions:
-            start = time.perf_counter()
-            jax.block_until_ready(function(*args))
-            times.append(time.perf_counter() - start)
-    return np.min(np.reshape(times, (rounds, -1)), axis=0)
+    times = [[_seconds(function, *args) for function in functions] for _ in range(rounds)]
+    return np.min(times, axis=0)
 
 
 def peak_memory() -> float:
-    """The most memory (MiB) that this process has held until now."""
+    """Peak memory (MiB) of this process."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def import_optional(name: str) -> ModuleType | None:
+    """A package of the extra `benchmarks`, or None if it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        return None
+
+
+def parser(module_doc: str | None, modes: Sequence[int] = ()) -> argparse.ArgumentParser:
+    """Command line of a benchmark, described by the first line of its module's docstring.
+
+    With `modes` there is an option --modes, whose default they are.
+    """
+    made = argparse.ArgumentParser(description=(module_doc or "").splitlines()[0])
+    if modes:
+        made.add_argument(
+            "--modes", type=int, nargs="+", default=list(modes), help="numbers of modes"
+        )
+    return made
+
+
+def measure_in_subprocess(
+    module: str, *arguments, environment: Mapping[str, str] | None = None
+) -> dict[str, float]:
+    """The JSON that `python -m MODULE --measure ARGUMENTS` prints last, in its own process."""
+    command = [sys.executable, "-m", module, "--measure", *map(str, arguments)]
+    done = subprocess.run(
+        command,
+        env=os.environ | dict(environment or {}),
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def print_table(header: Sequence[str], right_from: int = 1) -> None:
+    """Print header and ruler of a Markdown table; columns from `right_from` on are flush right."""
+    ruler = ["---" if i < right_from else "---:" for i in range(len(header))]
+    print_row(header)
+    print_row(ruler)
+
+
+def print_row(cells: Sequence[str]) -> None:
+    """Print a row of a Markdown table."""
+    print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def one_span_case(modes: int) -> jb.Case:
+    """One span with three sensors, crossed by a mass, with a duration for the slowest crossing."""
+    beam = jb.Beam(
+        length=0.6,
+        flexural_rigidity=11.68,
+        mass_per_length=0.535,
+        damping_ratio=0.03,
+        modes=modes,
+    )
+    return jb.Case(
+        beam,
+        sensors=[jb.Sensor(x) for x in (0.15, 0.3, 0.45)],
+        loads=[jb.MovingMass(mass=0.5, speed=1.0)],
+        run=jb.Run(duration=0.6 / SLOWEST + 0.5),
+    )

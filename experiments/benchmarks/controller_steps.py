@@ -1,25 +1,22 @@
-"""Time per step of every kind of controller: one by one, typical and worst, and 256 at once.
+"""Computing time per step of every kind of controller: typical, worst, and in a batch of 256.
 
     python -m experiments.benchmarks.controller_steps [--only TEXT]
 
-The one-span rig with a patch and five modes, crossed by 0.509 kg at 1 m/s, five sensors read every
-10 ms. A step is all that a controller does between a measurement and a command, estimator and
-recognition of the load included; what it designs beforehand is left out. The steps are those of the
-crossing, on one core, compiled (see `jaxbeam.analysis.computing_time`): the median and the worst of them, and
-the time for each of 256 at once.
+One span with a patch and five modes, crossed by 0.509 kg at 1 m/s, five sensors read every 10 ms. A
+step is the computation from a measurement to a command, estimator and load identification included,
+design excluded. The steps are those of the crossing, on one core, compiled (see `computing_time`):
+the median and the worst of them, and the time for each of 256 at once.
 """
 
-from experiments.benchmarks.cores import one_core
+from experiments.benchmarks.cores import use_one_core
 
 if __name__ == "__main__":
-    one_core()  # before JAX looks
+    use_one_core()  # before JAX starts its threads
 
-import argparse
 import warnings
 
-import numpy as np
-
 import jaxbeam as jb
+from experiments.benchmarks.common import parser, print_row, print_table
 from jaxbeam.analysis.computing_time import ComputingTimes, computing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control import KINDS, SamplingWarning
@@ -35,13 +32,15 @@ GATE_IDENTIFICATION = jb.Recognition(gates=[-0.2, -0.1], until=0.3)
 SCHEDULE_GRID = {"masses": [0.2, 0.4, 0.6], "speeds": [1.0, 1.5]}
 CONTROLLERS = {
     "prescribed": jb.Prescribed(offsets=[1.0], period=PERIOD),
-    "passage": jb.Passage(
+    "feedforward": jb.Passage(
         gates=[-0.2, -0.1], shares=[0.0, 0.5, 1.0], values=[[1.0, 6.0, 1.0]], period=PERIOD
     ),
-    "relief": jb.Relief(readings=[-1e-3, 0.0], values=[[7.0, 0.0]], notches=[18.0], period=PERIOD),
+    "internal-model": jb.Relief(
+        readings=[-1e-3, 0.0], values=[[7.0, 0.0]], notches=[18.0], period=PERIOD
+    ),
     "feedback, linear": jb.Feedback(gains=[2e3], period=PERIOD),
     "feedback, cubic": jb.Feedback(gains=[2e9], power=3, period=PERIOD),
-    "feedback-scheduled, recognised": jb.ScheduledFeedback(
+    "feedback-scheduled, load identified": jb.ScheduledFeedback(
         masses=[0.2, 0.6], gains=[[2e3, 4e3]], recognition=GATE_IDENTIFICATION, period=PERIOD
     ),
     "pd": jb.PD(gains=[2e3], rate_gains=20.0, lag=0.02, period=PERIOD),
@@ -54,17 +53,17 @@ CONTROLLERS = {
     "lqr, mode shapes inverted": jb.LQR(**WEIGHTS, estimator=jb.Inversion()),
     "lqr, observer": jb.LQR(**WEIGHTS, estimator=jb.Observer(speed=2.0)),
     "lqr, Kalman filter": jb.LQR(**WEIGHTS, estimator=jb.Kalman(**NOISE)),
-    "lqr, Kalman filter along the crossing": jb.LQR(
+    "lqr, Kalman filter, loads known": jb.LQR(
         **WEIGHTS, estimator=jb.Kalman(**NOISE, loads="known")
     ),
-    "lqr, Kalman filter that weighs the load": jb.LQR(
+    "lqr, Kalman filter, loads estimated": jb.LQR(
         **WEIGHTS, estimator=jb.Kalman(**NOISE, loads="estimated", weight_deviation=2.0)
     ),
     "dlqr": jb.DiscreteLQR(**WEIGHTS),
     "lqr-step": jb.StepLQR(**FINITE_HORIZON),
     "lqr-finite": jb.FiniteLQR(**FINITE_HORIZON),
     "lqr-augmented": jb.AugmentedLQR(**FINITE_HORIZON),
-    "lqr-scheduled, recognised": jb.ScheduledLQR(
+    "lqr-scheduled, load identified": jb.ScheduledLQR(
         **FINITE_HORIZON, **SCHEDULE_GRID, recognition=GATE_IDENTIFICATION
     ),
     "mpc, unconstrained": jb.MPC(**MPC_4, solver="unconstrained"),
@@ -81,7 +80,7 @@ CONTROLLERS = {
 
 
 def patch_case(controller: AbstractController) -> jb.Case:
-    """The one-span rig with a patch, under a controller; the load has passed gates before it."""
+    """One span with a patch under a controller; the load passes gates before it."""
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=MODES),
         actuators=[
@@ -102,7 +101,7 @@ def patch_case(controller: AbstractController) -> jb.Case:
 
 
 def measure(controller: AbstractController) -> ComputingTimes:
-    """Time the steps that a controller makes in the crossing."""
+    """Times (s) of the steps of a controller in the crossing."""
     with warnings.catch_warnings():
         for kind in (ContactLossWarning, SamplingWarning):
             warnings.simplefilter("ignore", kind)
@@ -111,23 +110,16 @@ def measure(controller: AbstractController) -> ComputingTimes:
 
 def main() -> None:
     """Print the table. Raises SystemExit if a kind of controller is missing from it."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", default="", help="text in the names of those that are timed")
-    only = parser.parse_args().only
+    options = parser(__doc__)
+    options.add_argument("--only", default="", help="time the controllers whose names contain this")
+    only = options.parse_args().only
     left_out = set(KINDS.values()) - {type(law) for law in CONTROLLERS.values()}
     if left_out:
         raise SystemExit(f"no controller of kind {', '.join(k.__name__ for k in left_out)}")
-    print(
-        f"{'microseconds per step':40} {'median':>9} {'worst':>9} {'256 at once':>12} {'worst':>9}"
-    )
+    print_table(("microseconds per step", "median", "worst", "256 at once", "worst"))
     for name, controller in CONTROLLERS.items():
-        if only not in name:
-            continue
-        found = 1e6 * np.array(measure(controller))
-        print(
-            f"{name:40} {found[0]:9.2f} {found[1]:9.2f} {found[2]:12.2f} {found[3]:9.2f}",
-            flush=True,
-        )
+        if only in name:
+            print_row((name, *(f"{1e6 * seconds:.2f}" for seconds in measure(controller))))
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Speed of an identification against scipy: five numbers of a rig from ten logged crossings.
+"""Speed of an identification against scipy: five parameters from ten logged crossings.
 
     python -m experiments.benchmarks.identification
 
-scipy's least squares takes differences over crossings integrated by DOP853; jaxbeam takes exact
-derivatives. Both start at the same wrong values and minimise the same weighted squares. DOP853 is
-as accurate as differences ask for: with looser tolerances they are noise.
+scipy's least squares takes finite differences over crossings integrated by DOP853; jaxbeam takes
+exact derivatives. Both start at the same wrong values and minimise the same weighted squares.
+DOP853 is as accurate as the differences need: with looser tolerances they are noise.
 """
 
 import time
@@ -28,15 +28,16 @@ TRUTH = {
     "sensors.0.position": 0.15,
     "sensors.1.position": 0.3,
 }
-INITIAL_VALUES = np.array([11.0, 0.56, 0.02, 0.14, 0.31])
+INITIAL_VALUES = np.array([11.0, 0.56, 0.02, 0.14, 0.31])  # N m^2, kg/m, 1, m, m
 SPEEDS = np.linspace(0.8, 4.0, 10)  # m/s, one for each log
-MASS, NOISE, RATE, MODES, FREE_VIBRATION = 0.5, 1e-5, 500.0, 3, 0.3
-TOLERANCE = 1e-11  # of DOP853, relative to the sizes of the states
-STEP = 1e-5  # of the differences, relative to each number
+MASS, NOISE, SAMPLE_RATE, FREE_VIBRATION = 0.5, 1e-5, 500.0, 0.3  # kg, m, Hz, s
+MODES = 3
+TOLERANCE = 1e-11  # of DOP853, relative to the scales of the states
+STEP = 1e-5  # of the differences, relative to each value
 
 
 def scipy_deflections(values: np.ndarray, speed: float, times: np.ndarray) -> np.ndarray:
-    """Deflections (time, sensor) in m while a mass crosses and after, by DOP853."""
+    """Deflections (time, sensor) in m of a crossing and the free vibration after it, by DOP853."""
     beam = replace(
         PinnedBeam(MODES),
         flexural_rigidity=values[0],
@@ -44,21 +45,21 @@ def scipy_deflections(values: np.ndarray, speed: float, times: np.ndarray) -> np
         damping_ratio=values[2],
         sensors=(values[3], values[4]),
     )
-    size = (beam.state_scales[:, :, None] * MASS).ravel()
+    scales = (beam.state_scales[:, :, None] * MASS).ravel()
     exit_time = beam.length / speed
-    settings = {"method": "DOP853", "rtol": 1e-13, "atol": TOLERANCE * size}
+    settings = {"method": "DOP853", "rtol": 1e-13, "atol": TOLERANCE * scales}
 
-    def during(masses):
+    def flat_rate(masses):
         rate = crossing_rate(beam, np.array(masses), speed)
         return lambda t, y: rate(t, y.reshape(2, MODES, 1)).ravel()
 
     on = times < exit_time - 1e-9
     first = solve_ivp(
-        during([MASS]), (0, exit_time), 0 * size, t_eval=[*times[on], exit_time], **settings
+        flat_rate([MASS]), (0, exit_time), 0 * scales, t_eval=[*times[on], exit_time], **settings
     ).y
     later = np.maximum(times[~on], exit_time)
     second = solve_ivp(
-        during([0.0]), (exit_time, later[-1]), first[:, -1], t_eval=later, **settings
+        flat_rate([0.0]), (exit_time, later[-1]), first[:, -1], t_eval=later, **settings
     ).y
     states = np.hstack([first[:, :-1], second])
     return (beam.sensor_shapes @ states[:MODES]).T
@@ -69,17 +70,17 @@ def make_logs() -> list[Log]:
     rng = np.random.default_rng(0)
     logs = []
     for i, speed in enumerate(SPEEDS):
-        times = np.arange(int((0.6 / speed + FREE_VIBRATION) * RATE)) / RATE
+        times = np.arange(int((0.6 / speed + FREE_VIBRATION) * SAMPLE_RATE)) / SAMPLE_RATE
         clean = scipy_deflections(np.array(list(TRUTH.values())), speed, times)
         values = clean + NOISE * rng.normal(size=clean.shape)
         load = jb.MovingMass(mass=MASS, speed=speed)
-        words = ("left", "middle"), ("deflection",) * 2, ("m",) * 2, f"log {i}"
-        logs.append(Log(times, values, *words, loads=(load,)))
+        labels = ("left", "middle"), ("deflection",) * 2, ("m",) * 2, f"log {i}"
+        logs.append(Log(times, values, *labels, loads=(load,)))
     return logs
 
 
-def case() -> jb.Case:
-    """The rig with the starts of the search."""
+def initial_case() -> jb.Case:
+    """The case with the start values."""
     beam = jb.Beam(
         length=0.6,
         flexural_rigidity=INITIAL_VALUES[0],
@@ -91,7 +92,10 @@ def case() -> jb.Case:
 
 
 def fit_by_scipy(logs: list[Log]) -> tuple[np.ndarray, int, float]:
-    """Values by scipy's least squares with differences, evaluations of all logs, and seconds."""
+    """Identification by scipy's least squares with finite differences.
+
+    Returns the values (parameter,), the number of evaluations of all logs, and the wall time (s).
+    """
     calls = 0
 
     def residuals(values):
@@ -117,10 +121,13 @@ def fit_by_scipy(logs: list[Log]) -> tuple[np.ndarray, int, float]:
 
 
 def time_fits() -> dict[str, float]:
-    """Time both; seconds, their ratio, and the largest relative difference of the optima."""
+    """Wall times (s) of both and their ratios, and the largest relative difference of the optima.
+
+    "largest_error" is the largest standard error of a parameter, relative.
+    """
     logs = make_logs()
     begin = time.perf_counter()
-    dataset = make_dataset(case(), logs)
+    dataset = make_dataset(initial_case(), logs)
     numbers = free_parameters(dataset.cases, dict.fromkeys(TRUTH), 1.0)
     search = LeastSquares(dataset, numbers)
     found = search.solve(dataset.measured)
@@ -129,7 +136,7 @@ def time_fits() -> dict[str, float]:
     found = search.solve(dataset.measured)
     again = time.perf_counter() - begin
     values, calls, seconds = fit_by_scipy(logs)
-    # A fit finds the noise; for the same weights as scipy's it is given.
+    # A fit estimates the noise; here it is given, for the same weights as scipy.
     noise = np.full(found.noise.shape, NOISE)
     given = search.step_scale(found.unbounded, noise)[None], search.weights(noise), dataset.measured
     points, _ = search.minimise(found.unbounded[None], *given, np.ones(len(numbers), bool))

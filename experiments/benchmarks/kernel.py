@@ -1,14 +1,13 @@
-"""The practical limit: the integrator's method by hand in C, compiled on the spot, on one core.
+"""The practical limit: the integrator's method by hand in C, compiled when run, on one core.
 
     python -m experiments.benchmarks.kernel [--modes 3 6 12]
 
 The sweep of the speed benchmark by `kernel.c` (gcc -O3 -march=native, 64 masses side by side), with
-the time steps and the propagators that jaxbeam has chosen; making these is left out of its time,
-and it is told the closed form of the mode shapes. jaxbeam does all of that in its time, on all
-cores. Without a C compiler the benchmark says so and ends.
+the time steps and propagators that jaxbeam chooses, whose computation is not in its time, and with
+the closed form of the mode shapes. The time of jaxbeam includes all of that, and is on all cores.
+Without a C compiler the benchmark says so and ends.
 """
 
-import argparse
 import ctypes
 import shutil
 import subprocess
@@ -19,10 +18,16 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from experiments.benchmarks.common import (
+    interleaved_best,
+    one_span_case,
+    parser,
+    print_row,
+    print_table,
+)
 from experiments.benchmarks.rivals.pinned_beam import GRAVITY, PinnedBeam
-from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, one_span_case, sweep_peaks
-from experiments.benchmarks.timing import interleaved_best
-from jaxbeam.integrator.propagators import GAUSS, LOOKED
+from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, sweep_peaks
+from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
 from jaxbeam.numerics.peak_search import interpolation_matrix, newton_step_limit
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.specification import sweep_specification
@@ -32,12 +37,12 @@ Library = Callable[..., None]
 
 
 def compiler() -> str | None:
-    """The C compiler of this machine, if it has one."""
+    """Path of a C compiler, or None."""
     return shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 
 def build(modes: int, folder: Path) -> Library:
-    """The kernel for so many modes, compiled into a folder."""
+    """The kernel for a number of modes, compiled into a folder."""
     source, target = Path(__file__).with_name("kernel.c"), folder / f"kernel{modes}.so"
     command = [compiler(), str(source), f"-DMODES={modes}", *FLAGS, "-o", str(target)]
     subprocess.run(command, check=True)  # type: ignore[arg-type]
@@ -45,7 +50,11 @@ def build(modes: int, folder: Path) -> Library:
 
 
 def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
-    """The beam as one array, and for each speed what a crossing takes: all as kernel.c has it."""
+    """Arguments of `crossing` in kernel.c.
+
+    Returns the numbers of the beam as one array, and for each speed (m/s) the step matrices on the
+    beam and after the exit, the speed, the length (s) of a step, and the two numbers of steps.
+    """
     case = one_span_case(modes)
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
     runner = sweep_specification(case, over, False, False, TOLERANCE, "double").runner()
@@ -58,22 +67,20 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     )
     discrete_models = jax.tree.map(np.asarray, found)
     pinned_beam = PinnedBeam(modes)
-    rates = discrete_models.rig.state_matrix[0, :, 1, :]
+    rates = discrete_models.model.state_matrix[0, :, 1, :]
     peak_search_points = (
-        np.array(LOOKED),
-        interpolation_matrix(LOOKED)[: len(LOOKED)],
-        newton_step_limit(LOOKED),
+        np.array(PEAK_NODES),
+        interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)],
+        newton_step_limit(PEAK_NODES),
     )
-    # Signs of modes are free: those of jaxbeam are seen in its rows for the sensors at rest.
-    seen, angles = (
-        discrete_models.watch[0, 0, :3, :, 0],
-        np.outer(pinned_beam.sensors, pinned_beam.wavenumbers),
-    )
-    signs = np.where(np.sum(seen * np.sin(angles), axis=0) < 0, -1.0, 1.0)
+    # Signs of modes are arbitrary: those of jaxbeam follow from its rows of the sensors.
+    sensor_rows = discrete_models.watch[0, 0, :3, :, 0]
+    sines = np.sin(np.outer(pinned_beam.sensors, pinned_beam.wavenumbers))
+    signs = np.where(np.sum(sensor_rows * sines, axis=0) < 0, -1.0, 1.0)
     numbers = (
         [pinned_beam.length, GRAVITY],
         pinned_beam.mode_amplitudes * signs,
-        GAUSS,
+        GAUSS_NODES,
         *peak_search_points,
         rates,
     )
@@ -81,65 +88,67 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     beam = np.concatenate([np.ravel(part) for part in parts])
     crossings = []
     for i, speed in enumerate(runner.batches.shared_values[:, 0]):
-        task = jax.tree.map(lambda leaf, i=i: leaf[i], discrete_models)
-        on, last = np.flatnonzero(task.grid.counts)  # the crossing, and what comes after it
-        kinds = [int(task.grid.kind[panel]) for panel in (on, last)]
-        span = float(task.grid.lengths[kinds[0]])
-        counts = int(task.grid.counts[on]), int(task.grid.counts[last])
+        model = jax.tree.map(lambda leaf, i=i: leaf[i], discrete_models)
+        panels = np.flatnonzero(model.grid.counts)  # the crossing, and the time after the exit
+        kinds = [int(model.grid.kind[panel]) for panel in panels]
+        counts = [int(model.grid.counts[panel]) for panel in panels]
+        step_length = float(model.grid.lengths[kinds[0]])
         crossings.append(
-            (*(_step_matrices(task, kind) for kind in kinds), float(speed), span, *counts)
+            (*(_step_matrices(model, kind) for kind in kinds), float(speed), step_length, *counts)
         )
     return beam, crossings
 
 
-def _step_matrices(task, kind: int) -> np.ndarray:
-    step = task.step
+def _step_matrices(model, kind: int) -> np.ndarray:
+    """Step matrices of one kind of step as `StepMatrices` of kernel.c."""
+    step = model.step
     parts = (
-        step.drift_nodes[kind],
-        step.push_nodes[kind][..., 0],
-        step.drift_end[kind],
-        step.push_end[kind][..., 0],
-        task.watch[kind],
-        task.watch_push[kind][..., 0],
+        step.transition_nodes[kind],
+        step.input_nodes[kind][..., 0],
+        step.transition_end[kind],
+        step.input_end[kind][..., 0],
+        model.watch[kind],
+        model.monitored_input[kind][..., 0],
     )
     return np.concatenate([np.ravel(part) for part in parts])
 
 
 def kernel_peaks(library: Library, beam: np.ndarray, crossings: list) -> np.ndarray:
-    """Peaks (mass, speed, sensor) by the kernel."""
+    """Peaks (mass, speed, sensor) in m by the kernel."""
 
-    def at(array):
+    def pointer(array):
         return array.ctypes.data_as(ctypes.c_void_p)
 
-    found = np.empty((len(crossings), MASSES.size, 3))
-    for one, (during, after, speed, span, on, off) in zip(found, crossings, strict=True):
-        numbers = ctypes.c_double(speed), ctypes.c_double(span), ctypes.c_int(on), ctypes.c_int(off)
-        library(at(beam), at(during), at(after), *numbers, at(MASSES), at(one))
-    return found.swapaxes(0, 1)
+    peaks = np.empty((len(crossings), MASSES.size, 3))
+    for of_speed, crossing in zip(peaks, crossings, strict=True):
+        during, after, speed, step_length, on, off = crossing
+        numbers = ctypes.c_double(speed), ctypes.c_double(step_length)
+        counts = ctypes.c_int(on), ctypes.c_int(off)
+        matrices = pointer(beam), pointer(during), pointer(after)
+        library(*matrices, *numbers, *counts, pointer(MASSES), pointer(of_speed))
+    return peaks.swapaxes(0, 1)
 
 
 def main() -> None:
     """Compile the kernel, time it beside jaxbeam, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--modes", type=int, nargs="+", default=[3, 6, 12])
-    given = parser.parse_args()
+    given = parser(__doc__, modes=[3, 6, 12]).parse_args()
     if compiler() is None:
         print("no C compiler here (cc, gcc, clang): nothing to compare with")
         return
-    print("| 4096 crossings | jaxbeam, all cores | C kernel, one core | ratio | difference |")
-    print("| --- | ---: | ---: | ---: | ---: |")
+    columns = "jaxbeam, all cores", "C kernel, one core", "ratio", "difference"
+    print_table(("4096 crossings", *columns))
     with tempfile.TemporaryDirectory() as folder:
         for modes in given.modes:
             library, (beam, crossings) = build(modes, Path(folder)), kernel_arguments(modes)
-            ours, kernel_result = sweep_peaks(modes), kernel_peaks(library, beam, crossings)
-            apart = np.max(np.abs(kernel_result / ours - 1))
+            by_jaxbeam, by_kernel = sweep_peaks(modes), kernel_peaks(library, beam, crossings)
+            difference = np.max(np.abs(by_kernel / by_jaxbeam - 1))
             functions = [
                 lambda _, m=modes: sweep_peaks(m),
-                lambda _, part=(library, beam, crossings): kernel_peaks(*part),
+                lambda _, arguments=(library, beam, crossings): kernel_peaks(*arguments),
             ]
             first, second = interleaved_best(functions, None)
-            row = f"{first:.3f} s | {second:.3f} s | {first / second:.2f} | {apart:.0e}"
-            print(f"| {modes} modes | {row} |", flush=True)
+            times = f"{first:.3f} s", f"{second:.3f} s", f"{first / second:.2f}"
+            print_row((f"{modes} modes", *times, f"{difference:.0e}"))
 
 
 if __name__ == "__main__":

@@ -2,12 +2,11 @@
 
     python -m experiments.benchmarks.profile [--modes 3] [--keep FOLDER]
 
-The sweep of the speed benchmark is run once under JAX's profiler. Each kernel that XLA has made is
-put down to the innermost `jax.named_scope` of jaxbeam in which it was written; loops and branches
-are left out, as they only contain others. The trace may be kept, for https://ui.perfetto.dev.
+The sweep of the speed benchmark runs once under JAX's profiler. Each kernel that XLA makes counts
+for the innermost `jax.named_scope` of jaxbeam in which it was written; loops and branches are left
+out, as they only contain others. --keep saves the trace for https://ui.perfetto.dev.
 """
 
-import argparse
 import collections
 import gzip
 import json
@@ -16,27 +15,40 @@ import re
 import tempfile
 from pathlib import Path
 
+import jax
+
+from experiments.benchmarks.common import parser, print_row, print_table
+from experiments.benchmarks.sweep import sweep_peaks
+from jaxbeam.sweeps.programs import integrate_block
+
 STAGES = (
-    *("modes", "rig", "propagators", "path", "collocation", "propagation", "extremes", "peaks"),
+    "modes",
+    "modal_model",
+    "propagators",
+    "load_path",
+    "collocation",
+    "propagation",
+    "running_peaks",
+    "peaks",
     "native",
 )
-# What they take is told by what they call; a call that calls nothing is a kernel.
+# Their time is that of the kernels they call; a call without kernels is a kernel itself.
 CONTROL_FLOW = re.compile(r"(while|cond|conditional)[.\d]*$")
 
 
 def stage_of(op_name: str) -> str:
-    """The innermost stage that the name of an operation mentions, such as jit(f)/path/while/dot."""
+    """The innermost stage in the name of an operation, such as jit(f)/load_path/while/dot."""
     named = [part for part in op_name.split("/") if part in STAGES]
     return named[-1] if named else "the rest"
 
 
 def operation_stages(dump: Path, module: str) -> dict[str, str]:
-    """The stage of every operation of a compiled module, from what XLA has dumped.
+    """The stage of every operation of a compiled module, from XLA's dump.
 
-    XLA may make one kernel of a whole loop, a call, which then is of all stages of what it calls.
+    XLA may make one kernel of a whole loop, a call; it counts for all stages of what it calls.
     """
     found, calls = {}, {}
-    within = collections.defaultdict(set)  # what stages and computations a computation names
+    within = collections.defaultdict(set)  # stages and computations named by each computation
     for path in dump.glob(f"*{module}*after_optimizations.txt"):
         computation = ""
         for line in path.read_text().splitlines():
@@ -59,7 +71,7 @@ def operation_stages(dump: Path, module: str) -> dict[str, str]:
 
 
 def stage_shares(trace: Path, found: dict[str, str], module: str) -> dict[str, float]:
-    """The share of each stage in the time of all kernels of a module."""
+    """Share of each stage in the time of all kernels of a module, largest first."""
     (path,) = trace.rglob("*.trace.json.gz")
     with gzip.open(path) as file:
         events = json.load(file)["traceEvents"]
@@ -74,7 +86,7 @@ def stage_shares(trace: Path, found: dict[str, str], module: str) -> dict[str, f
         around = open_until[event["pid"], event["tid"]]
         while around and around[-1][0] <= event["ts"]:
             around.pop()
-        if around:  # it is told of by itself
+        if around:  # an event within another counts for its own stage alone
             times[around[-1][1]] -= took
         around.append((event["ts"] + took, stage))
         times[stage] += took
@@ -83,29 +95,24 @@ def stage_shares(trace: Path, found: dict[str, str], module: str) -> dict[str, f
 
 def main() -> None:
     """Profile the sweep and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--modes", type=int, default=3)
-    parser.add_argument("--keep", type=Path, help="folder for the trace")
-    given = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--modes", type=int, default=3)
+    options.add_argument("--keep", type=Path, help="folder for the trace")
+    given = options.parse_args()
     folder = given.keep or Path(tempfile.mkdtemp())
     flags = f"--xla_dump_to={folder / 'hlo'} --xla_dump_hlo_as_text"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
-    import jax
-
-    from experiments.benchmarks.sweep import sweep_peaks
-
-    jax.config.update("jax_enable_compilation_cache", False)  # what is not compiled is not dumped
+    jax.config.update("jax_enable_compilation_cache", False)  # cached programs are not dumped
     sweep_peaks(given.modes)
-    options = jax.profiler.ProfileOptions()
-    options.python_tracer_level = 0
-    with jax.profiler.trace(str(folder / "trace"), profiler_options=options):
+    settings = jax.profiler.ProfileOptions()
+    settings.python_tracer_level = 0
+    with jax.profiler.trace(str(folder / "trace"), profiler_options=settings):
         sweep_peaks(given.modes)
-    found = stage_shares(
-        folder / "trace", operation_stages(folder / "hlo", "jit_block"), "jit_block"
-    )
-    print(f"| {given.modes} modes, 4096 crossings | share of the time |\n| --- | ---: |")
-    for stage, share in found.items():
-        print(f"| {stage} | {share:.0%} |")
+    module = f"jit_{integrate_block.__name__}"
+    stages = operation_stages(folder / "hlo", module)
+    print_table((f"{given.modes} modes, 4096 crossings", "share of the time"))
+    for stage, share in stage_shares(folder / "trace", stages, module).items():
+        print_row((stage, f"{share:.0%}"))
 
 
 if __name__ == "__main__":

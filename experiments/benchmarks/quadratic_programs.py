@@ -2,21 +2,20 @@
 
     python -m experiments.benchmarks.quadratic_programs
 
-The rig of `steps` under predictive control of 4 to 8 variables with limits; the programs are those
-of the ticks of its crossing, scaled so that the largest entry of H is one. OSQP is set up once and
-told by vectors what is new at a tick; it starts from the last solution, keeps its factors, and
-polishes. Given are its own account of updates and solutions, and what a call takes from Python.
-jaxbeam starts anew each time: on one core, compiled, one after the other in a loop and 256 at once.
-Without OSQP the benchmark says so and ends.
+The rig of `controller_steps` under predictive control of 4 to 8 variables with limits; the programs
+are those of the sampling instants of its crossing, scaled so that the largest entry of H is one.
+OSQP is set up once and updated by the vectors of each sample; it starts from the last solution,
+keeps its factors, and polishes. The table has its own report of the times of updates and solutions,
+and the time of a call from Python. jaxbeam starts anew each time: on one core, compiled, one after
+the other in a loop and 256 at once. Without OSQP the benchmark says so and ends.
 """
 
-from experiments.benchmarks.cores import one_core
+from experiments.benchmarks.cores import use_one_core
 
 if __name__ == "__main__":
-    one_core()  # before JAX looks
+    use_one_core()  # before JAX starts its threads
 
 import contextlib
-import importlib
 import os
 import sys
 import time
@@ -29,31 +28,32 @@ import numpy as np
 import scipy.sparse
 
 import jaxbeam as jb
+from experiments.benchmarks.common import (
+    import_optional,
+    parser,
+    print_row,
+    print_table,
+    time_call,
+)
 from experiments.benchmarks.controller_steps import PREDICTIVE, patch_case
-from experiments.benchmarks.timing import time_call
 from jaxbeam.control import SamplingWarning
 from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.simulate import ContactLossWarning
 
-HORIZONS = {4: 6, 6: 8, 8: 10}  # variables, and periods ahead
+HORIZONS = {4: 6, 6: 8, 8: 10}  # variables, and horizon (periods)
 BATCH_SIZE, ROUNDS = 256, 20
-ACCURACY = 1e-7  # of OSQP's residuals, before it polishes
-SOLUTION_TOLERANCE = 1e-6  # share of the largest move by which solutions may differ
-MAX_ITERATIONS = 100_000  # iterations of OSQP
-
-
-def import_osqp() -> ModuleType | None:
-    """The package, if it is installed."""
-    try:
-        return importlib.import_module("osqp")
-    except ImportError:
-        return None
+ACCURACY = 1e-7  # of OSQP's residuals, before polishing
+SOLUTION_TOLERANCE = 1e-6  # difference of solutions over the largest move
+MAX_ITERATIONS = 100_000  # of OSQP
 
 
 def crossing_programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """H (variable, variable), f (tick, variable), M and gamma (tick, row) of a crossing."""
+    """Programs of a crossing: minimise x'Hx/2 + f'x subject to M x <= gamma, one each sample.
+
+    Returns H (variable, variable), f (sample, variable), M (row, variable), gamma (sample, row).
+    """
     case = patch_case(jb.MPC(horizon=HORIZONS[variables], moves=variables, **PREDICTIVE))
     with warnings.catch_warnings():
         for kind in (ContactLossWarning, SamplingWarning):
@@ -77,9 +77,10 @@ def crossing_programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def solve_by_jaxbeam(H, f, M, gamma) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Solutions, whether limits are felt, and seconds of each: one by one, and of many at once.
+    """Solutions (sample, variable), whether constraints are active (sample,), and times (s).
 
-    Raises RuntimeError if a program is left unsolved.
+    The times are those of a program in a loop, and in a batch. Raises RuntimeError if a program is
+    not solved.
     """
 
     @compiled
@@ -100,7 +101,7 @@ def solve_by_jaxbeam(H, f, M, gamma) -> tuple[np.ndarray, np.ndarray, float, flo
 
 
 def solve_by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, float, float]:
-    """Solutions, and seconds of each: by its own account, and called from Python."""
+    """Solutions (sample, variable), and times (s) of a program: OSQP's report, and of a call."""
     solver = package.OSQP()
     matrices = scipy.sparse.csc_matrix(np.triu(H)), scipy.sparse.csc_matrix(M)
     free = np.full(gamma.shape[1], -np.inf)
@@ -122,7 +123,7 @@ def solve_by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, floa
 
 @contextlib.contextmanager
 def _suppress_output():
-    """Nothing is printed, by C neither: OSQP tells of its polishing whatever it is asked."""
+    """Discard what is printed, by C too: OSQP reports its polishing whatever its settings."""
     sys.stdout.flush()
     kept = os.dup(1)
     with open(os.devnull, "w") as nowhere:
@@ -136,24 +137,27 @@ def _suppress_output():
 
 def main() -> None:
     """Print the table. Raises RuntimeError if the solutions differ."""
-    package = import_osqp()
+    parser(__doc__).parse_args()
+    package = import_optional("osqp")
     if package is None:
         print("OSQP is not installed (uv sync --extra benchmarks): nothing to compare with")
         return
-    print("| variables | limits felt | jaxbeam, one by one | 256 at once | OSQP, own account"
-          " | OSQP, called from Python | largest difference |")  # fmt: skip
-    print("| ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
+    ours = "limits active", "jaxbeam, one by one", "256 at once"
+    print_table(
+        ("variables", *ours, "OSQP, its report", "OSQP, from Python", "largest difference"),
+        right_from=0,
+    )
     for variables in HORIZONS:
         H, f, M, gamma = crossing_programs(variables)
         H, f = H / np.max(np.abs(H)), f / np.max(np.abs(H))
-        ours, constrained, single, batch = solve_by_jaxbeam(H, f, M, gamma)
-        theirs, own, called = solve_by_osqp(package, H, f, M, gamma)
-        difference = np.max(np.abs(theirs - ours)) / np.max(np.abs(ours))
+        x, constrained, single, batch = solve_by_jaxbeam(H, f, M, gamma)
+        by_osqp, own, called = solve_by_osqp(package, H, f, M, gamma)
+        difference = np.max(np.abs(by_osqp - x)) / np.max(np.abs(x))
         if difference > SOLUTION_TOLERANCE:
             raise RuntimeError(f"{variables} variables: solutions differ by {difference:.0e}")
-        times = " | ".join(f"{1e6 * t:.1f} us" for t in (single, batch, own, called))
-        print(f"| {variables} | {np.mean(constrained):.0%} of {len(f)} | {times} | {difference:.0e} |",
-              flush=True)  # fmt: skip
+        times = [f"{1e6 * t:.1f} us" for t in (single, batch, own, called)]
+        active = f"{np.mean(constrained):.0%} of {len(f)}"
+        print_row((str(variables), active, *times, f"{difference:.0e}"))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""Time of designing optimal regulators, many at once: finite-time ones, and time-invariant ones.
+"""Time of designing many optimal regulators at once: finite-horizon and time-invariant ones.
 
     python -m experiments.benchmarks.regulator_designs
 
-The one-span rig with a point force, crossed by a mass. A design is the table of gains along the
-whole crossing; how right it is, between the edges of the table too, was found for 7 modes by
-scipy's DOP853 (`tests/numerics/test_finite_horizon.py`). Designs are those of a grid, as many masses as speeds
-as weights of the force, so that they share what depends on the speed or the mass alone; or all
-numbers of each are its own. They are worked out in batches, by a thread for each core. Some are
-timed, and scaled to 4096; compiling is told apart.
+One span with a point force, crossed by a mass. A finite-horizon design is the table of gains along
+the whole crossing; its error, between the breakpoints too, was found for 7 modes by scipy's DOP853
+(`tests/numerics/test_finite_horizon.py`). Designs form a grid of masses, speeds and weights of the
+force, so that they share what depends on speed or mass alone; or all numbers of each design differ.
+They are computed in batches, by one thread for each core. A share of them is timed and scaled to
+4096; compiling is timed apart.
 """
 
 import math
@@ -21,34 +21,32 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
+from experiments.benchmarks.common import parser, print_row, print_table
 from jaxbeam.control.optimal.lqr import finite_horizon_gains
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.riccati import lqr
 from jaxbeam.runtime.compiling import xla_options
 
-DESIGNS, REPEATS, BATCH_SIZE = 4096, 3, 16  # BATCH also is how many values a number has in the grid
+DESIGNS, REPEATS, BATCH_SIZE = 4096, 3, 16  # each axis of the grid has BATCH_SIZE values
 THREADS = os.cpu_count() or 1
-PHASE_STEPS = {3.0: 3e-4, 2.0: 3e-5}  # rad the fastest mode turns in a stretch: error of the gains
-MODE_COUNTS = (3, 7)  # modes
-MASSES, SPEEDS, COMMAND_WEIGHTS = (
-    (0.26, 0.51),
-    (2.0, 3.0),
-    (1e-4, 1e-2),
-)  # kg, m/s, weight of the force
+# Phase (rad) by which the fastest mode advances in an interval, and the error of the gains.
+PHASE_STEPS = {3.0: 3e-4, 2.0: 3e-5}
+MODE_COUNTS = (3, 7)
+MASSES, SPEEDS, COMMAND_WEIGHTS = (0.26, 0.51), (2.0, 3.0), (1e-4, 1e-2)  # kg, m/s, -
 ADDRESSES = ("loads.0.mass", "loads.0.speed", "controller.command_weight.0")
 
 
 class DesignTimes(NamedTuple):
-    """Seconds: of compiling, and of all designs."""
+    """Wall times (s) of compiling and of all designs."""
 
     compiling: float
     run: float
 
 
 def time_designs(function, batches, share: float = 1.0, threads: int = THREADS) -> DesignTimes:
-    """Time a function of batches, a part of which each thread works out; the fastest of some runs.
+    """Time a function of batches, distributed over threads; the shortest of REPEATS runs.
 
-    `share` of all batches is timed, so many that each thread has the same number.
+    A `share` of all batches is timed, the same number in each thread, and the time is scaled.
     """
     each = max(1, round(len(batches) * share / threads))
     program = jax.jit(lambda some: jax.lax.map(function, some), compiler_options=xla_options())
@@ -65,7 +63,7 @@ def time_designs(function, batches, share: float = 1.0, threads: int = THREADS) 
 
 
 def regulator_case(modes: int, points: int) -> jb.Case:
-    """The rig with a regulator to be designed."""
+    """One span with a finite-horizon regulator, of a number of modes and of intervals."""
     weights = [1e6] * modes + [10.0] * modes
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=modes),
@@ -76,7 +74,7 @@ def regulator_case(modes: int, points: int) -> jb.Case:
 
 
 def grid() -> np.ndarray:
-    """Masses, speeds and weights (pair, number, weight), a batch sharing mass and speed."""
+    """Masses, speeds and weights, (pair, number, weight); a batch shares mass and speed."""
     axes = (
         np.linspace(*MASSES, BATCH_SIZE),
         np.linspace(*SPEEDS, BATCH_SIZE),
@@ -86,7 +84,7 @@ def grid() -> np.ndarray:
 
 
 def scattered_grid() -> np.ndarray:
-    """The same (batch, number, design), all numbers different."""
+    """Masses, speeds and weights, (batch, number, design), all numbers different."""
     values = grid()
     low, high = values.min(axis=(0, 2)), values.max(axis=(0, 2))
     shares = np.random.default_rng(0).uniform(size=(DESIGNS // BATCH_SIZE, 3, BATCH_SIZE))
@@ -94,27 +92,27 @@ def scattered_grid() -> np.ndarray:
 
 
 def interval_count(modes: int, phase_step: float) -> int:
-    """Stretches in which the fastest mode turns by so many rad, at the lowest speed."""
+    """Intervals in which the fastest mode advances by a phase (rad), at the lowest speed."""
     beam = regulator_case(modes, 1).beam
-    length, rigidity, density = 0.6, float(beam.rigidity), float(beam.linear_density)
+    length, rigidity, density = 0.6, float(beam.bending_stiffness), float(beam.linear_density)
     fastest = (modes * math.pi / length) ** 2 * math.sqrt(rigidity / density)
     return math.ceil(fastest * length / SPEEDS[0] / phase_step)
 
 
 def time_finite_horizon(modes: int, points: int, shared: bool, share: float) -> DesignTimes:
-    """Time finite-time designs: those of the grid, which share much, or others."""
+    """Time finite-horizon designs: those of the grid (`shared`), or with all numbers different."""
     case = regulator_case(modes, points)
-    layout = lay_out(case)
+    layout = mesh_layout(case)
 
-    def one(mass, speed, effort):
-        changed = jb.replace(case, dict(zip(ADDRESSES, (mass, speed, effort), strict=True)))
+    def design(mass, speed, command_weight):
+        changed = jb.replace(case, dict(zip(ADDRESSES, (mass, speed, command_weight), strict=True)))
         table = finite_horizon_gains(changed.controller, jb.state_space(changed, layout=layout))[0]
-        return jnp.sum(table.coefficients)  # all of each design is needed, but not kept
+        return jnp.sum(table.coefficients)  # a sum needs every gain, and takes no memory
 
     def batch(values):
         if shared:
-            return jax.vmap(one, (None, None, 0))(values[0, 0], values[1, 0], values[2])
-        return jax.vmap(one)(*values)
+            return jax.vmap(design, (None, None, 0))(values[0, 0], values[1, 0], values[2])
+        return jax.vmap(design)(*values)
 
     return time_designs(batch, grid() if shared else scattered_grid(), share)
 
@@ -125,28 +123,30 @@ def time_invariant(modes: int) -> DesignTimes:
     plant = jb.state_space(case).unloaded
     Q = case.controller.weights(jb.state_space(case))[0]
 
-    def one(effort):
-        return lqr(plant.A, plant.B, Q, effort * jnp.eye(1))[0]
+    def design(command_weight):
+        return lqr(plant.A, plant.B, Q, command_weight * jnp.eye(1))[0]
 
-    # By one thread: several that have a library invert batches may wait for each other for ever.
-    return time_designs(jax.vmap(one), np.geomspace(*COMMAND_WEIGHTS, DESIGNS)[None], threads=1)
+    # One thread: several threads that call LAPACK for batches of inverses may deadlock.
+    return time_designs(jax.vmap(design), np.geomspace(*COMMAND_WEIGHTS, DESIGNS)[None], threads=1)
 
 
-def print_row(name: str, found: DesignTimes) -> None:
-    """Print a line of the table."""
-    print(f"{name:64} {found.compiling:13.2f} {found.run:12.2f}", flush=True)
+def print_times(name: str, found: DesignTimes) -> None:
+    """Print a row of the table."""
+    print_row((name, f"{found.compiling:.2f}", f"{found.run:.2f}"))
 
 
 def main() -> None:
     """Print the table."""
-    print(f"{'':64} compiling (s)   {DESIGNS} take (s)")
+    parser(__doc__).parse_args()
+    print_table(("regulators", "compiling (s)", f"{DESIGNS} designs (s)"))
     for modes in MODE_COUNTS:
-        print_row(f"time-invariant, {2 * modes} states", time_invariant(modes))
-        for turn, error in PHASE_STEPS.items():
-            name = f"finite-time, {2 * modes} states, to {error:.0e}"
-            points = interval_count(modes, turn)
-            print_row(f"{name}, grid", time_finite_horizon(modes, points, True, 1 / 4))
-            print_row(f"{name}, all different", time_finite_horizon(modes, points, False, 1 / 16))
+        print_times(f"time-invariant, {2 * modes} states", time_invariant(modes))
+        for phase, error in PHASE_STEPS.items():
+            name = f"finite-horizon, {2 * modes} states, to {error:.0e}"
+            points = interval_count(modes, phase)
+            print_times(f"{name}, grid", time_finite_horizon(modes, points, True, 1 / 4))
+            different = time_finite_horizon(modes, points, False, 1 / 16)
+            print_times(f"{name}, all different", different)
 
 
 if __name__ == "__main__":

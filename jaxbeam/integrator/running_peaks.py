@@ -23,10 +23,10 @@ class Peaks(NamedTuple):
     NaN where a run failed, and for contact that is never lost.
     """
 
-    peak_deflection: Float[Array, "*task lane sensor"]
-    peak_time: Float[Array, "*task lane sensor"]
-    lowest_contact_force: Float[Array, "*task lane load"]
-    contact_lost_time: Float[Array, "*task lane load"]
+    peak_deflection: Float[Array, "*task batch sensor"]
+    peak_time: Float[Array, "*task batch sensor"]
+    lowest_contact_force: Float[Array, "*task batch load"]
+    contact_lost_time: Float[Array, "*task batch load"]
 
 
 class RunningPeaks(eqx.Module):
@@ -37,16 +37,16 @@ class RunningPeaks(eqx.Module):
     with which a load presses on the beam; `contact_lost_time` (s) is the first time it would have to pull.
     """
 
-    estimate: Float[Array, "sensor lane"]
-    samples: Float[Array, "point sensor lane"]
-    step_start: Float[Array, "sensor lane"]
-    step_length: Float[Array, "sensor lane"]
-    lowest_contact_force: Float[Array, "load lane"]
-    contact_lost_time: Float[Array, "load lane"]
-    finite: Bool[Array, " lane"]
+    estimate: Float[Array, "sensor batch"]
+    samples: Float[Array, "source sensor batch"]
+    step_start: Float[Array, "sensor batch"]
+    step_length: Float[Array, "sensor batch"]
+    lowest_contact_force: Float[Array, "load batch"]
+    contact_lost_time: Float[Array, "load batch"]
+    finite: Bool[Array, " batch"]
     magnitude: Callable = eqx.field(static=True)
 
-    def refined_peak(self) -> tuple[Float[Array, "sensor lane"], Float[Array, "sensor lane"]]:
+    def refined_peak(self) -> tuple[Float[Array, "sensor batch"], Float[Array, "sensor batch"]]:
         """Largest size of deflection (m) of each watched place, and when (s); NaN if not sound."""
         value, position = refine_peak(self.samples, PEAK_NODES, self.magnitude)
         time = self.step_start + position * self.step_length

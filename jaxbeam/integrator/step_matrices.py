@@ -36,9 +36,9 @@ class CommandMatrices(eqx.Module):
 class NodeMatrices(eqx.Module):
     """The states at the nodes, from the state at the start, contact forces and commands."""
 
-    transition: Float[Array, "step inner state"]
-    force_response: Float[Array, "step inner row"]
-    command_response: Float[Array, "step inner command"]
+    transition: Float[Array, "step node_state state"]
+    force_response: Float[Array, "step node_state row"]
+    command_response: Float[Array, "step node_state command"]
 
 
 class StepMatrices(eqx.Module):
@@ -52,7 +52,7 @@ class StepMatrices(eqx.Module):
     contact_compliance: Float[Array, "step row row"]
     transition: Float[Array, "step block side side"]
     force_response: Float[Array, "step state row"]
-    monitored: Float[Array, "step looked all"] | None
+    monitored: Float[Array, "step sample input"] | None
     commands: CommandMatrices | None
     nodes: NodeMatrices | None
     loaded: Bool[Array, " step"]
@@ -69,9 +69,9 @@ class DiscreteModel(eqx.Module):
     model: ModalModel
     grid: TimeGrid
     propagators: Propagators
-    monitored_transition: Float[Array, "length looked block side"] | None
-    monitored_input: Float[Array, "length looked force block input"] | None
-    flexibility: Float[Array, " place"] | None
+    monitored_transition: Float[Array, "length sample block side"] | None
+    monitored_input: Float[Array, "length sample force block input"] | None
+    flexibility: Float[Array, " position"] | None
     modal_command_matrix: Float[Array, "mode actuator"] | None
     with_node_states: bool = eqx.field(static=True)
     magnitude: Callable = eqx.field(static=True, default=abs)
@@ -85,7 +85,7 @@ class DiscreteModel(eqx.Module):
 def discrete_model(
     model: ModalModel,
     grid: TimeGrid,
-    positions: Float[Array, " place"] | None,
+    positions: Float[Array, " position"] | None,
     policy: AbstractInputPolicy | None = None,
 ) -> DiscreteModel:
     """Propagators for all step lengths of a grid; deflections are watched at some places (m)."""
@@ -137,8 +137,8 @@ def _peak_node_rows(propagators: Propagators, rows):
 
 
 def _static_flexibility(
-    model: ModalModel, shapes: Float[Array, "place mode"]
-) -> Float[Array, " place"]:
+    model: ModalModel, shapes: Float[Array, "position mode"]
+) -> Float[Array, " position"]:
     """Static deflection at places under a unit force there; not finite if a mode has no stiffness.
 
     Modes that nothing couples need no factorisation, which takes longer than all the rest.
@@ -161,10 +161,10 @@ def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
 
     return dataclasses.replace(
         discrete,
-        watch=both_signs(discrete.monitored_transition),
+        monitored_transition=both_signs(discrete.monitored_transition),
         monitored_input=both_signs(discrete.monitored_input),
         flexibility=jnp.tile(discrete.flexibility, 2),
-        size=operator.pos,
+        magnitude=operator.pos,
     )
 
 
@@ -178,10 +178,10 @@ class LoadPath(eqx.Module):
     length_index: Int[Array, " step"]
     start: Float[Array, " step"]
     length: Float[Array, " step"]
-    loads: Int[Array, "step slot"]
-    on_beam: Bool[Array, "step slot"]
-    shape_rows: Float[Array, "step slot node block mode"]
-    contact_rows: Float[Array, "step slot node block side"]
+    loads: Int[Array, "step load"]
+    on_beam: Bool[Array, "step load"]
+    shape_rows: Float[Array, "step load node block mode"]
+    contact_rows: Float[Array, "step load node block side"]
 
 
 @jax.named_scope("load_path")

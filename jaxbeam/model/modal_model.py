@@ -39,11 +39,31 @@ class ModalModel(eqx.Module):
         return self.state_matrix.shape[0] * self.state_matrix.shape[1]
 
     @property
+    def mode_count(self) -> int:
+        """Number of modes."""
+        return self.modes.stiffness.shape[0]
+
+    @property
+    def coordinate_index(self) -> slice:
+        """Index of the coordinates q among the states."""
+        return slice(0, 2 * self.mode_count, 2)
+
+    @property
+    def rate_index(self) -> slice:
+        """Index of the rates q' among the states."""
+        return slice(1, 2 * self.mode_count, 2)
+
+    @property
+    def A(self) -> Float[Array, "state state"]:
+        """State matrix in full, whether or not it consists of blocks."""
+        return block_diag(*self.state_matrix)
+
+    @property
     def modes_per_block(self) -> int:
         """Number of modal coordinates in each block of the state matrix."""
-        return self.modes.stiffness.shape[0] // self.state_matrix.shape[0]
+        return self.mode_count // self.state_matrix.shape[0]
 
-    def shapes(self, x, derivatives: tuple[int, ...]) -> Float[Array, "order *place mode"]:
+    def shapes(self, x, derivatives: tuple[int, ...]) -> Float[Array, "order *position mode"]:
         """Rows that take q to the deflection (or its x-derivatives) at positions x (m).
 
         Transposed, they take a force at x to forces on q.
@@ -53,9 +73,7 @@ class ModalModel(eqx.Module):
 
     def stiffness(self) -> Float[Array, "mode mode"]:
         """Stiffness matrix of the coordinates q, suspensions included, in 1/s^2."""
-        negative_state_matrix = -block_diag(*self.state_matrix)
-        size = 2 * self.modes.stiffness.shape[0]
-        return negative_state_matrix[1:size:2, 0:size:2]
+        return -self.A[self.rate_index, self.coordinate_index]
 
 
 def has_coupling(case: Case) -> bool:

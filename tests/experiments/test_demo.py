@@ -1,4 +1,4 @@
-"""The demonstration does what the README says, from logs to a controller."""
+"""The demonstration: files, intervals around the true values, and the tuned controller."""
 
 import json
 
@@ -16,14 +16,14 @@ WRITTEN = {
 
 
 @pytest.mark.slow
-def test_three_jobs_in_a_row(tmp_path, capsys, monkeypatch):
+def test_identification_sweep_and_tuning(tmp_path, capsys, monkeypatch):
     identify = tuning.identify
 
-    def for_long(*given):
+    def identify_optimised(*arguments):
         with well_compiled():
-            return identify(*given)
+            return identify(*arguments)
 
-    monkeypatch.setattr(tuning, "identify", for_long)
+    monkeypatch.setattr(tuning, "identify", identify_optimised)
     demo.run(tmp_path / "out", json=True)
     assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN
     found = json.loads(capsys.readouterr().out)
@@ -32,18 +32,19 @@ def test_three_jobs_in_a_row(tmp_path, capsys, monkeypatch):
     intervals = {name: number["interval_95"] for name, number in numbers.items()}
     hits = [low <= truth[name] <= high for name, (low, high) in intervals.items()]
     assert sum(hits) >= len(hits) - 1
-    with xarray.open_dataset(tmp_path / "out" / "map.nc") as crossed:
-        assert not crossed.failed.any()
-        assert crossed.peak_deflection.sizes == {**dict.fromkeys(demo.MAP, 45), "sensor": 3}
+    with xarray.open_dataset(tmp_path / "out" / "map.nc") as results:
+        assert not results.failed.any()
+        sizes = {**dict.fromkeys(demo.SWEPT_VALUES, 45), "sensor": 3}
+        assert results.peak_deflection.sizes == sizes
     runs = found["tuned"]["runs"]["held out"]
     peaks = ("least_peak", "peak_after", "peak_before", "uncontrolled_peak")
     least, after, before, free = (np.array(runs[name]) for name in peaks)
     assert np.all(least < after) and np.all(before < free)
-    # Tuned, the loop takes off far more than by hand.
+    # The tuned loop reduces the peaks far more than the hand-set one.
     assert np.all(free - after > 1.5 * (free - before))
 
 
-def test_a_folder_that_is_in_use_is_left_alone(tmp_path):
+def test_a_folder_that_is_not_empty_is_refused(tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="is not empty; choose another"):
         demo.run(tmp_path)

@@ -1,1 +1,1 @@
-"""The speed benchmark's problem solved by scipy, diffrax and numba."""
+"""The crossing of the speed benchmark solved by scipy, diffrax and numba."""

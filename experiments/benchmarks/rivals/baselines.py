@@ -1,9 +1,9 @@
-"""The speed benchmark's problem, solved with scipy and with diffrax as well as each allows.
+"""The crossing of `pinned_beam` solved with scipy and with diffrax as well as each allows.
 
-The problem is that of `crossing`. Wanted are the largest absolute deflections at the sensors, over
-the crossing and the free vibration after it, to one part in a million; or deflections at given
-times. The rules are the same for every solver: integrate the crossing, take the free vibration from
-its closed form where no controller acts, and refine peaks between samples with the same cubic.
+Wanted are the largest absolute deflections at the sensors, over the crossing and the free vibration
+after it, to one part in a million; or deflections at given times. The rules are the same for every
+solver: integrate the crossing, take the free vibration from its closed form where no controller
+acts, and refine peaks between samples with the same cubic.
 """
 
 from functools import partial
@@ -16,6 +16,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 import jaxbeam  # noqa: F401 - switches JAX to double precision
+from experiments.benchmarks.common import Timing, time_call
 from experiments.benchmarks.rivals.pinned_beam import (
     crossing_rate,
     free_peaks,
@@ -23,18 +24,17 @@ from experiments.benchmarks.rivals.pinned_beam import (
     free_vibration,
     hermite_peaks,
 )
-from experiments.benchmarks.timing import Timing, time_call
 
 FREE_VIBRATION = 0.5  # s of vibration after the exit
-REFERENCE_TOLERANCE = 1e-12  # tolerance of references
-SCIPY_TOLERANCE = 5e-8  # with which no peak was worse than 5e-7; twice as loose, some passed 1e-6
+REFERENCE_TOLERANCE = 1e-12
+SCIPY_TOLERANCE = 5e-8  # errors of peaks up to 5e-7; with twice that, some exceed 1e-6
 
 
 def reference_peaks(beam, masses, speeds, free=FREE_VIBRATION):
-    """Peaks to about 1e-10, (mass, speed, sensor) in m, for checking the others.
+    """Reference peaks (mass, speed, sensor) in m, right to about 1e-10.
 
-    As `scipy_peaks`, at the limit of double precision, with all masses of one speed integrated
-    as one system, which shares their steps and Python's overhead.
+    As `scipy_peaks` at the limit of double precision, with all masses of one speed integrated as
+    one system, which shares their steps and Python's overhead.
     """
     masses, times = np.asarray(masses), free_times(beam, free, tolerance=1e-10)
     runs = [
@@ -69,11 +69,11 @@ def scipy_histories(beam, masses, speeds, times, tolerance=SCIPY_TOLERANCE):
 
 
 def scipy_time(solve, beam, masses, speeds, runs=12, repeat=3, reference=None):
-    """What `solve(rig, masses, speeds)` would take for all of these, from a sample of `runs`.
+    """Time of `solve(beam, masses, speeds)` for all of these, scaled from a sample of `runs`.
 
-    The cost of a run is a constant plus a share that grows with its duration, L / v; both are
-    fitted to runs spread over the speeds, each with another mass, each timed `repeat` times; and,
-    if asked for, compared with the function `reference`.
+    The time of a run is a constant plus a share proportional to its duration, L / v; both are
+    fitted to runs at speeds spread over all, each with another mass, each timed `repeat` times. A
+    function `reference` is called between them for the ratio.
     """
     chosen = np.linspace(0, len(speeds) - 1, runs).round().astype(int)
     mixed = np.resize(np.asarray(masses)[:: max(len(masses) // runs, 1)], runs)
@@ -92,30 +92,30 @@ def scipy_time(solve, beam, masses, speeds, runs=12, repeat=3, reference=None):
     )
 
 
-@partial(jax.jit, static_argnames=("rig", "free", "shared_steps"))
-def diffrax_peaks(rig, masses, speeds, free=FREE_VIBRATION, shared_steps=False):
+@partial(jax.jit, static_argnames=("beam", "free", "shared_steps"))
+def diffrax_peaks(beam, masses, speeds, free=FREE_VIBRATION, shared_steps=False):
     """Peaks by diffrax, mapped over speeds and batched over masses, (mass, speed, sensor) in m.
 
     Masses in kg, speeds in m/s, `free` in s. Every run has its own adaptive steps (`vmap`), or
-    with `shared_steps` all masses of a speed are one system, with steps that suit the worst:
-    that spares the selects which `vmap` puts around every step, and is several times faster.
-    A run that fails is NaN.
+    with `shared_steps` all masses of a speed are one system, with steps for the largest error: that
+    avoids the selects which `vmap` puts around every step, and is several times faster. Failed runs
+    are NaN.
     """
-    times = free_times(rig, free)
+    times = free_times(beam, free)
 
     def at_speed(speed):
         if shared_steps:
-            return _diffrax_runs(rig, masses, speed, times)
-        return jax.vmap(lambda mass: _diffrax_runs(rig, mass[None], speed, times)[0])(masses)
+            return _diffrax_runs(beam, masses, speed, times)
+        return jax.vmap(lambda mass: _diffrax_runs(beam, mass[None], speed, times)[0])(masses)
 
     return jax.lax.map(at_speed, speeds).swapaxes(0, 1)
 
 
 def _scipy_steps(beam, masses, speed, end, tolerance):
-    """Every step of DOP853 from rest to a time (s), for all `masses` as one system.
+    """Steps of DOP853 from rest to a time `end` (s), with all `masses` as one system.
 
-    Each as its start, its length, and the function that takes times in it to states (2, mode, run,
-    time). Steps end where a load passes a support and where the controller acts.
+    Yields for each step its start (s), its length (s), and a function from times in it to states
+    (2, mode, run, time). Steps end where a load passes a support and at sampling instants.
     """
     size = beam.state_scales[:, :, None] * masses
     passed = beam.length / speed * np.arange(1, beam.spans + 1) / beam.spans
@@ -125,11 +125,13 @@ def _scipy_steps(beam, masses, speed, end, tolerance):
     stops = np.unique(np.concatenate([sampling_instants, passed, [end]]).round(13))
     state, modal_forces = np.zeros_like(size), None
     if beam.gain is not None and beam.period is None:
-        modal_forces = partial(np.matmul, beam.patch_shapes @ beam.answer(np.eye(beam.modes)))
+        modal_forces = partial(
+            np.matmul, beam.patch_shapes @ beam.feedback_commands(np.eye(beam.modes))
+        )
     for start, stop in pairwise(stops[stops <= end + 1e-12]):
         span = int(np.sum(passed < start + 1e-12))
         if beam.period is not None and np.min(np.abs(sampling_instants - start)) < 1e-12:
-            held = beam.patch_shapes @ beam.answer(state[0])
+            held = beam.patch_shapes @ beam.feedback_commands(state[0])
             modal_forces = lambda q, held=held: held  # noqa: E731
         rate = crossing_rate(beam, masses, speed, span if span < beam.spans else None, modal_forces)
         solver = DOP853(
@@ -137,7 +139,7 @@ def _scipy_steps(beam, masses, speed, end, tolerance):
             start,
             state.ravel(),
             stop,
-            rtol=1e-13,  # so small that the absolute tolerance rules: it is peaks that matter
+            rtol=1e-13,  # so small that the absolute tolerance decides, as for the error of peaks
             atol=tolerance * size.ravel(),
         )
         while solver.status == "running":
@@ -150,6 +152,7 @@ def _scipy_steps(beam, masses, speed, end, tolerance):
 
 
 def _states(dense, shape, times):
+    """States (2, mode, run, time) of a dense output at times (s)."""
     return dense(times).reshape(*shape, -1)
 
 

@@ -1,12 +1,11 @@
-"""The speed benchmark's problem by loops that numba compiles: adaptive Runge-Kutta, run by run.
+"""The crossing of `pinned_beam` by loops that numba compiles: adaptive Runge-Kutta, run by run.
 
-Runs are shared among all cores, each with steps of its own: an embedded pair of Runge and Kutta, as
-scipy and diffrax take it, with the step controlled by the same norm. Between steps the deflection
-is the quintic through values, rates and accelerations at both ends; the rest follows the rules of
+Runs are distributed over all cores, each with its own steps: an embedded Runge-Kutta pair, as in
+scipy and diffrax, with the step controlled by the same norm. Within steps the deflection is the
+quintic through values, rates and accelerations at both ends; the rest follows the rules of
 `baselines`. Without numba the same functions are plain Python, slow and for tests.
 """
 
-import importlib
 import math
 from types import ModuleType
 
@@ -16,22 +15,14 @@ import numpy as np
 from experiments.benchmarks.rivals.baselines import FREE_VIBRATION
 from experiments.benchmarks.rivals.pinned_beam import GRAVITY, free_times
 
-TOLERANCE = 1e-8  # with which no peak of the benchmark's grid is worse than 1e-6
+TOLERANCE = 1e-8  # errors of the peaks of the benchmark's grid stay below 1e-6
 SOLVER, ORDER = diffrax.Dopri5, 5  # faster here than Tsit5 and Dopri8, with 3 modes and with 12
-MAX_STEPS = 10**6  # steps of a run
-PEAK_INTERVALS = 4  # of each step, between which a cubic finds the peak
-
-
-def import_numba() -> ModuleType | None:
-    """The package, if it is installed."""
-    try:
-        return importlib.import_module("numba")
-    except ImportError:
-        return None
+MAX_STEPS = 10**6  # of a run
+PEAK_INTERVALS = 4  # of each step, in each of which a cubic finds the peak
 
 
 def compile_peaks(package: ModuleType | None):
-    """The function that fills in the peaks of all runs, compiled by numba, or plain without it."""
+    """The function that fills in the peaks of all runs, compiled by numba if it is given."""
     if package is None:
         jit, share, every = (lambda function: function), range, (lambda function: function)
     else:
@@ -40,10 +31,10 @@ def compile_peaks(package: ModuleType | None):
 
     @jit
     def accelerate(t, state, out, shape, mass, speed, numbers, squares, damping, amplitude):
-        """[q', q''] of a run to its [q, q'], as `crossing_rate`; sines by turning."""
+        """[q', q''] of a run from [q, q'], as `crossing_rate`; sines by the addition theorem."""
         modes = squares.size
         sine, cosine = math.sin(numbers[0] * speed * t), math.cos(numbers[0] * speed * t)
-        now_sine, now_cosine, along, size = 0.0, 1.0, 0.0, 0.0
+        now_sine, now_cosine, convected, size = 0.0, 1.0, 0.0, 0.0
         for j in range(modes):
             now_sine, now_cosine = (
                 now_sine * cosine + now_cosine * sine,
@@ -52,11 +43,11 @@ def compile_peaks(package: ModuleType | None):
             travel = speed * numbers[j]
             phi = amplitude * now_sine
             free = -damping[j] * state[modes + j] - squares[j] * state[j]
-            along += phi * (free - travel * travel * state[j])
-            along += 2 * travel * amplitude * now_cosine * state[modes + j]
+            convected += phi * (free - travel * travel * state[j])
+            convected += 2 * travel * amplitude * now_cosine * state[modes + j]
             size += phi * phi
             shape[j], out[j], out[modes + j] = phi, state[modes + j], free
-        force = mass * (GRAVITY + along) / (1 + mass * size)
+        force = mass * (GRAVITY + convected) / (1 + mass * size)
         for j in range(modes):
             out[modes + j] -= shape[j] * force
 
@@ -95,9 +86,9 @@ def compile_peaks(package: ModuleType | None):
         return peak
 
     @jit
-    def cross(mass, speed, rig, pair, tolerance, peaks):
-        """The end of the crossing; peaks are filled in. Returns [q, q'], NaN if it fails."""
-        length, numbers, squares, damping, amplitude, rows, sizes = rig
+    def cross(mass, speed, beam, pair, tolerance, peaks):
+        """The state [q, q'] at the exit, NaN if it fails; fills in the peaks of the crossing."""
+        length, numbers, squares, damping, amplitude, rows, sizes = beam
         weights, end_weights, error_weights, nodes = pair
         modes, stages = squares.size, nodes.size
         rates = np.zeros((stages, 2 * modes))
@@ -117,19 +108,19 @@ def compile_peaks(package: ModuleType | None):
                 accelerate(t + nodes[i] * step, trial, rates[i], shape, mass, speed, *constants)
             error = 0.0
             for n in range(2 * modes):
-                total = wrong = 0.0
+                total = difference = 0.0
                 for k in range(stages):
                     total += end_weights[k] * rates[k, n]
-                    wrong += error_weights[k] * rates[k, n]
+                    difference += error_weights[k] * rates[k, n]
                 after[n] = state[n] + step * total
-                error += (step * wrong / (sizes[n] * mass)) ** 2
+                error += (step * difference / (sizes[n] * mass)) ** 2
             error = math.sqrt(error / (2 * modes)) / tolerance
             change = min(max(0.9 * max(error, 1e-12) ** (-1 / ORDER), 0.2), 5.0)
             if error <= 1.0:
                 accelerate(t + step, after, after_rate, shape, mass, speed, *constants)
                 for s in range(peaks.size):
-                    seen = quintic(step, rows[s], state, rates[0], after, after_rate)
-                    peaks[s] = max(peaks[s], seen)
+                    peak = quintic(step, rows[s], state, rates[0], after, after_rate)
+                    peaks[s] = max(peaks[s], peak)
                 t += step
                 state[:], rates[0] = after, after_rate
                 if t >= end * (1 - 1e-14):
@@ -139,7 +130,7 @@ def compile_peaks(package: ModuleType | None):
         return state
 
     @jit
-    def ring(state, times, decays, exponents, rows, peaks):
+    def vibrate_freely(state, times, decays, exponents, rows, peaks):
         """Peaks of the free vibration that follows, from tables of exp(p t), (time, mode)."""
         modes = exponents.size
         starts = np.zeros(modes, np.complex128)
@@ -163,19 +154,19 @@ def compile_peaks(package: ModuleType | None):
                 before[s], before_rate[s] = value, rate
 
     @every
-    def fill(masses, speeds, rig, pair, tolerance, times, decays, exponents, found):
+    def fill(masses, speeds, beam, pair, tolerance, times, decays, exponents, found):
         for run in share(masses.size * speeds.size):
             i, j = run // speeds.size, run % speeds.size
-            state = cross(masses[i], speeds[j], rig, pair, tolerance, found[i, j])
-            ring(state, times, decays, exponents, rig[5], found[i, j])
+            state = cross(masses[i], speeds[j], beam, pair, tolerance, found[i, j])
+            vibrate_freely(state, times, decays, exponents, beam[5], found[i, j])
 
     return fill
 
 
 def numba_peaks(peak_function, beam, masses, speeds, free=FREE_VIBRATION):
-    """Peaks (mass, speed, sensor) in m by what `compile_peaks` has made; masses in kg, speeds in m/s.
+    """Peaks (mass, speed, sensor) in m by the function that `compile_peaks` returns.
 
-    For rigs of one span without control.
+    Masses in kg, speeds in m/s; for beams of one span without control.
     """
     tableau = SOLVER.tableau
     nodes = np.append(0.0, np.asarray(tableau.c))

@@ -1,4 +1,4 @@
-"""The speed benchmark's problem, and the closed forms that all solvers of it may use.
+"""The pinned beam of the speed benchmark, and the closed forms that all solvers share.
 
 A point mass m enters a pinned beam at t = 0 and crosses at constant speed v; the beam has one span,
 or two over a support in the middle. With mass-normalised modes phi_j and x = v t,
@@ -6,9 +6,9 @@ or two over a support in the middle. With mass-normalised modes phi_j and x = v 
     q_j'' + 2 zeta w_j q_j' + w_j^2 q_j = -phi_j(x) R + p_j,
     R = m (g + w_tt + 2 v w_xt + v^2 w_xx)  at x,
 
-which is the moving mass with its full convective acceleration. w_tt holds the unknown q'', but only
-along phi, so R has a closed form (Sherman and Morrison 1950); `crossing_rate` below is that form,
-shared by all. p are forces of patches under control, if there are any.
+which is the moving mass with its full convective acceleration. w_tt contains the unknown q'', but
+only along phi, so R has a closed form (Sherman and Morrison 1950), that of `crossing_rate`. p are
+modal forces of patches under control.
 """
 
 from dataclasses import dataclass
@@ -25,10 +25,10 @@ MOMENT = 8.292e-4 * 0.35 * 200.0  # N m of a patch per volt of command
 
 @dataclass(frozen=True)
 class PinnedBeam:
-    """The pinned rig of the benchmark, in SI units, with `modes` modes; its spans are equal.
+    """The pinned beam of the benchmark, in SI units, with equal spans.
 
-    With a `gain` (V/m) a patch on each span answers the sensor of its number, u = -gain y: every
-    `period` (s), held in between, or at every instant without one.
+    With a `gain` (V/m) the patch on each span answers the sensor of its number, u = -gain y: every
+    `period` (s), held in between, or continuously without a period.
     """
 
     modes: int
@@ -43,10 +43,10 @@ class PinnedBeam:
 
     @cached_property
     def wavenumbers(self):
-        """Of the modes, (mode,) in 1/m.
+        """Wavenumbers of the modes, (mode,) in 1/m.
 
-        Two spans, each of length a: sines, k a = n pi, and, as if the middle were clamped,
-        tan k a = tanh k a, in turn.
+        Two spans, each of length a: in turn those of sines, k a = n pi, and those of spans clamped
+        in the middle, tan k a = tanh k a.
         """
         if self.spans == 1:
             return np.arange(1, self.modes + 1) * np.pi / self.length
@@ -55,12 +55,12 @@ class PinnedBeam:
             return np.sin(x) - np.cos(x) * np.tanh(x)
 
         turns = np.arange(1, self.modes // 2 + 2) * np.pi
-        held = [brentq(clamped, turn + 0.1, turn + np.pi / 2, xtol=1e-14) for turn in turns]
-        return 2 / self.length * np.transpose([turns, np.array(held)]).ravel()[: self.modes]
+        roots = [brentq(clamped, turn + 0.1, turn + np.pi / 2, xtol=1e-14) for turn in turns]
+        return 2 / self.length * np.transpose([turns, np.array(roots)]).ravel()[: self.modes]
 
     @cached_property
     def sinh_share(self):
-        """The share h (mode,) of sinh k s in modes of two spans that are clamped in the middle."""
+        """Share of sinh k s in mode shapes, (mode,): nonzero for modes clamped in the middle."""
         if self.spans == 1:
             return np.zeros(self.modes)
         angles = self.wavenumbers * self.length / 2
@@ -73,11 +73,11 @@ class PinnedBeam:
 
     @cached_property
     def mode_amplitudes(self):
-        """What makes the modal masses one, (mode,) in 1/sqrt(kg)."""
+        """Amplitude of the mass-normalised modes, (mode,) in 1/sqrt(kg)."""
         return np.sqrt(2 / (self.mass_per_length * self.length * (1 - self.sinh_share**2)))
 
     def shapes(self, position, derivative=0):
-        """Mode shapes or slopes at a place (m) of the beam, (mode,) in 1/sqrt(kg), or by 1/m."""
+        """Mode shapes at a position (m), (mode,) in 1/sqrt(kg), or slopes, in 1/(m sqrt(kg))."""
         right = self.spans == 2 and position > self.length / 2
         s, k = (self.length - position if right else position), self.wavenumbers
         wave, grown = (np.sin, np.sinh) if derivative == 0 else (np.cos, np.cosh)
@@ -88,13 +88,13 @@ class PinnedBeam:
 
     @cached_property
     def symmetry_signs(self):
-        """The sign of each mode at the mirrored place, (mode,)."""
+        """Sign of each mode at the mirrored position, (mode,)."""
         return np.where(np.arange(self.modes) % 2 == 0, -1.0, 1.0)
 
     @cached_property
     def sensor_shapes(self):
         """Mode shapes at the sensors, (sensor, mode) in 1/sqrt(kg)."""
-        return np.array([self.shapes(place) for place in self.sensors])
+        return np.array([self.shapes(position) for position in self.sensors])
 
     @cached_property
     def patch_shapes(self):
@@ -105,41 +105,41 @@ class PinnedBeam:
 
     @cached_property
     def poles(self):
-        """-zeta w + i w_d of the free vibration of every mode, (mode,) in 1/s."""
+        """Poles -zeta w + i w_d of the modes, (mode,) in 1/s."""
         zeta = self.damping_ratio
         return self.frequencies * (-zeta + 1j * np.sqrt(1 - zeta**2))
 
     @cached_property
     def state_scales(self):
-        """Scale of [q, q'] per kg of load, (2, mode): the first mode under it at rest.
+        """Scales of [q, q'] per kg of load, (2, mode): those of the first mode under it at rest.
 
-        Errors are measured against it in every mode, since all add to the deflection alike.
+        They are the same for every mode, since all add to the deflection alike.
         """
         size = GRAVITY * self.mode_amplitudes[0] / self.frequencies[0] ** 2
         return size * np.stack([np.ones(self.modes), self.frequencies])
 
     def feedback_commands(self, q):
-        """Commands (patch, run) to coordinates (mode, run)."""
+        """Commands (patch, run) in V, from coordinates (mode, run)."""
         return -self.gain * (self.sensor_shapes[: self.spans] @ q)
 
 
 def crossing_rate(beam, masses, speed, span: int | None = 0, modal_forces=None):
     """The function (t, [q, q']) -> [q', q''] of all `masses` at one speed; (2, mode, run) each.
 
-    It holds while they are on the span of that number, or with None on no span. `modal_forces` gives the
-    modal forces (mode, run) that coordinates meet with, if there are any.
+    It holds while they are on the span of that number, or with None off the beam. `modal_forces`
+    is a function from coordinates to the modal forces of patches, (mode, run) each.
     """
     damping = (2 * beam.damping_ratio * beam.frequencies)[:, None]
     stiffness = (beam.frequencies**2)[:, None]
     off_beam, span = span is None, span or 0
     k = beam.wavenumbers
-    signed_amplitude = beam.mode_amplitudes * (beam.mirrored if span else 1.0)
+    signed_amplitude = beam.mode_amplitudes * (beam.symmetry_signs if span else 1.0)
     slope_factor = 2 * speed * (-1) ** span * signed_amplitude * k
     curvature_factor = -((speed * k) ** 2)
-    has_sinh = np.any(beam.held != 0)
+    has_sinh = np.any(beam.sinh_share != 0)
 
     def accelerations(q, velocity):
-        """Those without a mass, (mode, run)."""
+        """Accelerations of the modes without a mass, (mode, run)."""
         free = -damping * velocity - stiffness * q
         return free if modal_forces is None else free + modal_forces(q)
 
@@ -154,9 +154,9 @@ def crossing_rate(beam, masses, speed, span: int | None = 0, modal_forces=None):
         phi, two_speed_slope = signed_amplitude * xp.sin(angle), slope_factor * xp.cos(angle)
         curvature = curvature_factor * phi  # times speed^2
         if has_sinh:
-            grown = signed_amplitude * beam.held * xp.sinh(angle)
+            grown = signed_amplitude * beam.sinh_share * xp.sinh(angle)
             phi, curvature = phi - grown, curvature + curvature_factor * grown
-            two_speed_slope = two_speed_slope - slope_factor * beam.held * xp.cosh(angle)
+            two_speed_slope = two_speed_slope - slope_factor * beam.sinh_share * xp.cosh(angle)
         free = accelerations(q, velocity)
         convected = phi @ free + curvature @ q + two_speed_slope @ velocity
         force = masses * (GRAVITY + convected) / (1 + masses * (phi @ phi))
@@ -168,8 +168,8 @@ def crossing_rate(beam, masses, speed, span: int | None = 0, modal_forces=None):
 def hermite_peaks(interval, value, rate):
     """Largest absolute value of the cubics through `value` and `rate` at successive times.
 
-    `interval` is (time - 1,), `value` and `rate` are (time, ...); returns (...). The stationary
-    point taken in each interval is the first of the kind its left slope leads to.
+    `interval` is (time - 1,), `value` and `rate` are (time, ...); returns (...). In each interval
+    it takes the first maximum where the left slope is positive, else the first minimum.
     """
     xp = value.__array_namespace__()
     interval = interval.reshape((-1,) + (1,) * (value.ndim - 1))
@@ -186,8 +186,8 @@ def hermite_peaks(interval, value, rate):
 def free_times(beam, free, tolerance=1e-7):
     """Times at which cubics through the free vibration are right to `tolerance`, (time,) in s.
 
-    A cubic errs by h^4 w'''' / 384. Mode j is taken to start with w_1 / w_j of the peak, which
-    grants every mode the same largest bending moment; as high modes die out, h grows.
+    The error of a cubic is h^4 w'''' / 384. Mode j is assumed to start with w_1 / w_j of the peak,
+    the same largest bending moment for every mode; as high modes decay, h grows.
     """
     ratio = beam.frequencies / beam.frequencies[0]
     times = [0.0]
@@ -198,7 +198,7 @@ def free_times(beam, free, tolerance=1e-7):
 
 
 def free_vibration(beam, times, q, velocity):
-    """Deflections and their rates (time, sensor, run) in free vibration, in m and m/s.
+    """Deflections and their rates in free vibration, (time, sensor, run) in m and m/s.
 
     q_j = Re(a_j exp(p_j t)) with p_j = -zeta w_j + i w_d, from `q` and `velocity`, (mode, run),
     at time zero.

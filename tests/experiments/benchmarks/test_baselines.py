@@ -1,4 +1,4 @@
-"""The baselines of the speed benchmark solve the same problem, and solve it right."""
+"""The other solvers of the speed benchmark: agreement with each other and with oracles."""
 
 import time
 
@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from experiments.benchmarks import cases
+from experiments.benchmarks.common import Timing, time_call
 from experiments.benchmarks.rivals import baselines, numba_peaks
 from experiments.benchmarks.rivals.baselines import (
     diffrax_peaks,
@@ -21,7 +22,6 @@ from experiments.benchmarks.rivals.pinned_beam import (
     free_times,
     hermite_peaks,
 )
-from experiments.benchmarks.timing import Timing, time_call
 from tests.oracles.closed_loop import Actuator, Clock, Sensor, respond
 from tests.oracles.loads import Load
 from tests.oracles.modal_equations import Span
@@ -93,7 +93,7 @@ def test_cubic_peaks_are_exact_for_a_cubic_and_need_no_sample_at_the_peak():
     np.testing.assert_allclose(peak, abs(lowest), rtol=1e-14)
 
 
-def test_free_times_cover_the_time_asked_for_and_thin_out_as_high_modes_die():
+def test_free_times_cover_the_duration_and_thin_out_as_high_modes_decay():
     times = free_times(PinnedBeam(12), 0.5)
     assert times[0] == 0.0 and times[-1] == 0.5
     assert np.all(np.diff(times) > 0)
@@ -106,86 +106,88 @@ def test_time_call_keeps_compiling_apart():
     assert np.isnan(timing.ratio)
 
 
-def test_time_call_compares_with_what_runs_beside(monkeypatch):
-    """A clock that all run slower by, and ever more so: the ratio stays."""
-    now, pace = [0.0], [1.0]
+def test_ratio_to_a_reference_does_not_depend_on_the_speed_of_the_machine(monkeypatch):
+    """A machine that becomes slower with every call."""
+    now, slowness = [0.0], [1.0]
 
-    def passing(seconds):
-        now[0] += seconds * pace[0]
-        pace[0] *= 1.1
+    def work(seconds):
+        now[0] += seconds * slowness[0]
+        slowness[0] *= 1.1
 
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    timing = time_call(passing, 6.0, repeat=3, reference=lambda: passing(2.0))
+    timing = time_call(work, 6.0, repeat=3, reference=lambda: work(2.0))
     assert timing.ratio == pytest.approx(3.0, rel=0.01)
     assert timing.run > 7.0
-    # The shortest are not of one moment: the other's first call comes just before ours.
+    # The shortest calls are the first: that of the reference comes just before the other.
     assert timing.ratio_of_shortest == pytest.approx(3.0 * 1.1)
 
 
 def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
-    """Costs of the form it assumes are added up exactly."""
+    """Times that are a constant plus a share proportional to 1 / v are summed exactly."""
     masses, speeds = np.linspace(0.1, 1, 5), np.linspace(0.3, 10, 9)
 
-    def known_cost(function, rig, masses, speeds, repeat, beside):
-        cost = 0.01 + 0.02 / speeds[0]
-        return Timing(run=cost, ratio=3 / speeds[0], shortest=cost / 2, reference_shortest=0.1)
+    def known_time(function, beam, masses, speeds, repeat, reference):
+        seconds = 0.01 + 0.02 / speeds[0]
+        return Timing(
+            run=seconds, ratio=3 / speeds[0], shortest=seconds / 2, reference_shortest=0.1
+        )
 
-    monkeypatch.setattr(baselines, "time_call", known_cost)
+    monkeypatch.setattr(baselines, "time_call", known_time)
     found = scipy_time(scipy_peaks, PinnedBeam(1), masses, speeds, runs=4)
     np.testing.assert_allclose(found.run, np.sum(0.01 + 0.02 / speeds) * len(masses))
     np.testing.assert_allclose(found.ratio, np.sum(3 / speeds) * len(masses))
     np.testing.assert_allclose(found.ratio_of_shortest, found.run / 2 / 0.1)
 
 
-@pytest.mark.parametrize("place", [0.1, 0.55, 0.7, 1.15])
-def test_modes_of_two_spans_are_those_of_the_oracle(place):
-    rig, oracle = PinnedBeam(6, 1.2, spans=2), TwoSpans(1.2, 11.68, 0.535, 6, 0.03)
-    np.testing.assert_allclose(rig.frequencies, oracle.frequencies, rtol=1e-12)
+@pytest.mark.parametrize("position", [0.1, 0.55, 0.7, 1.15])
+def test_modes_of_two_spans_are_those_of_the_oracle(position):
+    beam, oracle = PinnedBeam(6, 1.2, spans=2), TwoSpans(1.2, 11.68, 0.535, 6, 0.03)
+    np.testing.assert_allclose(beam.frequencies, oracle.frequencies, rtol=1e-12)
     for order in (0, 1):
-        expected = oracle.shapes(place, order)
+        expected = oracle.shapes(position, order)
         atol = 1e-12 * np.max(np.abs(expected))
-        np.testing.assert_allclose(rig.shapes(place, order), expected, atol=atol)
+        np.testing.assert_allclose(beam.shapes(position, order), expected, atol=atol)
 
 
 @pytest.mark.parametrize("spans", [1, 2])
 def test_scipy_histories_under_control_are_those_of_the_oracle(spans):
-    """Through the full mass matrix, with sensors, clock and patches of its own."""
-    rig = cases.plain(spans, "sampled", 4)
+    """The oracle has a full mass matrix, and its own sensors, clock and patches."""
+    beam = cases.pinned_beam(spans, "sampled", 4)
     kind = TwoSpans if spans == 2 else Span
-    beam = kind(rig.length, rig.flexural_rigidity, rig.mass_per_length, 4, rig.damping_ratio)
+    oracle = kind(beam.length, beam.flexural_rigidity, beam.mass_per_length, 4, beam.damping_ratio)
     edges = [(0.6 * i + 0.2575, 0.6 * i + 0.3425) for i in range(spans)]
     patches = [Actuator([(a, 1, 1.0), (b, 1, -1.0)], 8.292e-4 * 0.35 * 200) for a, b in edges]
     times = np.arange(0.0, 0.5, 0.02)
     expected = respond(
-        beam,
+        oracle,
         [Load(0.7, 4.0)],
         patches,
-        [Sensor(x) for x in rig.sensors],
+        [Sensor(x) for x in beam.sensors],
         lambda readings, *_: -1e3 * readings[:spans],
         times.tolist(),
         Clock(0.01),
     )
-    found = baselines.scipy_histories(rig, [0.7], [4.0], times)[0, 0]
+    found = baselines.scipy_histories(beam, [0.7], [4.0], times)[0, 0]
     size = np.max(np.abs(expected.deflection))
     np.testing.assert_allclose(found, expected.deflection, atol=1e-6 * size)
 
 
-def test_a_rate_off_the_beam_is_that_of_a_mass_of_none():
-    rig = PinnedBeam(3)
+def test_rate_off_the_beam_is_that_of_a_zero_mass():
+    beam = PinnedBeam(3)
     state = np.random.default_rng(0).normal(size=(2, 3, 1))
-    away = crossing_rate(rig, np.ones(1), 1.0, None)(0.2, state)
-    np.testing.assert_allclose(away, crossing_rate(rig, np.zeros(1), 1.0)(0.2, state))
+    off_beam = crossing_rate(beam, np.ones(1), 1.0, None)(0.2, state)
+    np.testing.assert_allclose(off_beam, crossing_rate(beam, np.zeros(1), 1.0)(0.2, state))
 
 
 @pytest.mark.parametrize("modes", [3, 6])
-def test_loops_for_numba_find_the_peaks_uncompiled_too(modes):
-    rig = PinnedBeam(modes)
-    expected = reference_peaks(rig, MASSES, SPEEDS)
-    found = numba_peaks.numba_peaks(numba_peaks.compile_peaks(None), rig, MASSES, SPEEDS)
+def test_loops_for_numba_find_the_peaks_uncompiled(modes):
+    beam = PinnedBeam(modes)
+    expected = reference_peaks(beam, MASSES, SPEEDS)
+    found = numba_peaks.numba_peaks(numba_peaks.compile_peaks(None), beam, MASSES, SPEEDS)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-def test_numba_finds_what_the_same_loops_find_uncompiled():
+def test_numba_and_the_uncompiled_loops_agree():
     package = pytest.importorskip("numba")
     found, plain = (
         numba_peaks.numba_peaks(numba_peaks.compile_peaks(p), PinnedBeam(3), MASSES, SPEEDS)

@@ -11,7 +11,7 @@ from experiments.studies.held_out import RIGIDITY
 from experiments.studies.loads import held_out_loads, training_loads
 from jaxbeam import rigs
 from jaxbeam.analysis.stability import frozen_poles
-from jaxbeam.case.case import known_case
+from jaxbeam.case.case import concrete_case
 from jaxbeam.model.modes import mesh_layout
 from tuning.control.fixed_design import with_fixed_design
 
@@ -68,7 +68,7 @@ def changed_plant(rig, side, factor, run=None):
     case = jb.replace(dataclasses.replace(bench, controller=law), run or {})
     design = {RIGIDITY: float(case.beam.flexural_rigidity)}
     plant = jb.replace(case, {RIGIDITY: factor * design[RIGIDITY]})
-    return with_fixed_design(plant, design, mesh_layout(known_case(plant)))
+    return with_fixed_design(plant, design, mesh_layout(concrete_case(plant)))
 
 
 @pytest.mark.parametrize("rig", ["B", "C"])

@@ -91,7 +91,7 @@ def test_every_published_number_has_a_finding_in_its_chapter(chapter):
     } == used
 
 
-@pytest.mark.parametrize("name", rigs.NAMES)
+@pytest.mark.parametrize("name", rigs.RIG_NAMES)
 def test_published_rigs_are_cases(name):
     case = rigs.load(name)
     assert case.title.startswith(name) and case.loads and case.sensors
