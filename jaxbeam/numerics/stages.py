@@ -62,7 +62,7 @@ def collocated_stages(
     return Stage(
         transition=scaled_stages.transition * scale[:, None] / scale,
         input_matrix=scaled_stages.input_matrix * scale[:, None],
-        cost=scaled_stages.toll / scale_with_inputs / scale_with_inputs[:, None],
+        cost=scaled_stages.cost / scale_with_inputs / scale_with_inputs[:, None],
     )
 
 
