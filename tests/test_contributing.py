@@ -1,0 +1,68 @@
+"""CONTRIBUTING is true: its paths and commands exist, and its picture shows today's imports."""
+
+import html
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from docs.draw_rooms import PICTURE, listing, package_imports
+from tests.modules import ROOT
+
+TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+SPANS = re.findall(r"`([^`]+)`", TEXT)
+IMAGES = re.findall(r"!\[[^]]*\]\(([^)]+)\)", TEXT)
+PATHS = sorted({span for span in SPANS if re.fullmatch(r"[.\w<>*/-]+(/|\.\w+)", span)} | {*IMAGES})
+LINES = [span for span in SPANS if span.startswith((".venv/bin/", "bash ", "python3 "))]
+COMMANDS = [shlex.split(part) for line in LINES for part in line.split("&&")]
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_paths_exist(path):
+    """A <name> in a path stands for any file there."""
+    assert list(ROOT.glob(re.sub(r"<\w+>", "*", path))), f"CONTRIBUTING names {path}"
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_commands_exist(command):
+    """Programs are declared or made by the first command, files exist, the tests are collected."""
+    program, *arguments = command
+    if command[:3] == ["python3", "-m", "venv"] or program == ".venv/bin/pip":
+        return
+    if program == "bash":
+        script, *words = arguments
+        assert all(word in (ROOT / script).read_text() for word in words)
+        return
+    assert program == ".venv/bin/uv"
+    if arguments == ["sync"]:
+        return
+    run, tool, *options = arguments
+    assert run == "run"
+    if tool == "python":
+        assert options == ["-m", "docs.draw_rooms"]
+        return
+    groups = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    declared = (
+        groups["dependency-groups"]["dev"] + groups["project"]["optional-dependencies"]["test"]
+    )
+    assert any(re.match(rf"{tool}\b", requirement) for requirement in declared)
+    assert all(Path(ROOT / word).exists() for word in options if "/" in word)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command", [c for c in COMMANDS if c[1:3] == ["run", "pytest"] and len(c) > 3], ids=" ".join
+)
+def test_pytest_accepts_its_options(command):
+    line = [sys.executable, "-m", *command[2:], "--collect-only", "-q", "tests/model/test_modes.py"]
+    ended = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+
+
+def test_the_picture_shows_the_imports_of_today():
+    text = html.unescape(PICTURE.read_text(encoding="utf-8"))
+    assert listing(package_imports()) in text, "run: .venv/bin/uv run python -m docs.draw_rooms"
