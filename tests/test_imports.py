@@ -28,7 +28,7 @@ tuning.aliases  tuning.checkpoint  tuning.optional
 tuning.logs
 tuning.parameters  tuning.modal
 tuning.fit
-tuning.control
+tuning.weighing  tuning.control
 tuning
 experiments.thesis  experiments.demo
 experiments.studies  experiments.validation

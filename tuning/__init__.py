@@ -25,12 +25,12 @@ from tuning.fit.report import write_report
 from tuning.fit.storage import load_fit, save_fit
 from tuning.fit.uncertainty.posterior import sample
 from tuning.fit.uncertainty.profile import profile
-from tuning.fit.weigh import weigh
 from tuning.logs.log import Log
 from tuning.logs.quality import find_faults, mask
 from tuning.logs.reading import read_log, read_logs
-from tuning.modal.modal import ModalFit, identify_modes
+from tuning.modal.identify_modes import ModalFit, identify_modes
 from tuning.parameters.prior import Prior
+from tuning.weighing.weigh import weigh
 
 __all__ = [
     "Fit",

@@ -3,7 +3,7 @@
 import functools
 import warnings
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import TypeVar, cast
 
 Target = TypeVar("Target", bound=Callable)
 
@@ -46,15 +46,15 @@ def accepts_old_arguments(**new_names: str) -> Callable[[Target], Target]:
             return function(*given, **options)
 
         if not isinstance(target, type):
-            return with_old_arguments  # pyright: ignore[reportReturnType]
+            return cast(Target, with_old_arguments)
         target.__init__ = with_old_arguments
-        return target
+        return cast(Target, target)
 
     return decorate
 
 
 def current_word(word: str, new_words: Mapping[str, str], what: str) -> str:
-    """The word itself, or the one that took its place, with a warning that names `what` it is of."""
+    """The word, or the one that took its place, with a warning; `what` says what it is for."""
     if word not in new_words:
         return word
     warn_of_old_name(f"{what} {word!r}", repr(new_words[word]), stacklevel=4)

@@ -1,5 +1,6 @@
-"""The state of a long search on disk, so that it survives whatever stops it."""
+"""Checkpoints: the state of a long search on disk, from which a stopped search goes on."""
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -9,14 +10,48 @@ from pathlib import Path
 import numpy as np
 
 
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """File with the state of one search; without a path nothing is written or read.
+
+    `digest` is the `fingerprint` of the search, kept in the file.
+    """
+
+    path: Path | None = None
+    digest: str = ""
+
+    def load(self) -> dict[str, np.ndarray] | None:
+        """Arrays of the state, None if there is no file yet.
+
+        Raises ValueError if the file is damaged or belongs to another search.
+        """
+        return load(self.path, self.digest) if self.path and self.path.exists() else None
+
+    def save(self, arrays: dict[str, np.ndarray]) -> None:
+        """Write the arrays of the state."""
+        if self.path is not None:
+            save(self.path, self.digest, arrays)
+
+
+NO_CHECKPOINT = Checkpoint()
+
+
+def checkpoint_path(checkpoint: str | os.PathLike | None, resume: bool) -> Path | None:
+    """Path of a checkpoint. Raises FileExistsError if it exists and `resume` is not set."""
+    path = None if checkpoint is None else Path(checkpoint)
+    if path is not None and path.exists() and not resume:
+        raise FileExistsError(f"{path} exists: resume that search, or delete it")
+    return path
+
+
 def fingerprint(description: dict) -> str:
-    """A short name of all that decides a search, to tell one search from another."""
+    """Digest (16 hexadecimal digits) of all that decides a search."""
     text = json.dumps(description, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def save(path: Path, digest: str, arrays: dict[str, np.ndarray]) -> None:
-    """Write named arrays, all of them or, if stopped while at it, none."""
+    """Write named arrays to a file in one step: a stopped write leaves the file as it was."""
     part = path.with_name(path.name + ".part")
     with open(part, "wb") as file:
         np.savez(file, fingerprint=np.array(digest), **arrays)
@@ -26,7 +61,7 @@ def save(path: Path, digest: str, arrays: dict[str, np.ndarray]) -> None:
 
 
 def load(path: Path, digest: str) -> dict[str, np.ndarray]:
-    """Read what `save` wrote. Raises ValueError if it is damaged, or of another search."""
+    """Arrays written by `save`. Raises ValueError if damaged or written under another digest."""
     try:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -34,7 +69,7 @@ def load(path: Path, digest: str) -> dict[str, np.ndarray]:
         raise ValueError(f"{path} is damaged: delete it to start anew") from None
     if str(arrays.pop("fingerprint", "")) != digest:
         raise ValueError(
-            f"{path} belongs to another search (other case, numbers, runs or settings): delete it"
-            " to start anew, or name another file"
+            f"{path} belongs to another search (other case, parameters, runs or settings, or an"
+            " older version of jaxbeam): delete it to start anew, or name another file"
         )
     return arrays

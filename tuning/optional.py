@@ -1,11 +1,11 @@
-"""Libraries that come with extras only, and are imported where they are used."""
+"""Optional libraries, installed with extras and imported where they are used."""
 
 import importlib
 from types import ModuleType
 
 
 def import_extra(name: str, extra: str) -> ModuleType:
-    """Import a library of one of jaxbeam's extras. Raises ImportError, saying how to install it."""
+    """Import a library of an extra of jaxbeam. Raises ImportError, which says how to install it."""
     try:
         return importlib.import_module(name)
     except ImportError:

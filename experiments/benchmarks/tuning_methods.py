@@ -69,7 +69,7 @@ def run_evolution(
     @compiled
     def worst_peaks(points, run_set):
         def worst_peak(point):
-            return jnp.max(run_set.merits(dict(zip(free, point, strict=True)))["peak"])
+            return jnp.max(run_set.metrics(dict(zip(free, point, strict=True)))["peak"])
 
         return jax.lax.map(worst_peak, points)
 

@@ -1,7 +1,7 @@
-"""Rigs of finite elements, what is measured on them, and searches for what they are made of.
+"""Rigs of finite elements, their readings, and fits of models to these.
 
-The plant is the finite-element beam with its first modes, integrated by scipy; the model that is
-fitted to its readings keeps fewer, or as many.
+The plant is a finite-element beam with its first modes, integrated by scipy; the model fitted to
+its readings has as many modes, or fewer.
 """
 
 import dataclasses
@@ -15,15 +15,16 @@ from tests.oracles import crossing, finite_elements
 from tests.oracles.loads import Load
 from tuning import Fit, Log
 from tuning.fit.dataset import make_dataset
-from tuning.fit.identify import fit_result
 from tuning.fit.least_squares import LeastSquares
+from tuning.fit.result import fit_result
 from tuning.fit.uncertainty.covariance import t_quantile
-from tuning.parameters.free import free_parameters
+from tuning.parameters.free import free_parameters, to_unbounded
 
 RATE, MEMORY = 100.0, 0.5  # Hz, correlation from sample to sample
 NOISE = {"deflection": 1e-5, "acceleration": 2e-3}  # m, m/s^2
 UNITS = {"deflection": "m", "acceleration": "m/s^2"}
-YIELDING, SAGGING = 1e6, 4e4  # N/m: under 0.5 kg by half the noise, and by twelve times the noise
+# N/m: under 0.5 kg supports yield by half the noise, and by twelve times the noise.
+YIELDING, SAGGING = 1e6, 4e4
 MOMENT, AMPLIFIER = 8.292e-4, 200.0  # N m/V
 SHAKER = {"position": 0.5, "stiffness": 3500.0, "damping": 80.0, "force_per_volt": 4.6}
 
@@ -38,7 +39,7 @@ class Plant:
     modes: int = 12
 
     def readings(self, times, commands, loaded=True):
-        """What the sensors read (time, sensor); commands (time, actuator) are joined by lines."""
+        """Readings (time, sensor); commands (time, actuator) are linear between samples."""
         model = finite_elements.assemble(self.beam)
         rows = [self._row(model, actuator) for actuator in self.case.actuators]
 
@@ -61,7 +62,7 @@ class Plant:
         return np.stack(columns, axis=1)
 
     def _row(self, model, actuator):
-        """Nodal forces per volt, and how late (s) they are: a pure delay in place of a lag."""
+        """Nodal forces per volt, and their delay (s): a pure delay in place of a lag."""
         if isinstance(actuator, jb.Shaker):
             return float(actuator.force_per_volt) * model.shape(
                 float(actuator.position)
@@ -131,7 +132,7 @@ def coloured(shape, seed):
 
 
 class Rehearsal:
-    """Readings of a plant, and one compiled search for all its numbers."""
+    """Readings of a plant, and one compiled least-squares problem in all its parameters."""
 
     def __init__(self, made: Plant):
         self.truth, count = made.truth, len(made.case.actuators)
@@ -153,26 +154,27 @@ class Rehearsal:
             actuators=(None,) * sensors + tuple(range(count)),
         )
         start = {address: 1.06 * value for address, value in made.truth.items()}
-        campaign = make_dataset(replace(made.case, start), [log])
+        dataset = make_dataset(replace(made.case, start), [log])
         scale = np.ptp(self.clean)
-        self.numbers = free_parameters(campaign.cases, dict.fromkeys(made.truth), scale)
-        self.search = LeastSquares(campaign, self.numbers)
-        self.known = np.array([n.to_unbounded(made.truth[n.address]) for n in self.numbers])
+        self.parameters = free_parameters(dataset.cases, dict.fromkeys(made.truth), scale)
+        self.least_squares = LeastSquares(dataset, self.parameters)
+        self.true_point = to_unbounded(self.parameters, made.truth.values())
 
     def fit(self, noise, free, held=None):
-        """A fit of what is free, the other numbers `held`, or known; noise of unit size."""
+        """Solution for the free parameters, others held at a point or at the truth; unit noise."""
         measured = (self.clean + self.noise * noise)[None]
-        start = np.where(free, self.search.start_point, self.known if held is None else held)
-        return self.search.solve(measured, start=start, free=free)
+        held = self.true_point if held is None else held
+        start = np.where(free, self.least_squares.start_point, held)
+        return self.least_squares.solve(measured, start=start, free=free)
 
     def errors(self, found, free):
-        """Errors of what was free, in half widths of the stated intervals."""
+        """Errors of the free parameters, in half widths of the stated intervals."""
         halves = t_quantile(found.degrees_of_freedom) * found.uncertainty.errors[free]
         return (found.values[free] - np.array(list(self.truth.values()))[free]) / halves
 
-    def told(self, noise, found) -> Fit:
-        """All of a fit."""
-        campaign = self.search.data
-        fit = fit_result(campaign.cases[0], self.search, found)
-        noisy = dataclasses.replace(campaign, measured=(self.clean + self.noise * noise)[None])
-        return dataclasses.replace(fit, campaign=noisy)
+    def result(self, noise, found) -> Fit:
+        """The fit of a solution."""
+        dataset = self.least_squares.data
+        fit = fit_result(dataset.cases[0], self.least_squares, found)
+        noisy = dataclasses.replace(dataset, measured=(self.clean + self.noise * noise)[None])
+        return dataclasses.replace(fit, dataset=noisy)

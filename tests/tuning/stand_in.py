@@ -1,4 +1,4 @@
-"""A campaign whose readings are a formula: what surrounds a fit is tested without simulating."""
+"""A dataset whose readings are a formula, for tests of fits without simulation."""
 
 import dataclasses
 
@@ -8,12 +8,12 @@ import numpy as np
 import jaxbeam as jb
 from tuning import Log
 from tuning.fit.dataset import Dataset
-from tuning.fit.identify import fit_result
 from tuning.fit.least_squares import LeastSquares
+from tuning.fit.result import fit_result
 from tuning.parameters.free import free_parameters
 
 TRUTH = {"beam.flexural_rigidity": 20.0, "beam.damping_ratio": 0.03, "sensors.0.offset": 0.2}
-PULLS = (1.0, 1.6, 0.7)  # how hard the beam of each log was pulled before it was let go
+AMPLITUDES = (1.0, 1.6, 0.7)  # initial deflection (m) in each log
 TIMES = np.arange(120) / 50.0
 NOISE = 0.02
 CASE = jb.Case(
@@ -23,57 +23,56 @@ CASE = jb.Case(
 )
 
 
-def formula(rigidity, damping, offset, pull):
-    """A decaying oscillation: pull e^(-z w t) cos(w t) + offset, with w = 2 sqrt(rigidity)."""
+def formula(rigidity, damping, offset, amplitude):
+    """A decaying oscillation: a e^(-z w t) cos(w t) + offset, with w = 2 sqrt(rigidity)."""
     w = 2 * rigidity**0.5
-    return pull * jnp.exp(-damping * w * TIMES) * jnp.cos(w * TIMES) + offset
+    return amplitude * jnp.exp(-damping * w * TIMES) * jnp.cos(w * TIMES) + offset
 
 
 @dataclasses.dataclass(frozen=True)
 class StandIn(Dataset):
-    """Logs of one channel, each with a pull of its own; its numbers are those of `TRUTH`."""
+    """Logs of one channel that differ in amplitude; its free parameters are those of `TRUTH`."""
 
     def predictor(self, addresses):
         def predict(values):
-            given = dict(zip(TRUTH, TRUTH.values(), strict=True))
-            given |= dict(zip(addresses, values, strict=True))
-            numbers = [given[address] for address in TRUTH]
-            logs = [formula(*numbers, pull) for pull in PULLS[: len(self.logs)]]
+            by_address = TRUTH | dict(zip(addresses, values, strict=True))
+            parameters = [by_address[address] for address in TRUTH]
+            logs = [formula(*parameters, a) for a in AMPLITUDES[: len(self.logs)]]
             return jnp.stack(logs)[..., None]
 
         return predict
 
-    def doubt(self, values):
+    def validity_warning(self, values):
         return ""
 
 
 def clean(logs=3):
-    """The readings without noise (log, time, channel)."""
-    return np.array([formula(*TRUTH.values(), pull) for pull in PULLS[:logs]])[..., None]
+    """Readings without noise (log, time, channel)."""
+    return np.array([formula(*TRUTH.values(), a) for a in AMPLITUDES[:logs]])[..., None]
 
 
-def campaign(measured=None, real=None, logs=3, seed=0) -> StandIn:
-    """A campaign of clean readings with white noise, unless others are given."""
+def dataset(measured=None, mask=None, logs=3, seed=0) -> StandIn:
+    """Dataset of the given readings; by default clean ones with white noise."""
     if measured is None:
         noise = np.random.default_rng(seed).normal(size=(logs, TIMES.size, 1))
         measured = clean(logs) + NOISE * noise
-    real = np.ones(measured.shape) if real is None else real
+    mask = np.ones(measured.shape) if mask is None else mask
     made = [
         Log(TIMES, part, ("w",), ("deflection",), ("m",), f"run {i}", valid=has > 0)
-        for i, (part, has) in enumerate(zip(measured, real, strict=True))
+        for i, (part, has) in enumerate(zip(measured, mask, strict=True))
     ]
     times = np.tile(TIMES, (len(made), 1))
-    return StandIn(CASE, [CASE] * len(made), made, None, times, measured, real)
+    return StandIn(CASE, [CASE] * len(made), made, None, times, measured, mask)
 
 
-def search(free=None, loss="squares", **about) -> LeastSquares:
-    """A search for the numbers of `TRUTH`, or some of them."""
-    made = campaign(**about)
+def least_squares(free=None, loss="squares", **options) -> LeastSquares:
+    """Least-squares problem in the parameters of `TRUTH`, or some of them."""
+    data = dataset(**options)
     free = dict.fromkeys(TRUTH) if free is None else free
-    return LeastSquares(made, free_parameters(made.cases, free, 1.0), loss)
+    return LeastSquares(data, free_parameters(data.cases, free, 1.0), loss)
 
 
-def fit(found: LeastSquares | None = None):
-    """The fit of a search."""
-    found = search() if found is None else found
-    return fit_result(CASE, found, found.solve(found.data.measured))
+def fit(problem: LeastSquares | None = None):
+    """Fit of a least-squares problem."""
+    problem = least_squares() if problem is None else problem
+    return fit_result(CASE, problem, problem.solve(problem.data.measured))

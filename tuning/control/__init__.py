@@ -1,1 +1,1 @@
-"""Control."""
+"""Controllers tuned by gradients through the closed loop."""

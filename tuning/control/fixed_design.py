@@ -24,15 +24,15 @@ class FixedDesign(AbstractController):
 
     @property
     def stateless(self) -> bool:
-        return self.law.memoryless
+        return self.law.stateless
 
     @property
     def open_loop(self) -> bool:
-        return self.law.blind
+        return self.law.open_loop
 
     @property
     def design_depends_on_loads(self) -> bool:
-        return self.law.knows_loads
+        return self.law.design_depends_on_loads
 
     def init(self, plant):
         return self.law.init(state_space(self.design_case, layout=self.layout))
@@ -50,13 +50,13 @@ class FixedDesign(AbstractController):
         return self.law.flow(memory, own, measurement, t, limited)
 
     def validate(self, case):
-        return self.law.fault(case)
+        return self.law.validate(case)
 
     def failures(self, memory):
         return self.law.failures(memory)
 
     def breakpoints(self, case):
-        return self.law.knots(case)
+        return self.law.breakpoints(case)
 
 
 def with_fixed_design(case: Case, nominal: Mapping[str, Any], layout: Layout) -> Case:

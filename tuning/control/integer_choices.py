@@ -1,4 +1,4 @@
-"""Whole numbers of a controller, such as horizons: each choice tuned, and the best taken."""
+"""Integer parameters of a controller, such as horizons: the case is tuned with each choice."""
 
 import dataclasses
 import itertools
@@ -16,17 +16,14 @@ from tuning.control.tuning_result import TuningResult
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class IntegerSearchResult:
-    """What every choice of whole numbers has come to; `best` is that of the lowest objective.
-
-    Training runs choose, held-out ones have no part in it.
-    """
+    """Tuning results by choice of integers."""
 
     choices: tuple[dict[str, int], ...]
     tuned: tuple[TuningResult, ...]
 
     @property
     def best(self) -> TuningResult:
-        """The tuning that has come furthest down on training runs."""
+        """The result with the lowest objective on training runs; stable ones come first."""
         ranks = [
             (found.stability_violation > 0, found.run_sets[0].objective[1]) for found in self.tuned
         ]
@@ -52,26 +49,26 @@ def tune_integers(
     objective: Objective | None = None,
     **options: Any,
 ) -> IntegerSearchResult:
-    """Tune a case with every combination of whole numbers at some addresses.
+    """Tune a case with every combination of integers at some addresses.
 
-    `choices` are lists by address, such as {"controller.horizon": [4, 6, 8]}. Whole numbers decide
-    the shape of the computation and have no slope, so each combination is a search of its own;
-    `options` are those of `tune`.
+    `choices` are lists by address, such as {"controller.horizon": [4, 6, 8]}. Integers decide array
+    shapes and have no gradient, so that each combination is a search of its own; `options` are
+    those of `tune`.
 
-    Raises ValueError for an address without a whole number, and as `tune` does.
+    Raises ValueError for an address without an integer, and as `tune` does.
     """
     rows = [dict(zip(choices, row, strict=True)) for row in itertools.product(*choices.values())]
     if not choices or not rows:
-        raise ValueError("name at least one whole number, with at least one value to try")
+        raise ValueError("name at least one integer, with at least one value to try")
     chosen = [with_integers(case, row) for row in rows]
     found = [tune(own, free, cases, objective, **options) for own in chosen]
     return IntegerSearchResult(tuple(rows), tuple(found))
 
 
 def with_integers(case: Case, values: Mapping[str, int]) -> Case:
-    """The case with other whole numbers at some addresses.
+    """The case with other integers at some addresses.
 
-    Raises ValueError for an address at which there is no whole number.
+    Raises ValueError for an address at which there is no integer.
     """
     for address, value in values.items():
         case = _replace_integer(case, address.split("."), int(value), address)
@@ -79,7 +76,7 @@ def with_integers(case: Case, values: Mapping[str, int]) -> Case:
 
 
 def _replace_integer(part, path: list[str], value: int, address: str):
-    """The part of a case with a whole number replaced, a step of the path at a time."""
+    """A part of a case with the integer at the path within it replaced."""
     step, *rest = path
     if isinstance(part, tuple):
         if not (step.isdigit() and int(step) < len(part)):
@@ -97,7 +94,7 @@ def _replace_integer(part, path: list[str], value: int, address: str):
     if rest:
         return dataclasses.replace(part, **{step: _replace_integer(old, rest, value, address)})
     if isinstance(old, bool) or not isinstance(old, (int, np.integer)):
-        raise ValueError(f"{address} is no whole number: tune it as a free one")
+        raise ValueError(f"{address} is no integer: tune it as a free parameter")
     return dataclasses.replace(part, **{step: value})
 
 

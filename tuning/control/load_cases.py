@@ -1,4 +1,4 @@
-"""The load cases that a controller is tuned on, and those it is proven on."""
+"""Load cases of a tuning: training runs, and held-out runs on which the result is checked."""
 
 import dataclasses
 import itertools
@@ -10,26 +10,24 @@ from pathlib import Path
 import numpy as np
 from scipy.stats.qmc import LatinHypercube
 
-from jaxbeam.case.case import Case, replace
-from jaxbeam.case.fields import known
-from jaxbeam.case.loads import motion
+from jaxbeam.case.case import Case, crossing_times, replace
+from jaxbeam.case.fields import concrete
 from jaxbeam.case.trajectory import NEVER
 
-AddressValues = dict[str, float]  # numbers of the case by address
+AddressValues = dict[str, float]  # values of the case by address
 TABLES = ("training", "held_out")
-PLANT_PREFIXES = (
-    "beam.",
-    "supports.",
-    "actuators.",
-    "sensors.",
-)  # what addresses of the plant begin with
+# Addresses of the plant begin with these.
+PLANT_PREFIXES = ("beam.", "supports.", "actuators.", "sensors.")
 
 
 @dataclasses.dataclass(frozen=True)
 class LoadCases:
-    """Numbers of the case, by address, that differ from run to run: loads, plants, anything.
+    """Values of the case, by address, that differ from run to run: loads, plants, anything.
 
-    `training` runs are tuned on, `held_out` ones only looked at when all is done.
+    The tuning minimises the objective of the `training` runs; `held_out` runs are simulated with
+    its result only.
+
+    Raises ValueError without training runs, and for a held-out run that is a training run.
     """
 
     training: tuple[AddressValues, ...]
@@ -47,10 +45,10 @@ class LoadCases:
     def across(
         self, plants: Sequence[AddressValues], others: Sequence[AddressValues] = ()
     ) -> "LoadCases":
-        """Every training run on each of the plants, and every held-out run on each of the others.
+        """Every training run on each of the plants, every held-out run on each of the `others`.
 
-        Plants are numbers by address, as `tuning.draw_plants` gives them; without others the
-        held-out runs stay on the case's own.
+        Plants are values by address, as `tuning.draw_plants` returns them; without `others`,
+        held-out runs have the plant of the case.
         """
         held_out = _all_pairs(self.held_out, others) if others else self.held_out
         return LoadCases(_all_pairs(self.training, plants), held_out)
@@ -63,7 +61,7 @@ def _all_pairs(
 
 
 def full_grid(values: Mapping[str, Sequence[float]]) -> tuple[AddressValues, ...]:
-    """Every combination of the values given by address."""
+    """Full grid: every combination of the values given by address."""
     rows = itertools.product(*values.values())
     return tuple(dict(zip(values, map(float, row), strict=True)) for row in rows)
 
@@ -71,7 +69,7 @@ def full_grid(values: Mapping[str, Sequence[float]]) -> tuple[AddressValues, ...
 def latin_hypercube(
     ranges: Mapping[str, Sequence[float]], count: int, seed: int = 0
 ) -> tuple[AddressValues, ...]:
-    """Values drawn evenly from a range for each address, spread as a Latin hypercube.
+    """Latin hypercube: `count` draws of values, evenly spread over a range for each address.
 
     Raises ValueError for a count below 1 or a range that does not ascend.
     """
@@ -89,10 +87,12 @@ def latin_hypercube(
 def read_load_cases(path: str | os.PathLike) -> LoadCases:
     """Read load cases from a TOML file with tables [training] and [held_out].
 
-    Each holds lists of values by address in quotes, such as "loads.0.mass" = [0.2, 0.5], all
-    combinations of which are run. With `draws = 12` (and `seed = 1`, 0 if left out) the lists are
-    ranges, low and high, from which so many runs are drawn. Raises ValueError, naming the file and
-    the key, for what it does not understand; OSError if it cannot be read.
+    Each table has lists of values by address in quotes, such as "loads.0.mass" = [0.2, 0.5]; its
+    runs are all combinations. With `draws = 12` (and `seed = 1`, 0 if left out) the lists are
+    ranges, low and high, of which the runs are a Latin hypercube.
+
+    Raises ValueError, naming the file and the key, for faulty content; OSError if the file cannot
+    be read.
     """
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
@@ -125,9 +125,9 @@ def read_load_cases(path: str | os.PathLike) -> LoadCases:
 
 
 def _table_runs(table, draw_options, where: str) -> tuple[AddressValues, ...]:
-    """Runs of a table: the grid of its lists, or draws from them."""
+    """Runs of a table: the full grid of its lists, or draws from its ranges."""
     if any(type(number) is not int or number < 0 for number in draw_options.values()):
-        raise ValueError(f"{where}: draws and seed are whole numbers, such as draws = 12")
+        raise ValueError(f"{where}: draws and seed are integers, such as draws = 12")
     if "draws" not in draw_options:
         if draw_options:
             raise ValueError(f"{where}.seed is for drawing: say how many with draws = 12")
@@ -145,14 +145,14 @@ def _table_runs(table, draw_options, where: str) -> tuple[AddressValues, ...]:
 
 
 def run_case(case: Case, run: AddressValues) -> Case:
-    """The case of a run. Raises ValueError if its loads have not left when the run ends."""
+    """The case of a run. Raises ValueError if it ends before its loads have left the beam."""
     changed = replace(case, run)
-    ends = [float(motion(load, changed.beam.length).window()[1]) for load in changed.loads]
-    last, duration = max(ends, default=0.0), float(known(changed.run.duration))
+    last = crossing_times(changed)[:, 1].max(initial=0.0)
+    duration = float(concrete(changed.run.duration))
     if last < NEVER and last > duration:
         raise ValueError(
-            f"run.duration is {duration:g} s, but with {_describe(run)} the last load leaves only at"
-            f" {last:.4g} s: simulate longer"
+            f"run.duration is {duration:g} s, but with {_describe(run)} the last load leaves only"
+            f" at {last:.4g} s: simulate longer"
         )
     return changed
 
@@ -162,6 +162,6 @@ def _describe(run: AddressValues) -> str:
 
 
 def value_columns(runs: Sequence[AddressValues]) -> dict[str, np.ndarray]:
-    """Values of some runs by address, NaN where a run leaves the case's own."""
+    """Values of some runs by address (run,), NaN where a run has the value of the case."""
     names = dict.fromkeys(address for run in runs for address in run)
     return {name: np.array([run.get(name, np.nan) for run in runs]) for name in names}

@@ -1,6 +1,6 @@
-"""Ways downhill. Each asks for the value and the slope at one point a step, and nothing else.
+"""Optimisers: Adam, L-BFGS, BFGS, each with one evaluation of value and gradient per step.
 
-So all of them share the one program that simulates, and their evaluations can be counted alike.
+All share the one program that simulates, and their evaluations are counted alike.
 """
 
 import abc
@@ -14,46 +14,42 @@ import optimistix
 from jaxtyping import Array, Bool, Float
 
 METHODS = ("adam", "lbfgs", "bfgs")
-ADAM_STEP = 0.1  # first step of Adam in search variables, each of which is of order one
-MAX_FIRST_STEP = 0.5  # longest first step of a line search, for each variable in the mean
-BACKTRACKING_FACTOR = 0.5  # of a step that led to a loop which diverges, or not far enough down
-SUFFICIENT_DECREASE = (
-    1e-4  # share of the decrease that the slope promises with which a step is accepted
-)
-SHARPNESS_STAGES = (
-    5  # of the sharpness of maxima, for methods that learn curvatures: these jump with it
-)
+ADAM_STEP = 0.1  # first step of Adam, in search variables, which are of order one
+MAX_FIRST_STEP = 0.5  # longest first step of a line search, root mean square of the variables
+BACKTRACKING_FACTOR = 0.5  # on a step that led to an unstable loop or decreased too little
+SUFFICIENT_DECREASE = 1e-4  # share of the decrease predicted by the slope (Armijo condition)
+SHARPNESS_STAGES = 5  # stages of sharper maxima, for methods whose curvatures jump with sharpness
 
-Point = Float[Array, " free"]
+Point = Float[Array, " parameter"]
 Value = Float[Array, ""]
 Flag = Bool[Array, ""]
 
 
 class AbstractOptimiser(eqx.Module):
-    """Interface: memory at the start, and one step of a single search."""
+    """Interface: initial state and one step of a search from a single start."""
 
     @property
     @abc.abstractmethod
     def sharpness_stages(self) -> int | None:
-        """In how many stages maxima get sharper; at every step a little if None."""
+        """Number of stages in which maxima get sharper; None if they do at every step."""
 
     @abc.abstractmethod
     def init(self, point: Point) -> Any:
-        """Memory before the first step."""
+        """State before the first step."""
 
     @abc.abstractmethod
     def step(
         self, previous, point: Point, value: Value, gradient: Point, objective_changed: Flag
     ) -> tuple[Point, Any]:
-        """The next point to ask for, and the memory.
+        """The next point to evaluate, and the state after the step.
 
-        `value` is infinite where the loop diverges (the slope is zero then). `objective_changed` says that
-        what is minimised has changed a little, so that earlier values do not compare.
+        `value` is infinite, and the gradient zero, where the loop diverges. `objective_changed` is
+        true if the objective has become sharper, so that earlier values do not compare.
         """
 
 
 class AdamState(NamedTuple):
-    """Memory of `Adam`: its moments, the last sound point, and the size of its steps."""
+    """State of `Adam`: its moments, the last point with a finite value, and the scale of steps."""
 
     moments: Any
     last_finite: Point
@@ -61,7 +57,10 @@ class AdamState(NamedTuple):
 
 
 class Adam(AbstractOptimiser):
-    """Steps along averaged slopes (Kingma and Ba, 2015; optax), shorter towards the end."""
+    """Adam (Kingma and Ba, 2015; optax) with steps that get shorter along a cosine.
+
+    A step to a point where the loop diverges is taken back, and later ones are shorter.
+    """
 
     steps: int
 
@@ -71,7 +70,7 @@ class Adam(AbstractOptimiser):
 
     @property
     def transformation(self) -> optax.GradientTransformation:
-        """The rule of optax."""
+        """The update rule of optax."""
         return optax.adam(optax.cosine_decay_schedule(ADAM_STEP, self.steps, alpha=0.05))
 
     def init(self, point):
@@ -79,15 +78,15 @@ class Adam(AbstractOptimiser):
 
     def step(self, previous, point, value, gradient, objective_changed):
         finite = jnp.isfinite(value)
-        scale = jnp.where(finite, previous.scale, BACKTRACKING_FACTOR * previous.scale)
-        base = jnp.where(finite, point, previous.sound)
+        scale = jnp.where(finite, previous.step_scale, BACKTRACKING_FACTOR * previous.step_scale)
+        base = jnp.where(finite, point, previous.last_finite)
         change, moments = self.transformation.update(gradient, previous.moments)
         next_point = base + jnp.where(finite, scale, 0.0) * change
         return next_point, AdamState(moments, base, scale)
 
 
 class LineSearchState(NamedTuple):
-    """Memory of `LBFGS`: curvatures, and the line on which it looks for a point further down."""
+    """State of `LBFGS`: curvature pairs, and the line of the current line search."""
 
     curvature: Any
     origin: Point
@@ -98,9 +97,9 @@ class LineSearchState(NamedTuple):
 
 
 class LBFGS(AbstractOptimiser):
-    """Quasi-Newton steps from the last few slopes (Nocedal, 1980; optax), halved until they pay.
+    """L-BFGS (Nocedal, 1980; optax) with a backtracking line search.
 
-    What is remembered is dropped where the function bends downwards, or has been sharpened.
+    Curvature pairs are dropped where the curvature is negative or the objective has changed.
     """
 
     transformation = optax.scale_by_lbfgs(memory_size=10)
@@ -116,7 +115,9 @@ class LBFGS(AbstractOptimiser):
         )
 
     def step(self, previous, point, value, gradient, objective_changed):
-        goal = previous.value + SUFFICIENT_DECREASE * previous.length * previous.directional_slope
+        goal = (
+            previous.value + SUFFICIENT_DECREASE * previous.step_length * previous.directional_slope
+        )
         accepted = jnp.isfinite(value) & (objective_changed | (value <= goal))
         last = previous.curvature
         negative_curvature = jnp.vdot(point - last.params, gradient - last.updates) <= 0
@@ -132,23 +133,22 @@ class LBFGS(AbstractOptimiser):
         next_line = LineSearchState(
             learnt, point, value, direction, jnp.vdot(direction, gradient), jnp.ones(())
         )
-        halved = previous._replace(length=BACKTRACKING_FACTOR * previous.length)
+        halved = previous._replace(step_length=BACKTRACKING_FACTOR * previous.step_length)
         found = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), next_line, halved)
-        return found.anchor + found.length * found.direction, found
+        return found.origin + found.step_length * found.direction, found
 
 
 class OptimistixState(NamedTuple):
-    """Memory of `Optimistix`: where its solver stands, and the arrays of its state."""
+    """State of `Optimistix`: the point of its solver, and the arrays of the solver's state."""
 
     point: Point
     state: Any
 
 
 class Optimistix(AbstractOptimiser):
-    """A minimiser of optimistix that looks at one point a step, such as BFGS.
+    """A minimiser of optimistix that evaluates one point per step, such as BFGS.
 
-    It is given the plane through the value with the slope at the point that it asks for, which is
-    all it can see of the function there.
+    It is given the tangent plane at that point in place of the objective.
     """
 
     solver: optimistix.AbstractMinimiser
@@ -174,8 +174,8 @@ class Optimistix(AbstractOptimiser):
 
         template = self.solver.init(_zero_function, point, None, {}, value, None, frozenset())
         state = eqx.combine(previous.state, eqx.filter(template, eqx.is_array, inverse=True))
-        anchor, state, _ = self.solver.step(plane, previous.anchor, None, {}, state, frozenset())
-        return state.y_eval, OptimistixState(anchor, eqx.filter(state, eqx.is_array))
+        next_point, state, _ = self.solver.step(plane, previous.point, None, {}, state, frozenset())
+        return state.y_eval, OptimistixState(next_point, eqx.filter(state, eqx.is_array))
 
 
 def _zero_function(point, _):
@@ -183,7 +183,7 @@ def _zero_function(point, _):
 
 
 def optimiser(name: str, steps: int) -> AbstractOptimiser:
-    """The method of a name. Raises ValueError for an unknown one."""
+    """Optimiser by name, for a number of steps. Raises ValueError for an unknown name."""
     if name not in METHODS:
         raise ValueError(f"a method is one of {', '.join(METHODS)}, not {name!r}")
     if name == "adam":

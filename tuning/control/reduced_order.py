@@ -1,4 +1,4 @@
-"""Reduced-order feedback: which states to feed back, found by a search whose shares are relaxed."""
+"""Reduced-order feedback: the states to feed back, selected by a search over relaxed shares."""
 
 import dataclasses
 from typing import Any
@@ -15,15 +15,16 @@ from tuning.control.tune import ParameterBounds, tune
 from tuning.control.tuning_result import TuningResult
 
 FEEDBACK_ADDRESS = "controller.feedback"
-SHARE_PENALTY = 10.0  # of the objective, for shares that together are one off
-CANDIDATE_COUNT = 3  # states that may be the last to be fed back
+SHARE_PENALTY = 10.0  # added to the objective if the sum of the shares is off by one
+CANDIDATE_COUNT = 3  # states tried as the last one to be fed back
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReducedFeedback:
-    """States that are fed back (`fed_back`, from 0), by their `shares` in the relaxed search.
+    """Indices of the states that are fed back, and all `shares` of the relaxed search.
 
-    `tuned` is what the others came to once the shares were rounded; its start is the rounded law.
+    `relaxed` is the result with these shares, `tuned` that with the shares rounded and the other
+    parameters tuned again.
     """
 
     fed_back: tuple[int, ...]
@@ -40,7 +41,7 @@ class ReducedFeedback:
         lines += [
             "",
             f"objective on training: {relaxed:.5g} with these shares, {rounded:.5g} when they are"
-            f" rounded, {tuned:.5g} when the others are tuned again",
+            f" rounded, {tuned:.5g} when the other parameters are tuned again",
         ]
         return "\n".join([*lines, "", str(self.tuned)])
 
@@ -53,16 +54,16 @@ def tune_reduced(
     objective: Objective | None = None,
     **options: Any,
 ) -> ReducedFeedback:
-    """Tune a regulator that feeds back only `keep` of its states, and find which.
+    """Tune a regulator that feeds back `keep` of its states only, and select these.
 
-    First the share of every state (the law's `feedback`) is a free number from 0 to 1, tuned with
-    the others while the shares together come to `keep`. Then the largest become 1, the others 0,
-    and the numbers in `free` are tuned once more, from where they had come to; for the last of the
-    states the next in line are tried as well, and the best on training runs is taken. `options` are
-    those of `tune`, without checkpoints.
+    First the share of each state (the controller's `feedback`) is a free parameter from 0 to 1,
+    with a penalty that keeps their sum at `keep`. Then the largest shares become 1, the others 0,
+    and the parameters in `free` are tuned again from their last values; for the last state the next
+    largest shares are tried as well, and the best on training runs is the result. `options` are
+    those of `tune`, without a checkpoint.
 
-    Raises ValueError for a controller that is no regulator, for a number of states that it has
-    not, and as `tune` does.
+    Raises ValueError for a controller that is no regulator, for more states than it has, and as
+    `tune` does.
     """
     law = case.controller
     if not isinstance(law, AbstractRegulator):
@@ -76,7 +77,7 @@ def tune_reduced(
     shared = dict.fromkeys(names, (0.0, 1.0))
 
     def penalty(values):
-        # Both ways: weights make up for shares that are all too small.
+        # On both sides: weights can compensate shares that are all too small.
         total = jnp.sum(jnp.stack([values[name] for name in names]))
         return SHARE_PENALTY * (total - keep) ** 2
 
@@ -88,10 +89,11 @@ def tune_reduced(
         penalty=penalty,
         **options,
     )
-    found = {n.address: x for n, x in zip(relaxed.parameters, relaxed.values, strict=True)}
+    pairs = zip(relaxed.parameters, relaxed.values, strict=True)
+    found = {parameter.address: value for parameter, value in pairs}
     shares = np.array([found[name] for name in names])
     order = np.argsort(-shares, kind="stable")
-    # What is best in part need not be when whole: the last places are tried out.
+    # The best relaxed shares need not be the best when rounded.
     candidates = [
         np.append(order[: keep - 1], last) for last in order[keep - 1 :][:CANDIDATE_COUNT]
     ]
@@ -101,7 +103,7 @@ def tune_reduced(
         results.append(tune(rounded, free, cases, objective, **options))
     best = min(
         range(len(candidates)),
-        key=lambda i: (results[i].violation > 0, results[i].run_sets[0].objective[1]),
+        key=lambda i: (results[i].stability_violation > 0, results[i].run_sets[0].objective[1]),
     )
     return ReducedFeedback(
         tuple(sorted(map(int, candidates[best]))), shares, relaxed, results[best]
@@ -109,6 +111,6 @@ def tune_reduced(
 
 
 def _with_feedback(case: Case, shares: Float[np.ndarray, " state"]) -> Case:
-    """The case with other shares of its states fed back."""
+    """The case with other shares of its controller's states fed back."""
     law = dataclasses.replace(case.controller, feedback=shares)
     return dataclasses.replace(case, controller=law)

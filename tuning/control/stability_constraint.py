@@ -1,4 +1,4 @@
-"""A constraint on tuning: the loop is to stay stable while loads cross, with room to spare."""
+"""Constraint on a tuning: the closed loop is stable, with a margin, while loads cross."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -10,24 +10,32 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.analysis.linearised_loop import linearise, loop_dynamics, loop_timing
-from jaxbeam.case.case import Case, known_case, replace, value_at
-from jaxbeam.case.loads import motion
-from jaxbeam.model.modes import lay_out
+from jaxbeam.case.case import Case, concrete_case, crossing_times, replace, stack_cases, value_at
+from jaxbeam.model.modes import mesh_layout
+from tuning.aliases import accepts_old_arguments
 from tuning.control.fixed_design import with_fixed_design
 from tuning.control.load_cases import AddressValues, run_case
 from tuning.control.run_set import RunSet
 
-STABILITY_PENALTY_SLOPE = 1.0  # of the objective, for each 1/s of too large a real part
+STABILITY_PENALTY_SLOPE = 1.0  # added to the objective for each 1/s of violation
 
 
+@accepts_old_arguments(
+    largest="max_real_part",
+    delay="extra_delay",
+    spread="parameter_tolerance",
+    places="instants",
+)
 @dataclasses.dataclass(frozen=True)
 class StabilityConstraint:
-    """Frozen poles of all training runs are to have real parts of at most `max_real_part` (1/s).
+    """Real parts of the frozen poles of all training runs are at most `max_real_part` (1/s).
 
-    They are looked at without loads and at `instants` instants along each crossing; also with each
-    of the numbers in `parameter_tolerance` changed by its share up and down, and, for a controller that
-    samples, with a `extra_delay` (s) on top of its own. Poles cost more than runs: `crossings`, numbers
-    by address like those of load cases, may take the place of all training runs.
+    Poles are computed without loads and at a number of `instants` along the crossing of the first
+    load of each run; also with each parameter in `parameter_tolerance` (address: share) changed by
+    its share up and down and, for a sampled controller, with an `extra_delay` (s). As poles cost
+    more than runs, `crossings` (values by address, like load cases) may replace the training runs.
+
+    Raises ValueError for a negative delay, less than one instant and shares outside 0 to 1.
     """
 
     max_real_part: float = 0.0
@@ -37,44 +45,41 @@ class StabilityConstraint:
     crossings: tuple[AddressValues, ...] = ()
 
     def __post_init__(self):
-        if (
-            self.extra_delay < 0
-            or self.instants < 1
-            or any(not 0 < s < 1 for s in self.parameter_tolerance.values())
-        ):
-            raise ValueError(
-                "stable takes a delay that is not negative, at least one place, and spreads"
-                " between 0 and 1"
-            )
+        if self.extra_delay < 0 or self.instants < 1:
+            raise ValueError("stable needs a delay that is not negative, and at least one instant")
+        if any(not 0 < share < 1 for share in self.parameter_tolerance.values()):
+            raise ValueError("parameter tolerances are shares between 0 and 1")
 
     def violation_of_runs(self, case: Case, run_set: RunSet):
-        """`violation` for a case under tuning, along the crossings or all runs of its bench."""
+        """`violation_function` for a case, along the crossings or all runs of its run set."""
         if self.crossings:
             return self.violation_function([run_case(case, run) for run in self.crossings])
         return self.violation_function(run_set.cases, run_set.nominal)
 
     def violation_function(self, cases: list[Case], nominal: Mapping[str, Any] | None = None):
-        """Function of values by address: by how much (1/s) the worst pole is too far right.
+        """Function from values by address to the violation (1/s) of the constraint; 0 if it is met.
 
-        Laws are designed for the cases, not for what the spread makes of them, and for the
-        `nominal` numbers, by address, where the cases differ from these. Raises ValueError as
-        `linearised_loop` does, and for a delay without a sampling period.
+        Controllers are designed for the cases without the parameter tolerance, and for the
+        `nominal` parameters, by address, where the cases differ from these. Raises ValueError as
+        `linearised_loop` does, and for an extra delay without a sampling period.
         """
-        sampling = loop_timing(cases[0])
-        if sampling is None and self.extra_delay:
-            raise ValueError("stable.delay needs a controller that samples: give it a period")
-        samplings = [sampling]
+        timing = loop_timing(cases[0])
+        if timing is None and self.extra_delay:
+            raise ValueError(
+                "stable.extra_delay needs a sampled controller: give the controller a period"
+            )
+        timings = [timing]
         if self.extra_delay:
-            samplings.append(sampling._replace(delay=sampling.delay + self.extra_delay))
-        layout = lay_out(known_case(cases[0]))
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
+            timings.append(timing._replace(delay=timing.delay + self.extra_delay))
+        layout = mesh_layout(concrete_case(cases[0]))
+        stacked = jax.tree.map(jnp.asarray, stack_cases(cases))
         instants = jnp.asarray(np.array([self._evaluation_times(case) for case in cases]))
-        # One row as it is, and two for each number in the spread.
+        # One row with the nominal values, and two for each parameter with a tolerance.
         shares = np.diag(list(self.parameter_tolerance.values()))
         factors = 1 + np.concatenate([np.zeros((1, len(shares))), shares, -shares])
 
         def growth_rates(values, case, factor, times):
-            """Of each clock at each time (clock, time)."""
+            """Growth rates (1/s) by loop timing and time, with parameters multiplied by factors."""
             case = replace(case, values)
             design_values = {a: value_at(case, a) for a in self.parameter_tolerance} | dict(
                 nominal or {}
@@ -86,10 +91,10 @@ class StabilityConstraint:
             def at(own):
                 return jax.vmap(lambda t: linearise(loop, own, t).growth_rate())(times)
 
-            return jnp.stack([at(own) for own in samplings])
+            return jnp.stack([at(own) for own in timings])
 
         def violation(values: Mapping[str, Any]) -> Float[Array, ""]:
-            # Slopes of poles cost more than poles do, and only those of the worst are wanted.
+            # Derivatives of poles cost more than poles, and only the worst pole needs them.
             fixed = jax.lax.stop_gradient(dict(values))
             rows = jnp.asarray(factors)
             found = jax.lax.map(
@@ -98,16 +103,16 @@ class StabilityConstraint:
                 ),
                 (stacked, instants),
             )
-            run, row, own, place = jnp.unravel_index(jnp.argmax(found), found.shape)
+            run, row, own, instant = jnp.unravel_index(jnp.argmax(found), found.shape)
             case = jax.tree.map(lambda leaf: leaf[run], stacked)
-            worst = growth_rates(values, case, rows[row], instants[run, place][None])[own, 0]
+            worst = growth_rates(values, case, rows[row], instants[run, instant][None])[own, 0]
             return jnp.maximum(worst - self.max_real_part, 0.0)
 
         return violation
 
     def _evaluation_times(self, case: Case) -> Float[np.ndarray, " time"]:
-        """Before the first load, and evenly along the crossing of the first."""
-        entry, leave = (float(t) for t in motion(case.loads[0], case.beam.length).window())
+        """A time (s) before the first load, and others evenly along its crossing."""
+        entry, leave = crossing_times(case)[0]
         leave = min(leave, float(case.run.duration))
         shares = (np.arange(self.instants) + 0.5) / self.instants
         return np.append(entry - 1.0, entry + (leave - entry) * shares)

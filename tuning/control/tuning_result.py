@@ -1,4 +1,4 @@
-"""What a tuning has come to: before and after, training and held out, beside the bound."""
+"""Result of a controller tuning: runs before and after, training and held out."""
 
 import dataclasses
 import math
@@ -12,16 +12,16 @@ from tuning.control.load_cases import AddressValues, value_columns
 from tuning.control.objective import Objective
 from tuning.parameters.free import FreeParameter
 
-LIMIT_TOLERANCE = 0.01  # of a limit: excess that is not spoken of
+LIMIT_TOLERANCE = 0.01  # share of a limit by which it may be exceeded without a remark
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RunSetResult:
-    """Runs before and after tuning. Peaks in m; `least_peaks` is the bound, NaN where not asked for.
+    """Runs of a run set before and after tuning.
 
-    `objective_values` are those of the objective (before and after, by run), `objective` the one number for
-    all runs; `saturated_share` is the share of the run that commands spend at a limit, and `merits` all
-    figures of merit of the runs together, both after tuning.
+    Peaks are in m; `least_peaks` are the least achievable ones, NaN if not computed.
+    `saturated_share` is the share of the time after tuning in which a command is at a limit;
+    `objective` has the values before and after; `metrics` are those after tuning, aggregated.
     """
 
     name: str
@@ -30,36 +30,35 @@ class RunSetResult:
     peaks_before: Float[np.ndarray, " run"]
     peaks_after: Float[np.ndarray, " run"]
     least_peaks: Float[np.ndarray, " run"]
-    objective_values: Float[np.ndarray, "2 run"]
     saturated_share: Float[np.ndarray, " run"]
     objective: list[float]
-    merits: dict[str, float] = dataclasses.field(default_factory=dict)
+    metrics: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def attained_shares(self, peaks: Float[np.ndarray, " run"]) -> Float[np.ndarray, " run"]:
-        """Shares of the attainable reduction that peaks stand for, run by run."""
+        """Shares of the attainable reduction that some peaks (m) attain, by run."""
         return (self.uncontrolled_peaks - peaks) / (self.uncontrolled_peaks - self.least_peaks)
 
 
 class StartResult(NamedTuple):
-    """Where one of several starts came to: the objective (with its price), and the values."""
+    """Best point of one of several starts: the objective, penalties included, and the values."""
 
     value: float
-    values: Float[np.ndarray, " free"]
+    values: Float[np.ndarray, " parameter"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TuningResult:
-    """Result of a tuning: the tuned case, and what it does to training and held-out runs.
+    """Result of a tuning: the tuned case, and its training and held-out runs.
 
-    `history` holds the true objective by step and start, NaN where the loop diverged, which
-    happened `rejected_steps` times. `stability_violation` (1/s) is by how much a pole lies too far right for the
-    constraint on stability, zero if it is met or was not asked for. `start_results` are the best that
-    each start has met, lowest first.
+    `history` is the true objective by step and start, NaN where the closed loop was unstable, which
+    happened in `rejected_steps`. `stability_violation` (1/s) is the excess of the real part of a
+    pole over the stability constraint, 0 if that is met or not given. `start_results` are the best
+    points of all starts, lowest objective first.
     """
 
     case: Case
     parameters: list[FreeParameter]
-    values: Float[np.ndarray, " free"]
+    values: Float[np.ndarray, " parameter"]
     objective: Objective
     history: Float[np.ndarray, "step start"]
     rejected_steps: int
@@ -69,9 +68,9 @@ class TuningResult:
 
     @property
     def limit_excess(self) -> dict[str, float]:
-        """The limits that training or held-out runs exceed, and by how much at most."""
+        """Largest excess, by metric, of the limits that training or held-out runs exceed."""
         found = {
-            name: max(outcome.merits[name] for outcome in self.run_sets) - limit
+            name: max(outcome.metrics[name] for outcome in self.run_sets) - limit
             for name, limit in self.objective.limits.items()
         }
         return {
@@ -85,38 +84,43 @@ class TuningResult:
 
     @property
     def verdict(self) -> str:
-        """The result in one sentence; the worst of the held-out runs is part of it."""
-        deciding = self.run_sets[-1]
-        relative = deciding.peaks_after / deciding.uncontrolled_peaks
-        worst = int(np.argmax(relative))
+        """The result in one sentence, with the worst of the held-out runs."""
+        last = self.run_sets[-1]
+        reductions = 1 - last.peaks_after / last.uncontrolled_peaks
+        worst = int(np.argmin(reductions))
+        before = 1 - last.peaks_before[worst] / last.uncontrolled_peaks[worst]
         start, end = self.run_sets[0].objective
         sentence = f"objective on training {start:.4g} before, {end:.4g} after"
-        if not math.isfinite(deciding.peaks_after.max()):
-            return f"{sentence}; a {deciding.name} run diverges: not fit for use"
+        if not math.isfinite(last.peaks_after.max()):
+            return f"{sentence}; a {last.name} run diverges: not fit for use"
         sentence += (
-            f"; worst {deciding.name} run: peak {1 - relative[worst]:.1%} below no control"
-            f" ({1 - deciding.peaks_before[worst] / deciding.uncontrolled_peaks[worst]:.1%} before tuning)"
+            f"; worst {last.name} run: peak {reductions[worst]:.1%} below no control"
+            f" ({before:.1%} before tuning)"
         )
-        if np.isfinite(deciding.least_peaks).all():
-            shares = deciding.attained_shares(deciding.peaks_after)
+        if np.isfinite(last.least_peaks).all():
+            shares = last.attained_shares(last.peaks_after)
             sentence += (
                 f"; of the attainable reduction at least {shares.min():.1%},"
                 f" {shares.mean():.1%} in the mean"
             )
         if self.stability_violation > 0:
-            sentence += f"; not as stable as asked for: a pole lies {self.stability_violation:.3g} 1/s too far right"
+            sentence += (
+                "; the stability constraint is violated: the real part of a pole is"
+                f" {self.stability_violation:.3g} 1/s too large"
+            )
         for name, amount in self.limit_excess.items():
             sentence += f"; {name} exceeds its limit of {self._limit(name):.4g} by {amount:.3g}"
-        if deciding.name == "training":
+        if last.name == "training":
             sentence += "; nothing was held out, so this proves nothing for other loads"
         return sentence
 
     def __str__(self) -> str:
-        lines = [f"{'number':<34}{'before':>14}{'after':>14}  unit"]
-        for number, value in zip(self.parameters, self.values, strict=True):
-            mark = "  (at a bound)" if number.at_bound(value) else ""
+        lines = [f"{'parameter':<34}{'before':>14}{'after':>14}  unit"]
+        for parameter, value in zip(self.parameters, self.values, strict=True):
+            mark = "  (at a bound)" if parameter.at_bound(value) else ""
             lines.append(
-                f"{number.address:<34}{number.start:>14.6g}{value:>14.6g}  {number.unit}{mark}"
+                f"{parameter.address:<34}{parameter.start:>14.6g}{value:>14.6g}"
+                f"  {parameter.unit}{mark}"
             )
         for outcome in self.run_sets:
             lines += ["", *_run_table(outcome)]
@@ -125,12 +129,12 @@ class TuningResult:
         if self.rejected_steps:
             lines += [
                 "",
-                f"{self.rejected_steps} steps came to a loop that diverges and were taken back",
+                f"{self.rejected_steps} steps led to an unstable closed loop and were taken back",
             ]
         return "\n".join([*lines, "", self.verdict])
 
     def to_dict(self) -> dict:
-        """The result as plain numbers and words, for JSON."""
+        """Plain numbers and words for JSON."""
         pairs = zip(self.parameters, self.values, strict=True)
         return {
             "numbers": {
@@ -167,7 +171,7 @@ class TuningResult:
         }
 
     def plot(self):
-        """Figure of the peaks of all runs, before, after and least, and of the search."""
+        """Figure of the peaks of all runs before and after, their least peaks, and the search."""
         from jaxbeam.plot import TuningPanel, plot_tuning
 
         panels = [
@@ -185,7 +189,7 @@ class TuningResult:
 
 
 def _run_labels(outcome: RunSetResult) -> list[str]:
-    """What is special about each run, in short: the last word of each address and its value."""
+    """A label for each run: the last word of each address that varies, and its value."""
     return [
         ", ".join(f"{address.rsplit('.', 1)[-1]} {value:g}" for address, value in run.items())
         for run in outcome.runs
@@ -193,7 +197,7 @@ def _run_labels(outcome: RunSetResult) -> list[str]:
 
 
 def _start_lines(minima: tuple[StartResult, ...]) -> list[str]:
-    """A line for each start: the objective, and the values it belongs to."""
+    """A line for each start: the objective at its best point, and the values there."""
     lines = []
     for found in minima:
         values = "  ".join(f"{value:.5g}" for value in found.values)
@@ -203,7 +207,7 @@ def _start_lines(minima: tuple[StartResult, ...]) -> list[str]:
 
 
 def _run_table(outcome: RunSetResult) -> list[str]:
-    """A table of the runs of one kind, with a line for the worst and the mean."""
+    """Lines of a table of the runs of a run set: what varies, peaks (mm), attained shares."""
     varied = value_columns(outcome.runs)
     names = [*varied, "no control", "before", "after", "least", "share before", "share after"]
     before, after = (

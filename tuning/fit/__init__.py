@@ -1,1 +1,1 @@
-"""Fit."""
+"""Fits of a case to logs: datasets, least squares, results, validation, experiment design."""

@@ -1,4 +1,4 @@
-"""Logs and the case that is to explain them, made ready for a fit."""
+"""Dataset: logs padded to one length, with the simulation model of each."""
 
 import dataclasses
 import re
@@ -8,27 +8,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.case.validation import check
-from jaxbeam.integrator.events import Schedule, stacked
-from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan
+from jaxbeam.case.case import Case, replace, stack_cases, value_at
+from jaxbeam.case.validation import check_case
+from jaxbeam.integrator.events import EventSchedule, stack_schedules
+from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
 from jaxbeam.simulation.simulate import simulate_readings
 from tuning.logs.log import Log
 from tuning.logs.pairing import case_of_log, check_loads, check_times, pad_cases, sensor_readings
 from tuning.parameters.free import LOG_ADDRESS, with_values
 
-SIMULATION_TOLERANCE = 1e-5  # of the largest deflection: what logs can resolve, with room to spare
+SIMULATION_TOLERANCE = 1e-5  # of the largest deflection, below the resolution of logs
 OFFSET_ADDRESS = re.compile(r"sensors\.(\d+)\.offset")
 
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Logs with the case of each: logs alike in structure share one compiled simulation.
+    """Logs with the case of each, alike in structure, so that they share one compiled simulation.
 
-    Logs are padded to the longest with equally spaced times, `mask` is 1 for samples
-    that were measured and 0 for those that only fill up. Samples are (log, time, channel). Where
-    a controller takes part, its commands from a log included, `schedule` holds its clock in each.
-    `nominal_case` is the case before any log changed it.
+    Logs are padded to the longest with equally spaced times; `mask` is 1 for measured samples and
+    0 for padding. Samples are (log, time, channel). With a controller, or commands from a log,
+    `schedule` holds the times of its events in each log. `nominal_case` is the case as given.
     """
 
     nominal_case: Case
@@ -38,12 +37,12 @@ class Dataset:
     times: Float[np.ndarray, "log time"]
     measured: Float[np.ndarray, "log time channel"]
     mask: Float[np.ndarray, "log time channel"]
-    schedule: Schedule | None = None
+    schedule: EventSchedule | None = None
 
     def log_addresses(self, addresses: list[str]) -> tuple[list[str], np.ndarray]:
-        """Addresses as seen within a log, and which of the free numbers (log, address) each is.
+        """Addresses within a log, and the index of the free parameter at each (log, address).
 
-        A number of one log is -1 in the others, which keep their own.
+        The index is -1 where the parameter belongs to another log.
         """
         inner = list(dict.fromkeys(LOG_ADDRESS.sub(r"\2", address) for address in addresses))
         which = np.full((len(self.logs), len(inner)), -1)
@@ -54,10 +53,10 @@ class Dataset:
         return inner, which
 
     def predictor(self, addresses: list[str]):
-        """Function from the values at the addresses to all samples, with cheap derivatives.
+        """Function from values at the addresses to all samples, with derivatives at low cost.
 
-        Each log is differentiated by its own few numbers only, one log after the other: side by
-        side they would not share what is equal in time.
+        Each log is differentiated by its own parameters only, one log after the other: as a batch
+        they would not share what is the same at all times.
         """
         own_addresses, which = self.log_addresses(addresses)
         simulated_addresses = [
@@ -65,7 +64,6 @@ class Dataset:
         ]
         columns = [own_addresses.index(address) for address in simulated_addresses]
         own = jnp.array([[value_at(case, a) for a in own_addresses] for case in self.cases])
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self.cases)
         zero_offsets = {a: 0.0 for a in offset_addresses(self.cases[0])}
         channels = {
             int(OFFSET_ADDRESS.fullmatch(a)[1]): own_addresses.index(a)
@@ -89,7 +87,7 @@ class Dataset:
             ]
             return jnp.stack(rows, axis=1)[:, None, :]
 
-        runs = (stacked, jnp.asarray(self.times), self.schedule)
+        runs = (stack_cases(self.cases), jnp.asarray(self.times), self.schedule)
 
         @jax.custom_jvp
         def predict(values):
@@ -97,7 +95,7 @@ class Dataset:
             samples = jax.lax.map(lambda part: simulated(*part), (runs, table[:, columns]))
             return samples + offsets(table)
 
-        # A function of its own is traced once for all programs that it is a part of.
+        # A jitted function is traced once for all programs that it is part of.
         @jax.jit
         def linearised(runs, table):
             def both(part):
@@ -123,10 +121,10 @@ class Dataset:
         return predict
 
     def validity_warning(self, values: dict[str, float]) -> str:
-        """Why fitted values may be wrong although the search ended; "" if there is no doubt.
+        """Warning that the integration plan does not hold at the fitted values; "" if it does.
 
-        The plan was made for the starts; far from them loads may come in another order, or
-        steps be too long. And without bounds a number may end where no rig can have it.
+        The plan was made for the starts: far from them loads may enter in another order, or steps
+        be too long; and without bounds a parameter may end at a value that no beam can have.
         """
         for i, (case, times) in enumerate(zip(self.cases, self.times, strict=True)):
             try:
@@ -134,7 +132,7 @@ class Dataset:
                     with_values(case, i, values), jnp.asarray(times), SIMULATION_TOLERANCE
                 )
             except (ValueError, RuntimeError) as error:
-                return f", to a case that cannot be: {error}"
+                return f", to a case that cannot be simulated: {error}"
             changed = (
                 plan.shapes.layout != self.plan.shapes.layout
                 or plan.shapes.max_loads > self.plan.shapes.max_loads
@@ -150,14 +148,14 @@ def offset_addresses(case: Case) -> list[str]:
 
 
 def make_dataset(case: Case, logs: list[Log]) -> Dataset:
-    """Check logs against the case and bring them to one shape.
+    """Dataset of logs, checked against the case.
 
     Raises ValueError, naming the log, if its channels do not match the sensors, no load is known,
-    it ends before the first load has crossed, or logs differ too much to be fitted together.
+    it ends before the first load has crossed, or logs differ in structure.
     """
     if not logs:
         raise ValueError("give at least one log")
-    check(case)
+    check_case(case)
     for log in logs:
         check_times(log)
     count = max(log.times.size for log in logs)
@@ -181,36 +179,22 @@ def make_dataset(case: Case, logs: list[Log]) -> Dataset:
         integration_plan(own, jnp.asarray(t), SIMULATION_TOLERANCE)
         for own, t in zip(cases, times, strict=True)
     ]
-    if len({plan.shapes.layout for plan in plans}) > 1:
-        raise ValueError("the logs differ in the order of places along the beam; fit them apart")
-    static_shapes = dataclasses.replace(
-        plans[0].shapes,
-        slots=max(plan.shapes.max_loads for plan in plans),
-        coupled=any(plan.shapes.coupled for plan in plans),
-    )
-    plan = dataclasses.replace(
-        plans[0],
-        shapes=static_shapes,
-        substeps=max(plan.substeps for plan in plans),
-        lead=max(plan.lead_samples for plan in plans),
-        equally_spaced=all(plan.equally_spaced for plan in plans),
-        schedule=None,
-    )
+    plan = dataclasses.replace(common_plan(plans, "logs"), schedule=None)
     schedules = [own.schedule for own in plans]
-    schedule = None if schedules[0] is None else stacked(schedules)
+    schedule = None if schedules[0] is None else stack_schedules(schedules)
     return Dataset(
-        case,
-        cases,
-        logs,
-        plan,
-        np.array(times),
-        np.array(measured),
-        np.array(mask, float),
-        schedule,
+        nominal_case=case,
+        cases=cases,
+        logs=logs,
+        plan=plan,
+        times=np.array(times),
+        measured=np.array(measured),
+        mask=np.array(mask, float),
+        schedule=schedule,
     )
 
 
-def _padded_times(times: Float[np.ndarray, " time"], count: int) -> Float[np.ndarray, " filled"]:
-    """Times followed by as many more, equally spaced, as make up a count."""
+def _padded_times(times: Float[np.ndarray, " time"], count: int) -> Float[np.ndarray, " padded"]:
+    """Times (s) continued at their mean spacing up to a count."""
     spacing = np.diff(times).mean()
     return np.append(times, times[-1] + spacing * np.arange(1, count - times.size + 1))

@@ -1,10 +1,10 @@
-"""Fits to measured frequency responses: of a hammer, a shaker or commands, loads away.
+"""Fits to measured frequency responses (hammer, shaker or commands to actuators), without loads.
 
     measured = responses_of(log)                      # from a log of commands and readings
     fit = identify_responses(case, measured, ["beam.flexural_rigidity", "beam.damping_ratio"])
 
-What is compared is the logarithm of the complex response, ln |H| + i arg H, because measured
-responses are off by a share of themselves, at resonances as well as beside them.
+Compared are logarithms of the complex responses, ln |H| + i arg H, because errors of measured
+responses are relative, at resonances as well as beside them.
 """
 
 import dataclasses
@@ -16,24 +16,26 @@ import scipy.signal
 from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.model.frequency_response import Parked, frequency_response
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.frequency_response import StationaryMasses, frequency_response
+from jaxbeam.model.modes import mesh_layout
+from tuning.aliases import accepts_old_arguments
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares
-from tuning.fit.uncertainty.covariance import t_quantile
+from tuning.fit.uncertainty.covariance import confidence_intervals
 from tuning.logs.log import Log
 from tuning.parameters.free import FreeParameter, free_parameters
 from tuning.parameters.prior import Prior
 
-MIN_RELATIVE_SD = 1e-3  # relative deviation of a measured response: no sensor is better calibrated
+MIN_RELATIVE_SD = 1e-3  # of a measured response; no sensor is better calibrated
 
 
+@accepts_old_arguments(parked="stationary_masses")
 @dataclasses.dataclass(frozen=True, eq=False)
 class Responses:
     """Measured frequency responses, a column for each pair of an input and an output.
 
-    `values` are complex, in SI units of output per input; `pairs` in the words of
-    `jaxbeam.frequency_response`; `deviations` relative standard deviations of the values, one for
-    all if not known. `stationary` are masses on the beam: (position in m, mass in kg) each.
+    `values` are complex, in SI units of output per input; `pairs` are named as in
+    `jaxbeam.frequency_response`; `deviations` are relative standard deviations of the values, the
+    same for all if left out. `stationary_masses` are (position in m, mass in kg) each.
 
     Raises ValueError if shapes disagree, frequencies do not ascend from above zero, or a value is
     zero or not finite.
@@ -43,7 +45,7 @@ class Responses:
     values: Complex[np.ndarray, "frequency pair"]
     pairs: tuple[tuple[str, str], ...]
     deviations: Float[np.ndarray, "frequency pair"] | None = None
-    stationary: Parked = ()
+    stationary_masses: StationaryMasses = ()
     source: str = "responses"
 
     def __post_init__(self):
@@ -63,17 +65,17 @@ class Responses:
             )
 
 
+@accepts_old_arguments(least="min_coherence")
 def responses_of(log: Log, segment: float | None = None, min_coherence: float = 0.8) -> Responses:
-    """Estimate the responses of the sensors in a log to the one command in it.
+    """Frequency responses of the sensors in a log to the one command in it.
 
-    H1 = S_uy / S_uu by Welch's method in segments of so many seconds (an eighth of the log if left
-    out); relative deviations follow from the coherence g^2 as sqrt((1 - g^2) / (2 n g^2)) (Bendat
-    and Piersol, Random Data, section 9.1). Frequencies with less than the `min_coherence` coherence at
-    some sensor are left out. Segments much shorter than the vibration rings make damping look
-    larger than it is.
+    H1 = S_uy / S_uu by Welch's method with a `segment` in s (an eighth of the log if left out);
+    relative standard deviations follow from the coherence g^2, sqrt((1 - g^2) / (2 n g^2)) (Bendat
+    and Piersol, Random Data, section 9.1). Frequencies with a coherence below `min_coherence` at
+    some sensor are left out. Segments much shorter than the decay bias damping upwards.
 
     Raises ValueError unless there is one command and a named sensor, for uneven sampling, and if
-    no frequency is coherent enough.
+    hardly any frequency is coherent enough.
     """
     commands = [i for i, actuator in enumerate(log.actuators) if actuator is not None]
     sensors = [i for i, sensor in enumerate(log.sensors) if sensor is not None]
@@ -112,7 +114,7 @@ def responses_of(log: Log, segment: float | None = None, min_coherence: float = 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _ResponseData:
-    """Responses as samples for a search: one log, whose times are frequencies."""
+    """Responses as regression data: one log, whose times are frequencies."""
 
     case: Case
     responses: Responses
@@ -122,15 +124,15 @@ class _ResponseData:
     def predictor(self, addresses: list[str]):
         """Function from values at the addresses to weighted logarithms of the responses."""
         case, given = self.case, self.responses
-        layout, weights = lay_out(case), _weights(given)
+        layout, weights = mesh_layout(case), _weights(given)
         frequencies, measured = jnp.asarray(given.frequencies), jnp.asarray(given.values)
 
         def predict(values):
             changed = replace(case, dict(zip(addresses, values, strict=True)))
             response = frequency_response(
-                changed, frequencies, given.pairs, given.stationary, layout
+                changed, frequencies, given.pairs, given.stationary_masses, layout
             ).values
-            # Relative to what was measured, phases do not wrap.
+            # Relative to the measured responses, phases do not wrap.
             log_ratio = jnp.log(response / measured)
             parts = jnp.concatenate([log_ratio.real, log_ratio.imag], axis=1)
             return (_weighted_logarithms(given) + parts * weights)[None]
@@ -140,16 +142,16 @@ class _ResponseData:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ResponseFit:
-    """Numbers fitted to frequency responses (SI units), as in `tuning.Fit`.
+    """Parameters fitted to frequency responses (SI units), named as in `tuning.Fit`.
 
-    `relative_misfit` (pair,) is the root mean square of the relative difference between measured and
-    `fitted` responses.
+    `fitted` are the responses with the fitted values; `relative_misfit` is the root mean square of
+    their relative difference from the measured ones.
     """
 
     parameters: list[FreeParameter]
-    values: Float[np.ndarray, " free"]
-    errors: Float[np.ndarray, " free"]
-    correlation: Float[np.ndarray, "free free"]
+    values: Float[np.ndarray, " parameter"]
+    errors: Float[np.ndarray, " parameter"]
+    correlation: Float[np.ndarray, "parameter parameter"]
     unidentifiable: list[dict[str, float]]
     degrees_of_freedom: float
     verdict: str
@@ -159,17 +161,16 @@ class ResponseFit:
 
     @property
     def addresses(self) -> list[str]:
-        """Addresses of the free numbers."""
-        return [number.address for number in self.parameters]
+        """Addresses of the free parameters."""
+        return [parameter.address for parameter in self.parameters]
 
     @property
-    def intervals(self) -> Float[np.ndarray, "free 2"]:
-        """95 % intervals; infinite where the data cannot tell."""
-        half = t_quantile(self.degrees_of_freedom) * self.errors
-        return np.stack([self.values - half, self.values + half], axis=1)
+    def intervals(self) -> Float[np.ndarray, "parameter 2"]:
+        """95 % intervals; infinite for parameters that are not identifiable."""
+        return confidence_intervals(self.values, self.errors, self.degrees_of_freedom)
 
     def to_dict(self) -> dict:
-        """Numbers with their intervals (SI units), misfits by pair and the verdict."""
+        """Parameters with their intervals (SI units), misfits by pair and the verdict, for JSON."""
         rows = zip(self.addresses, self.values, self.intervals, strict=True)
         return {
             "numbers": {name: {"value": v, "interval_95": pair} for name, v, pair in rows},
@@ -196,41 +197,42 @@ def identify_responses(
     *,
     loss: str = "squares",
 ) -> ResponseFit:
-    """Fit numbers of a case to measured frequency responses.
+    """Fit parameters of a case to measured frequency responses.
 
-    As `tuning.fit.identify` does with logs, but in the frequency domain: exact for the modes that the
-    case keeps, whatever the excitation was. Loads of the case are away.
+    Like `tuning.identify` with logs, but in the frequency domain: exact for the modes of the case,
+    whatever the excitation was. Loads of the case are left out.
 
     Raises ValueError for faulty input.
     """
     bounds = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
     parameters = free_parameters([case], bounds, 1.0)
     measured_logarithms = _weighted_logarithms(measured)[None]
-    # A first call outside of any compiling checks case, pairs and parked masses.
-    frequency_response(case, measured.frequencies[:2], measured.pairs, measured.stationary)
+    # A first call, not compiled, checks case, pairs and stationary masses.
+    frequency_response(case, measured.frequencies[:2], measured.pairs, measured.stationary_masses)
     data = _ResponseData(case, measured, measured_logarithms, np.ones(measured_logarithms.shape))
     found = LeastSquares(data, parameters, loss).solve(measured_logarithms)
-    values = {n.address: float(v) for n, v in zip(parameters, found.values, strict=True)}
+    pairs = zip(parameters, found.values, strict=True)
+    values = {parameter.address: float(value) for parameter, value in pairs}
     log_difference = ((found.predicted - measured_logarithms)[0] / _weights(measured)).T.reshape(
         2, len(measured.pairs), -1
     )
     relative = (log_difference[0] + 1j * log_difference[1]).T
     return ResponseFit(
-        parameters,
-        found.values,
-        found.uncertainty.errors,
-        found.uncertainty.correlation,
-        found.uncertainty.unidentifiable,
-        found.degrees_of_freedom,
-        "converged" if found.converged else f"not converged after {MAX_STEPS} steps",
-        replace(case, values),
-        measured.values * np.exp(relative),
-        np.sqrt(np.mean(np.abs(relative) ** 2, axis=0)),
+        parameters=parameters,
+        values=found.values,
+        errors=found.uncertainty.errors,
+        correlation=found.uncertainty.correlation,
+        unidentifiable=found.uncertainty.unidentifiable,
+        degrees_of_freedom=found.degrees_of_freedom,
+        verdict="converged" if found.converged else f"not converged after {MAX_STEPS} steps",
+        case=replace(case, values),
+        fitted=measured.values * np.exp(relative),
+        relative_misfit=np.sqrt(np.mean(np.abs(relative) ** 2, axis=0)),
     )
 
 
 def _weights(responses: Responses) -> Float[np.ndarray, "frequency part"]:
-    """One over the relative deviations, for magnitudes and phases."""
+    """Reciprocals of the relative standard deviations, for magnitudes, then phases."""
     if responses.deviations is None:
         return np.ones((responses.frequencies.size, 2 * len(responses.pairs)))
     return np.tile(1 / responses.deviations, (1, 2))

@@ -1,4 +1,4 @@
-"""Weighted least squares over the free numbers of a campaign; noise is found on the way."""
+"""Weighted least squares over the free parameters of a dataset, with noise estimated by channel."""
 
 import dataclasses
 import functools
@@ -15,58 +15,55 @@ from jaxtyping import Bool, Float
 from jaxbeam.runtime.compiling import compiled, xla_options
 from tuning.fit.loss import check_loss, robust_residual, variance_factor
 from tuning.fit.uncertainty.covariance import Uncertainty, autocorrelation_factor, uncertainty
-from tuning.parameters.free import FreeParameter
+from tuning.parameters.free import FreeParameter, to_unbounded
 
-NOISE_ITERATIONS = 2  # of fitting with the noise levels found in the round before
-MAX_STEPS = 60
-WEAK_PRIOR_WIDTH = (
-    2.0  # width of the weak prior around the starts: a factor of e^2, or two typical sizes
-)
+NOISE_ITERATIONS = 2  # fits, each with the noise levels that the one before has estimated
+MAX_STEPS = 60  # steps of one fit
+WEAK_PRIOR_WIDTH = 2.0  # standard deviation in search variables: e^2, or two typical sizes
 
 
 @runtime_checkable
 class RegressionData(Protocol):
-    """What a search needs of a campaign: samples, which of them count, and how to predict them.
+    """Interface of the data of a fit: samples and a model that predicts them.
 
-    `measured` and `mask` (1 or 0) are (log, time, channel); `predictor` makes of addresses a
-    function from values at them to such samples, differentiable forward.
+    `measured` and `mask` (1 for samples that count, else 0) are (log, time, channel).
     """
 
     measured: np.ndarray
     mask: np.ndarray
 
     def predictor(self, addresses: list[str]) -> Callable:
-        """Function from the values at the addresses to all samples."""
+        """Function from values at the addresses to all samples, differentiable forward."""
         ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LeastSquaresSolution:
-    """What came out of a search; `noise` is the standard deviation of the residuals.
+    """Solution of a least-squares problem.
 
-    `autocorrelation_factor` is the factor by which their autocorrelation raises variances, 1 for white ones;
-    `degrees_of_freedom` counts the independent samples that are left over, by which intervals widen;
-    `jacobian` the derivatives of the predicted samples with respect to the values; `unbounded` holds
-    the search variables of the values.
+    `unbounded` are the search variables of the values; `noise` the standard deviation of the
+    residuals; `autocorrelation_factor` the factor by which their autocorrelation raises variances,
+    1 for white ones; `degrees_of_freedom` the number of independent samples left; `jacobian` the
+    derivatives of the predicted samples with respect to the values.
     """
 
-    values: Float[np.ndarray, " free"]
-    unbounded: Float[np.ndarray, " free"]
+    values: Float[np.ndarray, " parameter"]
+    unbounded: Float[np.ndarray, " parameter"]
     predicted: Float[np.ndarray, "log time channel"]
     noise: Float[np.ndarray, "log channel"]
     autocorrelation_factor: Float[np.ndarray, "log channel"]
     degrees_of_freedom: float
-    jacobian: Float[np.ndarray, "log time channel free"]
+    jacobian: Float[np.ndarray, "log time channel parameter"]
     uncertainty: Uncertainty
     converged: bool
 
 
 class LeastSquares:
-    """Least squares over the free numbers of a campaign, compiled once for any samples.
+    """Least-squares problem in the free parameters of a dataset, compiled once for any samples.
 
-    Priors of the numbers count as further residuals. `loss` is one of `tuning.fit.loss`.
+    Priors of the parameters count as further residuals. `loss` is one of `tuning.fit.loss`.
 
-    Raises ValueError if there are more numbers than samples, or for an unknown loss.
+    Raises ValueError if there are more parameters than samples, or for an unknown loss.
     """
 
     def __init__(
@@ -74,22 +71,20 @@ class LeastSquares:
     ):
         check_loss(loss)
         if data.mask.sum() < len(parameters):
-            raise ValueError(f"{len(parameters)} free numbers need at least as many samples")
+            raise ValueError(f"{len(parameters)} free parameters need at least as many samples")
         self.data, self.parameters, self.loss = data, parameters, loss
-        self.start_point = np.array([number.to_unbounded(number.start) for number in parameters])
-        weak_prior_widths = WEAK_PRIOR_WIDTH * np.array(
-            [number.unbounded_size for number in parameters]
-        )
-        predict = data.predictor([number.address for number in parameters])
+        self.start_point = to_unbounded(parameters, [p.start for p in parameters])
+        weak_prior_widths = WEAK_PRIOR_WIDTH * np.array([p.unbounded_size for p in parameters])
+        predict = data.predictor([p.address for p in parameters])
 
         def values_at(y):
-            return jnp.stack([number.from_unbounded(y[i]) for i, number in enumerate(parameters)])
+            return jnp.stack([p.from_unbounded(y[i]) for i, p in enumerate(parameters)])
 
         def prior_residuals(values):
-            return jnp.stack([n.prior.prior_residual(values[i]) for i, n in enumerate(parameters)])
+            return jnp.stack([p.prior.prior_residual(values[i]) for i, p in enumerate(parameters)])
 
         def linearised(values):
-            # One pass gives samples and derivatives (see `Campaign.predictor`).
+            # One pass gives samples and derivatives (see `Dataset.predictor`).
             samples, push = jax.linearize(predict, values)
             return samples, jax.vmap(push, out_axes=-1)(jnp.eye(values.shape[0]))
 
@@ -98,9 +93,8 @@ class LeastSquares:
             y = jnp.where(free, z * scale, held)
             values = values_at(y)
             residuals = robust_residual(loss, (measured - predict(values)) * weights)
-            # What the data cannot see would wander off, and spoil what they can: a prior too weak
-            # to move anything they tell holds it near the start (in the next round, near what was
-            # found in the round before). It has no part in the errors.
+            # A weak Gaussian prior around the start (in the second fit, around the result of the
+            # first) keeps unidentifiable directions bounded; it is left out of standard errors.
             weak_prior_residuals = (z * scale - held) / weak_prior_widths
             return jnp.concatenate(
                 [residuals.ravel(), prior_residuals(values), weak_prior_residuals]
@@ -123,12 +117,9 @@ class LeastSquares:
         self.from_unbounded, self.prior_residuals = values_at, prior_residuals
         self._values_at = compiled(values_at)
         self._unbounded_slopes = compiled(lambda y: jnp.diag(jax.jacfwd(values_at)(y)))
-        self._prior_residuals, self._prior_jacobian = (
-            compiled(prior_residuals),
-            compiled(jax.jacfwd(prior_residuals)),
-        )
+        self._prior_residuals = compiled(prior_residuals)
+        self._prior_jacobian = compiled(jax.jacfwd(prior_residuals))
         self._linearised_function, self._minimise_function = linearised, minimise
-        self._minimise_batch = compiled(jax.vmap(minimise, (0, 0, None, None, None)))
 
     @functools.cached_property
     def _compiled_programs(self):
@@ -136,9 +127,8 @@ class LeastSquares:
         count, samples = len(self.parameters), jnp.zeros(self.data.measured.shape)
         point = jnp.zeros(count)
         given = point, point, samples, samples, jnp.zeros(count, bool)
-        # Compiling takes most of the time of a small fit: one beside the other, and its tracing.
-        # JAX takes up what it has traced before only under the same mesh, and optimistix traces
-        # under one that is empty.
+        # Compiling takes most of the time of a small fit, so both are compiled at once. JAX reuses
+        # traces only under the same mesh, and optimistix traces under an empty one.
         empty = jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ()))
         with ThreadPoolExecutor(1) as pool, empty:
             linear = pool.submit(
@@ -151,18 +141,18 @@ class LeastSquares:
         self,
         measured: Float[np.ndarray, "log time channel"],
         *,
-        start: Float[np.ndarray, " free"] | None = None,
+        start: Float[np.ndarray, " parameter"] | None = None,
         included_logs: Bool[np.ndarray, "log"] | None = None,
-        free: Bool[np.ndarray, " free"] | None = None,
+        free: Bool[np.ndarray, " parameter"] | None = None,
     ) -> LeastSquaresSolution:
-        """Fit the numbers to samples like those of the campaign, from their starts on.
+        """Fit to samples of the shape of the dataset's.
 
-        `start` are other starts (search variables), `included_logs` says which logs count, `free` which
-        numbers move. The noise of each channel is guessed first, then found from the residuals.
-        Standard errors are those of the linearised fit (0 for what does not move), widened where
-        residuals are correlated in time.
+        `start` are search variables to start from (the parameters' own starts if left out),
+        `included_logs` the logs that count, `free` the parameters that move. The noise of each
+        channel is estimated from second differences first, then from the residuals. Standard errors
+        are those of the linearised fit (0 for held parameters), widened for autocorrelation.
 
-        Raises RuntimeError if the search leaves the range in which the case can be simulated.
+        Raises RuntimeError if the case cannot be simulated at the fitted values.
         """
         y = self.start_point if start is None else start
         free = np.ones(len(self.parameters), bool) if free is None else free
@@ -172,54 +162,51 @@ class LeastSquares:
         jacobian = None
         for _ in range(NOISE_ITERATIONS):
             scale = self.step_scale(y, noise, mask, jacobian)
-            points, found = self.minimise(
-                y[None], scale[None], self.weights(noise, mask), measured, free
-            )
-            y, converged = points[0], found[0]
+            y, converged = self.minimise(y, scale, self.weights(noise, mask), measured, free)
             values = self.values_at(y)
             predicted, jacobian = self.linearised(values)
             residuals = measured - predicted
             if not np.all(np.isfinite(residuals)):
                 raise RuntimeError(
-                    "the fit left the range in which the case can be simulated; give its numbers "
-                    "bounds"
+                    "the fit left the range in which the case can be simulated; give its "
+                    "parameters bounds"
                 )
             noise = self._residual_noise(residuals, mask)
         factors = self._autocorrelation_factors(residuals)
         counts = mask.sum(axis=1)
         independent = np.sum(counts / factors)
         degrees_of_freedom = max(independent - free.sum(), 1.0)
-        # Coloured noise is fitted more closely than white noise: its level looks too low.
+        # Autocorrelated noise is fitted more closely than white noise: its level looks too low.
         noise_correction = (1 - free.sum() / counts.sum()) * independent / degrees_of_freedom
         widened = noise * np.sqrt(factors * max(noise_correction, 1.0))
         found = self._uncertainty(values, jacobian, mask, noise, widened, residuals, free)
         return LeastSquaresSolution(
-            values,
-            y,
-            predicted,
-            noise,
-            factors,
-            degrees_of_freedom,
-            jacobian,
-            found,
-            bool(converged),
+            values=values,
+            unbounded=y,
+            predicted=predicted,
+            noise=noise,
+            autocorrelation_factor=factors,
+            degrees_of_freedom=degrees_of_freedom,
+            jacobian=jacobian,
+            uncertainty=found,
+            converged=converged,
         )
 
     def linearised(self, values):
-        """Predicted samples at some values, and their derivatives (log, time, channel, free)."""
+        """Predicted samples at values, and their derivatives (log, time, channel, parameter)."""
         return tuple(map(np.asarray, self._compiled_programs[0](jnp.asarray(values))))
 
-    def values_at(self, y) -> Float[np.ndarray, " free"]:
-        """Values of the numbers at a point of the search."""
+    def values_at(self, y) -> Float[np.ndarray, " parameter"]:
+        """Values of the parameters at search variables."""
         return np.asarray(self._values_at(jnp.asarray(y)))
 
     def step_scale(
-        self, y: Float[np.ndarray, " free"], noise, mask=None, jacobian=None
-    ) -> Float[np.ndarray, " free"]:
-        """Size of steps of the search: a thousand of the standard errors each would have alone.
+        self, y: Float[np.ndarray, " parameter"], noise, mask=None, jacobian=None
+    ) -> Float[np.ndarray, " parameter"]:
+        """Unit of each search variable: a thousand times the standard error it would have alone.
 
-        In these units all numbers are of one size, and the solver's first damping, one, hardly
-        shortens its first step. The `jacobian` at the point need not be known.
+        In these units all parameters are of one size, and the solver's initial damping, one, hardly
+        shortens its first step. The `jacobian` at the point is computed if left out.
         """
         weights = self.weights(noise, mask)
         if jacobian is None:
@@ -229,9 +216,9 @@ class LeastSquares:
         return 1e3 / np.maximum(strength, max(1e-9 * strength.max(), 1e-300))
 
     def cost(self, values, noise, measured, mask=None) -> float:
-        """Half the sum of squared residuals in standard deviations of the noise, or their loss.
+        """Half the sum of squared residuals over their noise (or their loss), priors included.
 
-        Priors have their part. Infinite where the case cannot be simulated.
+        Infinite where the case cannot be simulated.
         """
         residuals = (measured - self.linearised(values)[0]) * self.weights(noise, mask)
         squares = jnp.sum(robust_residual(self.loss, jnp.asarray(residuals)) ** 2) + jnp.sum(
@@ -240,67 +227,52 @@ class LeastSquares:
         return float(squares / 2) if np.isfinite(squares) else np.inf
 
     def weights(self, noise, mask=None) -> Float[np.ndarray, "log time channel"]:
-        """One over the noise for real samples, zero for those that only fill up."""
+        """One over the noise for measured samples, zero for padding."""
         return (self.data.mask if mask is None else mask) / noise[:, None, :]
 
     def initial_noise(self, measured) -> Float[np.ndarray, "log channel"]:
-        """Noise guessed from the second differences, which a smooth response hardly has."""
+        """Noise estimated from second differences, in which a smooth response hardly shows."""
         second_differences = np.abs(np.diff(measured, 2, axis=1))
         mask = self.data.mask
-        counts = (mask[:, 2:] * mask[:, 1:-1] * mask[:, :-2]) > 0
-        levels = np.array(
-            [
-                [np.median(second_differences[i, :, c][counts[i, :, c]]) if counts[i, :, c].any() else 0.0
-                 for c in range(second_differences.shape[2])]
-                for i in range(len(second_differences))
-            ]
-        )  # fmt: skip
+        counted = (mask[:, 2:] * mask[:, 1:-1] * mask[:, :-2]) > 0
+
+        def median(log, channel):
+            own = second_differences[log, counted[log, :, channel], channel]
+            return np.median(own) if own.size else 0.0
+
+        logs, _, channels = measured.shape
+        levels = np.array([[median(i, c) for c in range(channels)] for i in range(logs)])
         return np.maximum(1.4826 * levels / np.sqrt(6), self._noise_floor(1e-6))
 
     def minimise(
         self,
-        points: Float[np.ndarray, "start free"],
-        scales: Float[np.ndarray, "start free"],
+        point: Float[np.ndarray, " parameter"],
+        scale: Float[np.ndarray, " parameter"],
         weights: Float[np.ndarray, "log time channel"],
         measured: Float[np.ndarray, "log time channel"],
-        free: Bool[np.ndarray, " free"],
-    ) -> tuple[Float[np.ndarray, "start free"], Bool[np.ndarray, " start"]]:
-        """Search points from several starts, and which searches converged.
-
-        On an accelerator all go side by side; on a CPU, one after the other takes no longer, and
-        needs no further program.
-        """
-        shared = [jnp.asarray(part) for part in (weights, measured, free)]
-        if len(points) > 1 and jax.default_backend() != "cpu":
-            found = self._minimise_batch(jnp.asarray(points), jnp.asarray(scales), *shared)
-        else:
-            pairs = zip(points, scales, strict=True)
-            single = [
-                self._compiled_programs[1](jnp.asarray(point), jnp.asarray(scale), *shared)
-                for point, scale in pairs
-            ]
-            found = [np.stack(part) for part in zip(*single, strict=True)]
-        return np.asarray(found[0]), np.asarray(found[1])
+        free: Bool[np.ndarray, " parameter"],
+    ) -> tuple[Float[np.ndarray, " parameter"], bool]:
+        """Search variables at the minimum found from a point, and whether the search converged."""
+        given = (point, scale, weights, measured, free)
+        ended, converged = self._compiled_programs[1](*map(jnp.asarray, given))
+        return np.asarray(ended), bool(converged)
 
     def _uncertainty(self, values, jacobian, mask, noise, widened, residuals, free) -> Uncertainty:
-        """Standard errors and what is unseen, from samples and priors; 0 for what was held."""
+        """Uncertainty from samples and priors; standard errors of held parameters are 0."""
         weights = self.weights(widened, mask)
         if self.loss != "squares":
             sized = (residuals * self.weights(noise, mask))[mask > 0]
             weights = weights / np.sqrt(variance_factor(self.loss, sized))
         rows = (jacobian * weights[..., None]).reshape(-1, len(self.parameters))
-        if any(number.prior.mean is not None for number in self.parameters):
+        if any(p.prior.mean is not None for p in self.parameters):
             rows = np.vstack([rows, self._prior_jacobian(values)])
-        free_parameters = [
-            (n, n.typical_size_at(float(v))) for n, v in zip(self.parameters, values, strict=True)
-        ]
-        free_parameters = [
-            pair for pair, free_one in zip(free_parameters, free, strict=True) if free_one
+        moving = [
+            (p.address, p.typical_size_at(float(value)))
+            for p, value, moves in zip(self.parameters, values, free, strict=True)
+            if moves
         ]
         found = uncertainty(
-            [n.address for n, _ in free_parameters],
-            rows[:, free],
-            np.array([s for _, s in free_parameters]),
+            [address for address, _ in moving], rows[:, free], np.array([s for _, s in moving])
         )
         if free.all():
             return found
@@ -309,9 +281,10 @@ class LeastSquares:
         return Uncertainty(errors, correlation, found.unidentifiable)
 
     def _residual_noise(self, residuals, mask) -> Float[np.ndarray, "log channel"]:
-        """Standard deviation of the residuals, for the numbers fitted to them.
+        """Standard deviation of the residuals, corrected for the number of parameters.
 
-        Under a robust loss, the median of their sizes: outliers are not to raise it.
+        Under a robust loss it is estimated from the median of their sizes, which outliers leave as
+        it is.
         """
         counts = mask.sum(axis=1)
         free_share = max(1 - len(self.parameters) / counts.sum(), 1e-9)
@@ -322,20 +295,20 @@ class LeastSquares:
             some = counts > 0
             sizes = np.where(some[:, None, :], sizes, 0.0)
             noise = 1.4826 * np.nanmedian(sizes, axis=1) / np.sqrt(free_share)
-        # A log without any weight tells its noise, too, though not to the fit.
+        # A log without any weight in the fit has a noise of its own.
         unused = counts == 0
         own = np.sqrt(np.mean(residuals**2, axis=1))
         return np.maximum(np.where(unused, own, noise), self._noise_floor(1e-9))
 
     def _noise_floor(self, share: float) -> Float[np.ndarray, " channel"]:
-        """Least noise of each channel: a share of its range, so that no weight is infinite."""
+        """Lower limit of the noise: a share of each channel's range, so that weights are finite."""
         return np.maximum(share * np.ptp(self.data.measured, axis=(0, 1)), 1e-300)
 
     def _autocorrelation_factors(self, residuals) -> Float[np.ndarray, "log channel"]:
         mask = self.data.mask > 0
         return np.array(
             [
-                [autocorrelation_factor(part[has[:, i], i]) for i in range(part.shape[1])]
-                for part, has in zip(residuals, mask, strict=True)
+                [autocorrelation_factor(own[has]) for own, has in zip(log.T, valid.T, strict=True)]
+                for log, valid in zip(residuals, mask, strict=True)
             ]
         )

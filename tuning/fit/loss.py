@@ -1,7 +1,7 @@
-"""How much a residual counts: its square, or less if it is far out.
+"""Losses of a fit: squares, and robust ones that reduce the weight of outliers.
 
-Each loss is half the square of `shaped(r)`, so that least squares minimises any of them; r is a
-residual in standard deviations of the noise.
+Each loss is half the square of `robust_residual(r)`, so that least squares minimises any of them;
+r is a residual over the standard deviation of the noise.
 """
 
 import jax.numpy as jnp
@@ -9,17 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 LOSSES = ("squares", "soft-l1", "huber")
-HUBER_THRESHOLD = 1.345  # of Huber's loss: 95 % as efficient as squares where noise is normal
+HUBER_THRESHOLD = 1.345  # 95 % of the efficiency of squares for normal noise
 
 
 def check_loss(loss: str) -> None:
-    """Raises ValueError for a loss that is not known."""
+    """Raise ValueError for an unknown loss."""
     if loss not in LOSSES:
         raise ValueError(f"a loss is one of {', '.join(LOSSES)}, not {loss!r}")
 
 
 def robust_residual(loss: str, residual: Float[Array, "*any"]) -> Float[Array, "*any"]:
-    """The residual f for which f^2 / 2 is the loss: that of squares, soft-l1 or Huber.
+    """Residual f whose half square f^2 / 2 is the loss.
 
     soft-l1: f^2 / 2 = sqrt(1 + r^2) - 1; Huber: f^2 / 2 = k |r| - k^2 / 2 beyond k.
     """
@@ -36,10 +36,10 @@ def robust_residual(loss: str, residual: Float[Array, "*any"]) -> Float[Array, "
 
 
 def variance_factor(loss: str, residuals: Float[np.ndarray, " sample"]) -> float:
-    """Factor by which variances of a robust fit exceed those of the linearised least squares.
+    """Factor by which variances of a robust fit exceed those of linearised least squares.
 
     E[psi^2] / E[psi']^2 with psi the derivative of the loss (Huber, Robust Statistics, section
-    6.3), for residuals in standard deviations of the noise.
+    6.3), for residuals over the standard deviation of the noise.
     """
     if loss == "soft-l1":
         root = np.sqrt(1 + residuals**2)

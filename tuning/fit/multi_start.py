@@ -1,50 +1,52 @@
-"""A fit searched from many starts at once, and the table of the minima found."""
+"""Multi-start search: a fit searched from several points, and the distinct minima found."""
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.stats import norm, qmc
 
-from tuning.checkpoint import load, save
+from tuning.checkpoint import NO_CHECKPOINT, Checkpoint
 from tuning.fit.least_squares import WEAK_PRIOR_WIDTH, LeastSquares
 from tuning.parameters.free import FreeParameter
 
-STARTS_PER_BLOCK = 8  # starts searched from side by side, and between two states on disk
-SAME_MINIMUM_DISTANCE = 1e-2  # typical sizes: values closer than that are those of one minimum
+STARTS_PER_BLOCK = 8  # starts between two checkpoints
+SAME_MINIMUM_DISTANCE = 1e-2  # typical sizes; values closer than that belong to one minimum
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LocalMinimum:
-    """Where searches ended: half the sum of weighted squares there, values, and from how many."""
+    """A minimum of the misfit, and the number of starts that led to it.
+
+    `cost` is half the sum of weighted squares, `unbounded` the search variables of the values.
+    """
 
     cost: float
-    values: Float[np.ndarray, " free"]
-    unbounded: Float[np.ndarray, " free"]
+    values: Float[np.ndarray, " parameter"]
+    unbounded: Float[np.ndarray, " parameter"]
     starts: int
     converged: bool
 
 
 def draw_start_points(
     parameters: Sequence[FreeParameter], count: int, seed: int
-) -> Float[np.ndarray, "start free"]:
-    """Search points to start from: the numbers' own first, then a Latin hypercube.
+) -> Float[np.ndarray, "start parameter"]:
+    """Search points: the parameters' own starts first, then a Latin hypercube.
 
-    Between two bounds all values (on the number's scale) are as likely; without, starts scatter
-    around the number's own by about its typical size.
+    Between two bounds the draws are even on the parameter's scale; without, they scatter around
+    its own start by about its typical size.
     """
-    own = np.array([[number.to_unbounded(number.start) for number in parameters]])
+    own = np.array([[p.to_unbounded(p.start) for p in parameters]])
     if count == 1:
         return own
     shares = qmc.LatinHypercube(len(parameters), rng=np.random.default_rng(seed)).random(count - 1)
     columns = []
-    for i, number in enumerate(parameters):
-        if np.isfinite(number.high - number.low):
-            columns.append(number.unbounded_at_share(np.clip(shares[:, i], 1e-3, 1 - 1e-3)))
+    for i, parameter in enumerate(parameters):
+        if np.isfinite(parameter.high - parameter.low):
+            columns.append(parameter.unbounded_at_share(np.clip(shares[:, i], 1e-3, 1 - 1e-3)))
         else:
-            width = WEAK_PRIOR_WIDTH / 2 * number.unbounded_size
+            width = WEAK_PRIOR_WIDTH / 2 * parameter.unbounded_size
             columns.append(own[0, i] + width * norm.ppf(shares[:, i]))
     return np.concatenate([own, np.stack(columns, axis=1)])
 
@@ -54,60 +56,63 @@ def multi_start(
     measured: Float[np.ndarray, "log time channel"],
     count: int,
     seed: int,
-    checkpoint: Path | None = None,
-    digest: str = "",
+    checkpoint: Checkpoint = NO_CHECKPOINT,
 ) -> list[LocalMinimum]:
-    """Search from several starts, in blocks that run side by side; return minima, lowest first.
+    """Minima found from `count` starts, lowest first.
 
-    The noise is that guessed from the samples, so that costs compare. After each block the state
-    is written to the `checkpoint`, under its `digest`; if there is one already, the search goes on
-    from there, to the same result. Searches that ended in no number are left out.
+    All searches take the noise estimated from the samples, so that their costs compare. Searches
+    that end in values with which the case cannot be simulated are left out. The checkpoint is
+    written after each block of starts; a search that finds one goes on from there, to the same
+    result.
 
     Raises ValueError for a checkpoint that is damaged or of another search, and RuntimeError if
-    no search ended in a number.
+    the case cannot be simulated at any of the ends.
     """
     starts = draw_start_points(least_squares.parameters, count, seed)
     noise = least_squares.initial_noise(measured)
-    found = {"points": np.empty((0, starts.shape[1])), "converged": np.empty(0, bool)}
-    if checkpoint is not None and checkpoint.exists():
-        found = load(checkpoint, digest)
+    found = checkpoint.load() or {
+        "points": np.empty((0, starts.shape[1])),
+        "converged": np.empty(0, bool),
+    }
     weights, free = least_squares.weights(noise), np.ones(len(least_squares.parameters), bool)
     while len(found["points"]) < count:
         block = starts[len(found["points"]) :][:STARTS_PER_BLOCK]
         scales = np.array([least_squares.step_scale(point, noise) for point in block])
         scales = np.where(np.isfinite(scales), scales, 1.0)
-        points, converged = least_squares.minimise(block, scales, weights, measured, free)
+        ends = [
+            least_squares.minimise(point, scale, weights, measured, free)
+            for point, scale in zip(block, scales, strict=True)
+        ]
+        points, converged = zip(*ends, strict=True)
         found = {
             "points": np.concatenate([found["points"], points]),
             "converged": np.concatenate([found["converged"], converged]),
         }
-        if checkpoint is not None:
-            save(checkpoint, digest, found)
+        checkpoint.save(found)
     return _distinct_minima(least_squares, measured, noise, found)
 
 
 def _distinct_minima(least_squares: LeastSquares, measured, noise, found) -> list[LocalMinimum]:
-    """Gather what ended in the same place."""
-    sizes = np.array([number.typical_size for number in least_squares.parameters])
+    """Ends of searches, those at the same values taken together."""
+    sizes = np.array([parameter.typical_size for parameter in least_squares.parameters])
     values = [least_squares.values_at(point) for point in found["points"]]
     costs = np.array([least_squares.cost(value, noise, measured) for value in values])
     minima: list[LocalMinimum] = []
     for i in np.argsort(costs, kind="stable"):
         if not np.isfinite(costs[i]):
             continue
+        converged = bool(found["converged"][i])
         for j, minimum in enumerate(minima):
             if np.all(np.abs(minimum.values - values[i]) < SAME_MINIMUM_DISTANCE * sizes):
                 minima[j] = dataclasses.replace(
                     minimum,
                     starts=minimum.starts + 1,
-                    converged=minimum.converged or bool(found["converged"][i]),
+                    converged=minimum.converged or converged,
                 )
                 break
         else:
-            converged = bool(found["converged"][i])
-            minima.append(
-                LocalMinimum(float(costs[i]), values[i], found["points"][i], 1, converged)
-            )
+            point = found["points"][i]
+            minima.append(LocalMinimum(float(costs[i]), values[i], point, 1, converged))
     if not minima:
         raise RuntimeError("no start led to values with which the case can be simulated")
     return minima

@@ -1,23 +1,21 @@
-"""A written account of an identification: Markdown and HTML, with tables and figures."""
+"""Report on an identification: sections of remarks, tables and figures."""
 
 import os
 from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbeam.files.report import (
-    ReportFigure,
-    ReportSection,
-    ReportTable,
-    write_report as write_files,
-)
-from tuning.fit.identify import Fit
-from tuning.fit.model_validation import HeldOutPrediction, ModelCriteria, channel_residuals
-from tuning.fit.summary import remarks
+from jaxbeam.files import report
+from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable
+from tuning.aliases import accepts_old_arguments
+from tuning.fit.model_validation import HeldOutPrediction, ModelCriteria
+from tuning.fit.result import Fit
+from tuning.fit.summary import interval_text
 from tuning.fit.uncertainty.posterior import Posterior
 from tuning.fit.uncertainty.profile import Profile
 
 
+@accepts_old_arguments(unseen="held_out", rivals="models")
 def write_report(
     folder: str | os.PathLike,
     fit: Fit,
@@ -28,78 +26,68 @@ def write_report(
     models: Sequence[ModelCriteria] = (),
     overwrite: bool = False,
 ) -> None:
-    """Write report.md, report.html and their pictures to a folder.
+    """Write a report on a fit, report.md and report.html with figures, to a folder.
 
     Raises FileExistsError if the folder is not empty and `overwrite` is not set.
     """
     sections = report_sections(fit, profiles, posterior, held_out, models)
     title = fit.case.title or "Identification"
-    write_files(folder, title, sections, overwrite=overwrite)
+    report.write_report(folder, title, sections, overwrite=overwrite)
 
 
 def report_sections(
     fit: Fit,
     profiles: Sequence[Profile] = (),
     posterior: Posterior | None = None,
-    predictions: Sequence[HeldOutPrediction] = (),
+    held_out: Sequence[HeldOutPrediction] = (),
     models: Sequence[ModelCriteria] = (),
 ) -> list[ReportSection]:
-    """What is to be told of a fit, section by section."""
-    from tuning.fit.plots import plot_posterior, plot_profiles
+    """Sections of the report on a fit; those on what is left out are left out."""
+    from tuning.fit.uncertainty.plots import plot_posterior, plot_profiles
 
+    tables = [_parameter_table(fit), *_minima_table(fit)]
+    measured = [ReportFigure("fit", fit.plot()), _residual_table(fit)]
     sections = [
-        ReportSection("Numbers", [fit.verdict + ".", _parameter_table(fit), *_minima_table(fit)]),
-        ReportSection("Remarks", remarks(fit)),
-        ReportSection(
-            "Measured and fitted", [ReportFigure("fit", fit.plot()), _residual_table(fit)]
-        ),
+        ReportSection("Parameters", [fit.verdict + ".", *tables]),
+        ReportSection("Remarks", fit.remarks),
+        ReportSection("Measured and fitted", measured),
     ]
     if len(fit.parameters) > 1:
         sections.append(ReportSection("Correlations", [_correlation_table(fit)]))
     if profiles:
         verdicts = [found.verdict + "." for found in profiles]
-        sections.append(
-            ReportSection(
-                "Profiles", [*verdicts, ReportFigure("profiles", plot_profiles(profiles))]
-            )
-        )
+        figure = ReportFigure("profiles", plot_profiles(profiles))
+        sections.append(ReportSection("Profiles", [*verdicts, figure]))
     if posterior:
-        parts = [posterior.verdict + ".", _posterior_table(posterior)]
-        sections.append(
-            ReportSection(
-                "Posterior", [*parts, ReportFigure("posterior", plot_posterior(posterior))]
-            )
-        )
-    if predictions:
-        sections.append(
-            ReportSection("Logs left out", [found.verdict + "." for found in predictions])
-        )
+        figure = ReportFigure("posterior", plot_posterior(posterior))
+        parts = [posterior.verdict + ".", _posterior_table(posterior), figure]
+        sections.append(ReportSection("Posterior", parts))
+    if held_out:
+        verdicts = [found.verdict + "." for found in held_out]
+        sections.append(ReportSection("Held-out logs", verdicts))
     if models:
-        sections.append(ReportSection("Rival models", [_model_table(models)]))
+        sections.append(ReportSection("Models compared", [_model_table(models)]))
     return sections
 
 
 def _parameter_table(fit: Fit) -> ReportTable:
     rows = []
-    for number, value, error, (low, high) in zip(
+    for parameter, value, error, interval in zip(
         fit.parameters, fit.values, fit.errors, fit.intervals, strict=True
     ):
-        identifiable = np.isfinite(error)
-        interval = f"{low:.5g} to {high:.5g}" if identifiable else "the data cannot tell"
-        prior = number.prior
-        prior_text = "" if prior.mean is None else f"{prior.mean:.5g} ± {prior.deviation:.3g}"
+        prior = parameter.prior
         rows.append(
             (
-                number.address,
-                number.unit,
-                f"{number.start:.5g}",
-                prior_text,
+                parameter.address,
+                parameter.unit,
+                f"{parameter.start:.5g}",
+                "" if prior.mean is None else f"{prior.mean:.5g} ± {prior.deviation:.3g}",
                 f"{value:.6g}",
-                f"{error:.2g}" if identifiable else "",
-                interval,
+                f"{error:.2g}" if np.isfinite(error) else "",
+                interval_text(interval),
             )
         )
-    header = ("number", "unit", "start", "prior", "fitted", "standard error", "95 % interval")
+    header = ("parameter", "unit", "start", "prior", "fitted", "standard error", "95 % interval")
     return ReportTable(header, rows)
 
 
@@ -123,10 +111,10 @@ def _residual_table(fit: Fit) -> ReportTable:
             f"{found.autocorrelation_factor:.3g}",
             f"{1e3 * found.time_shift:.2g} ± {2e3 * found.time_shift_sd:.2g}",
         )
-        for found in channel_residuals(fit)
+        for found in fit.channel_residuals
     ]
-    header = ("log", "sensor", "residual (SI)", "chance of such colour", "variances times")
-    return ReportTable((*header, "late by (ms)"), rows)
+    header = ("log", "sensor", "residual (SI)", "p-value of whiteness", "variances times")
+    return ReportTable((*header, "delay (ms)"), rows)
 
 
 def _correlation_table(fit: Fit) -> ReportTable:
@@ -151,7 +139,7 @@ def _posterior_table(posterior: Posterior) -> ReportTable:
         (address, f"{mean:.6g}", f"{sd:.2g}", f"{low:.5g} to {high:.5g}", f"{r:.3f}", f"{n:.0f}")
         for address, mean, sd, (low, high), r, n in columns
     ]
-    header = ("number", "mean", "deviation", "95 % interval", "R-hat", "effective draws")
+    header = ("parameter", "mean", "deviation", "95 % interval", "R-hat", "effective draws")
     return ReportTable(header, rows)
 
 
@@ -161,4 +149,4 @@ def _model_table(models: Sequence[ModelCriteria]) -> ReportTable:
          f"{r.weight:.2g}")
         for r in models
     ]  # fmt: skip
-    return ReportTable(("model", "free numbers", "ln L", "AIC", "BIC", "weight"), rows)
+    return ReportTable(("model", "parameters", "ln L", "AIC", "BIC", "weight"), rows)

@@ -1,4 +1,4 @@
-"""A fit on disk: everything it came from and everything it found, in one file."""
+"""Fits on disk: the parameters found, with the case and the logs, in one file."""
 
 import dataclasses
 import json
@@ -11,21 +11,31 @@ from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tuning.checkpoint import load, save
 from tuning.fit.dataset import make_dataset
-from tuning.fit.identify import Fit
 from tuning.fit.least_squares import LeastSquares
 from tuning.fit.multi_start import LocalMinimum
+from tuning.fit.result import Fit
 from tuning.logs.log import Log
 from tuning.parameters.free import FreeParameter
-from tuning.parameters.prior import Prior
+from tuning.parameters.prior import OLD_SCALES, Prior
 
-FORMAT = "jaxbeam fit 1"
-_FIT_ARRAYS = ("values", "errors", "correlation", "noise", "fitted", "colour")
+FORMAT, OLD_FORMAT = "jaxbeam fit 2", "jaxbeam fit 1"
+# Names in the old format of what is now called otherwise.
+_OLD_NAMES = {
+    "nominal_case": "given",
+    "parameters": "numbers",
+    "unidentifiable": "unseen",
+    "degrees_of_freedom": "freedom",
+    "autocorrelation_factor": "colour",
+    "typical_size": "size",
+    "prior": "belief",
+}
+_FIT_ARRAYS = ("values", "errors", "correlation", "noise", "fitted", "autocorrelation_factor")
 _LOG_ARRAYS = ("times", "values", "valid")
 _LOG_FIELDS = ("names", "quantities", "units", "sensors", "positions", "actuators", "notes")
 
 
 def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None:
-    """Write a fit to a file (.npz), with its logs and case, to the last bit.
+    """Write a fit with its logs and case to a file (.npz), without any loss of precision.
 
     Raises FileExistsError if the file exists and `overwrite` is not set.
     """
@@ -35,11 +45,11 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
     logs = fit.dataset.logs
     header = {
         "case": case_to_dict(fit.case),
-        "given": case_to_dict(fit.dataset.nominal_case),
-        "numbers": [dataclasses.asdict(number) for number in fit.parameters],
-        "unseen": fit.unidentifiable,
+        "nominal_case": case_to_dict(fit.dataset.nominal_case),
+        "parameters": [dataclasses.asdict(parameter) for parameter in fit.parameters],
+        "unidentifiable": fit.unidentifiable,
         "verdict": fit.verdict,
-        "freedom": fit.degrees_of_freedom,
+        "degrees_of_freedom": fit.degrees_of_freedom,
         "loss": fit.least_squares.loss,
         "logs": [_log_header(log, fit.case) for log in logs],
         "minima": [[m.cost, m.starts, m.converged] for m in fit.minima],
@@ -53,23 +63,22 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
 
 
 def load_fit(path: str | os.PathLike) -> Fit:
-    """Read what `save_fit` wrote. Raises ValueError if it is damaged, or is no fit."""
+    """Fit from a file written by `save_fit`.
+
+    Raises ValueError if there is no such file, or it is damaged or no fit.
+    """
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: there is no such fit")
-    try:
-        arrays = load(path, FORMAT)
-    except ValueError:  # what it says of searches would have a fit, or a case, deleted
-        raise ValueError(
-            f"{path} is no fit, or is damaged; name the .npz file that identify wrote"
-        ) from None
-    header = json.loads(str(arrays["about"]))
-    logs = [
-        _read_log(i, entry, header["given"]["beam"], arrays)
-        for i, entry in enumerate(header["logs"])
+    arrays, header = _read(path)
+    nominal_case = case_from_dict(header["nominal_case"])
+    beam = header["nominal_case"]["beam"]
+    logs = [_read_log(i, entry, beam, arrays) for i, entry in enumerate(header["logs"])]
+    parameters = [
+        FreeParameter(**{**entry, "prior": Prior(**entry["prior"])})
+        for entry in header["parameters"]
     ]
-    parameters = [FreeParameter(**{**n, "belief": Prior(**n["belief"])}) for n in header["numbers"]]
-    dataset = make_dataset(case_from_dict(header["given"]), logs)
+    dataset = make_dataset(nominal_case, logs)
     minima = [
         LocalMinimum(
             cost, arrays[f"minimum{i}.values"], arrays[f"minimum{i}.point"], starts, converged
@@ -79,18 +88,46 @@ def load_fit(path: str | os.PathLike) -> Fit:
     return Fit(
         parameters=parameters,
         **{name: arrays[name] for name in _FIT_ARRAYS},
-        unidentifiable=header["unseen"],
+        unidentifiable=header["unidentifiable"],
         verdict=header["verdict"],
         case=case_from_dict(header["case"]),
         dataset=dataset,
-        degrees_of_freedom=header["freedom"],
+        degrees_of_freedom=header["degrees_of_freedom"],
         least_squares=LeastSquares(dataset, parameters, header["loss"]),
         minima=tuple(minima),
     )
 
 
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict]:
+    """Arrays and header of a file of either format, by their present names."""
+    for file_format in (FORMAT, OLD_FORMAT):
+        try:
+            arrays = load(path, file_format)
+        except ValueError:
+            continue
+        header = json.loads(str(arrays["about"]))
+        if file_format == OLD_FORMAT:
+            arrays, header = _with_new_names(arrays), _with_new_names(header)
+            header["parameters"] = [_with_new_scale(entry) for entry in header["parameters"]]
+        return arrays, header
+    raise ValueError(f"{path} is no fit, or is damaged; name the .npz file that identify wrote")
+
+
+def _with_new_names(content: dict) -> dict:
+    """Content of the old format with the present names."""
+    new_names = {old: new for new, old in _OLD_NAMES.items()}
+    return {new_names.get(name, name): entry for name, entry in content.items()}
+
+
+def _with_new_scale(entry: dict) -> dict:
+    """A free parameter of the old format, with the present names and scales."""
+    entry = _with_new_names(entry)
+    scale = entry["prior"]["scale"]
+    return entry | {"prior": entry["prior"] | {"scale": OLD_SCALES.get(scale, scale)}}
+
+
 def _log_header(log: Log, case: Case) -> dict:
-    """What a log says of itself, as plain words and numbers; loads as in a case file."""
+    """Names, units and sources of a log as plain data; loads as in a case file."""
     header = {name: getattr(log, name) for name in _LOG_FIELDS} | {
         "source": log.source,
         "loads": None,

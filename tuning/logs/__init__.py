@@ -1,1 +1,1 @@
-"""Logs."""
+"""Logs of measured runs: files, units, faults, and their match with a case."""

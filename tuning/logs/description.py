@@ -1,4 +1,4 @@
-"""The TOML file beside a log, of the same stem: loads, and what each column is."""
+"""Description of a log, in a TOML file of the same stem: columns, units, sensors and loads."""
 
 import difflib
 import tomllib
@@ -14,15 +14,18 @@ _KEYS = ("loads", "columns", "time", "runs")
 _COLUMN_KEYS = {
     "unit": (str, "a word"),
     "sensitivity": (str, 'like "100 mV/g"'),
-    "sensor": (int, "a whole number from 0"),
+    "sensor": (int, "an integer from 0"),
     "position": ((int, float), "a number in m"),
-    "actuator": (int, "a whole number from 0"),
+    "actuator": (int, "an integer from 0"),
 }
 
 
 @dataclass(frozen=True)
 class LogDescription:
-    """What the file beside a log says; empty where there is none."""
+    """Description of a log; empty without a file.
+
+    `columns` has the entries of each column by its name; `runs` the loads of each run by its name.
+    """
 
     time: str | None = None
     columns: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -30,36 +33,36 @@ class LogDescription:
     runs: Mapping[str, tuple[AbstractLoad, ...]] = field(default_factory=dict)
 
     def loads_of(self, run: str) -> tuple[AbstractLoad, ...] | None:
-        """The loads of a run of the file: its own, or else those of all."""
+        """Loads of a run of the file: its own, or else those of all runs."""
         return self.runs.get(run, self.loads)
 
     def sensitivity(self, name: str) -> str | None:
-        """What the transducer of a column gives for what it measures, such as `100 mV/g`."""
+        """Sensitivity of the transducer of a column, such as `100 mV/g`."""
         return self.columns.get(name, {}).get("sensitivity")
 
     def unit(self, name: str) -> str | None:
-        """Unit declared for a column."""
+        """Unit of a column."""
         return self.columns.get(name, {}).get("unit")
 
     def sensor(self, name: str) -> int | None:
-        """Index of the sensor of the case that a column is."""
+        """Index, in the case, of the sensor of a column."""
         return self.columns.get(name, {}).get("sensor")
 
     def actuator(self, name: str) -> int | None:
-        """Index of the actuator of the case whose command a column is."""
+        """Index, in the case, of the actuator whose command a column is."""
         return self.columns.get(name, {}).get("actuator")
 
     def position(self, name: str) -> float | None:
-        """Distance of a column's sensor from the left end in m."""
+        """Position (m) of the sensor of a column."""
         position = self.columns.get(name, {}).get("position")
         return None if position is None else float(position)
 
 
 def read_description(log: Path) -> LogDescription:
-    """Read the TOML file beside a log, if there is one.
+    """Description in the TOML file beside a log, empty if there is none.
 
-    Raises ValueError, naming file and key, for TOML that cannot be read, unknown keys (with the
-    nearest known one) and values of the wrong type.
+    Raises ValueError, naming file and key, for invalid TOML, unknown keys (with the nearest known
+    one) and values of the wrong type.
     """
     path = log.with_suffix(".toml")
     if not path.is_file():
@@ -68,7 +71,7 @@ def read_description(log: Path) -> LogDescription:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path}: {error}") from None
-    if "beam" in data:  # a case file that happens to have the name of the log
+    if "beam" in data:  # a case file of the same stem
         return LogDescription()
     _check_keys(path, "", data, _KEYS)
     columns = {}
@@ -103,7 +106,7 @@ def _check_types(path, prefix, entry) -> None:
 
 
 def _loads(path, prefix, table) -> tuple[AbstractLoad, ...]:
-    """Build loads from their tables, as a case file has them."""
+    """Loads from their tables, as in a case file."""
     try:
         return tuple(
             read_part(f"{prefix}loads.{i}", entry, KINDS)

@@ -1,4 +1,4 @@
-"""Logged runs: measured samples in SI units, and what is known about how they were made."""
+"""Logs of measured runs: samples in SI units, with their sensors, commands and loads."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,21 +8,20 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.loads import AbstractLoad
 
-# Times may stray from an even grid by this share of a step: printed times are rounded.
-MAX_GRID_DEVIATION_STEPS = 0.25
+MAX_GRID_DEVIATION_STEPS = 0.25  # steps between times and an even grid, for rounded times
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
     """Samples of some channels over time, in SI units.
 
-    `times` (time,) in s, strictly increasing; `values` (time, channel) in the SI unit of each
-    channel's quantity; both are read-only. `quantities` are those of `jaxbeam.case.sensors.QUANTITIES`,
-    or force (N) or voltage (V); `units` are as read, for labels. `sensors` and `positions` (m)
-    say which sensor of a case each channel is and where, None where that is not known;
-    `actuators` say to which actuator of a case a channel is the command, None for readings;
-    `loads` are those that crossed while it was logged, None if that is not known. Fits leave out
-    samples that are not `valid` (time, channel), by default none; `notes` are sentences about it.
+    `times` in s increase strictly; `values` are in the SI unit of each channel's quantity; both are
+    read-only. `quantities` are those of sensors (`jaxbeam.case.quantities`), "force" (N) or
+    "voltage" (V); `units` are those of the file, for labels. `sensors` and `positions` (m) are the
+    index and position of the sensor of the case that a channel is, None if unknown; `actuators` the
+    index of the actuator whose command it is, None for readings; `loads` are those that crossed,
+    None if unknown. Samples that are not `valid` (time, channel) are left out of fits, by default
+    none. `notes` are sentences on how the log was read.
 
     Raises ValueError if lengths disagree, a value is not finite or times do not increase.
     """
@@ -66,9 +65,9 @@ class Log:
 
     @property
     def sample_rate(self) -> float:
-        """Samples per second in Hz, of a log sampled evenly.
+        """Sampling rate (Hz) of a log sampled evenly.
 
-        Raises ValueError, saying where, if times stray from an even grid by more than rounding.
+        Raises ValueError, with the time, if times are off an even grid by more than rounding.
         """
         even_grid = np.linspace(self.times[0], self.times[-1], self.times.size)
         step = even_grid[1] - even_grid[0]
@@ -76,8 +75,8 @@ class Log:
         if deviation.max() > MAX_GRID_DEVIATION_STEPS:
             raise ValueError(
                 f"{self.source}: the log is not sampled evenly (at t = "
-                f"{self.times[np.argmax(deviation)]:.6g} s it is {deviation.max():.2g} steps off an even "
-                f"grid of {step:.4g} s); resample it to equal steps first"
+                f"{self.times[np.argmax(deviation)]:.6g} s it is {deviation.max():.2g} steps off "
+                f"an even grid of {step:.4g} s); resample it to equal steps first"
             )
         return float(1 / step)
 

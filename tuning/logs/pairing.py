@@ -1,28 +1,28 @@
-"""A log and a case brought together: sensors, commands and loads, checked against each other."""
+"""A log matched with a case: sensors, commands and loads, checked against each other."""
 
 import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.case.case import Case, replace
+from jaxbeam.case.case import Case, crossing_times, replace
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import AbstractLoad, trajectory
+from jaxbeam.case.loads import AbstractLoad
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.trajectory import NEVER
 from jaxbeam.control import Prescribed
 from tuning.logs.log import Log
 
-MAX_START_DURATIONS = (
-    10.0  # start of a log, in its own durations, that is still simulated from 0 on
-)
+MAX_START_DURATIONS = 10.0  # first time of a log, in its durations, that is simulated from 0 on
 COMMAND_UNITS = {"voltage": "V", "force": "N"}
 
 
 def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case:
-    """The case as it was during a log: with the loads and commands of then, until its end.
+    """The case with the loads and commands of a log, until its end.
 
-    Commands are joined by straight lines from sample to sample; `times` (s) are those of the log
-    and any that fill it up, for which the last commands stay. Raises
-    ValueError, naming the log, for a command that no actuator of the case takes.
+    Commands are linear from sample to sample; `times` (s) are those of the log and of its padding,
+    in which the last commands stay. Raises ValueError, naming the log, for a command that no
+    actuator of the case accepts.
     """
     if log.loads is not None:
         case = dataclasses.replace(case, loads=tuple(log.loads))
@@ -39,9 +39,9 @@ def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case
 
 
 def pad_cases(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> list[Case]:
-    """The cases, each with what others have besides: commands of zero, loads that come too late.
+    """The cases, all with one structure: zero commands, and loads that enter after the end, added.
 
-    So a crossing without commands and a beam at rest that is shaken are runs of one structure.
+    Thus a crossing without commands and a shaken beam without loads are alike.
     """
     commanded = any(isinstance(case.controller, Prescribed) for case in cases)
     longest = max((case.loads for case in cases), key=len)
@@ -59,7 +59,7 @@ def pad_cases(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> lis
 
 
 def _entering_at(load: AbstractLoad, time: float) -> AbstractLoad:
-    """The load, entering at a time (s)."""
+    """The load with another entry time (s)."""
     if load.times is None:
         return dataclasses.replace(load, entry_time=time)
     return dataclasses.replace(load, times=load.times - load.times[0] + time)
@@ -98,9 +98,9 @@ def _check_command(case: Case, log: Log, channel: int, actuator: int) -> None:
 def sensor_readings(
     case: Case, log: Log
 ) -> tuple[Float[np.ndarray, "time sensor"], Bool[np.ndarray, "time sensor"]]:
-    """The readings of a log in the order of the case's sensors (time, sensor), and which count.
+    """Readings of a log in the order of the case's sensors (time, sensor), and which are valid.
 
-    A log that does not name its sensors has them all, in their order. Raises ValueError, naming
+    A log that does not name its sensors has all of them, in their order. Raises ValueError, naming
     the log, if its channels do not match the sensors.
     """
     sensors = case.sensors
@@ -120,20 +120,21 @@ def sensor_readings(
     values = np.zeros((log.times.size, len(sensors)))
     valid = np.zeros(values.shape, bool)
     for number, channel in order.items():
-        quantity = sensors[number].quantity
-        if log.quantities[channel] != quantity:
+        quantity = QUANTITIES.get(log.quantities[channel])
+        if quantity is None or quantity.unit != sensors[number].unit:
             raise ValueError(
                 f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in "
-                f"{log.units[channel]}, but sensors.{number} measures {quantity}"
+                f"{log.units[channel]}, but sensors.{number} measures {sensors[number].quantity}"
             )
         values[:, number], valid[:, number] = log.values[:, channel], log.valid[:, channel]
     return values, valid
 
 
 def check_times(log: Log) -> None:
-    """Check that a run can have the times of a log. Raises ValueError, naming the log, if not.
+    """Check the times of a log, for runs start at t = 0 from rest.
 
-    Runs start at t = 0 from rest, and simulate all that lies before the first sample.
+    Raises ValueError, naming the log, for too few samples, times below 0 and a start much later
+    than the log is long.
     """
     first, last = float(log.times[0]), float(log.times[-1])
     if log.times.size < 3:
@@ -151,25 +152,22 @@ def check_times(log: Log) -> None:
 
 
 def check_loads(log: Log, case: Case) -> None:
-    """Check that a load is known, and has crossed when the log ends. Raises ValueError if not."""
+    """Raise ValueError unless a load is known and has crossed before the log ends."""
     if case.controller is not None and not case.loads:
         return
     if not case.loads:
         raise ValueError(
             f"{log.source}: no load is known, neither in the case nor in the TOML file beside the "
-            "log; without loads, only modes can be identified (leave out --free)"
+            "log; without loads, only modes can be identified (`identify_modes`)"
         )
-    exits = [float(trajectory(load, case.beam.length).entry_exit_times()[1]) for load in case.loads]
-    entries = [
-        float(trajectory(load, case.beam.length).entry_exit_times()[0]) for load in case.loads
-    ]
+    entries, exits = crossing_times(case).T
     end = float(log.times[-1])
     if end < min(entries):
         raise ValueError(
             f"{log.source}: it ends at {end:.4g} s, before the first load enters at "
             f"{min(entries):.4g} s"
         )
-    crossing = [leave for leave in exits if np.isfinite(leave) and leave < 1e200]
+    crossing = [leave for leave in exits if leave < NEVER]
     if crossing and end < min(crossing):
         raise ValueError(
             f"{log.source}: it ends at {end:.4g} s, before the first load has crossed at "

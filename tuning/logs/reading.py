@@ -1,21 +1,21 @@
-"""Reading logs from files, with what is known about how they were made.
+"""Logs read from files, with the descriptions beside them.
 
     log = read_log("run7.csv")                        # units in the headings: time [s], d1 [mm]
     log = read_log("run7.csv", units={"time": "s", "d1": "mm"}, columns=["d1"])
 
-Beside a log there may be a TOML file of the same stem, which says what the log does not:
+A TOML file of the same stem beside a log describes it (all entries are optional):
 
-    time = "t"                                        # the column of times
+    time = "t"                                        # column of times
     [columns]                                         # only these are read
     t = "ms"
-    d1 = { unit = "mm", sensor = 0, position = 0.3 }  # which sensor of the case it is, and where
-    a1 = { unit = "V", sensitivity = "100 mV/g" }     # volts of a transducer
-    u = { unit = "V", actuator = 0 }                  # the command to an actuator of the case
+    d1 = { unit = "mm", sensor = 0, position = 0.3 }  # index of the sensor in the case
+    a1 = { unit = "V", sensitivity = "100 mV/g" }     # output of a transducer
+    u = { unit = "V", actuator = 0 }                  # command to an actuator of the case
     [[loads]]                                         # as in a case file
     kind = "mass"
     mass = 0.5
     speed = 0.55
-    [[runs.fast.loads]]                               # those of one run, where a file has several
+    [[runs.fast.loads]]                               # loads of one run of several
     kind = "mass"
     mass = 0.5
     speed = 2.0
@@ -49,12 +49,12 @@ def read_log(
 ) -> Log:
     """Read a log: separated values, LabVIEW (.lvm, .tdms), MATLAB, HDF5, netCDF or Parquet.
 
-    `columns` names the channels to keep, in this order; `units` gives the unit of columns by name
-    (or one for all channels) and wins over the file; `time` names the column of times, by default
-    the one called time or t, or the first with a unit of time. What is not given here is taken
-    from the TOML file beside the log, then from the log itself. Sampling is that of the times.
-    `run` names the run in a file of several. Samples that are `missing` (empty cells, NaN) are
-    refused unless it is "mask": then fits leave them out, and straight lines stand in for them.
+    `columns` are the channels to keep, in this order; `units` the unit of columns by name (or one
+    for all channels), which prevails over the file; `time` the column of times, by default the one
+    called time or t, or the first with a unit of time. What is not given here is taken from the
+    TOML file beside the log, then from the log itself. `run` is the name of the run in a file of
+    several. Samples that are `missing` (empty cells, NaN) are refused or, with "mask", interpolated
+    and left out of fits.
 
     Raises ValueError, naming file and line, for an empty or damaged log, unknown columns or units,
     columns without a unit, cells that are not finite numbers, times that do not increase, and
@@ -76,7 +76,7 @@ def read_logs(
     run: str | None = None,
     missing: str = "refuse",
 ) -> list[Log]:
-    """Read all runs in a file, one log for each; the rest is as for `read_log`.
+    """Read all runs in a file, one log for each, with the options of `read_log`.
 
     Raises ValueError as `read_log` does, and for a `run` that is not in the file.
     """
@@ -90,8 +90,8 @@ def read_logs(
     }
     if run is not None and run not in tables:
         raise ValueError(f"{path}: it has no run {run!r}; it has {', '.join(map(repr, tables))}")
-    sidecar = read_description(path)
-    if unknown := [name for name in sidecar.runs if name not in tables]:
+    description = read_description(path)
+    if unknown := [name for name in description.runs if name not in tables]:
         raise ValueError(
             f"{path.with_suffix('.toml')}: runs.{unknown[0]} is no run of {path.name}; it has "
             f"{', '.join(map(repr, tables))}"
@@ -99,14 +99,14 @@ def read_logs(
     chosen = tables if run is None else {run: tables[run]}
     return [
         _make_log(
-            path, name if len(tables) > 1 else "", table, sidecar, columns, units, time, missing
+            path, name if len(tables) > 1 else "", table, description, columns, units, time, missing
         )
         for name, table in chosen.items()
     ]
 
 
 def _split_runs(name: str, table: LogTable) -> dict[str, LogTable]:
-    """The runs of a table: rows that differ in its column called run, if it has one."""
+    """Tables of the runs of a table, by the values of its column `run`, if it has one."""
     if "run" not in table.names:
         return {name: table}
     keys = table.values[:, table.names.index("run")]
@@ -121,20 +121,22 @@ def _split_runs(name: str, table: LogTable) -> dict[str, LogTable]:
 
 
 def _make_log(
-    path, run, table: LogTable, sidecar: LogDescription, columns, units, time, missing
+    path, run, table: LogTable, description: LogDescription, columns, units, time, missing
 ) -> Log:
-    """Make a log of one run, in SI units."""
+    """Log of one run, in SI units."""
     names = _check_names(path, table.names)
-    time_column = _time_column(path, table, time or sidecar.time)
-    channels = list(columns or sidecar.columns or [name for name in names if name != time_column])
+    time_column = _time_column(path, table, time or description.time)
+    channels = list(
+        columns or description.columns or [name for name in names if name != time_column]
+    )
     channels = [name for name in channels if name not in (time_column, "run")]
-    for name in (*channels, *sidecar.columns, *(units if isinstance(units, Mapping) else ())):
+    for name in (*channels, *description.columns, *(units if isinstance(units, Mapping) else ())):
         _check_column(path, name, names)
     if not channels:
         raise ValueError(f"{path}: there is no column besides the time, {time_column!r}")
     declared = units if isinstance(units, Mapping) else dict.fromkeys(channels, units)
     column_units = [
-        _unit_of(path, table, name, declared, sidecar) for name in (time_column, *channels)
+        _unit_of(path, table, name, declared, description) for name in (time_column, *channels)
     ]
     if column_units[0][1].quantity != "time":
         raise ValueError(
@@ -159,17 +161,17 @@ def _make_log(
         quantities=tuple(unit.quantity for _, unit in column_units[1:]),
         units=tuple(text for text, _ in column_units[1:]),
         source=source,
-        sensors=tuple(sidecar.sensor(name) for name in channels),
-        positions=tuple(sidecar.position(name) for name in channels),
-        actuators=tuple(sidecar.actuator(name) for name in channels),
-        loads=sidecar.loads_of(run),
+        sensors=tuple(description.sensor(name) for name in channels),
+        positions=tuple(description.position(name) for name in channels),
+        actuators=tuple(description.actuator(name) for name in channels),
+        loads=description.loads_of(run),
         valid=valid[:, 1:],
         notes=tuple(notes),
     )
 
 
 def _check_names(path, names):
-    """Return the column names, checked to be all there and all different."""
+    """Column names, checked to be complete and different."""
     for i, name in enumerate(names):
         if not name:
             raise ValueError(f"{path}: column {i + 1} has no name")
@@ -187,7 +189,7 @@ def _check_column(path, name, names) -> None:
 
 
 def _time_column(path, table: LogTable, requested: str | None) -> str:
-    """Return the name of the column of times."""
+    """Name of the column of times."""
     if requested is not None:
         _check_column(path, requested, table.names)
         return requested
@@ -206,11 +208,15 @@ def _time_column(path, table: LogTable, requested: str | None) -> str:
 
 
 def _unit_of(
-    path, table: LogTable, name: str, declared: Mapping[str, str | None], sidecar: LogDescription
+    path,
+    table: LogTable,
+    name: str,
+    declared: Mapping[str, str | None],
+    description: LogDescription,
 ):
-    """Return the unit of a column, as text and as what it means."""
+    """Unit of a column, as text and as `Unit`."""
     in_file = table.units[table.names.index(name)]
-    text = declared.get(name) or sidecar.unit(name) or in_file
+    text = declared.get(name) or description.unit(name) or in_file
     if not text:
         raise ValueError(
             f"{path}, column {name!r}: no unit found; write it in the heading, {name} [mm], "
@@ -218,7 +224,7 @@ def _unit_of(
             f"in {path.with_suffix('.toml').name}"
         )
     try:
-        logged, sensitivity = unit(text), sidecar.sensitivity(name)
+        logged, sensitivity = unit(text), description.sensitivity(name)
         return text, transducer_unit(sensitivity, logged) if sensitivity else logged
     except ValueError as error:
         raise ValueError(f"{path}, column {name!r}: {error}") from None

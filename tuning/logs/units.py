@@ -1,12 +1,14 @@
-"""Units of logged columns, and what one of each is in SI.
+"""Units of logged columns, with their factors to SI.
 
-Units live at the edge: a log is converted once, on reading, and is SI from then on.
+A log is converted once, on reading, and is in SI units from then on.
 """
 
 import difflib
 import math
 import re
 from typing import NamedTuple
+
+from jaxbeam.case.quantities import QUANTITIES
 
 
 class Unit(NamedTuple):
@@ -19,7 +21,7 @@ class Unit(NamedTuple):
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, exact by definition
 
-# The same word never means two things here: mg is a thousandth of g, not a milligram.
+# Each word has one meaning: mg is a thousandth of g, not a milligram.
 UNITS = {
     "s": Unit("s", 1.0, "time"),
     "ms": Unit("s", 1e-3, "time"),
@@ -49,8 +51,10 @@ UNITS = {
     "V": Unit("V", 1.0, "voltage"),
     "mV": Unit("V", 1e-3, "voltage"),
 }
+for _name, _quantity in QUANTITIES.items():
+    UNITS.setdefault(_quantity.unit, Unit(_quantity.unit, 1.0, _name))
 
-# Other spellings of the same units; what is not here is looked up as written.
+# Other spellings of units in the table.
 _SPELLINGS = {
     "sec": "s",
     "seconds": "s",
@@ -65,10 +69,15 @@ _SPELLINGS = {
 }
 
 
-def unit(text: str) -> Unit:
-    """Return the unit a log names, e.g. `mm`, `µm`, `m/s²` or `g`.
+def time_derivative(quantity: str) -> int:
+    """Order of a quantity as a time derivative: 1 for velocity, 2 for acceleration, else 0."""
+    return QUANTITIES[quantity].time_derivative if quantity in QUANTITIES else 0
 
-    Raises ValueError, with the nearest known units, for one that is not in the table.
+
+def unit(text: str) -> Unit:
+    """Unit by the name in a log, such as `mm`, `µm`, `m/s²` or `g`.
+
+    Raises ValueError, with the nearest known units, for an unknown one.
     """
     name = text.strip().replace("µ", "u").replace("μ", "u")
     for square in ("²", "**2", "s2"):
@@ -87,11 +96,11 @@ _SENSITIVITY = re.compile(
 
 
 def transducer_unit(text: str, output_unit: Unit) -> Unit:
-    """The unit of what a transducer measures, given its sensitivity, such as `100 mV/g`.
+    """Unit of the quantity that a transducer measures, from its sensitivity, such as `100 mV/g`.
 
-    `output_unit` is the unit of the column, that of the transducer's output (volts, say).
+    `output_unit` is that of its output, the unit of the column (volts, say).
 
-    Raises ValueError if the text is no sensitivity, is zero, or is in another kind of unit.
+    Raises ValueError for a text that is no sensitivity, for zero, and for another output quantity.
     """
     found = _SENSITIVITY.fullmatch(text)
     if found is None or float(found["size"]) == 0.0:
@@ -99,7 +108,8 @@ def transducer_unit(text: str, output_unit: Unit) -> Unit:
     out, measured = unit(found["out"]), unit(found["of"].strip().strip("()"))
     if out.quantity != output_unit.quantity:
         raise ValueError(
-            f"the sensitivity {text!r} is for {out.quantity}, but the column is {output_unit.quantity}"
+            f"the sensitivity {text!r} is for {out.quantity}, but the column is "
+            f"{output_unit.quantity}"
         )
     per_unit = float(found["size"]) * out.factor / measured.factor
     return Unit(measured.si, output_unit.factor / per_unit, measured.quantity)

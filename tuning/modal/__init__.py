@@ -1,1 +1,1 @@
-"""Modal."""
+"""Modes (natural frequencies, damping ratios) identified from logs of unknown excitation."""

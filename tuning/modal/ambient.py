@@ -5,34 +5,36 @@ Under excitation whose spectrum is flat across a resonance, the power spectrum o
     M_c(f) = b_c + d_c (f_0 / f)^2 + sum_k a_kc r^q / ((1 - r^2)^2 + (2 z_k r)^2),   r = f / f_k,
 
 with q = 0, 2, 4 for deflection, velocity, acceleration; b is the noise and d the drift. The power
-in the bins of a long record is independent and exponentially distributed about it, which
-gives the likelihood (Whittle 1953). Channels are added as if independent; as they are not, the
-covariance is that of fully coherent channels, which near a resonance they are.
+in the bins of a long record is independent and exponentially distributed about it, which gives the
+likelihood (Whittle 1953). Channels are added as if independent; the covariance is that of fully
+coherent channels, as they are near a resonance.
 """
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import norm
 
+from tuning.logs.units import time_derivative
 from tuning.modal.decay_fit import MIN_BINS, inverse_transform
-from tuning.modal.decay_poles import MAX_MODES, Spectrum, band_spectrum
+from tuning.modal.decay_poles import (
+    FALSE_ALARM_PROBABILITY,
+    MAX_MODES,
+    Spectrum,
+    band_spectrum,
+)
 from tuning.modal.result import IdentifiedMode, ModeCandidates, rejection_reason
 
-_QUANTITY_EXPONENT = {"deflection": 0, "velocity": 2, "acceleration": 4}
-FALSE_ALARM_PROBABILITY = 1e-4
 MIN_DAMPING_RATIO, INITIAL_DAMPING_RATIOS = 1e-5, (0.003, 0.01, 0.03)
-# A resonance must stand on enough bins for its width to be seen.
-SMOOTHING_WIDTHS_BINS = (0, 1, 4, 12)
+SMOOTHING_WIDTHS_BINS = (0, 1, 4, 12)  # half widths of the moving averages that show resonances
 
 
 def fit_ambient(values, rate: float, start: int, stop: int, band, quantities) -> ModeCandidates:
-    """Identify modes from the samples `start` to `stop` of a log (values: time, channel)."""
+    """Modes from the samples `start` to `stop` of a log (values: time, channel)."""
     spectrum = band_spectrum(values[start:stop], rate, band)
     modes, reasons = (), ()
     if spectrum.bins.size >= MIN_BINS:
-        modes = _find_modes(
-            spectrum, np.array([_QUANTITY_EXPONENT.get(name, 0) for name in quantities])
-        )
+        exponents = np.array([2 * time_derivative(name) for name in quantities])
+        modes = _find_modes(spectrum, exponents)
         reasons = tuple(rejection_reason(mode, spectrum.duration, band) for mode in modes)
     return ModeCandidates(
         modes=modes,
@@ -46,7 +48,7 @@ def fit_ambient(values, rate: float, start: int, stop: int, band, quantities) ->
 
 
 def _find_modes(spectrum: Spectrum, exponents) -> tuple[IdentifiedMode, ...]:
-    """Add resonances one at a time while the likelihood gains more than chance would give."""
+    """Resonances, added one at a time as long as the likelihood gains more than by chance."""
     power = np.abs(spectrum.values) ** 2
     reference_power = np.median(power, axis=0) + 1e-30 * power.max()
     power, bins, channels = power / reference_power, spectrum.bins, power.shape[1]
@@ -67,7 +69,7 @@ def _find_modes(spectrum: Spectrum, exponents) -> tuple[IdentifiedMode, ...]:
 
 
 def _initial_guesses(ratio, bins):
-    """Parameters (log f, log z, log a_c) of resonances where the power exceeds the model most."""
+    """Parameters (log f, log z, log a_c) of resonances where power exceeds the model most."""
     guesses = set()
     for width in SMOOTHING_WIDTHS_BINS:
         window = np.ones(2 * width + 1) / np.sqrt(2 * width + 1)
@@ -80,7 +82,7 @@ def _initial_guesses(ratio, bins):
 
 
 def _model(parameters, bins, exponents):
-    """Power of each channel and bin, and its slopes by parameters (parameter, channel, bin).
+    """Power of each channel and bin, and its derivatives (parameter, channel, bin).
 
     Parameters are logarithms: b and d of all channels, then of each mode f_k, z_k and a_kc.
     """
@@ -96,12 +98,12 @@ def _model(parameters, bins, exponents):
         square = (bins / np.exp(parameters[offset])) ** 2
         damping = np.exp(parameters[offset + 1])
         denominator = (1 - square) ** 2 + 4 * damping**2 * square
-        shapes = {slope: square ** (slope // 2) / denominator for slope in set(exponents.tolist())}
+        shapes = {q: square ** (q // 2) / denominator for q in set(exponents.tolist())}
         by_square = (-2 * (1 - square) + 4 * damping**2) * square / denominator
         by_damping = -8 * damping**2 * square / denominator
-        for c, slope in enumerate(exponents.tolist()):
-            part = np.exp(parameters[offset + 2 + c]) * shapes[slope]
-            gradient[offset, c] = part * (2 * by_square - slope)
+        for c, q in enumerate(exponents.tolist()):
+            part = np.exp(parameters[offset + 2 + c]) * shapes[q]
+            gradient[offset, c] = part * (2 * by_square - q)
             gradient[offset + 1, c] = part * by_damping
             gradient[offset + 2 + c, c] = part
             model[c] += part
@@ -109,7 +111,7 @@ def _model(parameters, bins, exponents):
 
 
 def _negative_log_likelihood(parameters, bins, power, exponents):
-    """Minus the logarithm of the likelihood, and its gradient."""
+    """Negative logarithm of the likelihood, and its gradient."""
     model, gradient = _model(parameters, bins, exponents)
     ratio = power.T / model
     cost = np.sum(np.log(model) + ratio)
@@ -117,20 +119,20 @@ def _negative_log_likelihood(parameters, bins, power, exponents):
 
 
 def _maximise_likelihood(parameters, data):
-    """Best parameters from a start, frequencies in the band and damping in a wide range."""
-    bins, _, slopes = data
+    """Solution of scipy from a start, with frequencies in the band and bounded damping."""
+    bins, _, exponents = data
     mode_bounds = [(np.log(bins[0]), np.log(bins[-1])), (np.log(MIN_DAMPING_RATIO), 0.0)]
-    mode_bounds += [(-60.0, 60.0)] * slopes.size
-    count = (parameters.size - 2 * slopes.size) // len(mode_bounds)
-    bounds = [(-30.0, 60.0)] * (2 * slopes.size) + mode_bounds * count
+    mode_bounds += [(-60.0, 60.0)] * exponents.size
+    count = (parameters.size - 2 * exponents.size) // len(mode_bounds)
+    bounds = [(-30.0, 60.0)] * (2 * exponents.size) + mode_bounds * count
     return minimize(_negative_log_likelihood, parameters, data, "L-BFGS-B", jac=True, bounds=bounds)
 
 
 def _identified_modes(parameters, data, reference_power) -> tuple[IdentifiedMode, ...]:
     """Modes with standard deviations (sandwich covariance, coherent channels) and energies."""
-    bins, power, slopes = data
-    channels = slopes.size
-    model, gradient = _model(parameters, bins, slopes)
+    bins, power, exponents = data
+    channels = exponents.size
+    model, gradient = _model(parameters, bins, exponents)
     relative = gradient / model
     channel_rows, summed_rows = relative.reshape(parameters.size, -1), relative.sum(axis=1)
     inverse = np.linalg.pinv(channel_rows @ channel_rows.T, hermitian=True)

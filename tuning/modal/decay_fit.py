@@ -1,31 +1,36 @@
-"""Modes from a free decay: the window trimmed, the poles found, and what does not last left out."""
+"""Modes from a free decay: window, poles, and rejection of poles that are not reproduced."""
 
 import numpy as np
 from scipy.stats import t as student
 
-from tuning.modal.decay_poles import PoleFit, Spectrum, band_spectrum, find_poles, refine
+from tuning.modal.decay_poles import (
+    PoleFit,
+    Spectrum,
+    band_spectrum,
+    find_poles,
+    pole_parameters,
+    refine,
+)
 from tuning.modal.result import IdentifiedMode, ModeCandidates, rejection_reason
 from tuning.modal.window import band_pass
 
-MIN_BINS = 8
-TRIM_PARTS = 16  # of a window; the first is cut while the rest does not predict it
-LATE_START_SHARE = 0.3
-MAX_UNPREDICTED_ENERGY = 0.5  # share of the energy
-MAX_PREDICTING_MODES = 6  # modes that predict
-# A true mode is found again, within this many standard deviations, in parts of the window.
-MAX_POLE_SHIFT_SD = 4.0
-SHORTER_WINDOW_CUT = 0.2
-WEAK_ENERGY_SHARE = 0.2  # share of the strongest mode's energy
+MIN_BINS = 8  # bins of a spectrum to find poles in
+TRIM_PARTS = 16  # parts of a window, by which it is shortened or extended
+LATE_START_SHARE = 0.3  # of a window, after which its modes must predict its first part
+MAX_UNPREDICTED_ENERGY = 0.5  # share of the energy of a part that belongs to the decay
+MAX_PREDICTING_MODES = 6  # modes for predictions
+MAX_POLE_SHIFT_SD = 4.0  # standard deviations by which a pole may differ in a shorter window
+SHORTER_WINDOW_CUT = 0.2  # share of the window that is cut off for a shorter one
+WEAK_ENERGY_SHARE = 0.2  # of the strongest mode's energy; below it poles must be reproduced
 NOT_REPRODUCED = "not the same in parts of the window"
 
 
 def fit_decay(values, rate: float, start: int, stop: int, band) -> ModeCandidates | None:
-    """Identify modes from the free decay between two samples of a log (values: time, channel).
+    """Modes from the free decay between two samples of a log (values: time, channel).
 
-    A mode must be found again in the window without its first and without its last fifth; how
-    far it moves there, beyond what noise explains, adds to its uncertainty (a real structure's
-    frequency and damping depend a little on amplitude). None where the band has too few
-    frequencies.
+    A weak mode must be reproduced in the window without its first and without its last fifth. The
+    change of a pole there, beyond what noise explains, adds to its uncertainty (frequency and
+    damping of a real structure depend slightly on amplitude). None if the band has too few bins.
     """
     spectrum = band_spectrum(values[start:stop], rate, band)
     if spectrum.bins.size < MIN_BINS:
@@ -55,11 +60,10 @@ def fit_decay(values, rate: float, start: int, stop: int, band) -> ModeCandidate
 
 
 def trim_to_free_decay(values, rate: float, start: int, stop: int, band) -> tuple[int, int]:
-    """The samples around a decay, roughly known, in which its modes predict what is measured.
+    """Range of samples (start, stop) around a roughly known decay that is free of excitation.
 
-    The beginning is cut, in coarse steps and then in fine ones, while the modes of the later part
-    do not predict it backwards: there something still excites the structure. The end is moved on
-    while they predict what follows.
+    The beginning is cut, in coarse steps and then in fine ones, as long as the modes of the later
+    part do not predict it backwards. The end is moved on as long as they predict the next samples.
     """
     for part in (max((stop - start) // TRIM_PARTS, 1), max((stop - start) // (4 * TRIM_PARTS), 1)):
         while stop - start > TRIM_PARTS // 2 * part:
@@ -82,14 +86,14 @@ def trim_to_free_decay(values, rate: float, start: int, stop: int, band) -> tupl
 
 
 def _unpredicted_energy(values, rate, fitted_range, predicted_range, band) -> float:
-    """Share of the energy of the samples `predicted_range` that modes of the samples `fitted_range` do not make."""
+    """Share of the energy of predicted samples that modes of the fitted ones do not explain."""
     spectrum = band_spectrum(values[fitted_range[0] : fitted_range[1]], rate, band)
     if spectrum.bins.size < MIN_BINS:
         return 0.0
     found = find_poles(spectrum, max_modes=MAX_PREDICTING_MODES)
     times = (np.arange(*predicted_range) - fitted_range[0]) / rate
     predicted = (np.exp(np.multiply.outer(times, found.poles)) @ found.amplitudes).real
-    # Filtered with what follows, if anything does, for a filter is unsure at the ends.
+    # Filtered together with the samples that follow: a filter is inaccurate at the ends.
     first, last = (
         min(fitted_range[0], predicted_range[0]),
         max(fitted_range[1], 2 * predicted_range[1] - predicted_range[0]),
@@ -101,7 +105,7 @@ def _unpredicted_energy(values, rate, fitted_range, predicted_range, band) -> fl
 
 
 def inverse_transform(values, spectrum: Spectrum):
-    """Samples (sample, channel) of the bins of a spectrum."""
+    """Samples (sample, channel) from values at the bins of a spectrum; zero at all others."""
     whole = np.zeros((spectrum.samples // 2 + 1, values.shape[1]), complex)
     first = round(spectrum.bins[0] * spectrum.duration)
     whole[first : first + len(values)] = values
@@ -109,15 +113,15 @@ def inverse_transform(values, spectrum: Spectrum):
 
 
 def _not_reproduced(found: PoleFit, others, spectrum: Spectrum):
-    """Tell which poles are not the same in shorter windows; the strongest are in any case.
+    """Which weak poles differ in shorter windows (mode,).
 
-    A weak pole beside a strong one often makes up for what is not linear in the strong one: it
-    stays in the fit, where it does that, but is no mode.
+    A weak pole beside a strong one often stands for the nonlinearity of the strong one: it stays in
+    the fit, but is no mode.
     """
     moved = np.zeros(found.poles.size)
     for other in others:
         deviation = np.sqrt(np.diag(found.covariance) + np.diag(other.covariance))
-        change = np.abs(_pole_parameters(other.poles) - _pole_parameters(found.poles)) / deviation
+        change = np.abs(pole_parameters(other.poles) - pole_parameters(found.poles)) / deviation
         moved = np.maximum(moved, np.max(change.reshape(-1, 2), axis=1))
         moved[other.poles.real > 0] = np.inf
     share = _energy_shares(found, spectrum)
@@ -125,31 +129,26 @@ def _not_reproduced(found: PoleFit, others, spectrum: Spectrum):
 
 
 def _refit(found: PoleFit, spectrum: Spectrum, other: Spectrum) -> PoleFit:
-    """The same poles refined on another window, with the noise level of the first."""
+    """The poles refined on another window, with the noise level of the first."""
     levels = [np.interp(other.bins, spectrum.bins, level) for level in found.noise.T]
     return refine(found.poles, other, np.stack(levels, 1) * other.samples / spectrum.samples)
 
 
-def _pole_parameters(poles):
-    """(s, w) of each pole, in the order of its covariance."""
-    return np.stack([-poles.real, poles.imag], axis=1).ravel()
-
-
 def _nonstationary_variance(found: PoleFit, others):
-    """Variance of each of (s, w, ...) over the window, beyond what noise explains.
+    """Variance of (s, w) of each pole over the window, beyond what noise explains.
 
-    As if they were spread evenly over the range seen: a third of the square of half the range.
+    For a uniform distribution over the range seen: a third of the square of half the range.
     """
     extra = np.zeros(2 * found.poles.size)
     for other in others:
         expected = np.maximum(np.diag(other.covariance) - np.diag(found.covariance), 0)
-        change = (_pole_parameters(other.poles) - _pole_parameters(found.poles)) ** 2
+        change = (pole_parameters(other.poles) - pole_parameters(found.poles)) ** 2
         extra += np.where(change > 4 * expected, change - expected, 0) / 3 / len(others)
     return extra
 
 
 def _energy_shares(found: PoleFit, spectrum: Spectrum):
-    """Share of each mode in the energy of the samples, the channels' energies added."""
+    """Share of each mode in the energy of the samples, added over channels."""
     rates = 2 * -found.poles.real * spectrum.duration
     decay_factor = np.where(
         np.abs(rates) < 1e-6, 1.0, -np.expm1(-rates) / np.where(rates, rates, 1)
@@ -160,7 +159,7 @@ def _energy_shares(found: PoleFit, spectrum: Spectrum):
 
 
 def _identified_modes(found: PoleFit, scatter, spectrum: Spectrum) -> tuple[IdentifiedMode, ...]:
-    """Frequency and damping of each pole, |p| / 2 pi and s / |p|, with standard deviations."""
+    """Frequency |p| / 2 pi and damping ratio s / |p| of each pole, with standard deviations."""
     modes = []
     for k, (pole, share) in enumerate(
         zip(found.poles, _energy_shares(found, spectrum), strict=True)

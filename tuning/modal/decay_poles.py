@@ -4,13 +4,13 @@ The samples of a decay are damped sinusoids common to all channels, a slow drift
 
     y_c(t) = sum_k Re(a_kc exp(p_k t)) + drift_c(t) + noise_c(t),   p_k = -s_k + i w_k.
 
-The discrete Fourier transform over the N samples of the window is known in closed form, cut off at
-its end as it is: a geometric series, S(p, w) = (exp(p N h) - 1) / (exp((p - i w) h) - 1). Noise
-of any colour is nearly independent from bin to bin, so least squares weighted by its local level
-is maximum likelihood, and only the noise near a mode matters to it. The amplitudes are linear and
-are projected out (variable projection: Golub and Pereyra 1973, Kaufman 1975). Modes are
-added one at a time where the residual is largest, all refined together each time (RELAX: Li and
-Stoica 1996), and kept only while the likelihood gains more than chance would give.
+The discrete Fourier transform over the N samples of the window is known in closed form, with the
+truncation at its end: a geometric series, S(p, w) = (exp(p N h) - 1) / (exp((p - i w) h) - 1).
+Coloured noise, too, is nearly independent from bin to bin, so that least squares weighted by its
+local level is maximum likelihood. The amplitudes are linear and are projected out (variable
+projection: Golub and Pereyra 1973, Kaufman 1975). Modes are added one at a time where the residual
+is largest, all refined together each time (RELAX: Li and Stoica 1996), as long as the likelihood
+gains more than by chance.
 """
 
 import functools
@@ -20,23 +20,21 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import least_squares
 
-NOISE_SMOOTHING_BINS = 12  # bins on either side over which the level of the noise is averaged
+NOISE_SMOOTHING_BINS = 12  # bins on either side over which the noise level is averaged
 MAX_MODES = 24
-# A mode of C channels has 2 C + 2 numbers; chance must not find one in hundreds of logs, though
-# it may look for it at every bin.
-FALSE_ALARM_PROBABILITY = 1e-4
-# No real structure is linear to the last digit, so that beside a strong mode its own misfit looks
-# like weak ones: what is below this share of the amplitudes nearby is not taken for a mode.
+FALSE_ALARM_PROBABILITY = 1e-4  # of a mode found in noise, over all bins
+# No structure is exactly linear: the misfit of a strong mode looks like weak ones beside it. What
+# is below this share of the amplitudes nearby is not taken for a mode.
 NONLINEARITY_SHARE = 0.1
-NEARBY_BINS = 2  # bins
-COARSE_TOLERANCE = 1e-3  # accuracy while modes are counted
-MAX_POLE_SHIFT_BINS = 1.5  # bins that a pole may move in one refinement
-DRIFT_ORDER = 3
-LEAKAGE_ORDER = 2
+NEARBY_BINS = 2  # bins on either side that count as nearby
+COARSE_TOLERANCE = 1e-3  # of the refinement while modes are counted
+MAX_POLE_SHIFT_BINS = 1.5  # bins by which a pole may move in one refinement
+DRIFT_ORDER = 3  # of the polynomial for the drift over the window
+LEAKAGE_ORDER = 2  # of the polynomial for leakage from modes outside the band
 
 
 class Spectrum(NamedTuple):
-    """Transform of a window: bins (Hz), values, and the samples and step (s) they come from."""
+    """Fourier transform of a window: bins (Hz), values, number of samples and their step (s)."""
 
     bins: Float[np.ndarray, " bin"]
     values: Complex[np.ndarray, "bin channel"]
@@ -45,17 +43,17 @@ class Spectrum(NamedTuple):
 
     @property
     def duration(self) -> float:
-        """Length of the window in s; bins are 1 / duration apart."""
+        """Length of the window (s); bins are 1 / duration apart."""
         return self.samples * self.step
 
 
 class PoleFit(NamedTuple):
-    """Poles found in a spectrum, with what is left when they are fitted.
+    """Poles fitted to a spectrum, and the residual.
 
-    `poles` (mode,) in 1/s, upper half plane, ascending; `covariance` is that of all -real and
-    imaginary parts, (s_1, w_1, s_2, w_2, ...); `amplitudes` (mode, channel) at the start of the
-    window; `model` is the modes' part of the spectrum and `residual` what nothing explains;
-    `degrees_of_freedom` the degrees of freedom of the noise level, for intervals.
+    `poles` (1/s) are in the upper half plane, ascending; `covariance` is that of (s_1, w_1, s_2,
+    w_2, ...), minus their real parts and their imaginary parts; `amplitudes` are those at the start
+    of the window; `model` is the part of the spectrum due to modes; `degrees_of_freedom` are those
+    of the noise level, for intervals.
     """
 
     poles: Complex[np.ndarray, " mode"]
@@ -70,16 +68,16 @@ class PoleFit(NamedTuple):
 def band_spectrum(
     values: Float[np.ndarray, "time channel"], rate: float, band: tuple[float, float]
 ) -> Spectrum:
-    """Transform samples taken at `rate` (Hz); keep the bins of a band (Hz), zero excluded."""
+    """Spectrum of samples taken at `rate` (Hz), with the bins of a band (Hz) above zero."""
     count = len(values)
     bins = np.fft.rfftfreq(count, 1 / rate)
-    # The bin of the Nyquist frequency is real, unlike all others: leave it out.
+    # The bin of the Nyquist frequency is left out: it is real, unlike all others.
     keep = (bins >= band[0]) & (bins <= band[1]) & (bins > 0) & (bins < rate / 2)
     return Spectrum(bins[keep], np.fft.rfft(values, axis=0)[keep], count, 1 / rate)
 
 
 def find_poles(spectrum: Spectrum, max_modes: int = MAX_MODES) -> PoleFit:
-    """Find the poles, `max_modes` at most, that a free decay's spectrum shows beyond chance."""
+    """Poles, `max_modes` at most, of the modes that are significant in a free decay's spectrum."""
     channels = spectrum.values.shape[1]
     # Chi-square tail: half the drop in weighted squares is what the likelihood gains.
     trials = 4 * spectrum.bins.size
@@ -112,7 +110,7 @@ def find_poles(spectrum: Spectrum, max_modes: int = MAX_MODES) -> PoleFit:
 
 
 def _prune_poles(best: PoleFit, spectrum: Spectrum, misfit_level, min_gain: float) -> PoleFit:
-    """Take out again, weakest first, the poles that the others have made needless."""
+    """Remove poles, weakest first, that are not significant beside the others."""
     level = _robust_level(best.residual) + misfit_level
     best = refine(best.poles, spectrum, level)
     for pole in best.poles[np.argsort(np.sum(np.abs(best.amplitudes), axis=1))]:
@@ -138,7 +136,7 @@ def _smooth(power, width):
 
 
 def _robust_level(residual):
-    """Level of the noise at each bin, from medians so that a mode not yet found stands out."""
+    """Noise level at each bin, from medians, so that modes not yet found stand out."""
     power = np.abs(residual) ** 2
     width = min(2 * NOISE_SMOOTHING_BINS, len(power) // 2)
     padded = np.pad(power, ((width, width), (0, 0)), mode="reflect")
@@ -147,7 +145,7 @@ def _robust_level(residual):
 
 
 def _initial_pole(spectrum: Spectrum, residual, level) -> complex:
-    """The pole that alone explains most of a residual, of a few at and beside its highest peaks."""
+    """The pole that alone explains most of a residual, among candidates near its highest peaks."""
     ratio = np.sum(np.abs(residual) ** 2 / level, axis=1, keepdims=True)
     shares = [_smooth(ratio, width)[:, 0] / np.sqrt(2 * width + 1) for width in (0, 2, 8)]
     peaks = spectrum.bins[[int(np.argmax(share)) for share in shares]]
@@ -162,9 +160,9 @@ def _initial_pole(spectrum: Spectrum, residual, level) -> complex:
 
 
 def _pole_transform(poles, spectrum: Spectrum):
-    """The closed-form transform of exp(p t) at every bin, and its derivative by p."""
+    """Transform of exp(p t) at every bin in closed form, and its derivative by p (bin, pole)."""
     exponents = (poles - 2j * np.pi * spectrum.bins[:, None]) * spectrum.step
-    # exp(-i w N h) is 1 at every bin. A pole on a bin, undamped, would divide zero by zero.
+    # exp(-i w N h) is 1 at every bin. An undamped pole at a bin would divide zero by zero.
     exponents = np.where(np.abs(exponents) < 1e-12, 1e-12, exponents)
     numerator, denominator = np.expm1(spectrum.samples * exponents), np.expm1(exponents)
     slope = (
@@ -175,7 +173,7 @@ def _pole_transform(poles, spectrum: Spectrum):
 
 
 def _nuisance_columns(spectrum: Spectrum):
-    """What is no mode: a drift over the window, and leakage from modes outside the band."""
+    """Columns of a drift over the window, and of leakage from modes outside the band."""
     time = np.linspace(-1, 1, spectrum.samples)
     all_bins = np.fft.rfftfreq(spectrum.samples, spectrum.step)
     first = int(np.argmin(np.abs(all_bins - spectrum.bins[0])))
@@ -190,7 +188,7 @@ def _nuisance_columns(spectrum: Spectrum):
 
 
 def _modal_columns(poles, spectrum: Spectrum):
-    """Columns of the real and imaginary part of each amplitude, and their slopes by s and w."""
+    """Columns of real and imaginary part of each amplitude, and derivatives by s and w."""
     above, slope_above = _pole_transform(poles, spectrum)
     below, slope_below = _pole_transform(poles.conj(), spectrum)
     columns = np.stack([above + below, 1j * (above - below)], axis=-1) / 2
@@ -202,12 +200,12 @@ def _modal_columns(poles, spectrum: Spectrum):
 
 
 def _real_over_imag(columns):
-    """Real and imaginary parts under each other."""
+    """Real parts, then imaginary parts, along the first axis."""
     return np.concatenate([columns.real, columns.imag])
 
 
 def _project_amplitudes(poles, spectrum: Spectrum, weights, nuisance):
-    """Weighted residual with the best amplitudes, its Jacobian, amplitudes, and leverages."""
+    """Weighted residual with the best amplitudes, its Jacobian, amplitudes, model and leverages."""
     columns, slopes = _modal_columns(poles, spectrum)
     bins, count = columns.shape[0], poles.size
     design = np.concatenate([columns.reshape(bins, 2 * count), nuisance], axis=1)
@@ -228,13 +226,13 @@ def _project_amplitudes(poles, spectrum: Spectrum, weights, nuisance):
     return np.array(residuals), np.array(jacobians), np.array(solutions), model, leverages
 
 
-def _pole_parameters(poles, duration):
-    """(s, w) of each pole times the duration: numbers of order one change a spectrum."""
-    return np.stack([-poles.real, poles.imag], axis=1).ravel() * duration
+def pole_parameters(poles: Complex[np.ndarray, " mode"]) -> Float[np.ndarray, " parameter"]:
+    """Decay rate s and angular frequency w (1/s) of each pole: (s_1, w_1, s_2, w_2, ...)."""
+    return np.stack([-poles.real, poles.imag], axis=1).ravel()
 
 
-def _poles_from_parameters(parameters, duration):
-    rate, angular_frequency = parameters.reshape(-1, 2).T / duration
+def _poles_from_parameters(parameters):
+    rate, angular_frequency = parameters.reshape(-1, 2).T
     return -rate + 1j * angular_frequency
 
 
@@ -244,24 +242,25 @@ def refine(
     level: Float[np.ndarray, "bin channel"],
     accuracy: float = 1e-8,
 ) -> PoleFit:
-    """Refine all poles together by least squares weighted by a level of the noise.
+    """Poles refined together by least squares, weighted by the noise level.
 
-    It ends when a step gains less than the share `accuracy` of the squares left.
+    The search ends when a step reduces the squares by less than the share `accuracy`.
     """
     if poles.size:
         duration, nuisance, weights = spectrum.duration, _nuisance_columns(spectrum), level**-0.5
 
-        start = _pole_parameters(poles, duration)
+        # In units of 1 / duration changes of order one change a spectrum.
+        start = pole_parameters(poles) * duration
 
         @functools.lru_cache(maxsize=1)
         def projected(key):
             moved = start + np.frombuffer(key)
             return _project_amplitudes(
-                _poles_from_parameters(moved, duration), spectrum, weights, nuisance
+                _poles_from_parameters(moved / duration), spectrum, weights, nuisance
             )
 
-        # A pole stays near where it was seen: joint fits of many weak ones would wander. Moves,
-        # not parameters, are the unknowns, as the solver's trust region goes by their size.
+        # Poles stay near their starts: joint fits of many weak ones would drift away. Moves, not
+        # parameters, are the unknowns, as the solver's trust region scales with their size.
         max_shift = np.tile([np.inf, 2 * np.pi * MAX_POLE_SHIFT_BINS], poles.size)
         lower_bounds = np.tile([-1.0, 0.0], poles.size) - start
         solved = least_squares(
@@ -273,7 +272,7 @@ def refine(
             xtol=1e-8,
             max_nfev=40,
         )
-        poles = _poles_from_parameters(start + solved.x, duration)
+        poles = _poles_from_parameters((start + solved.x) / duration)
         poles = np.where(poles.imag < 0, poles.conj(), poles)
         poles = poles[np.argsort(poles.imag)]
     return _fit_amplitudes(poles, spectrum, level)
@@ -293,9 +292,9 @@ def _fit_amplitudes(poles, spectrum: Spectrum, level) -> PoleFit:
     leverage = leverage + np.einsum("cjp,pq,cjq->jc", slopes.conj(), inverse, slopes).real
     residual_share = np.maximum(2 - leverage, 0.02) / 2
     count = _smooth(residual_share, NOISE_SMOOTHING_BINS)
-    # Not the weighted residual is averaged: that would keep the shape of the level assumed.
-    # Channels share disturbances, so their noise is correlated: score covariance from the local
-    # cross-spectra of the residual, then the sandwich.
+    # The residual is averaged without weights, which would keep the shape of the assumed level.
+    # Channels share disturbances, so their noise is correlated: the score covariance comes from
+    # local cross-spectra of the residual, the covariance from the sandwich formula.
     residual = weighted * np.sqrt(level)
     cross = _smooth(np.einsum("jc,jd->jcd", residual, residual.conj()), NOISE_SMOOTHING_BINS)
     cross = cross / np.sqrt(count[:, :, None] * count[:, None, :])

@@ -4,9 +4,9 @@
     print(fit)
     fit.plot("modes.png")
 
-A free decay is looked for first, say after a load has left the beam, and fitted (`tuning.modal.decay_poles`);
-a log without one is taken as the response to ambient excitation (`tuning.modal.ambient`). Only modes
-that the log determines well are given; the others are listed with the reason they were left out.
+A log with a free decay, say after a load has left the beam, is fitted by poles (`decay_poles`);
+a log without one is treated as the response to ambient excitation (`ambient`). Modes that the log
+determines well are the result; others are listed with the reason for rejecting them.
 """
 
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ from tuning.modal.result import IdentifiedMode, ModeCandidates
 from tuning.modal.window import DECAY_ENERGY_SHARE, energy_band, find_decay
 
 MIN_SAMPLES = 64
-# What the log is taken for: in steady random vibration, too, a few cycles look like a decay.
+# Cycles of a free decay: in steady random vibration, too, a few cycles look like a decay.
 MIN_DECAY_CYCLES = 10.0
-MAX_RESIDUAL_ENERGY = 0.25  # of the energy
+MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 KINDS = ("free decay", "ambient")
 
 
@@ -32,10 +32,10 @@ class ModalFit:
     """Modes identified from a log, ascending in frequency.
 
     `modes` are those well identified, `rejected` the others with the reason. `kind` is "free
-    decay" or "ambient"; `window` (s) and `band` (Hz) are what was looked at. `quantile` times a
-    standard deviation is half a 95 % interval (Student's t, for the noise level is estimated too).
-    `times`, `measured` and `fitted` (time, channel) are the band's part of the log in the window
-    and, for a free decay, what the modes make of it.
+    decay" or "ambient"; `window` (s) and `band` (Hz) are those of the fit. `quantile` times a
+    standard deviation is half a 95 % interval (Student's t, as the noise level is estimated, too).
+    `times` and `measured` are the log in the window and the band, `fitted` is the response of the
+    modes to it for a free decay, else None.
     """
 
     modes: tuple[IdentifiedMode, ...]
@@ -95,7 +95,7 @@ class ModalFit:
         return "\n".join(lines)
 
     def to_dict(self) -> dict:
-        """Plain numbers for JSON: modes with 95 % intervals, window, band, what was left out."""
+        """Plain numbers for JSON: modes with 95 % intervals, window, band and rejected modes."""
         intervals = zip(self.modes, self.frequency_intervals, self.damping_intervals, strict=True)
         return {
             "kind": self.kind,
@@ -122,10 +122,10 @@ class ModalFit:
         }
 
     def plot(self, path=None):
-        """Draw log, spectrum and fit; save to `path` if given. Returns the figure."""
-        from tuning.modal.plot import plot_modes
+        """Figure of log, spectrum and fit; saved to `path` if given."""
+        from tuning.modal.plot import plot_modal_fit
 
-        return plot_modes(self, path)
+        return plot_modal_fit(self, path)
 
 
 def identify_modes(
@@ -136,14 +136,14 @@ def identify_modes(
     count: int | None = None,
     kind: str | None = None,
 ) -> ModalFit:
-    """Identify modes from a log of unknown excitation.
+    """Modes from a log of unknown excitation.
 
-    `window` (s) is the part of the log to use, found where left out; `band` (Hz) the range of
-    frequencies, by default the one with the kinetic energy; `count` keeps so many modes, those
-    with most energy; `kind` is "free decay" or "ambient", by default whichever the log shows.
+    `window` (s) is the part of the log to use, by default that of the free decay; `band` (Hz) the
+    range of frequencies, by default that of the kinetic energy; `count` modes are kept, those with
+    most energy; `kind` is "free decay" or "ambient", by default decided from the log.
 
     Raises ValueError for a log that is not sampled evenly or is too short, a window outside the
-    log, a band above half the sampling rate, a count below one and an unknown kind.
+    log, a band above half the sampling rate, a count below 1 and an unknown kind.
     """
     rate = log.sample_rate
     start, stop = _sample_range(log, window)
@@ -190,7 +190,7 @@ def identify_modes(
 def _fit_free_decay(
     log, rate, start, stop, window, band
 ) -> tuple[ModeCandidates | None, tuple[float, float]]:
-    """Fit the free decay in the given window, or in the one found; and the band used."""
+    """Fit of the free decay in the given window or the one found, and its band (Hz)."""
     limits = band or (0.0, rate / 2)
     if window is None:
         found = find_decay(log.values, rate, band, log.quantities)
@@ -204,7 +204,7 @@ def _fit_free_decay(
 
 
 def _is_free_decay(found: ModeCandidates, rate: float, least_cycles: float) -> bool:
-    """Tell whether modes make most of what was measured, over many cycles, as in a free decay."""
+    """Whether modes explain most of the energy, over many cycles, as in a free decay."""
     duration = (found.stop - found.start) / rate
     residual_energy = np.sum((found.measured - found.fitted) ** 2) / np.sum(found.measured**2)
     good = [mode for mode, why in zip(found.modes, found.rejection_reasons, strict=True) if not why]
@@ -213,7 +213,7 @@ def _is_free_decay(found: ModeCandidates, rate: float, least_cycles: float) -> b
 
 
 def _sample_range(log: Log, window) -> tuple[int, int]:
-    """First and last (exclusive) sample of a window in s."""
+    """First and last (exclusive) sample of a window (s)."""
     if window is None:
         return 0, log.times.size
     if not (log.times[0] <= window[0] < window[1] <= log.times[-1] + 1 / log.sample_rate):

@@ -1,34 +1,34 @@
-"""Picture of identified modes: the log and its window, the spectrum, the fit and what is left."""
+"""Figure of identified modes: the log and its window, the spectrum, the fit and its residual."""
 
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
-from jaxbeam.case.sensors import QUANTITIES
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.plot.style import COLOURS, GREY, INK, use_style
 
-INK, MODE, FIT, FAINT = "#333333", "#c0392b", "#1f6f8b", "#9aa5ab"
-MAX_POINTS = 4000  # a longer log is drawn as the range of each of so many pieces
+FIT, MODE = COLOURS[:2]
+MAX_POINTS = 4000  # of the log; a longer one is drawn as the range of each of so many pieces
 
 
-def plot_modes(fit, path: str | Path | None = None):
-    """Draw a `ModalFit`; save it if a path is given. Returns the matplotlib figure."""
+@use_style
+def plot_modal_fit(fit, path: str | Path | None = None) -> Figure:
+    """Figure of a `ModalFit`, for the channel with most energy; saved if a path is given."""
     decays = fit.fitted is not None
-    figure, rows = plt.subplots(
-        4 if decays else 2, 1, figsize=(9, 9.5 if decays else 6), layout="constrained",
-        height_ratios=(1, 1.6, 1.3, 0.6) if decays else (1, 1.6),
-    )  # fmt: skip
+    figure = Figure(figsize=(9, 9.5 if decays else 6))
+    heights = (1, 1.6, 1.3, 0.6) if decays else (1, 1.6)
+    rows = figure.subplots(len(heights), 1, height_ratios=heights)
     strongest = int(np.argmax(np.sum(fit.measured**2, axis=0)))
-    unit = QUANTITIES.get(fit.log.quantities[strongest], fit.log.units[strongest])
+    quantity = QUANTITIES.get(fit.log.quantities[strongest])
+    unit = fit.log.units[strongest] if quantity is None else quantity.unit
     _draw_log(rows[0], fit, strongest, unit)
     _draw_spectrum(rows[1], fit, strongest, unit)
     if decays:
         _draw_fit(rows[2], rows[3], fit, strongest, unit)
-    for row in rows:
-        row.spines[["top", "right"]].set_visible(False)
-    figure.suptitle(f"{Path(fit.log.source).name}: modes from {_kind_text(fit)}", color=INK)
+    figure.suptitle(f"{Path(fit.log.source).name}: modes from {_kind_text(fit)}")
     if path is not None:
-        figure.savefig(path, dpi=150)
+        figure.savefig(path)
     return figure
 
 
@@ -37,13 +37,13 @@ def _kind_text(fit) -> str:
 
 
 def _draw_log(axes, fit, channel, unit):
-    """The whole log of one channel, the window marked."""
+    """The whole log of one channel, with the window."""
     times, values = fit.log.times, fit.log.values[:, channel]
     size = max(times.size // MAX_POINTS, 1)
     pieces = values[: times.size // size * size].reshape(-1, size)
     axes.fill_between(
         times[::size][: len(pieces)], pieces.min(axis=1), pieces.max(axis=1),
-        color=FAINT, linewidth=0.6, edgecolor=FAINT,
+        color=GREY, linewidth=0.6, edgecolor=GREY,
     )  # fmt: skip
     axes.axvspan(*fit.window, color=FIT, alpha=0.15, linewidth=0)
     axes.text(
@@ -55,7 +55,7 @@ def _draw_log(axes, fit, channel, unit):
 
 
 def _draw_spectrum(axes, fit, channel, unit):
-    """Amplitude of the window's spectrum, with the modes found."""
+    """Amplitude spectrum of the window, with the modes."""
     inside = slice(*np.searchsorted(fit.log.times, [fit.window[0], fit.window[1]]))
     values = fit.log.values[inside, channel]
     window = np.hanning(values.size)
@@ -65,7 +65,7 @@ def _draw_spectrum(axes, fit, channel, unit):
     axes.semilogy(bins[keep], amplitude[keep], color=INK, linewidth=0.9)
     for mode, reason in fit.rejected:
         if reason and fit.band[0] <= mode.frequency <= fit.band[1]:
-            axes.axvline(mode.frequency, color=FAINT, linewidth=0.7, linestyle=":")
+            axes.axvline(mode.frequency, color=GREY, linewidth=0.7, linestyle=":")
     for k, mode in enumerate(fit.modes):
         axes.axvline(mode.frequency, color=MODE, linewidth=1.0)
         axes.annotate(
@@ -79,13 +79,13 @@ def _draw_spectrum(axes, fit, channel, unit):
 def _draw_fit(axes, residual_axes, fit, channel, unit):
     """Measured and fitted decay in the band, and the residual on the same scale."""
     measured, fitted = fit.measured[:, channel], fit.fitted[:, channel]
-    axes.plot(fit.times, measured, color=FAINT, linewidth=2.2, label="measured, in the band")
+    axes.plot(fit.times, measured, color=GREY, linewidth=2.2, label="measured, in the band")
     axes.plot(fit.times, fitted, color=FIT, linewidth=0.9, label="fitted modes")
     axes.legend(frameon=False, loc="upper right", ncols=2)
     residual_axes.plot(fit.times, measured - fitted, color=INK, linewidth=0.8)
-    left = np.sum((measured - fitted) ** 2) / max(np.sum(measured**2), 1e-300)
+    residual_share = np.sum((measured - fitted) ** 2) / max(np.sum(measured**2), 1e-300)
     residual_axes.text(
-        0.995, 0.97, f"residual, {100 * left:.2g} % of the energy", color=INK, va="top",
+        0.995, 0.97, f"residual, {100 * residual_share:.2g} % of the energy", color=INK, va="top",
         ha="right", transform=residual_axes.transAxes,
     )  # fmt: skip
     residual_axes.set_ylim(np.array(axes.get_ylim()) / 2)

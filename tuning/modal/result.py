@@ -1,22 +1,21 @@
-"""What identifying modes from samples gives, whichever way it was done, and which to trust."""
+"""Modes identified from samples, and the reasons for which some are rejected."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-# A damping ratio whose standard deviation is a larger share of it is not well identified.
-MAX_RELATIVE_DAMPING_SD = 0.3
+MAX_RELATIVE_DAMPING_SD = 0.3  # standard deviation of a damping ratio over the ratio
 MAX_DAMPING_RATIO = 0.2
-MIN_CYCLES = 4.0
-MIN_ENERGY_SHARE = 0.002
-MAX_BAND_SHARE = 0.98  # a mode nearer to the end of the band may be the flank of one beyond
+MIN_CYCLES = 4.0  # cycles of a mode in the window
+MIN_ENERGY_SHARE = 0.002  # of the energy of the log in the band
+MAX_BAND_SHARE = 0.98  # of the upper end of the band; a mode above may be the flank of another
 
 
 class IdentifiedMode(NamedTuple):
-    """A mode, or what looked like one: frequency in Hz, damping ratio, their standard deviations.
+    """A mode: undamped natural frequency (Hz) and damping ratio, with standard deviations.
 
-    `frequency` is the undamped natural one; `energy_share` is that of the energy of the log in the band.
+    `energy_share` is its share of the energy of the log in the band.
     """
 
     frequency: float
@@ -27,11 +26,11 @@ class IdentifiedMode(NamedTuple):
 
 
 class ModeCandidates(NamedTuple):
-    """Candidate modes with the reason against each (empty: none), and what they were found in.
+    """Candidate modes with the reason for rejecting each (empty for a mode that is accepted).
 
     `start` and `stop` are the samples used; `quantile` times a standard deviation is half a 95 %
-    interval; `measured` and `fitted` (sample, channel) the band's part of the log and of the fit
-    (None where there is no fit in time).
+    interval; `measured` and `fitted` are the part in the band of the log and of the fit (None
+    without a fit in time).
     """
 
     modes: tuple[IdentifiedMode, ...]
@@ -44,7 +43,7 @@ class ModeCandidates(NamedTuple):
 
 
 def rejection_reason(mode: IdentifiedMode, duration: float, band: tuple[float, float]) -> str:
-    """Say why a mode found in `duration` seconds is not well identified; empty if it is."""
+    """Reason why a mode found in `duration` seconds is not well identified; empty if it is."""
     if not band[0] <= mode.frequency <= MAX_BAND_SHARE * band[1]:
         return "at the edge of the band"
     if mode.damping_ratio < 2 * mode.damping_sd:

@@ -1,21 +1,20 @@
-"""Where in a log the structure vibrates freely, and in which band of frequencies."""
+"""Window of the free decay in a log, and the frequency band of its vibration."""
 
 import functools
 
 import numpy as np
 from jaxtyping import Float
 
-# Energy must fall by this many nepers to be called a decay: random vibration under steady
-# excitation swells and fades as well, but hardly by so much along a straight line.
+from tuning.logs.units import time_derivative
+
+# Fall of the energy that makes a decay: random vibration under steady excitation rises and falls as
+# well, but hardly by so much along a straight line.
 MIN_FALL_NEPERS = 3.5
-ENERGY_BLOCKS = 150
+ENERGY_BLOCKS = 150  # blocks of a log over which energy is averaged
 BAND_ITERATIONS = 4
-DECAY_ENERGY_SHARE = 0.95  # of the energy, to look for the decay in
-MIN_BLOCKS = 10
-# The logarithm of a decay's energy strays by about this much from a line, because modes beat.
-BEAT_SCATTER_NEPERS = 0.25
-# Powers of angular frequency that turn a quantity's spectrum into one of velocity.
-_VELOCITY_EXPONENT = {"acceleration": -1, "velocity": 0}
+DECAY_ENERGY_SHARE = 0.95  # of the energy, in the band in which a decay is searched
+MIN_BLOCKS = 10  # blocks of a decay
+BEAT_SCATTER_NEPERS = 0.25  # scatter of the log energy of a decay about a line, by beating modes
 
 
 def energy_band(
@@ -24,10 +23,10 @@ def energy_band(
     quantities: tuple[str, ...],
     share: float = 0.98,
 ) -> tuple[float, float]:
-    """Return the band (Hz) in which the vibration has its kinetic energy, with a margin above.
+    """Band (Hz) of the kinetic energy of a vibration, with a margin above.
 
-    Up to 1.5 times the frequency below which that `share` of the energy lies, leaving out the
-    sensors' noise, which is what is seen in the upper half of the spectrum.
+    Its upper end is 1.5 times the frequency below which that `share` of the energy lies. The noise
+    of the sensors, estimated from the upper half of the spectrum, is left out.
     """
     count = len(values)
     time = np.linspace(-1, 1, count)
@@ -36,15 +35,15 @@ def energy_band(
     power = np.abs(np.fft.rfft(level * np.hanning(count)[:, None], axis=0)) ** 2
     bins = np.fft.rfftfreq(count, 1 / rate)
     noise = np.median(power[bins.size // 2 :], axis=0) / np.log(2)
-    # A mode must swing a few times in a log to be told from drift.
+    # Four cycles in a log distinguish a mode from drift.
     lowest = 4 * rate / count
     excess = np.where(power > 6 * noise, power - noise, 0.0)[bins >= lowest]
     bins = bins[bins >= lowest]
-    powers = np.array([2 * _VELOCITY_EXPONENT.get(quantity, 1) for quantity in quantities])
+    powers = np.array([2 * (1 - time_derivative(quantity)) for quantity in quantities])
     kinetic = excess * (2 * np.pi * bins[:, None]) ** powers
     if not np.any(kinetic > 0):
         return lowest, 0.5 * rate
-    # Channels of one quantity add up as they are; different quantities count the same.
+    # Channels of one quantity are added as they are; different quantities have equal weights.
     kinds = np.array(quantities)
     totals = np.array([np.sum(kinetic[:, kinds == kind]) for kind in quantities])
     kinetic = np.sum(kinetic / np.where(totals > 0, totals, 1.0), axis=1)
@@ -59,12 +58,13 @@ def band_pass(
     band: tuple[float, float],
     powers: Float[np.ndarray, " channel"] | float = 0.0,
 ) -> Float[np.ndarray, "time channel"]:
-    """Keep the part of a signal whose frequencies (Hz) lie in a band.
+    """Part of a signal with frequencies (Hz) in a band.
 
-    Each channel is multiplied by that power of angular frequency (2: a deflection's acceleration).
+    The spectrum of each channel is multiplied by that power of the angular frequency (2: the
+    acceleration of a deflection).
     """
     bins = np.fft.rfftfreq(len(values), 1 / rate)
-    # Without the line from first to last sample the signal has no jump where it wraps round.
+    # Without the line from first to last sample the periodic signal has no jump.
     line = np.linspace(0, 1, len(values))[:, None]
     spectrum = np.fft.rfft(values - values[0] * (1 - line) - values[-1] * line, axis=0)
     inside = ((bins >= band[0]) & (bins <= band[1]))[:, None]
@@ -86,14 +86,14 @@ def find_decay_in_band(
     band: tuple[float, float],
     quantities: tuple[str, ...],
 ) -> tuple[int, int] | None:
-    """Find the free decay in a log: the samples (start, stop) between which energy falls steadily.
+    """Free decay in a log: samples (start, stop) between which the energy falls steadily.
 
     Of all windows, the one along which the logarithm of the energy in the band falls farthest and
-    most smoothly: along a line or, as fast modes die first, a parabola that opens upwards (an end
-    of excitation bends the other way). Accelerations are looked at, because in them the slow path
-    of a load over the beam hardly shows. None if in no window the energy falls far enough.
+    most smoothly: along a line or, as fast modes decay first, a parabola that opens upwards (an end
+    of excitation bends the other way). Energy is that of accelerations, in which the quasi-static
+    response to a crossing load hardly shows. None if the energy falls far enough in no window.
     """
-    powers = np.array([1.0 + _VELOCITY_EXPONENT.get(quantity, 1) for quantity in quantities])
+    powers = np.array([2.0 - time_derivative(quantity) for quantity in quantities])
     signal = band_pass(values, rate, band, powers)
     energy = np.sum(signal**2 / (np.mean(signal**2, axis=0) + 1e-300), axis=1)
     size = max(len(energy) // ENERGY_BLOCKS, 1)
@@ -109,7 +109,7 @@ def find_decay_in_band(
         fall = fitted[:, 0] - fitted[:, -1]
         score = fall / (1 + np.mean((centred - fitted) ** 2, axis=1) / BEAT_SCATTER_NEPERS**2)
         for start in np.flatnonzero((fall > MIN_FALL_NEPERS) & (score > best)):
-            # Under steady excitation what fades soon swells again.
+            # Under steady excitation the energy soon rises again.
             after = level[start + length : start + 2 * length]
             if score[start] > best and np.all(after < pieces[start].max() - fall[start] / 2):
                 # The excitation may end within the first block.
@@ -123,15 +123,15 @@ def find_decay(
     band: tuple[float, float] | None,
     quantities: tuple[str, ...],
 ) -> tuple[int, int] | None:
-    """Find the free decay (start, stop) in a log, in a given band (Hz) or the decay's own.
+    """Free decay in a log (start, stop), in a given band (Hz) or in that of the decay.
 
-    The whole log, with its excitation, reaches higher in frequency than the decay that follows:
-    unless it is given, the band is taken again from what was found, until that is the decay.
+    The excited part of a log contains higher frequencies than the decay: a band that is not given
+    is computed again from the window found, until it is that of the decay.
     """
     limits = band or energy_band(values, rate, quantities, DECAY_ENERGY_SHARE)
     found = find_decay_in_band(values, rate, limits, quantities)
     for _ in range(0 if band or found is None else BAND_ITERATIONS):
-        # What lasts longest tells: the second half of what was found so far.
+        # The band is that of the second half of the window found so far.
         late = values[(found[0] + found[1]) // 2 : found[1]]
         limits = (
             limits[0],

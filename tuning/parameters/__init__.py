@@ -1,1 +1,1 @@
-"""Parameters."""
+"""Free parameters: addresses, bounds, scales and priors."""

@@ -1,4 +1,4 @@
-"""What is known of a free number before any log is looked at."""
+"""Bounds, scale and prior distribution of a free parameter."""
 
 import dataclasses
 from typing import Any
@@ -7,51 +7,54 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-SCALES = ("plain", "log", "logit")
+from tuning.aliases import current_word
+
+SCALES = ("linear", "log", "logit")
+OLD_SCALES = {"plain": "linear"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Prior:
-    """Bounds of a free number, the scale on which it is searched, and a prior; all optional.
+    """Bounds of a free parameter, the scale of its search, and a prior distribution; all optional.
 
-    With `mean` and `deviation` (SI units) the number is believed to be so beforehand: normally
-    distributed or, on a log scale, log-normally, with the mean as median and deviation / mean as
-    standard deviation of the logarithm. The fit is then the maximum a posteriori. On the scale
-    "log" or "logit", which need two bounds, values are spread evenly in the logarithm, or in the
-    log-odds of the place between the bounds.
+    `mean` and `deviation` (SI units) are those of a normal prior or, on the scale "log", of a
+    log-normal one with the mean as median and deviation / mean as standard deviation of the
+    logarithm. The fit is then the maximum a posteriori. The scales "log" and "logit" need two
+    bounds: starts are drawn evenly in the logarithm, or in the log-odds of the share between them.
 
-    Raises ValueError for a deviation that is not positive, a prior of which a half is missing, an
-    unknown scale, and a scale or prior that needs other bounds or signs.
+    Raises ValueError for an unknown scale, a prior without mean or deviation, a deviation that is
+    not positive, and a scale or prior that does not fit the bounds.
     """
 
     low: float | None = None
     high: float | None = None
     mean: float | None = None
     deviation: float | None = None
-    scale: str = "plain"
+    scale: str = "linear"
 
     def __post_init__(self):
+        object.__setattr__(self, "scale", current_word(self.scale, OLD_SCALES, "the scale"))
         if self.scale not in SCALES:
             raise ValueError(f"a scale is one of {', '.join(SCALES)}, not {self.scale!r}")
         if (self.mean is None) != (self.deviation is None):
             raise ValueError("a prior needs both a mean and a deviation")
         if self.deviation is not None and not 0 < self.deviation < np.inf:
             raise ValueError(f"the deviation of a prior must be positive, not {self.deviation:g}")
-        if self.scale != "plain" and self.bounds is None:
+        if self.scale != "linear" and self.bounds is None:
             raise ValueError(f"the scale {self.scale!r} needs two bounds, low and high")
         if self.scale == "log" and not (self.low > 0 and (self.mean is None or self.mean > 0)):
             raise ValueError("on a log scale bounds and mean must be positive")
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Both bounds, an infinite one for one that is missing; None without any."""
+        """Both bounds, infinite where one is missing; None without any."""
         if self.low is None and self.high is None:
             return None
         low = -np.inf if self.low is None else float(self.low)
         return low, (np.inf if self.high is None else float(self.high))
 
     def prior_residual(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        """Distance of a value from the mean of the prior, in its deviations; 0 without a prior."""
+        """Deviation of a value from the mean of the prior, over the prior's; 0 without a prior."""
         if self.mean is None:
             return jnp.zeros_like(value)
         if self.scale == "log":
@@ -60,7 +63,7 @@ class Prior:
 
 
 def as_prior(bounds: Any) -> Prior:
-    """A belief as it is, or what bounds (low, high) or None mean."""
+    """A `Prior` as it is, or one with the bounds (low, high) or, for None, without any."""
     if isinstance(bounds, Prior):
         return bounds
     return Prior() if bounds is None else Prior(*(float(bound) for bound in bounds))

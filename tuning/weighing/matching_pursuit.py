@@ -1,7 +1,7 @@
-"""Where loads may have crossed: a quick look at a log with static influence lines only.
+"""Matching pursuit: loads that explain the readings of a log by static influence lines.
 
-Loads are added, singly and in pairs, where they explain most of what is left (matching pursuit),
-and all of them are moved together after that. What the beam's inertia does is left over.
+Loads are added, singly and in pairs, where they explain most of the residual, and all are then
+refined together. The dynamic part of the response stays in the residual.
 """
 
 from typing import NamedTuple
@@ -11,29 +11,29 @@ import scipy.optimize
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads import MovingMass
 from jaxbeam.model.statics import influence_line
 from tuning.logs.log import Log
 
-POSITION_COUNT = 201  # along the beam, at which influence lines are tabulated
-SPEED_COUNT = 16  # tried in each direction
-ENTRY_TIME_COUNT = 80  # tried for each speed
-MAX_SAMPLES = 300  # of a log, at most, that are looked at
+POSITION_COUNT = 201  # points of an influence line
+SPEED_COUNT = 16  # candidates in each direction
+ENTRY_TIME_COUNT = 80  # candidates for each speed
+MAX_SAMPLES = 300  # of a log; a longer one is thinned out
 
 
 class MatchingPursuitResult(NamedTuple):
-    """Loads, and the root mean square (m) of what they leave."""
+    """Loads, and the root mean square (m) of the residual."""
 
     loads: list[MovingMass]
     residual_rms: float
 
 
 class MatchingPursuit:
-    """Readings of slow loads on a beam, to be held against those of a log.
+    """Quasi-static readings of candidate loads on a beam, and those of a log.
 
-    Constant parts of the readings, such as offsets, are left out on both sides. `readings_rms` (m) is
-    the root mean square of the readings themselves.
+    The mean is subtracted from all readings, and with it any offset. `readings_rms` (m) is the root
+    mean square of the readings of the log.
     """
 
     def __init__(self, case: Case, log: Log, speeds: tuple[float, float], both_ways: bool):
@@ -42,10 +42,10 @@ class MatchingPursuit:
         self.times = log.times[::stride]
         self.readings = _centred(log.values[::stride, chosen])
         self.readings_rms = float(np.sqrt(np.mean(self.readings**2)))
-        self.length = float(known(case.beam.length))
+        self.length = float(concrete(case.beam.length))
         self.positions = np.linspace(0, self.length, POSITION_COUNT)
-        sensors = np.array([float(known(sensor.position)) for sensor in case.sensors])
-        weight = float(known(case.run.gravity))
+        sensors = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
+        weight = float(concrete(case.run.gravity))
         self.influence_lines = np.asarray(influence_line(case, sensors, self.positions)) * weight
         signs = (1.0, -1.0) if both_ways else (1.0,)
         tried = [sign * speed for sign in signs for speed in np.geomspace(*speeds, SPEED_COUNT)]
@@ -56,11 +56,11 @@ class MatchingPursuit:
         self.candidate_norms = np.maximum(np.linalg.norm(self.candidate_readings, axis=1), 1e-300)
 
     def find(self, count: int) -> MatchingPursuitResult:
-        """So many loads that together explain the readings as well as slow loads can.
+        """The `count` loads that together explain the readings best.
 
-        Loads that are on the beam together are hard to tell apart one by one, so the last two are
-        also looked for as a pair, among all pairs that are tried. Masses are a little above zero,
-        so that a fit may start there.
+        Loads that are on the beam at once are hard to tell apart one by one, so the last two are
+        also searched as a pair, among all pairs of candidates. Masses are positive, so that a fit
+        can start from them.
         """
         load_parameters = self._find_loads(count)
         least = 1e-3 * max(np.max(load_parameters[:, 0]), 1e-12)
@@ -71,7 +71,7 @@ class MatchingPursuit:
         return MatchingPursuitResult(loads, self._residual_rms(load_parameters))
 
     def _find_loads(self, count: int) -> Float[np.ndarray, "load 3"]:
-        """Masses, speeds and entry times of so many loads."""
+        """Masses (kg), speeds (m/s) and entry times (s) of `count` loads."""
         if count == 0:
             return np.empty((0, 3))
         fewer = self._find_loads(count - 1)
@@ -82,13 +82,13 @@ class MatchingPursuit:
         return min((self._refine(numbers) for numbers in tried), key=self._residual_rms)
 
     def _best_load(self, residual: Float[np.ndarray, "time sensor"]) -> Float[np.ndarray, "load 3"]:
-        """The load that explains most of what is left."""
+        """The load that explains most of the residual."""
         gains = np.maximum(self.candidate_readings @ residual.ravel(), 0.0) / self.candidate_norms
         best = int(np.argmax(gains))
         return np.array([[gains[best] / self.candidate_norms[best], *self.candidates[best]]])
 
     def _best_pair(self, residual: Float[np.ndarray, "time sensor"]) -> Float[np.ndarray, "load 3"]:
-        """The two loads that explain most of what is left: least squares for all pairs at once."""
+        """The two loads that explain most of the residual, by least squares for all pairs."""
         columns = self.candidate_readings / self.candidate_norms[:, None]
         gains, overlap = columns @ residual.ravel(), columns @ columns.T
         determinant = np.maximum(1 - overlap**2, 1e-3)
@@ -100,12 +100,12 @@ class MatchingPursuit:
         return np.array([[masses[0], *self.candidates[i]], [masses[1], *self.candidates[j]]])
 
     def _entry_times(self, speed: float) -> Float[np.ndarray, " entry"]:
-        """Times of entry with which most of the crossing lies within the log."""
+        """Entry times (s) with which at least half of the crossing lies within the log."""
         half = self.length / abs(speed) / 2
         return np.linspace(self.times[0] - half, self.times[-1] - half, ENTRY_TIME_COUNT)
 
     def _unit_mass_readings(self, speed: float, entry: float) -> Float[np.ndarray, "time sensor"]:
-        """What the sensors read while one kilogram crosses slowly."""
+        """Quasi-static readings (m) while one kilogram crosses."""
         start = 0.0 if speed > 0 else self.length
         position = start + speed * (self.times - entry)
         table = [
@@ -116,7 +116,7 @@ class MatchingPursuit:
     def _residual(
         self, load_parameters: Float[np.ndarray, "load 3"]
     ) -> Float[np.ndarray, "time sensor"]:
-        """What loads of these masses, speeds and entry times leave unexplained."""
+        """Readings that loads of these masses, speeds and entry times do not explain."""
         residual = self.readings
         for mass, speed, entry in load_parameters:
             residual = residual - mass * self._unit_mass_readings(speed, entry)
@@ -126,7 +126,7 @@ class MatchingPursuit:
         return float(np.sqrt(np.mean(self._residual(load_parameters) ** 2)))
 
     def _refine(self, load_parameters: Float[np.ndarray, "load 3"]) -> Float[np.ndarray, "load 3"]:
-        """The loads moved together to where they explain most."""
+        """All loads refined together by least squares."""
         least, most = load_parameters.copy(), load_parameters.copy()
         crossing_time = self.length / np.abs(load_parameters[:, 1])
         least[:, 0], most[:, 0] = 0.0, np.inf

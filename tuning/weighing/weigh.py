@@ -1,39 +1,35 @@
-"""Weighing in motion: how many loads crossed, how heavy and how fast, from deflections alone.
+"""Weighing in motion: number, masses, speeds and entry times of loads, from deflections alone.
 
-Starts come from the exact static influence lines (see `pursuit`); then all loads are fitted
-together with the full dynamics. Loads are added as long as residuals are no white noise and
-Schwarz's criterion falls (see `criticism`).
+Starts come from static influence lines (`matching_pursuit`); then all loads are fitted together
+with the full dynamics. Loads are added until the residuals are white noise or Schwarz's criterion
+(BIC) rises.
 """
 
 import dataclasses
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import known
+from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads import AbstractLoad, MovingMass
-from tuning.fit.identify import Fit, identify
-from tuning.fit.matching_pursuit import MatchingPursuit
-from tuning.fit.model_validation import (
-    WHITENESS_SIGNIFICANCE,
-    ModelCriteria,
-    channel_residuals,
-    compare_fits,
-)
+from tuning.aliases import accepts_old_arguments
+from tuning.fit.identify import identify
+from tuning.fit.model_validation import ModelCriteria, compare_fits
+from tuning.fit.residuals import WHITENESS_SIGNIFICANCE
+from tuning.fit.result import Fit
 from tuning.logs.log import Log
+from tuning.weighing.matching_pursuit import MatchingPursuit
 
 _LOAD_PARAMETERS = ("mass", "speed", "entry_time")
-_MAX_MISFIT_RATIO = (
-    0.7  # what another load must make of the static misfit to be looked for at first
-)
-_MAX_RESIDUAL_SHARE = (
-    0.65  # of the readings' deviation: one load must leave less to be there at all
-)
+# The first fit has so many loads that each reduced the static residual to this share or less.
+_MAX_MISFIT_RATIO = 0.7
+# Residual over readings (RMS) beyond which not even one load is found.
+_MAX_RESIDUAL_SHARE = 0.65
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Weighing:
-    """Loads found in a log: the fit of the best count, and all counts tried, best first.
+    """Loads found in a log: the best fit, and criteria of all load counts tried, best first.
 
-    `load_counts` is empty where the first count tried left nothing but white noise.
+    `load_counts` is empty where the first count tried left white noise.
     """
 
     fit: Fit
@@ -41,36 +37,37 @@ class Weighing:
 
     @property
     def loads(self) -> tuple[AbstractLoad, ...]:
-        """The loads, in the order in which they were found."""
+        """The fitted loads, in the order in which they were found."""
         return self.fit.cases[0].loads
 
     def to_dict(self) -> dict:
-        """Loads with standard errors and intervals (SI units), counts tried, and the verdict."""
-        told = self.fit.to_dict()
+        """Loads with standard errors and intervals (SI units), counts and verdict, for JSON."""
+        parameters = self.fit.to_dict()["numbers"]
         loads = [
-            {part: told["numbers"][f"loads.{i}.{part}"] for part in _LOAD_PARAMETERS}
+            {name: parameters[f"loads.{i}.{name}"] for name in _LOAD_PARAMETERS}
             for i in range(len(self.loads))
         ]
-        counts = {rival.name: rival.bic for rival in self.load_counts}
+        counts = {count.name: count.bic for count in self.load_counts}
         return {"loads": loads, "bic": counts, "verdict": self.fit.verdict}
 
     def __str__(self) -> str:
         lines = [f"{_count_text(len(self.loads))} found"]
-        lines += [f"BIC with {rival.name}: {rival.bic:.1f}" for rival in self.load_counts]
+        lines += [f"BIC with {count.name}: {count.bic:.1f}" for count in self.load_counts]
         return "\n".join([*lines, str(self.fit)])
 
 
+@accepts_old_arguments(most="max_count")
 def weigh(
     case: Case, log: Log, speeds: tuple[float, float], max_count: int = 3, both_ways: bool = True
 ) -> Weighing:
-    """Find the masses, speeds and entry times of the loads that crossed a known beam in a log.
+    """Masses, speeds and entry times of the loads that crossed a known beam in a log.
 
-    `speeds` (m/s) are the lowest and highest that come into question, in both directions or only
-    from the left; at `max_count` so many loads are looked for. Offsets of the sensors are fitted along.
-    Loads of the case or the log are not used.
+    `speeds` (m/s) are the lowest and highest possible ones, in both directions or, without
+    `both_ways`, from the left only; at most `max_count` loads are found. Offsets of the sensors are
+    fitted as well. Loads of the case or the log are not used.
 
     Raises ValueError if a sensor does not measure deflection, speeds are not 0 < low < high, or no
-    load shows in the log, and as `identify` does.
+    load is found in the log, and as `identify` does.
     """
     low, high = speeds
     if not 0 < low < high:
@@ -82,7 +79,7 @@ def weigh(
     pursuit = MatchingPursuit(case, log, (low, high), both_ways)
     first = pursuit.find(1)
     if first.residual_rms > _MAX_RESIDUAL_SHARE * pursuit.readings_rms:
-        raise ValueError(f"{log.source}: no load shows in it at these speeds")
+        raise ValueError(f"{log.source}: no load is found in it at these speeds")
     found = first
     while len(found.loads) < max_count and (
         more := pursuit.find(len(found.loads) + 1)
@@ -93,7 +90,7 @@ def weigh(
         count = len(found.loads)
         fit = fits[_count_text(count)] = _fit_loads(case, log, found.loads)
         if (
-            min(channel.p_value for channel in channel_residuals(fit)) > WHITENESS_SIGNIFICANCE
+            min(channel.p_value for channel in fit.channel_residuals) > WHITENESS_SIGNIFICANCE
             or count >= max_count
         ):
             break
@@ -105,11 +102,11 @@ def weigh(
 
 
 def _fit_loads(case: Case, log: Log, loads: list[MovingMass]) -> Fit:
-    """Fit all loads together, and the offsets of the sensors."""
-    length, end = float(known(case.beam.length)), float(log.times[-1])
+    """Fit of all loads together, and of the offsets of the sensors."""
+    length, end = float(concrete(case.beam.length)), float(log.times[-1])
     free: dict[str, tuple[float, float] | None] = {}
     for i, load in enumerate(loads):
-        speed = float(known(load.speed))
+        speed = float(concrete(load.speed))
         low, high = sorted([0.3 * speed, 3 * speed])
         free[f"loads.{i}.mass"] = None
         free[f"loads.{i}.speed"] = low, high

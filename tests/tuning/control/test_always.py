@@ -1,4 +1,4 @@
-"""What holds of every tuning, whatever the rig, the loads and what is free: on random cases."""
+"""Properties of every tuning, on random cases."""
 
 import dataclasses
 import tempfile
@@ -13,22 +13,21 @@ import tuning
 from tests.tuning.small_rig import GAIN, rig
 from tuning.control.load_cases import run_case
 
-CUTOFF, PLACE = "sensors.0.filter.cutoff", "sensors.0.position"
-FREE = {GAIN: (-9000.0, 9000.0), CUTOFF: (5.0, 45.0), PLACE: (0.1, 0.5)}
-
+CUTOFF, POSITION = "sensors.0.filter.cutoff", "sensors.0.position"
+FREE = {GAIN: (-9000.0, 9000.0), CUTOFF: (5.0, 45.0), POSITION: (0.1, 0.5)}
 
 PROBLEMS = {
     "gain": st.floats(-4000.0, 8000.0),
     "rigidity": st.floats(9.0, 16.0),
     "damping": st.floats(0.0, 0.1),
-    "place": st.floats(0.15, 0.45),
+    "position": st.floats(0.15, 0.45),
     "cutoff": st.floats(8.0, 40.0),
     "masses": st.lists(st.floats(0.05, 0.6), min_size=3, max_size=3, unique=True),
     "speeds": st.lists(st.floats(1.3, 2.5), min_size=3, max_size=3),
 }
 
 
-def small(gain, rigidity, damping, place, cutoff) -> jb.Case:
+def small(gain, rigidity, damping, position, cutoff) -> jb.Case:
     """A rig of two modes with one sensor behind a filter, under linear feedback."""
     case = rig(jb.Feedback([gain], period=0.01))
     beam = dataclasses.replace(
@@ -37,24 +36,24 @@ def small(gain, rigidity, damping, place, cutoff) -> jb.Case:
         flexural_rigidity=np.asarray(rigidity),
         damping_ratio=np.asarray(damping),
     )
-    sensor = jb.Sensor(place, filter=jb.Filter(cutoff, order=2))
+    sensor = jb.Sensor(position, filter=jb.Filter(cutoff, order=2))
     return dataclasses.replace(case, beam=beam, sensors=(sensor,))
 
 
-def peak(case: jb.Case, place: float) -> float:
-    """The largest deflection (m) at samples, at a place that stays where a sensor may be moved."""
-    return float(np.abs(jb.simulate(case).at([place])).max())
+def peak(case: jb.Case, position: float) -> float:
+    """Largest deflection (m) at samples, at a position that does not move with the sensor."""
+    return float(np.abs(jb.simulate(case).at([position])).max())
 
 
-def relative(case: jb.Case, place: float) -> float:
-    """The same, relative to the run without control."""
-    return peak(case, place) / peak(dataclasses.replace(case, controller=None), place)
+def relative_peak(case: jb.Case, position: float) -> float:
+    """Peak relative to that of the run without control."""
+    return peak(case, position) / peak(dataclasses.replace(case, controller=None), position)
 
 
 @pytest.mark.slow
 @settings(max_examples=4)
 @given(st.fixed_dictionaries(PROBLEMS))
-def test_it_never_gets_worse_and_says_what_the_saved_case_does(problem):
+def test_the_objective_never_rises_and_is_that_of_the_saved_case(problem):
     speeds = problem.pop("speeds")
     runs = [
         {"loads.0.mass": mass, "loads.0.speed": speed}
@@ -72,12 +71,12 @@ def test_it_never_gets_worse_and_says_what_the_saved_case_does(problem):
         file = Path(folder) / "tuned.toml"
         jb.save_case(found.case, file)
         saved = jb.load_case(file)
-    # True values are those of the saved case, simulated run by run.
-    place = float(case.sensors[0].position)
-    peaks = [relative(run_case(saved, run), place) for run in cases.training]
+    # The true objective is that of the saved case, simulated run by run.
+    position = float(case.sensors[0].position)
+    peaks = [relative_peak(run_case(saved, run), position) for run in cases.training]
     assert after == pytest.approx(max(peaks), rel=1e-3)
-    # The verdict on the run held out, likewise; peaks between samples may be a little larger.
+    # The same for the held-out run; peaks between samples may be slightly larger.
     own = run_case(saved, cases.held_out[0])
-    assert 1 - 1e-3 < held_out.after[0] / peak(own, place) < 1.02
-    below = 1 - held_out.after[0] / held_out.uncontrolled[0]
+    assert 1 - 1e-3 < held_out.peaks_after[0] / peak(own, position) < 1.02
+    below = 1 - held_out.peaks_after[0] / held_out.uncontrolled_peaks[0]
     assert f"worst held out run: peak {below:.1%} below no control" in found.verdict

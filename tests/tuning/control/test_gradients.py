@@ -1,4 +1,4 @@
-"""Derivatives of what is tuned for, through closed loops of several kinds, against differences."""
+"""Gradients of metrics through closed loops of all kinds of controllers, against differences."""
 
 import dataclasses
 
@@ -108,32 +108,32 @@ def rig(controller):
     )
 
 
-ELSEWHERE = {jb.MPC, jb.StepLQR, jb.AugmentedLQR}  # test_mpc, test_regulators
+ELSEWHERE = {jb.MPC, jb.StepLQR, jb.AugmentedLQR}  # in test_mpc and test_regulators
 
 
-def test_no_kind_of_law_is_left_out():
+def test_all_kinds_of_controllers_are_tested():
     assert {type(law) for law, _ in LOOPS.values()} | ELSEWHERE == set(KINDS.values())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", LOOPS)
-def test_slopes_through_the_loop_are_those_of_differences(kind):
+def test_gradients_through_the_closed_loop(kind):
     controller, start = LOOPS[kind]
     case = rig(controller)
-    if kind not in ("feedback", "relief"):  # once is enough; without, it compiles sooner
+    if kind not in ("feedback", "relief"):  # without the filter it compiles faster
         case = dataclasses.replace(case, sensors=[jb.Sensor(0.25)])
-    bench = make_run_set(case, RUNS)
+    run_set = make_run_set(case, RUNS)
     sizes = np.array(list(start.values()))
 
     @jax.jit
     @jax.value_and_grad
     def both(shares):
         values = dict(zip(start, shares * sizes, strict=True))
-        merits = bench.merits(values, 50.0)
-        return merits["peak"][0] + 0.1 * merits["effort"][0]
+        metrics = run_set.metrics(values, 50.0)
+        return metrics["peak"][0] + 0.1 * metrics["effort"][0]
 
     ones = np.ones(sizes.size)
-    slope = both(jnp.asarray(ones))[1]
+    gradient = both(jnp.asarray(ones))[1]
     expected = central(lambda shares: both(shares)[0], ones, step=1e-4)
-    np.testing.assert_allclose(slope, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
     assert np.all(np.abs(expected) > 1e-7)

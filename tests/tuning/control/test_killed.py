@@ -1,4 +1,4 @@
-"""Searches and samplings that are killed outright go on to the very same end."""
+"""Searches and samplings whose process is killed are resumed to the same results."""
 
 import os
 import signal
@@ -10,30 +10,35 @@ import pytest
 
 import tuning
 from tests.tuning.small_rig import GAIN, rig
-from tests.tuning.stand_in import fit, search
+from tests.tuning.stand_in import fit, least_squares
+from tuning.checkpoint import Checkpoint
 from tuning.fit.multi_start import multi_start
 from tuning.fit.uncertainty.posterior import sample
 
-# What a process does until, having written its first state, it is killed.
+# Code of a process that is killed once it has written its first checkpoint.
 CHILD = """
 import os, signal, sys
-import tuning.control.optimisation, tuning.fit.uncertainty.posterior, tuning.fit.multi_start
+import tuning.checkpoint
 from pathlib import Path
-from tests.tuning import test_killed
-from tests.tuning.stand_in import fit, search
+from tests.tuning import stand_in
+from tests.tuning.control import test_killed
+from tuning.checkpoint import Checkpoint
+from tuning.fit.multi_start import multi_start
+from tuning.fit.uncertainty.posterior import sample
 file = Path(sys.argv[1])
-def save_and_die(path, mark, arrays):
-    saved(path, mark, arrays)
+save = tuning.checkpoint.save
+def save_and_die(path, digest, arrays):
+    save(path, digest, arrays)
     os.kill(os.getpid(), signal.SIGKILL)
-saved = tuning.fit.multi_start.save
-tuning.fit.multi_start.save = tuning.fit.uncertainty.posterior.save = tuning.control.optimisation.save = save_and_die
+tuning.checkpoint.save = save_and_die
 {task}
 """
-SCOUT = (
-    "wide = search(); tuning.fit.multi_start.scout(wide, wide.campaign.measured, 12, 1, file, 'it')"
-)
+SEARCH = """
+problem = stand_in.least_squares()
+multi_start(problem, problem.data.measured, 12, 1, Checkpoint(file, "digest"))
+"""
 TUNE = "test_killed.tuned(file)"
-SAMPLE = "tuning.fit.uncertainty.posterior.sample(fit(), 200, 2, 50, checkpoint=file)"
+SAMPLE = "sample(stand_in.fit(), 200, 2, 50, checkpoint=file)"
 
 
 def killed(task, file):
@@ -44,7 +49,7 @@ def killed(task, file):
 
 
 def tuned(file, **options):
-    """A tuning in mini-batches, from two starts, that keeps its state in a file, or not."""
+    """A tuning in mini-batches from two starts, with a checkpoint unless `file` is None."""
     cases = tuning.LoadCases(tuning.full_grid({"loads.0.mass": [0.2, 0.3, 0.4]}))
     return tuning.tune(
         rig(), {GAIN: (500.0, 7500.0)}, cases, steps=12, starts=2, batch=2, least_peaks=False,
@@ -53,24 +58,24 @@ def tuned(file, **options):
 
 
 @pytest.mark.slow
-def test_a_tuning(tmp_path):
+def test_a_killed_tuning_is_resumed(tmp_path):
     killed(TUNE, tmp_path / "search.npz")
     resumed, whole = tuned(tmp_path / "search.npz", resume=True), tuned(None)
     np.testing.assert_array_equal(resumed.history, whole.history)
     np.testing.assert_array_equal(resumed.values, whole.values)
 
 
-def test_a_search_from_many_starts(tmp_path):
-    killed(SCOUT, tmp_path / "search.npz")
-    found = search()
-    given = found, found.data.measured, 12, 1
-    resumed = multi_start(*given, tmp_path / "search.npz", "it")
+def test_a_killed_multi_start_search_is_resumed(tmp_path):
+    killed(SEARCH, tmp_path / "search.npz")
+    problem = least_squares()
+    given = problem, problem.data.measured, 12, 1
+    resumed = multi_start(*given, Checkpoint(tmp_path / "search.npz", "digest"))
     for one, other in zip(resumed, multi_start(*given), strict=True):
         assert one.cost == other.cost and one.starts == other.starts
         np.testing.assert_array_equal(one.values, other.values)
 
 
-def test_draws_of_a_posterior(tmp_path):
+def test_a_killed_sampling_is_resumed(tmp_path):
     pytest.importorskip("blackjax")
     killed(SAMPLE, tmp_path / "draws.npz")
     resumed = sample(fit(), 200, 2, 50, checkpoint=tmp_path / "draws.npz", resume=True)

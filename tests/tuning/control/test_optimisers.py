@@ -1,4 +1,4 @@
-"""Ways downhill on functions whose least is known, and with loops that diverge on the way."""
+"""Optimisers on functions whose minimum is known, also undefined at some points."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ STARTS = jnp.array([[-1.2, 1.0], [0.5, -0.5], [1.3, 1.9]])
 
 
 def valley(point):
-    """Rosenbrock's function; beyond x = 1.4 it is not defined."""
+    """Rosenbrock's function, undefined beyond x = 1.4."""
     x, y = point
     return jnp.where(x > 1.4, jnp.nan, 100 * (y - x**2) ** 2 + (1 - x) ** 2)
 
@@ -21,47 +21,48 @@ def bowl(point):
     return 3 * (point[0] - 0.3) ** 2 + point[0] * point[1] + (point[1] + 0.2) ** 2
 
 
-def descend(name, function, steps, stages=1):
-    """Least values that searches from all starts have met, and how many points were unsound."""
+def minimise(name, function, steps, stages=1):
+    """Least values from all starts, and the number of points where the function is undefined."""
     method = optimiser(name, steps)
-    ask = jax.jit(jax.vmap(jax.value_and_grad(function)))
-    onward = jax.jit(jax.vmap(method.step, (0, 0, 0, 0, None)))
-    points, memory = STARTS, jax.vmap(method.init)(STARTS)
-    best, unsound = np.full(len(STARTS), np.inf), 0
+    evaluate = jax.jit(jax.vmap(jax.value_and_grad(function)))
+    advance = jax.jit(jax.vmap(method.step, (0, 0, 0, 0, None)))
+    points, states = STARTS, jax.vmap(method.init)(STARTS)
+    best, undefined = np.full(len(STARTS), np.inf), 0
     for step in range(steps):
-        value, slope = ask(points)
-        sound = np.isfinite(value)
-        unsound += int((~sound).sum())
-        best = np.fmin(best, np.where(sound, value, np.inf))
-        slope = jnp.where(sound[:, None], slope, 0.0)
-        fresh = jnp.asarray(step % (steps // stages) == 0)
-        points, memory = onward(memory, points, jnp.where(sound, value, jnp.inf), slope, fresh)
-    return best, unsound
+        value, gradient = evaluate(points)
+        finite = np.isfinite(value)
+        undefined += int((~finite).sum())
+        best = np.fmin(best, np.where(finite, value, np.inf))
+        gradient = jnp.where(finite[:, None], gradient, 0.0)
+        changed = jnp.asarray(step % (steps // stages) == 0)
+        value = jnp.where(finite, value, jnp.inf)
+        points, states = advance(states, points, value, gradient, changed)
+    return best, undefined
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_every_start_comes_to_the_least(name):
+def test_every_start_reaches_the_minimum(name):
     expected = scipy.optimize.minimize(bowl, [0.0, 0.0]).fun
-    # Adam does not stop at the least, but circles it ever closer.
+    # Adam oscillates about the minimum with decreasing amplitude.
     steps, tolerance = (200, 1e-4) if name == "adam" else (60, 1e-9)
-    best, _ = descend(name, bowl, steps)
+    best, _ = minimise(name, bowl, steps)
     np.testing.assert_allclose(best, expected, atol=tolerance)
 
 
 @pytest.mark.parametrize("name", ["lbfgs", "bfgs"])
-def test_curvatures_lead_through_a_valley_and_back_from_where_nothing_is_defined(name):
-    best, unsound = descend(name, valley, 120, stages=3)
+def test_quasi_newton_methods_follow_a_valley_and_return_from_undefined_points(name):
+    best, undefined = minimise(name, valley, 120, stages=3)
     np.testing.assert_allclose(best, 0.0, atol=1e-9)
-    assert name != "lbfgs" or unsound > 0
+    assert name != "lbfgs" or undefined > 0
 
 
-def test_adam_steps_back_and_goes_slower():
+def test_adam_takes_a_step_back_and_makes_shorter_ones():
     method = optimiser("adam", 10)
     start = jnp.zeros(1)
-    first, memory = method.step(method.init(start), start, jnp.ones(()), -jnp.ones(1), True)
-    back, memory = method.step(memory, first, jnp.inf * jnp.ones(()), jnp.zeros(1), False)
-    assert first[0] > 0 and back[0] == 0.0 and memory.scale == 0.5
-    again, _ = method.step(memory, back, jnp.ones(()), -jnp.ones(1), False)
+    first, state = method.step(method.init(start), start, jnp.ones(()), -jnp.ones(1), True)
+    back, state = method.step(state, first, jnp.inf * jnp.ones(()), jnp.zeros(1), False)
+    assert first[0] > 0 and back[0] == 0.0 and state.step_scale == 0.5
+    again, _ = method.step(state, back, jnp.ones(()), -jnp.ones(1), False)
     assert 0 < again[0] < first[0]
 
 

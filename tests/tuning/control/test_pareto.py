@@ -1,4 +1,4 @@
-"""Limits, fronts, ranks, methods, mini-batches and whole numbers, all on one small rig."""
+"""Limits, Pareto fronts, ranks, optimisers, mini-batches and integers, on one small rig."""
 
 import dataclasses
 
@@ -11,11 +11,11 @@ import jaxbeam as jb
 import tuning
 from tests.tuning.small_rig import GAIN, rig
 from tuning.control.integer_choices import with_integers
-from tuning.control.objective import MERITS
+from tuning.control.objective import METRICS
 from tuning.control.run_set import make_run_set
 from tuning.control.tuning_result import RunSetResult
 
-FREE = {GAIN: (500.0, 7500.0)}  # from 12000 on the loop is unstable, with minima of its own
+FREE = {GAIN: (500.0, 7500.0)}  # from 12000 on the loop is unstable, with further minima
 RUNS = tuning.full_grid({"loads.0.mass": [0.2, 0.3, 0.4, 0.5]})
 CASES = tuning.LoadCases(RUNS, ({"loads.0.mass": 0.35},))
 OPTIONS = {"steps": 40, "least_peaks": False, "progress": False}
@@ -23,12 +23,12 @@ OPTIONS = {"steps": 40, "least_peaks": False, "progress": False}
 
 @pytest.fixture(scope="module")
 def swept():
-    """Merits of the worst run at many gains: what searches must not beat, and come close to."""
-    bench = make_run_set(rig(), RUNS)
-    merits = jax.jit(lambda gain: bench.merits({GAIN: gain}))
+    """Metrics of the worst run at many gains, which searches must come close to."""
+    run_set = make_run_set(rig(), RUNS)
+    metrics = jax.jit(lambda gain: run_set.metrics({GAIN: gain}))
     gains = np.geomspace(500.0, 7500.0, 90)
-    rows = [merits(jnp.asarray(gain)) for gain in gains]
-    return {name: np.array([float(np.max(row[name])) for row in rows]) for name in MERITS}
+    rows = [metrics(jnp.asarray(gain)) for gain in gains]
+    return {name: np.array([float(np.max(row[name])) for row in rows]) for name in METRICS}
 
 
 @pytest.mark.slow
@@ -37,14 +37,14 @@ def test_every_method_finds_what_a_sweep_finds(swept, method):
     found = tuning.tune(rig(), FREE, CASES, method=method, starts=2, seed=3, **OPTIONS)
     assert found.run_sets[0].objective[1] <= swept["peak"].min() * 1.002
     assert found.history.shape == (40, 2) and np.isfinite(found.history).all()
-    values = [minimum.value for minimum in found.minima]
+    values = [minimum.value for minimum in found.start_results]
     assert values == sorted(values) and len(values) == 2
     assert values[0] == pytest.approx(found.run_sets[0].objective[1], rel=1e-6)
     assert "minima by start:" in str(found)
 
 
 @pytest.mark.slow
-def test_a_front(swept):
+def test_a_pareto_front(swept):
     limits = [0.15, 0.3, 0.22]
     front = tuning.pareto(
         rig(), FREE, CASES, tuning.Objective({"peak": 1.0}), "effort", limits, **OPTIONS
@@ -52,7 +52,7 @@ def test_a_front(swept):
     assert front.limits == (0.3, 0.22, 0.15)
     for limit, (effort, peak) in zip(front.limits, front.points(), strict=True):
         assert effort <= limit * 1.01
-        # The best that a gain of the sweep reaches within the limit.
+        # The lowest peak of the gains of the sweep within the limit.
         assert peak <= swept["peak"][swept["effort"] <= limit].min() * 1.005
     assert np.all(np.diff(front.points()[:, 1]) > 0)
     assert "effort held out" in str(front)
@@ -60,21 +60,21 @@ def test_a_front(swept):
 
 
 @pytest.mark.slow
-def test_ranks(swept):
+def test_lexicographic_order(swept):
     first, second = tuning.lexicographic(
         rig(), FREE, CASES, ["peak", "effort"], slack=0.03, **OPTIONS
     )
-    best, allowed = first.run_sets[0].merits["peak"], second.objective.limits["peak"]
+    best, allowed = first.run_sets[0].metrics["peak"], second.objective.limits["peak"]
     assert allowed == pytest.approx(1.03 * best)
-    assert second.run_sets[0].merits["peak"] <= allowed * 1.01
-    assert second.run_sets[0].merits["effort"] < first.run_sets[0].merits["effort"]
+    assert second.run_sets[0].metrics["peak"] <= allowed * 1.01
+    assert second.run_sets[0].metrics["effort"] < first.run_sets[0].metrics["effort"]
     most, least = (swept["effort"][swept["peak"] <= share * allowed].min() for share in (1.0, 1.01))
-    assert 0.99 * least <= second.run_sets[0].merits["effort"] <= 1.02 * most
+    assert 0.99 * least <= second.run_sets[0].metrics["effort"] <= 1.02 * most
 
 
 @pytest.mark.slow
 def test_mini_batches(swept):
-    """Steps on two of four runs come to the same, and the same again by the same seed."""
+    """Steps on two of four runs reach the same objective, and repeat with the same seed."""
     options = OPTIONS | {"batch": 2}
     found, again = (tuning.tune(rig(), FREE, CASES, seed=1, **options) for _ in range(2))
     assert found.run_sets[0].objective[1] <= swept["peak"].min() * 1.01
@@ -83,12 +83,10 @@ def test_mini_batches(swept):
     assert not np.array_equal(found.history, other.history)
 
 
-def test_limits_that_held_out_runs_exceed_are_told():
-    merits = {"peak": 1.0, "effort": 0.3}
-    outcome = RunSetResult(
-        "held out", ({},), *(np.full(1, x) for x in (1.0, 0.9, 0.8, 0.7)), np.ones((2, 1)),
-        np.zeros(1), [1.0, 0.8], merits,
-    )  # fmt: skip
+def test_limits_that_held_out_runs_exceed_are_in_the_verdict():
+    metrics = {"peak": 1.0, "effort": 0.3}
+    peaks = (np.full(1, x) for x in (1.0, 0.9, 0.8, 0.7))
+    outcome = RunSetResult("held out", ({},), *peaks, np.zeros(1), [1.0, 0.8], metrics)
     found = tuning.TuningResult(
         rig(), [], np.zeros(0), tuning.Objective(limits={"effort": 0.2, "peak": 1.0}),
         np.zeros((1, 1)), 0, [outcome, outcome],
@@ -97,23 +95,23 @@ def test_limits_that_held_out_runs_exceed_are_told():
     assert "effort exceeds its limit of 0.2 by 0.1" in found.verdict
 
 
-def test_whole_numbers():
+def test_integers():
     case = with_integers(rig(jb.Feedback([1.0], period=0.01)), {"controller.power": 3})
     assert case.controller.power == 3
     for address, message in {
         "controller.horizon": "nothing at controller.horizon; there it has",
         "sensors.4.order": "nothing at sensors.4.order",
-        "beam.length": "beam.length is no whole number",
+        "beam.length": "beam.length is no integer",
     }.items():
         with pytest.raises(ValueError, match=message):
             with_integers(rig(), {address: 2})
-    with pytest.raises(ValueError, match="at least one whole number"):
+    with pytest.raises(ValueError, match="at least one integer"):
         tuning.tune_integers(rig(), {}, FREE, CASES)
 
 
 @pytest.mark.slow
-def test_the_best_of_whole_numbers_is_taken():
-    """A power of 1 or 3 of the reading: of a cubic law so small a gain does nothing."""
+def test_the_best_integer_is_selected():
+    """A power of 1 or 3 of the reading: with such gains a cubic law hardly acts."""
     found = tuning.tune_integers(
         rig(), {"controller.power": [1, 3]}, FREE, CASES, **(OPTIONS | {"steps": 3})
     )
@@ -133,30 +131,30 @@ BAD = [
 
 
 @pytest.mark.parametrize(("changes", "message"), BAD, ids=[words[:20] for _, words in BAD])
-def test_what_cannot_be_tuned_is_refused(changes, message):
+def test_wrong_arguments_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         tuning.tune(**({"case": rig(), "free": FREE, "cases": CASES} | changes), **OPTIONS)
 
 
 def test_limits_are_checked():
-    with pytest.raises(ValueError, match="limits of merits must be positive and finite"):
+    with pytest.raises(ValueError, match="limits of metrics must be positive and finite"):
         tuning.Objective(limits={"effort": 0.0})
-    with pytest.raises(ValueError, match="there is no merit 'costs'"):
+    with pytest.raises(ValueError, match="there is no metric 'costs'"):
         tuning.pareto(rig(), FREE, CASES, tuning.Objective(), "costs", [1.0])
     with pytest.raises(ValueError, match="each once, the most important first"):
         tuning.lexicographic(rig(), FREE, CASES, ["peak", "peak"])
 
 
-def test_draws_of_load_cases(tmp_path):
+def test_latin_hypercube_of_load_cases(tmp_path):
     rows = tuning.latin_hypercube({"a": (1.0, 2.0), "b": (0.0, 8.0)}, 8, seed=3)
-    eighths = sorted(int((row["a"] - 1) * 8) for row in rows)  # a Latin hypercube: one in each
+    eighths = sorted(int((row["a"] - 1) * 8) for row in rows)  # of a Latin hypercube, one in each
     assert eighths == list(range(8)) == sorted(int(row["b"]) for row in rows)
     file = tmp_path / "loads.toml"
     file.write_text('[training]\ndraws = 8\nseed = 3\n"a" = [1.0, 2.0]\n"b" = [0.0, 8.0]\n')
     assert tuning.read_load_cases(file).training == rows
     for text, message in {
         'draws = 0\n"a" = [1.0, 2.0]': "the number of draws must be 1 or more",
-        'draws = 2.5\n"a" = [1.0, 2.0]': "draws and seed are whole numbers",
+        'draws = 2.5\n"a" = [1.0, 2.0]': "draws and seed are integers",
         'seed = 2\n"a" = [1.0, 2.0]': "training.seed is for drawing",
         'draws = 2\n"a" = [1.0, 2.0, 3.0]': "must be a range, low and high",
         'draws = 2\n"a" = [2.0, 1.0]': "a range must ascend",

@@ -1,4 +1,4 @@
-"""From a fit to tuning: plants that its logs leave possible, and laws that do not know them."""
+"""Plants drawn from a fit, and controllers designed for the nominal plant."""
 
 import dataclasses
 
@@ -35,8 +35,8 @@ def test_plants_have_the_covariance_of_the_fit(found):
     assert not np.array_equal(drawn(found, 3), drawn(found, 3, seed=1))
 
 
-def test_few_samples_leave_long_tails(found):
-    """As many plants lie in the fit's 95 % interval as Student's law says."""
+def test_plants_have_students_distribution_for_few_samples(found):
+    """95 % of the plants lie in the 95 % interval of the fit."""
     few = dataclasses.replace(found, degrees_of_freedom=3.0)
     rows = drawn(few)[:, 2]
     inside = np.mean((rows > few.intervals[2, 0]) & (rows < few.intervals[2, 1]))
@@ -45,14 +45,15 @@ def test_few_samples_leave_long_tails(found):
     assert scipy.stats.kstest(standard, scipy.stats.t(3).cdf).pvalue > 1e-3
 
 
-def test_plants_keep_within_bounds(found):
+def test_plants_are_within_bounds(found):
     low = float(found.values[1])
-    numbers = [dataclasses.replace(n, low=low) if i == 1 else n
-               for i, n in enumerate(found.numbers)]  # fmt: skip
-    assert drawn(dataclasses.replace(found, numbers=numbers), 300)[:, 1].min() >= low
-    numbers[1] = dataclasses.replace(numbers[1], low=low + 9 * float(found.errors[1]))
+    parameters = list(found.parameters)
+    parameters[1] = dataclasses.replace(parameters[1], low=low)
+    bounded = dataclasses.replace(found, parameters=parameters)
+    assert drawn(bounded, 300)[:, 1].min() >= low
+    parameters[1] = dataclasses.replace(parameters[1], low=low + 9 * float(found.errors[1]))
     with pytest.raises(ValueError, match="lie within the bounds of the fit"):
-        drawn(dataclasses.replace(found, numbers=numbers), 5)
+        drawn(dataclasses.replace(found, parameters=parameters), 5)
 
 
 def test_draws_of_a_posterior_are_plants():
@@ -65,23 +66,25 @@ def test_draws_of_a_posterior_are_plants():
         tuning.draw_plants(posterior, 101)
 
 
-def test_what_cannot_be_drawn_is_refused(found):
+def test_plants_that_cannot_be_drawn_are_refused(found):
     blind = dataclasses.replace(found, errors=np.array([1.0, np.inf, 1.0]))
-    with pytest.raises(ValueError, match="cannot see beam.damping_ratio, so that nothing says"):
+    with pytest.raises(
+        ValueError, match="not identifiable from the data: beam.damping_ratio; to draw plants"
+    ):
         tuning.draw_plants(blind, 3)
     with pytest.raises(ValueError, match="must be 1 or more, not 0"):
         tuning.draw_plants(found, 0)
     loads = Posterior(["logs.0.loads.0.mass"], np.ones((1, 5, 1)), np.ones(1), np.ones(1), 0)
-    with pytest.raises(ValueError, match="nothing that was identified concerns the plant"):
+    with pytest.raises(ValueError, match="no parameter of the plant was identified"):
         tuning.draw_plants(loads, 3)
 
 
-def test_a_case_adopts_the_plant(found):
+def test_a_case_with_the_identified_plant(found):
     other = dataclasses.replace(CASE, loads=(jb.MovingMass(mass=0.1, speed=2.0),))
-    adopted = tuning.with_identified_plant(other, found)
-    assert float(adopted.beam.flexural_rigidity) == found.values[0]
-    assert float(adopted.sensors[0].offset) == found.values[2]
-    assert float(adopted.loads[0].mass) == 0.1
+    changed = tuning.with_identified_plant(other, found)
+    assert float(changed.beam.flexural_rigidity) == found.values[0]
+    assert float(changed.sensors[0].offset) == found.values[2]
+    assert float(changed.loads[0].mass) == 0.1
 
 
 def test_runs_are_simulated_on_every_plant():
@@ -95,27 +98,27 @@ def test_runs_are_simulated_on_every_plant():
 WEIGHTS = {"state_weight": [1e4, 1.0], "command_weight": [1e-3]}
 
 
-def test_a_law_is_designed_for_the_plant_it_is_told_of():
-    """On a softer beam it acts as the very gains that were designed for the stiffer one."""
+def test_controllers_are_designed_for_the_nominal_plant():
+    """On a softer beam the commands are those of the gains designed for the stiffer one."""
     law = jb.LQR(**WEIGHTS, period=0.01)
     model = jb.state_space(rig(law))
     gain = np.asarray(law.init(model)[0])
     soft = {RIGIDITY: 10.0}
     fixed = jb.StateFeedback(gain=gain.reshape(1, -1), period=0.01)
     expected = jb.simulate(jb.replace(rig(fixed), soft))
-    bench = make_run_set(rig(law), [soft])
-    assert float(bench.nominal[RIGIDITY]) == 13.211
-    told = bench.records({})[0]
-    np.testing.assert_allclose(told.command, expected.command, rtol=1e-6, atol=1e-9)
-    knowing = jb.simulate(jb.replace(rig(law), soft))
-    assert np.abs(np.asarray(knowing.command) - told.command).max() > 1e-3
+    run_set = make_run_set(rig(law), [soft])
+    assert float(run_set.nominal[RIGIDITY]) == 13.211
+    record = run_set.records({})[0]
+    np.testing.assert_allclose(record.command, expected.command, rtol=1e-6, atol=1e-9)
+    designed_for_soft = jb.simulate(jb.replace(rig(law), soft))
+    assert np.abs(np.asarray(designed_for_soft.command) - record.command).max() > 1e-3
     case = rig(law)
-    assert with_fixed_design(case, {}, bench.plan.shapes.layout) is case
+    assert with_fixed_design(case, {}, run_set.plan.shapes.layout) is case
 
 
 @pytest.mark.slow
-def test_tuned_for_the_worst_of_the_plants():
-    """From a fit straight to tuning; what is said of a plant is what simulating it gives."""
+def test_tuning_for_the_worst_of_several_plants():
+    """Peaks in the result are those of a simulation of each plant."""
     identified = Posterior(
         [RIGIDITY], np.linspace(11.0, 15.0, 9).reshape(1, 9, 1), np.ones(1), np.ones(1), 0
     )
@@ -126,13 +129,13 @@ def test_tuned_for_the_worst_of_the_plants():
     )  # fmt: skip
     training, held_out = tuned.run_sets
     assert float(tuned.case.beam.flexural_rigidity) == pytest.approx(13.0)
-    plants = [run[RIGIDITY] for outcome in tuned.run_sets for run in outcome.runs]
+    plants = [run[RIGIDITY] for run_set in tuned.run_sets for run in run_set.runs]
     assert len(set(plants)) == 4 and all(11.0 <= value <= 15.0 for value in plants)
-    relative = training.after / training.uncontrolled
+    relative = training.peaks_after / training.uncontrolled_peaks
     assert training.objective[1] == pytest.approx(relative.max(), rel=1e-3)
     run = held_out.runs[1]
     record = jb.simulate(jb.replace(tuned.case, run))
-    assert held_out.after[1] == pytest.approx(float(record.peak_deflection[0]), rel=1e-4)
+    assert held_out.peaks_after[1] == pytest.approx(float(record.peak_deflection[0]), rel=1e-4)
     plain = jb.simulate(dataclasses.replace(record.case, controller=None))
-    peak = np.abs(plain.deflection).max()  # at samples, as what it is compared with
-    assert held_out.uncontrolled[1] == pytest.approx(peak, rel=1e-3)
+    peak = np.abs(plain.deflection).max()  # at samples, like the peak that it is compared with
+    assert held_out.uncontrolled_peaks[1] == pytest.approx(peak, rel=1e-3)

@@ -1,4 +1,4 @@
-"""Which states to feed back: relaxed shares against trying every choice."""
+"""States to feed back: selection by relaxed shares, against every choice."""
 
 import dataclasses
 import itertools
@@ -18,36 +18,34 @@ KEEP, STATES = 1, 4
 
 @pytest.fixture(scope="module")
 def regulated():
-    """Two modes under a regulator whose weights were set by hand."""
+    """Two modes under a regulator with weights set by hand."""
     law = jb.LQR(state_weight=[1e4, 1e4, 1.0, 1.0], command_weight=[1e-3], period=0.01)
     case = rig(law)
     return dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=2))
 
 
 @pytest.mark.slow
-def test_the_states_are_those_that_trying_every_choice_finds(regulated):
+def test_the_states_selected_are_the_best_of_all_choices(regulated):
     found = tuning.tune_reduced(regulated, KEEP, FREE, CASES, **OPTIONS)
     ends = {}
-    for kept in itertools.combinations(range(STATES), KEEP):
-        shares = np.isin(np.arange(STATES), kept).astype(float)
+    for fed_back in itertools.combinations(range(STATES), KEEP):
+        shares = np.isin(np.arange(STATES), fed_back).astype(float)
         law = dataclasses.replace(regulated.controller, feedback=shares)
-        one = tuning.tune(
-            dataclasses.replace(regulated, controller=law), FREE, CASES, **OPTIONS
-        )
-        ends[kept] = one.run_sets[0].objective[1]
-    assert found.kept == min(ends, key=ends.get)
+        one = tuning.tune(dataclasses.replace(regulated, controller=law), FREE, CASES, **OPTIONS)
+        ends[fed_back] = one.run_sets[0].objective[1]
+    assert found.fed_back == min(ends, key=ends.get)
     rounded, end = found.tuned.run_sets[0].objective
-    assert end <= rounded and end < 1.002 * ends[found.kept]
-    # The choice matters, and the shares kept to their budget.
+    assert end <= rounded and end < 1.002 * ends[found.fed_back]
+    # The choice matters, and the sum of the shares is as required.
     assert max(ends.values()) > 1.05 * end
     assert found.shares.sum() == pytest.approx(KEEP, abs=0.05)
     np.testing.assert_array_equal(
-        np.asarray(found.tuned.case.controller.feedback), np.isin(range(STATES), found.kept)
+        np.asarray(found.tuned.case.controller.feedback), np.isin(range(STATES), found.fed_back)
     )
-    assert "when the others are tuned again" in str(found)
+    assert "when the other parameters are tuned again" in str(found)
 
 
-def test_what_has_no_states_to_leave_out_is_refused(regulated):
+def test_wrong_controllers_and_numbers_of_states_are_refused(regulated):
     with pytest.raises(ValueError, match="only regulators, such as kind 'lqr'"):
         tuning.tune_reduced(rig(), 1, FREE, CASES)
     with pytest.raises(ValueError, match="keep must be 1 to 3 of the 4 states; it is 4"):

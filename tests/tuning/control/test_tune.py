@@ -1,7 +1,6 @@
-"""Tuning against searches without gradients, and what becomes of it when it is stopped."""
+"""Tuning against searches without gradients, gradients of objectives, and checkpoints."""
 
 import dataclasses
-import importlib
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +12,9 @@ import jaxbeam as jb
 import tuning
 from jaxbeam.analysis.stability import frozen_poles
 from tests.differences import central
+from tuning import checkpoint
 from tuning.checkpoint import load, save
-from tuning.control import optimisation
+from tuning.control import penalised_objective
 from tuning.control.load_cases import run_case
 from tuning.control.objective import Objective
 from tuning.control.optimisation import Optimisation
@@ -46,85 +46,82 @@ def rig(gain=2000.0, **options):
 
 
 @pytest.fixture(scope="module")
-def bench():
+def run_set():
     return make_run_set(rig(), RUNS, least_peaks=True)
 
 
 @pytest.fixture(scope="module")
-def merits(bench):
-    """Merits by gain and, if given, sharpness of the maxima: a program for all."""
-    program = jax.jit(lambda *given: bench.merits(*given))
+def metrics(run_set):
+    """Metrics by gain and, if given, sharpness of the maxima, compiled once."""
+    program = jax.jit(lambda *given: run_set.metrics(*given))
     return lambda gain, *sharp: program({GAIN: jnp.asarray(gain)}, *map(jnp.asarray, sharp))
 
 
 @pytest.mark.slow
-def test_merits_are_those_of_the_simulated_runs(merits):
-    merits = merits(5000.0)
+def test_merits_are_those_of_the_simulated_runs(metrics):
+    metrics = metrics(5000.0)
     for i, run in enumerate(RUNS):
         record = jb.simulate(jb.replace(run_case(rig(), run), {GAIN: 5000.0}))
         plain = jb.simulate(run_case(jb.Case(rig().beam, sensors=rig().sensors, loads=rig().loads,
                                           run=rig().run), run))  # fmt: skip
         bent, free = np.abs(record.deflection), np.abs(plain.deflection)
-        assert merits["peak"][i] == pytest.approx(bent.max() / free.max(), rel=1e-4)
-        assert merits["rms"][i] == pytest.approx(
+        assert metrics["peak"][i] == pytest.approx(bent.max() / free.max(), rel=1e-4)
+        assert metrics["rms"][i] == pytest.approx(
             np.sqrt(np.mean(bent**2) / np.mean(free**2)), rel=1e-4
         )
         limit = jb.bound(run_case(rig(), run)).peak
         missed = (bent.max() - limit) / (free.max() - limit)
-        assert merits["shortfall"][i] == pytest.approx(missed, rel=1e-3)
+        assert metrics["shortfall"][i] == pytest.approx(missed, rel=1e-3)
         late = np.asarray(record.times) > 0.4
-        assert merits["after_exit"][i] == pytest.approx(bent[late].max() / free.max(), rel=1e-3)
+        assert metrics["after_exit"][i] == pytest.approx(bent[late].max() / free.max(), rel=1e-3)
         effort = np.sqrt(np.mean(np.asarray(record.command) ** 2)) / 7.5
-        assert merits["effort"][i] == pytest.approx(effort, rel=1e-4)
+        assert metrics["effort"][i] == pytest.approx(effort, rel=1e-4)
         weight = 9.81 * run["loads.0.mass"]
         on = np.asarray(record.contact_force) != 0
         change = np.abs(np.asarray(record.contact_force) - weight)[on].max() / weight
-        assert merits["contact"][i] == pytest.approx(change, rel=1e-3)
+        assert metrics["contact"][i] == pytest.approx(change, rel=1e-3)
 
 
 @pytest.mark.slow
-def test_gradients_of_the_objectives(bench):
-    """Of a mix of all, which share the runs, and so what is compiled for them."""
+def test_gradients_of_the_objectives(run_set):
+    """Gradient of a sum of all, so that they share a compiled program."""
     weights = {"peak": 1.0, "rms": 0.3, "effort": 0.1, "contact": 0.2}
     objectives = [tuning.Objective(weights, over) for over in ("mean", "worst", "cvar")]
 
     @jax.jit
     def value(gain):
-        merits = bench.merits({GAIN: gain}, 80.0)
-        parts = [each.aggregate(each.weighted_merits(merits), 80.0) for each in objectives]
+        metrics = run_set.metrics({GAIN: gain}, 80.0)
+        parts = [each.aggregate(each.weighted_metrics(metrics), 80.0) for each in objectives]
         return parts[0] + 0.7 * parts[1] + 0.4 * parts[2]
 
     expected = central(lambda point: value(point[0]), [4000.0], step=1.0)[0]
     assert jax.jit(jax.grad(value))(4000.0) == pytest.approx(expected, rel=1e-6)
 
 
-def test_slopes_of_few_and_of_many_numbers_are_the_same(bench, monkeypatch):
-    """The one found forward, the other in reverse; and those of differences."""
+def test_forward_and_reverse_gradients_are_equal(run_set, monkeypatch):
+    """And equal to differences."""
     target = Objective().target
-    numbers = free_parameters([rig()], dict(FREE), 1.0)
-    search = Optimisation(bench, numbers, Objective())
+    search = Optimisation(run_set, free_parameters([rig()], dict(FREE), 1.0), Objective())
     points = jnp.asarray(search.start_points(2, 1))
-    sharpness, rows = jnp.asarray(40.0), jnp.arange(len(RUNS))
+    values_and_gradients = penalised_objective.values_and_gradients.__wrapped__
 
     def found(points):
-        return optimisation._slope.__wrapped__(
-            *search._program_arguments, points, sharpness, rows, target
-        )
+        return values_and_gradients(*search._step_arguments(points, 40.0, range(len(RUNS)), target))
 
     (smooth, true), forward = jax.jit(found)(points)
-    monkeypatch.setattr(optimisation, "FEW", 0)
+    monkeypatch.setattr(penalised_objective, "MAX_FORWARD_PARAMETERS", 0)
     in_reverse = jax.jit(lambda points: found(points))
-    (again, truly), backward = in_reverse(points)
-    np.testing.assert_allclose([smooth, true], [again, truly], rtol=1e-12)
-    np.testing.assert_allclose(forward, backward, rtol=1e-9)
+    values, reverse = in_reverse(points)
+    np.testing.assert_allclose([smooth, true], values, rtol=1e-12)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
     expected = central(lambda y: in_reverse(y[:, None])[0][0].sum(), points[:, 0], step=1e-4)
     np.testing.assert_allclose(forward[:, 0], expected, rtol=1e-5)
 
 
-def test_smooth_maxima_come_to_the_true_ones(merits):
-    true = merits(4000.0)["peak"]
+def test_smooth_maxima_converge_to_the_true_ones(metrics):
+    true = metrics(4000.0)["peak"]
     for sharpness in (100.0, 1000.0):
-        smooth = merits(4000.0, sharpness)["peak"]
+        smooth = metrics(4000.0, sharpness)["peak"]
         assert np.all(smooth >= true) and np.all(smooth - true < np.log(200) / sharpness)
 
 
@@ -137,9 +134,9 @@ def tuned():
     return tuning.tune(rig(), FREE, CASES, **OPTIONS)
 
 
-def test_finds_what_a_search_without_gradients_finds(merits, tuned):
+def test_the_minimum_is_that_of_a_search_without_gradients(metrics, tuned):
     def peak(gain):
-        return float(np.max(merits(gain)["peak"]))
+        return float(np.max(metrics(gain)["peak"]))
 
     gains = np.geomspace(500.0, 40000.0, 60)
     values = [peak(gain) for gain in gains]
@@ -149,26 +146,26 @@ def test_finds_what_a_search_without_gradients_finds(merits, tuned):
     assert tuned.run_sets[0].objective[1] < tuned.run_sets[0].objective[0]
 
 
-def test_the_proof(tuned):
+def test_the_result_on_training_and_held_out_runs(tuned):
     training, held_out = tuned.run_sets
     for outcome in tuned.run_sets:
-        # Nobody beats the bound: it holds at instants, peaks in between are a little larger.
-        assert np.all(outcome.after >= outcome.least * (1 - 1e-3))
-        assert np.all(outcome.shares(outcome.uncontrolled) == 0)
-        assert np.all(outcome.shares(outcome.least) == 1)
+        # Least peaks hold at samples; peaks between them may be slightly larger.
+        assert np.all(outcome.peaks_after >= outcome.least_peaks * (1 - 1e-3))
+        assert np.all(outcome.attained_shares(outcome.uncontrolled_peaks) == 0)
+        assert np.all(outcome.attained_shares(outcome.least_peaks) == 1)
     run = held_out.runs[0]
     record = jb.simulate(run_case(tuned.case, run))
-    assert held_out.after[0] == pytest.approx(float(record.peak_deflection[0]), rel=1e-4)
+    assert held_out.peaks_after[0] == pytest.approx(float(record.peak_deflection[0]), rel=1e-4)
     assert tuned.verdict.startswith("objective on training ")
     assert "worst held out run: peak" in tuned.verdict
-    assert f"at least {held_out.shares(held_out.after).min():.1%}" in tuned.verdict
+    assert f"at least {held_out.attained_shares(held_out.peaks_after).min():.1%}" in tuned.verdict
     assert GAIN in str(tuned) and "held out runs: peaks in mm" in str(tuned)
     assert tuned.to_dict()["numbers"][GAIN]["after"] == tuned.values[0]
-    assert tuned.history.shape == (25, 2) and tuned.rejected == 0
+    assert tuned.history.shape == (25, 2) and tuned.rejected_steps == 0
     tuned.plot()
 
 
-def test_another_seed_comes_to_the_same(tuned):
+def test_another_seed_reaches_the_same_objective(tuned):
     cases = tuning.LoadCases(RUNS)
     again = tuning.tune(rig(9000.0), FREE, cases, seed=5, least_peaks=False, **OPTIONS)
     assert again.run_sets[0].objective[1] == pytest.approx(tuned.run_sets[0].objective[1], rel=2e-3)
@@ -176,18 +173,18 @@ def test_another_seed_comes_to_the_same(tuned):
 
 
 @pytest.mark.slow
-def test_a_search_that_was_stopped_goes_on_to_the_same_end(tuned, tmp_path, monkeypatch):
+def test_a_stopped_search_is_resumed_to_the_same_result(tuned, tmp_path, monkeypatch):
     file = tmp_path / "search.npz"
 
-    def killed(*arguments):
+    def save_and_stop(*arguments):
         save(*arguments)
         raise KeyboardInterrupt
 
     options = OPTIONS | {"least_peaks": False}
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(importlib.import_module("tuning.control.optimisation"), "save", killed)
+        patch.setattr(checkpoint, "save", save_and_stop)
         tuning.tune(rig(), FREE, CASES, checkpoint=file, **options)
-    with pytest.raises(FileExistsError, match="resume the search"):
+    with pytest.raises(FileExistsError, match="resume that search"):
         tuning.tune(rig(), FREE, CASES, checkpoint=file, **options)
     with pytest.raises(ValueError, match="belongs to another search"):
         tuning.tune(rig(2500.0), FREE, CASES, checkpoint=file, resume=True, **options)
@@ -199,7 +196,7 @@ def test_a_search_that_was_stopped_goes_on_to_the_same_end(tuned, tmp_path, monk
         load(file, "")
 
 
-def test_the_start_is_kept_where_nothing_better_is_met():
+def test_the_start_is_the_result_if_nothing_is_better():
     cases, free = tuning.LoadCases(RUNS), {GAIN: (1999.0, 2001.0)}
     worse = tuning.Objective({"effort": 1.0})
     options = OPTIONS | {"steps": 2, "least_peaks": False}
@@ -211,8 +208,8 @@ PLAIN = jb.Case(rig().beam, loads=rig().loads, sensors=rig().sensors)
 
 
 @pytest.mark.slow
-def test_a_loop_that_is_to_stay_stable():
-    # A light load: heavy ones have frozen poles to the right on the far half even without control.
+def test_tuning_with_a_stability_constraint():
+    # With a heavy load frozen poles are unstable on the far half even without control.
     light = {"loads.0.mass": 0.05}
     cases, free = tuning.LoadCases((light,)), {GAIN: (50.0, 40000.0)}
     stable = tuning.StabilityConstraint(
@@ -221,8 +218,8 @@ def test_a_loop_that_is_to_stay_stable():
     found = tuning.tune(
         rig(100.0), free, cases, stable=stable, steps=20, least_peaks=False, progress=False
     )
-    assert found.violation == 0.0 and found.values[0] > 100.0
-    # Held against eigenvalues, with the delay and each change in the case itself.
+    assert found.stability_violation == 0.0 and found.values[0] > 100.0
+    # Against eigenvalues of cases with the delay and each change of the rigidity.
     late = jb.Feedback(found.case.controller.gains, period=0.01, delay=0.005)
     for factor in (0.9, 1.0, 1.1):
         case = dataclasses.replace(run_case(found.case, light), controller=late)
@@ -230,15 +227,15 @@ def test_a_loop_that_is_to_stay_stable():
         assert frozen_poles(case, np.linspace(0.0, 0.4, 30)).largest_real_part.max() <= -0.5 + 0.1
 
 
-def test_slope_of_the_violation():
+def test_gradient_of_the_violation():
     violation = jax.jit(
-        tuning.StabilityConstraint(max_real_part=-50.0, instants=2).violation(
+        tuning.StabilityConstraint(max_real_part=-50.0, instants=2).violation_function(
             [run_case(rig(), RUNS[0])]
         )
     )
-    slope = jax.grad(lambda gain: violation({GAIN: gain}))(3000.0)
+    gradient = jax.grad(lambda gain: violation({GAIN: gain}))(3000.0)
     expected = central(lambda point: violation({GAIN: point[0]}), [3000.0], step=3.0)[0]
-    assert slope == pytest.approx(expected, rel=1e-4)
+    assert gradient == pytest.approx(expected, rel=1e-4)
 
 
 BAD = [
@@ -251,7 +248,7 @@ BAD = [
     ({"free": {GAIN: (5000.0, 9000.0)}}, f"{GAIN} starts at 2000, outside its bounds"),
     (
         {"objective": tuning.Objective({"shortfall": 1.0}), "least_peaks": False},
-        "leave bounds on to tune for it",
+        "leave least_peaks on for it",
     ),
     ({"steps": 0}, "steps and starts must be 1 or more"),
     ({"cases": tuning.LoadCases(({"loads.0.speed": 0.5},))}, "run.duration is 0.6 s, but with"),
@@ -261,13 +258,13 @@ BAD = [
 
 
 @pytest.mark.parametrize(("changes", "message"), BAD, ids=[message[:24] for _, message in BAD])
-def test_what_cannot_be_tuned_is_refused(changes, message):
+def test_wrong_arguments_are_refused(changes, message):
     given = {"case": rig(), "free": {GAIN: None}, "cases": tuning.LoadCases(RUNS)} | changes
     with pytest.raises(ValueError, match=message):
         tuning.tune(**given, progress=False)
 
 
-def test_runs_that_cannot_be_proven_are_told_before_the_search(tmp_path):
+def test_faulty_held_out_runs_are_refused_before_the_search(tmp_path):
     slow = tuning.LoadCases(training=RUNS, held_out=tuning.full_grid({"loads.0.speed": [0.7]}))
     with pytest.raises(ValueError, match="with loads.0.speed = 0.7 the last load leaves only at"):
         tuning.tune(rig(), FREE, slow, least_peaks=False, checkpoint=tmp_path / "search.npz")
@@ -298,10 +295,10 @@ def test_load_cases_from_a_file(tmp_path):
         tuning.read_load_cases(tmp_path / "none.toml")
 
 
-def test_objectives_that_make_no_sense():
-    for weights, message in (({"peek": 1.0}, "no merit 'peek'"), ({}, "needs merits"),
+def test_faulty_objectives_are_refused():
+    for weights, message in (({"peek": 1.0}, "no metric 'peek'"), ({}, "needs metrics"),
                              ({"peak": -1.0}, "positive, finite weights")):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             tuning.Objective(weights)
-    with pytest.raises(ValueError, match="over may be mean, worst, cvar"):
+    with pytest.raises(ValueError, match="aggregation may be mean, worst, cvar"):
         tuning.Objective(aggregation="median")

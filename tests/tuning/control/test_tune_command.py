@@ -1,4 +1,4 @@
-"""The command line of tunings: what it asks of the library, what it writes, and how it refuses."""
+"""Command line of tunings: calls of the library, files written, and refusals."""
 
 import json
 
@@ -9,7 +9,7 @@ import jaxbeam as jb
 import tuning
 from jaxbeam.cli import main
 from tests.tuning.small_rig import GAIN, RIGIDITY, rig
-from tests.tuning.stand_in import campaign, fit, search
+from tests.tuning.stand_in import dataset, fit, least_squares
 from tuning.fit import storage
 
 LOADS = '[training]\n"loads.0.mass" = [0.3, 0.5]\n[held_out]\n"loads.0.mass" = [0.4]\n'
@@ -34,26 +34,26 @@ def call(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_from_a_fit_to_a_tuned_case(call, tmp_path, monkeypatch):
-    """The file that identify writes goes in, a case that simulates comes out."""
-    monkeypatch.setattr(storage, "prepare", lambda case, logs: campaign())
-    found = fit(search(free={RIGIDITY: None, "beam.damping_ratio": None}))
+    """From the file written by identify to a tuned case that can be simulated."""
+    monkeypatch.setattr(storage, "make_dataset", lambda case, logs: dataset())
+    found = fit(least_squares(free={RIGIDITY: None, "beam.damping_ratio": None}))
     tuning.save_fit(found, tmp_path / "fit.npz")
     code, out, err = call(f"{TUNE} --fit fit.toml --plants 2 --aggregate cvar -o tuned.toml --json")
     assert code == 0, err
-    told = json.loads(out)
-    assert len(told["runs"]["training"]["cases"]) == 4
-    assert len(told["runs"]["held out"]["cases"]) == 2
-    plants = [run[RIGIDITY] for kind in told["runs"].values() for run in kind["cases"]]
+    result = json.loads(out)
+    assert len(result["runs"]["training"]["cases"]) == 4
+    assert len(result["runs"]["held out"]["cases"]) == 2
+    plants = [run[RIGIDITY] for kind in result["runs"].values() for run in kind["cases"]]
     assert len(set(plants)) == 4
     assert np.all(np.abs(np.array(plants) - found.values[0]) < 6 * found.errors[0])
     tuned = jb.load_case(tmp_path / "tuned.toml")
     assert float(tuned.beam.flexural_rigidity) == found.values[0]
-    assert float(tuned.controller.gains[0]) == told["numbers"][GAIN]["after"]
+    assert float(tuned.controller.gains[0]) == result["numbers"][GAIN]["after"]
     assert not (tmp_path / "tuned.search.npz").exists()
     assert call("simulate tuned.toml -o run.nc")[0] == 0
 
 
-def test_what_is_asked_of_a_front(call, tmp_path, monkeypatch):
+def test_arguments_of_a_pareto_front(call, tmp_path, monkeypatch):
     asked = {}
 
     class Front:
@@ -69,54 +69,54 @@ def test_what_is_asked_of_a_front(call, tmp_path, monkeypatch):
     monkeypatch.setattr(tuning, "pareto", pareto)
     code, out, err = call(f"{TUNE} --pareto effort=0.1,0.2 --limit after_exit=0.5 --aggregate mean")
     assert code == 0 and "a front" in out, err
-    case, free, cases, objective, merit, limits = asked["given"]
+    case, free, cases, objective, metric, limits = asked["given"]
     assert free == {GAIN: (500.0, 7500.0)} and len(cases.training) == 2
-    assert (merit, limits) == ("effort", [0.1, 0.2])
+    assert (metric, limits) == ("effort", [0.1, 0.2])
     assert objective == tuning.Objective({"peak": 1.0}, "mean", limits={"after_exit": 0.5})
     assert asked["options"]["method"] == "lbfgs" and asked["options"]["steps"] == 2
 
 
-def test_ranks_and_choices_are_handed_on(call, monkeypatch):
+def test_arguments_of_the_other_kinds_of_tuning(call, monkeypatch):
     asked = {}
 
-    class Told:
+    class Result:
         def to_dict(self):
             return {"verdict": "fine"}
 
-    class Chosen:
-        best = Told()
+    class IntegerSearch:
+        best = Result()
 
     def lexicographic(*given, **options):
-        asked["rank"] = given[3], options["over"]
-        return Told(), Told()
+        asked["lexicographic"] = given[3], options["aggregation"]
+        return Result(), Result()
 
-    def tune_choices(*given, **options):
-        asked["choose"] = given[1], options["method"]
-        return Chosen()
+    def tune_integers(*given, **options):
+        asked["integers"] = given[1], options["method"]
+        return IntegerSearch()
 
     def tune_reduced(*given, **options):
-        asked["keep"] = given[1], list(given[2]), options["starts"]
+        asked["states"] = given[1], list(given[2]), options["starts"]
         return Reduced()
 
     class Reduced:
-        tuned = Told()
+        tuned = Result()
 
     monkeypatch.setattr(tuning, "lexicographic", lexicographic)
     monkeypatch.setattr(tuning, "tune_reduced", tune_reduced)
-    monkeypatch.setattr(tuning, "tune_choices", tune_choices)
+    monkeypatch.setattr(tuning, "tune_integers", tune_integers)
     assert json.loads(call(f"{TUNE} --lexicographic peak,effort --json")[1]) == {"verdict": "fine"}
     assert json.loads(call(f"{TUNE} --integers controller.power=1,3 --json")[1])
     assert json.loads(call(f"{TUNE} --states 1 --starts 2 --json")[1]) == {"verdict": "fine"}
     assert asked == {
-        "keep": (1, [GAIN], 2),
-        "rank": (["peak", "effort"], "worst"),
-        "choose": ({"controller.power": [1, 3]}, "adam"),
+        "states": (1, [GAIN], 2),
+        "lexicographic": (["peak", "effort"], "worst"),
+        "integers": ({"controller.power": [1, 3]}, "adam"),
     }
 
 
 REFUSED = {
     "--pareto effort": "--pareto takes METRIC=NUMBER",
-    "--pareto effort=0.1 --lexicographic peak": "--lexicographic and --pareto are mutually exclusive",
+    "--pareto effort=0.1 --lexicographic peak": "and --pareto are mutually exclusive",
     "--lexicographic peak --objective rms=1": "--lexicographic takes the place of --objective",
     "--pareto effort=0.1 --starts 3": "are for a single search, not for --pareto",
     "--integers controller.power=1 --resume": "are for a single search, not for --integers",
@@ -132,6 +132,6 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("options", REFUSED)
-def test_what_makes_no_sense_is_refused(call, options):
+def test_contradictory_options_are_refused(call, options):
     code, _, err = call(f"{TUNE} {options}")
     assert code != 0 and REFUSED[options] in " ".join(err.split())

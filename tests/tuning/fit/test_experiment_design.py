@@ -1,4 +1,4 @@
-"""The best place of a sensor, against the modal equations and differences on a grid."""
+"""The best position of a sensor, against modal equations and differences on a grid."""
 
 import dataclasses
 
@@ -21,13 +21,13 @@ CASE = jb.Case(
 FREE = ["beam.flexural_rigidity", "beam.mass_per_length"]
 
 
-def errors_by_differences(places, noise):
-    """Standard errors of rigidity and mass per length (place, free) with one sensor at a place."""
+def errors_by_differences(positions, noise):
+    """Standard errors of rigidity and mass per length, by position of one sensor."""
     times = np.arange(81) / 200.0
 
     def respond(**changes):
         span = dataclasses.replace(SPAN, **changes)
-        return modal_equations.respond(span, [Load(0.5, 2.0, 0.02)], places, times).deflection
+        return modal_equations.respond(span, [Load(0.5, 2.0, 0.02)], positions, times).deflection
 
     step = 1e-4
     slopes = np.stack([
@@ -40,18 +40,18 @@ def errors_by_differences(places, noise):
 
 
 @pytest.mark.slow
-def test_where_a_sensor_tells_mass_best():
+def test_the_best_sensor_position_for_the_mass():
     bounds = (0.05, 0.55)
     found = design_experiment(
         CASE, FREE, {"sensors.0.position": bounds}, target=FREE[1], noise=2e-5
     )
-    places = np.linspace(*bounds, 101)
-    grid = errors_by_differences(places, 2e-5)
+    positions = np.linspace(*bounds, 101)
+    grid = errors_by_differences(positions, 2e-5)
     np.testing.assert_allclose(
         found.errors_before, errors_by_differences(np.array([0.12]), 2e-5)[0], rtol=1e-3
     )
     best = int(np.argmin(grid[:, 1]))
-    assert found.after[0] == pytest.approx(places[best], abs=0.005)
+    assert found.after[0] == pytest.approx(positions[best], abs=0.005)
     assert found.errors_after[1] == pytest.approx(grid[best, 1], rel=2e-3)
     assert found.errors_after[1] < found.errors_before[1]
     near = errors_by_differences(np.array([0.1195, 0.1205]), 2e-5)[:, 1]
@@ -65,10 +65,10 @@ def test_where_a_sensor_tells_mass_best():
 @pytest.mark.parametrize(
     "given, words",
     [
-        ({"over": {}}, "name at least one number that may be chosen"),
-        ({"target": "beam.length"}, "beam.length is to be sharpened but is not free"),
+        ({"over": {}}, "name at least one number to choose"),
+        ({"target": "beam.length"}, "the target beam.length is not free"),
         ({"over": {FREE[0]: (5.0, 20.0)}}, "cannot be both fitted and chosen"),
-        ({"over": {"loads.0.speed": (3.0, 4.0)}}, "loads.0.speed is 2, outside of its bounds"),
+        ({"over": {"loads.0.speed": (3.0, 4.0)}}, "loads.0.speed is 2, outside its bounds"),
         ({"over": {"loads.0.sped": (3.0, 4.0)}}, "did you mean 'loads.0.speed'"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Command lines around fits: what they ask of the library, what they print, how they refuse."""
+"""Command lines around fits: calls of the library, output, and refusals."""
 
 import json
 
@@ -9,6 +9,8 @@ import tuning
 from tests.tuning import stand_in
 from tests.tuning.fit import test_frequency_responses
 from tests.tuning.fit.test_identify_command import call
+from tuning.fit.experiment_design import ExperimentDesign
+from tuning.fit.model_validation import HeldOutPrediction
 
 __all__ = ["call"]
 
@@ -39,18 +41,15 @@ def test_weighing(call, tmp_path, monkeypatch):
     assert code == 1 and "--speeds takes LOW:HIGH in m/s, such as 0.5:3, not 'fast'" in err
 
 
-def test_rivals_and_unseen_logs(call, tmp_path, monkeypatch):
-    """What is printed of rivals is what the library says; needless numbers cost."""
-    held = stand_in.search({"beam.flexural_rigidity": None})
+def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):
+    """The criteria printed are those of the library; superfluous parameters cost."""
+    held = stand_in.least_squares({"beam.flexural_rigidity": None})
     fits = {"three": stand_in.fit(), "one": stand_in.fit(held)}
     for name in fits:
         (tmp_path / f"{name}.npz").touch()
     monkeypatch.setattr(tuning, "load_fit", lambda path: fits[path.stem])
-    monkeypatch.setattr(
-        tuning,
-        "hold_out",
-        lambda fit, logs: [tuning.fit.model_validation.Unseen("new", np.array([1.1]))],
-    )
+    predictions = [HeldOutPrediction("new", np.array([1.1]))]
+    monkeypatch.setattr(tuning, "predict_held_out", lambda fit, logs: predictions)
     code, out, err = call("compare-models three.npz one.npz --held-out runs.csv")
     assert code == 1 and "the cell is empty" in err
     code, out, err = call("compare-models three.npz one.npz")
@@ -71,15 +70,16 @@ def test_rivals_and_unseen_logs(call, tmp_path, monkeypatch):
 def test_an_experiment_is_planned(call, monkeypatch):
     asked = {}
 
-    def sharpen(case, free, over, **settings):
+    def design_experiment(case, free, over, **settings):
         asked.update(free=free, over=over, settings=settings)
-        return tuning.fit.experiment_design.Design(
+        return ExperimentDesign(
             ["sensors.0.position"], ["m"], np.array([0.1]), np.array([0.3]), ["beam.length"],
             np.array([2.0]), np.array([1.0]), np.ones((1, 1)), case,
         )  # fmt: skip
 
-    monkeypatch.setattr(tuning, "sharpen", sharpen)
-    line = "design-experiment case.toml --free beam.length --vary sensors.0.position=0.1:0.5 --noise 1e-6"
+    monkeypatch.setattr(tuning, "design_experiment", design_experiment)
+    vary = "--vary sensors.0.position=0.1:0.5"
+    line = f"design-experiment case.toml --free beam.length {vary} --noise 1e-6"
     code, out, err = call(f"{line} -o better.toml")
     assert code == 0, err
     assert asked["over"] == {"sensors.0.position": (0.1, 0.5)}
@@ -87,10 +87,8 @@ def test_an_experiment_is_planned(call, monkeypatch):
     assert "standard error of beam.length: 2 -> 1" in out and "written: better.toml" in out
     told = json.loads(call(f"{line} --json")[1])
     assert told["standard_errors"]["beam.length"] == {"before": 2.0, "after": 1.0}
-    assert (
-        "name what can be chosen with --vary"
-        in call("design-experiment case.toml --free beam.length")[2]
-    )
+    without_choice = call("design-experiment case.toml --free beam.length")[2]
+    assert "name what can be chosen with --vary" in without_choice
     assert "--vary takes ADDRESS=VALUE" in call(f"{line} --vary loads.0.speed")[2]
 
 

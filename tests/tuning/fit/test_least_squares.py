@@ -1,4 +1,4 @@
-"""Priors, scales, robust losses, many starts, stages: on readings that are a formula."""
+"""Priors, scales, robust losses, multi-start and stages, on readings that are a formula."""
 
 import sys
 
@@ -7,7 +7,18 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from tests.tuning.stand_in import CASE, NOISE, PULLS, TRUTH, campaign, clean, fit, formula, search
+from tests.tuning.stand_in import (
+    AMPLITUDES,
+    CASE,
+    NOISE,
+    TRUTH,
+    clean,
+    dataset,
+    fit,
+    formula,
+    least_squares,
+)
+from tuning.checkpoint import Checkpoint
 from tuning.fit.identify import _stage_mask, identify
 from tuning.fit.loss import HUBER_THRESHOLD, check_loss, robust_residual, variance_factor
 from tuning.fit.multi_start import draw_start_points, multi_start
@@ -24,21 +35,23 @@ def plain():
 
 
 def test_the_optimum_is_that_of_scipy():
-    """Its least squares, with differences for derivatives, from the same start."""
-    plain = fit(search(logs=1))
+    """Least squares with derivatives by differences, from the same start."""
+    plain = fit(least_squares(logs=1))
 
     def residuals(values):
-        residuals = plain.dataset.measured[0, :, 0] - formula(*values, PULLS[0])
+        residuals = plain.dataset.measured[0, :, 0] - formula(*values, AMPLITUDES[0])
         return np.asarray(residuals) / plain.noise[0, 0]
 
     found = scipy.optimize.least_squares(residuals, plain.start_values, x_scale=[20, 0.03, 0.2],
                                          xtol=1e-12, ftol=1e-14, gtol=1e-12)  # fmt: skip
     np.testing.assert_allclose(plain.values, found.x, rtol=1e-6)
     errors = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
-    np.testing.assert_allclose(plain.errors, errors, rtol=0.15)  # some residuals look coloured
+    np.testing.assert_allclose(
+        plain.errors, errors, rtol=0.15
+    )  # some residuals look autocorrelated
 
 
-# What scipy says of the losses, as functions of the squared residual.
+# Losses of scipy, as functions of the squared residual.
 RHO = {
     "squares": lambda z: z,
     "soft-l1": lambda z: 2 * (np.sqrt(1 + z) - 1),
@@ -51,12 +64,10 @@ RHO = {
 @pytest.mark.parametrize("loss", RHO)
 def test_losses(loss):
     residuals = np.linspace(-9, 9, 101)
-    np.testing.assert_allclose(
-        np.asarray(robust_residual(loss, jnp.asarray(residuals))) ** 2, RHO[loss](residuals**2), rtol=1e-12,
-        atol=1e-14,
-    )  # fmt: skip
+    losses = np.asarray(robust_residual(loss, jnp.asarray(residuals))) ** 2
+    np.testing.assert_allclose(losses, RHO[loss](residuals**2), rtol=1e-12, atol=1e-14)
     normal = np.random.default_rng(0).normal(size=100_000)
-    # Huber's constant is made for an efficiency of 95 %.
+    # The threshold of Huber's loss is chosen for an efficiency of 95 %.
     expected = {"squares": 1.0, "huber": 1 / 0.95, "soft-l1": None}[loss]
     assert expected is None or variance_factor(loss, normal) == pytest.approx(expected, rel=0.01)
 
@@ -72,7 +83,9 @@ def test_outliers_hardly_move_a_robust_fit(loss):
     measured = clean() + NOISE * rng.normal(size=clean().shape)
     hit = rng.random(measured.shape) < 0.08
     measured[hit] += 0.7
-    ordinary, robust = (fit(search(loss=name, measured=measured)) for name in ("squares", loss))
+    ordinary, robust = (
+        fit(least_squares(loss=name, measured=measured)) for name in ("squares", loss)
+    )
     offset = ADDRESSES.index("sensors.0.offset")
     assert abs(ordinary.values[offset] - 0.2) > 0.04
     assert np.all(np.abs(robust.values - VALUES) < 4 * robust.errors)
@@ -81,76 +94,81 @@ def test_outliers_hardly_move_a_robust_fit(loss):
 
 
 def test_masked_samples_do_not_count():
-    measured, real = clean() + 0.0, np.ones(clean().shape)
-    measured[0, 30:40], real[0, 30:40] = 50.0, 0.0
-    found = fit(search(measured=measured, real=real))
+    measured, mask = clean() + 0.0, np.ones(clean().shape)
+    measured[0, 30:40], mask[0, 30:40] = 50.0, 0.0
+    found = fit(least_squares(measured=measured, mask=mask))
     np.testing.assert_allclose(found.values, VALUES, rtol=1e-6)
     assert np.isnan(found.residuals[0, 30:40]).all()
 
 
 def test_a_prior_counts_as_a_measurement(plain):
-    """With a prior as certain as the data, the value lies midway and the error is smaller."""
+    """With a prior as narrow as the likelihood, the value lies midway, the error is smaller."""
     damping = ADDRESSES.index("beam.damping_ratio")
     error, value = plain.errors[damping], plain.values[damping]
     known = Prior(mean=float(value + 2 * error), deviation=float(error))
-    found = fit(search(free=dict.fromkeys(TRUTH) | {"beam.damping_ratio": known}))
+    found = fit(least_squares(free=dict.fromkeys(TRUTH) | {"beam.damping_ratio": known}))
     assert found.values[damping] == pytest.approx(value + error, abs=0.1 * error)
     assert found.errors[damping] == pytest.approx(error / np.sqrt(2), rel=0.05)
 
 
-def test_a_prior_tells_what_the_data_cannot():
+def test_residual_of_a_prior():
     known = {"beam.mass_per_length": Prior(mean=2.0, deviation=0.1)}
-    made = campaign()
-    blind = search(free=dict.fromkeys(TRUTH))
-    assert made.measured.shape == blind.data.measured.shape
-    number = free_parameters([CASE], known, 1.0)[0]
-    assert number.low == 0.0 and number.prior.prior_residual(jnp.asarray(2.2)) == pytest.approx(2.0)
+    parameter = free_parameters([CASE], known, 1.0)[0]
+    assert parameter.low == 0.0
+    assert parameter.prior.prior_residual(jnp.asarray(2.2)) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("scale", ["log", "logit"])
 def test_scales(scale):
-    number = FreeParameter("x", "m", 0.1, 0.01, 100.0, 99.99, Prior(0.01, 100.0, scale=scale))
+    prior = Prior(0.01, 100.0, scale=scale)
+    parameter = FreeParameter("x", "m", 0.1, 0.01, 100.0, 99.99, prior)
+
+    def value_at(unbounded):
+        return float(parameter.from_unbounded(jnp.asarray(unbounded)))
+
     for value in (0.15, 1.0, 3.0, 99.0):
-        assert float(
-            number.from_unbounded(jnp.asarray(number.to_unbounded(value)))
-        ) == pytest.approx(value)
-    shares = number.unbounded_at_share(np.array([0.25, 0.5, 0.75]))
-    values = np.array([float(number.from_unbounded(jnp.asarray(y))) for y in shares])
+        assert value_at(parameter.to_unbounded(value)) == pytest.approx(value)
+    shares = parameter.unbounded_at_share(np.array([0.25, 0.5, 0.75]))
     expected = [0.1, 1.0, 10.0] if scale == "log" else [25.0075, 50.005, 75.0025]
-    np.testing.assert_allclose(values, expected, rtol=1e-9)
+    np.testing.assert_allclose([value_at(y) for y in shares], expected, rtol=1e-9)
+
+
+def test_the_old_word_for_a_linear_scale_warns():
+    with pytest.warns(DeprecationWarning, match="the scale 'plain' is now called 'linear'"):
+        assert Prior(scale="plain") == Prior()
 
 
 @pytest.mark.parametrize(
     "given, words",
     [
-        ({"scale": "cube"}, "a scale is one of plain, log, logit, not 'cube'"),
+        ({"scale": "cube"}, "a scale is one of linear, log, logit, not 'cube'"),
         ({"mean": 1.0}, "a prior needs both a mean and a deviation"),
         ({"mean": 1.0, "deviation": 0.0}, "the deviation of a prior must be positive, not 0"),
         ({"scale": "log"}, "the scale 'log' needs two bounds, low and high"),
         ({"low": -1.0, "high": 1.0, "scale": "log"}, "on a log scale bounds and mean must be"),
     ],
 )
-def test_faulty_beliefs(given, words):
+def test_faulty_priors(given, words):
     with pytest.raises(ValueError, match=words):
         Prior(**given)
 
 
-def test_numbers_of_every_log():
+def test_parameters_of_every_log():
     found = free_parameters([CASE, CASE], {"logs.*.loads.0.speed": (0.5, 2.0)}, 1.0)
-    assert [number.address for number in found] == [f"logs.{i}.loads.0.speed" for i in (0, 1)]
+    assert [parameter.address for parameter in found] == [f"logs.{i}.loads.0.speed" for i in (0, 1)]
     with pytest.raises(ValueError, match=r"logs.0.loads.0.speed is free twice; name it once"):
         twice = {"logs.*.loads.0.speed": None, "logs.0.loads.0.speed": None}
         free_parameters([CASE, CASE], twice, 1.0)
 
 
-def test_stages_move_only_what_they_name(plain):
-    mask = _stage_mask(plain.numbers, ["beam.damping_ratio", "sensors.0.offset"])
+def test_stages_move_only_their_parameters(plain):
+    mask = _stage_mask(plain.parameters, ["beam.damping_ratio", "sensors.0.offset"])
     assert mask.tolist() == [False, True, True]
-    moved = plain.search.estimate(plain.campaign.measured, free=mask)
+    moved = plain.least_squares.solve(plain.dataset.measured, free=mask)
     assert moved.values[0] == pytest.approx(19.0) and moved.values[2] != pytest.approx(0.0)
     assert moved.uncertainty.errors[0] == 0.0 < moved.uncertainty.errors[1]
     with pytest.raises(ValueError, match="a stage fits beam.length, which is not free; free are"):
-        _stage_mask(plain.numbers, ["beam.length"])
+        _stage_mask(plain.parameters, ["beam.length"])
 
 
 BOUNDS = {
@@ -162,12 +180,12 @@ BOUNDS = {
 
 @pytest.fixture(scope="module")
 def wide():
-    return search(free=BOUNDS)
+    return least_squares(free=BOUNDS)
 
 
 def test_many_starts_find_several_minima(wide):
-    """An oscillation fitted to one of another frequency: between them the misfit has hills."""
-    minima = multi_start(wide, wide.campaign.measured, 12, seed=1)
+    """The misfit of two oscillations of different frequencies has several minima."""
+    minima = multi_start(wide, wide.data.measured, 12, seed=1)
     assert len(minima) > 1 and sum(found.starts for found in minima) == 12
     costs = [found.cost for found in minima]
     assert costs == sorted(costs) and costs[1] > 2 * costs[0]
@@ -175,44 +193,45 @@ def test_many_starts_find_several_minima(wide):
 
 
 def test_starts_fill_the_bounds(wide):
-    points = draw_start_points(wide.numbers, 9, seed=0)
+    points = draw_start_points(wide.parameters, 9, seed=0)
     values = np.array([wide.values_at(point) for point in points])
     np.testing.assert_allclose(values[0], [19.0, 0.02, 0.0], atol=1e-9)
-    eighths = np.floor((values[1:, 0] - 4) / 7).astype(int)  # a Latin hypercube: one in each
+    eighths = np.floor((values[1:, 0] - 4) / 7).astype(int)  # of a Latin hypercube, one in each
     assert sorted(eighths) == list(range(8))
     logs = np.floor(8 * np.log(values[1:, 1] / 0.001) / np.log(200)).astype(int)
     assert sorted(logs) == list(range(8))
-    assert len(draw_start_points(wide.numbers, 1, seed=0)) == 1
+    assert len(draw_start_points(wide.parameters, 1, seed=0)) == 1
 
 
-def test_a_search_that_was_killed_goes_on_to_the_same_end(wide, tmp_path, monkeypatch):
+def test_a_stopped_search_is_resumed_to_the_same_result(wide, tmp_path, monkeypatch):
     file = tmp_path / "search.npz"
-    whole = multi_start(wide, wide.campaign.measured, 12, seed=1)
+    arguments = wide, wide.data.measured, 12, 1
+    whole = multi_start(*arguments)
 
-    class Killed(Exception):
+    class Stopped(Exception):
         pass
 
-    def killing(*given, **about):
+    def stopping(*given):
         if file.exists():
-            raise Killed
-        return minimise(*given, **about)
+            raise Stopped
+        return minimise(*given)
 
     minimise = wide.minimise
-    monkeypatch.setattr(wide, "minimise", killing)
-    with pytest.raises(Killed):
-        multi_start(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="this")
+    monkeypatch.setattr(wide, "minimise", stopping)
+    with pytest.raises(Stopped):
+        multi_start(*arguments, Checkpoint(file, "this"))
     monkeypatch.undo()
-    resumed = multi_start(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="this")
+    resumed = multi_start(*arguments, Checkpoint(file, "this"))
     assert [found.cost for found in resumed] == [found.cost for found in whole]
     np.testing.assert_array_equal(resumed[0].values, whole[0].values)
     with pytest.raises(ValueError, match="belongs to another search"):
-        multi_start(wide, wide.campaign.measured, 12, seed=1, checkpoint=file, digest="that")
+        multi_start(*arguments, Checkpoint(file, "that"))
 
 
-def test_identify_takes_the_lowest_minimum_and_goes_on(tmp_path, monkeypatch):
-    """The whole way, but for the campaign, which is a formula; a wrong start alone fails."""
-    made = campaign()
-    monkeypatch.setattr(sys.modules["tuning.fit.identify"], "prepare", lambda case, logs: made)
+def test_identify_takes_the_lowest_minimum_and_resumes(tmp_path, monkeypatch):
+    """All of `identify` with a formula for a dataset; from the start alone it would fail."""
+    made = dataset()
+    monkeypatch.setattr(sys.modules["tuning.fit.identify"], "make_dataset", lambda *given: made)
     far = {address: BOUNDS[address] for address in ADDRESSES}
     file = tmp_path / "search.npz"
     found = identify(CASE, made.logs, far, starts=12, seed=1, checkpoint=file)

@@ -1,4 +1,4 @@
-"""Criticism, profiles and posterior of fits, on readings that are a formula."""
+"""Validation, profiles, posterior and storage of fits, on readings that are a formula."""
 
 import dataclasses
 import json
@@ -12,26 +12,22 @@ from scipy.integrate import quad
 import jaxbeam as jb
 from jaxbeam.files.case_file import case_to_dict
 from tests.tuning.stand_in import (
+    AMPLITUDES,
     CASE,
     NOISE,
-    PULLS,
     TIMES,
     TRUTH,
-    campaign,
     clean,
+    dataset,
     fit,
     formula,
-    search,
+    least_squares,
 )
+from tuning.checkpoint import load, save
 from tuning.fit import model_validation, storage
-from tuning.fit.identify import fit_result
-from tuning.fit.model_validation import (
-    channel_residuals,
-    compare_fits,
-    cross_validate,
-    residual_remarks,
-    whiteness_p_value,
-)
+from tuning.fit.model_validation import compare_fits, cross_validate
+from tuning.fit.residuals import residual_remarks, whiteness_p_value
+from tuning.fit.result import fit_result
 from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.fit.uncertainty.posterior import _log_density, draw_by_nuts, sample, with_diagnostics
 from tuning.fit.uncertainty.profile import profile
@@ -44,65 +40,67 @@ def plain():
     return fit()
 
 
-def refit(plain, measured, **about):
-    """Another log, fitted by the same program."""
-    found = plain.search.estimate(measured, **about)
-    made = dataclasses.replace(plain.campaign, measured=measured)
-    return dataclasses.replace(fit_result(plain.case, plain.search, found), campaign=made)
+def refit(plain, measured, **options):
+    """Fit of other samples by the same compiled program."""
+    solution = plain.least_squares.solve(measured, **options)
+    data = dataclasses.replace(plain.dataset, measured=measured)
+    found = fit_result(plain.case, plain.least_squares, solution)
+    return dataclasses.replace(found, dataset=data)
 
 
-# Criticism.
+# Model validation.
 
 
 def test_whiteness_of_known_noise():
     rng = np.random.default_rng(0)
-    chances = [whiteness_p_value(rng.normal(size=400)) for _ in range(300)]
-    assert np.mean(np.array(chances) < 0.1) == pytest.approx(0.1, abs=0.05)
+    p_values = [whiteness_p_value(rng.normal(size=400)) for _ in range(300)]
+    assert np.mean(np.array(p_values) < 0.1) == pytest.approx(0.1, abs=0.05)
     walk = np.convolve(rng.normal(size=400), np.ones(3) / 3, mode="valid")
     assert whiteness_p_value(walk) < 1e-9 and whiteness_p_value(np.ones(50)) == 1.0
 
 
-def test_a_good_fit_has_nothing_said_against_it(plain):
-    found = channel_residuals(plain)
+def test_no_remarks_on_the_residuals_of_a_good_fit(plain):
+    found = plain.channel_residuals
     assert [(c.log, c.sensor) for c in found] == [(0, 0), (1, 0), (2, 0)]
-    assert residual_remarks(found, plain.campaign.logs) == []
+    assert residual_remarks(found, ["run 0", "run 1", "run 2"]) == []
     np.testing.assert_allclose([c.noise for c in found], NOISE, rtol=0.2)
 
 
-def test_a_late_channel_and_coloured_residuals_are_told(plain):
-    measured = np.array(plain.campaign.measured)
+def test_remarks_on_a_late_channel_and_autocorrelated_residuals(plain):
+    measured = np.array(plain.dataset.measured)
     late = np.interp(TIMES - 0.004, TIMES, clean()[1, :, 0])
     measured[1, :, 0] = late + measured[1, :, 0] - clean()[1, :, 0]
-    # Fitted to the others only, so that nothing else makes up for it.
-    found = refit(plain, measured, use=np.array([True, False, True]))
-    _, channel, _ = channel_residuals(found)
+    # Fitted to the other logs, so that no parameter compensates the delay.
+    found = refit(plain, measured, included_logs=np.array([True, False, True]))
+    _, channel, _ = found.channel_residuals
     assert channel.time_shift == pytest.approx(0.004, abs=4 * channel.time_shift_sd)
     assert channel.time_shift_sd < 0.001
-    coloured, late_ = residual_remarks([channel], found.dataset.logs)
-    assert coloured.startswith("run 1: residuals are no white noise, so the model misses something")
-    assert late_.startswith("run 1: sensor 0 seems ") and " ms late (+- " in late_
+    colour, delay = residual_remarks([channel], ["run 0", "run 1", "run 2"])
+    assert colour.startswith("run 1: residuals are no white noise, so the model misses something")
+    assert delay.startswith("run 1: sensor 0 seems ") and " ms late (+- " in delay
 
 
-def test_rivals(plain):
-    """Without its damping free the model is wrong; with a number too many, it is no better."""
-    held = plain.search.estimate(plain.campaign.measured, free=np.array([True, False, True]))
+def test_information_criteria(plain):
+    """A model whose damping is held at a wrong value loses against the right one."""
+    problem = plain.least_squares
+    held = problem.solve(plain.dataset.measured, free=np.array([True, False, True]))
     undamped = dataclasses.replace(
-        fit_result(plain.case, plain.search, held), numbers=plain.numbers[:2]
+        fit_result(plain.case, problem, held), parameters=plain.parameters[:2]
     )
     best, worse = compare_fits({"damped": plain, "0.02": undamped})
     assert (best.name, worse.name) == ("damped", "0.02")
     assert worse.bic - best.bic > 10 and best.weight > 0.99
-    # White residuals, one channel a log: the textbook formulas, but for independent samples.
+    # White residuals, one channel per log: textbook formulas with independent samples.
     squares = np.nansum(plain.residuals**2, axis=(1, 2)) / TIMES.size
-    counts = TIMES.size / plain.colour[:, 0]
+    counts = TIMES.size / plain.autocorrelation_factor[:, 0]
     likely = -np.sum(counts * (np.log(2 * np.pi * squares) + 1)) / 2
     assert best.log_likelihood == pytest.approx(likely)
     assert best.aic == pytest.approx(6 - 2 * likely)
     assert best.bic == pytest.approx(3 * np.log(counts.sum()) - 2 * likely)
     with pytest.raises(ValueError, match="at least two"):
         compare_fits({"one": plain})
-    with pytest.raises(ValueError, match="of other samples"):
-        compare_fits({"one": plain, "other": refit(plain, plain.campaign.measured + 1.0)})
+    with pytest.raises(ValueError, match="of different samples"):
+        compare_fits({"one": plain, "other": refit(plain, plain.dataset.measured + 1.0)})
 
 
 def test_cross_validation(plain):
@@ -111,28 +109,30 @@ def test_cross_validation(plain):
     ratios = np.array([found.residual_ratio[0] for found in left_out])
     np.testing.assert_allclose(ratios, 1.0, atol=0.3)
     assert left_out[0].verdict.startswith("run 0: predicted; residuals are ")
-    measured = np.array(plain.campaign.measured)
-    measured[2] *= 1.3  # a run of which the model does not know something
-    told = [found.verdict for found in cross_validate(refit(plain, measured))]
-    assert "run 2: not predicted" in told[2]
+    measured = np.array(plain.dataset.measured)
+    measured[2] *= 1.3  # an effect that the model does not have
+    verdicts = [found.verdict for found in cross_validate(refit(plain, measured))]
+    assert "run 2: not predicted" in verdicts[2]
     with pytest.raises(ValueError, match="at least two"):
-        cross_validate(fit(search(logs=1)))
+        cross_validate(fit(least_squares(logs=1)))
 
 
-def test_logs_that_were_held_out(plain, monkeypatch):
+def test_prediction_of_held_out_logs(plain, monkeypatch):
     measured = clean() + NOISE * np.random.default_rng(9).normal(size=(3, 120, 1))
     measured[1] += 0.1
-    monkeypatch.setattr(model_validation, "prepare", lambda case, logs: campaign(measured=measured))
-    good, bad, _ = model_validation.predict_held_out(plain, campaign(measured=measured).logs)
-    assert good.ratio[0] == pytest.approx(1.0, abs=0.25) and ": predicted; " in good.verdict
-    assert bad.ratio[0] == pytest.approx(np.hypot(1, 0.1 / NOISE), rel=0.1)
+    data = dataset(measured=measured)
+    monkeypatch.setattr(model_validation, "make_dataset", lambda case, logs: data)
+    good, bad, _ = model_validation.predict_held_out(plain, data.logs)
+    assert good.residual_ratio[0] == pytest.approx(1.0, abs=0.25)
+    assert ": predicted; " in good.verdict
+    assert bad.residual_ratio[0] == pytest.approx(np.hypot(1, 0.1 / NOISE), rel=0.1)
     assert ": not predicted; " in bad.verdict
 
 
 # Profiles.
 
 
-def test_the_profile_of_a_number_that_acts_linearly_is_a_parabola(plain):
+def test_the_profile_of_a_linear_parameter_is_a_parabola(plain):
     found = profile(plain, "sensors.0.offset")
     error, centre = plain.errors[2], found.values[found.deviance.argmin()]
     assert abs(centre - plain.values[2]) < 0.1 * error
@@ -143,17 +143,18 @@ def test_the_profile_of_a_number_that_acts_linearly_is_a_parabola(plain):
     assert found.critical_deviance == pytest.approx(t_quantile(plain.degrees_of_freedom) ** 2)
 
 
-def test_a_number_at_its_bound_has_a_profile_of_one_side():
-    """Damping far below its error: the data only say that it is below something."""
-    undamped = np.array([formula(20.0, 1e-5, 0.2, pull) for pull in PULLS])[..., None]
+def test_a_parameter_at_its_bound_has_a_profile_on_one_side():
+    """Damping far below its error: only an upper limit is identifiable."""
+    undamped = np.array([formula(20.0, 1e-5, 0.2, amplitude) for amplitude in AMPLITUDES])[
+        ..., None
+    ]
     noise = NOISE * np.random.default_rng(1).normal(size=undamped.shape)
-    found = fit(search(measured=undamped + noise))
-    told = profile(found, "beam.damping_ratio")
-    assert told.interval[0] == -np.inf and 0.0 < told.interval[1] < 1.0
-    assert told.verdict.startswith("the data only say that beam.damping_ratio is below ")
+    found = profile(fit(least_squares(measured=undamped + noise)), "beam.damping_ratio")
+    assert found.interval[0] == -np.inf and 0.0 < found.interval[1] < 1.0
+    assert found.verdict.startswith("the data only say that beam.damping_ratio is below ")
 
 
-def test_the_profile_of_a_number_that_is_not_free(plain):
+def test_the_profile_of_a_parameter_that_is_not_free(plain):
     with pytest.raises(ValueError, match="beam.length is not free in this fit; free are beam"):
         profile(plain, "beam.length")
 
@@ -162,7 +163,7 @@ def test_the_profile_of_a_number_that_is_not_free(plain):
 
 
 def test_the_sampler_draws_from_a_known_density(tmp_path):
-    """Two correlated normal variables; stopped in between, it draws the same."""
+    """Two correlated normal variables; a stopped sampling is resumed to the same draws."""
     pytest.importorskip("blackjax")
     covariance = np.array([[1.0, 0.6], [0.6, 1.5]])
     inverse = jnp.linalg.inv(covariance)
@@ -177,28 +178,33 @@ def test_the_sampler_draws_from_a_known_density(tmp_path):
     np.testing.assert_allclose(found.means, 0.0, atol=0.2)
     assert found.verdict.startswith("mixed: R-hat up to ") and divergences == 0
     file = tmp_path / "draws.npz"
-    first, _ = draw_by_nuts(density, 2, 100, 2, 100, 0, file, "this")
+    first, _ = draw_by_nuts(density, 2, 100, 2, 100, 0, Checkpoint(file, "this"))
     np.testing.assert_array_equal(first, draws[:, :100])
-    with pytest.raises(FileExistsError, match="resume that sampling, or delete it"):
-        draw_by_nuts(*given, file, "this")
-    resumed, _ = draw_by_nuts(*given, file, "this", resume=True)
+    resumed, _ = draw_by_nuts(*given, Checkpoint(file, "this"))
     np.testing.assert_array_equal(resumed, draws)
     with pytest.raises(ValueError, match="belongs to another search"):
-        draw_by_nuts(*given, file, "that", resume=True)
+        draw_by_nuts(*given, Checkpoint(file, "that"))
 
 
-def test_chains_that_do_not_mix_are_told():
+def test_a_checkpoint_is_not_overwritten(plain, tmp_path):
+    file = tmp_path / "draws.npz"
+    file.touch()
+    with pytest.raises(FileExistsError, match="exists: resume that search, or delete it"):
+        sample(plain, checkpoint=file)
+
+
+def test_verdicts_on_chains_that_do_not_mix():
     pytest.importorskip("blackjax")
     apart = np.random.default_rng(0).normal(size=(2, 300, 1)) + np.array([[[0.0]], [[5.0]]])
     assert "the chains have not mixed" in with_diagnostics(["a"], apart, 0).verdict
     few = np.random.default_rng(0).normal(size=(2, 20, 1))
     assert "effective draws: draw more" in with_diagnostics(["a"], few, 0).verdict
-    astray = np.random.default_rng(0).normal(size=(2, 300, 1))
-    assert "100 divergent steps" in with_diagnostics(["a"], astray, 100).verdict
+    divergent = np.random.default_rng(0).normal(size=(2, 300, 1))
+    assert "100 divergent steps" in with_diagnostics(["a"], divergent, 100).verdict
 
 
 def test_the_posterior_of_a_fit_is_as_wide_as_its_intervals(plain):
-    """The model is nearly linear within its errors, so both ways must agree."""
+    """The model is nearly linear within its errors, so that both agree."""
     pytest.importorskip("blackjax")
     found = sample(plain, draws=300, chains=2, warmup=100)
     np.testing.assert_allclose(found.deviations, plain.errors, rtol=0.2)
@@ -208,14 +214,14 @@ def test_the_posterior_of_a_fit_is_as_wide_as_its_intervals(plain):
 
 def test_unknown_noise_levels_are_integrated_out():
     """Twelve samples: against the integral over the level, by quadrature."""
-    real = np.zeros((1, TIMES.size, 1))
-    real[0, :12] = 1.0
-    found = fit(search({"sensors.0.offset": None}, logs=1, real=real))
-    density, _, start, spread = _log_density(found, "estimated")
-    places = np.linspace(-4.0, 4.0, 9)
-    ours = np.array([density(jnp.array([place])) for place in places])
-    offsets = start[0] + spread[0, 0] * places
-    rest = (campaign(logs=1).measured - clean(1))[0, :12, 0] + TRUTH["sensors.0.offset"]
+    mask = np.zeros((1, TIMES.size, 1))
+    mask[0, :12] = 1.0
+    found = fit(least_squares({"sensors.0.offset": None}, logs=1, mask=mask))
+    density, _, start, whitening = _log_density(found, "estimated")
+    points = np.linspace(-4.0, 4.0, 9)
+    ours = np.array([density(jnp.array([point])) for point in points])
+    offsets = start[0] + whitening[0, 0] * points
+    rest = (dataset(logs=1).measured - clean(1))[0, :12, 0] + TRUTH["sensors.0.offset"]
     count = 12 / found.autocorrelation_factor[0, 0]
 
     def evidence(offset):
@@ -230,35 +236,37 @@ def test_unknown_noise_levels_are_integrated_out():
 
     theirs = np.log([evidence(offset) for offset in offsets])
     np.testing.assert_allclose(ours - ours[4], theirs - theirs[4], atol=1e-3)
-    # Less sure than with the noise held: the tails of Student's distribution.
-    held = _log_density(found)[0]
-    assert ours[-1] - ours[4] > float(held(jnp.array([4.0])) - held(jnp.array([0.0])))
+    # Wider than with fixed noise: the tails of Student's distribution.
+    fixed = _log_density(found)[0]
+    assert ours[-1] - ours[4] > float(fixed(jnp.array([4.0])) - fixed(jnp.array([0.0])))
 
 
-def test_another_word_on_the_noise_is_refused(plain):
-    with pytest.raises(ValueError, match="noise can be 'held' or 'estimated', not 'free'"):
+def test_unknown_noise_models_are_refused(plain):
+    with pytest.raises(ValueError, match="noise can be 'fixed' or 'estimated', not 'free'"):
         sample(plain, noise="free")
 
 
-def test_blind_directions_are_not_sampled(plain):
+def test_unidentifiable_directions_are_not_sampled(plain):
     blind = dataclasses.replace(plain, unidentifiable=[{"beam.damping_ratio": 0.1}])
-    with pytest.raises(ValueError, match="cannot see beam.damping_ratio: give a prior"):
+    with pytest.raises(
+        ValueError, match="not identifiable from the data: beam.damping_ratio; give a prior"
+    ):
         sample(blind)
 
 
-# On disk.
+# Storage.
 
 
-def test_a_fit_is_kept_to_the_last_bit(plain, tmp_path, monkeypatch):
-    # The stand-in is made anew, as the campaign of real logs would be.
-    monkeypatch.setattr(storage, "prepare", lambda case, logs: campaign())
+def test_a_fit_is_stored_without_loss(plain, tmp_path, monkeypatch):
+    # The stand-in is made again, as the dataset of real logs would be.
+    monkeypatch.setattr(storage, "make_dataset", lambda case, logs: dataset())
     storage.save_fit(plain, tmp_path / "fit.npz")
     again = storage.load_fit(tmp_path / "fit.npz")
     assert str(again) == str(plain)
     for name in ("values", "errors", "correlation", "fitted", "noise", "intervals"):
         np.testing.assert_array_equal(getattr(again, name), getattr(plain, name))
     np.testing.assert_allclose(
-        again.search.estimate(again.campaign.measured).values, plain.values, rtol=1e-12
+        again.least_squares.solve(again.dataset.measured).values, plain.values, rtol=1e-12
     )
     with pytest.raises(FileExistsError, match="exists already"):
         storage.save_fit(plain, tmp_path / "fit.npz")
@@ -269,12 +277,35 @@ def test_a_fit_is_kept_to_the_last_bit(plain, tmp_path, monkeypatch):
         storage.load_fit(tmp_path / "cut.npz")
 
 
-def test_logs_are_kept_with_their_loads():
+def test_fits_of_the_old_format_are_read(plain, tmp_path, monkeypatch):
+    """Names of the format "jaxbeam fit 1" are those of its version of jaxbeam."""
+    monkeypatch.setattr(storage, "make_dataset", lambda case, logs: dataset())
+    file = tmp_path / "fit.npz"
+    storage.save_fit(plain, file)
+    arrays = load(file, storage.FORMAT)
+    about = json.loads(str(arrays.pop("about")))
+    for entry in about["parameters"]:
+        entry["size"], entry["belief"] = entry.pop("typical_size"), entry.pop("prior")
+        entry["belief"]["scale"] = "plain"
+    old_names = {
+        "nominal_case": "given",
+        "parameters": "numbers",
+        "unidentifiable": "unseen",
+        "degrees_of_freedom": "freedom",
+    }
+    about = {old_names.get(name, name): entry for name, entry in about.items()}
+    arrays["colour"] = arrays.pop("autocorrelation_factor")
+    save(file, "jaxbeam fit 1", arrays | {"about": np.array(json.dumps(about))})
+    again = storage.load_fit(file)
+    assert str(again) == str(plain) and again.parameters == plain.parameters
+
+
+def test_logs_are_stored_with_their_loads():
     loads = (jb.MovingMass(mass=0.5, speed=-1.0, entry_time=0.1), jb.MovingForce(force=3, speed=2))
-    log = dataclasses.replace(campaign().logs[0], loads=loads, notes=("half of it",), sensors=(0,))
-    about = json.loads(json.dumps(storage._about(log, CASE)))
+    log = dataclasses.replace(dataset().logs[0], loads=loads, notes=("half of it",), sensors=(0,))
+    about = json.loads(json.dumps(storage._log_header(log, CASE)))
     arrays = {f"log0.{name}": getattr(log, name) for name in ("times", "values", "valid")}
-    again = storage._log(0, about, case_to_dict(CASE)["beam"], arrays)
+    again = storage._read_log(0, about, case_to_dict(CASE)["beam"], arrays)
     assert eqx.tree_equal(again.loads, loads)
     for name in ("names", "units", "sensors", "notes", "source"):
         assert getattr(again, name) == getattr(log, name)

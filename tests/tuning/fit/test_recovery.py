@@ -1,6 +1,6 @@
-"""What finite elements were made of comes back: more modes, yielding supports, coloured noise.
+"""Parameters of finite-element rigs are recovered under coloured noise, by models of fewer modes.
 
-Numbers are fitted alone, the others known, and all together. A model that is wrong must say so.
+They are fitted one by one, the others known, and all together; a wrong model is called unreliable.
 """
 
 import numpy as np
@@ -18,9 +18,10 @@ from tests.tuning.rehearsals import (
     patch,
     plant,
 )
+from tuning.parameters.free import to_unbounded
 
-WIDE = 3 / 1.96  # half widths in three standard errors
-FEWEST = 4  # numbers of the smallest rig
+WIDE = 3 / 1.96  # half widths of an interval in three standard errors
+FEWEST = 4  # parameters of the smallest rig
 
 PLANTS = {
     "one span, shaker": plant(
@@ -62,8 +63,8 @@ def rehearsal(request) -> Rehearsal:
 
 
 @pytest.mark.slow
-def test_all_together_lie_within_their_intervals(rehearsal):
-    """None further off than three standard errors, nor all together than one fit in a thousand."""
+def test_all_parameters_together_lie_within_their_intervals(rehearsal):
+    """None is off by more than three standard errors; together, by the 99.9 % quantile."""
     free = np.ones(len(rehearsal.truth), bool)
     found = rehearsal.fit(coloured(rehearsal.clean.shape, seed=0), free)
     assert found.converged
@@ -75,8 +76,8 @@ def test_all_together_lie_within_their_intervals(rehearsal):
 
 
 @pytest.mark.slow
-def test_each_alone_lies_within_its_interval(rehearsal):
-    """Those of the beam, which all rigs have, on the rig with one patch only."""
+def test_each_parameter_alone_lies_within_its_interval(rehearsal):
+    """Parameters of the beam, which all rigs have, on the rig with one patch only."""
     names = list(rehearsal.truth)
     own = ("actuators", "supports")
     wanted = [n for n in names if n.startswith(own) or len(names) == FEWEST]
@@ -91,16 +92,13 @@ def test_each_alone_lies_within_its_interval(rehearsal):
 @pytest.mark.slow
 @pytest.mark.parametrize("rehearsal", ["one span, patch"], indirect=True)
 def test_intervals_of_a_wrong_model_are_called_unreliable(rehearsal):
-    """A beam taken for a tenth stiffer than it is puts the other numbers off; the fit says so."""
+    """A rigidity held 10 % too high biases the other parameters; the fit says so."""
     noise = np.random.default_rng(0).normal(size=rehearsal.clean.shape)
     free = np.array([name != "beam.flexural_rigidity" for name in rehearsal.truth])
     right = rehearsal.fit(noise, free)
     assert np.all(np.abs(rehearsal.errors(right, free)) < WIDE)
-    assert right.converged and "unreliable" not in str(rehearsal.told(noise, right))
-    known = np.array(list(rehearsal.truth.values()))
-    stiffer = [
-        n.to_unbounded(1.1 * value) for n, value in zip(rehearsal.numbers, known, strict=True)
-    ]
-    wrong = rehearsal.fit(noise, free, np.array(stiffer))
+    assert right.converged and "unreliable" not in str(rehearsal.result(noise, right))
+    stiffer = to_unbounded(rehearsal.parameters, [1.1 * x for x in rehearsal.truth.values()])
+    wrong = rehearsal.fit(noise, free, stiffer)
     assert np.any(np.abs(rehearsal.errors(wrong, free)) > WIDE)
-    assert "unreliable" in str(rehearsal.told(noise, wrong))
+    assert "unreliable" in str(rehearsal.result(noise, wrong))

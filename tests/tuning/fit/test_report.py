@@ -1,4 +1,4 @@
-"""What is said and written of a fit."""
+"""Summary, remarks and report of a fit."""
 
 import dataclasses
 import re
@@ -6,11 +6,10 @@ import re
 import numpy as np
 import pytest
 
-from tests.tuning.stand_in import NOISE, TRUTH, clean, fit, search
+from tests.tuning.stand_in import NOISE, TRUTH, clean, fit, least_squares
 from tuning.fit.model_validation import compare_fits, cross_validate
 from tuning.fit.multi_start import LocalMinimum
 from tuning.fit.report import write_report
-from tuning.fit.summary import remarks
 from tuning.fit.uncertainty.posterior import with_diagnostics
 from tuning.fit.uncertainty.profile import Profile
 from tuning.parameters.prior import Prior
@@ -21,18 +20,18 @@ def plain():
     return fit()
 
 
-def test_the_whole_account(plain, tmp_path):
+def test_a_report_with_all_sections(plain, tmp_path):
     minima = tuple(LocalMinimum(cost, plain.values, plain.values, 3, True) for cost in (1.5, 40.0))
-    told = dataclasses.replace(plain, minima=minima)
+    found = dataclasses.replace(plain, minima=minima)
     values = np.linspace(0.19, 0.21, 5)
     offset = Profile("sensors.0.offset", "m", values, (values - 0.2) ** 2 * 1e5, 4.0,
                      (0.195, np.inf), (0.194, 0.206))  # fmt: skip
     draws = plain.values + plain.errors * np.random.default_rng(0).normal(size=(2, 50, 3))
-    held = plain.search.estimate(plain.campaign.measured, free=np.array([True, False, True]))
-    worse = dataclasses.replace(plain, fitted=held.predicted, numbers=plain.numbers[:2])
+    held = plain.least_squares.solve(plain.dataset.measured, free=np.array([True, False, True]))
+    worse = dataclasses.replace(plain, fitted=held.predicted, parameters=plain.parameters[:2])
     write_report(
         tmp_path / "report",
-        told,
+        found,
         profiles=[offset],
         posterior=with_diagnostics(plain.addresses, draws, 0),
         held_out=cross_validate(plain),
@@ -40,13 +39,13 @@ def test_the_whole_account(plain, tmp_path):
     )
     text = (tmp_path / "report" / "report.md").read_text()
     page = (tmp_path / "report" / "report.html").read_text()
-    for heading in ("Numbers", "Remarks", "Measured and fitted", "Correlations", "Profiles",
-                    "Posterior", "Logs left out", "Rival models"):  # fmt: skip
+    for heading in ("Parameters", "Remarks", "Measured and fitted", "Correlations", "Profiles",
+                    "Posterior", "Held-out logs", "Models compared"):  # fmt: skip
         assert f"## {heading}\n" in text and f"<h2>{heading}</h2>" in page
     assert "the data only say that sensors.0.offset is above 0.195 m." in text
     assert re.search(r"\| beam.flexural_rigidity \| N m\^2 \| 19 \|  \| 20\.\d+ \| 0\.\d+ \|", text)
     assert "<td>held &amp; &lt;fast&gt;</td>" in page
-    assert "2 minima from 6 starts:\n  misfit 1.5 from 3 starts: " in str(told)
+    assert "2 minima from 6 starts:\n  misfit 1.5 from 3 starts: " in str(found)
     for name in re.findall(r"!\[.*\]\((.*)\)", text):
         assert (tmp_path / "report" / name).stat().st_size > 1000
         assert f'src="{name}"' in page
@@ -58,7 +57,7 @@ def test_remarks_on_priors_and_on_logs():
     measured = clean() + NOISE * np.random.default_rng(0).normal(size=clean().shape)
     measured[1, 60] += 2.0
     known = {"beam.damping_ratio": Prior(mean=0.03, deviation=1e-5)}
-    found = fit(search(measured=measured, free=dict.fromkeys(TRUTH) | known))
-    said = "\n".join(remarks(found))
-    assert "beam.damping_ratio is told by its prior more than by the logs" in said
+    found = fit(least_squares(measured=measured, free=dict.fromkeys(TRUTH) | known))
+    said = "\n".join(found.remarks)
+    assert "beam.damping_ratio is determined by its prior more than by the logs" in said
     assert "run 1: w has spikes (one sample), first at t = 1.2 s (not masked)" in said

@@ -1,4 +1,4 @@
-"""Faults put into a clean log are found where they are, and nothing else is."""
+"""Faults put into a clean log are found at their samples, and nowhere else."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def test_spikes():
 
 
 def test_an_impact_that_rings_has_no_spikes():
-    """Faster than cubics follow, as of a roller on a footbridge, but not for one sample only."""
+    """Faster than cubics, like a roller on a footbridge, but not for a single sample."""
     after = np.maximum(TIMES - 0.4, 0.0)
     ringing = np.exp(-5 * after) * np.sin(2 * np.pi * 90 * after)
     assert find_faults(log_of(np.column_stack([ringing, ringing]))) == []
@@ -54,8 +54,8 @@ def test_clipped_readings():
     values[:, 1] = np.clip(values[:, 1], -0.7, 0.9)
     (fault,) = find_faults(dataclasses.replace(log, values=values))
     assert (fault.kind, fault.channel) == ("saturation", "b")
-    truly = (log.values[:, 1] > 0.9) | (log.values[:, 1] < -0.7)
-    assert np.mean(fault.samples[truly]) > 0.7 and not np.any(fault.samples[~truly])
+    clipped = (log.values[:, 1] > 0.9) | (log.values[:, 1] < -0.7)
+    assert np.mean(fault.samples[clipped]) > 0.7 and not np.any(fault.samples[~clipped])
 
 
 def test_a_stuck_channel():
@@ -66,14 +66,14 @@ def test_a_stuck_channel():
 def test_gaps_and_a_drifting_clock():
     kept = np.r_[:200, 230:600]
     (gap,) = find_faults(log_of(CLEAN[kept], TIMES[kept]))
-    assert gap.words == "run.csv: about 30 samples are missing after t = 0.398 s"
+    assert gap.message == "run.csv: about 30 samples are missing after t = 0.398 s"
     bent = TIMES + 0.004 * (TIMES / 1.2) * (1 - TIMES / 1.2) * 4
     (drift,) = find_faults(log_of(times=bent))
-    assert "the clock drifts: midway the times are 2 steps" in drift.words
+    assert "the clock drifts: midway the times are 2 steps" in drift.message
     assert find_faults(log_of(times=np.round(TIMES, 3))) == []
 
 
-def test_masking_is_asked_for_and_said():
+def test_masking_is_on_request_and_noted():
     log = changed(100, 3.0, changed(slice(400, 500), 0.123))
     masked = mask(log, ["spikes"])
     assert np.flatnonzero(~masked.valid[:, 0]).tolist() == [100] and masked.valid[:, 1].all()

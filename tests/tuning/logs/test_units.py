@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from jaxbeam.case.sensors import QUANTITIES
+from jaxbeam.case.quantities import QUANTITIES
 from tuning.logs.units import UNITS, unit
 
 
@@ -33,8 +33,8 @@ def test_quantities_are_those_of_sensors():
     """What a sensor can measure has, in a log, the SI unit the sensor says."""
     for entry in UNITS.values():
         if entry.quantity in QUANTITIES:
-            assert entry.si == QUANTITIES[entry.quantity]
-    assert {entry.quantity for entry in UNITS.values()} >= set(QUANTITIES)
+            assert entry.si == QUANTITIES[entry.quantity].unit
+    assert {entry.si for entry in UNITS.values()} >= {entry.unit for entry in QUANTITIES.values()}
 
 
 @pytest.mark.parametrize("text", ["milimeter", "G", "kn", "furlong", ""])

@@ -1,4 +1,4 @@
-"""Loads weighed in motion from logs of the modal equations, which share no code with jaxbeam."""
+"""Weighing in motion, from logs of modal equations that share no code with jaxbeam."""
 
 import dataclasses
 
@@ -8,8 +8,8 @@ import pytest
 from tests.oracles import modal_equations
 from tests.oracles.loads import Load
 from tests.tuning.fit.test_identify import deviations, log_of, one_span
-from tuning.fit.matching_pursuit import MatchingPursuit
-from tuning.fit.weigh import weigh
+from tuning.weighing.matching_pursuit import MatchingPursuit
+from tuning.weighing.weigh import weigh
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)
 TIMES = np.arange(301) / 250
@@ -24,11 +24,11 @@ def crossing(loads, noise=1e-5):
 TWO = [Load(0.5, 1.2, 0.1), Load(0.3, -1.6, 0.5)]
 
 
-def test_pursuit_comes_near_without_any_dynamics():
+def test_matching_pursuit_comes_close_without_dynamics():
     pursuit = MatchingPursuit(CASE, crossing(TWO), (0.8, 2.5), both_ways=True)
     found = pursuit.find(2)
-    numbers = sorted([float(n.mass), float(n.speed), float(n.entry_time)] for n in found.loads)
-    np.testing.assert_allclose(numbers, [[0.3, -1.6, 0.5], [0.5, 1.2, 0.1]], atol=0.05)
+    parameters = sorted([float(n.mass), float(n.speed), float(n.entry_time)] for n in found.loads)
+    np.testing.assert_allclose(parameters, [[0.3, -1.6, 0.5], [0.5, 1.2, 0.1]], atol=0.05)
     assert found.residual_rms < 0.2 * pursuit.readings_rms < 0.5 * pursuit.find(1).residual_rms
 
 
@@ -41,14 +41,14 @@ def test_two_loads_that_meet_on_the_beam():
         "sensors.0.offset": 0.0, "sensors.1.offset": 0.0,
     }  # fmt: skip
     assert len(found.loads) == 2
-    assert found.load_counts == []  # nothing but white noise is left
+    assert found.load_counts == []  # the residuals are white noise
     assert np.all(np.abs(deviations(found.fit, truth)) < 3.5)
     assert found.fit.errors[0] < 0.01 and found.fit.errors[3] < 0.01  # kg
-    assert str(found).startswith("2 loads found\nnumber ")
+    assert str(found).startswith("2 loads found\nparameter ")
     assert found.to_dict()["loads"][1]["mass"]["value"] == pytest.approx(0.3, rel=0.02)
 
 
-def test_what_cannot_be_weighed():
+def test_logs_and_cases_that_cannot_be_weighed():
     log = crossing(TWO)
     with pytest.raises(ValueError, match="speeds must be 0 < low < high"):
         weigh(CASE, log, (2.0, 1.0))
@@ -56,5 +56,5 @@ def test_what_cannot_be_weighed():
     with pytest.raises(ValueError, match="weighing needs deflections; sensors.1 does not measure"):
         weigh(dataclasses.replace(CASE, sensors=(CASE.sensors[0], sensor)), log, (1.0, 2.0))
     upwards = dataclasses.replace(log, values=np.abs(log.values))
-    with pytest.raises(ValueError, match="no load shows in it at these speeds"):
+    with pytest.raises(ValueError, match="no load is found in it at these speeds"):
         weigh(CASE, upwards, (1.0, 2.0))

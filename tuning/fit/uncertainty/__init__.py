@@ -1,1 +1,1 @@
-"""Uncertainty."""
+"""Uncertainty of fitted parameters: covariance, profile likelihood, posterior."""

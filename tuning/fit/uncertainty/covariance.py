@@ -1,4 +1,7 @@
-"""What a fit leaves uncertain: covariance, intervals, and what the data cannot see."""
+"""Covariance, confidence intervals and unidentifiable directions of a least-squares fit.
+
+All follow from the singular values of the fit's Jacobian.
+"""
 
 import dataclasses
 
@@ -6,48 +9,48 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import t as student
 
-UNIDENTIFIABLE_SD = (
-    0.5  # standard error, in typical sizes, beyond which a direction counts as unseen
-)
-PARTICIPATION_SHARE = 0.1  # of an unseen direction: an address with more takes part in it
-UNBOUNDED_SD = (
-    1e4  # typical sizes: the spread of a direction without any effect is taken for so much
-)
-REPORTED_CHANGE = (
-    0.1  # of a typical size: the largest change with which an unseen direction is reported
-)
+# In typical sizes of the parameters, as all of these but the share:
+UNIDENTIFIABLE_SD = 0.5  # standard error beyond which a direction counts as unidentifiable
+PARTICIPATION_SHARE = 0.1  # of an unidentifiable direction: addresses with more are part of it
+UNBOUNDED_SD = 1e4  # standard error given to a direction without any effect
+REPORTED_CHANGE = 0.1  # largest change with which an unidentifiable direction is reported
 
 
 @dataclasses.dataclass(frozen=True)
 class Uncertainty:
-    """Standard errors (infinite where the data cannot tell), correlation, unseen directions.
+    """Standard errors, correlation and unidentifiable directions, in the order of the addresses.
 
-    Each unseen direction is a dictionary from address to change, in SI units: made together,
-    these changes leave the readings as good as they are.
+    Errors (SI) are infinite, and correlations NaN, where a parameter is not identifiable. Each
+    entry of `unidentifiable` is a dictionary from address to change (SI): made together, these
+    changes leave the readings as good as they are.
     """
 
-    errors: Float[np.ndarray, " free"]
-    correlation: Float[np.ndarray, "free free"]
+    errors: Float[np.ndarray, " parameter"]
+    correlation: Float[np.ndarray, "parameter parameter"]
     unidentifiable: list[dict[str, float]]
+
+
+def autocorrelation(centred: Float[np.ndarray, " time"], lag: int) -> float:
+    """Autocorrelation, at a lag of so many samples, of a series whose mean is zero."""
+    return float(centred[:-lag] @ centred[lag:]) / float(centred @ centred)
 
 
 def autocorrelation_factor(residuals: Float[np.ndarray, " time"]) -> float:
     """Factor by which a residual's autocorrelation raises variances: 1 + 2 sum of correlations.
 
-    Summed over the first lags, up to where the correlation vanishes in its own scatter; this is
-    exact for slow changes of the reading and too much for fast ones (Box, Jenkins, Time Series
-    Analysis, section 2.1.5).
+    Summed over the first lags, up to where the correlation falls below its own scatter,
+    1 / sqrt(n). Exact for slow changes of the reading, too large for fast ones (Box and Jenkins,
+    Time Series Analysis, section 2.1.5).
     """
     if residuals.size < 2:
         return 1.0
     centred = residuals - residuals.mean()
-    power = float(centred @ centred)
-    if power == 0.0:
+    if float(centred @ centred) == 0.0:
         return 1.0
     factor = 1.0
     limit = 1 / np.sqrt(centred.size)
     for lag in range(1, centred.size // 4):
-        correlation = float(centred[:-lag] @ centred[lag:]) / power
+        correlation = autocorrelation(centred, lag)
         if correlation < limit:
             break
         factor += 2 * correlation
@@ -55,23 +58,33 @@ def autocorrelation_factor(residuals: Float[np.ndarray, " time"]) -> float:
 
 
 def t_quantile(degrees_of_freedom: float) -> float:
-    """Standard errors to either side of a 95 % interval: Student's quantile.
+    """Half width of a 95 % interval in standard errors: Student's quantile, 1.96 in the limit.
 
-    `degrees_of_freedom` is the number of independent samples beyond those that the values took; 1.96 for many.
+    `degrees_of_freedom` is the number of independent samples less that of the parameters.
     """
     return float(student.ppf(0.975, degrees_of_freedom))
 
 
+def confidence_intervals(
+    values: Float[np.ndarray, " parameter"],
+    errors: Float[np.ndarray, " parameter"],
+    degrees_of_freedom: float,
+) -> Float[np.ndarray, "parameter 2"]:
+    """95 % intervals of values with their standard errors; infinite for infinite errors."""
+    half = t_quantile(degrees_of_freedom) * errors
+    return np.stack([values - half, values + half], axis=1)
+
+
 def uncertainty(
     addresses: list[str],
-    jacobian: Float[np.ndarray, "residual free"],
-    sizes: Float[np.ndarray, " free"],
+    jacobian: Float[np.ndarray, "residual parameter"],
+    sizes: Float[np.ndarray, " parameter"],
 ) -> Uncertainty:
-    """Uncertainty of values from the Jacobian of residuals in units of their standard errors.
+    """Uncertainty of values from the Jacobian of residuals in units of their standard deviation.
 
     The covariance is the inverse of J' J, by the singular directions of J in typical `sizes`.
-    Directions whose standard error exceeds `UNIDENTIFIABLE_SD` are unseen: all addresses that take part in
-    one get names instead of numbers, and so does any whose own standard error exceeds it.
+    Directions whose standard error exceeds `UNIDENTIFIABLE_SD` are unidentifiable: addresses that
+    are part of one are named and have no standard error, and so have all whose own exceeds it.
     """
     _, strength, directions = np.linalg.svd(np.linalg.qr(jacobian * sizes, mode="r"))
     # Columns in exact proportion leave a strength of rounding size.

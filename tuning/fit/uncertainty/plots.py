@@ -1,4 +1,4 @@
-"""Pictures of what is known about fitted numbers: profiles and posterior."""
+"""Figures of the uncertainty of fitted parameters: profiles and posterior."""
 
 from collections.abc import Sequence
 
@@ -9,12 +9,12 @@ from jaxbeam.plot.style import COLOURS, FAINT, INK, use_style
 from tuning.fit.uncertainty.posterior import Posterior
 from tuning.fit.uncertainty.profile import Profile
 
-PANELS_PER_ROW = 3  # panels side by side
+PANELS_PER_ROW = 3
 
 
 @use_style
 def plot_profiles(profiles: Sequence[Profile]) -> Figure:
-    """For each number the rise of -2 ln L, and where it passes what 95 % confidence allows."""
+    """Figure of the deviance of each parameter, with its critical value and the interval."""
     figure, panels = _panels(len(profiles))
     for axes, found in zip(panels, profiles, strict=False):
         axes.plot(found.values, found.deviance, "o-", color=INK, markersize=3, linewidth=1)
@@ -35,7 +35,7 @@ def plot_profiles(profiles: Sequence[Profile]) -> Figure:
 
 @use_style
 def plot_posterior(posterior: Posterior) -> Figure:
-    """For each number a histogram of its draws, each chain a line, and the 95 % interval."""
+    """Figure of histograms of the draws of each parameter, a line for each chain, and intervals."""
     figure, panels = _panels(len(posterior.addresses))
     for i, axes in enumerate(panels):
         draws = posterior.draws[..., i]
@@ -50,7 +50,7 @@ def plot_posterior(posterior: Posterior) -> Figure:
 
 
 def _panels(count: int):
-    """A figure with so many panels, three side by side."""
+    """A figure with so many panels, and its axes."""
     rows = -(-count // PANELS_PER_ROW)
     figure = Figure(figsize=(3.2 * min(count, PANELS_PER_ROW), 2.4 * rows))
     grid = figure.subplots(rows, min(count, PANELS_PER_ROW), squeeze=False).ravel()

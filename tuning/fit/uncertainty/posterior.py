@@ -1,4 +1,4 @@
-"""The posterior of the free numbers, sampled: what intervals look like where errors do not.
+"""Posterior of fitted parameters, sampled: intervals where the linearised fit does not hold.
 
 No-U-turn sampling (Hoffman and Gelman, 2014) by blackjax, the extra `bayes`.
 """
@@ -6,69 +6,76 @@ No-U-turn sampling (Hoffman and Gelman, 2014) by blackjax, the extra `bayes`.
 import dataclasses
 import os
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tuning.checkpoint import fingerprint, load, save
-from tuning.fit.identify import Fit
+from tuning.aliases import current_word
+from tuning.checkpoint import NO_CHECKPOINT, Checkpoint, checkpoint_path, fingerprint
+from tuning.fit.result import Fit
 from tuning.optional import import_extra
 
-NOISE_MODELS = ("held", "estimated")
-DRAWS_PER_BLOCK = 100  # draws between two states on disk
-MAX_R_HAT = 1.05  # R-hat beyond which chains have not mixed
-MIN_EFFECTIVE_DRAWS = 100  # effective draws below which intervals are not to be trusted
+NOISE_MODELS = ("fixed", "estimated")
+OLD_NOISE_MODELS = {"held": "fixed"}
+DRAWS_PER_BLOCK = 100  # draws between two checkpoints
+MAX_R_HAT = 1.05  # beyond it chains have not mixed
+MIN_EFFECTIVE_DRAWS = 100  # below it intervals are not reliable
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Posterior:
-    """Draws (chain, draw, free) of the free numbers in SI units, and how well they mixed.
+    """Draws (chain, draw, parameter) of the free parameters in SI units, with diagnostics.
 
-    `r_hat` compares the spread between and within chains (1 is perfect), `effective_draws` is the number
-    of independent draws that these are worth; `divergences` counts steps that went astray.
+    `r_hat` is the ratio of the spread between chains to that within (1 for chains that have mixed),
+    `effective_draws` the number of independent draws; `divergences` counts divergent steps.
     """
 
     addresses: list[str]
-    draws: Float[np.ndarray, "chain draw free"]
-    r_hat: Float[np.ndarray, " free"]
-    effective_draws: Float[np.ndarray, " free"]
+    draws: Float[np.ndarray, "chain draw parameter"]
+    r_hat: Float[np.ndarray, " parameter"]
+    effective_draws: Float[np.ndarray, " parameter"]
     divergences: int
 
     @property
-    def means(self) -> Float[np.ndarray, " free"]:
+    def means(self) -> Float[np.ndarray, " parameter"]:
         """Means of the draws."""
         return self.draws.mean(axis=(0, 1))
 
     @property
-    def deviations(self) -> Float[np.ndarray, " free"]:
+    def deviations(self) -> Float[np.ndarray, " parameter"]:
         """Standard deviations of the draws."""
         return self.draws.std(axis=(0, 1))
 
     @property
-    def intervals(self) -> Float[np.ndarray, "free 2"]:
+    def intervals(self) -> Float[np.ndarray, "parameter 2"]:
         """Central 95 % intervals."""
         return np.quantile(self.draws, [0.025, 0.975], axis=(0, 1)).T
 
     @property
     def verdict(self) -> str:
-        """Whether the draws may be trusted."""
+        """Whether the draws are reliable, in a sentence."""
         if not np.all(self.r_hat < MAX_R_HAT):
             return f"the chains have not mixed (R-hat up to {self.r_hat.max():.3f}): draw more"
         if not np.all(self.effective_draws > MIN_EFFECTIVE_DRAWS):
             return f"only {self.effective_draws.min():.0f} effective draws: draw more"
         if self.divergences > 0.01 * self.draws[..., 0].size:
-            return f"{self.divergences} divergent steps: the corners of the posterior are missed"
-        return f"mixed: R-hat up to {self.r_hat.max():.3f}, {self.effective_draws.min():.0f} effective draws"
+            return f"{self.divergences} divergent steps: parts of the posterior are not sampled"
+        draws = f"{self.effective_draws.min():.0f} effective draws"
+        return f"mixed: R-hat up to {self.r_hat.max():.3f}, {draws}"
 
     def to_dict(self) -> dict:
-        """Means, deviations, intervals, R-hat and effective draws by address, and the verdict."""
+        """Means, deviations, intervals and diagnostics by address, and the verdict, for JSON."""
         rows = zip(
-            self.addresses, self.means, self.deviations, self.intervals, self.r_hat, self.effective_draws,
+            self.addresses,
+            self.means,
+            self.deviations,
+            self.intervals,
+            self.r_hat,
+            self.effective_draws,
             strict=True,
-        )  # fmt: skip
+        )
         numbers = {
             address: {
                 "mean": float(mean),
@@ -83,7 +90,7 @@ class Posterior:
 
     def __str__(self) -> str:
         width = max(map(len, self.addresses))
-        head = f"{'number':{width}}  {'mean':>11}  {'deviation':>10}  {'95 % interval':^25}"
+        head = f"{'parameter':{width}}  {'mean':>11}  {'deviation':>10}  {'95 % interval':^25}"
         lines = [f"{head}  {'R-hat':>6}  {'draws':>6}"]
         rows = zip(self.addresses, self.means, self.deviations, self.intervals, strict=True)
         for i, (address, mean, deviation, (low, high)) in enumerate(rows):
@@ -102,30 +109,32 @@ def sample(
     seed: int = 0,
     checkpoint: str | os.PathLike | None = None,
     resume: bool = False,
-    noise: str = "held",
+    noise: str = "fixed",
 ) -> Posterior:
-    """Sample the posterior of a fit's numbers: its likelihood, priors, and bounds.
+    """Sample the posterior of the parameters of a fit, from likelihood, priors and bounds.
 
-    The noise is that of the fit, widened where residuals are coloured; if it is "estimated", the
+    With the noise "fixed" it is that of the fit, widened for autocorrelation; with "estimated" the
     level of each channel is unknown with the prior 1 / level, and integrated out (Gelman and
-    others, section 3.2). A number without a prior is believed to be anywhere within its bounds.
-    Chains start around the fit, scattered as widely as its standard errors; for speed the sampler
-    moves in the directions and sizes of these.
+    others, section 3.2). A parameter without a prior is uniform within its bounds. Chains start
+    around the fit, scattered by its standard errors, and the sampler works in variables whitened
+    by its covariance.
 
-    With a `checkpoint` file sampling can be stopped at any time and taken up with `resume`: the
-    draws are the same.
+    With a `checkpoint` file sampling can be stopped at any time; with `resume` it goes on, to the
+    same draws.
 
-    Raises ValueError if the data cannot see some direction without a prior, for another word on
-    the noise, and for a damaged or foreign checkpoint, FileExistsError if it exists and `resume`
-    is not set, ImportError without blackjax.
+    Raises ValueError for a direction that is not identifiable and has no prior, an unknown word
+    for the noise, and a checkpoint that is damaged or of another sampling; FileExistsError if the
+    checkpoint exists and `resume` is not set; ImportError without blackjax.
     """
     if fit.unidentifiable:
         raise ValueError(
-            f"the data cannot see {', '.join(fit.unidentifiable[0])}: give a prior, or a value known "
-            "otherwise, before sampling"
+            f"not identifiable from the data: {', '.join(fit.unidentifiable[0])}; give a prior, or "
+            "a value known otherwise, before sampling"
         )
+    noise = current_word(noise, OLD_NOISE_MODELS, "the noise")
     if noise not in NOISE_MODELS:
         raise ValueError(f"noise can be {' or '.join(map(repr, NOISE_MODELS))}, not {noise!r}")
+    path = checkpoint_path(checkpoint, resume)
     density, from_unbounded, start, whitening = _log_density(fit, noise)
     digest = fingerprint(
         {
@@ -135,10 +144,8 @@ def sample(
             "settings": [chains, warmup, seed, noise],
         }
     )
-    file = None if checkpoint is None else Path(checkpoint)
-    found, divergences = draw_by_nuts(
-        density, start.size, draws, chains, warmup, seed, file, digest, resume
-    )
+    kept = Checkpoint(path, digest)
+    found, divergences = draw_by_nuts(density, start.size, draws, chains, warmup, seed, kept)
     values = np.asarray(
         jax.vmap(jax.vmap(from_unbounded))(jnp.asarray(start + found @ whitening.T))
     )
@@ -146,9 +153,9 @@ def sample(
 
 
 def with_diagnostics(
-    addresses: list[str], draws: Float[np.ndarray, "chain draw free"], divergences: int
+    addresses: list[str], draws: Float[np.ndarray, "chain draw parameter"], divergences: int
 ) -> Posterior:
-    """Draws with R-hat and effective number (Gelman and others, Bayesian Data Analysis, 11.4).
+    """Posterior of draws: R-hat, effective draws (Gelman and others, Bayesian Data Analysis, 11.4).
 
     Raises ImportError without blackjax.
     """
@@ -163,15 +170,13 @@ def with_diagnostics(
     )
 
 
-def _log_density(fit: Fit, noise_model: str = "held"):
-    """Log density over whitened search variables, their map to values, centre and directions."""
+def _log_density(fit: Fit, noise_model: str = "fixed"):
+    """Log density of whitened search variables, map to values, centre, whitening matrix."""
     least_squares, dataset = fit.least_squares, fit.dataset
-    noise = np.where(np.isnan(fit.noise), 1.0, fit.noise * np.sqrt(fit.autocorrelation_factor))
-    weights, measured = jnp.asarray(least_squares.weights(noise)), jnp.asarray(dataset.measured)
+    weights = jnp.asarray(least_squares.weights(fit.widened_noise))
+    measured = jnp.asarray(dataset.measured)
     predict = dataset.predictor(fit.addresses)
-    parameters = fit.parameters
-    pairs = zip(parameters, fit.values, strict=True)
-    start = np.array([number.to_unbounded(float(value)) for number, value in pairs])
+    start = fit.unbounded
     slopes = np.diag(jax.jacfwd(least_squares.from_unbounded)(jnp.asarray(start)))
     _, jacobian = least_squares.linearised(fit.values)
     rows = (jacobian * np.asarray(weights)[..., None]).reshape(-1, start.size) * slopes
@@ -179,15 +184,15 @@ def _log_density(fit: Fit, noise_model: str = "held"):
         np.asarray(jax.jacfwd(least_squares.prior_residuals)(jnp.asarray(fit.values))) * slopes
     )
     information = rows.T @ rows + prior_jacobian.T @ prior_jacobian
-    # A number at a bound has no slope there: its search variable wanders over order one.
-    floor = 1 / np.array([number.unbounded_size for number in parameters]) ** 2
+    # At a bound the value has no slope; its search variable varies by its own typical size.
+    floor = 1 / np.array([p.unbounded_size for p in fit.parameters]) ** 2
     whitening = np.linalg.cholesky(np.linalg.inv(information + np.diag(floor)))
 
     independent = dataset.mask.sum(axis=1) / fit.autocorrelation_factor
 
     def misfit(residuals):
         squares = jnp.sum(residuals**2, axis=1)
-        if noise_model == "held":
+        if noise_model == "fixed":
             return jnp.sum(squares)
         # The integral of level^-(n + 1) exp(-squares / (2 level^2)) is squares^(-n / 2).
         return jnp.sum(independent * jnp.log(jnp.where(independent > 0, squares, 1.0)))
@@ -209,19 +214,17 @@ def draw_by_nuts(
     chains: int,
     warmup: int,
     seed: int,
-    file: Path | None = None,
-    digest: str = "",
-    resume: bool = False,
+    checkpoint: Checkpoint = NO_CHECKPOINT,
 ) -> tuple[Float[np.ndarray, "chain draw size"], int]:
-    """Draws from a log density near a standard normal one, and how many steps diverged.
+    """Draws from a log density close to the standard normal one, and the number of divergences.
 
-    Step sizes are adapted first; then draws are made in blocks, each with random numbers of its
-    own, and kept in the file. Raises ValueError for a damaged or foreign file, FileExistsError if
-    it exists and `resume` is not set, ImportError without blackjax.
+    The step size is adapted first; then draws are made in blocks with random numbers of their own,
+    after each of which the checkpoint is written.
+
+    Raises ValueError for a checkpoint that is damaged or of another sampling, ImportError without
+    blackjax.
     """
     blackjax = import_extra("blackjax", "bayes")
-    if file is not None and file.exists() and not resume:
-        raise FileExistsError(f"{file} exists: resume that sampling, or delete it")
     keys = jax.random.split(jax.random.key(seed), chains)
 
     def adapt(key):
@@ -242,10 +245,9 @@ def draw_by_nuts(
         )
         return positions, divergent
 
-    if file is not None and file.exists():
-        state = load(file, digest)
-    else:
-        # Chain after chain: side by side each would wait for the longest path of all.
+    state = checkpoint.load()
+    if state is None:
+        # Chain after chain: in a batch each would wait for the longest trajectory of all.
         position, step, mass = map(np.asarray, jax.jit(lambda k: jax.lax.map(adapt, k))(keys))
         state = {
             "position": position, "step": step, "mass": mass,
@@ -263,6 +265,5 @@ def draw_by_nuts(
             "draws": np.concatenate([state["draws"], positions], axis=1),
             "divergent": state["divergent"] + divergent.sum(),
         }
-        if file is not None:
-            save(file, digest, state)
+        checkpoint.save(state)
     return state["draws"][:, :draws], int(state["divergent"])

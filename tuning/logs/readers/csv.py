@@ -1,4 +1,4 @@
-"""Logs as separated values: names (with units) in the first line, numbers below.
+"""Separated values (.csv, .tsv, .txt, .dat): names with units in the first line, numbers below.
 
     time (s); d1 [mm]; d2 [mm]
     0,000; 0,12; -0,03
@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import LogTable, parse_heading, parse_numbers, read_text
+from tuning.logs.readers.table import LogFormat, LogTable, parse_heading, parse_numbers, read_text
 
 
-def read_csv(path: Path) -> LogTable:
-    """Read a file of values separated by tabs, semicolons or commas.
+def read_csv(path: Path) -> dict[str, LogTable]:
+    """Table of a file of values separated by tabs, semicolons or commas.
 
     The separator is the first of these three that occurs in the line of names. Unless it is the
     comma, numbers may have a decimal comma. Units stand in brackets or parentheses after names.
@@ -52,11 +52,11 @@ def read_csv(path: Path) -> LogTable:
     names, units = zip(*map(parse_heading, headings), strict=True)
     decimal_comma = separator != "," and _has_decimal_comma(path, rows, lines)
     values = parse_numbers(path, names, rows, lines, decimal_comma)
-    return LogTable(names, units, values, np.array(lines))
+    return {"": LogTable(names, units, values, np.array(lines))}
 
 
 def _nonempty_rows(path, kept, top, separator):
-    """The cells of the rows that have any, from the line of names on, and their line numbers."""
+    """Cells of the rows that are not empty, from the line of names on, and their line numbers."""
     reader = csv.reader(io.StringIO("".join(kept[top:])), delimiter=separator)
     rows, lines = [], []
     try:
@@ -78,7 +78,7 @@ def _all_numbers(cells) -> bool:
 
 
 def _has_decimal_comma(path, rows, lines) -> bool:
-    """Tell whether cells have commas; a file with points as well is not guessed at."""
+    """Whether cells have decimal commas. Raises ValueError for a file with points as well."""
     comma = next((i for i, row in enumerate(rows) if any("," in cell for cell in row)), None)
     point = next((i for i, row in enumerate(rows) if any("." in cell for cell in row)), None)
     if comma is not None and point is not None:
@@ -87,3 +87,8 @@ def _has_decimal_comma(path, rows, lines) -> bool:
             "and decimal points; write one of them throughout, without thousands separators"
         )
     return comma is not None
+
+
+FORMAT = LogFormat(
+    "separated values", read_csv, suffixes=(".csv", ".tsv", ".txt", ".dat"), is_text=True
+)

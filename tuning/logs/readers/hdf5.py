@@ -1,10 +1,16 @@
-"""HDF5 files, with MATLAB's since version 7.3 and netCDF-4 among them: each group is a run."""
+"""HDF5 files, including MATLAB files since version 7.3 and netCDF-4: each group is a run."""
 
 from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import LogTable, damaged_file_error, table_of, text_attribute
+from tuning.logs.readers.table import (
+    LogFormat,
+    LogTable,
+    damaged_file_error,
+    table_of,
+    text_attribute,
+)
 from tuning.optional import import_extra
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -13,7 +19,7 @@ _RATES = ("sample_rate", "sampling_rate", "fs")
 
 
 def read_hdf5(path: Path) -> dict[str, LogTable]:
-    """Read an HDF5 file: one run for each group that holds lists of numbers, by its path.
+    """Tables of an HDF5 file: one run for each group with lists of numbers, by its path.
 
     Units are the attribute `units` or `unit` of a dataset. Times are a dataset called time, or
     follow from an attribute `sample_rate` (Hz) of the group or the file.
@@ -37,7 +43,7 @@ def read_hdf5(path: Path) -> dict[str, LogTable]:
                 rates[group] = _sample_rate(item.parent) or _sample_rate(file)
 
             file.visititems(visit)
-    except Exception as error:  # whatever h5py meets in a file that is not as it should be
+    except Exception as error:  # h5py raises many types for damaged files
         raise damaged_file_error(path, error) from None
     return {
         group: table_of(
@@ -48,12 +54,12 @@ def read_hdf5(path: Path) -> dict[str, LogTable]:
 
 
 def _numbers(dataset) -> np.ndarray:
-    """The numbers of a dataset, NaN where it says that none was measured."""
+    """Numbers of a dataset, NaN for its fill value."""
     values = np.asarray(dataset[()], float)
     fill = dataset.attrs.get("_FillValue")
     if fill is not None:
         values = np.where(values == np.ravel(fill)[0], np.nan, values)
-    # MATLAB keeps vectors as matrices of one column.
+    # MATLAB stores vectors as matrices of one column.
     return np.ravel(values) if 1 in values.shape and values.ndim == 2 else values
 
 
@@ -68,3 +74,6 @@ def _sample_rate(group) -> float | None:
 
 def _times_function(rate: float | None):
     return None if rate is None else lambda count: np.arange(count) / rate
+
+
+FORMAT = LogFormat("HDF5", read_hdf5, suffixes=(".h5", ".hdf5"), magics=(MAGIC, MATLAB_MAGIC))

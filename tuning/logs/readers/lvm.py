@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import LogTable, parse_numbers, read_text
+from tuning.logs.readers.table import LogFormat, LogTable, parse_numbers, read_text
 
 MAGIC = "LabVIEW Measurement"
 _END = "***End_of_Header***"
@@ -20,7 +20,7 @@ _SPECIAL = ("***Start_Special***", "***End_Special***")
 
 @dataclass
 class _Segment:
-    """One segment while it is read: its header, its column headings and its rows."""
+    """One segment: its header, column headings, rows and their line numbers."""
 
     header: dict[str, list[str]]
     headings: list[str] = field(default_factory=list)
@@ -28,10 +28,10 @@ class _Segment:
     lines: list[int] = field(default_factory=list)
 
 
-def read_lvm(path: Path) -> LogTable:
-    """Read a LabVIEW measurement file; several segments are put one after the other in time.
+def read_lvm(path: Path) -> dict[str, LogTable]:
+    """Table of a LabVIEW measurement file, with its segments joined in time.
 
-    A segment whose times start afresh is moved by the difference of the segments' start times.
+    A segment whose times start again at zero is moved by the difference of the start times.
 
     Raises ValueError, naming file and line, for headers without end, segments with different
     channels, channels with times of their own, and cells that are no numbers.
@@ -52,17 +52,17 @@ def read_lvm(path: Path) -> LogTable:
             )
     values = _join_segments(path, segments, [part[2] for part in parts])
     numbered = np.concatenate([segment.lines for segment in segments])
-    return LogTable(("time", *names), ("s", *units), values, numbered, time="time")
+    return {"": LogTable(("time", *names), ("s", *units), values, numbered, time="time")}
 
 
 def _separator(lines) -> str:
-    """Return the separator the header names; a tab if it names none."""
+    """Separator named in the header, a tab by default."""
     named = next((line for line in lines if line.startswith("Separator")), "Separator\tTab")
     return "," if "Comma" in named else "\t"
 
 
 def _file_header(path, lines):
-    """Return the file header and the index of the line after it."""
+    """File header, and the index of the line after it."""
     separator = _separator(lines)
     header = {}
     for i, line in enumerate(lines):
@@ -75,7 +75,7 @@ def _file_header(path, lines):
 
 
 def _segments(path, lines, first, separator, file_header) -> list[_Segment]:
-    """Split the lines after the file header into segments."""
+    """Segments in the lines after the file header."""
     segments: list[_Segment] = []
     header: dict[str, list[str]] | None = None
     special = False
@@ -107,7 +107,7 @@ def _segments(path, lines, first, separator, file_header) -> list[_Segment]:
 
 
 def _columns(path, segment: _Segment, decimal_comma: bool):
-    """Return names, units and values of a segment, time (s) being the first column of values."""
+    """Names, units and values of a segment; the first column of values is the time (s)."""
     headings = segment.headings
     if "Comment" in headings:
         headings = headings[: headings.index("Comment")]
@@ -140,7 +140,7 @@ def _columns(path, segment: _Segment, decimal_comma: bool):
 
 
 def _implicit_times(path, segment: _Segment, decimal_comma: bool):
-    """Times of a segment without a column of times, from X0 and Delta_X."""
+    """Times (s) of a segment without a column of times, from X0 and Delta_X."""
     if "Delta_X" not in segment.header:
         raise ValueError(f"{path}: the log has neither a column of times (X_Value) nor a Delta_X")
     cells = [segment.header.get("X0", ["0"])[0], segment.header["Delta_X"][0]]
@@ -150,7 +150,7 @@ def _implicit_times(path, segment: _Segment, decimal_comma: bool):
 
 
 def _join_segments(path, segments, values):
-    """Put segments one after the other; one that starts afresh is moved by its start time."""
+    """Values of all segments; one whose times start again is moved by its start time."""
     joined = [values[0]]
     for before, segment, rows in zip(segments, segments[1:], values[1:], strict=False):
         if rows[0, 0] <= joined[-1][-1, 0]:
@@ -166,7 +166,7 @@ def _join_segments(path, segments, values):
 
 
 def _seconds_between(path, first: _Segment, later: _Segment) -> float:
-    """Seconds from the start of one segment to that of another, from Date and Time."""
+    """Time (s) from the start of one segment to that of another, by their Date and Time."""
     starts = []
     for segment in (first, later):
         date, time = (segment.header.get(key, [""])[0] for key in ("Date", "Time"))
@@ -176,8 +176,13 @@ def _seconds_between(path, first: _Segment, later: _Segment) -> float:
             starts.append((start, float(f"0.{fraction or 0}")))
         except ValueError:
             raise ValueError(
-                f"{path}, line {segment.lines[0]}: the times of segments start afresh, but this "
+                f"{path}, line {segment.lines[0]}: the times of segments start again, but this "
                 f"segment's Date {date!r} and Time {time!r} do not tell when it started"
             ) from None
     (day, part), (later_day, later_part) = starts
     return (later_day - day).total_seconds() + later_part - part
+
+
+FORMAT = LogFormat(
+    "LabVIEW (LVM)", read_lvm, suffixes=(".lvm",), magics=(MAGIC.encode(),), is_text=True
+)

@@ -6,23 +6,23 @@ import numpy as np
 from scipy.io import loadmat, matlab
 
 from tuning.logs.readers.mat_elements import check_elements
-from tuning.logs.readers.table import LogTable, damaged_file_error, table_of
+from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error, table_of
 
 MAGIC = b"MATLAB 5.0 MAT-file"
 
 
 def read_mat(path: Path) -> dict[str, LogTable]:
-    """Read a MATLAB file: one run of its variables, and one for each struct of vectors.
+    """Tables of a MATLAB file: a run of its variables, and one for each struct of vectors.
 
-    A struct `units` within a run names the units of its variables. The entries of an array of
-    structs are runs `name.0`, `name.1`, ... Scalars and text are left out.
+    A struct `units` within a run has the units of its variables. The entries of an array of structs
+    are runs `name.0`, `name.1`, ... Scalars and text are left out.
 
     Raises ValueError for a damaged file, or one that holds objects only (such as a timetable).
     """
     try:
         check_elements(path.read_bytes())
         content = loadmat(path, squeeze_me=True, struct_as_record=False)
-    except Exception as error:  # scipy raises whatever its parser stumbles over
+    except Exception as error:  # scipy raises many types for damaged files
         raise damaged_file_error(path, error) from None
     content = {name: value for name, value in content.items() if not name.startswith("__")}
     runs = {"": content}
@@ -53,3 +53,6 @@ def _fields(struct) -> dict:
 
 def _is_numeric_array(value) -> bool:
     return isinstance(value, np.ndarray) and value.size > 1 and value.dtype.kind in "fiub"
+
+
+FORMAT = LogFormat("MATLAB", read_mat, suffixes=(".mat",), magics=(MAGIC,))

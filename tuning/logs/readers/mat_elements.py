@@ -1,8 +1,8 @@
-"""Whether a MATLAB file holds together, found out before scipy reads it.
+"""Consistency of the elements of a MATLAB file, checked before scipy reads it.
 
-scipy trusts the types, sizes and counts in a file; a wrong one ends the whole process or keeps it
-busy for minutes. The format is that of "MAT-File Format" (MathWorks), section 1: a tree of data
-elements, each a tag (type and size) and its data.
+scipy trusts the types, sizes and counts in a file; a wrong one ends the process or takes minutes.
+The format is that of "MAT-File Format" (MathWorks), section 1: a tree of data elements, each a tag
+(type and size) and its data.
 """
 
 import math
@@ -30,10 +30,10 @@ class Element(NamedTuple):
 
 
 def check_elements(content: bytes) -> None:
-    """Walk through the elements of a MATLAB file (version 5 to 7).
+    """Check the elements of a MATLAB file (version 5 to 7).
 
-    Raises ValueError where types, sizes or counts contradict each other, zlib.error where what is
-    compressed is damaged.
+    Raises ValueError for types, sizes or counts that contradict each other, zlib.error for damaged
+    compressed data.
     """
     order = "<" if content[126:128] == b"IM" else ">"
     for element in _elements(content[HEADER:], order):
@@ -60,7 +60,7 @@ def _elements(data: bytes, order: str) -> list[Element]:
 
 def _check_array(data: bytes, order: str) -> None:
     if not data:
-        return  # an empty array may be written so
+        return  # an empty array
     flags, *rest = _elements(data, order)
     word = struct.unpack_from(f"{order}I", flags.data)[0]
     kind = word & 0xFF

@@ -4,24 +4,28 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import LogTable, damaged_file_error, table_of, text_attribute
+from tuning.logs.readers.table import (
+    LogFormat,
+    LogTable,
+    damaged_file_error,
+    table_of,
+    text_attribute,
+)
 from tuning.optional import import_extra
 
 MAGIC = b"PAR1"
 
 
 def read_parquet(path: Path) -> dict[str, LogTable]:
-    """Read a Parquet file: one run of its columns of numbers.
+    """Table of a Parquet file: one run of its columns of numbers.
 
     Units stand in brackets after names, or in the metadata `unit` of a column. A column of dates
-    becomes seconds since its first; what is null becomes NaN, which reading a log then speaks of.
+    becomes seconds since the first; null becomes NaN, a missing sample.
 
     Raises ValueError for a damaged file, ImportError without pyarrow.
     """
-    pyarrow, parquet = (
-        import_extra("pyarrow", "parquet"),
-        import_extra("pyarrow.parquet", "parquet"),
-    )
+    pyarrow = import_extra("pyarrow", "parquet")
+    parquet = import_extra("pyarrow.parquet", "parquet")
     try:
         table = parquet.read_table(path)
     except (OSError, pyarrow.ArrowException) as error:
@@ -36,3 +40,6 @@ def read_parquet(path: Path) -> dict[str, LogTable]:
             arrays[field.name] = values
             units.setdefault(field.name, text_attribute((field.metadata or {}).get(b"unit")))
     return {"": table_of(str(path), arrays, units)}
+
+
+FORMAT = LogFormat("Parquet", read_parquet, suffixes=(".parquet",), magics=(MAGIC,))

@@ -1,11 +1,11 @@
-"""What every reader returns: named columns of numbers as read, and the lines they came from."""
+"""Tables of logged columns as read from files, and formats of files with their readers."""
 
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,9 +18,9 @@ TIME_NAMES = ("time", "t", "zeit", "temps", "x_value")
 class LogTable:
     """Columns of one run in a log file, in the units of the file.
 
-    `units` holds the unit of each column as the file names it, or None; `lines` the line number
-    of each row, None where the file has no lines. Where the format says which column is time,
-    `time` is its name. `notes` say what is to be known of how it was read, in a sentence each.
+    `units` are those of the columns as named in the file, or None; `lines` the line numbers of the
+    rows, None for a file without lines; `time` the name of the column of times, where the format
+    defines it; `notes` sentences on how it was read.
     """
 
     names: tuple[str, ...]
@@ -31,8 +31,23 @@ class LogTable:
     notes: tuple[str, ...] = ()
 
 
+class LogFormat(NamedTuple):
+    """A format of log files.
+
+    `read` returns the tables of the runs in a file, by name (a single run is called ""). A file
+    that begins with one of `magics` is of the format; so is a text file (`is_text`) with one of the
+    `suffixes`.
+    """
+
+    name: str
+    read: Callable[[Path], dict[str, LogTable]]
+    suffixes: tuple[str, ...]
+    magics: tuple[bytes, ...] = ()
+    is_text: bool = False
+
+
 def parse_heading(text: str) -> tuple[str, str | None]:
-    """The name and unit in the heading of a column, such as `d1 [mm]`; None without a unit."""
+    """Name and unit in the heading of a column, such as `d1 [mm]`; None without a unit."""
     found = _HEADING.match(text.strip())
     return (found["name"], found["unit"]) if found else (text.strip(), None)
 
@@ -44,11 +59,11 @@ def table_of(
     times_function: Callable[[int], np.ndarray] | None = None,
     notes: Sequence[str] = (),
 ) -> LogTable:
-    """A table of the arrays of one run, by name; a name may be a heading with a unit.
+    """Table of the arrays of one run, by name; a name may be a heading with a unit.
 
-    An array of several columns becomes `name.0`, `name.1`, ... What is not as long as the times
-    (else as most of the arrays) is left out, which a note says. `times_function` gives the times (s) of so
-    many samples, for a run that has no column of them.
+    An array of several columns becomes `name.0`, `name.1`, ... Arrays that are not as long as the
+    times (or else as most of the arrays) are left out, with a note. `times_function` returns the
+    times (s) of so many samples, for a run without a column of times.
 
     Raises ValueError if there are no numbers.
     """
@@ -78,12 +93,12 @@ def table_of(
 
 
 def is_time_name(name: str) -> bool:
-    """Tell whether a column is called as columns of times are."""
+    """Whether a name is one of a column of times."""
     return name.lower() in TIME_NAMES
 
 
 def _length(arrays: Mapping[str, np.ndarray]) -> int:
-    """Number of samples: that of the times, or else the one that most arrays have."""
+    """Number of samples: that of the times, or else that of most arrays."""
     for label, array in arrays.items():
         if is_time_name(parse_heading(label)[0]):
             return max(array.shape, default=0)
@@ -92,7 +107,7 @@ def _length(arrays: Mapping[str, np.ndarray]) -> int:
 
 
 def read_bytes(path: Path, count: int = -1) -> bytes:
-    """Return the bytes of a file, or the first few.
+    """Bytes of a file, or the first `count` of them.
 
     Raises ValueError if there is no such file or it is empty.
     """
@@ -106,13 +121,13 @@ def read_bytes(path: Path, count: int = -1) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file: UTF-8, or the Windows encoding older loggers write.
+    """Text of a file in UTF-8 or the Windows encoding (cp1252) of older loggers.
 
     Raises ValueError if there is no such file, it is empty, or it is no text.
     """
     data = read_bytes(path)
     if b"\0" in data:
-        raise ValueError(f"{path}: this is no text but a binary file of no kind known here")
+        raise ValueError(f"{path}: this is no text but a binary file of an unknown format")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -123,14 +138,14 @@ def read_text(path: Path) -> str:
 
 
 def text_attribute(attribute: Any) -> str | None:
-    """The text of an attribute of a file, None if it holds none."""
+    """Text of an attribute of a file; None for an empty one or another type."""
     if isinstance(attribute, bytes):
         attribute = attribute.decode(errors="replace")
     return attribute if isinstance(attribute, str) and attribute else None
 
 
 def damaged_file_error(path: Path, error: Exception) -> ValueError:
-    """The error for a file that the library which reads it stumbles over, in one line."""
+    """Error for a file that the library which reads it cannot read, in one line."""
     words = "".join(letter if letter.isprintable() else " " for letter in str(error))
     why = textwrap.shorten(words, 150, placeholder=" ...") or type(error).__name__
     return ValueError(f"{path}: the file is damaged or cut off: {why}")
@@ -143,9 +158,10 @@ def parse_numbers(
     lines: Sequence[int],
     decimal_comma: bool,
 ) -> Float[np.ndarray, "row column"]:
-    """Convert the cells of a table, given the line number of each row; empty ones become NaN.
+    """Numbers in the cells of a table; empty cells become NaN.
 
-    Raises ValueError naming file, line and column for a cell that is no number.
+    `lines` are the line numbers of the rows. Raises ValueError, naming file, line and column, for a
+    cell that is no number.
     """
     if not rows:
         raise ValueError(f"{path}: the log is empty: there are column names but no rows")
@@ -162,7 +178,7 @@ def parse_numbers(
 
 
 def _bad_cell(path, names, rows, lines) -> ValueError:
-    """The error for the first cell that is no number."""
+    """Error for the first cell that is no number."""
     for row, line in zip(rows, lines, strict=True):
         for name, cell in zip(names, row, strict=True):
             try:

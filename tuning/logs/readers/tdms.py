@@ -1,4 +1,4 @@
-"""LabVIEW's binary logs (.tdms), by npTDMS: each group of channels is a run."""
+"""LabVIEW TDMS files (.tdms), by npTDMS: each group of channels is a run."""
 
 import contextlib
 import logging
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tuning.logs.readers.table import (
+    LogFormat,
     LogTable,
     damaged_file_error,
     is_time_name,
@@ -20,7 +21,7 @@ MAGIC = b"TDSm"
 
 
 def read_tdms(path: Path) -> dict[str, LogTable]:
-    """Read a .tdms file: one run for each group that holds numbers, by the group's name.
+    """Tables of a TDMS file: one run for each group with numbers, by the name of the group.
 
     Times are a channel called time, or follow from the waveform properties `wf_increment` and
     `wf_start_offset` of the channels; units are the property `unit_string`.
@@ -33,7 +34,7 @@ def read_tdms(path: Path) -> dict[str, LogTable]:
         with _silenced(nptdms):
             file = nptdms.TdmsFile.read(path)
             groups = {group.name: _channels(group) for group in file.groups()}
-    except Exception as error:  # whatever npTDMS meets in a file that is not as it should be
+    except Exception as error:  # npTDMS raises many types for damaged files
         raise damaged_file_error(path, error) from None
     notes = ["the recording breaks off within a segment"] if _is_truncated(file) else []
     runs = {}
@@ -50,7 +51,7 @@ def read_tdms(path: Path) -> dict[str, LogTable]:
 
 @contextlib.contextmanager
 def _silenced(nptdms):
-    """Keep npTDMS from printing what it thinks of a file: it is said here."""
+    """Suppress log messages and warnings of npTDMS; errors are raised here."""
     manager = nptdms.log.log_manager
     level = manager.log_level
     manager.set_level(logging.CRITICAL)
@@ -71,7 +72,7 @@ def _is_truncated(file) -> bool:
 
 
 def _times_function(source, channels):
-    """Times by number of samples, from the waveform properties; None if no channel has them."""
+    """Function from a number of samples to times (s), from waveform properties, or None."""
     grids = {
         (p["wf_increment"], p.get("wf_start_offset", 0.0))
         for name, channel in channels.items()
@@ -86,3 +87,6 @@ def _times_function(source, channels):
         return None
     ((step, start),) = grids
     return lambda count: start + step * np.arange(count)
+
+
+FORMAT = LogFormat("LabVIEW (TDMS)", read_tdms, suffixes=(".tdms",), magics=(MAGIC,))

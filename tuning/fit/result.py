@@ -1,0 +1,218 @@
+"""Result of an identification: values with standard errors, residuals, and what to doubt."""
+
+import dataclasses
+import functools
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.quantities import QUANTITIES
+from tuning.fit import summary
+from tuning.fit.dataset import Dataset
+from tuning.fit.least_squares import MAX_STEPS, LeastSquares, LeastSquaresSolution
+from tuning.fit.multi_start import LocalMinimum
+from tuning.fit.residuals import ChannelResiduals, channel_residuals, residual_remarks
+from tuning.fit.uncertainty.covariance import confidence_intervals
+from tuning.parameters.free import LOG_ADDRESS, FreeParameter, to_unbounded, with_values
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """Result of an identification, in SI units and the order of `parameters`.
+
+    `errors` are standard errors, infinite for parameters that are not identifiable from the data;
+    `unidentifiable` holds the directions responsible: changes by address that, made together, leave
+    the readings as good as they are. `noise` is the standard deviation of the residuals, NaN for a
+    sensor that a log lacks. `case` has the fitted values; with several logs, those of one log
+    (`logs.1.loads.0.speed`) are in `cases`, one for each log. `autocorrelation_factor` is the
+    factor by which autocorrelation of the residuals raises variances and has widened the
+    intervals; `degrees_of_freedom` the number of independent samples left. `minima` are those
+    found from several starts, lowest first.
+    """
+
+    parameters: list[FreeParameter]
+    values: Float[np.ndarray, " parameter"]
+    errors: Float[np.ndarray, " parameter"]
+    correlation: Float[np.ndarray, "parameter parameter"]
+    unidentifiable: list[dict[str, float]]
+    noise: Float[np.ndarray, "log channel"]
+    verdict: str
+    case: Case
+    dataset: Dataset
+    fitted: Float[np.ndarray, "log time channel"]
+    autocorrelation_factor: Float[np.ndarray, "log channel"]
+    degrees_of_freedom: float
+    least_squares: LeastSquares
+    minima: tuple[LocalMinimum, ...] = ()
+
+    @property
+    def residuals(self) -> Float[np.ndarray, "log time channel"]:
+        """Measured minus fitted, NaN where nothing was measured."""
+        dataset = self.dataset
+        return np.where(dataset.mask > 0, dataset.measured - self.fitted, np.nan)
+
+    @functools.cached_property
+    def channel_residuals(self) -> list[ChannelResiduals]:
+        """Noise, whiteness and time shift of the residuals of each sensor in each log."""
+        return channel_residuals(
+            self.dataset.times, self.fitted, self.residuals, self.noise, self.autocorrelation_factor
+        )
+
+    @property
+    def widened_noise(self) -> Float[np.ndarray, "log channel"]:
+        """Noise widened for autocorrelation; 1 where a log lacks the sensor."""
+        widened = self.noise * np.sqrt(self.autocorrelation_factor)
+        return np.where(np.isnan(self.noise), 1.0, widened)
+
+    @property
+    def addresses(self) -> list[str]:
+        """Addresses of the free parameters."""
+        return [parameter.address for parameter in self.parameters]
+
+    @property
+    def start_values(self) -> Float[np.ndarray, " parameter"]:
+        """Values from which the search began."""
+        return np.array([parameter.start for parameter in self.parameters])
+
+    @property
+    def unbounded(self) -> Float[np.ndarray, " parameter"]:
+        """Search variables of the fitted values."""
+        return to_unbounded(self.parameters, self.values)
+
+    @property
+    def cases(self) -> list[Case]:
+        """The fitted case of each log, with the loads that crossed, until the log's end."""
+        values = dict(zip(self.addresses, map(float, self.values), strict=True))
+        return [with_values(case, i, values) for i, case in enumerate(self.dataset.cases)]
+
+    @property
+    def intervals(self) -> Float[np.ndarray, "parameter 2"]:
+        """95 % intervals within the bounds; infinite for parameters that are not identifiable."""
+        intervals = confidence_intervals(self.values, self.errors, self.degrees_of_freedom)
+        low = np.array([parameter.low for parameter in self.parameters])
+        high = np.array([parameter.high for parameter in self.parameters])
+        within = np.clip(intervals, low[:, None], high[:, None])
+        return np.where(np.isfinite(self.errors)[:, None], within, intervals)
+
+    @property
+    def at_bound(self) -> list[str]:
+        """Addresses of the parameters that ended at one of their bounds."""
+        pairs = zip(self.parameters, self.values, strict=True)
+        return [parameter.address for parameter, value in pairs if parameter.at_bound(value)]
+
+    @property
+    def remarks(self) -> list[str]:
+        """Sentences on bounds, unidentifiable directions, correlations, priors, noise and logs."""
+        logs = self.dataset.logs
+        return [
+            *summary.bound_remarks(self.parameters, self.values),
+            *summary.unidentifiable_remarks(self.parameters, self.unidentifiable),
+            *summary.correlation_remarks(self.addresses, self.correlation),
+            *summary.prior_remarks(self.parameters, self.errors),
+            *summary.noise_remarks(self.case.sensors, logs, self.noise),
+            *residual_remarks(self.channel_residuals, [log.source for log in logs]),
+            *summary.log_remarks(logs),
+        ]
+
+    def __str__(self) -> str:
+        table = summary.parameter_table(self.parameters, self.values, self.intervals)
+        minima = summary.minima_lines(self.minima)
+        return "\n".join([*table, *minima, "", *self.remarks, self.verdict])
+
+    def to_dict(self) -> dict:
+        """Plain numbers and words for JSON; None for what is not identifiable."""
+        parameters = {}
+        rows = zip(self.parameters, self.values, self.errors, self.intervals, strict=True)
+        for parameter, value, error, interval in rows:
+            identifiable = bool(np.isfinite(error))
+            parameters[parameter.address] = {
+                "value": float(value),
+                "unit": parameter.unit,
+                "standard_error": float(error) if identifiable else None,
+                "interval_95": interval.tolist() if identifiable else None,
+                "start": parameter.start,
+                "at_bound": parameter.at_bound(value),
+            }
+        return {
+            "numbers": parameters,
+            "correlation": _nan_to_none(self.correlation),
+            "unseen": self.unidentifiable,
+            "noise": _nan_to_none(self.noise),
+            "verdict": self.verdict,
+        }
+
+    def plot(self):
+        """Figure of measured, fitted and residual, one column for each log and quantity."""
+        from jaxbeam.plot import FitPanel, plot_fit
+
+        quantities = [sensor.quantity for sensor in self.case.sensors]
+        panels = []
+        for i, log in enumerate(self.dataset.logs):
+            count = log.times.size
+            for quantity in dict.fromkeys(quantities):
+                has = self.dataset.mask[i].any(axis=0)
+                channels = [n for n, other in enumerate(quantities) if other == quantity and has[n]]
+                if not channels:
+                    continue
+                panels.append(
+                    FitPanel(
+                        title=log.source.rsplit("/", 1)[-1],
+                        times=log.times,
+                        measured=self.dataset.measured[i, :count, channels].T,
+                        fitted=self.fitted[i, :count, channels].T,
+                        names=[f"sensor {n}" for n in channels],
+                        unit=QUANTITIES[quantity].unit,
+                    )
+                )
+        return plot_fit(panels, title=self.case.title)
+
+
+def fit_result(
+    case: Case,
+    least_squares: LeastSquares,
+    solution: LeastSquaresSolution,
+    minima: tuple[LocalMinimum, ...] = (),
+) -> Fit:
+    """Fit from the solution of its least-squares problem; `case` is the one before the fit."""
+    dataset, parameters = least_squares.data, least_squares.parameters
+    pairs = zip(parameters, solution.values, strict=True)
+    values = {parameter.address: float(value) for parameter, value in pairs}
+    verdict = (
+        "converged"
+        if solution.converged
+        else f"not converged after {MAX_STEPS} steps: start closer"
+    )
+    return Fit(
+        parameters=parameters,
+        values=solution.values,
+        errors=solution.uncertainty.errors,
+        correlation=solution.uncertainty.correlation,
+        unidentifiable=solution.uncertainty.unidentifiable,
+        noise=np.where(dataset.mask.any(axis=1), solution.noise, np.nan),
+        verdict=verdict + dataset.validity_warning(values),
+        case=_fitted_case(case, dataset, values),
+        dataset=dataset,
+        fitted=solution.predicted,
+        autocorrelation_factor=solution.autocorrelation_factor,
+        degrees_of_freedom=solution.degrees_of_freedom,
+        least_squares=least_squares,
+        minima=minima,
+    )
+
+
+def _fitted_case(case: Case, dataset: Dataset, values: dict[str, float]) -> Case:
+    """The case with the fitted values; with a single log, with the loads of that log, too."""
+    if len(dataset.logs) == 1:
+        fitted = with_values(dataset.cases[0], 0, values)
+        # Commands that were logged belong to the log.
+        fitted = dataclasses.replace(fitted, controller=case.controller)
+        return replace(fitted, {"run.duration": case.run.duration})
+    shared = {address: v for address, v in values.items() if not LOG_ADDRESS.fullmatch(address)}
+    if any(log.loads is not None for log in dataset.logs):
+        shared = {address: v for address, v in shared.items() if not address.startswith("loads.")}
+    return replace(case, shared)
+
+
+def _nan_to_none(table: Float[np.ndarray, "row column"]) -> list[list[float | None]]:
+    return [[None if np.isnan(entry) else entry for entry in row] for row in table.tolist()]
