@@ -1,8 +1,8 @@
-"""The validation page says what was found, and a check that fails is seen to fail."""
+"""The validation page marks errors above their tolerance, NaN included, and counts the others."""
 
 import pytest
 
-from experiments.validation.checks import Check
+from experiments.validation.check import Check
 from experiments.validation.page import validation_page
 
 
@@ -12,6 +12,6 @@ from experiments.validation.page import validation_page
 )
 def test_page(error, word, count):
     text = validation_page([("A group", [Check("peaks", "closed form", error, 1e-6)])])
-    assert f"**{count} of 1 checks" in text
+    assert f"**{count} of 1 errors" in text
     assert "## A group" in text
     assert f"| peaks | closed form | {error:.1e} | 1e-06 | {word} |" in text
