@@ -1,6 +1,6 @@
-"""What every test needs, set before anything else is imported.
+"""Settings of all tests, made before anything else is imported.
 
-float64 is not set here: importing `jaxbeam` sets it, and the tests rely on that as users do.
+float64 is not set here: importing `jaxbeam` sets it, for the tests as for users.
 """
 
 import collections
@@ -10,14 +10,14 @@ import os
 import sys
 import tempfile
 
-# No window, on a machine with or without a screen; also in processes a test starts.
+# No window, with or without a screen; also in processes that a test starts.
 os.environ["MPLBACKEND"] = "Agg"
-# On a machine with a GPU, several test processes share it: none may take most of the memory.
+# Several test processes share a GPU: none may allocate most of its memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-# Test processes share the cores: threads for small matrices would wait for each other.
+# Test processes share the cores: threads of small matrix products would wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Most of the time of the tests is compiling: as `jaxbeam.runtime.compiling` does for the library itself,
-# and without the optimisations that small cases do not repay.
+# Compiling takes most of the time of the tests: the settings of `jaxbeam.runtime.compiling`, and
+# without optimisations, whose time small cases do not regain.
 os.environ["XLA_FLAGS"] = " ".join(
     [
         "--xla_backend_optimization_level=0",
@@ -26,7 +26,7 @@ os.environ["XLA_FLAGS"] = " ".join(
     ]
 )
 if importlib.metadata.version("jaxlib").startswith(("0.10.", "0.11.0")):
-    # Later ones do not know it, and an unknown flag ends the process.
+    # Later versions do not have this flag, and an unknown flag ends the process.
     os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 # What one process has compiled, the other test processes, later files, and commands that tests
 # start need not compile again: they use the same folder, set before the test processes start. It
@@ -41,13 +41,12 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 import hypothesis
 import pytest
 
-# Tracing makes millions of small objects that live on: to look through them for garbage as often
-# as Python does otherwise takes up to a tenth of the time, and finds next to nothing.
+# Tracing makes millions of small objects that live long: with Python's own thresholds, garbage
+# collection takes up to a tenth of the time and frees next to nothing.
 gc.set_threshold(100_000, 20, 100)
 
-# The same examples in every run, so a red test stays red until it is mended. No deadline:
-# the first example pays for compiling. No database: with fixed examples there is nothing
-# to remember.
+# The same examples in every run, so that a failing test fails until it is repaired. No deadline:
+# the first example includes compiling. No database: it would only hold the same examples.
 hypothesis.settings.register_profile(
     "jaxbeam",
     derandomize=True,
@@ -60,14 +59,14 @@ hypothesis.settings.load_profile("jaxbeam")
 
 
 def pytest_collection_modifyitems(items):
-    """Files with most slow tests first: at the end no process waits long for the other."""
+    """Order files by their number of slow tests, so that both processes end at about one time."""
     slow = collections.Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(autouse=True)
 def _close_figures():
-    """Close what a test drew: matplotlib warns of many open figures, and warnings are errors."""
+    """Close the figures of a test: matplotlib warns of many open ones, and warnings are errors."""
     yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
@@ -75,7 +74,7 @@ def _close_figures():
 
 @pytest.fixture(autouse=True, scope="module")
 def _clear_compiled():
-    """Drop what a file compiled: kept for all files it would take several gigabytes."""
+    """Drop the programs of a test file: those of all files would take several gigabytes."""
     yield
     if "jaxbeam.runtime.compiling" in sys.modules:
         sys.modules["jaxbeam.runtime.compiling"].clear_caches()

@@ -1,4 +1,4 @@
-"""Central differences, the other way to a derivative."""
+"""Derivatives by central differences, independent of automatic differentiation."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ import numpy as np
 def central(function, point, step: float = 1e-3, order: int = 6) -> np.ndarray:
     """Jacobian of a function of a vector, (result..., entry), by central differences.
 
-    The step is absolute; order 6 has an error of step^6, and rounding divided by the step.
+    The step is absolute. The error is step^order, plus rounding divided by the step.
     """
     weights = {2: (1 / 2,), 4: (2 / 3, -1 / 12), 6: (3 / 4, -3 / 20, 1 / 60)}[order]
     point, columns = np.asarray(point, float), []

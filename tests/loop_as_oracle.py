@@ -1,4 +1,4 @@
-"""A case with a controller in the words of the independent closed loop."""
+"""Conversion of a case with a controller to the independent closed loop of `oracles`."""
 
 import numpy as np
 
@@ -13,15 +13,15 @@ from tests.oracles.two_spans import TwoSpans
 
 
 def span_of(case: Case) -> Span | TwoSpans:
-    """One span on two pins, or two equal ones on three."""
+    """One pinned span, or two equal spans for a case with a support."""
     beam = case.beam
-    numbers = beam.length, beam.rigidity, beam.linear_density
+    numbers = beam.length, beam.bending_stiffness, beam.linear_density
     kind = TwoSpans if case.supports else Span
     return kind(*map(float, numbers), beam.modes, float(beam.damping_ratio))
 
 
 def parts_of(case: Case) -> tuple[Span | TwoSpans, list, list, list]:
-    """Span, loads, actuators and sensors; loads must travel at given speeds."""
+    """Span, loads, actuators and sensors of a case whose loads have given speeds."""
     loads = [
         Load(
             float(load.mass),
@@ -36,19 +36,19 @@ def parts_of(case: Case) -> tuple[Span | TwoSpans, list, list, list]:
 
 
 def expected(case: Case, times, law: closed_loop.Law | None = None) -> closed_loop.Motion:
-    """The motion of a case at times (s) by the oracle, under its own law or another."""
+    """Motion of a case at times (s) by the oracle, under its own law or another."""
     controller, clock = case.controller, None
     if controller.period is not None:
         delay = _number(controller.delay) or 0.0
         period = float(controller.period)
         clock = closed_loop.Clock(period, delay, _number(controller.resolution))
-    knots = [] if controller.knots(case) is None else np.asarray(controller.knots(case)).tolist()
+    breakpoints = controller.breakpoints(case)
     return closed_loop.respond(
         *parts_of(case),
         _law(controller) if law is None else law,
         np.asarray(times).tolist(),
         clock,
-        knots,
+        [] if breakpoints is None else np.asarray(breakpoints).tolist(),
     )
 
 
@@ -58,13 +58,13 @@ def _actuator(actuator) -> closed_loop.Actuator:
     if isinstance(actuator, Shaker):
         gain, lag = actuator.force_per_volt, float(actuator.bandwidth)
     return closed_loop.Actuator(
-        [(float(x), order, factor) for x, order, factor in actuator.stroke()],
+        [(float(x), order, factor) for x, order, factor in actuator.displacement_map()],
         float(gain),
         lag,
         float(device.stiffness),
         float(device.damping),
         None if limits is None else tuple(np.asarray(limits).tolist()),
-        _number(actuator.command_rate()),
+        _number(actuator.command_rate_limit()),
     )
 
 
@@ -94,9 +94,9 @@ def _law(controller) -> closed_loop.Law:
         powers = controller.power + 2 * np.arange(len(rows))
 
         def feedback(readings, *_):
-            heard = readings[: len(controller.gains)]
+            own = readings[: len(controller.gains)]
             terms = zip(np.asarray(rows), powers, strict=True)
-            return -sum(gains * heard * np.abs(heard) ** (power - 1) for gains, power in terms)
+            return -sum(gains * own * np.abs(own) ** (power - 1) for gains, power in terms)
 
         return feedback
     if isinstance(controller, StateFeedback):
@@ -106,9 +106,9 @@ def _law(controller) -> closed_loop.Law:
     def prescribed(_, state, t):
         command = np.array(controller.offsets)
         if controller.amplitudes is not None:
-            turn = 2 * np.pi * np.asarray(controller.frequencies) * t
-            turn = turn + (0.0 if controller.phases is None else np.asarray(controller.phases))
-            command = command + (np.asarray(controller.amplitudes) * np.sin(turn)).sum(axis=1)
+            angle = 2 * np.pi * np.asarray(controller.frequencies) * t
+            angle = angle + (0.0 if controller.phases is None else np.asarray(controller.phases))
+            command = command + (np.asarray(controller.amplitudes) * np.sin(angle)).sum(axis=1)
         if controller.times is not None:
             for i, row in enumerate(np.asarray(controller.values)):
                 command[i] += np.interp(t, controller.times, row, left=0.0, right=0.0)

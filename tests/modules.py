@@ -1,4 +1,4 @@
-"""The source files of the packages, for the tests that read code."""
+"""Source files of the packages, for tests of the code itself."""
 
 import ast
 from pathlib import Path
@@ -9,7 +9,7 @@ PACKAGES = ("jaxbeam", "tuning", "experiments")
 
 
 def module_files() -> dict[str, Path]:
-    """Every module by dotted name; a package itself is called `package.__init__`."""
+    """Paths of all modules by dotted name; that of a package ends in `.__init__`."""
     paths = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
     return {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in paths}
 

@@ -1,4 +1,4 @@
-"""What may go wrong in files: trees and bytes that are changed at random places."""
+"""Random damage to files: changed trees of dictionaries and lists, and changed bytes."""
 
 import copy
 import datetime
@@ -19,19 +19,20 @@ SNIPPETS = (
 )
 
 
-def _places(tree: Any, way: tuple = ()) -> list[tuple]:
-    """The ways to everything in a tree of dictionaries and lists."""
-    inner = tree.items() if isinstance(tree, dict) else enumerate(tree)
-    found = []
-    for key, value in inner:
-        found.append((*way, key))
+def _paths(tree: Any, parent: tuple = ()) -> list[tuple]:
+    """Paths (keys and indices) of all entries in a tree of dictionaries and lists."""
+    entries = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    paths = []
+    for key, value in entries:
+        paths.append((*parent, key))
         if isinstance(value, dict | list):
-            found += _places(value, (*way, key))
-    return found
+            paths += _paths(value, (*parent, key))
+    return paths
 
 
-def _follow(tree: Any, way: tuple) -> Any:
-    for key in way:
+def _entry(tree: Any, path: tuple) -> Any:
+    """The entry at a path."""
+    for key in path:
         tree = tree[key]
     return tree
 
@@ -41,20 +42,20 @@ def trees(draw, tree: dict) -> dict:
     """A tree with up to three entries replaced, removed, renamed, swapped or scaled."""
     tree = copy.deepcopy(tree)
     for _ in range(draw(st.integers(1, 3))):
-        places = _places(tree)
-        if not places:
+        paths = _paths(tree)
+        if not paths:
             break
-        *way, key = draw(st.sampled_from(places))
-        parent = _follow(tree, way)
-        what = draw(st.sampled_from(["replace", "remove", "rename", "swap", "scale"]))
-        if what == "replace":
+        *path, key = draw(st.sampled_from(paths))
+        parent = _entry(tree, path)
+        change = draw(st.sampled_from(["replace", "remove", "rename", "swap", "scale"]))
+        if change == "replace":
             parent[key] = copy.deepcopy(draw(st.sampled_from(HOSTILE)))
-        elif what == "remove":
+        elif change == "remove":
             del parent[key]
-        elif what == "rename" and isinstance(parent, dict):
+        elif change == "rename" and isinstance(parent, dict):
             parent[draw(st.text("abkinx_. ", max_size=6))] = parent.pop(key)
-        elif what == "swap":
-            parent[key] = copy.deepcopy(_follow(tree, draw(st.sampled_from(places))))
+        elif change == "swap":
+            parent[key] = copy.deepcopy(_entry(tree, draw(st.sampled_from(paths))))
         elif isinstance(parent[key], float):
             parent[key] *= draw(st.sampled_from([-1.0, 1e-200, 1e200]))
     return tree
@@ -62,25 +63,25 @@ def trees(draw, tree: dict) -> dict:
 
 @st.composite
 def contents(draw, content: bytes) -> bytes:
-    """The bytes of a file with up to five places changed, removed, filled in or repeated."""
+    """The bytes of a file with up to five changes: bits, cuts, insertions, repetitions, an end."""
     changed = bytearray(content)
     for _ in range(draw(st.integers(1, 5))):
         if not changed:
             break
-        # Most of what matters is at the beginning.
-        reach = draw(st.sampled_from([60, 300, len(changed)]))
-        place = draw(st.integers(0, min(reach, len(changed)) - 1))
-        what = draw(st.sampled_from(["flip", "cut", "fill", "snippet", "repeat", "end"]))
-        if what == "flip":
-            changed[place] ^= 1 << draw(st.integers(0, 7))
-        elif what == "cut":
-            del changed[place : place + draw(st.integers(1, 50))]
-        elif what == "fill":
-            changed[place:place] = draw(st.binary(min_size=1, max_size=20))
-        elif what == "snippet":
-            changed[place:place] = draw(st.sampled_from(SNIPPETS))
-        elif what == "repeat":
-            changed[place:place] = changed[place // 2 : place // 2 + 40]
+        # More often near the beginning, where headers are.
+        limit = draw(st.sampled_from([60, 300, len(changed)]))
+        at = draw(st.integers(0, min(limit, len(changed)) - 1))
+        change = draw(st.sampled_from(["flip", "cut", "fill", "snippet", "repeat", "end"]))
+        if change == "flip":
+            changed[at] ^= 1 << draw(st.integers(0, 7))
+        elif change == "cut":
+            del changed[at : at + draw(st.integers(1, 50))]
+        elif change == "fill":
+            changed[at:at] = draw(st.binary(min_size=1, max_size=20))
+        elif change == "snippet":
+            changed[at:at] = draw(st.sampled_from(SNIPPETS))
+        elif change == "repeat":
+            changed[at:at] = changed[at // 2 : at // 2 + 40]
         else:
-            del changed[place:]
+            del changed[at:]
     return bytes(changed)

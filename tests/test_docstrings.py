@@ -1,6 +1,7 @@
-"""What is public says what it is, and what it raises."""
+"""Docstrings: every public module, class, function and method has one, with what it raises."""
 
 import ast
+import doctest
 import importlib
 import inspect
 
@@ -12,12 +13,12 @@ FILES = module_files()
 
 
 def public(nodes, *kinds):
-    """The definitions of some kinds among syntax nodes whose names are public."""
+    """Definitions of some kinds among syntax nodes, with public names."""
     return [n for n in nodes if isinstance(n, kinds) and not n.name.startswith("_")]
 
 
 def raised(function: ast.FunctionDef) -> set[str]:
-    """Names of the exceptions that a function raises itself; '' where only a value is named."""
+    """Names of the exceptions that a function raises itself; "" for a variable that is raised."""
     calls = [n.exc for n in ast.walk(function) if isinstance(n, ast.Raise) and n.exc is not None]
     names = [ast.unparse(c.func if isinstance(c, ast.Call) else c) for c in calls]
     return {name if name.endswith(("Error", "Exception")) else "" for name in names}
@@ -26,14 +27,14 @@ def raised(function: ast.FunctionDef) -> set[str]:
 @pytest.mark.parametrize("name", FILES)
 def test_modules_functions_and_classes_are_documented(name):
     tree = parse(FILES[name])
-    assert not tree.body or ast.get_docstring(tree), f"{name} says nothing about itself"
+    assert not tree.body or ast.get_docstring(tree), f"{name} has no docstring"
     for node in public(tree.body, ast.FunctionDef, ast.ClassDef):
         assert ast.get_docstring(node), f"{name}.{node.name} has no docstring"
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_methods_are_documented_where_they_are_introduced(name):
-    """A method that fulfils an interface inherits the docstring of the interface."""
+def test_methods_are_documented_where_they_are_declared(name):
+    """A method that implements an interface inherits its docstring."""
     module = None
     for node in public(parse(FILES[name]).body, ast.ClassDef):
         for method in public(node.body, ast.FunctionDef):
@@ -50,3 +51,11 @@ def test_docstrings_say_what_is_raised(name):
             assert "aises" in text and error in text, (
                 f"the docstring of {name}.{function.name} should say: Raises {error or '...'}"
             )
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, path in FILES.items() if ">>> " in path.read_text(encoding="utf-8")]
+)
+def test_examples_in_docstrings_print_what_they_show(name):
+    found = doctest.testmod(importlib.import_module(name.removesuffix(".__init__")))
+    assert found.attempted and not found.failed

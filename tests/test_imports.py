@@ -1,4 +1,4 @@
-"""Data flows one way: a package imports only those above it in ORDER, and no modules import in a circle."""
+"""Imports: a package imports only those above it in ORDER, and no modules import in a circle."""
 
 import ast
 import graphlib
@@ -10,8 +10,8 @@ import pytest
 
 from tests.modules import PACKAGES, module_files, parse
 
-# Each package may import those above it. A package named here stands for all within it that are
-# not named themselves; those of a line do not import each other.
+# A package imports only those in lines above its own. A name stands for all modules within it that
+# no longer name here covers.
 ORDER = """
 jaxbeam.case  jaxbeam.runtime
 jaxbeam.numerics
@@ -39,7 +39,7 @@ jaxbeam.__main__
 
 
 def ranks(order: str) -> dict[str, int]:
-    """The level of each package that the order names, lowest first."""
+    """Line number of each package of an order."""
     return {name: level for level, line in enumerate(order.split("\n")) for name in line.split()}
 
 
@@ -48,7 +48,7 @@ FILES = module_files()
 
 
 def package(module: str) -> str:
-    """The entry of the order under which a module falls: the longest that it begins with."""
+    """The entry of ORDER that covers a module: the longest that it begins with."""
     if module == "jaxbeam.__init__":
         return "jaxbeam"
     parts = module.split(".")
@@ -60,7 +60,7 @@ def package(module: str) -> str:
 
 
 def imported(tree: ast.AST, files: Mapping[str, object]) -> Iterator[tuple[str, int]]:
-    """Our modules that the code in a syntax tree imports, anywhere in it, and the line."""
+    """Modules of PACKAGES that a syntax tree imports, anywhere in it, and the line numbers."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -80,7 +80,7 @@ def imported(tree: ast.AST, files: Mapping[str, object]) -> Iterator[tuple[str, 
 
 
 def violations(imports: Mapping[str, set[str]]) -> list[str]:
-    """Imports between packages that do not go upwards in ORDER, in words."""
+    """Sentences on imports of packages that are not above in ORDER."""
     found = []
     for module, others in imports.items():
         for other in others:
@@ -91,7 +91,7 @@ def violations(imports: Mapping[str, set[str]]) -> list[str]:
 
 
 def circle(imports: Mapping[str, set[str]]) -> list[str]:
-    """Modules that import each other in a circle, or none."""
+    """Modules that import each other in a circle; empty without one."""
     try:
         graphlib.TopologicalSorter(imports).prepare()
     except graphlib.CycleError as error:
@@ -105,7 +105,7 @@ IMPORTS = {
 }
 
 
-def test_packages_import_only_what_is_above_them():
+def test_packages_import_only_those_above_them():
     assert violations(IMPORTS) == []
 
 
@@ -136,3 +136,14 @@ def test_experiments_are_imported_only_when_a_command_needs_them():
         names = itertools.chain.from_iterable(imported(node, FILES) for node in eager)
         found = [name for name, _ in names if name.startswith("experiments")]
         assert not found, f"{module} imports {found} outside a function"
+
+
+def test_only_the_validation_page_imports_the_tests():
+    """Its references are the independent sources of the tests, which the wheel does not have."""
+    found = {
+        module
+        for module, path in FILES.items()
+        for node in ast.walk(parse(path))
+        if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "tests"
+    }
+    assert found and all(module.startswith("experiments.validation.") for module in found)

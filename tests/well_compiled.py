@@ -1,16 +1,16 @@
-"""Programs that run so long in a test that they repay to be compiled as well as for users."""
+"""Compiling with optimisations, for programs that run so long in a test that it pays."""
 
 import contextlib
 import os
 
 import pytest
 
-ROUGHLY = "--xla_backend_optimization_level=0"  # of `conftest`
+NO_OPTIMISATION = "--xla_backend_optimization_level=0"  # set in `conftest`
 
 
 @contextlib.contextmanager
 def well_compiled():
-    """The library's own programs that are compiled within get the optimisations it asks for."""
+    """Context in which the library's programs are compiled with the optimisations it asks for."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"].replace(ROUGHLY, ""))
+        patch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"].replace(NO_OPTIMISATION, ""))
         yield

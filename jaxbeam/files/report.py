@@ -51,7 +51,7 @@ class ReportSection(NamedTuple):
 
 
 def check_report_folder(folder: str | os.PathLike, overwrite: bool) -> None:
-    """Raise FileExistsError if the folder is not empty and `overwrite` is not set."""
+    """Raises FileExistsError if the folder is not empty and `overwrite` is not set."""
     folder = Path(folder)
     if folder.exists() and any(folder.iterdir()) and not overwrite:
         raise FileExistsError(f"the folder {folder} is not empty; choose another, or overwrite it")

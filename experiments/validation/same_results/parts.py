@@ -93,7 +93,10 @@ def word(new: str, old: str) -> str:
 
 
 def first_of(thing: Any, *names: str) -> Any:
-    """The attribute under the first of some names that exists, newest name first."""
+    """The attribute under the first of some names that exists, newest name first.
+
+    Raises AttributeError if there is none.
+    """
     for name in names:
         if hasattr(thing, name):
             return getattr(thing, name)
