@@ -9,9 +9,8 @@ memory. Then the largest error, of peaks relative to each, of histories relative
 deflection of each run, against DOP853 with a strict tolerance at some masses and speeds.
 
 scipy is DOP853 in a loop with the tolerance at which its peaks are right to one part in a million,
-timed on some runs and scaled; where peaks are wanted it stops half a second after the exit. diffrax
-has all masses of a speed on shared steps, and is timed where no controller acts and peaks are
-wanted.
+timed on some runs and scaled; for peaks it stops half a second after the exit. diffrax has all
+masses of a speed on shared steps, and is timed for peaks without a controller.
 """
 
 import argparse
@@ -139,7 +138,7 @@ def measure(spans: int, loop: str, saved: str, modes: int, side: int) -> dict[st
 
 
 def main() -> None:
-    """Measure all kinds of sweep that are asked for and print the table."""
+    """Measure the selected kinds of sweeps and print the table."""
     saved_kinds = ["peaks", "histories"]
     options = parser(__doc__, modes=[3, 6, 12])
     options.add_argument("--spans", type=int, nargs="+", choices=[1, 2], default=[1, 2])

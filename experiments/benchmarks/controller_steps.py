@@ -19,7 +19,9 @@ import jaxbeam as jb
 from experiments.benchmarks.common import parser, print_row, print_table
 from jaxbeam.analysis.computing_time import ComputingTimes, computing_times
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.control import KINDS, SamplingWarning
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.kinds import kinds
+from jaxbeam.control import SamplingWarning
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 PERIOD, MODES = 0.01, 5
@@ -113,7 +115,7 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("--only", default="", help="time the controllers whose names contain this")
     only = options.parse_args().only
-    left_out = set(KINDS.values()) - {type(law) for law in CONTROLLERS.values()}
+    left_out = set(kinds(AbstractController).values()) - {type(law) for law in CONTROLLERS.values()}
     if left_out:
         raise SystemExit(f"no controller of kind {', '.join(k.__name__ for k in left_out)}")
     print_table(("microseconds per step", "median", "worst", "256 at once", "worst"))

@@ -140,7 +140,7 @@ def time_fits() -> dict[str, float]:
     noise = np.full(found.noise.shape, NOISE)
     given = search.step_scale(found.unbounded, noise)[None], search.weights(noise), dataset.measured
     points, _ = search.minimise(found.unbounded[None], *given, np.ones(len(numbers), bool))
-    ours = search.values_at(points[0])
+    by_jaxbeam = search.values_at(points[0])
     return {
         "first_fit_s": first,
         "fit_s": again,
@@ -148,7 +148,7 @@ def time_fits() -> dict[str, float]:
         "scipy_evaluations": calls,
         "ratio": seconds / again,
         "ratio_first": seconds / first,
-        "difference": float(np.max(np.abs(ours / values - 1))),
+        "difference": float(np.max(np.abs(by_jaxbeam / values - 1))),
         "largest_error": float(np.max(found.uncertainty.errors / np.abs(found.values))),
     }
 

@@ -74,7 +74,7 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
         newton_step_limit(PEAK_NODES),
     )
     # Signs of modes are arbitrary: those of jaxbeam follow from its rows of the sensors.
-    sensor_rows = discrete_models.watch[0, 0, :3, :, 0]
+    sensor_rows = discrete_models.monitored_transition[0, 0, :3, :, 0]
     sines = np.sin(np.outer(pinned_beam.sensors, pinned_beam.wavenumbers))
     signs = np.where(np.sum(sensor_rows * sines, axis=0) < 0, -1.0, 1.0)
     numbers = (
@@ -101,13 +101,13 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
 
 def _step_matrices(model, kind: int) -> np.ndarray:
     """Step matrices of one kind of step as `StepMatrices` of kernel.c."""
-    step = model.step
+    step = model.propagators
     parts = (
         step.transition_nodes[kind],
         step.input_nodes[kind][..., 0],
         step.transition_end[kind],
         step.input_end[kind][..., 0],
-        model.watch[kind],
+        model.monitored_transition[kind],
         model.monitored_input[kind][..., 0],
     )
     return np.concatenate([np.ravel(part) for part in parts])

@@ -70,7 +70,7 @@ def operation_stages(dump: Path, module: str) -> dict[str, str]:
     return found
 
 
-def stage_shares(trace: Path, found: dict[str, str], module: str) -> dict[str, float]:
+def stage_shares(trace: Path, stages: dict[str, str], module: str) -> dict[str, float]:
     """Share of each stage in the time of all kernels of a module, largest first."""
     (path,) = trace.rglob("*.trace.json.gz")
     with gzip.open(path) as file:
@@ -82,7 +82,7 @@ def stage_shares(trace: Path, found: dict[str, str], module: str) -> dict[str, f
         name = about.get("hlo_op", "")
         if about.get("hlo_module") != module or CONTROL_FLOW.match(name):
             continue
-        stage, took = found.get(name, "the rest"), event.get("dur", 0.0)
+        stage, took = stages.get(name, "the rest"), event.get("dur", 0.0)
         around = open_until[event["pid"], event["tid"]]
         while around and around[-1][0] <= event["ts"]:
             around.pop()

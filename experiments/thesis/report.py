@@ -14,7 +14,7 @@ from experiments.thesis.verdicts import (
 from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable, text_table
 
 TITLE = "The thesis, reproduced"
-COLUMNS = ("number", "published", "ours", "difference", "tolerance", "verdict")
+COLUMNS = ("number", "published", "computed", "difference", "tolerance", "verdict")
 METHOD = (
     "The thesis's figures and measured curves are not available: comparisons are with printed"
     " numbers, and figures have the thesis's axes. Tolerances depend on the kind of number and were"

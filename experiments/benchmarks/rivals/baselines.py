@@ -1,9 +1,9 @@
 """The crossing of `pinned_beam` solved with scipy and with diffrax as well as each allows.
 
-Wanted are the largest absolute deflections at the sensors, over the crossing and the free vibration
-after it, to one part in a million; or deflections at given times. The rules are the same for every
-solver: integrate the crossing, take the free vibration from its closed form where no controller
-acts, and refine peaks between samples with the same cubic.
+The results are the largest absolute deflections at the sensors, over the crossing and the free
+vibration after it, to one part in a million; or deflections at given times. The rules are the same
+for every solver: integrate the crossing, take the free vibration from its closed form where no
+controller acts, and refine peaks between samples with the same cubic.
 """
 
 from functools import partial
@@ -230,8 +230,8 @@ def _diffrax_runs(beam, masses, speed, times):
             throw=False,
         )
         deflection, end = jax.tree.leaves(solution.ys)
-        seen = hermite_peaks(jnp.diff(samples), deflection[:, 0], deflection[:, 1])
-        state, peaks = end[0], jnp.maximum(peaks, seen)
+        peaks_of_span = hermite_peaks(jnp.diff(samples), deflection[:, 0], deflection[:, 1])
+        state, peaks = end[0], jnp.maximum(peaks, peaks_of_span)
         successful &= solution.result == diffrax.RESULTS.successful
     peaks = jnp.maximum(peaks, free_peaks(beam, times, *state)).T
     return jnp.where(successful, peaks, jnp.nan)

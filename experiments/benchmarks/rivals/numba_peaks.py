@@ -149,8 +149,8 @@ def compile_peaks(package: ModuleType | None):
                     value += rows[s, j] * q[j]
                     rate += rows[s, j] * velocity[j]
                 if i > 0:
-                    seen = cubic(times[i] - times[i - 1], before[s], before_rate[s], value, rate)
-                    peaks[s] = max(peaks[s], seen)
+                    peak = cubic(times[i] - times[i - 1], before[s], before_rate[s], value, rate)
+                    peaks[s] = max(peaks[s], peak)
                 before[s], before_rate[s] = value, rate
 
     @every

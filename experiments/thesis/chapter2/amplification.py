@@ -123,8 +123,8 @@ def run(load_rig) -> ExperimentResult:
             _inconsistency_fig_2_25([whole, on[WHILE_LOADED], on_spring]),
         ),
         *(
-            make_finding(printed, *_with_interpretations(values), obstacle)
-            for printed, values, obstacle in (
+            make_finding(printed, *_with_interpretations(values), inconsistency)
+            for printed, values, inconsistency in (
                 (published.YANG_AMPLIFICATION, yang.T, ""),
                 (
                     published.TWO_SPAN_AMPLIFICATION,

@@ -7,10 +7,10 @@ import jaxbeam as jb
 from experiments.thesis.cases import one_span, two_spans
 from experiments.thesis.chapter2 import published
 from experiments.thesis.chapter2.patches import DENSITY, MODULUS
+from experiments.thesis.chapter2.sine_basis import sine_basis_modes
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
-from jaxbeam.model.modal_model import rig
-from jaxbeam.model.modes import lay_out
-from jaxbeam.model.sine_basis import sine_basis_modes
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.plot.style import colour, set_title, use_style
 
 TABLE_2_2_BEAM = {"beam.flexural_rigidity": 12.11, "beam.mass_per_length": 0.5411}  # Table 2.2
@@ -23,10 +23,10 @@ def run(load_rig) -> ExperimentResult:
     exact, printed_exact = (
         np.asarray(jb.modes(case).frequencies) for case in (two, table_2_2_case)
     )
-    scale = (two.beam.rigidity / two.beam.linear_density) ** 0.25 / one.beam.length
+    scale = (two.beam.bending_stiffness / two.beam.linear_density) ** 0.25 / one.beam.length
     lambdas = np.sqrt(2 * np.pi * exact) / scale
 
-    stiff = 1e5 * float(table_2_2_case.beam.rigidity) / float(one.beam.length)
+    stiff = 1e5 * float(table_2_2_case.beam.bending_stiffness) / float(one.beam.length)
     spring_frequencies = sine_basis_modes(table_2_2_case, stiff).frequencies
     approximate = np.asarray(sine_basis_modes(two).frequencies)
     errors = 100 * (approximate / exact - 1)
@@ -124,7 +124,11 @@ def _frequency_at_patch_density(one):
 def _frequencies_on_suspension(case, stiffness):
     """Natural frequencies (Hz) of the beam on its shaker with a suspension stiffness (N/m)."""
     case = jb.replace(case, {"actuators.0.stiffness": stiffness})
-    return np.sqrt(np.linalg.eigvalsh(np.asarray(rig(case, lay_out(case)).stiffness()))) / 2 / np.pi
+    return (
+        np.sqrt(np.linalg.eigvalsh(np.asarray(modal_model(case, mesh_layout(case)).stiffness())))
+        / 2
+        / np.pi
+    )
 
 
 @use_style

@@ -47,11 +47,11 @@ def fit_rig(rig: str, load_rig) -> tuning.Fit:
 def run(load_rig) -> ExperimentResult:
     """Fits of rigs A, B and C, with 95 % intervals as remarks."""
     fits = {rig: fit_rig(rig, load_rig) for rig in HAND_FITTED}
-    findings = [make_finding(PUBLISHED[rig], found.values) for rig, found in fits.items()]
+    findings = [make_finding(PUBLISHED[rig], fit.values) for rig, fit in fits.items()]
     remarks = ["The measured logs are not available: these come from finite elements."]
-    for rig, found in fits.items():
+    for rig, fit in fits.items():
         for address, value, (low, high) in zip(
-            found.addresses, found.values, found.intervals, strict=True
+            fit.addresses, fit.values, fit.intervals, strict=True
         ):
             remarks.append(f"rig {rig}, {address}: {value:.4g}, 95 % {low:.4g} to {high:.4g}")
     return ExperimentResult(tuple(findings), {"logs": _draw(fits)}, tuple(remarks))
@@ -62,11 +62,11 @@ def _draw(fits) -> Figure:
     """Logged and fitted deflections above, residuals below; a column for each rig."""
     figure = Figure(figsize=(7.2, 5.6))
     columns = figure.subplots(2, len(fits), sharex="col").T
-    for (above, below), (rig, found) in zip(columns, fits.items(), strict=True):
-        times, last = found.campaign.times[0], found.fitted.shape[2] - 1
-        above.plot(times, 1e3 * found.campaign.measured[0, :, last], color="0.6", label="log")
-        above.plot(times, 1e3 * found.fitted[0, :, last], color=colour(0), lw=1, label="fitted")
-        below.plot(times, 1e6 * found.residuals[0, :, last], color=colour(1), lw=1)
+    for (above, below), (rig, fit) in zip(columns, fits.items(), strict=True):
+        times, last = fit.dataset.times[0], fit.fitted.shape[2] - 1
+        above.plot(times, 1e3 * fit.dataset.measured[0, :, last], color="0.6", label="log")
+        above.plot(times, 1e3 * fit.fitted[0, :, last], color=colour(0), lw=1, label="fitted")
+        below.plot(times, 1e6 * fit.residuals[0, :, last], color=colour(1), lw=1)
         above.set_title(f"rig {rig}")
         below.set_xlabel("time (s)")
     figure.axes[0].set_ylabel("deflection (mm)")

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments.thesis.chapter2 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
-from jaxbeam.model.statics import static_lift
+from jaxbeam.model.statics import static_deflection_per_command
 from jaxbeam.plot.style import colour, set_title, use_style
 
 WIDTH, MODULUS, DENSITY = 0.1, 65e9, 2800.0  # m, Pa, kg/m^3
@@ -27,7 +27,7 @@ def run(load_rig) -> ExperimentResult:
         patch_width=57e-3,
     )
     findings = (
-        make_finding(published.PATCH_MOMENT, patch.moment),
+        make_finding(published.PATCH_MOMENT, patch.moment_constant),
         make_finding(
             published.PATCH_SECTION,
             _section_constants(HEIGHT),
@@ -41,7 +41,7 @@ def run(load_rig) -> ExperimentResult:
 def _section_constants(height):
     """Flexural rigidity (N m^2) and mass per length (kg/m) of a section of some height (m)."""
     beam = jb.Beam(0.6, width=WIDTH, height=height, youngs_modulus=MODULUS, density=DENSITY)
-    return [beam.rigidity, beam.linear_density]
+    return [beam.bending_stiffness, beam.linear_density]
 
 
 @use_style
@@ -51,7 +51,7 @@ def _draw(load_rig) -> Figure:
     for axes, rig in zip(figure.subplots(1, 2, sharey=True), "BC", strict=True):
         case = load_rig(rig)
         x = np.linspace(0, float(case.beam.length), 241)
-        static_deflection = np.asarray(static_lift(case, x))
+        static_deflection = np.asarray(static_deflection_per_command(case, x))
         for i, actuator in enumerate(case.actuators):
             volts = PATCH_VOLTAGE / float(actuator.amplifier_gain)
             axes.plot(

@@ -10,8 +10,12 @@ import jaxbeam as jb
 from experiments.thesis.cases import data_physics_v4
 from experiments.thesis.chapter2 import published
 from experiments.thesis.verdicts import LITERAL, Experiment, ExperimentResult, make_finding
-from jaxbeam.model.channels import shaker_chain
-from jaxbeam.model.frequency_response import FrequencyResponse, extremes, frequency_response
+from jaxbeam.model.channels import shaker_channels
+from jaxbeam.model.frequency_response import (
+    FrequencyResponse,
+    frequency_response,
+    resonances_and_antiresonances,
+)
 from jaxbeam.plot.style import colour, set_title, use_style
 
 FREQUENCIES = np.geomspace(1.0, 1000.0, 4000)  # Hz
@@ -61,7 +65,7 @@ def run(load_rig) -> ExperimentResult:
 
 def _response(beam: jb.Beam, stationary_masses=()) -> FrequencyResponse:
     case = jb.Case(beam, actuators=[data_physics_v4()])
-    return frequency_response(case, FREQUENCIES, shaker_chain(0), stationary_masses)
+    return frequency_response(case, FREQUENCIES, shaker_channels(0), stationary_masses)
 
 
 def _mass_in_impedance_only(beam: jb.Beam) -> FrequencyResponse:
@@ -76,7 +80,11 @@ def _mass_in_impedance_only(beam: jb.Beam) -> FrequencyResponse:
 
 def _peaks(response: FrequencyResponse, pair: int) -> list[tuple[float, float]]:
     """Peaks of one input-output pair of a response: frequency (Hz) and magnitude."""
-    return [(at, magnitude) for kind, at, magnitude in extremes(response, pair) if kind == "peak"]
+    return [
+        (at, magnitude)
+        for kind, at, magnitude in resonances_and_antiresonances(response, pair)
+        if kind == "peak"
+    ]
 
 
 def _features(response: FrequencyResponse) -> dict:
@@ -85,7 +93,7 @@ def _features(response: FrequencyResponse) -> dict:
     "low": its value at the lowest frequency (N/V), "drops": dips below that (Hz), "peak": the
     largest peak (Hz, N/V).
     """
-    found = extremes(response, 3)
+    found = resonances_and_antiresonances(response, 3)
     low = found[0][2]
     drops = [at for kind, at, magnitude in found if kind == "dip" and magnitude < low]
     return {

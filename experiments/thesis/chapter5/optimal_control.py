@@ -215,11 +215,11 @@ def _draw_interpretations(tables, ratios) -> Figure:
     panels = figure.subplots(1, len(tables), sharey=True)
     for axes, (kind, both_speeds) in zip(panels, tables, strict=True):
         printed = np.concatenate([one.numbers for one in both_speeds])
-        places = np.arange(printed.size)
+        bars = np.arange(printed.size)
         for i, (name, values) in enumerate(ratios[kind].items()):
-            axes.plot(places, np.ravel(values), "o", markersize=4, color=colour(i), label=name)
-        axes.plot(places, printed, "_", color="k", markersize=14, label="printed")
-        axes.set_xticks(places, [f"{mass:g}" for mass in 2 * MASSES], rotation=90)
+            axes.plot(bars, np.ravel(values), "o", markersize=4, color=colour(i), label=name)
+        axes.plot(bars, printed, "_", color="k", markersize=14, label="printed")
+        axes.set_xticks(bars, [f"{mass:g}" for mass in 2 * MASSES], rotation=90)
         axes.set(title=kind, xlabel="mass (kg), at 0.3 and 0.55 m/s")
     # By one interpretation the response grows without bound; the table has its peak.
     panels[0].set(ylabel="peak in percent of no control", ylim=(0, 110))

@@ -16,7 +16,7 @@ from experiments.thesis.chapter5.regulator_limits import TimeVaryingLoops
 from experiments.thesis.verdicts import LITERAL
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import integration_plan
 
@@ -132,7 +132,7 @@ class RegulatorRuns:
     """
 
     def __init__(self, rig: jb.Case):
-        self.layout, self.plans, self.records = lay_out(rig), {}, {}
+        self.layout, self.plans, self.records = mesh_layout(rig), {}, {}
 
     def peak(
         self, name, design, actuator, kind, speed, mass, feedback=None, design_mass=None

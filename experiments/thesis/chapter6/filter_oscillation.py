@@ -9,7 +9,7 @@ from experiments.thesis.chapter6 import published
 from experiments.thesis.chapter6.patch_rigs import simulate_changes
 from experiments.thesis.figures import plot_deflections
 from experiments.thesis.verdicts import Finding, make_finding
-from jaxbeam.model.statics import static_lift
+from jaxbeam.model.statics import static_deflection_per_command
 from jaxbeam.plot.style import set_title, use_style
 
 SPEED, MASS = 0.28, 0.509  # m/s, kg
@@ -67,7 +67,9 @@ def gain_margin_finding(case: jb.Case, corrections) -> Finding:
     position, amplifier = case.sensors[0].position, float(case.actuators[0].amplifier_gain)
     margins = {
         f"c_p {correction:g}": amplifier
-        / static_lift(jb.replace(case, {"actuators.0.correction": correction}), position)
+        / static_deflection_per_command(
+            jb.replace(case, {"actuators.0.correction": correction}), position
+        )
         for correction in corrections
     }
     (_, literal), *others = margins.items()

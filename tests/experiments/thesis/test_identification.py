@@ -1,4 +1,4 @@
-"""Logs that finite elements made, and what is found in them of the numbers fitted by hand."""
+"""Identification of the numbers fitted by hand, from logs made by finite elements."""
 
 import numpy as np
 import pytest
@@ -9,13 +9,13 @@ from tests.tuning import make_rig_logs
 
 
 @pytest.mark.slow
-def test_one_patch():
-    """The committed log is the one that is made here, and the fit's intervals hold the truth."""
-    kept = np.loadtxt(LOGS / "B.csv", delimiter=",", skiprows=1)
-    np.testing.assert_allclose(kept, make_rig_logs.make("B"), atol=2e-5)
+def test_intervals_of_rig_b_contain_the_true_values():
+    """The log in the repository is the one that `make_rig_logs` makes."""
+    stored = np.loadtxt(LOGS / "B.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(stored, make_rig_logs.make("B"), atol=2e-5)
     assert (LOGS / "B.toml").read_text(encoding="utf-8") == make_rig_logs.beside("B")
-    found = fit_rig("B", rigs.load)
-    low, high = found.intervals.T
+    fit = fit_rig("B", rigs.load)
+    low, high = fit.intervals.T
     truth = np.array(list(HAND_FITTED["B"].values()))
-    assert np.all((low < truth) & (truth < high)), str(found)
+    assert np.all((low < truth) & (truth < high)), str(fit)
     assert np.all(high - low < 0.1 * truth)

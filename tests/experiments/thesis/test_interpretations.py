@@ -30,8 +30,8 @@ def sines(modes):
 def test_critical_speed_of_the_denser_beam():
     heavier = 2800 * 0.06 * 3.3e-3
     speed = np.pi / LENGTH * np.sqrt(RIGIDITY / heavier)
-    ours = LENGTH * frequencies._frequency_at_patch_density(one_span(rigs.load)) / np.pi
-    np.testing.assert_allclose(ours, speed, rtol=1e-9)
+    computed = LENGTH * frequencies._frequency_at_patch_density(one_span(rigs.load)) / np.pi
+    np.testing.assert_allclose(computed, speed, rtol=1e-9)
     assert (
         abs(speed - published.CRITICAL_SPEEDS.numbers[0])
         < published.CRITICAL_SPEEDS.allowed_error[0]
@@ -59,11 +59,11 @@ def test_the_mass_in_one_equation_only():
     beam = dataclasses.replace(rigs.load("A").beam, modes=4)
     found = shaker._mass_in_impedance_only(beam)
     some = slice(None, None, 97)
-    theirs = [force_per_volt(f, 0.5, 0.0) for f in np.asarray(found.frequencies)[some]]
-    np.testing.assert_allclose(np.asarray(found.values)[some, 3], theirs, rtol=1e-8)
+    expected = [force_per_volt(f, 0.5, 0.0) for f in np.asarray(found.frequencies)[some]]
+    np.testing.assert_allclose(np.asarray(found.values)[some, 3], expected, rtol=1e-8)
     both = shaker._response(beam, shaker.STATIONARY_MASS)
-    theirs = [force_per_volt(f, 0.5, 0.5) for f in np.asarray(both.frequencies)[some]]
-    np.testing.assert_allclose(np.asarray(both.values)[some, 3], theirs, rtol=1e-8)
+    expected = [force_per_volt(f, 0.5, 0.5) for f in np.asarray(both.frequencies)[some]]
+    np.testing.assert_allclose(np.asarray(both.values)[some, 3], expected, rtol=1e-8)
 
 
 def test_sampled_gain_of_the_other_shaker():
@@ -78,10 +78,10 @@ def test_sampled_gain_of_the_other_shaker():
     held = expm(5e-3 * np.vstack([np.hstack([A, B]), np.zeros((1, 8))]))
     A, B = held[:7, :7], held[:7, 7:]
     cost = solve_discrete_are(A, B, np.diag(STATE_WEIGHTS), [[COMMAND_WEIGHT]])
-    theirs = np.linalg.solve(COMMAND_WEIGHT + B.T @ cost @ B, B.T @ cost @ A)[0]
-    ours = np.asarray(
+    expected = np.linalg.solve(COMMAND_WEIGHT + B.T @ cost @ B, B.T @ cost @ A)[0]
+    computed = np.asarray(
         optimal_gain(with_other_shaker(with_active_shaker(rigs.load("A"))), 5e-3, STATE_WEIGHTS)[0]
     )[0]
-    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+    np.testing.assert_allclose(computed, expected, rtol=1e-6)
     printed = published_regulators.SAMPLED_GAIN
-    assert np.all(np.abs(theirs - printed.numbers) <= printed.allowed_error)
+    assert np.all(np.abs(expected - printed.numbers) <= printed.allowed_error)
