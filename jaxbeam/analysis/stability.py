@@ -217,7 +217,7 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
 
         def advance_sample(whole, t):
             def after(state):
-                return ravel_pytree(unweighted.tick(timing, rebuild(state), t, None, substeps)[0])[
+                return ravel_pytree(unweighted.sampling_step(timing, rebuild(state), t, None, substeps)[0])[
                     0
                 ]
 

@@ -56,7 +56,7 @@ def compute_blocks(
         raise RuntimeError("the cluster has no workers; start some, then resume")
     size = max(1, min(MAX_BUNDLE, len(blocks) // (BUNDLES_PER_THREAD * threads)))
     bundles = [blocks[i : i + size] for i in range(0, len(blocks), size)]
-    futures = client.map(compute_and_store, bundles, mark=fingerprint, path=path, pure=False)
+    futures = client.map(compute_and_store, bundles, fingerprint=fingerprint, path=path, pure=False)
     try:
         for future in as_completed(futures, loop=client.loop):
             yield from future.result()

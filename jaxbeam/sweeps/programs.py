@@ -198,7 +198,7 @@ def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=No
         running_peaks, states, *_, memory = integrate_history(
             discrete, loads, max_loads=max_loads, steps=steps, policy=policy
         )
-        samples = states[substeps * grid.place[program.schedule.sample_events]]
+        samples = states[substeps * grid.event_panels[program.schedule.sample_events]]
         rows = discrete.model.shapes(varied.sensor_positions, (0,))[0]
         modal = samples[:, 0 : 2 * varied.beam.modes : 2]
         history["deflection"] = jnp.einsum("sm,tml->lts", rows, modal)

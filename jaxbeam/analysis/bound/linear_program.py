@@ -64,7 +64,7 @@ class _LinearProgram:
     def __init__(self, influence, low, high, max_change):
         self.influence = influence
         self.shape = influence.response.shape[2:]
-        self.deflection_scale = np.max(np.abs(influence.free @ influence.rows.T))
+        self.deflection_scale = np.max(np.abs(influence.unforced @ influence.deflection_rows.T))
         self.command_scale = _command_scales(influence, low, high, self.deflection_scale)
         self.low, self.high, self.max_change = (
             part / self.command_scale for part in (low, high, max_change)
@@ -115,7 +115,7 @@ class _LinearProgram:
             )
         if best.status != SOLVED:
             raise RuntimeError(f"the linear program for the bound failed: {best.message}")
-        multipliers = np.zeros((self.influence.instants.size, self.influence.rows.shape[0]))
+        multipliers = np.zeros((self.influence.times.size, self.influence.deflection_rows.shape[0]))
         when, where, sign = self.active_rows
         row_multipliers = best.ineqlin.marginals[right.size - sign.size :]
         np.add.at(multipliers, (when, where), -sign * row_multipliers)
@@ -130,11 +130,11 @@ class _LinearProgram:
         difference, identity = sp.kron(difference, sp.eye(actuators)), sp.eye(holds * actuators)
         change = sp.eye(difference.shape[0])
         when, where, sign = self.active_rows
-        rows = self.influence.rows[where] * sign[:, None] / self.deflection_scale
+        rows = self.influence.deflection_rows[where] * sign[:, None] / self.deflection_scale
         response = (
             np.einsum("im,imka->ika", rows, self.influence.response[when]) * self.command_scale
         )
-        free = np.sum(rows * self.influence.free[when], axis=1)
+        free = np.sum(rows * self.influence.unforced[when], axis=1)
         peak_rows = sp.csr_array(response.reshape(sign.size, holds * actuators))
         blocks = [
             [difference, -change, None, None],
@@ -159,7 +159,7 @@ class _LinearProgram:
 
 def _command_scales(influence, low, high, deflection_scale):
     """What each command is measured in: its larger limit, or what bends the beam as loads do."""
-    deflection_per_command = np.abs(influence.rows).max(axis=0) @ np.abs(influence.response).max(
+    deflection_per_command = np.abs(influence.deflection_rows).max(axis=0) @ np.abs(influence.response).max(
         axis=(0, 2)
     )
     scales = np.where(
