@@ -5,11 +5,12 @@ import itertools
 from hypothesis import strategies as st
 
 from jaxbeam.case.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
-from jaxbeam.case.beam import ENDS, Beam, Support
+from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.loads import MovingForce, MovingMass
-from jaxbeam.case.sensors import QUANTITIES, Sensor
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import Sensor
 
 
 def numbers(low: float, high: float) -> st.SearchStrategy[float]:
@@ -43,7 +44,9 @@ def beams(draw) -> Beam:
         damping = {"damping_ratio": draw(ratio | st.lists(ratio, min_size=modes, max_size=modes))}
     else:
         damping = {"rayleigh_damping": [draw(numbers(0.0, 1.0)), draw(numbers(0.0, 1e-3))]}
-    ends = draw(st.sampled_from([f"{a}-{b}" for a, b in itertools.product(ENDS, ENDS)]))
+    ends = draw(
+        st.sampled_from([f"{a}-{b}" for a, b in itertools.product(END_CONDITIONS, END_CONDITIONS)])
+    )
     return Beam(length=draw(numbers(0.1, 50.0)), ends=ends, modes=modes, **stuff, **damping)
 
 
@@ -105,7 +108,7 @@ def filters(draw) -> Filter:
 def sensors(draw, length: float) -> Sensor:
     """A sensor of any quantity."""
     quantity = draw(st.sampled_from(list(QUANTITIES)))
-    fibre = draw(numbers(-0.1, 0.1)) if quantity == "strain" else None
+    fibre = draw(numbers(-0.1, 0.1)) if QUANTITIES[quantity].at_fibre else None
     offset = draw(numbers(-1.0, 1.0))
     return Sensor(
         draw(numbers(0.0, length)),

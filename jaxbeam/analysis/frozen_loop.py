@@ -216,16 +216,14 @@ class LoopDynamics(eqx.Module):
     def _sensor_inputs(self, state, command, t):
         """What the sensors see of the plant with their analogue filters."""
         signals = self.output_rows @ self.augmented_plant.to_modal(state)
-        measures_acceleration = np.array(
-            [s.quantity == "acceleration" for s in self.plant.case.sensors], bool
-        )
-        if not measures_acceleration.any():
+        has_feedthrough = np.array([s.has_feedthrough for s in self.plant.case.sensors], bool)
+        if not has_feedthrough.any():
             return signals
         system = self.augmented_plant.at(t)
         accelerations = system.C @ state + system.D @ jnp.concatenate(
             [command, self.augmented_plant.weights]
         )
-        return jnp.where(measures_acceleration, accelerations, signals)
+        return jnp.where(has_feedthrough, accelerations, signals)
 
     def _controller_step(self, memory, readings, state, command, t):
         measurement = self._measurement(readings, state, command)

@@ -1,4 +1,4 @@
-"""The beam and what it rests on: section, material, damping, ends and supports."""
+"""Beam and supports: section, material, modal damping, end conditions."""
 
 import equinox as eqx
 import numpy as np
@@ -16,16 +16,22 @@ from jaxbeam.case.fields import (
     number,
 )
 
-MAX_MODES = 1000  # of a beam; finding more would take minutes
+MAX_MODES = 1000  # more modes would take minutes to compute
 
-END_CONDITIONS = ("pinned", "clamped", "free", "guided")
+# Whether an end condition holds the deflection and the rotation of the end.
+END_CONDITIONS = {
+    "pinned": (True, False),
+    "clamped": (True, True),
+    "free": (False, False),
+    "guided": (False, True),
+}
 
 
 class Support(eqx.Module):
-    """A support between (or at) the ends of a beam.
+    """Support at a position along a beam, rigid or elastic.
 
     Without a `stiffness` it holds the deflection rigidly; with one it is a vertical spring.
-    Supports shape the modes of the beam, except for their dampers, which couple those modes.
+    Supports enter the modes of the beam, except for their dampers, which couple the modes.
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
@@ -39,7 +45,7 @@ class Support(eqx.Module):
 
 
 class Beam(eqx.Module):
-    """A straight Euler-Bernoulli beam of uniform section.
+    """Straight Euler-Bernoulli beam of uniform section.
 
     Give either `flexural_rigidity` and `mass_per_length`, or the rectangular section and material
     `width`, `height`, `youngs_modulus`, `density` (height is measured in the bending direction).
@@ -95,7 +101,7 @@ class Beam(eqx.Module):
         return self.ends.split("-")[1]
 
     def validate(self, address: str) -> str | None:
-        """What does not go together in it, as a sentence, or None."""
+        """First inconsistency between its fields as an error message, or None."""
         ends = self.ends.split("-")
         if len(ends) != 2:
             return (

@@ -1,4 +1,6 @@
-"""What is measured, and where."""
+"""Point sensors on the beam."""
+
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,26 +8,19 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, number, part
 from jaxbeam.case.filters import Filter
-
-QUANTITIES = {
-    "deflection": "m",
-    "velocity": "m/s",
-    "acceleration": "m/s^2",
-    "slope": "rad",
-    "strain": "1",
-}
+from jaxbeam.case.quantities import QUANTITIES
 
 
 class Sensor(eqx.Module):
-    """A point sensor on the beam.
+    """Point sensor of a quantity at a position on the beam; deflections are positive upwards.
 
-    `strain` is the bending strain at the fibre `fibre_distance` above the neutral axis,
-    -z d2w/dx2; deflection is positive upwards. `offset` is added to the reading; noise, range,
-    resolution and a filter follow, and whatever is left out is ideal (see `sensing`).
+    `strain` is the bending strain -z d2w/dx2 of the fibre at z = `fibre_distance` above the neutral
+    axis. `offset` and noise are added to the quantity; the reading is limited to the range and
+    rounded to the resolution (see `jaxbeam.model.sensor_signals`). What is left out is ideal.
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
-    quantity: str = choice("what is measured", *QUANTITIES, default="deflection")
+    quantity: str = choice("measured quantity", *QUANTITIES, default="deflection")
     offset: Float[Array, ""] = number("unit of quantity", "constant added", default=0.0)
     fibre_distance: Float[Array, ""] | None = number(
         "m", "height of the strain gauge above the neutral axis", default=None
@@ -44,22 +39,48 @@ class Sensor(eqx.Module):
         "s", "time between readings; that of controller or run if left out", POSITIVE, default=None
     )
     delay: Float[Array, ""] | None = number(
-        "s", "age of the deflection that is read", NOT_NEGATIVE, default=None
+        "s", "from deflection to reading", NOT_NEGATIVE, default=None
     )
 
     @property
+    def unit(self) -> str:
+        """SI unit of the readings."""
+        return QUANTITIES[self.quantity].unit
+
+    @property
+    def has_feedthrough(self) -> bool:
+        """Whether forces and commands change the reading at once, as they change accelerations."""
+        return QUANTITIES[self.quantity].time_derivative == 2
+
+    @property
+    def has_digital_filter(self) -> bool:
+        """Whether a filter acts on its samples."""
+        return self.filter is not None and self.filter.realisation == "digital"
+
+    def sampled_features(self, address: str) -> Iterator[str]:
+        """What of it exists at samples only, each as the subject of an error message."""
+        if self.has_digital_filter:
+            yield f"{address}.filter, which is digital,"
+        for name in ("sampling_period", "delay", "noise", "resolution"):
+            if getattr(self, name) is not None:
+                yield f"{address}.{name}"
+        if self.has_feedthrough:
+            yield f"the {self.quantity} of {address}"
+
+    @property
     def noise_variance(self) -> Float[Array, ""]:
-        """Variance of the noise of one reading, in the square of its unit; what filters call R."""
+        """Variance of the noise of a reading, in the square of its unit; R of a Kalman filter."""
         return jnp.zeros(()) if self.noise is None else self.noise**2
 
     def validate(self, address: str) -> str | None:
-        """What does not go together in it, as a sentence, or None."""
-        if self.quantity == "strain" and self.fibre_distance is None:
+        """First inconsistency between its fields as an error message, or None."""
+        at_fibre = QUANTITIES[self.quantity].at_fibre
+        if at_fibre and self.fibre_distance is None:
             return (
-                f"{address}.fibre_distance is missing: strain needs the height of the gauge above"
-                " the neutral axis in m"
+                f"{address}.fibre_distance is missing: {self.quantity} needs the height of the gauge"
+                " above the neutral axis in m"
             )
-        if self.quantity != "strain" and self.fibre_distance is not None:
+        if not at_fibre and self.fibre_distance is not None:
             return (
                 f"{address}.fibre_distance would have no effect on a sensor of {self.quantity};"
                 " leave it out, or set quantity to 'strain'"

@@ -1,17 +1,17 @@
-"""Where a rig is driven and where it is read, in words: inputs and outputs of responses.
+"""Channels of a frequency response: its inputs and outputs by name.
 
 Inputs:
     actuators.I                    command of actuator I, in V or N
-    actuators.I.active_force       what it makes of its command, such as the force of a coil
+    actuators.I.active_force       force that its command generates, such as that of a coil
     force@X                        force on the beam at X m
 Outputs:
-    sensors.I                      what sensor I would read without noise, filter and delay
-    deflection@X, velocity@X, acceleration@X, slope@X
+    sensors.I                      reading of sensor I without noise, filter and delay
+    deflection@X, velocity@X, ...  quantity at X m (`case.quantities`, but those at a fibre)
     actuators.I.current            current in the coil of an electrodynamic shaker
     actuators.I.active_force       as above
-    actuators.I.transmitted_force  what reaches the beam, after its own mass and suspension
+    actuators.I.transmitted_force  force on the beam: active force less that of mass and suspension
 
-For an actuator that acts on slopes, as a patch does, forces are moments.
+The forces of an actuator that acts on slopes, such as a patch, are moments.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,10 +23,12 @@ import numpy as np
 from jaxbeam.case.actuators import AbstractActuator, Electrodynamic
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam, suggestion
-from jaxbeam.case.sensors import QUANTITIES
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.output_rows import row_on_states, sensor_rows
 
-POINT_QUANTITIES = ("deflection", "velocity", "acceleration", "slope")  # strain also needs a fibre
+POINT_QUANTITIES = tuple(name for name, quantity in QUANTITIES.items() if not quantity.at_fibre)
 ACTUATOR_QUANTITIES = ("current", "active_force", "transmitted_force")
 
 
@@ -42,15 +44,15 @@ class ChannelPair(NamedTuple):
 
     @property
     def excitation(self) -> str:
-        """The input that drives the rig: the command behind an active force."""
+        """Input of the model: for an active force, the command that generates it."""
         return self.input.removesuffix(".active_force")
 
 
 def shaker_channels(index: int) -> tuple[tuple[str, str], ...]:
-    """The chain of an electrodynamic shaker, eqs (2.26) to (2.34) of the thesis, as pairs.
+    """Pairs (input, output) along an electrodynamic shaker, eqs (2.26) to (2.34) of the thesis.
 
     Voltage to current, voltage to coil force, coil force to transmitted force, and voltage to
-    transmitted force, of the actuator of this number.
+    transmitted force, of the actuator with this index.
     """
     command = f"actuators.{index}"
     coil_force, transmitted_force = f"{command}.active_force", f"{command}.transmitted_force"
@@ -63,9 +65,9 @@ def shaker_channels(index: int) -> tuple[tuple[str, str], ...]:
 
 
 def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
-    """Every command to every sensor, and the chains of electrodynamic shakers.
+    """Pairs of each command and each sensor, and those along electrodynamic shakers.
 
-    Without commands: a force at each sensor to that sensor. Raises ValueError if a case has
+    Without commands, a force at each sensor and that sensor. Raises ValueError if a case has
     neither.
     """
     pairs = []
@@ -76,7 +78,7 @@ def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
             pairs += shaker_channels(i)
     if not pairs:
         positions = [float(sensor.position) for sensor in case.sensors]
-        pairs = [(f"force@{place:g}", f"sensors.{j}") for j, place in enumerate(positions)]
+        pairs = [(f"force@{x:g}", f"sensors.{j}") for j, x in enumerate(positions)]
     if not pairs:
         raise ValueError(
             "the case has neither sensors nor actuators; name an input and an output, such as"
@@ -86,7 +88,7 @@ def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
 
 
 def check_pairs(case: Case, pairs: Iterable[Sequence[str]]) -> tuple[ChannelPair, ...]:
-    """The pairs with their units. Raises ValueError for words that mean nothing in the case."""
+    """Pairs with their units. Raises ValueError for channels that the case does not have."""
     checked = []
     for source, output in pairs:
         output_unit, input_unit = _output_unit(case, output), _input_unit(case, source)
@@ -100,40 +102,30 @@ def check_pairs(case: Case, pairs: Iterable[Sequence[str]]) -> tuple[ChannelPair
 
 
 def input_column(case: Case, model: ModalModel, input: str):
-    """What an input does to the rates of the states, (state,), and to the commands (actuator,)."""
+    """Input vector (state,) on the rates of the states, and commands (actuator,), of an input."""
     commands = jnp.zeros(len(case.actuators))
     if "@" in input:
         position = float(input.partition("@")[2])
-        return _row_on_states(model, model.shapes(position, (0,))[0], 1), commands
+        return row_on_states(model, model.shapes(position, (0,))[0], 1), commands
     index = int(input.split(".")[1])
     return model.command_matrix[:, index], commands.at[index].set(1.0)
 
 
 def output_row(case: Case, model: ModalModel, output: str):
-    """Rows that take the states, their rates (both (state,)) and the commands to an output."""
+    """Rows of an output on the states, on their rates (both (state,)) and on the commands."""
     zero_row, feedthrough = jnp.zeros(model.state_count), jnp.zeros(len(case.actuators))
     name, at_point, position = output.partition("@")
     if at_point or name.startswith("sensors."):
-        if at_point:
-            quantity, position, fibre_distance = name, float(position), None
-        else:
-            sensor = case.sensors[int(name.split(".")[1])]
-            quantity, position, fibre_distance = (
-                sensor.quantity,
-                sensor.position,
-                sensor.fibre_distance,
-            )
-        derivative = {"slope": 1, "strain": 2}.get(quantity, 0)
-        shape = model.shapes(position, (derivative,))[0]
-        shape = -fibre_distance * shape if quantity == "strain" else shape
-        if quantity == "acceleration":
-            return zero_row, _row_on_states(model, shape, 1), feedthrough
-        return _row_on_states(model, shape, int(quantity == "velocity")), zero_row, feedthrough
+        sensor = (
+            Sensor(float(position), name) if at_point else case.sensors[int(name.split(".")[1])]
+        )
+        on_states, on_rates = sensor_rows(model, [sensor]).on_states(model)
+        return on_states[0], on_rates[0], feedthrough
     _, index, actuator_output = name.split(".")
     index = int(index)
     attachments = [actuator.attachment() for actuator in case.actuators]
     sizes = [device.state_matrix.shape[0] for device in attachments]
-    start = 2 * model.modes.stiffness.shape[0] + sum(sizes[:index])
+    start = 2 * model.mode_count + sum(sizes[:index])
     attachment, device_states = attachments[index], np.arange(start, start + sizes[index])
     if actuator_output == "current":
         return zero_row.at[device_states].set(1.0), zero_row, feedthrough
@@ -142,21 +134,15 @@ def output_row(case: Case, model: ModalModel, output: str):
     if actuator_output == "active_force":
         return active_force, zero_row, feedthrough
     displacement = model.displacement_map[index]
-    suspension_force = attachment.stiffness * _row_on_states(
+    suspension_force = attachment.stiffness * row_on_states(
         model, displacement, 0
-    ) + attachment.damping * _row_on_states(model, displacement, 1)
+    ) + attachment.damping * row_on_states(model, displacement, 1)
     mass = 0.0 if attachment.mass is None else attachment.mass
     return (
         active_force - suspension_force,
-        -mass * _row_on_states(model, displacement, 1),
+        -mass * row_on_states(model, displacement, 1),
         feedthrough,
     )
-
-
-def _row_on_states(model: ModalModel, shape, first_state: int):
-    """A row over the coordinates as one over the states: on q (first = 0) or on q' (1)."""
-    states = np.arange(first_state, 2 * model.modes.stiffness.shape[0], 2)
-    return jnp.zeros(model.state_count).at[states].set(shape)
 
 
 def _input_unit(case: Case, channel: str) -> str:
@@ -171,8 +157,8 @@ def _input_unit(case: Case, channel: str) -> str:
         raise ValueError(f"the input {channel!r} takes no command")
     if actuator_input not in ("", "active_force"):
         raise ValueError(
-            f"the input {channel!r} does not exist; an actuator is driven by its command, its address"
-            " alone, or by its active_force"
+            f"the input {channel!r} does not exist; an actuator is driven by its command, its"
+            " address alone, or by its active_force"
         )
     return _force_unit(actuator) if actuator_input else actuator.command_unit
 
@@ -184,15 +170,14 @@ def _output_unit(case: Case, channel: str) -> str:
             hint = suggestion(name, POINT_QUANTITIES)
             raise ValueError(f"the output {channel!r} does not exist; {hint}, as deflection@0.3")
         _check_position(case, channel, position)
-        return QUANTITIES[name]
+        return QUANTITIES[name].unit
     if name.startswith("sensors."):
-        return QUANTITIES[
-            case.sensors[_parse_index(channel, "sensors", len(case.sensors))].quantity
-        ]
+        return case.sensors[_parse_index(channel, "sensors", len(case.sensors))].unit
     actuator, actuator_output = _parse_actuator(case, channel, "output")
     if actuator_output not in ACTUATOR_QUANTITIES:
         raise ValueError(
-            f"the output {channel!r} does not exist; {suggestion(actuator_output, ACTUATOR_QUANTITIES)}"
+            f"the output {channel!r} does not exist;"
+            f" {suggestion(actuator_output, ACTUATOR_QUANTITIES)}"
         )
     if actuator_output == "current" and not isinstance(actuator, Electrodynamic):
         kind = type(actuator).__name__
@@ -201,7 +186,10 @@ def _output_unit(case: Case, channel: str) -> str:
 
 
 def _parse_actuator(case: Case, channel: str, role: str) -> tuple[AbstractActuator, str]:
-    """The actuator that a word names, and what of it."""
+    """Actuator that a channel names, and its quantity ("" for the command).
+
+    Raises ValueError for a channel of another kind, or of an actuator that the case does not have.
+    """
     if not channel.startswith("actuators."):
         examples = "actuators.0 or force@0.3" if role == "input" else "sensors.0 or deflection@0.3"
         raise ValueError(f"the {role} {channel!r} does not exist; write, for example, {examples}")
@@ -227,7 +215,7 @@ def _check_position(case: Case, channel: str, position: str) -> None:
 
 
 def accepts_commands(actuator: AbstractActuator) -> bool:
-    """Whether an actuator does something with a command, as a passive one does not."""
+    """Whether an actuator accepts commands; a passive one does not."""
     return actuator.command_unit != "1"
 
 

@@ -1,12 +1,12 @@
-"""The physics of contact: travelling loads on a vibrating beam.
+"""Contact law of travelling loads on a vibrating beam.
 
-A load of mass m at x(t) stays on the beam, so it is accelerated with the deflection under it,
+A load of mass m at x(t) stays on the beam, so its acceleration is that of the deflection under it,
 
     D2w/Dt2 = w_tt + 2 x' w_xt + x'^2 w_xx + x'' w_x,
 
 and the force on the beam, positive upwards, is r = -W - m D2w/Dt2 with W its weight (corrected
-eqs 2.3 to 2.13 of the thesis; a force has m = 0). In the states z of the rig, with f the forces
-on the modes, D2w/Dt2 = (contact row) . z + (shape row) . f.
+eqs 2.3 to 2.13 of the thesis; a force has m = 0). With the states z of the modal model and forces
+f on the modes, D2w/Dt2 = (contact row) . z + (shape row) . f.
 """
 
 import equinox as eqx
@@ -23,14 +23,14 @@ from jaxbeam.numerics.batched_linalg import solve_small
 
 
 class LoadSet(eqx.Module):
-    """All loads of a run: how they move, and how heavy they are.
+    """All loads of a run: trajectories, inertia (kg) and weight (N).
 
-    Inertia (kg) and weight (N) may differ between lanes: runs that share everything else.
+    Inertia and weight may differ between the runs of a batch, which share everything else.
     """
 
     trajectories: tuple[AbstractTrajectory, ...]
-    inertia: Float[Array, "load lane"]
-    weight: Float[Array, "load lane"]
+    inertia: Float[Array, "load batch"]
+    weight: Float[Array, "load batch"]
 
     def kinematics(self, times: Float[Array, "*time"]) -> tuple[Float[Array, "load *time"], ...]:
         """Positions (m), speeds (m/s) and accelerations (m/s^2) at given times (s)."""
@@ -41,13 +41,14 @@ class LoadSet(eqx.Module):
         return position, speed, acceleration
 
     def cubics(self) -> tuple[Float[Array, "load piece"], Float[Array, "load piece 4"]]:
-        """The paths as cubic polynomials, as many for each load.
+        """Start times (s) and coefficients of the cubic pieces of the trajectories.
 
-        Of loads as cases have them, see `motion.AbstractPieces`.
+        Padded to the same number of pieces; for trajectories of the kind
+        `AbstractPiecewiseTrajectory`, which those of cases are.
         """
         if not self.trajectories:
             return jnp.zeros((0, 1)), jnp.zeros((0, 1, 4))
-        cubics_by_load = [path.pieces() for path in self.trajectories]
+        cubics_by_load = [path.cubics() for path in self.trajectories]
         max_pieces = max(times.shape[0] for times, _ in cubics_by_load)
         padding = [(0, max_pieces - times.shape[0]) for times, _ in cubics_by_load]
         pairs = list(zip(cubics_by_load, padding, strict=True))
@@ -56,14 +57,14 @@ class LoadSet(eqx.Module):
         return jnp.stack(times), jnp.stack(cubics)
 
     def on_beam(self, times: Float[Array, "*time"]) -> Bool[Array, "load *time"]:
-        """Which loads are on the beam at given times (s): from entry until just before exit."""
+        """Whether each load is on the beam at given times (s), from entry until before exit."""
         windows = [path.entry_exit_times() for path in self.trajectories]
         on = [(entry <= times) & (times < leave) for entry, leave in windows]
         return jnp.array(on, bool).reshape(len(on), *jnp.shape(times))
 
 
 def load_set(case: Case) -> LoadSet:
-    """The loads of a case, as a single lane."""
+    """Loads of a case, as a batch of one run."""
     trajectories = tuple(trajectory(load, case.beam.length) for load in case.loads)
     gravity = case.run.gravity
     inertia = [load.inertia() for load in case.loads]
@@ -75,10 +76,10 @@ def load_set(case: Case) -> LoadSet:
 
 
 def contact_rows(model: ModalModel, position, speed, acceleration, active):
-    """Shape rows (*place, block, mode) and contact rows (*place, block, side) at the loads.
+    """Shape rows (*position, block, mode) and contact rows (*position, block, side) at the loads.
 
-    Position (m), speed (m/s), acceleration (m/s^2) and whether it is on the beam, all (*place,);
-    where it is not, the rows are zero.
+    Position (m), speed (m/s), acceleration (m/s^2) and `active` (on the beam) of the loads all have
+    the shape (*position,); rows of loads off the beam are zero.
     """
     position_on_beam = jnp.where(active, position, 0.0)
     shape, slope, curvature = jnp.where(
@@ -106,24 +107,24 @@ def contact_at(
     model: ModalModel,
     loads: LoadSet,
     time: Float[Array, ""],
-    state: Float[Array, "state lane"],
-    command: Float[Array, "actuator lane"] | None = None,
-) -> tuple[Float[Array, "load lane"], Float[Array, "mode lane"]]:
+    state: Float[Array, "state batch"],
+    command: Float[Array, "actuator batch"] | None = None,
+) -> tuple[Float[Array, "load batch"], Float[Array, "mode batch"]]:
     """Contact forces r (N, upwards on the beam) and accelerations of q at an instant (s).
 
-    At the time at which a load enters or leaves they are those just after.
+    At the instant at which a load enters or leaves, those just after it.
     """
     position, speed, acceleration = loads.kinematics(time)
     active = loads.on_beam(time)
     shape, rows = contact_rows(model, position, speed, acceleration, active)
-    load_count, mode_count = position.shape[0], model.modes.stiffness.shape[0]
+    load_count, mode_count = position.shape[0], model.mode_count
     shape, rows = shape.reshape(load_count, mode_count), rows.reshape(load_count, model.state_count)
     blocks, side, _ = model.state_matrix.shape
     rates = (model.state_matrix @ state.reshape(blocks, side, -1)).reshape(state.shape)
-    modal_acceleration = rates[1 : 2 * mode_count : 2]
+    modal_acceleration = rates[model.rate_index]
     acceleration_under_load = rows @ state
     if command is not None:
-        command_acceleration = model.command_matrix[1 : 2 * mode_count : 2] @ command
+        command_acceleration = model.command_matrix[model.rate_index] @ command
         modal_acceleration, acceleration_under_load = (
             modal_acceleration + command_acceleration,
             acceleration_under_load + shape @ command_acceleration,
@@ -138,10 +139,10 @@ def contact_at(
 
 @jax.custom_jvp
 def solve_contact_forces(compliance, inertia, load):
-    """Solve (1 + m_i G_ij) r_j = -d_i for every lane.
+    """Contact forces r (row, batch) from (delta_ij + m_i G_ij) r_j = -d_i.
 
-    `compliance` (row, row) are shared, `inertia` and `load` are (row, lane). The matrix is close to
-    the identity plus a positive matrix for the step lengths in use.
+    The `compliance` G (row, row) is shared by the batch; `inertia` m and `load` d are (row, batch).
+    For the step lengths in use, the matrix is close to the identity plus a positive matrix.
     """
     matrix = inertia[:, None] * compliance[:, :, None] + np.eye(compliance.shape[0])[:, :, None]
     return solve_small(matrix, -load[:, None])[:, 0]
@@ -149,7 +150,7 @@ def solve_contact_forces(compliance, inertia, load):
 
 @solve_contact_forces.defjvp
 def _solve_contact_forces_jvp(primals, tangents):
-    """The forces' change solves the same system: cheaper than differentiating the elimination."""
+    """Tangent of the forces by the same system: cheaper than differentiating the elimination."""
     force_coupling, inertia, right_side = primals
     force_coupling_tangent, inertia_tangent, right_side_tangent = tangents
     forces = solve_contact_forces(*primals)

@@ -1,10 +1,10 @@
-"""Frequency responses of a rig: beam, supports, actuators, and masses parked on the beam.
+"""Frequency responses of beam, supports and actuators, with stationary masses on the beam.
 
-With the states z of the rig and s = 2 pi i f,
+With the states z of the modal model and s = 2 pi i f,
 
     (s E - A) z = B u + shapes(y) . force,    y = (C + s C') z + D u.
 
-E is the identity but for the parked masses, eq. (2.30) of the thesis. C' takes accelerations.
+E is the identity plus the stationary masses, eq. (2.30) of the thesis; C' acts on the rates z'.
 """
 
 import os
@@ -15,7 +15,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Complex, Float
 
 from jaxbeam.case.case import Case
@@ -34,10 +33,10 @@ StationaryMasses = Sequence[tuple[Any, Any]]  # position (m) and mass (kg) of ea
 
 
 class FrequencyResponse(eqx.Module):
-    """Frequency responses, one column for each pair of an input and an output.
+    """Frequency responses at `frequencies` (Hz), one column for each pair of input and output.
 
-    `values` are complex: output amplitude per input amplitude, with the phase by which the output
-    leads, in the `unit` of the pair.
+    `values` are complex amplitudes of the output per input, in the `unit` of the pair; their phase
+    is that by which the output leads.
     """
 
     frequencies: Float[Array, " frequency"]
@@ -56,7 +55,7 @@ class FrequencyResponse(eqx.Module):
         return jnp.degrees(jnp.unwrap(jnp.angle(self.values), axis=0))
 
     def of(self, input: str, output: str) -> Complex[Array, " frequency"]:
-        """The response of one pair. Raises ValueError if the record does not have it."""
+        """Response of one pair. Raises ValueError if there is none of it."""
         for i, pair in enumerate(self.pairs):
             if (pair.input, pair.output) == (input, output):
                 return self.values[:, i]
@@ -64,7 +63,7 @@ class FrequencyResponse(eqx.Module):
         raise ValueError(f"there is no response of {output} to {input}; there are {available}")
 
     def to_xarray(self) -> "xarray.Dataset":
-        """Labelled dataset with units, all of it real so that every file format takes it."""
+        """Labelled dataset with units, of real variables that every file format can hold."""
         import xarray
 
         dims = ("frequency", "pair")
@@ -103,15 +102,15 @@ def frequency_response(
     stationary_masses: StationaryMasses = (),
     layout: Layout | None = None,
 ) -> FrequencyResponse:
-    """Frequency responses of a case at `frequencies` (Hz), its loads away.
+    """Frequency responses of a case at `frequencies` (Hz), without its loads.
 
-    `pairs` are (input, output), each in the words of `ports`; those of `common_pairs` if left
-    out. `stationary_masses` are masses that stand on the beam and move with it: (position in m, mass in kg).
-    Exact for the modes that the case keeps. Differentiable in every number of the case and in the
-    frequencies. Inside `jit`, give the `layout` found outside by `modes.lay_out(case)`.
+    `pairs` are (input, output) by the names of `channels`, by default those of `common_pairs`.
+    `stationary_masses` are pairs of position (m) and mass (kg) that vibrate with the beam. Exact
+    for the modes that the case keeps. Differentiable in every number of the case and in the
+    frequencies. Inside `jit`, pass the `layout` found outside by `model.modes.mesh_layout(case)`.
 
-    Raises ValueError for a faulty case, negative frequencies, an unknown input or output, or a
-    parked mass that is negative or off the beam.
+    Raises ValueError for an invalid case, negative frequencies, an unknown input or output, or a
+    stationary mass that is negative or off the beam.
     """
     check_case(case)
     frequencies, masses = (
@@ -136,7 +135,7 @@ def _responses(case: Case, layout: Layout, frequencies, stationary, pairs: tuple
         response = _evaluate_output(
             output_row(case, model, pair.output), states[:, :, i], s, command
         )
-        if pair.excitation != pair.input:  # the input is itself an output of the actuator
+        if pair.excitation != pair.input:  # an active force is itself an output: take the ratio
             response = response / _evaluate_output(
                 output_row(case, model, pair.input), states[:, :, i], s, command
             )
@@ -152,20 +151,19 @@ def _evaluate_output(row, states, s, command):
 def _state_responses(
     model: ModalModel, stationary, frequencies, input_matrix
 ) -> Complex[Array, "frequency state input"]:
-    """States of the rig for each column of pushes, at every frequency (Hz)."""
+    """States per unit of each input (column of the input matrix), at every frequency (Hz)."""
     A, E = _descriptor_matrices(model, stationary)
     s = 2j * jnp.pi * frequencies[:, None, None]
     return jnp.linalg.solve(s * E - A, input_matrix + 0j)
 
 
 def _descriptor_matrices(model: ModalModel, stationary):
-    """A and E of the rig with masses parked on it: their positions (m), and what they are (kg)."""
-    A = block_diag(*model.state_matrix)
+    """A and E of the model with stationary masses: (positions in m, masses in kg)."""
     positions, kilograms = stationary
     shapes = model.shapes(positions, (0,))[0]
-    rates = np.arange(1, 2 * model.modes.stiffness.shape[0], 2)
     added_mass = (shapes.T * kilograms) @ shapes
-    return A, jnp.eye(model.state_count).at[np.ix_(rates, rates)].add(added_mass)
+    rates = model.rate_index
+    return model.A, jnp.eye(model.state_count).at[rates, rates].add(added_mass)
 
 
 def receptance(
@@ -176,10 +174,10 @@ def receptance(
     stationary_masses: StationaryMasses = (),
     layout: Layout | None = None,
 ) -> Complex[Array, "..."]:
-    """Deflection at x per force at y, in m/N: (frequency, x..., y...).
+    """Receptance: deflection at x per force at y, in m/N, (frequency, x..., y...).
 
-    Positions x and y are in m and may have any shapes. Unlike `frequency_response` it is
-    differentiable in them. The rest is as there, the errors too.
+    Positions x and y (m) may have any shapes; differentiable in them too. Other arguments and
+    errors are those of `frequency_response`.
     """
     check_case(case)
     frequencies, masses = (
@@ -194,14 +192,10 @@ def receptance(
 @compiled
 def _receptance(case: Case, layout: Layout, frequencies, stationary, x, y):
     model = modal_model(case, layout)
-    mode_count = model.modes.stiffness.shape[0]
     input_matrix = jnp.zeros((model.state_count, y.size))
-    input_matrix = input_matrix.at[1 : 2 * mode_count : 2].set(
-        model.shapes(y.reshape(-1), (0,))[0].T
-    )
-    amplitudes = _state_responses(model, stationary, frequencies, input_matrix)[
-        :, : 2 * mode_count : 2
-    ]
+    input_matrix = input_matrix.at[model.rate_index].set(model.shapes(y.reshape(-1), (0,))[0].T)
+    states = _state_responses(model, stationary, frequencies, input_matrix)
+    amplitudes = states[:, model.coordinate_index]
     response = model.shapes(x.reshape(-1), (0,))[0] @ amplitudes
     return response.reshape(frequencies.size, *x.shape, *y.shape)
 
@@ -214,7 +208,7 @@ def mobility(
     stationary_masses: StationaryMasses = (),
     layout: Layout | None = None,
 ) -> Complex[Array, "..."]:
-    """Velocity at x per force at y, in m/(N s): H = s x receptance, eq. (2.29) of the thesis."""
+    """Mobility: velocity at x per force at y, in m/(N s); s x receptance, eq. (2.29)."""
     response = receptance(case, frequencies, x, y, stationary_masses, layout)
     return _differentiated(frequencies, response)
 
@@ -227,7 +221,7 @@ def accelerance(
     stationary_masses: StationaryMasses = (),
     layout: Layout | None = None,
 ) -> Complex[Array, "..."]:
-    """Acceleration at x per force at y, in 1/kg: A = s H = s^2 x receptance."""
+    """Accelerance: acceleration at x per force at y, in 1/kg, s^2 x receptance."""
     return _differentiated(
         frequencies, mobility(case, frequencies, x, y, stationary_masses, layout)
     )
@@ -241,10 +235,10 @@ def _differentiated(frequencies, response):
 def resonances_and_antiresonances(
     response: FrequencyResponse, index: int
 ) -> list[tuple[str, float, float]]:
-    """What stands out in the response of pair `index`: (word, frequency in Hz, magnitude).
+    """Features of the response of pair `index`: (kind, frequency in Hz, magnitude).
 
-    Its first frequency and its peaks and dips in between, as parabolas through three neighbours
-    have them.
+    "first" is that at the first frequency; each "peak" and "dip" is the vertex of the parabola
+    through three neighbouring frequencies.
     """
     f, magnitude = np.asarray(response.frequencies), np.asarray(response.magnitude)[:, index]
     extrema = [("first", float(f[0]), float(magnitude[0]))]
@@ -260,9 +254,9 @@ def resonances_and_antiresonances(
 
 
 def poles(case: Case, stationary_masses: StationaryMasses = ()) -> Complex[np.ndarray, " state"]:
-    """Poles of the rig in 1/s (angular, with the damping as negative real part), by size.
+    """Poles of beam, supports and actuators in rad/s, in order of magnitude.
 
-    Plain numbers, not differentiable. Raises ValueError as `frequency_response` does.
+    Not differentiable. Raises ValueError as `frequency_response` does.
     """
     check_case(case)
     A, E = _descriptor_matrices(
@@ -274,10 +268,10 @@ def poles(case: Case, stationary_masses: StationaryMasses = ()) -> Complex[np.nd
 def zeros(
     case: Case, pair: tuple[str, str], stationary_masses: StationaryMasses = ()
 ) -> Complex[np.ndarray, " zero"]:
-    """Zeros of the response of a pair (input, output) in 1/s, by size: where it vanishes.
+    """Transmission zeros of a pair (input, output) in rad/s, in order of magnitude.
 
-    For `actuators.I.active_force` as input they are those of the response to the command, which
-    has the same. Plain numbers, not differentiable. Raises ValueError as `frequency_response` does.
+    Those for the input `actuators.I.active_force` are those for the command. Not differentiable.
+    Raises ValueError as `frequency_response` does.
     """
     check_case(case)
     (checked_pair,) = check_pairs(case, [pair])
@@ -289,13 +283,13 @@ def zeros(
     pencil_A = jnp.block([[A, input_vector[:, None]], [state_row, feedthrough]])
     pencil_E = jnp.block([[E, jnp.zeros_like(input_vector)[:, None]], [-rate_row, jnp.zeros(1)]])
     eigenvalues = scipy.linalg.eigvals(np.asarray(pencil_A), np.asarray(pencil_E))
-    # Zeros at infinity come out as such, or as numbers far beyond anything that moves.
+    # Zeros at infinity are computed as infinite or as numbers far beyond the poles.
     largest_pole = np.abs(scipy.linalg.eigvals(np.asarray(A))).max()
     return _sort_by_magnitude(eigenvalues[np.abs(eigenvalues) < 1e4 * largest_pole])
 
 
 def _sort_by_magnitude(values):
-    """By size, conjugates (whose sizes differ by rounding alone) with the negative one first."""
+    """In order of magnitude; of conjugates, equal up to rounding, the negative frequency first."""
     sizes = np.array([float(f"{size:.9g}") for size in np.abs(values)])
     return values[np.lexsort((values.imag, sizes))]
 
@@ -315,14 +309,17 @@ def _checked_frequencies(frequencies):
 
 
 def _stationary_masses(case: Case, stationary_masses: StationaryMasses):
-    """Positions (mass,) and masses (mass,) of what is parked."""
+    """Positions (mass,) in m and masses (mass,) in kg, after checks.
+
+    Raises ValueError for a negative mass and a position off the beam.
+    """
     positions = jnp.array([position for position, _ in stationary_masses], float).reshape(-1)
     masses = jnp.array([mass for _, mass in stationary_masses], float).reshape(-1)
     if is_concrete(masses):
         for mass in concrete(masses):
             if not 0 <= mass < np.inf:
-                raise ValueError(f"a parked mass must not be negative; it is {mass:g} kg")
-    return _checked_position(case, "the place of a parked mass", positions), masses
+                raise ValueError(f"a stationary mass must not be negative; it is {mass:g} kg")
+    return _checked_position(case, "the position of a stationary mass", positions), masses
 
 
 def _checked_position(case: Case, name: str, x):

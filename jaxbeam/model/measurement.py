@@ -1,29 +1,12 @@
-"""What would be measured on a beam whose modes move in a given way."""
+"""Readings of the sensors from histories of the modal coordinates."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.model.modes import Modes
+from jaxbeam.model.output_rows import quantity_history
 from jaxbeam.model.sensor_signals import needs_times, noise_samples, sampled_readings, to_reading
-
-
-def quantity_history(
-    modes: Modes, modal_histories, x, quantity: str, fibre_distance
-) -> Float[Array, "time ..."]:
-    """History of a quantity at places x (m), when coordinates, rates and accelerations are those.
-
-    Raises ValueError for a quantity that there is not, and for strain without `fibre_distance` (m).
-    """
-    if quantity not in QUANTITIES:
-        raise ValueError(f"no quantity {quantity!r}; there are {', '.join(QUANTITIES)}")
-    if quantity == "strain" and fibre_distance is None:
-        raise ValueError("strain needs fibre_distance, the height above the neutral axis in m")
-    derivative = {"slope": 1, "strain": 2}.get(quantity, 0)
-    amplitudes = modal_histories[{"velocity": 1, "acceleration": 2}.get(quantity, 0)]
-    history = jnp.tensordot(amplitudes, modes.shapes(x, derivative), axes=[1, -1])
-    return -fibre_distance * history if quantity == "strain" else history
 
 
 def sensor_readings(
@@ -35,12 +18,12 @@ def sensor_readings(
     times: Float[Array, " time"] | None = None,
     noisy: bool = False,
 ) -> Float[Array, "time sensor"]:
-    """What the sensors of a case read when its modes move so (SI units; see `sensing`).
+    """Readings of the sensors of a case (SI units) from histories of its modal coordinates.
 
-    Only sensors with a filter, a delay or a sampling period ask for the times (s). Noise is drawn
-    by the run's seed if `noisy`; predictions to be held against logs leave it out.
+    The `times` (s) are needed for sensors with a filter, a delay or a sampling period. `noisy`
+    readings include noise drawn with the run's seed; predictions to compare with logs do without.
 
-    Raises ValueError, naming the sensor, for what `sensing.sampled_readings` refuses and for missing times.
+    Raises ValueError, naming the sensor, as `sampled_readings` does and for missing times.
     """
     modal_histories = coordinates, rates, accelerations
     samples = coordinates.shape[0]
@@ -55,9 +38,11 @@ def sensor_readings(
             columns.append(to_reading(sensor, values, noise_of_sensor))
             continue
         if times is None:
-            raise ValueError(f"sensors.{i} has a filter, delay or clock: its readings need times")
+            raise ValueError(
+                f"sensors.{i} has a filter, a delay or a sampling period: its readings need times"
+            )
         rates_of_change = None
-        if sensor.quantity != "acceleration":
+        if not sensor.has_feedthrough:
             rates_of_change = quantity_history(modes, modal_histories[1:], *channel)
         try:
             columns.append(

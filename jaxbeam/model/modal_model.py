@@ -1,10 +1,10 @@
-"""The rig: beam, supports and actuators as one linear system in modal coordinates.
+"""Modal model: beam, supports and actuators as one linear system in modal coordinates.
 
     q'' + D q' + K q = shapes(x) . forces,   z' = A z + B u
 
 The state z holds (q_1, q_1', q_2, q_2', ...) and then the actuators' own states. Where nothing
-couples the modes, A is kept as one 2 x 2 block a mode; otherwise it is a single full block. All
-that follows works on blocks and does not ask which of the two it has.
+couples the modes, A consists of one 2 x 2 block a mode, otherwise of one full block; both have
+the shape (block, side, side).
 """
 
 import equinox as eqx
@@ -22,9 +22,9 @@ from jaxbeam.runtime.compiling import compiled
 class ModalModel(eqx.Module):
     """Linear model of beam, supports and actuators, without loads and control.
 
-    Its coordinates q are modal amplitudes with unit mass matrix; `mode_map` (if any) maps them to
-    the amplitudes of `modes` where the moving mass of an actuator couples those. `displacement_map` are
-    the rows that take q to the stroke of each actuator.
+    The coordinates q have the unit mass matrix. Where the moving mass of an actuator couples the
+    `modes`, `mode_map` maps q to their amplitudes; else it is None. `displacement_map` maps q to
+    the displacement (m, or rotation in rad) at each actuator.
     """
 
     modes: Modes
@@ -64,30 +64,30 @@ class ModalModel(eqx.Module):
         return self.mode_count // self.state_matrix.shape[0]
 
     def shapes(self, x, derivatives: tuple[int, ...]) -> Float[Array, "order *position mode"]:
-        """Rows that take q to the deflection (or its x-derivatives) at positions x (m).
+        """Rows from q to the deflection (m), or its x-derivatives, at positions x (m).
 
-        Transposed, they take a force at x to forces on q.
+        Transposed, they map a force at x to generalised forces on q.
         """
         rows = self.modes.shape_derivatives(x, derivatives)
         return rows if self.mode_map is None else rows @ self.mode_map
 
     def stiffness(self) -> Float[Array, "mode mode"]:
-        """Stiffness matrix of the coordinates q, suspensions included, in 1/s^2."""
+        """Stiffness matrix K of the coordinates q, suspensions included, in 1/s^2."""
         return -self.A[self.rate_index, self.coordinate_index]
 
 
 def has_coupling(case: Case) -> bool:
-    """Tell whether any part of the case couples the modes: an actuator, a damper at a support."""
+    """Whether a part of the case couples the modes: an actuator, or a damper at a support."""
     return bool(case.actuators) or any(support.damping is not None for support in case.supports)
 
 
 def modal_model(case: Case, layout: Layout | None = None, full_matrix: bool = True) -> ModalModel:
-    """Assemble the rig of a case, eqs (2.31) to (2.36) of the thesis in mass-normalised modes.
+    """Modal model of a case, eqs (2.31) to (2.36) of the thesis in mass-normalised modes.
 
-    Actuators' suspensions and support dampers act on the modes, coupled and exact; non-classical
-    damping is not dropped. Without `full_matrix` the modes stay single blocks, which is right only
-    where nothing couples them (see `has_coupling`) and none are repeated. `layout` (from `mesh_layout`) is
-    needed inside `jit`, where the numbers that decide it are not known.
+    Suspensions of actuators and support dampers couple the modes; non-classical damping is kept.
+    Without `full_matrix` each mode is a block of its own: correct only where nothing couples the
+    modes (see `has_coupling`) and none are repeated. `layout` (from `mesh_layout`) is needed
+    inside `jit`, where the numbers that decide it are traced.
     """
     layout = mesh_layout(case) if layout is None else layout
     return assemble_modal_model(case, modes(case, layout), full_matrix)
@@ -97,9 +97,9 @@ _compiled = compiled(modal_model)
 
 
 def compiled_modal_model(case: Case, layout: Layout | None = None) -> ModalModel:
-    """The same rig by one program: step by step, the many small ones take seconds to compile.
+    """Modal model by one compiled program; operation by operation, compiling takes seconds.
 
-    Cases that differ in their controllers share it.
+    Cases that differ only in their controllers share the program.
     """
     layout = mesh_layout(case) if layout is None else layout
     uncontrolled_case = eqx.tree_at(
@@ -110,7 +110,7 @@ def compiled_modal_model(case: Case, layout: Layout | None = None) -> ModalModel
 
 @jax.named_scope("modal_model")
 def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> ModalModel:
-    """The rig of a case whose modes are known already; see `rig`."""
+    """Modal model of a case from its modes; `coupled` is `full_matrix` of `modal_model`."""
     count = case.beam.modes
     if not coupled:
         zero, one = jnp.zeros(count), jnp.ones(count)
@@ -150,7 +150,7 @@ def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> Moda
 
 
 def _state_space_matrices(stiffness, damping, displacement_map, attachments):
-    """State and command matrices of the modes and the actuators' own states together."""
+    """State matrix and command matrix of the modes and the actuators' own states."""
     count = stiffness.shape[0]
     device_sizes = [device.state_matrix.shape[0] for device in attachments]
     total = 2 * count + sum(device_sizes)

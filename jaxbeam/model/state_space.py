@@ -3,8 +3,8 @@
     z' = A(t) z + B(t) u + B_f(t) W,     y = C(t) z + D(t) (u, W)
 
 with the states z = (q, q', states of the actuators), eqs (2.36) and (2.46) of the thesis, commands
-u, and the weights W of the loads (N, positive downwards). While a mass is on the beam, the mass
-matrix I + sum m psi psi^T is inverted by its update of rank one for each load.
+u, and the weights W of the loads (N, positive downwards). The inverse of the mass matrix
+I + sum m psi psi^T of the beam with its loads is a low-rank update, one rank for each load.
 """
 
 import os
@@ -14,15 +14,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.model.contact import LoadSet, contact_rows, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
+from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.numerics.discretisation import c2d
 from jaxbeam.runtime.compiling import compiled
@@ -51,9 +50,9 @@ class StateSpace(eqx.Module):
     period: Float[Array, ""] | None = None
 
     def discretize(self, period: Float[Array, ""] | float) -> "StateSpace":
-        """The same system at samples a period (s) apart, its inputs held in between. Exact.
+        """Discrete-time system with this sampling period (s), exact for inputs held in between.
 
-        Differentiable. Raises ValueError if it is in discrete time already.
+        Differentiable. Raises ValueError if the system is in discrete time already.
         """
         if self.period is not None:
             raise ValueError("the system is in discrete time already; take the continuous one")
@@ -62,6 +61,14 @@ class StateSpace(eqx.Module):
         return StateSpace(
             transition, input_matrix[0], self.C, self.D, *parts, jnp.asarray(period, float)
         )
+
+    def static_response(self, outputs: Any) -> Float[Array, "output state"]:
+        """Rows -C A^-1 of some outputs: their values at rest under constant rates added to z'.
+
+        Times B they are the static gains of the inputs. `outputs` is an index or a slice. Not
+        finite where a mode has no stiffness.
+        """
+        return -jnp.linalg.solve(self.A.T, self.C[outputs].T).T
 
     def to_control(self) -> Any:
         """A `control.StateSpace` of the package python-control, with the same signal names.
@@ -105,10 +112,10 @@ class StateSpace(eqx.Module):
 
 
 class Plant(eqx.Module):
-    """State space of a rig crossed by loads, at any time t (s).
+    """State space of the beam with its loads, at any time t (s).
 
-    `coordinate_scale` times the rig's coordinates are the coordinates q of the states (see `state_space`).
-    Outputs are what the sensors would read if they were ideal.
+    The coordinates q of the states are `coordinate_scale` times those of the modal model (see
+    `state_space`). Outputs are the readings of ideal sensors.
     """
 
     case: Case
@@ -136,20 +143,20 @@ class Plant(eqx.Module):
         """Weights W of the loads in N, on the beam or off it."""
         return self.loads.weight[:, 0]
 
-    def from_modal(self, states: Float[Array, "state *lane"]) -> Float[Array, "state *lane"]:
-        """The states z of given states of the rig, which keeps (q_1, q_1', q_2, ...)."""
+    def from_modal(self, states: Float[Array, "state *batch"]) -> Float[Array, "state *batch"]:
+        """States z from the states of the modal model, whose order is (q_1, q_1', q_2, ...)."""
         ordered = states[self._state_order]
         return ordered * self._state_scales.reshape(-1, *(1,) * (states.ndim - 1))
 
-    def to_modal(self, states: Float[Array, "state *lane"]) -> Float[Array, "state *lane"]:
-        """The states of the rig for given states z."""
+    def to_modal(self, states: Float[Array, "state *batch"]) -> Float[Array, "state *batch"]:
+        """States of the modal model from the states z."""
         scaled = states / self._state_scales.reshape(-1, *(1,) * (states.ndim - 1))
         return scaled[np.argsort(self._state_order)]
 
     def at(self, t: Float[Array, ""] | float) -> StateSpace:
-        """The system frozen at a time (s); its inputs are the commands, then the weights W.
+        """System with the loads frozen at a time (s); inputs are the commands, then the weights.
 
-        At the time at which a load enters or leaves it is that just after.
+        At the instant at which a load enters or leaves, the system just after it.
         """
         return _plant_at(self, jnp.asarray(t, float))
 
@@ -158,7 +165,7 @@ class Plant(eqx.Module):
         return self.at(t).A
 
     def B(self, t: Float[Array, ""] | float) -> Float[Array, "state actuator"]:
-        """Command matrix B(t): the masses take part in the motion that forces cause at once."""
+        """Command matrix B(t) with the masses on the beam."""
         return self.at(t).B[:, : len(self.case.actuators)]
 
     def B_f(self, t: Float[Array, ""] | float) -> Float[Array, "state load"]:
@@ -167,13 +174,13 @@ class Plant(eqx.Module):
 
     @property
     def unloaded(self) -> StateSpace:
-        """The time-invariant system without loads; its inputs are the commands."""
+        """Time-invariant system without loads; its inputs are the commands."""
         return _unloaded_plant(self)
 
     def augmented(self, t: Float[Array, ""] | float) -> StateSpace:
-        """The system with the weights as further, constant states, eq. (5.8) of the thesis.
+        """System augmented by the weights as constant states, eq. (5.8) of the thesis.
 
-        Its inputs are the commands alone; the states of the loads start at `weights`.
+        Its inputs are the commands; the initial values of the added states are the `weights`.
         """
         frozen_system, commands = self.at(t), len(self.case.actuators)
         loads = frozen_system.inputs[commands:]
@@ -195,21 +202,21 @@ class Plant(eqx.Module):
 
     @property
     def _state_order(self) -> np.ndarray:
-        """Where the states z are among those of the rig."""
+        """Index of each state z among the states of the modal model."""
         modal = 2 * self.coordinate_scale.shape[0]
         actuator_states = np.arange(modal, self.modal_model.state_count)
         return np.concatenate([np.arange(0, modal, 2), np.arange(1, modal, 2), actuator_states])
 
     @property
     def _state_scales(self) -> Float[Array, " state"]:
-        """What the rig's states, in the order of z, are multiplied by."""
+        """Scale of each state z relative to that of the modal model."""
         actuator_scales = jnp.ones(
             self.modal_model.state_count - 2 * self.coordinate_scale.shape[0]
         )
         return jnp.concatenate([self.coordinate_scale, self.coordinate_scale, actuator_scales])
 
     def _contact_matrices(self, t):
-        """Shape rows (load, mode), contact rows (load, state of the rig) and masses (kg) at t."""
+        """Shape rows (load, mode), contact rows (load, state) and masses (kg) on the beam at t."""
         loads = self.loads
         position, speed, acceleration = loads.kinematics(t)
         windows = [path.entry_exit_times() for path in loads.trajectories]
@@ -224,10 +231,9 @@ class Plant(eqx.Module):
         )
 
     def _system_with_loads(self, shape_rows, contact_rows, mass) -> StateSpace:
-        """The system while loads of these masses, shape and contact rows are on the beam."""
-        model, modes = self.modal_model, self.coordinate_scale.shape[0]
-        rates = np.arange(1, 2 * modes, 2)
-        matrix, command = block_diag(*model.state_matrix), model.command_matrix
+        """System with loads of given masses (kg), shape and contact rows on the beam."""
+        model = self.modal_model
+        rates, matrix, command = model.rate_index, model.A, model.command_matrix
         # The contact forces: (1 + m S S') r = -W - m (rows z + S forces of the commands).
         force_input = (
             jnp.zeros((model.state_count, shape_rows.shape[0])).at[rates].set(shape_rows.T)
@@ -237,7 +243,7 @@ class Plant(eqx.Module):
         matrix = matrix - force_input @ (mass[:, None] * contact_rows)
         command = command - force_input @ (mass[:, None] * (shape_rows @ command[rates]))
         inputs = jnp.concatenate([command, -force_input], axis=1)
-        C, D = self._sensor_rows(matrix, inputs)
+        C, D = sensor_rows(model, self.case.sensors).of_system(model, matrix, inputs)
         order, scales = self._state_order, self._state_scales
         loads = tuple(Signal(f"load_{i}", "N") for i in range(len(mass)))
         return StateSpace(
@@ -248,31 +254,12 @@ class Plant(eqx.Module):
             states=self.states,
             inputs=_command_signals(self.case) + loads,
             outputs=tuple(
-                Signal(f"sensor_{i}_{s.quantity}", QUANTITIES[s.quantity])
-                for i, s in enumerate(self.case.sensors)
+                Signal(f"sensor_{i}_{s.quantity}", s.unit) for i, s in enumerate(self.case.sensors)
             ),
         )
 
-    def _sensor_rows(self, A, B):
-        """Rows that take the rig's states, and the inputs, to what the sensors measure."""
-        states, modal = self.modal_model.state_count, 2 * self.coordinate_scale.shape[0]
-        C = jnp.zeros((len(self.case.sensors), states))
-        D = jnp.zeros((len(self.case.sensors), B.shape[1]))
-        for i, sensor in enumerate(self.case.sensors):
-            derivative = {"slope": 1, "strain": 2}.get(sensor.quantity, 0)
-            shape = self.modal_model.shapes(sensor.position, (derivative,))[0]
-            if sensor.quantity == "strain":
-                shape = -sensor.fibre_distance * shape
-            if sensor.quantity == "acceleration":
-                C = C.at[i].set(shape @ A[1:modal:2])
-                D = D.at[i].set(shape @ B[1:modal:2])
-            else:
-                first_state = 1 if sensor.quantity == "velocity" else 0
-                C = C.at[i, first_state:modal:2].set(shape)
-        return C, D
 
-
-# One program each: done one by one, all these small operations would take seconds to compile.
+# Compiled as a whole: operation by operation, compiling takes seconds.
 @compiled
 def _plant_at(plant: Plant, t) -> StateSpace:
     return plant._system_with_loads(*plant._contact_matrices(t))
@@ -285,29 +272,26 @@ def _unloaded_plant(plant: Plant) -> StateSpace:
 
 
 def _command_signals(case: Case) -> tuple[Signal, ...]:
-    """The commands, in the unit in which the actuators' limits are given."""
+    """Names and units of the commands."""
     units = [actuator.command_unit for actuator in case.actuators]
     return tuple(Signal(f"command_{i}", unit) for i, unit in enumerate(units))
 
 
 def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = None) -> Plant:
-    """The state space of a case: beam, supports, actuators and loads; without its controller.
+    """State space of a case: beam, supports, actuators and loads, without its controller.
 
-    The coordinates q are those of the rig ("modal"), mass-normalised, in m kg^0.5; or ("sine")
-    the amplitudes in m of sin(n pi x / L), as throughout the thesis, where each mode is such a
-    sine: a uniform beam on two pins without supports in between. Filters, delays and noise of the
-    sensors are left out. Inside `jit`, give the `layout` found outside by `modes.lay_out`.
+    The coordinates q are mass-normalised ("modal"), in m kg^0.5, or ("sine") the amplitudes in m
+    of sin(n pi x / L) as in the thesis, for a uniform pinned-pinned beam without supports in
+    between. Filters, delays and noise of the sensors are left out. Inside `jit`, pass the `layout`
+    found outside by `model.modes.mesh_layout(case)`.
 
-    Raises ValueError for other coordinates, and if the modes are no sines.
+    Raises ValueError for other coordinates, and for "sine" if the modes are not such sines.
     """
     return build_plant(case, compiled_modal_model(case, layout), coordinates)
 
 
 def build_plant(case: Case, model: ModalModel, coordinates: str = "modal") -> Plant:
-    """The state space of a case whose rig is assembled already; see `state_space`.
-
-    Raises ValueError as that does.
-    """
+    """State space of a case from its modal model; raises ValueError as `state_space` does."""
     if coordinates == "modal":
         scale, coordinate = jnp.ones(case.beam.modes), Signal("q", "m kg^0.5")
     elif coordinates == "sine":
@@ -318,7 +302,10 @@ def build_plant(case: Case, model: ModalModel, coordinates: str = "modal") -> Pl
 
 
 def _sine_scale(case: Case, model: ModalModel) -> Float[Array, " mode"]:
-    """What the coordinates of the rig are to be multiplied by to give amplitudes of sines."""
+    """Factors from the coordinates of the modal model to the amplitudes of sines.
+
+    Raises ValueError if the modes are not sines.
+    """
     relative_positions = (np.arange(64) + 0.5) / 64
     shapes = model.shapes(case.beam.length * relative_positions, (0,))[0]
     sines = np.sin(np.pi * np.outer(relative_positions, np.arange(1, case.beam.modes + 1)))

@@ -23,6 +23,7 @@ from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.model.contact import LoadSet, contact_at
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout
+from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import (
     filtered_reading,
@@ -237,14 +238,10 @@ class ClosedLoop(AbstractInputPolicy):
         """What the sensors see at an instant (sensor, lane)."""
         signals = self.output_rows @ state
         sensors = self.plant.case.sensors
-        if not any(sensor.quantity == "acceleration" for sensor in sensors):
+        if not any(sensor.has_feedthrough for sensor in sensors):
             return signals
         _, accelerations = contact_at(self.model, self.loads, time, state, command)
-        for i, sensor in enumerate(sensors):
-            if sensor.quantity == "acceleration":
-                shape = self.model.shapes(sensor.position, (0,))[0]
-                signals = signals.at[i].set(shape @ accelerations)
-        return signals
+        return sensor_rows(self.model, sensors).with_accelerations(signals, accelerations)
 
     def _controller_step(self, controller_memory, readings, state, command, time):
         """The controller's step in every lane."""

@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.model.measurement import quantity_history, sensor_readings
+from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modes import Modes
+from jaxbeam.model.output_rows import quantity_history
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -176,7 +177,7 @@ class Record(eqx.Module):
         variables |= {
             f"mode_{name}": (
                 dims,
-                np.asarray(getattr(self.modes, name)),
+                np.asarray(getattr(self.modes, _MODE_FIELDS.get(name, name))),
                 {"units": unit, "long_name": words},
             )
             for name, (dims, unit, words) in _MODE_VARIABLES.items()
@@ -235,6 +236,7 @@ _MODE_VARIABLES = {
     "series": (("segment", "degree", "mode"), "kg^-0.5", "Chebyshev series of the mode shapes"),
     "unit": ((), "1/s^2", "flexural rigidity / (mass per length x length^4)"),
 }
+_MODE_FIELDS = {"unit": "stiffness_unit"}  # fields of `Modes` by the names in files, where they differ
 _STORED_VARIABLES = [name for name in _VARIABLES if name in Record.__annotations__]
 
 
@@ -270,7 +272,10 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
     return Record(
         case=case,
         modes=Modes(
-            **{name: jnp.asarray(dataset[label].values) for name, label in mode_variables.items()}
+            **{
+                _MODE_FIELDS.get(name, name): jnp.asarray(dataset[label].values)
+                for name, label in mode_variables.items()
+            }
         ),
         times=jnp.asarray(dataset["time"].values),
         error_estimate=jnp.asarray(float(dataset.attrs["error_estimate"])),

@@ -9,7 +9,7 @@ import xarray
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.case.sensors import QUANTITIES
+from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.simulation.record import record_from_xarray
 
 CASE = jb.Case(
@@ -40,8 +40,10 @@ def test_arrays_have_the_promised_shapes(record):
     assert record.times.shape == (101,)
     assert_allclose(record.times, np.arange(101) / 250.0)
     assert record.coordinates.shape == record.rates.shape == (101, 3)
-    for quantity in (*QUANTITIES, "measured"):
+    for quantity in ("deflection", "velocity", "acceleration", "slope", "strain", "measured"):
         assert getattr(record, quantity).shape == (101, 5)
+    for quantity in QUANTITIES:
+        assert record.at(CASE.sensor_positions, quantity, 0.002).shape == (101, 5)
     assert record.contact_force.shape == record.load_position.shape == (101, 2)
     assert record.peak_deflection.shape == record.peak_time.shape == (5,)
 
