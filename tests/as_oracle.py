@@ -1,13 +1,15 @@
-"""A case in the words of the independent finite-element oracle."""
+"""Cases as models of the independent finite-element oracle."""
 
 from jaxbeam.case.case import Case
 from tests.oracles import finite_elements
 
 
 def as_oracle(case: Case, elements: int = 40) -> finite_elements.Beam:
-    """The beam of a case with its supports, bonded patches and suspensions, loads left out."""
-    bonded = [b for b in (actuator.bonded() for actuator in case.actuators) if b is not None]
-    hung = [(a.stroke(), a.attachment()) for a in case.actuators]
+    """Finite-element beam of a case with supports, patches and suspensions, without loads."""
+    bonded = [
+        b for b in (actuator.section_stiffening() for actuator in case.actuators) if b is not None
+    ]
+    hung = [(a.displacement_map(), a.attachment()) for a in case.actuators]
     supports = [
         finite_elements.Support(
             float(s.position),
@@ -19,12 +21,14 @@ def as_oracle(case: Case, elements: int = 40) -> finite_elements.Beam:
     ]
     return finite_elements.Beam(
         float(case.beam.length),
-        float(case.beam.rigidity),
+        float(case.beam.bending_stiffness),
         float(case.beam.linear_density),
         case.beam.ends,
         supports,
         [
-            finite_elements.Patch(float(b.start), float(b.end), float(b.rigidity), float(b.mass))
+            finite_elements.Patch(
+                float(b.start), float(b.end), float(b.bending_stiffness), float(b.mass_per_length)
+            )
             for b in bonded
         ],
         [

@@ -1,4 +1,4 @@
-"""Runs with the loads of an oracle, in time steps that are given."""
+"""Runs with the loads of an oracle and prescribed time steps."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from tests.oracles.loads import Load
 
 
 def load_of(load: Load):
-    """The load of an oracle's load."""
+    """Load of a case from that of an oracle."""
     kind = {"mass": jb.MovingMass, "force": jb.MovingForce}[load.kind]
     return kind(
         mass=load.mass,
@@ -22,12 +22,12 @@ def load_of(load: Load):
 
 
 def plan_of(
-    case: jb.Case, substeps: int = 12, even: bool = True, slots: int | None = None
+    case: jb.Case, substeps: int = 12, even: bool = True, max_loads: int | None = None
 ) -> IntegrationPlan:
-    """A plan with a given number of steps a sample, which spares the search for it."""
-    shape = static_shapes(case)
-    shape = dataclasses.replace(shape, max_loads=slots or shape.max_loads)
-    return IntegrationPlan(shape, substeps, lead_samples=0, equally_spaced=even, error=0.0)
+    """Integration plan with a given number of steps between samples, without a trial run."""
+    shapes = static_shapes(case)
+    shapes = dataclasses.replace(shapes, max_loads=max_loads or shapes.max_loads)
+    return IntegrationPlan(shapes, substeps, lead_samples=0, equally_spaced=even, error=0.0)
 
 
 def assert_close(found, expected, tolerance: float) -> None:

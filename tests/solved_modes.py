@@ -1,15 +1,15 @@
-"""Beams whose modes are tested, and their modes, compiled as a whole."""
+"""Beams whose modes are tested, and their modes by one compiled program."""
 
 import equinox as eqx
 import numpy as np
 
 from jaxbeam.case.actuators import Patch
-from jaxbeam.case.beam import ENDS, Beam, Support
+from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case
-from jaxbeam.model.modes import Modes, lay_out, modes
+from jaxbeam.model.modes import Modes, mesh_layout, modes
 
-STUFF = {"flexural_rigidity": 11.68, "mass_per_length": 0.535}
-PAIRS = [f"{left}-{right}" for left in ENDS for right in ENDS]
+PROPERTIES = {"flexural_rigidity": 11.68, "mass_per_length": 0.535}
+PAIRS = [f"{left}-{right}" for left in END_CONDITIONS for right in END_CONDITIONS]
 PATCHED = Case(
     Beam(1.3, 2.0, 0.7, ends="guided-free", modes=8),
     [Support(0.3, 500.0, 0.4, 3.0), Support(0.91), Support(1.25, 20.0)],
@@ -26,8 +26,8 @@ def _modes(case, layout):
 
 
 def solve(case: Case) -> Modes:
-    """Compiled as a whole, which is faster than step by step."""
-    return _modes(case, lay_out(case))
+    """Modes of a case by one compiled program, faster than operation by operation."""
+    return _modes(case, mesh_layout(case))
 
 
 def parameters(case: Case, span: float) -> np.ndarray:
@@ -35,6 +35,8 @@ def parameters(case: Case, span: float) -> np.ndarray:
     return (0.535 / 11.68 * np.asarray(solve(case).stiffness)) ** 0.25 * span
 
 
-def held(stiffness, turn=0.0) -> Case:
-    """A pinned beam with one support of given springs."""
-    return Case(Beam(1.2, **STUFF, modes=12), [Support(0.5, stiffness, 0.0, turn)])
+def supported_beam(stiffness, rotational_stiffness=0.0) -> Case:
+    """Pinned beam on one support with a spring (N/m) and a rotational spring (N m/rad)."""
+    return Case(
+        Beam(1.2, **PROPERTIES, modes=12), [Support(0.5, stiffness, 0.0, rotational_stiffness)]
+    )

@@ -1,1 +1,1 @@
-"""The beam as equations: modes, modal model, contact law, state space, statics, frequency responses."""
+"""Model: modes, modal model, contact law, output rows, state space, statics, frequency response."""

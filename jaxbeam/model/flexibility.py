@@ -1,9 +1,9 @@
-"""Flexibility of the beam on its supports and suspensions, exact: no modes here.
+"""Static Green's function of the beam on its supports and suspensions, exact and without modes.
 
 Between the nodes of the layout the beam is uniform, so Hermite cubics are exact: a unit force at
-y acts on the nodes through their values at y (consistent nodal loads), and the segment it stands
-on bends in addition like a beam clamped at both ends. Suspensions of actuators are springs
-anywhere on the beam, solved for together with the nodes.
+y acts on the nodes through the cubics' values at y (consistent nodal loads), and its segment bends
+in addition like a beam clamped at both ends. Suspensions of actuators are springs anywhere on the
+beam, solved for together with the nodes.
 """
 
 import dataclasses
@@ -19,29 +19,31 @@ from jaxbeam.model.modes import Layout, assemble_matrices, section_properties, s
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.runtime.compiling import compiled
 
-MIN_RIGID_BODY_STIFFNESS = (
-    1e-10  # stiffness against rigid-body motion in E I / L^3: less is an unstable beam
-)
+# Least stiffness against rigid-body motion of a statically supported beam, in E I / L^3.
+MIN_RIGID_BODY_STIFFNESS = 1e-10
 
 
 class FlexibilityPoints(eqx.Module):
-    """Unit forces, or x-derivatives of them: positions (in L), each with its own derivative."""
+    """Points of unit forces (derivative 0) or unit couples (1) on the beam; positions in L.
+
+    A derivative d stands for the d-th x-derivative of a unit force, up to 3.
+    """
 
     positions: Float[Array, " point"]
     derivatives: tuple[int, ...] = eqx.field(static=True)
 
     def by_derivative(self) -> list[tuple[int, np.ndarray]]:
-        """Derivatives that occur, each with the indices of its points."""
+        """Pairs of a derivative that occurs and the indices of its points."""
         orders = np.array(self.derivatives, int)
         return [(int(order), np.flatnonzero(orders == order)) for order in np.unique(orders)]
 
 
 class Flexibility(eqx.Module):
-    """Deflections of the beam under given sources, prepared for any y.
+    """Deflections of the beam under unit sources, to be evaluated at any position y.
 
-    All in beam units: lengths in L, stiffness in E I / L^3. `series` are the cubics between the
-    nodes, one column a source; `sources` those at which segments bend between their nodes, and
-    `source_weights` how much of each point a source brings.
+    In beam units: lengths in L, stiffness in E I / L^3. `series` holds the cubics between the
+    nodes, one column a source; `sources` the points (unit sources, then suspensions) that bend
+    their segments between the nodes, and `source_weights` the force at each point per source.
     """
 
     nodes: Float[Array, " node"]
@@ -51,9 +53,9 @@ class Flexibility(eqx.Module):
     source_weights: Float[Array, "point source"]
 
     def __call__(
-        self, y: Float[Array, "*place"], derivative: int = 0
-    ) -> Float[Array, "*place source"]:
-        """Deflection at positions y under each source, or its derivative by y."""
+        self, y: Float[Array, "*position"], derivative: int = 0
+    ) -> Float[Array, "*position source"]:
+        """Deflection at positions y (in L) under each source, or a derivative of it by y."""
         segment_bending = _segment_bending(self.nodes, self.rigidity, y, derivative, self.sources)
         nodal = piecewise_chebyshev(self.nodes, self.series, y, (derivative,))[0]
         return nodal + segment_bending @ self.source_weights
@@ -65,19 +67,19 @@ def _factorial_power(x, exponent: int):
 
 
 def _macaulay(x, exponent: int):
-    """<x>^n / n! of Macaulay's method: nothing up to x = 0."""
+    """<x>^n / n! of Macaulay's method: zero up to x = 0."""
     return jnp.where(x > 0, _factorial_power(x, exponent), 0.0)
 
 
-def _cantilever_flexibility(nodes, rigidity, x, x_derivative: int, y, y_derivative: int):
-    """Bending between clamped nodes: order-th x- and derivative-th y-derivative.
+def _clamped_segment_bending(nodes, rigidity, x, x_derivative: int, y, y_derivative: int):
+    """Green's function of a segment clamped at both nodes, or derivatives of it by x and y.
 
-    Green's function of a clamped segment, E I w'''' = delta(x - y): Macaulay's cubic, less the
-    two Hermite cubics that take out its deflection and slope at the right node.
+    Solution of E I w'''' = delta(x - y): Macaulay's cubic less the two Hermite cubics with its
+    deflection and slope at the right node; zero where x and y are in different segments.
     """
     inner_nodes = nodes[1:-1]
     segment_of_x, segment_of_y = (
-        jnp.sum(place[..., None] >= inner_nodes, axis=-1) for place in (x, y)
+        jnp.sum(position[..., None] >= inner_nodes, axis=-1) for position in (x, y)
     )
     left, right = nodes[segment_of_y], nodes[segment_of_y + 1]
     length, s, y_to_right = right - left, x - left, right - y
@@ -96,11 +98,11 @@ def _cantilever_flexibility(nodes, rigidity, x, x_derivative: int, y, y_derivati
 
 def _segment_bending(
     nodes, rigidity, x, x_derivative: int, sources: FlexibilityPoints
-) -> Float[Array, "*place point"]:
-    """What each point bends its own segment at positions x, or an x-derivative of it."""
+) -> Float[Array, "*position point"]:
+    """Bending of the segment of each point at positions x, or its x-derivative."""
     total = jnp.zeros((*x.shape, len(sources.derivatives)))
     for derivative, index in sources.by_derivative():
-        part = _cantilever_flexibility(
+        part = _clamped_segment_bending(
             nodes, rigidity, x[..., None], x_derivative, sources.positions[index], derivative
         )
         total = total.at[..., index].set(part)
@@ -108,12 +110,12 @@ def _segment_bending(
 
 
 def flexibility(
-    case: Case, layout: Layout, x: Float[Array, " place"], x_derivative: int
+    case: Case, layout: Layout, x: Float[Array, " position"], x_derivative: int
 ) -> Flexibility:
-    """Prepare unit forces at positions x (m); with an order, its derivatives by x.
+    """Flexibility for unit forces at positions x (m), or for their x-derivatives.
 
-    With K the stiffness of nodes, f the forces of suspensions of stiffness k and B their rows:
-    K u - B' f = load,  f = -k (B u + (what the segment under the stroke bends)).
+    With nodal stiffness K, forces f of suspensions of stiffness k and their rows B:
+    K u - B' f = load,  f = -k (B u + bending of the segment under the suspension).
     """
     length = case.beam.length
     nodes, stiffness, _, to_series = assemble_matrices(case, _cubic_layout(layout))
@@ -122,20 +124,22 @@ def flexibility(
     )
 
     def nodal_forces(sources):
-        """Rows (point, unknown) of nodal forces."""
+        """Consistent nodal forces (point, unknown) of unit sources."""
         rows = jnp.zeros((len(sources.derivatives), stiffness.shape[0]))
-        for derivative, index in sources.groups():
+        for derivative, index in sources.by_derivative():
             shape_values = piecewise_chebyshev(
-                nodes, to_series, sources.places[index], (derivative,)
+                nodes, to_series, sources.positions[index], (derivative,)
             )[0]
             rows = rows.at[index].set(shape_values)
         return rows
 
     def bending_between(observed, sources):
-        """Matrix (point, point) of bending within segments, at some points due to others."""
+        """Bending within segments (point, point) at observed points due to sources."""
         matrix = jnp.zeros((len(observed.derivatives), len(sources.derivatives)))
-        for derivative, index in observed.groups():
-            there = _segment_bending(nodes, rigidity, observed.places[index], derivative, sources)
+        for derivative, index in observed.by_derivative():
+            there = _segment_bending(
+                nodes, rigidity, observed.positions[index], derivative, sources
+            )
             matrix = matrix.at[index].set(there)
         return matrix
 
@@ -171,15 +175,15 @@ def flexibility(
 
 
 def _suspensions(case: Case):
-    """Where actuators hold the beam: points, their factors (actuator, point), and stiffness.
+    """Points of the actuators' suspensions, factors (actuator, point), and stiffness (actuator, 1).
 
-    In beam units, in which a stroke of derivative d counts L^-d deflections.
+    In beam units; a term of derivative d of a displacement map has the factor L^-d.
     """
     length = case.beam.length
     displacements = [actuator.displacement_map() for actuator in case.actuators]
     terms = [(i, *term) for i, stroke in enumerate(displacements) for term in stroke]
     points = FlexibilityPoints(
-        jnp.array([place for _, place, _, _ in terms]).reshape(-1) / length,
+        jnp.array([position for _, position, _, _ in terms]).reshape(-1) / length,
         tuple(derivative for _, _, derivative, _ in terms),
     )
     factors = jnp.zeros((len(displacements), len(terms)))
@@ -193,16 +197,16 @@ def _cubic_layout(layout: Layout) -> Layout:
     return dataclasses.replace(layout, degrees=(3,) * len(layout.degrees))
 
 
-@compiled  # step by step, the many small programs take seconds to compile
+@compiled  # operation by operation, compiling takes seconds
 def _support_conditions(case: Case, layout: Layout):
-    """Nodes, and what `_suspensions` returns."""
+    """Node positions (in L), and points, factors and stiffness of the suspensions."""
     return assemble_matrices(case, _cubic_layout(layout))[0], *_suspensions(case)
 
 
 def check_supported(case: Case, layout: Layout) -> None:
-    """Refuse a beam that can move rigidly, w = a + b x, because nothing resists the motion.
+    """Check that supports, ends or suspensions resist every rigid-body motion w = a + b x.
 
-    Raises ValueError.
+    Raises ValueError for a beam that can move as a rigid body.
     """
     length, unit = case.beam.length, case.beam.length**3 / case.beam.bending_stiffness
     nodes, suspension_points, factors, suspension_stiffness = _support_conditions(case, layout)

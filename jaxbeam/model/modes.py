@@ -1,9 +1,9 @@
 """Natural frequencies and mass-normalised mode shapes of a supported beam.
 
-One mechanism serves every end condition, any number of spans, rigid and elastic supports and
-bonded patches: a Ritz expansion in smooth polynomials of high degree, one series for each
-segment between supports and patch edges, joined with continuous deflection and slope. It
-converges faster than any power of the degree, so frequencies are right to about 1e-11. Rigid
+One method serves every end condition, any number of spans, rigid and elastic supports and bonded
+patches: a Ritz expansion in polynomials of high degree, one series for each segment between
+supports and patch edges, with continuous deflection and slope. It converges faster than any power
+of the degree; frequencies have a relative error of about 1e-11. Rigid
 supports remove a degree of freedom instead of adding a penalty, and springs of any stiffness
 enter through a Cholesky factor, so neither costs accuracy. The problem is solved in beam units
 (length L, mass m L, stiffness E I / L^3), so beams that differ only in those share one solution.
@@ -19,27 +19,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.polynomial import legendre
 
+from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
 
 NODE_TOLERANCE = 1e-9  # of the length: closer nodes are one node
-END_CONDITIONS = {  # deflection, rotation
-    "pinned": (True, False),
-    "clamped": (True, True),
-    "free": (False, False),
-    "guided": (False, True),
-}
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What is where along the beam, as order and incidence only: no numbers, hence static.
+    """Nodes, segments and end conditions along the beam: order and incidence, hence static.
 
-    `nodes[i]` lists what sits at node i, as indices into `_places(case)`; `held[i]` says whether
-    its deflection and rotation are held; segment i runs from node i to i + 1, carries the patches
-    `bonded[i]` (indices of actuators) and a polynomial of degree `degrees[i]`.
+    `nodes[i]` lists the parts at node i, as indices into `_node_positions(case)`; `constrained[i]`
+    says whether its deflection and rotation are zero; segment i, from node i to i + 1, carries the
+    patches `patches[i]` (indices of actuators) and a polynomial of degree `degrees[i]`.
     """
 
     nodes: tuple[tuple[int, ...], ...]
@@ -49,7 +44,7 @@ class Layout:
 
 
 def _node_positions(case: Case) -> list:
-    """Positions (m) where segments may end: both ends, every support, both edges of patches."""
+    """Positions (m) of possible nodes: both ends, every support, both edges of every patch."""
     patch_ends = [
         edge for _, patch in _stiffened_sections(case) for edge in (patch.start, patch.end)
     ]
@@ -57,22 +52,22 @@ def _node_positions(case: Case) -> list:
 
 
 def _stiffened_sections(case: Case) -> list:
-    """What the actuators add to the section of the beam, with the index of the actuator."""
+    """Index of each actuator that stiffens the section of the beam, and its stiffening."""
     pairs = ((i, actuator.section_stiffening()) for i, actuator in enumerate(case.actuators))
     return [(i, bonded) for i, bonded in pairs if bonded is not None]
 
 
 def mesh_layout(case: Case) -> Layout:
-    """Order the places along the beam, from the numbers known now (not inside `jit`)."""
+    """Layout of nodes and segments of a case; its numbers must be concrete (not inside `jit`)."""
     length = float(concrete(case.beam.length))
-    positions = np.array([float(concrete(place)) / length for place in _node_positions(case)])
+    positions = np.array([float(concrete(x)) / length for x in _node_positions(case)])
     nodes: list[list[int]] = []
     for index in np.argsort(positions, kind="stable"):
         if nodes and positions[index] - positions[nodes[-1][0]] < NODE_TOLERANCE:
             nodes[-1].append(int(index))
         else:
             nodes.append([int(index)])
-    # An end stays exactly where it is, whatever else sits there.
+    # The lowest index comes first: an end keeps its exact position where a support sits on it.
     nodes = [sorted(node) for node in nodes]
 
     def node_conditions(node):
@@ -101,7 +96,7 @@ def mesh_layout(case: Case) -> Layout:
 
 @functools.cache
 def _reference_element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Basis on t in [-1, 1] as Chebyshev series, with its mass and bending matrices.
+    """Basis on t in [-1, 1] as Chebyshev series (degree, function), its mass and bending matrices.
 
     The four Hermite cubics (deflection and slope at both ends), then functions that vanish with
     their slope at both ends: Legendre polynomials integrated twice, orthonormal in bending.
@@ -124,8 +119,9 @@ class Modes(eqx.Module):
     """Modes of the supported beam: q_j'' + damping_j q_j' + stiffness_j q_j = psi_j(x) . force.
 
     `coupling` is the off-diagonal stiffness between repeated modes, zero in value but not in
-    derivative (see `eigen`). `stiffness_unit` is E I / (m L^4), in which stiffness is of order one for the
-    lowest mode. Shapes are mass-normalised, in kg^-1/2, positive near the left end.
+    derivative (see `eigen`). Stiffness is of order one for the lowest mode in the
+    `stiffness_unit` E I / (m L^4). Shapes are mass-normalised, in kg^-1/2, positive near the left
+    end; `series` are their Chebyshev series between the `nodes` (m).
     """
 
     stiffness: Float[Array, " mode"]
@@ -137,7 +133,7 @@ class Modes(eqx.Module):
     stiffness_unit: Float[Array, ""]
 
     def lowest(self, count: int) -> "Modes":
-        """The lowest modes alone."""
+        """The lowest modes, as many as `count`."""
         selection = slice(0, count)
         return Modes(
             stiffness=self.stiffness[selection],
@@ -175,17 +171,17 @@ class Modes(eqx.Module):
             elastic, self.damping / (2 * jnp.where(elastic, _safe_sqrt(self.stiffness), 1)), 0
         )
 
-    def shapes(self, x, derivative: int = 0) -> Float[Array, "*place mode"]:
-        """Mode shapes, or their derivatives up to the third, at positions x (m) of any shape.
+    def shapes(self, x, derivative: int = 0) -> Float[Array, "*position mode"]:
+        """Mode shapes, or their x-derivatives up to the third, at positions x (m) of any shape.
 
-        In kg^-1/2 m^-derivative. Positions off the beam continue the nearest segment's polynomial.
+        In kg^-1/2 m^-derivative; off the beam, by the polynomial of the nearest segment.
         """
         return self.shape_derivatives(x, (derivative,))[0]
 
     def shape_derivatives(
         self, x, derivatives: tuple[int, ...]
-    ) -> Float[Array, "order *place mode"]:
-        """Several derivatives of the mode shapes at once, which costs little more than one."""
+    ) -> Float[Array, "order *position mode"]:
+        """Several x-derivatives of the mode shapes at once; the cost is little more than of one."""
         return piecewise_chebyshev(self.nodes, self.series, x, derivatives)
 
 
@@ -196,12 +192,12 @@ def _safe_sqrt(square):
 
 @jax.named_scope("modes")
 def modes(case: Case, layout: Layout | None = None) -> Modes:
-    """Find the lowest `case.beam.modes` natural modes of the beam on its supports.
+    """Lowest `case.beam.modes` natural modes of the beam on its supports.
 
     Euler-Bernoulli beam, E I w'''' + m w_tt = 0, with supports, rotational springs and bonded
-    patches; actuators' suspensions and support dampers act on these modes later. Differentiable
-    in every number, at repeated frequencies too. Inside `jit`, give the `layout` found outside by
-    `lay_out(case)`.
+    patches; suspensions of actuators and support dampers are left to the modal model.
+    Differentiable in every number, at repeated frequencies too. Inside `jit`, pass the `layout`
+    found outside by `mesh_layout(case)`.
     """
     layout = mesh_layout(case) if layout is None else layout
     beam = case.beam
@@ -218,7 +214,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
 
 
 def normalised_modes(beam, values, coupling, nodes, series) -> Modes:
-    """Modes of given stiffness (1/s^2), damped as the beam says, positive near the left end."""
+    """Modes of given stiffness (1/s^2) with the beam's damping, positive near the left end."""
     damping, damping_coupling = _damping(beam, values, coupling)
     left_values = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
     signs = jax.lax.stop_gradient(jnp.where(left_values < 0, -1.0, 1.0))
@@ -240,9 +236,12 @@ def _stiffness_unit(beam):
 
 
 def assemble_matrices(case: Case, layout: Layout):
-    """Nodes, stiffness and mass in beam units, and the map from unknowns to Chebyshev series."""
+    """Nodes, stiffness and mass matrices in beam units, and Chebyshev series of the unknowns.
+
+    The series have the shape (segment, degree, unknown).
+    """
     beam, degrees = case.beam, layout.degrees
-    positions = jnp.stack([place / beam.length for place in _node_positions(case)])
+    positions = jnp.stack([x / beam.length for x in _node_positions(case)])
     nodes = positions[np.array([node[0] for node in layout.nodes])]
     nodal_unknowns = [[-1, -1] for _ in layout.nodes]
     size = 0
@@ -290,7 +289,7 @@ def assemble_matrices(case: Case, layout: Layout):
 
 
 def section_properties(case: Case, layout: Layout, segment: int):
-    """Bending stiffness and mass per length of a segment, in those of the beam without patches."""
+    """Bending stiffness and mass per length of a segment, relative to the beam without patches."""
     rigidity, density = jnp.ones(()), jnp.ones(())
     for actuator in layout.patches[segment]:
         patch = case.actuators[actuator].section_stiffening()
@@ -300,7 +299,7 @@ def section_properties(case: Case, layout: Layout, segment: int):
 
 
 def supported_matrices(case: Case, layout: Layout):
-    """Every support with its node."""
+    """Pairs of a support and the index of its node."""
     for i, node in enumerate(layout.nodes):
         for index in node:
             if 2 <= index < 2 + len(case.supports):
@@ -308,10 +307,10 @@ def supported_matrices(case: Case, layout: Layout):
 
 
 def _damping(beam, values, coupling):
-    """Modal damping (1/s), and what goes with the coupling of repeated modes.
+    """Modal damping (1/s), and damping between repeated modes (mode, mode).
 
-    Rayleigh, a + b K; or one ratio each, D = 2 zeta sqrt(K), whose derivative between repeated
-    modes is that of the matrix square root.
+    Rayleigh damping, a + b K; or modal ratios, D = 2 zeta sqrt(K), whose derivative between
+    repeated modes is that of the matrix square root.
     """
     if beam.rayleigh_damping is not None:
         mass_factor, stiffness_factor = beam.rayleigh_damping

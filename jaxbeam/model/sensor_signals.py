@@ -1,9 +1,8 @@
-"""How a sensor turns what the beam does into what it reads.
+"""Sensor model: from the true value of a quantity to the readings of a sensor.
 
-In this order: an analogue filter smooths the signal; it is sampled, `delay` after the fact; offset
-and noise are added; the reading is clipped to the range and rounded to the resolution; a digital
-filter takes the samples. The signal, its clock and the analogue filter are continuous and belong
-to the plant: `filtered_reading` is what happens at one sample, `sampled_readings` all of it for a whole history.
+In this order: analogue filter; sampling of the signal `delay` before; offset and noise; range and
+resolution; digital filter of the samples. `filtered_reading` makes a single reading from a sampled
+value; `sampled_readings` makes all readings of a history, with analogue filter, delay and clock.
 """
 
 from typing import Any
@@ -20,54 +19,52 @@ from jaxbeam.case.filters import (
     analogue_steady_state,
     filter_history,
     filter_step,
-    second_order_sections as filter_sections,
-    steady_filter_state as filter_initial,
+    second_order_sections,
+    steady_filter_state,
 )
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
 
-CLOCK_TOLERANCE_PERIODS = (
-    1e-6  # of a period: a sample this much before a tick of the clock is at the tick
-)
+CLOCK_TOLERANCE_PERIODS = 1e-6  # a time this much before a sampling instant counts as at it
 
 Sections = Float[Array, "section 6 ..."] | None  # None: no digital filter
-FilterState = Float[Array, "section 2 *lane"] | None
+FilterState = Float[Array, "section 2 *batch"] | None
 
 
 def sensor_sections(sensor: Sensor, period: Float[Array, ""] | float) -> Sections:
-    """Sections of the sensor's digital filter, None if it has none.
+    """Second-order sections of the sensor's digital filter, None if it has none.
 
-    They are for its own sampling period if it has one, else for the given one (s). Raises
+    Designed for the sensor's own sampling period, or for `period` (s) if it has none. Raises
     ValueError if the filter's cutoff is not below half the sampling frequency.
     """
     if sensor.filter is None or sensor.filter.realisation != "digital":
         return None
     own = sensor.sampling_period
-    return filter_sections(sensor.filter, period if own is None else own)
+    return second_order_sections(sensor.filter, period if own is None else own)
 
 
 def initial_filter_state(sensor: Sensor, sections: Sections, value) -> FilterState:
-    """Memory of a sensor that has long seen a constant value (SI unit of its quantity)."""
-    return None if sections is None else filter_initial(sections, to_reading(sensor, value))
+    """State of the digital filter at rest under a constant true value (SI unit of the quantity)."""
+    return None if sections is None else steady_filter_state(sections, to_reading(sensor, value))
 
 
 def filtered_reading(
     sensor: Sensor, sections: Sections, filter_state: FilterState, value, noise=None
-) -> tuple[Float[Array, " *lane"], FilterState]:
-    """One reading of a true value (both in the SI unit of the quantity), and the memory after it.
+) -> tuple[Float[Array, " *batch"], FilterState]:
+    """Reading of a true value (both in the SI unit of the quantity), and the filter state after it.
 
-    `noise` is a standard normal sample (see `noise_samples`), None for no noise. Values may have
-    lanes, which share the sensor or have numbers of their own in it along their last axis.
+    `noise` is a standard normal sample (see `noise_samples`), None for no noise. Values may have a
+    batch axis, along which the numbers of the sensor are shared or differ.
     """
     reading = to_reading(sensor, value, noise)
     return (reading, None) if sections is None else filter_step(sections, filter_state, reading)
 
 
 def to_reading(sensor: Sensor, value, noise=None) -> Float[Array, "..."]:
-    """The reading before the digital filter: offset, noise, range and resolution.
+    """Reading before the digital filter: offset, noise, range and resolution applied to the value.
 
-    Clipped readings have no derivative. Rounding is passed over by derivatives, which are those
-    of the unrounded reading (straight through): its own are zero and say nothing.
+    Derivatives are zero where the range clips; through rounding they are those of the unrounded
+    reading (straight-through estimator), since those of the rounded one are zero.
     """
     reading = value + sensor.offset
     if sensor.noise is not None and noise is not None:
@@ -81,14 +78,14 @@ def to_reading(sensor: Sensor, value, noise=None) -> Float[Array, "..."]:
 
 
 def noise_samples(seed: int, sensors: int, samples: int) -> Float[Array, "sample sensor"]:
-    """Standard normal samples, one for each reading; the same for the same seed and sensor."""
+    """Standard normal samples, one a reading; a sensor's depend on the seed and its index only."""
     keys = [jax.random.fold_in(jax.random.key(seed), sensor) for sensor in range(sensors)]
     columns = [jax.random.normal(key, (samples,)) for key in keys]
     return jnp.array(columns).reshape(sensors, samples).T
 
 
 def needs_times(sensor: Sensor) -> bool:
-    """Tell whether readings depend on more than the true value at the same time."""
+    """Whether readings depend on more than the simultaneous true value, hence on the times."""
     return not (sensor.filter is None and sensor.sampling_period is None and sensor.delay is None)
 
 
@@ -99,16 +96,15 @@ def sampled_readings(
     rates: Float[Array, " time"] | None,
     noise: Float[Array, " time"] | None = None,
 ) -> Float[Array, " time"]:
-    """What a sensor shows at ascending times (s) when it sees these true values and rates.
+    """Latest reading of a sensor at ascending times (s), from the true values and their rates.
 
-    Between the times the signal is the cubic through values and rates, straight lines where no
-    rates are given; before the first time it rests at the first value. The sensor reads at the
-    first time and at every sampling period from there, at each of the times if it has none, and
-    shows its latest reading; `noise` holds a standard normal sample for each reading.
+    Between the times the signal is the cubic Hermite interpolant of values and rates, linear
+    without rates; before the first time it is constant. The sensor is sampled at the first time
+    and every sampling period after it, or at each of the times if it has none; `noise` holds a
+    standard normal sample for each reading.
 
-    Raises ValueError if a filter needs times at equal spacing, which these are not; if a digital
-    filter would need readings between the times; if its cutoff is not below half the sampling
-    frequency.
+    Raises ValueError if a filter needs equally spaced times and these are not; if a digital filter
+    would need readings between the times; if its cutoff is not below half the sampling frequency.
     """
     _check_times(sensor, times)
     spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
@@ -136,7 +132,7 @@ def sampled_readings(
 
 
 def _apply_filter(filter: Filter, times, spacing, values, rates):
-    """Output of an analogue filter and its rate, at equally spaced times."""
+    """Output of an analogue filter and its rate at equally spaced times, exact for cubics."""
     matrix, column, row, _ = analogue_state_space(filter)
     transition, input_matrix = c2d(matrix, column[:, None], spacing, degree=3)
     forced_response = hermite_cubics(times, values, rates) @ input_matrix[..., 0]
@@ -169,6 +165,7 @@ def _check_times(sensor: Sensor, times) -> None:
         max_spacing = float(np.max(steps))
         if float(concrete(sampling_period)) < (1 - CLOCK_TOLERANCE_PERIODS) * max_spacing:
             raise ValueError(
-                f"its filter takes a reading every {float(concrete(sampling_period)):g} s, but samples of the run"
-                f" are {max_spacing:g} s apart: save samples as often (run.sample_rate)"
+                f"its filter takes a reading every {float(concrete(sampling_period)):g} s, but"
+                f" samples of the run are {max_spacing:g} s apart: save samples as often"
+                " (run.sample_rate)"
             )

@@ -1,5 +1,5 @@
-"""Exact static solutions: deflections, influence lines, lifts of actuators, and peaks while loads
-travel slowly. No modes here; see `flexibility`.
+"""Exact static solutions without modes: deflections, influence lines, static gains of actuators,
+and peaks of a slow crossing (see `flexibility`).
 """
 
 import jax
@@ -18,7 +18,8 @@ from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.numerics.peak_search import refine_peak
 from jaxbeam.runtime.compiling import compiled
 
-# On a stretch of a crossing: a cubic of a cubic is known exactly by ten.
+# Positions on an interval between events that determine the deflection exactly there: ten for a
+# cubic (flexibility) of a cubic (trajectory), a polynomial of degree nine.
 PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 10))
 
 
@@ -35,17 +36,22 @@ def _influence_line(case: Case, layout: Layout, x, load_positions, derivative: i
 def influence_line(
     case: Case, x, load_positions, derivative: int = 0, layout: Layout | None = None
 ) -> Float[Array, "..."]:
-    """Static deflection at x per newton that presses at each position, in m/N.
+    """Influence line: static deflection at x under 1 N downwards at each load position, in m/N.
 
-    Exact for E I w'''' = p with the case's supports, bonded patches and suspensions, commands
-    zero. `x` and `load_positions` are in m from the left end and may have any shapes; the result is
-    (position..., place...). `derivative` (up to 3)
-    gives that x-derivative instead, in m^(1-derivative)/N. By reciprocity the line of deflections
-    is also the deflected shape under 1 N at x. Differentiable in every number. Inside `jit`, give
-    the `layout` found outside by `modes.lay_out(case)`.
+    Exact for E I w'''' = p with the case's supports, bonded patches and suspensions; commands are
+    zero. `x` and `load_positions` (m from the left end) may have any shapes; the result has the
+    shape (load position..., x...). `derivative` (up to 3) gives that x-derivative instead, in
+    m^(1-derivative)/N. By reciprocity the line is also the deflected shape under 1 N at x.
+    Differentiable in every number. Inside `jit`, pass the `layout` found outside by
+    `model.modes.mesh_layout(case)`.
 
-    Raises ValueError for a faulty case, a place off the beam, or a beam that can move as a rigid
-    body.
+    Raises ValueError for an invalid case, a position off the beam, or a beam that can move as a
+    rigid body.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Case(jb.Beam(length=2.0, flexural_rigidity=6.0, mass_per_length=1.0))
+    >>> print(f"{jb.influence_line(beam, x=1.0, load_positions=1.0):.6f}")  # -L^3 / (48 E I)
+    -0.027778
     """
     x, load_positions = jnp.asarray(x, float), jnp.asarray(load_positions, float)
     layout = _validated_layout(case, layout, x=x, positions=load_positions)
@@ -59,13 +65,18 @@ def static_deflection(
     forces=None,
     derivative: int = 0,
     layout: Layout | None = None,
-) -> Float[Array, "*place"]:
-    """Static deflection at x (m) under forces that stand on the beam, in m, positive upwards.
+) -> Float[Array, "*position"]:
+    """Static deflection at x (m) under stationary forces, in m, positive upwards.
 
-    `forces` (load,) are in N, positive downwards, at `load_positions` (load,) in m; without them,
-    each load of the case presses with its weight. The rest is as for `influence_line`.
+    `forces` (load,) are in N, positive downwards, at `load_positions` (load,) in m; by default the
+    weights of the loads of the case. `derivative` and `layout` are those of `influence_line`.
 
     Raises ValueError as `influence_line` does, and where forces and positions differ in number.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Case(jb.Beam(length=2.0, flexural_rigidity=6.0, mass_per_length=1.0))
+    >>> print(f"{jb.static_deflection(beam, 1.0, load_positions=[1.0], forces=[18.0]):.3f}")
+    -0.500
     """
     positions = jnp.atleast_1d(jnp.asarray(load_positions, float))
     if forces is None:
@@ -84,12 +95,12 @@ def static_deflection(
 
 def static_deflection_per_command(
     case: Case, x, derivative: int = 0, layout: Layout | None = None
-) -> Float[Array, "actuator *place"]:
+) -> Float[Array, "actuator *position"]:
     """Static deflection at x (m) per unit of each actuator's steady command, in m/V or m/N.
 
-    Exact, the loads of the case away; `derivative` (up to 3) gives that x-derivative instead. At
-    a point where it jumps, such as the curvature at the edge of a patch, it is that to the right.
-    Inside `jit`, give the `layout`. Raises ValueError as `influence_line` does.
+    Exact, without the loads of the case. `derivative` (up to 3) gives that x-derivative instead; at
+    a discontinuity, such as that of the curvature at the end of a patch, its value to the right.
+    Inside `jit`, pass the `layout`. Raises ValueError as `influence_line` does.
     """
     x = jnp.asarray(x, float)
     layout = _validated_layout(case, layout, x=x)
@@ -99,7 +110,7 @@ def static_deflection_per_command(
 @compiled
 def _deflection_per_command(case: Case, layout: Layout, x, derivative: int):
     length = case.beam.length
-    greens = flexibility(case, layout, x.reshape(-1), derivative)  # by reciprocity, forces at x
+    greens = flexibility(case, layout, x.reshape(-1), derivative)  # by reciprocity: forces at x
     gains = jnp.zeros((len(case.actuators), x.size))
     for i, actuator in enumerate(case.actuators):
         terms = actuator.displacement_map()
@@ -108,16 +119,16 @@ def _deflection_per_command(case: Case, layout: Layout, x, derivative: int):
     return (gains * length ** (3 - derivative) / case.beam.bending_stiffness).reshape(-1, *x.shape)
 
 
-def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*place"]:
-    """Largest absolute static deflection at x (m) while the case's loads travel, in m.
+def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*position"]:
+    """Largest absolute static deflection (m) at x (m) over the whole crossing of the case's loads.
 
-    At every instant the loads press with their weights where their motions put them, as if the
-    beam followed without inertia: loads of equal speed keep their distances, so with one load or
-    a stream of equal speed this is the limit of slow travel. All the way counts, from the first
-    entry to the last exit (or stop), however long the run. What dynamic amplification divides by.
+    At every instant the loads press with their weights at their positions, without inertia of loads
+    and beam: the denominator of the dynamic amplification, and for one load or loads of equal speed
+    the limit of a slow crossing. The crossing is that from the first entry to the last exit (or
+    stop), whatever the duration of the run.
 
     The maximum is exact: between the events of a crossing the deflection is a polynomial in time.
-    Differentiable in every number where one instant is the highest. Raises ValueError as
+    Differentiable in every number where the maximum is unique. Raises ValueError as
     `influence_line` does.
     """
     x = jnp.asarray(x, float)
@@ -158,7 +169,10 @@ def _static_peak(case: Case, layout: Layout, x):
 
 
 def _validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:
-    """The layout of a case that is fit for statics, as far as its numbers are known."""
+    """Layout of a case, after checks of its concrete numbers, positions and supports.
+
+    Raises ValueError as `influence_line` does.
+    """
     check_case(case)
     for name, position in positions.items():
         check_on_beam(name, position, case.beam.length)

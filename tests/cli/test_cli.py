@@ -8,11 +8,11 @@ import pytest
 
 
 def frequency(n: int, rigidity: float = 11.68) -> float:
-    """Natural frequency n of the pinned beam above, in Hz (n pi / L)^2 sqrt(E I / m) / 2 pi."""
+    """Natural frequency n (Hz) of the pinned beam, (n pi / L)^2 sqrt(E I / m) / 2 pi."""
     return (n * math.pi / 0.6) ** 2 * math.sqrt(rigidity / 0.535) / (2 * math.pi)
 
 
-# Refusals that need no engine
+# Command lines refused before any computation
 
 REFUSED = [
     ("simulat case.toml", 'Unknown command "simulat". Did you mean "simulate"?'),
@@ -45,7 +45,7 @@ REFUSED = [
     ("frf case.toml --pair force@0.3:sensors.2", "'sensors.2' does not exist; the case has 2"),
     ("frf case.toml --mass-at 0.3", "--mass-at takes POSITION=MASS in m and kg, such as 0.3=0.5"),
     ("frf case.toml --mass-at 0.3=a", "--mass-at 0.3=a: 'a' is not a number"),
-    ("frf case.toml --mass-at 0.7=0.5", "the place of a parked mass must lie on the beam"),
+    ("frf case.toml --mass-at 0.7=0.5", "the position of a stationary mass must lie on the beam"),
     ("frf case.toml -o out.png", "a frequency response is written to a .nc file; call it out.nc"),
     ("identify", "identify needs at least one log: jaxbeam identify [CASE.toml] LOG..."),
     ("identify case.toml", "identify needs at least one log"),
@@ -59,7 +59,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("line", "message"), REFUSED)
-def test_wrong_lines_end_in_one_sentence(folder, refused, line, message):
+def test_wrong_command_lines_are_refused(folder, refused, line, message):
     (folder / "old.nc").touch()
     assert message in refused(line)
 
@@ -101,7 +101,7 @@ def test_simulate_prints_and_writes_the_same(run, folder):
     assert (folder / "out.gif").read_bytes().startswith(b"GIF89a")
 
 
-def test_simulate_overwrites_only_when_told(run, refused, folder):
+def test_simulate_overwrites_only_with_the_option(run, refused, folder):
     run("simulate case.toml -o out.nc")
     first = (folder / "out.nc").read_bytes()
     assert "out.nc exists" in refused("simulate case.toml -o out.nc --set loads.0.mass=0.1")
@@ -129,7 +129,7 @@ def test_sweep_agrees_with_single_runs(run, refused, folder):
 
 
 def test_frequency_responses(run, folder):
-    """A light beam under a parked mass rings where the two together do."""
+    """Resonance of one mode with a stationary mass at midspan: w^2 = k / (m + M)."""
     words = "frf case.toml --set beam.modes=1 --from 2 --to 60 --points 400"
     found = run(f"{words} --json --mass-at 0.3=0.5 --pair force@0.3:velocity@0.3")
     (response,) = found["responses"]
@@ -154,7 +154,7 @@ def test_paired_sweep(run):
 
 
 def write_decay(path):
-    """A log of a free decay: 12 Hz with ratio 0.01, 31 Hz with 0.02, and a little noise."""
+    """Write the log of a free decay: 12 Hz with damping ratio 0.01, 31 Hz with 0.02, and noise."""
     times = np.arange(4000) / 400.0
     signal = 1e-6 * np.random.default_rng(0).standard_normal(times.size)
     for hertz, ratio, size in ((12.0, 0.01, 1.0), (31.0, 0.02, 0.5)):
@@ -191,7 +191,7 @@ def test_identify_a_case(run, folder):
     assert (folder / "fit.png").exists()
 
 
-def test_lost_contact_is_said_once(run):
+def test_contact_loss_is_printed_once(run):
     printed = run("simulate case.toml --set loads.0.speed=6 --set loads.0.mass=3")
     assert printed.count("load 0 would have to pull") == 1
     assert "lowest contact force (N)" in printed

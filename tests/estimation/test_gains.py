@@ -55,7 +55,7 @@ def test_kalman_gain_in_continuous_time():
 
 def test_sampled_kalman_gain():
     step = transition(2e-3)
-    drift, noise = step.drift, step.noise
+    drift, noise = step.transition, step.noise
     gain, covariance, _ = control.dlqe(drift, np.eye(6), C, noise, R)
     found = SAMPLED(drift, C, noise, R)
     scale = np.sqrt(np.diag(covariance))
@@ -74,7 +74,7 @@ def test_sampled_gains_become_the_continuous_one():
     short = []
     for period in (2e-5, 1e-5):
         step = transition(period)
-        gain, _ = SAMPLED(step.drift, C, step.noise, R / period)
+        gain, _ = SAMPLED(step.transition, C, step.noise, R / period)
         short.append(
             np.max(np.abs((gain / period - whole) / scale)) / np.max(np.abs(whole / scale))
         )
@@ -96,7 +96,7 @@ def test_transitions_of_a_plant_that_stays_as_it_is(late):
     after = push[period] if late is None else push[period - late]
     scale = np.sqrt(np.diag(noise))
     outer = scale * scale[:, None]
-    assert_allclose(step.drift * scale / scale[:, None], drift * scale / scale[:, None], atol=1e-11)
+    assert_allclose(step.transition * scale / scale[:, None], drift * scale / scale[:, None], atol=1e-11)
     assert_allclose(step.noise / outer, noise / outer, rtol=0, atol=1e-10)
     assert_allclose(step.after / scale[:, None], after / scale[:, None], rtol=1e-9, atol=1e-9)
     whole = (step.before + step.after) / scale[:, None]
@@ -122,7 +122,7 @@ def test_one_output_leaves_one_choice_of_gain():
 
 def test_gradients_of_gains():
     step = transition(2e-3)
-    drift, noise = step.drift, step.noise
+    drift, noise = step.transition, step.noise
 
     @jax.jit
     def gains(point):

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.estimation import Kalman
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 from tests.differences import central
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant, conditioned
@@ -35,7 +35,7 @@ OFFSET = np.array([1e-4, 0.0, 0.0, 0.0])
 FORCES = np.array([1e-2, 2e-2])
 DEVIATION = 2.0
 ESTIMATED = Kalman(FORCES, loads="estimated", weight_deviation=DEVIATION)
-LAYOUT = lay_out(CASE)
+LAYOUT = mesh_layout(CASE)
 
 
 def with_delay(case, delay):
@@ -94,7 +94,7 @@ def test_estimates_are_those_of_gaussian_conditioning(kalman, delay, ticks):
     memory, (estimate, _) = filtered(kalman, with_delay(CASE, delay), commands, readings)
     within = 0.0 if delay is None else delay % PERIOD
     steps, rows = oracle(CASE, ticks, within, loaded)
-    size = steps[0].drift.shape[0]
+    size = steps[0].transition.shape[0]
     mean, covariance = np.zeros(size), np.zeros((size, size))
     if loaded:
         mean[-1] = 0.4 * 9.81
@@ -126,7 +126,7 @@ def test_surprises_and_errors_are_as_large_as_stated():
         values, vectors = np.linalg.eigh(step.noise)
         root = vectors * np.sqrt(np.maximum(values, 0))
         now = commands[:, k]
-        state = state @ step.drift.T + before @ step.before.T + now @ step.after.T
+        state = state @ step.transition.T + before @ step.before.T + now @ step.after.T
         state, before = state + random.normal(size=(runs, 6)) @ root.T, now
         readings[:, k] = state @ C.T + now @ D.T + OFFSET + NOISE * random.normal(size=(runs, 4))
     each = jax.vmap(filtered, in_axes=(None, None, 0, 0))

@@ -70,17 +70,17 @@ class NumpyKalman:
         self.step = self.plant.step(0.0, PERIOD, DELAY, self.intensity)
         self.C = self.plant.matrices(0.0)[2]
         self.covariance = scipy.linalg.solve_discrete_are(
-            self.step.drift.T, self.C.T, self.step.noise, NOISE**2 * np.eye(2)
+            self.step.transition.T, self.C.T, self.step.noise, NOISE**2 * np.eye(2)
         )
 
     def __call__(self, readings, state, t):
         now = self.next
         step = self.step if not self.loaded else self.plant.step(t, PERIOD, DELAY, self.intensity)
         C = self.plant.matrices(t)[2]
-        prior = step.drift @ self.state + step.before @ self.acting + step.after @ now
+        prior = step.transition @ self.state + step.before @ self.acting + step.after @ now
         spread = self.covariance
         if self.loaded:
-            spread = step.drift @ spread @ step.drift.T + step.noise
+            spread = step.transition @ spread @ step.transition.T + step.noise
         gain = spread @ C.T @ np.linalg.inv(C @ spread @ C.T + NOISE**2 * np.eye(2))
         if self.loaded:
             self.covariance = spread - gain @ C @ spread
@@ -121,15 +121,15 @@ def sampled_loop(case, modes):
     believed = inner.step(0.0, PERIOD, 0.0, np.diag([0, 0, FORCE, FORCE, 0.0]))
     seen = inner.matrices(0.0)[2]
     covariance = scipy.linalg.solve_discrete_are(
-        believed.drift.T, seen.T, believed.noise, NOISE**2 * np.eye(2)
+        believed.transition.T, seen.T, believed.noise, NOISE**2 * np.eye(2)
     )
     gain = covariance @ seen.T @ np.linalg.inv(seen @ covariance @ seen.T + NOISE**2 * np.eye(2))
     law = regulator(case)
-    left = (np.eye(inner.size) - gain @ seen) @ (believed.drift - believed.after @ law)
+    left = (np.eye(inner.size) - gain @ seen) @ (believed.transition - believed.after @ law)
     return np.block(
         [
-            [step.drift, -step.after @ law],
-            [gain @ C @ step.drift, left - gain @ C @ step.after @ law],
+            [step.transition, -step.after @ law],
+            [gain @ C @ step.transition, left - gain @ C @ step.after @ law],
         ]
     )
 

@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.controller import Measurement
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.estimation import Observer
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant
 
@@ -38,14 +38,14 @@ def matrices(case):
     plant = SampledPlant(*parts_of(case))
     step = plant.step(0.0, PERIOD, 0.0, np.zeros((5, 5)))
     A, _, C, D = plant.matrices(0.0)
-    return A, step.drift, step.after, C, D
+    return A, step.transition, step.after, C, D
 
 
 @pytest.mark.parametrize("observer", [Observer(speed=2.5), Observer(poles=POLES)])
 def test_poles(observer):
     """exp(p period) for every pole p asked for, and the shaker's own, which stays."""
     case = loop(observer)
-    layout = lay_out(case)
+    layout = mesh_layout(case)
     memory = jax.jit(lambda c: observer.init(jb.state_space(c, layout=layout)))(case)
     A, drift, _, C, _ = matrices(case)
     if observer.poles is None:
@@ -71,14 +71,14 @@ def test_an_observer_does_not_shift_the_poles_of_the_regulator():
 
 def test_the_error_dies_away_as_the_poles_say():
     case = loop(Observer(poles=POLES), delay=4e-4)
-    observer, layout = case.controller.estimator, lay_out(case)
+    observer, layout = case.controller.estimator, mesh_layout(case)
     plant = SampledPlant(*parts_of(case))
     step = plant.step(0.0, PERIOD, 4e-4, np.zeros((5, 5)))
     _, _, C, D = plant.matrices(0.0)
     commands = np.random.default_rng(0).normal(size=(60, 1))
     state, before, readings, states = np.array([1e-3, -1e-3, 0.1, 0.2, 0.0]), np.zeros(1), [], []
     for now in commands:
-        state = step.drift @ state + step.before @ before + step.after @ now
+        state = step.transition @ state + step.before @ before + step.after @ now
         readings.append(C @ state + D @ now)
         states.append(state)
         before = now
@@ -114,7 +114,7 @@ def test_the_error_dies_away_as_the_poles_say():
 )
 def test_faults_are_named(observer, message):
     with pytest.raises(ValueError, match=f"controller.estimator.{message}"):
-        check(loop(observer))
+        check_case(loop(observer))
 
 
 def test_beams_without_damping_need_poles():
@@ -122,4 +122,4 @@ def test_beams_without_damping_need_poles():
         loop(Observer(speed=2.0)), {"beam.damping_ratio": 0.0, "actuators.0.damping": 0.0}
     )
     with pytest.raises(ValueError, match="speed must not be used on a beam without damping"):
-        check(case)
+        check_case(case)

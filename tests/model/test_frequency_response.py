@@ -55,7 +55,7 @@ GENERAL = jb.Case(
 F = np.array([0.0, 0.7, 3.0, 11.0, 26.5, 84.0, 190.0, 900.0])
 
 
-def formulas(frequencies, modes=4, ratio=0.03, parked=()):
+def formulas(frequencies, modes=4, ratio=0.03, masses=()):
     """The chain as eqs (2.26) to (2.34) have it: U/I, F_c/U, F/F_c, F/U, for sine modes."""
     wave = np.arange(1, modes + 1) * np.pi / 0.6
     omega = wave**2 * np.sqrt(11.68 / 0.535)
@@ -64,8 +64,8 @@ def formulas(frequencies, modes=4, ratio=0.03, parked=()):
     chain = []
     for s in 2j * np.pi * np.asarray(frequencies):
         mass = np.eye(modes)
-        for place, added in parked:
-            mass += added * np.outer(np.sin(wave * place), np.sin(wave * place)) * size**2
+        for position, added in masses:
+            mass += added * np.outer(np.sin(wave * position), np.sin(wave * position)) * size**2
         beam = mass * s**2 + np.diag(2 * ratio * omega * s + omega**2)
         mobility_beam = s * at @ np.linalg.solve(beam, at)
         mobility_shaker = s / (s**2 * 0.02 + s * 0.55 + 9700)
@@ -76,7 +76,7 @@ def formulas(frequencies, modes=4, ratio=0.03, parked=()):
     return np.array(chain)
 
 
-def turns(frequencies, size):
+def dips_and_peaks(frequencies, size):
     """Frequencies and heights of the dips and of the peaks of a curve, ((dip, 2), (peak, 2))."""
     inner = size[1:-1]
     dips = np.flatnonzero((inner < size[:-2]) & (inner < size[2:])) + 1
@@ -87,10 +87,10 @@ def turns(frequencies, size):
 # The electrodynamic shaker of section 2.2
 
 
-@pytest.mark.parametrize("parked", [[], HALF_KILO, [(0.1, 0.2), (0.45, 0.7)]])
-def test_the_chain_of_the_thesis(parked):
-    found = frequency_response(RIG_A, F[1:], shaker_channels(0), parked)
-    assert_allclose(found.values, formulas(F[1:], parked=parked), rtol=1e-9)
+@pytest.mark.parametrize("masses", [[], HALF_KILO, [(0.1, 0.2), (0.45, 0.7)]])
+def test_the_chain_of_the_thesis(masses):
+    found = frequency_response(RIG_A, F[1:], shaker_channels(0), masses)
+    assert_allclose(found.values, formulas(F[1:], masses=masses), rtol=1e-9)
     assert [pair.unit for pair in found.pairs] == ["A/V", "N/V", "1", "N/V"]
 
 
@@ -100,24 +100,26 @@ def test_figures_2_15_and_2_18_without_a_mass():
     current, _, passed, total = np.asarray(found.magnitude).T
     assert_allclose(total[0], 2.38, atol=0.005)
     assert np.ptp(total[f < 5]) < 0.1 * total[0]
-    dips, peaks = turns(f, total)
+    dips, peaks = dips_and_peaks(f, total)
     assert_allclose(dips[:, 0], [20.3, 81.3, 184.4, 330.1], atol=0.1)
     assert_allclose(peaks[0], [27.5, 10.2], atol=0.06)
     # Figs 2.17 and 2.18: what resists the voltage, and what lifts the force, is one resonance.
-    impedance = turns(f, 1 / current)[1][0]
-    assert_allclose([impedance[0], turns(f, passed)[1][0, 0]], 26.65, atol=0.1)
+    impedance = dips_and_peaks(f, 1 / current)[1][0]
+    assert_allclose([impedance[0], dips_and_peaks(f, passed)[1][0, 0]], 26.65, atol=0.1)
 
 
 def test_figure_2_16_with_half_a_kilogram_in_the_middle():
     f = np.linspace(0.5, 40.0, 8001)
-    total = np.asarray(frequency_response(RIG_A, f, shaker_channels(0)[3:], HALF_KILO).magnitude)[:, 0]
-    dips, peaks = turns(f, total)
+    total = np.asarray(frequency_response(RIG_A, f, shaker_channels(0)[3:], HALF_KILO).magnitude)[
+        :, 0
+    ]
+    dips, peaks = dips_and_peaks(f, total)
     assert_allclose(peaks, [[13.1, 20.2]], atol=0.05)
     # Force drops where the beam alone, with the mass, would ring: finite elements.
     assert_allclose(dips[:, 0], loaded_frequency(), rtol=5e-3)
     undamped = replace(RIG_A, {"beam.damping_ratio": 0.0})
     total = np.asarray(frequency_response(undamped, f, shaker_channels(0)[3:], HALF_KILO).magnitude)
-    assert_allclose(turns(f, total[:, 0])[1], [[13.05, 27.6]], atol=0.05)
+    assert_allclose(dips_and_peaks(f, total[:, 0])[1], [[13.05, 27.6]], atol=0.05)
 
 
 def loaded_frequency() -> float:
@@ -151,7 +153,9 @@ def test_poles_and_zeros_of_the_shaker():
     bare = jb.Case(RIG_A.beam)
     found = zeros(RIG_A, shaker_channels(0)[3])
     assert_allclose(found, poles(bare), rtol=1e-7)
-    assert_allclose(zeros(RIG_A, shaker_channels(0)[3], HALF_KILO), poles(bare, HALF_KILO), rtol=1e-7)
+    assert_allclose(
+        zeros(RIG_A, shaker_channels(0)[3], HALF_KILO), poles(bare, HALF_KILO), rtol=1e-7
+    )
     natural = (np.arange(1, 5) * np.pi / 0.6) ** 2 * np.sqrt(11.68 / 0.535)
     assert_allclose(np.abs(poles(bare)), np.repeat(natural, 2), rtol=1e-9)
     ringing = poles(RIG_A)
@@ -160,11 +164,11 @@ def test_poles_and_zeros_of_the_shaker():
     assert_allclose(ringing[-1], -0.82 / 5e-5, rtol=0.05)
 
 
-# Any rig
+# Cases of all kinds
 
 
 def test_python_control_has_the_same_responses_of_the_state_space():
-    """Deflection, velocity, slope and strain are rows of the states; acceleration needs B too."""
+    """Deflection, velocity, slope and strain are rows on the states; acceleration needs B too."""
     model = eqx.filter_jit(modal_model)(GENERAL, mesh_layout(GENERAL))
     A, B = np.asarray(model.state_matrix[0]), np.asarray(model.command_matrix)
     rows, direct = np.zeros((5, len(A))), np.zeros((5, 4))
@@ -205,7 +209,7 @@ def test_receptance_of_a_pinned_beam_in_closed_form():
     assert_allclose(mobility(case, f, 0.1, 0.3), s[:, 0, 0] * found[:, 0, 0], rtol=1e-12)
 
 
-def test_finite_elements_with_patch_coil_and_parked_masses():
+def test_finite_elements_with_patch_coil_and_stationary_masses():
     """The full dynamic stiffness, coil eliminated, against twenty-four modes."""
     patch = jb.Patch(0.1, 0.3, 1e-3, added_mass=0.3, added_rigidity=4.0)
     coil = jb.Electrodynamic(0.75, 0.8, 5e-3, 4.2, 3.9, 0.02, 900.0, 0.5)
@@ -214,8 +218,8 @@ def test_finite_elements_with_patch_coil_and_parked_masses():
     model = finite_elements.assemble(as_oracle(case, elements=60), [0.4, 0.45, 0.75, 0.9])
     free, at = model.free, model.shape(0.75)
     inertia = model.mass + 0.02 * np.outer(at, at)
-    for place, mass in ((0.4, 0.3), (0.9, 0.1)):
-        inertia += mass * np.outer(model.shape(place), model.shape(place))
+    for position, mass in ((0.4, 0.3), (0.9, 0.1)):
+        inertia += mass * np.outer(model.shape(position), model.shape(position))
     frequencies, expected = np.array([2.0, 17.0, 46.0, 120.0]), []
     for s in 2j * np.pi * frequencies:
         coupled = 900.0 + 0.5 * s + 4.2 * 3.9 * s / (0.8 + 5e-3 * s)
@@ -271,7 +275,7 @@ def test_responses_differentiate_inside_jit():
 # The record
 
 
-def test_record_has_labels_and_units(tmp_path):
+def test_the_dataset_has_labels_and_units(tmp_path):
     found = frequency_response(RIG_A, np.linspace(1, 40, 40))
     assert [str(pair) for pair in found.pairs] == [
         "actuators.0 -> sensors.0",
@@ -295,7 +299,7 @@ def test_record_has_labels_and_units(tmp_path):
         found.of("force@0.3", "sensors.1")
 
 
-def test_extremes_lie_between_the_samples():
+def test_peaks_and_dips_lie_between_the_frequencies():
     f = np.geomspace(5.0, 50.0, 200)
     response = frequency_response(RIG_A, f, shaker_channels(0)[3:])
     first, dip, peak = resonances_and_antiresonances(response, 0)
@@ -316,8 +320,11 @@ BAD = [
     ({"frequencies": [-1.0]}, "frequencies must be finite and not negative, in Hz; found -1"),
     ({"frequencies": [np.nan]}, "found nan"),
     ({"frequencies": [[1.0]]}, "frequencies must be a list of numbers, not of shape"),
-    ({"parked": [(0.7, 0.1)]}, "the place of a parked mass must lie on the beam, between 0 and"),
-    ({"parked": [(0.3, -0.1)]}, "a parked mass must not be negative; it is -0.1 kg"),
+    (
+        {"stationary_masses": [(0.7, 0.1)]},
+        "the position of a stationary mass must lie on the beam, between 0 and",
+    ),
+    ({"stationary_masses": [(0.3, -0.1)]}, "a stationary mass must not be negative; it is -0.1 kg"),
     ({"pairs": []}, "name at least one pair of an input and an output"),
     ({"pairs": [("actuators.1", "sensors.0")]}, "'actuators.1' does not exist; the case has 1"),
     ({"pairs": [("actuators.x", "sensors.0")]}, "'actuators.x' does not exist; the case has 1"),
@@ -334,14 +341,14 @@ BAD = [
 
 
 @pytest.mark.parametrize(("changes", "message"), BAD)
-def test_bad_requests_are_refused(changes, message):
-    arguments = {"frequencies": [1.0], "pairs": None, "parked": ()} | changes
+def test_invalid_arguments_are_refused(changes, message):
+    arguments = {"frequencies": [1.0], "pairs": None, "stationary_masses": ()} | changes
     with pytest.raises(ValueError) as caught:
         frequency_response(RIG_A, **arguments)
     assert message in str(caught.value)
 
 
-def test_actuators_without_what_was_asked():
+def test_quantities_that_an_actuator_does_not_have_are_refused():
     case = jb.Case(RIG_A.beam, actuators=[jb.Shaker(0.5), jb.SpringDamper(0.2, 10.0)])
     with pytest.raises(ValueError, match="'actuators.0.current' does not exist: a Shaker has no"):
         frequency_response(case, [1.0], [("actuators.0", "actuators.0.current")])

@@ -11,7 +11,7 @@ from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.model.modes import Modes, mesh_layout, modes
 from tests.differences import central
-from tests.solved_modes import STUFF, solve
+from tests.solved_modes import PROPERTIES, solve
 
 BY_SECTION = Case(
     Beam(
@@ -59,7 +59,7 @@ def assert_derivatives(function, size: int, ways=REVERSE, floor: float = 0.0) ->
     [
         (BY_SECTION, NUMBERS, BOTH),
         (
-            Case(Beam(1.2, **STUFF, ends="clamped-free", modes=5), [Support(0.7)]),
+            Case(Beam(1.2, **PROPERTIES, ends="clamped-free", modes=5), [Support(0.7)]),
             ["beam.length", "beam.flexural_rigidity", "beam.mass_per_length"],
             REVERSE,
         ),
@@ -98,16 +98,18 @@ def crossing(**damping) -> Case:
     """
     wave = 2 * np.pi / 1.2
     spring = 4 * 11.68 * wave**3 / np.tanh(np.pi)
-    return Case(Beam(1.2, **STUFF, modes=6, **damping), [Support(0.6, spring)])
+    return Case(Beam(1.2, **PROPERTIES, modes=6, **damping), [Support(0.6, spring)])
 
 
 def decoupled(**damping) -> Case:
     """Two equal spans, each clamped at the common support by a very stiff spring."""
-    return Case(Beam(1.2, **STUFF, modes=6, **damping), [Support(0.6, rotational_stiffness=1e12)])
+    return Case(
+        Beam(1.2, **PROPERTIES, modes=6, **damping), [Support(0.6, rotational_stiffness=1e12)]
+    )
 
 
 FREE = Case(
-    Beam(1.2, **STUFF, ends="free-free", modes=6, damping_ratio=0.05),
+    Beam(1.2, **PROPERTIES, ends="free-free", modes=6, damping_ratio=0.05),
     actuators=[Patch(0.2, 0.5, 1.0, added_mass=0.2, added_rigidity=3.0)],
 )
 REPEATED = {
@@ -161,7 +163,7 @@ def test_second_derivatives_where_frequencies_are_repeated(case):
 
 def test_a_free_beam_feels_the_first_newton_per_metre_that_holds_it():
     """Rigid-body modes at zero: one-sided differences, for a stiffness cannot be negative."""
-    case = Case(Beam(1.2, **STUFF, ends="free-free", modes=5), [Support(0.3, 0.0, 0.0, 0.0)])
+    case = Case(Beam(1.2, **PROPERTIES, ends="free-free", modes=5), [Support(0.3, 0.0, 0.0, 0.0)])
     layout, x = mesh_layout(case), jnp.array([0.13, 0.8])
 
     @jax.jit

@@ -16,7 +16,7 @@ from tests.as_oracle import as_oracle
 from tests.oracles.closed_forms import single_span_parameters, two_span_parameters
 from tests.oracles.exact_frequencies import exact_frequencies
 from tests.oracles.finite_elements import assemble
-from tests.solved_modes import PAIRS, PATCHED, STUFF, held, parameters, solve
+from tests.solved_modes import PAIRS, PATCHED, PROPERTIES, parameters, solve, supported_beam
 
 
 def assert_frequencies(case: Case, rtol: float = 1e-12) -> None:
@@ -27,13 +27,13 @@ def assert_frequencies(case: Case, rtol: float = 1e-12) -> None:
 
 @pytest.mark.parametrize("ends", PAIRS)
 def test_single_spans_obey_their_characteristic_equations(ends):
-    found = parameters(Case(Beam(0.6, **STUFF, ends=ends, modes=12)), 0.6)
+    found = parameters(Case(Beam(0.6, **PROPERTIES, ends=ends, modes=12)), 0.6)
     assert_allclose(found, single_span_parameters(ends, 12), rtol=1e-13)
 
 
 @pytest.mark.parametrize("ratio", [0.5, 0.3714, 0.0593, 0.8007])
 def test_two_spans_obey_the_three_moment_condition(ratio):
-    found = parameters(Case(Beam(1.2, **STUFF, modes=12), [Support(1.2 * ratio)]), 1.2)
+    found = parameters(Case(Beam(1.2, **PROPERTIES, modes=12), [Support(1.2 * ratio)]), 1.2)
     assert_allclose(found, two_span_parameters(ratio, 12), rtol=1e-12)
 
 
@@ -53,32 +53,34 @@ TABLE = [  # k times the length of a span; source: independent reference tables
 @pytest.mark.parametrize(("spans", "ends", "expected"), TABLE)
 def test_equal_spans_have_the_printed_parameters(spans, ends, expected):
     supports = [Support(0.6 * i) for i in range(1, spans)]
-    case = Case(Beam(0.6 * spans, **STUFF, ends=ends, modes=len(expected)), supports)
+    case = Case(Beam(0.6 * spans, **PROPERTIES, ends=ends, modes=len(expected)), supports)
     assert_allclose(parameters(case, 0.6), expected, rtol=0, atol=6e-7)
 
 
 def test_an_elastic_support_ranges_from_none_to_a_rigid_one():
     for stiffness in (0.0, 1.0, 1e3, 1e5, 1e8, 1e12, 1e16):
-        assert_frequencies(held(stiffness))
-    none = solve(Case(Beam(1.2, **STUFF, modes=12))).frequencies
-    assert_allclose(solve(held(0.0)).frequencies, none, rtol=1e-12)
-    assert_allclose(solve(held(1e16)).frequencies, solve(held(None)).frequencies, rtol=1e-9)
+        assert_frequencies(supported_beam(stiffness))
+    none = solve(Case(Beam(1.2, **PROPERTIES, modes=12))).frequencies
+    assert_allclose(solve(supported_beam(0.0)).frequencies, none, rtol=1e-12)
+    assert_allclose(
+        solve(supported_beam(1e16)).frequencies, solve(supported_beam(None)).frequencies, rtol=1e-9
+    )
 
 
 def test_rotational_springs_range_from_none_to_a_clamp():
     def turned(stiffness):
         supports = [Support(0.0, rotational_stiffness=stiffness)]
-        return Case(Beam(1.2, **STUFF, modes=12), supports)
+        return Case(Beam(1.2, **PROPERTIES, modes=12), supports)
 
     for stiffness in (0.0, 1.0, 1e3, 1e8, 1e16):
         assert_frequencies(turned(stiffness))
-        assert_frequencies(held(None, stiffness))
-    clamped = solve(Case(Beam(1.2, **STUFF, ends="clamped-pinned", modes=12))).frequencies
+        assert_frequencies(supported_beam(None, stiffness))
+    clamped = solve(Case(Beam(1.2, **PROPERTIES, ends="clamped-pinned", modes=12))).frequencies
     assert_allclose(solve(turned(1e14)).frequencies, clamped, rtol=1e-10)
     # Two spans that a stiff spring clamps at their common support know nothing of each other.
-    apart = [Case(Beam(x, **STUFF, ends="clamped-pinned", modes=12)) for x in (0.5, 0.7)]
+    apart = [Case(Beam(x, **PROPERTIES, ends="clamped-pinned", modes=12)) for x in (0.5, 0.7)]
     expected = np.sort(np.concatenate([solve(case).frequencies for case in apart]))[:12]
-    assert_allclose(solve(held(None, 1e14)).frequencies, expected, rtol=1e-10)
+    assert_allclose(solve(supported_beam(None, 1e14)).frequencies, expected, rtol=1e-10)
 
 
 def test_bonded_patches_have_the_frequencies_and_shapes_of_finite_elements():
@@ -88,7 +90,7 @@ def test_bonded_patches_have_the_frequencies_and_shapes_of_finite_elements():
     found = solve(PATCHED)
     assert_allclose(found.angular_frequencies, omega, rtol=1e-6)
     x = np.linspace(0.0, 1.3, 40)
-    expected = np.array([model.shape(place) @ vectors for place in x])
+    expected = np.array([model.shape(position) @ vectors for position in x])
     expected *= np.sign(expected[0])
     assert_allclose(found.shapes(x), expected, rtol=0, atol=1e-5 * np.abs(expected).max())
 
@@ -101,12 +103,12 @@ def test_bonded_patches_have_the_frequencies_and_shapes_of_finite_elements():
         ([], [Patch(0.0, 1.2, 1.0, added_mass=0.3)]),  # all along
         ([Support(0.6), Support(0.6 + 1e-6)], []),  # nearly a clamp
         ([Support(0.6, 1e5), Support(0.612, 1e5)], []),
-        ([Support(0.4), Support(0.4, 50.0, 0.0, 7.0)], []),  # two things at one place
+        ([Support(0.4), Support(0.4, 50.0, 0.0, 7.0)], []),  # two things at one position
     ],
-    ids=["ends", "edge", "all along", "close", "close springs", "same place"],
+    ids=["ends", "edge", "all along", "close", "close springs", "same position"],
 )
 def test_degenerate_layouts(supports, actuators):
-    assert_frequencies(Case(Beam(1.2, **STUFF, modes=6), supports, actuators))
+    assert_frequencies(Case(Beam(1.2, **PROPERTIES, modes=6), supports, actuators))
 
 
 @st.composite
@@ -117,7 +119,9 @@ def random_beams(draw) -> Case:
     support = Support(0.013 * at, spring, 0.0, draw(st.sampled_from([0.0, 3.0, 1e9])))
     patch = Patch(0.013 * start, 0.65, 1.0, added_mass=0.3, added_rigidity=draw(st.floats(0, 50)))
     patches = draw(st.sampled_from([[], [patch]]))
-    return Case(Beam(1.3, **STUFF, ends=draw(st.sampled_from(PAIRS)), modes=5), [support], patches)
+    return Case(
+        Beam(1.3, **PROPERTIES, ends=draw(st.sampled_from(PAIRS)), modes=5), [support], patches
+    )
 
 
 @pytest.mark.slow

@@ -17,12 +17,12 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.sensor_signals import (
-    to_reading,
-    filter_sections,
     filtered_reading,
     initial_filter_state,
     noise_samples,
     sampled_readings,
+    sensor_sections,
+    to_reading,
 )
 from tests.differences import central
 
@@ -64,20 +64,22 @@ def test_noise_is_that_of_the_seed_and_of_the_stated_size():
     assert_allclose(np.corrcoef(drawn.T)[0, 1], 0.0, atol=0.03)
 
 
-def test_reading_sample_by_sample_is_reading_at_once():
+def test_readings_sample_by_sample_are_those_of_the_whole_history():
     sensor = Sensor(0.3, offset=0.2, noise=0.01, resolution=1e-3, filter=Filter(20.0, 3))
     noise = noise_samples(0, 1, 201)[:, 0]
-    sections = filter_sections(sensor, 1e-3)
-    memory = initial_filter_state(sensor, sections, jnp.zeros(()))
+    sections = sensor_sections(sensor, 1e-3)
+    filter_state = initial_filter_state(sensor, sections, jnp.zeros(()))
     step = jax.jit(filtered_reading)
     found = []
     for value, drawn in zip(VALUES, noise, strict=True):
-        reading, memory = step(sensor, sections, memory, value, drawn)
+        reading, filter_state = step(sensor, sections, filter_state, value, drawn)
         found.append(reading)
-    assert_allclose(found, sampled_readings(sensor, TIMES, VALUES, RATES, noise), rtol=0, atol=1e-13)
-    lanes = initial_filter_state(sensor, sections, jnp.zeros(4))
-    together, _ = filtered_reading(sensor, sections, lanes, jnp.linspace(0, 1, 4), None)
-    alone, _ = filtered_reading(sensor, sections, lanes[..., 2], jnp.array(2 / 3), None)
+    assert_allclose(
+        found, sampled_readings(sensor, TIMES, VALUES, RATES, noise), rtol=0, atol=1e-13
+    )
+    batch = initial_filter_state(sensor, sections, jnp.zeros(4))
+    together, _ = filtered_reading(sensor, sections, batch, jnp.linspace(0, 1, 4), None)
+    alone, _ = filtered_reading(sensor, sections, batch[..., 2], jnp.array(2 / 3), None)
     assert_allclose(together[2], alone, rtol=1e-14)
 
 
@@ -99,7 +101,7 @@ def test_an_analogue_filter_is_that_of_scipy(order):
     assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
-def test_a_delay_shows_the_past():
+def test_delayed_readings_are_those_of_an_earlier_signal():
     whole = sampled_readings(Sensor(0.3, delay=0.01), TIMES, VALUES, RATES)
     assert_allclose(whole[10:], VALUES[:-10], rtol=0, atol=1e-13)
     assert_allclose(whole[:10], 0.0, atol=1e-15)
@@ -108,7 +110,7 @@ def test_a_delay_shows_the_past():
     assert_allclose(between[5:], wave(TIMES - 0.00437)[5:], rtol=0, atol=5e-8)
 
 
-def test_a_clock_holds_its_readings():
+def test_readings_are_held_between_sampling_instants():
     sensor = Sensor(0.3, sampling_period=0.004, noise=0.1)
     noise = noise_samples(0, 1, 201)[:, 0]
     found = sampled_readings(sensor, TIMES, VALUES, RATES, noise)
@@ -116,11 +118,11 @@ def test_a_clock_holds_its_readings():
     assert_allclose(found, expected, rtol=0, atol=1e-13)
     # Not a multiple of the time between samples: the readings are those at its own times.
     odd = sampled_readings(Sensor(0.3, sampling_period=0.0033), TIMES, VALUES, RATES)
-    ticks = 0.0033 * np.floor(np.asarray(TIMES) / 0.0033 + 1e-9)
-    assert_allclose(odd, wave(ticks), rtol=0, atol=5e-8)
+    instants = 0.0033 * np.floor(np.asarray(TIMES) / 0.0033 + 1e-9)
+    assert_allclose(odd, wave(instants), rtol=0, atol=5e-8)
 
 
-def test_a_clock_drives_its_filter():
+def test_a_digital_filter_runs_at_the_sampling_period_of_its_sensor():
     sensor = Sensor(0.3, sampling_period=0.004, filter=Filter(20.0, 3))
     sos = scipy.signal.butter(3, 20.0, fs=250.0, output="sos")
     expected = np.repeat(scipy.signal.sosfilt(sos, VALUES[::4]), 4)[:201]
@@ -175,33 +177,33 @@ def record():
     return jb.simulate(CASE)
 
 
-def fitted_with(record, **changes):
-    """The same run, seen by sensors with other properties."""
+def with_sensors(record, **changes):
+    """The same run with other properties of the sensors."""
     sensors = tuple(dataclasses.replace(s, **changes) for s in CASE.sensors)
     return dataclasses.replace(record, case=dataclasses.replace(CASE, sensors=sensors))
 
 
-def test_ideal_sensors_read_the_truth(record):
+def test_ideal_sensors_read_the_true_values(record):
     truth = [record.at(0.25, quantity, z) for quantity, z in QUANTITIES]
     assert_array_equal(record.measured, np.array(truth).T)
 
 
 def test_a_record_reads_every_quantity_through_filter_and_delay(record):
     filter = Filter(40.0, 4)
-    found = fitted_with(record, filter=filter, delay=0.004).measured
+    found = with_sensors(record, filter=filter, delay=0.004).measured
     sos = scipy.signal.butter(4, 40.0, fs=2000.0, output="sos")
     late = np.asarray(record.measured)[np.maximum(np.arange(801) - 8, 0)]
     rest = scipy.signal.sosfilt_zi(sos)[:, :, None] * late[0]
     expected = scipy.signal.sosfilt(sos, late, axis=0, zi=rest)[0]
     assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected), axis=0).max())
     analogue = Filter(40.0, 4, realisation="analogue")
-    smooth = fitted_with(record, filter=analogue, delay=0.004).measured
+    smooth = with_sensors(record, filter=analogue, delay=0.004).measured
     size = np.max(np.abs(expected), axis=0)
     assert np.all(np.max(np.abs(smooth - expected), axis=0) < 0.02 * size)
 
 
 def test_noise_is_in_the_record_but_not_in_predictions(record):
-    noisy = fitted_with(record, noise=1e-3)
+    noisy = with_sensors(record, noise=1e-3)
     difference = np.asarray(noisy.measured - record.measured)
     assert_allclose(difference, 1e-3 * noise_samples(11, 4, 801), rtol=0, atol=1e-12)
     assert_array_equal(noisy.measured, noisy.measured)
@@ -210,16 +212,16 @@ def test_noise_is_in_the_record_but_not_in_predictions(record):
 
 
 def test_readings_that_need_times_ask_for_them(record):
-    delayed = fitted_with(record, delay=0.1)
+    delayed = with_sensors(record, delay=0.1)
     motion = delayed.coordinates, delayed.rates, delayed.accelerations
     with pytest.raises(ValueError, match=r"sensors.0 .* its readings need times"):
         sensor_readings(delayed.case, delayed.modes, *motion)
-    fast = fitted_with(record, filter=Filter(100.0), sampling_period=1e-4)
+    fast = with_sensors(record, filter=Filter(100.0), sampling_period=1e-4)
     with pytest.raises(ValueError, match=r"sensors.0: its filter takes a reading every 0.0001 s"):
         _ = fast.measured
 
 
-def test_a_sensor_lives_in_its_case_file(tmp_path):
+def test_case_files_hold_every_property_of_a_sensor(tmp_path):
     filter = Filter(10.0, 10)
     sensor = Sensor(
         0.25, offset=1e-5, noise=1e-5, range=[-0.01, 0.01], resolution=1e-6, filter=filter,
@@ -255,7 +257,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("changes", "message"), FAULTS)
-def test_faulty_sensors_are_refused(changes, message):
+def test_invalid_sensors_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         check_case(dataclasses.replace(CASE, sensors=(Sensor(0.25, **changes),)))
 
@@ -269,14 +271,14 @@ def test_faulty_sensors_are_refused(changes, message):
         ({"cutoff": "low"}, "sensors.0.filter.cutoff must be one number, not 'low'"),
     ],
 )
-def test_faulty_tables_of_a_filter_are_refused(filter, message):
+def test_invalid_filter_tables_are_refused(filter, message):
     beam = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}
     with pytest.raises(ValueError, match=re.escape(message)):
         case_from_dict({"beam": beam, "sensors": [{"position": 0.3, "filter": filter}]})
 
 
-def test_a_filter_may_be_slower_than_it_seems():
-    """An analogue filter, and one whose controller decides the sampling, know no such bound."""
+def test_the_bound_on_the_cutoff_needs_a_known_sampling_period():
+    """None for an analogue filter, nor for one whose controller decides the sampling."""
     analogue = Filter(5000.0, realisation="analogue")
     check_case(dataclasses.replace(CASE, sensors=(Sensor(0.25, filter=analogue),)))
 

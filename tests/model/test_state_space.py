@@ -29,7 +29,7 @@ SENSORS = [
     jb.Sensor(0.3, "strain", fibre_distance=0.0015),
     jb.Sensor(0.1, "slope"),
 ]
-RIG = jb.Case(
+CASE = jb.Case(
     BEAM,
     actuators=[
         jb.Shaker(0.5, stiffness=3500.0, damping=80.0),
@@ -43,12 +43,12 @@ RIG = jb.Case(
 
 @pytest.fixture(scope="module")
 def system():
-    return state_space(RIG)
+    return state_space(CASE)
 
 
 @pytest.fixture(scope="module")
 def record():
-    return jb.simulate(RIG)
+    return jb.simulate(CASE)
 
 
 def in_sines(states):
@@ -58,7 +58,7 @@ def in_sines(states):
 
 @pytest.mark.parametrize("t", [0.05, 0.21, 0.5])
 def test_matrices_are_those_of_the_modal_equations(t):
-    """Columns of A(t) by feeding the oracle one state at a time; B_f by feeding it none."""
+    """Columns of A(t) from unit states of the oracle, B_f(t) W from its state at rest."""
     kinds = ("mass", 0.509, 2.0, 1.5), ("force", 0.3, 3.0, 0.0), ("mass", 0.2, -2.5, 0.0)
     loads, ours = [], []
     for kind, mass, speed, braking in kinds:
@@ -72,8 +72,8 @@ def test_matrices_are_those_of_the_modal_equations(t):
     system = state_space(case)
     size = np.max(np.abs(expected))
     assert_allclose(eqx.filter_jit(system.A)(t), expected, rtol=0, atol=1e-10 * size)
-    push = system.B_f(t) @ system.weights
-    assert_allclose(push, rest, rtol=1e-9, atol=1e-9)
+    rate_by_weights = system.B_f(t) @ system.weights
+    assert_allclose(rate_by_weights, rest, rtol=1e-9, atol=1e-9)
     sines = state_space(case, "sine")
     assert_allclose(sines.A(t), expected, rtol=0, atol=1e-10 * size)  # all scaled alike
     assert_allclose(sines.B_f(t) @ sines.weights, in_sines(rest), rtol=1e-9, atol=1e-9)
@@ -103,7 +103,7 @@ def test_integrating_the_state_space_is_simulating(system, record):
 
 
 def _direct(system, t):
-    """What the loads add to the outputs at once."""
+    """Direct feedthrough of the weights to the outputs."""
     return system.at(t).D[:, len(system.case.actuators) :] @ system.weights
 
 
@@ -125,7 +125,7 @@ def test_frequency_response_is_that_of_the_physics():
     """Force and moment to deflection, from impedances written out here."""
     case = jb.Case(
         BEAM,
-        actuators=[jb.PointForce(0.5), *RIG.actuators],
+        actuators=[jb.PointForce(0.5), *CASE.actuators],
         sensors=[jb.Sensor(0.25), jb.Sensor(0.25, "velocity")],
     )
     model = state_space(case).unloaded.to_control()
@@ -159,7 +159,7 @@ def test_the_augmented_system_is_that_of_equation_5_8(system):
     assert_allclose(found, frozen.C @ z + frozen.D @ inputs, rtol=1e-12)
 
 
-def test_masses_take_part_in_what_commands_cause_at_once(system):
+def test_masses_on_the_beam_reduce_the_input_matrix_of_a_patch(system):
     """B(t) of a patch is smaller with a mass on it; that of the lagging shaker is constant."""
     free, loaded = system.unloaded.B, system.B(0.15)
     assert_array_equal(loaded[:, 0], free[:, 0])
@@ -194,7 +194,7 @@ def test_signals_are_named_with_units(system):
     assert model.input_labels == ["command_0", "command_1", "load_0", "load_1"]
     assert [s.unit for s in system.at(0.1).inputs] == ["V", "V", "N", "N"]
     assert model.output_labels[:2] == ["sensor_0_deflection", "sensor_1_velocity"]
-    assert state_space(RIG, "sine").states[0] == ("a_1", "m")
+    assert state_space(CASE, "sine").states[0] == ("a_1", "m")
 
 
 def test_a_mat_file_holds_it_all(system, tmp_path):
@@ -230,16 +230,16 @@ def test_sine_amplitudes_are_refused_where_modes_are_no_sines():
     with pytest.raises(ValueError, match="not sin"):
         state_space(spans, "sine")
     with pytest.raises(ValueError, match="coordinates may be 'modal' or 'sine', not 'nodal'"):
-        state_space(RIG, "nodal")
+        state_space(CASE, "nodal")
 
 
 def test_derivatives_by_mass_speed_and_rigidity():
-    layout = mesh_layout(RIG)
+    layout = mesh_layout(CASE)
 
     def discrete(point):
         names = ["loads.0.mass", "loads.0.speed", "beam.flexural_rigidity"]
         sizes = jnp.array([0.5, 2.0, 12.0])
-        case = jb.replace(RIG, dict(zip(names, point * sizes, strict=True)))
+        case = jb.replace(CASE, dict(zip(names, point * sizes, strict=True)))
         found = state_space(case, layout=layout).augmented(0.1).discretize(0.01)
         scale = jnp.array([200.0, 800.0, 1800.0, 1, 1, 1, 1, 1, 1])
         return (found.A * scale[:, None] / scale).ravel()

@@ -19,7 +19,7 @@ from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import closed_forms, finite_elements
 
-STUFF = {"flexural_rigidity": 3.0, "mass_per_length": 1.0}
+PROPERTIES = {"flexural_rigidity": 3.0, "mass_per_length": 1.0}
 UNSTABLE = ("free-free", "free-pinned", "pinned-free", "free-guided", "guided-free",
             "guided-guided")  # fmt: skip
 GENERAL = Case(
@@ -37,14 +37,14 @@ X = np.array([0.0, 0.05, 0.25, 0.33, 0.6, 1.0, 1.3])
 
 
 def oracle_line(case: Case, x, positions) -> np.ndarray:
-    """(position, place), with no more elements than needed: they are exact."""
+    """Influence lines (load position, x) of the oracle, exact with few elements."""
     beam = as_oracle(case, elements=1)
     return np.array([finite_elements.static_deflection(beam, x, [(p, -1.0)]) for p in positions])
 
 
 @pytest.mark.parametrize("ends", [f"{a}-{b}" for a in END_CONDITIONS for b in END_CONDITIONS])
 def test_one_span_has_the_line_of_macaulays_method(ends):
-    case, positions = Case(Beam(1.7, **STUFF, ends=ends)), np.linspace(0.0, 1.7, 8)
+    case, positions = Case(Beam(1.7, **PROPERTIES, ends=ends)), np.linspace(0.0, 1.7, 8)
     if ends in UNSTABLE:
         with pytest.raises(ValueError, match="rigid body.*hold its ends or add supports"):
             influence_line(case, 0.6, positions)
@@ -56,7 +56,7 @@ def test_one_span_has_the_line_of_macaulays_method(ends):
 
 def test_two_spans_have_the_textbook_deflections():
     """23 and -9 in 1536ths of P l^3 / E I."""
-    case = Case(Beam(2.0, **STUFF), supports=[Support(1.0)])
+    case = Case(Beam(2.0, **PROPERTIES), supports=[Support(1.0)])
     found = influence_line(case, [0.5, 1.5], [0.5])[0]
     assert_allclose(found, np.array([-23.0, 9.0]) / 1536 / 3.0, rtol=1e-13)
     loaded = replace_loads(case, [MovingForce(force=3.0, speed=2.0)])
@@ -64,7 +64,7 @@ def test_two_spans_have_the_textbook_deflections():
 
 
 def test_everything_at_once_as_finite_elements_have_it():
-    # No load so close to another place that the short element spoils the oracle.
+    # No load so close to another node that the short element spoils the oracle.
     y = np.array([0.02, 0.11, 0.3, 0.47, 0.7, 0.95, 1.15])
     expected = oracle_line(GENERAL, X, y)
     found = influence_line(GENERAL, X, y)
@@ -83,7 +83,7 @@ def test_without_forces_the_loads_of_the_case_press_with_their_weights():
     assert_allclose(found, expected, rtol=1e-14)
 
 
-def test_a_beam_that_only_suspensions_hold():
+def test_a_beam_supported_by_suspensions_alone():
     springs = [Shaker(0.1, 3500.0), SpringDamper(0.5, 1000.0)]
     case = Case(Beam(0.6, 11.68, 0.535, ends="free-free"), actuators=springs)
     expected = oracle_line(case, [0.2, 0.6], [0.05, 0.3])
@@ -100,7 +100,7 @@ def test_reciprocity():
 
 def test_very_stiff_springs_are_rigid_supports():
     def line(stiffness):
-        case = Case(Beam(1.2, **STUFF), supports=[Support(0.5, stiffness)])
+        case = Case(Beam(1.2, **PROPERTIES), supports=[Support(0.5, stiffness)])
         return influence_line(case, 0.8, np.linspace(0, 1.2, 9))
 
     assert_allclose(line(1e16), line(None), rtol=0, atol=1e-13 * np.abs(line(None)).max())
@@ -122,7 +122,7 @@ def replace_loads(case: Case, loads) -> Case:
 
 
 def sampled_peak(case: Case, x, until: float) -> np.ndarray:
-    """The same by brute force, at many instants."""
+    """Static peak by sampling many instants."""
     times, total = np.linspace(0.0, until, 40001), 0.0
     length = float(case.beam.length)
     for load in case.loads:
@@ -138,7 +138,7 @@ def sampled_peak(case: Case, x, until: float) -> np.ndarray:
 @pytest.mark.parametrize("speed", [0.01, 3.0, -3.0])
 def test_one_load_makes_the_extreme_of_the_influence_line_at_any_speed(speed):
     """Pinned, midspan: P L^3 / 48 E I; a quarter span, by Roark's largest deflection."""
-    case = Case(Beam(2.0, **STUFF), loads=[MovingMass(0.4, speed)])
+    case = Case(Beam(2.0, **PROPERTIES), loads=[MovingMass(0.4, speed)])
     a = 0.5  # the load at a: deflection elsewhere is largest sqrt((L^2 - a^2) / 3) from the far end
     extreme = a * (4.0 - a**2) ** 1.5 / (9 * np.sqrt(3) * 2.0)
     expected = 0.4 * 9.81 / 3.0 * np.array([8 / 48, extreme])
@@ -228,6 +228,6 @@ def test_gradients_of_lines_and_peaks():
         ),
     ],
 )
-def test_bad_input_is_refused(call, message):
+def test_invalid_arguments_are_refused(call, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         call()

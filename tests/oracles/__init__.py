@@ -1,1 +1,1 @@
-"""Independent solutions to hold jaxbeam against: numpy and scipy only, nothing from jaxbeam."""
+"""Independent solutions to compare jaxbeam with: numpy and scipy only, nothing from jaxbeam."""

@@ -57,7 +57,7 @@ class Sensor:
     delay: float = 0.0
 
     def row(self, span: Span) -> np.ndarray:
-        """What takes the modal coordinates, rates or accelerations to the signal."""
+        """Row from the modal coordinates, rates or accelerations to the signal."""
         if self.quantity == "strain":
             return -self.fibre * span.shapes(self.position, 2)
         return span.shapes(self.position, 1 if self.quantity == "slope" else 0)
@@ -73,7 +73,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Clock:
-    """When a sampled controller acts, how late its commands begin, in what steps they are."""
+    """Sampling period, delay (s) and resolution of the commands of a sampled controller."""
 
     period: float
     delay: float = 0.0
@@ -172,8 +172,8 @@ class _Plant:
         n = self.span.modes
         result = np.zeros(self.size)
         result[:n], result[n : 2 * n] = y[n : 2 * n], self.accelerations(t, y, command, active)
-        for place, i in enumerate(self.lagging, 2 * n):
-            result[place] = self.actuators[i].lag * (command[i] - y[place])
+        for index, i in enumerate(self.lagging, 2 * n):
+            result[index] = self.actuators[i].lag * (command[i] - y[index])
         for i, (part, matrix, column, _) in self.filters.items():
             result[part] = matrix @ y[part] + column * self.signal(i, y)
         return result
@@ -197,12 +197,12 @@ class _Plant:
         return np.linalg.solve(mass, force)
 
     def signal(self, i, y):
-        """What a sensor sees before any filter, accelerations apart."""
+        """Signal of a sensor before any filter, but for accelerations."""
         n = self.span.modes
         return self.rows[i] @ (y[n : 2 * n] if self.sensors[i].quantity == "velocity" else y[:n])
 
     def smooth(self, i, y):
-        """What it sees behind its analogue filter, if it has one."""
+        """Signal of a sensor after its analogue filter, if it has one."""
         if i not in self.filters:
             return self.signal(i, y)
         part, _, _, row = self.filters[i]
@@ -220,9 +220,9 @@ class _Loop:
         self.acts, self.times = set(), []
         if clock is None:
             return
-        ticks = clock.period * np.arange(int(end / clock.period + 1e-9) + 1)
-        self.acts = {round(t, DIGITS) for t in ticks}
-        self.times = [*ticks, *(ticks + clock.delay)]
+        instants = clock.period * np.arange(int(end / clock.period + 1e-9) + 1)
+        self.acts = {round(t, DIGITS) for t in instants}
+        self.times = [*instants, *(instants + clock.delay)]
         for sensor in plant.sensors:
             period = sensor.period or clock.period
             numbers = range(int(end / period + 1e-9) + 1)
@@ -239,7 +239,7 @@ class _Loop:
                 self.digital.append(None)
 
     def carry_out(self, t, state, active):
-        """All that is due at an event."""
+        """Take the readings and give the commands that are due at an event."""
         for i, sensor in enumerate(self.plant.sensors if self.clock else ()):
             if t in self.seen[i]:
                 self._read(i, sensor, self.seen[i][t], t, state, active)

@@ -1,6 +1,6 @@
 """Make the logs that `jaxbeam demo` identifies: python -m tests.oracles.make_demo_log
 
-The rig and its crossings are what rig.toml and the files beside the logs say, but for the values
+The case and its crossings are those of rig.toml and the files beside the logs, but for the values
 that truth.toml gives at their addresses. The beam is the finite-element model with sixteen modes,
 integrated by scipy; the readings get the sensors' offsets and white noise.
 """
@@ -32,10 +32,10 @@ def truth() -> tuple[dict, dict[str, dict]]:
     rig, logs = read("rig"), {name: read(name) for name in SAMPLING}
     for address, value in read("truth").items():
         *path, last = address.split(".")
-        place = rig | {"logs": list(logs.values())}
+        part = rig | {"logs": list(logs.values())}
         for step in path:
-            place = place[int(step) if step.isdigit() else step]
-        place[last] = value
+            part = part[int(step) if step.isdigit() else step]
+        part[last] = value
     return rig, logs
 
 

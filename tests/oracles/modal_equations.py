@@ -36,7 +36,7 @@ class Span:
 
     @functools.cached_property
     def frequencies(self) -> np.ndarray:
-        """Angular, rad/s."""
+        """Natural angular frequencies in rad/s."""
         return self.wavenumbers**2 * np.sqrt(self.flexural_rigidity / self.mass_per_length)
 
     @functools.cached_property
@@ -51,9 +51,9 @@ class Span:
         return np.sqrt(2.0 / (self.mass_per_length * self.length)) * k**derivative * np.sin(phase)
 
 
-@functools.lru_cache(16)  # solvers ask many times for the same place
+@functools.lru_cache(16)  # solvers ask many times for the same position
 def under(span, x: float) -> tuple[np.ndarray, ...]:
-    """Modes, slopes and curvatures of any span at a place, not to be changed."""
+    """Modes, slopes and curvatures of a span at a position; read-only arrays."""
     return tuple(span.shapes(x, derivative) for derivative in range(3))
 
 

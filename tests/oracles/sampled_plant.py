@@ -20,9 +20,12 @@ from tests.oracles.modal_equations import Span
 
 @dataclass(frozen=True)
 class Step:
-    """x_k = drift x_(k-1) + before u_(k-1) + after u_k + w, cov(w) = noise; u_k acts until k."""
+    """x_k = transition x_(k-1) + before u_(k-1) + after u_k + w, cov(w) = noise.
 
-    drift: np.ndarray
+    The command u_k acts until sample k.
+    """
+
+    transition: np.ndarray
     before: np.ndarray
     after: np.ndarray
     noise: np.ndarray
@@ -104,21 +107,21 @@ def conditioned(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of the last state, given all readings.
 
-    `start` is mean and covariance one step before the first tick; `rows` are C and D at the ticks;
-    `commands` (tick, input) acted until the ticks, none before the first.
+    `start` is mean and covariance one step before the first sample; `rows` are C and D at the
+    samples; `commands` (sample, input) acted until the samples, none before the first.
     """
     mean, covariance = start
     size, count = mean.size, len(steps)
     means, spread = [], np.zeros((count * size, count * size))
     before = np.zeros(commands.shape[1])
     for k, step in enumerate(steps):
-        mean = step.drift @ mean + step.before @ before + step.after @ commands[k]
-        covariance = step.drift @ covariance @ step.drift.T + step.noise
+        mean = step.transition @ mean + step.before @ before + step.after @ commands[k]
+        covariance = step.transition @ covariance @ step.transition.T + step.noise
         means.append(mean)
         here = slice(k * size, (k + 1) * size)
         spread[here, here] = covariance
         spread[here, : k * size] = (
-            step.drift @ spread[(k - 1) * size : k * size, : k * size] if k else 0.0
+            step.transition @ spread[(k - 1) * size : k * size, : k * size] if k else 0.0
         )
         spread[: k * size, here] = spread[here, : k * size].T
         before = commands[k]

@@ -37,7 +37,7 @@ class TwoSpans:
 
     @cached_property
     def frequencies(self) -> np.ndarray:
-        """Angular, rad/s."""
+        """Natural angular frequencies in rad/s."""
         return self.wavenumbers**2 * np.sqrt(self.flexural_rigidity / self.mass_per_length)
 
     @cached_property
@@ -47,7 +47,7 @@ class TwoSpans:
 
     @cached_property
     def scale(self) -> np.ndarray:
-        """What makes the modal masses one."""
+        """Factor that makes the modal masses one."""
         points, weights = np.polynomial.legendre.leggauss(60 + 4 * self.modes)
         x = self.length / 4 * (points + 1)  # half is enough: the other is its image
         squares = self._left(x, 0) ** 2
@@ -62,7 +62,7 @@ class TwoSpans:
         return self.scale * turned * self._left(np.array([self.length - x]), derivative)[0]
 
     def _left(self, x, derivative):
-        """Shapes (place, mode) on the left span, with a largest sine of one."""
+        """Shapes (position, mode) on the left span, with a largest sine of one."""
         k, span = self.wavenumbers, self.length / 2
         phase = np.multiply.outer(x, k)
         sine = np.sin(phase + 0.5 * np.pi * derivative)
@@ -74,7 +74,7 @@ class TwoSpans:
 
 @dataclass(frozen=True)
 class ProjectedSines:
-    """So many sines of the whole length, less what the support in the middle takes."""
+    """Sines of the whole length, constrained by the support in the middle."""
 
     length: float
     flexural_rigidity: float
@@ -93,7 +93,7 @@ class ProjectedSines:
 
     @cached_property
     def _solved(self):
-        """Squares of frequencies, and what takes their coordinates to those of the sines."""
+        """Squared angular frequencies, and the map from modal coordinates to those of the sines."""
         size = self.mass_per_length * self.length / 2
         kept = null_space(np.sin(self._whole * self.length / 2)[None])
         stiffness = self.flexural_rigidity * self._whole**4 * self.length / 2
@@ -102,12 +102,12 @@ class ProjectedSines:
 
     @cached_property
     def frequencies(self) -> np.ndarray:
-        """Angular, rad/s."""
+        """Natural angular frequencies in rad/s."""
         return np.sqrt(self._solved[0])
 
     @cached_property
     def damping(self) -> np.ndarray:
-        """That of the sines without the support, each with the damping ratio, projected."""
+        """Damping matrix in 1/s: that of the sines without the support, projected on the modes."""
         turn = self._whole**2 * np.sqrt(self.flexural_rigidity / self.mass_per_length)
         each = 2 * self.damping_ratio * turn * self.mass_per_length * self.length / 2
         return self._solved[1].T @ (each[:, None] * self._solved[1])
