@@ -1,1 +1,1 @@
-"""Exact modal propagation with collocated contact forces, step by step."""
+"""Integrator: exact modal propagation with contact forces collocated at Gauss nodes."""

@@ -1,12 +1,12 @@
-"""The adaptive reference beside the fast integrator: slow, readable, for checking.
+"""Reference integrator with adaptive steps, slow and readable, to validate the fast one.
 
 With a load of mass m and weight W at x(t), the mode shapes s there with their derivatives s' and
 s'', and all loads on the beam summed, the mass-matrix form of the equations of motion is
 
-    (I + m s s^T) q'' = (rig without loads) - s (W + m (2 x' s'^T q' + x'^2 s''^T q + x'' s'^T q)),
+    (I + m s s^T) q'' = (unloaded model) - s (W + m (2 x' s'^T q' + x'^2 s''^T q + x'' s'^T q)),
 
-eqs (2.11) to (2.16) of the thesis, solved for q'' at every instant. No collocation of contact
-forces: an embedded Runge-Kutta pair (Dopri8 of diffrax) chooses its own steps, from event to event.
+eqs (2.11) to (2.16) of the thesis, solved for q'' at every instant. Contact forces are not
+collocated: an embedded Runge-Kutta pair (Dopri8 of diffrax) chooses its steps, event by event.
 """
 
 import itertools
@@ -24,7 +24,7 @@ from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.runtime.compiling import compiled
 
 EVENT_MARGIN_SHARE = (
-    1e-14  # of the run: motions are asked for so far from their kinks, on the leg's own side
+    1e-14  # of the duration: kinematics are evaluated at least this far from events
 )
 
 
@@ -46,11 +46,11 @@ class AdaptiveSolution(eqx.Module):
 def simulate_adaptive(
     case: Case, times: Float[Array, " time"], tolerance: float = 1e-12
 ) -> AdaptiveSolution:
-    """Simulate a case as `jaxbeam.simulate` does, from rest at t = 0, by adaptive steps.
+    """Simulate a case as `jaxbeam.simulate` does, from rest at t = 0, with adaptive steps.
 
-    Samples at the ascending `times` (s); `tolerance` is the error allowed a step, relative to the
-    size the slowest mode is likely to reach. Neither differentiable nor for use inside `jit`.
-    Raises ValueError for a faulty case.
+    Samples are at the ascending `times` (s). `tolerance` bounds the error of a step relative to the
+    static deflection of the slowest mode. Neither differentiable nor usable inside `jit`. Raises
+    ValueError for an invalid case.
     """
     check_case(case)
     case, times = concrete_case(case), jnp.asarray(times, float)
@@ -80,7 +80,7 @@ def simulate_adaptive(
 
 
 def _event_times(model: ModalModel, loads: LoadSet, end: float) -> tuple[np.ndarray, np.ndarray]:
-    """Entry and exit of every load (load, 2), and the edges of legs without events, in s."""
+    """Entry and exit of each load (load, 2), and the boundaries of legs without events, in s."""
     windows = np.array([path.entry_exit_times() for path in loads.trajectories]).reshape(-1, 2)
     nonsmooth_times = [
         np.asarray(path.passage_times(model.modes.nodes)) for path in loads.trajectories
@@ -98,38 +98,41 @@ def _solve_leg(
 ):
     """State at the end of a leg, and coordinates, rates, accelerations and forces at the times.
 
-    What is returned for times outside the leg means nothing.
+    Values at times outside the leg are meaningless.
     """
     import diffrax
 
     start, stop = interval
-    count = model.modes.stiffness.shape[0]
-    displacement_index, velocity_index = np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2)
-    matrix = model.state_matrix[0]
+    count, matrix = model.mode_count, model.A
     mass = jnp.where(on_beam, loads.inertia[:, 0], 0.0)
     weight = jnp.where(on_beam, loads.weight[:, 0], 0.0)
 
     def accelerations(t, state):
-        """Of the modes, and the forces with which the loads press."""
+        """Modal accelerations, and contact forces (N, downwards on the beam)."""
         offset = EVENT_MARGIN_SHARE * times[-1]
         x, speed, acceleration = loads.kinematics(jnp.clip(t, start + offset, stop - offset))
         shape, slope, curvature = model.shapes(jnp.where(on_beam, x, 0.0), (0, 1, 2))
-        q, u = state[displacement_index], state[velocity_index]
+        q, u = state[model.coordinate_index], state[model.rate_index]
         convective = (
             2 * speed * (slope @ u) + speed**2 * (curvature @ q) + acceleration * (slope @ q)
         )
         free_force = weight + mass * convective
         inertia = jnp.eye(count) + shape.T @ (mass[:, None] * shape)
         modal_acceleration = jnp.linalg.solve(
-            inertia, (matrix @ state)[velocity_index] - shape.T @ free_force
+            inertia, (matrix @ state)[model.rate_index] - shape.T @ free_force
         )
         return modal_acceleration, free_force + mass * (shape @ modal_acceleration)
 
     def state_rate(t, state, _):
-        return (matrix @ state).at[velocity_index].set(accelerations(t, state)[0])
+        return (matrix @ state).at[model.rate_index].set(accelerations(t, state)[0])
 
     def save(t, state, _):
-        return state, state[displacement_index], state[velocity_index], *accelerations(t, state)
+        return (
+            state,
+            state[model.coordinate_index],
+            state[model.rate_index],
+            *accelerations(t, state),
+        )
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(state_rate),
@@ -152,9 +155,9 @@ def _solve_leg(
 def _state_scales(
     case: Case, model: ModalModel, loads: LoadSet, end: float
 ) -> Float[Array, " state"]:
-    """What errors of the states are measured against: the slowest mode under all the weight.
+    """Scales of the errors of the states: the slowest mode under the weight of all loads.
 
-    A rigid-body mode has all of the run to move away.
+    A rigid-body mode is scaled as a mode of angular frequency 1 / duration.
     """
     stiffness = jnp.maximum(model.modes.stiffness, 1 / end**2)
     weight = jnp.sum(jnp.abs(loads.weight)) + jnp.finfo(float).tiny

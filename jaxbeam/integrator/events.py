@@ -1,7 +1,7 @@
-"""When things happen that are known before a run: samples, ticks of a controller, knots of a table.
+"""Events known before a run: samples, control samples, breakpoints of commands.
 
-The times are merged into one list of edges, so that steps end there; what is due at each edge is
-noted beside it. Loads add edges of their own, whose times are numbers like any other (`grid`).
+Their times are merged into one schedule, so that steps end there, with the actions at each event.
+Events of the loads are added by the time grid (`time_grid`); their times may be traced.
 """
 
 import dataclasses
@@ -12,28 +12,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-SAME_TIME_SHARE = 1e-9  # of the run: closer times are one
-MAX_DISTINCT_GAPS = 64  # more different gaps than these are no longer told apart one by one
+SAME_TIME_SHARE = 1e-9  # of the duration: closer times are one event
+MAX_DISTINCT_GAPS = 64  # with more different intervals, each has a length of its own
 
 
 class EventSchedule(eqx.Module):
-    """Edges in time, the gaps between them, and what is due at each.
+    """Times of events (s), lengths of the intervals between them, and the actions at each event.
 
-    `length_index` says which of the `lengths` (s) each gap has; `sample_events` are the edges at which the run
-    is sampled. For a run with a controller: `control_sample` numbers the edges at which it acts, `reading`
-    those at which each sensor is read, -1 elsewhere. `reading_age` counts the readings of a sensor made
-    since the one that has arrived by a tick, `command_age` the commands made since the one that begins
-    to act at an edge, -1 where none does. `max_age` and `max_waiting` are their largest values.
+    `length_index` is the index of each interval among the `lengths` (s); `sample_events` are the
+    events at which the run is sampled. With a controller: `control_sample` is the number of the
+    control sample at an event and `reading` that of the reading of each sensor, -1 for none.
+    `reading_age` is the number of readings made since the one that is available at an event,
+    `command_age` the number of commands made since the one that takes effect, -1 for none;
+    `max_age` and `max_waiting` are their maxima. A sensor makes at most `max_readings`.
     """
 
-    times: Float[Array, " edge"]
-    length_index: Int[Array, " gap"]
+    times: Float[Array, " event"]
+    length_index: Int[Array, " interval"]
     lengths: Float[Array, " length"]
     sample_events: Int[Array, " time"]
-    control_sample: Int[Array, " edge"] | None = None
-    command_age: Int[Array, " edge"] | None = None
-    reading: Int[Array, "edge sensor"] | None = None
-    reading_age: Int[Array, "edge sensor"] | None = None
+    control_sample: Int[Array, " event"] | None = None
+    command_age: Int[Array, " event"] | None = None
+    reading: Int[Array, "event sensor"] | None = None
+    reading_age: Int[Array, "event sensor"] | None = None
     max_age: int = eqx.field(static=True, default=0)
     max_waiting: int = eqx.field(static=True, default=0)
     max_readings: int = eqx.field(static=True, default=0)
@@ -42,9 +43,9 @@ class EventSchedule(eqx.Module):
 def sample_schedule(
     times: Float[Array, " time"], equally_spaced: bool, lead_samples: int = 0
 ) -> EventSchedule:
-    """The schedule of nothing but samples at ascending times (s); `equally_spaced` if equally spaced.
+    """Schedule of a run without controller: samples at ascending times (s), which may be traced.
 
-    The first `lead_samples` times are no samples. Also for times that are being traced.
+    The first `lead_samples` times are events without a sample.
     """
     count = times.shape[0]
     sample_events = jnp.arange(lead_samples, count)
@@ -56,20 +57,22 @@ def sample_schedule(
 
 def controller_schedule(
     sample_times: Float[np.ndarray, " time"],
-    control_times: Float[np.ndarray, " tick"],
+    control_times: Float[np.ndarray, " control_sample"],
     delay: float,
     arrival_times: list[Float[np.ndarray, "_"]],
     sensor_delays: list[float],
-    breakpoints: Float[np.ndarray, " knot"],
+    breakpoints: Float[np.ndarray, " breakpoint"],
 ) -> EventSchedule:
-    """The schedule of a run with a controller, from rest at zero to the last sample.
+    """Schedule of a run with a controller, from rest at zero to the last sample.
 
-    `control_times` (s) are when the controller acts, its commands begin `delay` (s) later; `arrival_times` (s)
-    are when readings of each sensor arrive, of what it saw `sensor_delays` (s) before; `breakpoints` (s) are
-    where a prescribed command bends.
+    The controller acts at `control_times` (s), and its commands take effect `delay` (s) later. The
+    readings of each sensor are available at its `arrival_times` (s), taken from the signal
+    `sensor_delays` (s) before. `breakpoints` (s) are those of prescribed commands.
     """
     end = float(sample_times[-1])
-    signal_times = [clock - lag for clock, lag in zip(arrival_times, sensor_delays, strict=True)]
+    signal_times = [
+        arrivals - lag for arrivals, lag in zip(arrival_times, sensor_delays, strict=True)
+    ]
     all_times = np.sort(
         np.concatenate(
             [
@@ -84,7 +87,7 @@ def controller_schedule(
     )
     all_times = all_times[(all_times >= 0) & (all_times <= end * (1 + SAME_TIME_SHARE))]
     times = all_times[np.diff(all_times, prepend=-np.inf) > SAME_TIME_SHARE * end]
-    # Samples are where they were asked for, to the last bit; others give way to them.
+    # Events merged with a sample take its exact time.
     nearest_sample = np.clip(
         np.searchsorted(sample_times, times - SAME_TIME_SHARE * end), 0, sample_times.size - 1
     )
@@ -117,10 +120,10 @@ def controller_schedule(
     command_lag = np.where(command_start >= 0, latest_number(control_sample) - command_start, -1)
     reading_index = [number_at_events(times) for times in signal_times]
     latest_arrival = [
-        np.searchsorted(clock, times + SAME_TIME_SHARE * end, side="right") - 1
-        for clock in arrival_times
+        np.searchsorted(arrivals, times + SAME_TIME_SHARE * end, side="right") - 1
+        for arrivals in arrival_times
     ]
-    # What was seen before the run is what is seen at rest: the buffer holds nothing else then.
+    # Readings of signals before the run are those at rest, which fill the buffer at the start.
     pairs = zip(reading_index, latest_arrival, strict=True)
     reading_lag = [np.maximum(latest_number(made) - here, 0) for made, here in pairs]
     gaps = np.diff(times)
@@ -145,19 +148,19 @@ def controller_schedule(
         reading_age=stack_columns(reading_lag),
         max_age=int(max((part.max() for part in reading_lag), default=0)),
         max_waiting=int(command_lag.max(initial=0)),
-        max_readings=max((clock.size for clock in arrival_times), default=0),
+        max_readings=max((arrivals.size for arrivals in arrival_times), default=0),
     )
 
 
 def stack_schedules(schedules: list[EventSchedule]) -> EventSchedule:
-    """Schedules of equally many edges and samples, along a new first axis.
+    """Schedules with the same numbers of events and samples, stacked along a new first axis.
 
-    Raises ValueError if their numbers differ.
+    Raises ValueError if the numbers differ.
     """
     if len({(s.times.shape, s.sample_events.shape) for s in schedules}) > 1:
-        raise ValueError("the schedules differ in the number of their edges or samples")
+        raise ValueError("the schedules differ in the number of events or samples")
     max_lengths = max(s.lengths.shape[0] for s in schedules)
-    maxima = ("newest", "waiting", "most_reads")
+    maxima = ("max_age", "max_waiting", "max_readings")
     largest = {name: max(getattr(s, name) for s in schedules) for name in maxima}
 
     def pad(schedule):

@@ -1,4 +1,4 @@
-"""What commands the actuators of a run, as the integrator sees it."""
+"""Input policy: commands to the actuators, as the integrator asks for them."""
 
 import abc
 from typing import Any
@@ -8,9 +8,9 @@ from jaxtyping import Array, Float, Int
 
 
 class StepInfo(eqx.Module):
-    """A step, or several: start (s), length (s), and the edge of the schedule it starts at.
+    """Start (s) and length (s) of a step or several, and index of the event at the start.
 
-    `event` is -1 for a step that starts between two edges.
+    `event` is -1 for a step that starts between two events of the schedule.
     """
 
     start: Float[Array, " *step"]
@@ -19,10 +19,10 @@ class StepInfo(eqx.Module):
 
 
 class AbstractInputPolicy(eqx.Module):
-    """What commands the actuators of a run.
+    """Commands to the actuators of a run as a function of the state.
 
-    With `implicit`, it is told the states at the nodes within a step, and not only at the start. A
-    run is given up where a state of the rig exceeds its `state_bound`.
+    With `implicit`, commands depend on the states at the Gauss nodes of the step. A run is
+    abandoned as diverged where a state exceeds its `state_bound`.
     """
 
     implicit: eqx.AbstractVar[bool]
@@ -30,17 +30,17 @@ class AbstractInputPolicy(eqx.Module):
 
     @abc.abstractmethod
     def start(self, batch_size: int) -> Any:
-        """Its memory at the start of a run, of any structure."""
+        """Memory of the policy at the start of a batch of runs, of any structure."""
 
     @abc.abstractmethod
     def inputs(
-        self, memory, state: Float[Array, "state lane"], info: StepInfo, states
-    ) -> tuple[Float[Array, "node actuator lane"], Any]:
-        """Commands (node, actuator, lane) of a step from this state, and the memory after it.
+        self, memory, state: Float[Array, "state batch"], info: StepInfo, states
+    ) -> tuple[Float[Array, "node actuator batch"], Any]:
+        """Commands (node, actuator, batch) of a step from this state, and the memory after it.
 
-        `states` takes commands to the states at the nodes (node, state, lane), if `inner`.
+        If `implicit`, `states` maps commands to the states at the nodes (node, state, batch).
         """
 
     @abc.abstractmethod
     def observe(self, memory, info: StepInfo) -> Any:
-        """What is to be kept of the start of a step that starts at an edge, lanes last, or None."""
+        """Values to be saved at the start of a step with an event, batch axis last, or None."""

@@ -1,13 +1,12 @@
-"""The fast integrator: exact modal propagation, contact forces collocated at Gauss nodes.
+"""Integrator of a batch of runs: exact modal propagation, contact forces collocated at Gauss nodes.
 
-Within a step every contact force is the polynomial through its values at the Gauss nodes, and so
-is the force it puts on each mode; the rig answers exactly (`exponentials`). Demanding the contact
-law at the nodes gives a small linear system a step. The free rig brings neither error nor
+Within a step, the generalised forces of the loads are polynomials through their values at the
+Gauss nodes, under which the modal model is propagated exactly (`propagators`). The contact law at
+the nodes is a small linear system for each step. The unloaded model adds neither error nor
 stiffness at any step length; the order is twice the number of nodes. Steps are taken in chunks:
-what depends on the path alone is tabulated for a chunk at once and shared by all lanes
-(`matrices`), a short loop then advances the states, and what is wanted of the chunk is reduced at
-once again (`extremes`). Commands to the actuators are polynomials at the same nodes, given by a
-driver.
+their matrices are assembled at once and shared by the batch (`step_matrices`), a short loop
+advances the states (`step`), and peaks are updated for the chunk at once (`running_peaks`).
+Commands to the actuators are polynomials through the same nodes, given by an input policy.
 """
 
 from typing import Any
@@ -31,13 +30,13 @@ from jaxbeam.integrator.step_matrices import (
 from jaxbeam.model.contact import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 
-# Radians a step of the highest mode. Beyond twice the number of nodes the contact force of a mass,
-# a polynomial in each step, misses that mode's oscillation and feeds it.
+# Largest phase (rad) of the highest mode in a step. Beyond twice the number of nodes, the contact
+# force of a mass, a polynomial in each step, cannot follow that mode's oscillation and excites it.
 MAX_PHASE_PER_STEP = 1.9 * NODE_COUNT
 
 
 def max_stable_step(model: ModalModel, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
-    """Longest step (s) with which these loads on the rig can be integrated without blowing up."""
+    """Longest step (s) at which the integration of these loads on the model is stable."""
     limit = MAX_STEP_NORM / state_matrix_norm(model)
     if any(isinstance(load, MovingMass) for load in loads):
         highest_frequency = jnp.sqrt(jnp.max(jnp.linalg.eigvalsh(model.stiffness())))
@@ -46,7 +45,7 @@ def max_stable_step(model: ModalModel, loads: tuple[AbstractLoad, ...]) -> Float
 
 
 def _step_with_inputs(policy: AbstractInputPolicy, carry, step):
-    """One step of all lanes under the commands of a driver."""
+    """One step of a batch under the commands of an input policy."""
     state, memory = carry
     matrices, inertia, weight, info = step
 
@@ -64,16 +63,16 @@ def _step_with_inputs(policy: AbstractInputPolicy, carry, step):
     node_commands, memory = policy.inputs(memory, state, info, node_states)
     commands = jax.lax.collapse(node_commands, 0, 2)
     next_state, (state, forces) = advance(state, (matrices, inertia, weight, commands))
-    # A loop that diverges ends here, in its own lane, instead of running into overflow.
+    # A run that diverges becomes NaN here, without affecting the others, before it overflows.
     diverged = jnp.any(~(jnp.abs(next_state) <= policy.state_bound[:, None]), axis=0)
     next_state = jnp.where(diverged, jnp.nan, next_state)
     return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
 
 
 def _values_by_row(
-    values: Float[Array, "load lane"], path: LoadPath
-) -> Float[Array, "step row lane"]:
-    """A property of the loads for every row of the contact equations; zero for idle slots."""
+    values: Float[Array, "load batch"], path: LoadPath
+) -> Float[Array, "step row batch"]:
+    """A property of the loads for each row of the contact equations; zero off the beam."""
     selected = jnp.where(path.on_beam[..., None], values[path.loads], 0.0)
     return jnp.repeat(selected, len(GAUSS_NODES), axis=1)
 
@@ -81,9 +80,10 @@ def _values_by_row(
 def _chunk_function(
     discrete: DiscreteModel, loads: LoadSet, max_loads: int, policy: AbstractInputPolicy | None
 ):
-    """Function that takes state, memory and extremes through the chunk from a given step on.
+    """Function that advances state, memory and running peaks by the chunk from a given step on.
 
-    It returns them with the time (s) at its end, and with what may be kept of it.
+    It also returns the time (s) at the end of the chunk, and the histories (states before each
+    step, commands at the nodes, observations).
     """
 
     def chunk(state, memory, running_peaks: Any, first_step):
@@ -129,21 +129,21 @@ def integrate_history(
     steps: int,
     policy: AbstractInputPolicy | None = None,
 ):
-    """Integrate from rest over a grid: extremes, states, commands, what is shown, and memory.
+    """Integrate from rest over a grid: running peaks, states, commands, observations, final memory.
 
-    States (edge, state, lane) are those at the start of every step and at the end, commands
-    (step, command, lane) those at the nodes of every step, None without a `policy`; what it shows
-    is kept for every step, its memory that at the end. Extremes are those at the watched places,
-    None if there are none. `max_loads` is how many loads may be on the beam at once. Reverse mode
-    keeps the state and the contact forces of every step, under a driver one state a chunk.
+    States (boundary, state, batch) are those before each step and at the end. Commands (step,
+    command, batch) at the nodes, observations of each step, and the final memory of the `policy`
+    are None without one. Running peaks are those at the monitored positions, None without any.
+    `max_loads` is the largest number of loads on the beam at once. The reverse pass saves states
+    and contact forces of every step; under a policy, one state for each chunk.
     """
     chunk = _chunk_function(discrete, loads, max_loads, policy)
     batch_size, load_count = loads.inertia.shape[1], len(loads.trajectories)
 
     def one_chunk(carry, first):
-        state, memory, best = carry
-        state, memory, best, _, history = chunk(state, memory, best, first)
-        return (state, memory, best), history
+        state, memory, peaks = carry
+        state, memory, peaks, _, history = chunk(state, memory, peaks, first)
+        return (state, memory, peaks), history
 
     running_peaks = (
         None
@@ -171,41 +171,41 @@ def integrate_peaks(
     max_loads: int,
     policy: AbstractInputPolicy | None = None,
 ) -> tuple[RunningPeaks, Any]:
-    """Integrate from rest over a grid, keeping only extremes at the watched places.
+    """Integrate from rest over a grid: running peaks, and the final memory of the policy.
 
-    They are returned with the memory of the driver at the end.
-
-    The loop runs as long as it must: it ends early when all lanes are given up, and without a
-    driver when the energy left after the last exit cannot raise any peak. `max_loads` is how many
-    loads may be on the beam at once. Forward mode only.
+    The loop ends early when all runs have diverged or, without a policy, when the energy left
+    after the last exit cannot raise any peak. `max_loads` is the largest number of loads on the
+    beam at once. Forward mode only.
     """
     chunk = _chunk_function(discrete, loads, max_loads, policy)
     grid, stiffness = discrete.grid, discrete.model.stiffness()
-    modal_states = 2 * stiffness.shape[0]
 
     def unfinished(carry):
-        *_, first, going = carry
-        return going & (first < grid.step_count)
+        *_, first_step, continues = carry
+        return continues & (first_step < grid.step_count)
 
     def can_raise_peak(state, running_peaks, time):
         all_loads_left = time >= grid.last_exit
-        coordinates, rates = state[0:modal_states:2], state[1:modal_states:2]
+        coordinates, rates = (
+            state[discrete.model.coordinate_index],
+            state[discrete.model.rate_index],
+        )
         energy = jnp.sum(rates**2, axis=0) + jnp.sum(
             coordinates * (stiffness @ coordinates), axis=0
         )
         deflection_bound = jnp.sqrt(discrete.flexibility[:, None] * energy)
-        # A run that has blown up has nothing more to show.
+        # A run that has diverged cannot raise its peak further.
         settled = jnp.all((deflection_bound < running_peaks.estimate) | ~jnp.isfinite(energy))
         return ~(all_loads_left & settled)
 
     def next_chunk(carry):
-        state, memory, best, first_step, _ = carry
-        state, memory, best, time, _ = chunk(state, memory, best, first_step)
+        state, memory, peaks, first_step, _ = carry
+        state, memory, peaks, time, _ = chunk(state, memory, peaks, first_step)
         first_step = first_step + CHUNK_STEPS
         continues = (
-            jnp.any(best.finite) if policy is not None else can_raise_peak(state, best, time)
+            jnp.any(peaks.finite) if policy is not None else can_raise_peak(state, peaks, time)
         )
-        return state, memory, best, first_step, continues
+        return state, memory, peaks, first_step, continues
 
     batch_size, load_count = loads.inertia.shape[1], len(loads.trajectories)
     running_peaks = initial_peaks(
@@ -229,11 +229,11 @@ def integrate_at_events(
     *,
     max_loads: int,
     policy: AbstractInputPolicy | None = None,
-) -> Float[Array, "edge state lane"]:
-    """Integrate from rest over a grid, keeping only the states at the edges of its schedule.
+) -> Float[Array, "event state batch"]:
+    """Integrate from rest over a grid: states at the events of its schedule.
 
-    The number of steps between these need not be known when this is compiled. The state at the
-    last edge is left out, zero, unless a driver acts there. Forward mode only.
+    The number of steps between events may be traced. The state at the last event is zero, unless a
+    step with a policy starts there. Forward mode only.
     """
     chunk = _chunk_function(discrete, loads, max_loads, policy)
     grid = discrete.grid

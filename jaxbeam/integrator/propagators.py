@@ -1,4 +1,4 @@
-"""Exact propagation of a linear system over a step, with forces polynomial in time.
+"""Propagators: exact solution of a linear system over a step, with forces polynomial in time.
 
 For z' = A z + B f with f(t) = sum_k f_k l_k(t / h), the l_k being the Lagrange polynomials
 through Gauss nodes, the state at any fraction c of a step h is
@@ -7,8 +7,8 @@ through Gauss nodes, the state at any fraction c of a step h is
 
 with Phi_c = exp(A c h) and Theta_ck a combination of the phi functions
 phi_p(X) = int_0^1 e^{(1 - s) X} s^{p - 1} / (p - 1)! ds (Hochbruck and Ostermann, Acta Numerica
-2010, section 2). They are summed as a Taylor series of a fraction of X and doubled a fixed number
-of times, which holds for any damping, rigid-body modes and lags alike, and differentiates.
+2010, section 2). They are Taylor series of X / 2^7, doubled seven times: valid for any damping,
+rigid-body modes and lags of actuators, and differentiable.
 """
 
 import functools
@@ -22,22 +22,22 @@ from jaxtyping import Array, Float
 
 from jaxbeam.model.modal_model import ModalModel
 
-NODE_COUNT = 6  # Gauss nodes a step; the integrator is of order 12
+NODE_COUNT = 6  # Gauss nodes in a step; the integrator has order 12
 DOUBLINGS = 7
 TAYLOR_TERMS = 14
-MAX_STEP_NORM = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is right to rounding
+MAX_STEP_NORM = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is exact to rounding
 
 GAUSS_NODES = (np.polynomial.legendre.leggauss(NODE_COUNT)[0] + 1) / 2
-# Where in a step the deflection is looked at for its peak: the ends, and the nodes, of which the
-# propagators are needed anyway. Curves through these wiggle less than those through equal points.
+# Positions in a step at which the deflection is sampled for its peak: the ends and the Gauss nodes,
+# for which propagators exist. Interpolants through these oscillate less than through equal points.
 PEAK_NODES = (0.0, *(float(node) for node in GAUSS_NODES), 1.0)
 
 
 class Propagators(eqx.Module):
-    """Propagators over steps of given lengths: at the Gauss nodes, and at the end.
+    """Propagators over steps of given lengths, to the Gauss nodes and to the end of a step.
 
-    `drift_*` take the state at the start, `push_*` the inputs at the Gauss nodes; in the blocks of
-    the rig.
+    `transition_*` act on the state at the start, `input_*` on the inputs at the Gauss nodes, in the
+    blocks of the modal model.
     """
 
     transition_nodes: Float[Array, "*length node block side side"]
@@ -57,27 +57,27 @@ def lagrange_coefficients() -> np.ndarray:
 
 
 def end_weights() -> np.ndarray:
-    """Weights (node, end) of the values at the Gauss nodes for those at start and end of a step."""
+    """Weights (node, end) that extrapolate values at the Gauss nodes to the ends of a step."""
     coefficients = lagrange_coefficients()
     return np.stack([coefficients[:, 0], coefficients.sum(axis=1)], axis=1)
 
 
 def _multiply(a, b):
-    """Product of matrices (row, column, ...), many at once; spelt out for those of single modes."""
+    """Product of matrices (row, column, ...), spelt out for the small blocks of single modes."""
     if a.shape[1] > 3:
         return jnp.einsum("ij...,jk...->ik...", a, b)
     return sum(a[:, i, None] * b[None, i] for i in range(a.shape[1]))
 
 
 def state_matrix_norm(model: ModalModel) -> Float[Array, ""]:
-    """Norm of the balanced state matrix in 1/s: steps must be shorter than `MAX_STEP_NORM` over it."""
-    balance = _state_scaling(model)
-    matrix = model.state_matrix * balance[:, :, None] / balance[:, None, :]
+    """Norm of the scaled state matrix in 1/s; `MAX_STEP_NORM` over it bounds the step length."""
+    scale = _state_scaling(model)
+    matrix = model.state_matrix * scale[:, :, None] / scale[:, None, :]
     return jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=-1)))
 
 
 def _state_scaling(model: ModalModel):
-    """Scale of the states (block, side) that gives deflections and speeds of modes equal size."""
+    """Scaling (block, side) of the states to equal size of displacements and rates of a mode."""
     blocks, side, _ = model.state_matrix.shape
     modes_per_block = model.modes_per_block
     modes = np.arange(modes_per_block)
@@ -90,9 +90,9 @@ def _state_scaling(model: ModalModel):
 def propagators(
     model: ModalModel, lengths: Float[Array, " *length"], with_commands: bool = False
 ) -> Propagators:
-    """Propagators of the rig over steps of the given lengths (s), zero included.
+    """Propagators of a modal model over steps of the given lengths (s), which may be zero.
 
-    Inputs are the forces on the modes, and after them, if the rig is `with_commands`, the commands.
+    Inputs are the generalised forces on the modes, then, `with_commands`, the commands.
     """
     state_scale = _state_scaling(model)
     blocks, side, _ = model.state_matrix.shape
@@ -103,7 +103,7 @@ def propagators(
         input_matrix = jnp.concatenate([input_matrix, model.command_matrix], axis=1)
     fractions = np.append(GAUSS_NODES, 1.0)
     durations = lengths[..., None] * fractions
-    # Blocks and spans are the last axes, along which processors compute many at a time.
+    # Blocks and durations are the last axes, along which operations vectorise.
     x = jnp.moveaxis(matrix, 0, -1)[..., None] * durations.ravel() / 2**DOUBLINGS
     transition, phi_functions = _taylor_series(x, input_matrix)
     (transition, phi_functions), _ = jax.lax.scan(
@@ -120,7 +120,7 @@ def propagators(
     weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
     inputs = jnp.einsum("cfp,psmb...c->...cfbsm", weights, phi_functions)
     transition = jnp.einsum("stb...c->...cbst", transition)
-    # Inputs act on speeds and actuators' own states, which the balance leaves as they are.
+    # Inputs act on rates and actuators' own states, which the scaling leaves unchanged.
     inputs = inputs / state_scale[:, :, None]
     transition = transition * state_scale[:, None, :] / state_scale[:, :, None]
     return Propagators(
@@ -132,10 +132,10 @@ def propagators(
 
 
 def _taylor_series(x, input_matrix):
-    """exp(x), and phi_1 ... phi_NODES of x times the force matrix (phi, ...), for small x."""
+    """exp(x), and phi_1(x) ... phi_6(x) times the input matrix (phi, ...), for small x."""
     side, inputs = input_matrix.shape
     rest = x.shape[2:]
-    # Side by side, as they are summed alike; only what the terms are divided by differs.
+    # Both series at once: they differ only in the divisors of their terms.
     starting_terms = jnp.concatenate([jnp.eye(side), input_matrix], axis=1).reshape(
         side, -1, *(1,) * len(rest)
     )
@@ -154,13 +154,13 @@ def _taylor_series(x, input_matrix):
 
 
 def _double_argument(functions, _):
-    """The same functions of twice the argument."""
+    """exp and phi functions of twice the argument."""
     transition, phi_functions = functions
     propagated = jax.vmap(functools.partial(_multiply, transition))(phi_functions)
-    # Spelt out: as a product over the first axis it would be copied to and fro.
+    # Spelt out: a product over the first axis would transpose the arrays twice.
     weights = _doubling_weights().T.reshape(NODE_COUNT, NODE_COUNT, *(1,) * transition.ndim)
     doubled = propagated + sum(
-        weight * push for weight, push in zip(weights, phi_functions, strict=True)
+        weight * phi for weight, phi in zip(weights, phi_functions, strict=True)
     )
     powers_of_half = 0.5 ** np.arange(1, NODE_COUNT + 1).reshape(
         NODE_COUNT, *(1,) * transition.ndim

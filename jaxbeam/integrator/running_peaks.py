@@ -1,4 +1,7 @@
-"""The largest deflections and smallest contact forces of a run, kept without storing it."""
+"""Running peaks: largest deflections and smallest contact forces, updated chunk by chunk.
+
+Histories are not stored.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,13 +17,13 @@ from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
 from jaxbeam.integrator.step_matrices import LoadPath, StepMatrices
 from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
 
-PEAK_MARGIN = 1.1  # a peak between samples is less than this above the highest of them
+PEAK_MARGIN = 1.1  # upper bound of a peak over the highest of the samples around it
 
 
 class Peaks(NamedTuple):
-    """Results of runs: peaks (m) and when they are (s), contact forces (N) and their loss (s).
+    """Peaks of runs (m) and their times (s), smallest contact forces (N) and first losses (s).
 
-    NaN where a run failed, and for contact that is never lost.
+    NaN where a run failed; the time of a loss is NaN where contact is never lost.
     """
 
     peak_deflection: Float[Array, "*task batch sensor"]
@@ -30,15 +33,16 @@ class Peaks(NamedTuple):
 
 
 class RunningPeaks(eqx.Module):
-    """What is kept of a run.
+    """Peaks of the runs of a batch so far.
 
-    `samples` are the deflections at the points looked at in the step with the largest `magnitude` of
-    deflection of each watched place, `step_start` (s) and `step_length` (s) that step. Contact forces are those
-    with which a load presses on the beam; `contact_lost_time` (s) is the first time it would have to pull.
+    `samples` are the deflections (m) at the peak nodes of the step with the largest `estimate` of
+    the `magnitude` of each monitored deflection; that step has `step_start` (s) and `step_length`
+    (s). Contact forces (N) are positive where a load presses on the beam; `contact_lost_time` (s)
+    is the first instant of a tensile contact force. A run is `finite` until it diverges.
     """
 
     estimate: Float[Array, "sensor batch"]
-    samples: Float[Array, "source sensor batch"]
+    samples: Float[Array, "sample sensor batch"]
     step_start: Float[Array, "sensor batch"]
     step_length: Float[Array, "sensor batch"]
     lowest_contact_force: Float[Array, "load batch"]
@@ -47,13 +51,13 @@ class RunningPeaks(eqx.Module):
     magnitude: Callable = eqx.field(static=True)
 
     def refined_peak(self) -> tuple[Float[Array, "sensor batch"], Float[Array, "sensor batch"]]:
-        """Largest size of deflection (m) of each watched place, and when (s); NaN if not sound."""
+        """Peak magnitude of each monitored deflection (m), and its time (s); NaN if not finite."""
         value, position = refine_peak(self.samples, PEAK_NODES, self.magnitude)
         time = self.step_start + position * self.step_length
         return jnp.where(self.finite, value, jnp.nan), jnp.where(self.finite, time, jnp.nan)
 
     def peaks(self) -> Peaks:
-        """All that is known at the end, with lanes first."""
+        """Peaks at the end of the runs, with the batch axis first."""
         lost = jnp.where(self.contact_lost_time < NEVER, self.contact_lost_time, jnp.nan)
         return Peaks(*(part.T for part in (*self.refined_peak(), self.lowest_contact_force, lost)))
 
@@ -62,7 +66,7 @@ class RunningPeaks(eqx.Module):
 def update_peaks(
     running_peaks: RunningPeaks, matrices: StepMatrices, path: LoadPath, states, forces, commands
 ) -> RunningPeaks:
-    """Extremes of the run so far, from those up to a chunk of steps and the chunk itself."""
+    """Running peaks after a further chunk of steps."""
     steps, batch_size = states.shape[0], states.shape[-1]
     start, length = path.start, path.length
     parts = (states, forces) if commands is None else (states, forces, commands)
@@ -90,7 +94,7 @@ def update_peaks(
             best.magnitude,
         )
 
-    # Most chunks come nowhere near the peak so far, or press all along: they end here.
+    # Most chunks stay far below the peak so far and lose no contact: they skip the refinement.
     largest = jnp.max(jnp.abs(samples), axis=(0, 1))
     running_peaks = jax.lax.cond(
         jnp.any(largest * PEAK_MARGIN > running_peaks.estimate),
@@ -99,7 +103,7 @@ def update_peaks(
         running_peaks,
     )
     least_of_step = jnp.min(-forces.reshape(steps, -1, len(GAUSS_NODES), batch_size), axis=2)
-    # A load that is not on the beam, or has no slot, does not count.
+    # Loads off the beam do not count.
     is_load = (
         path.loads[:, :, None] == np.arange(running_peaks.lowest_contact_force.shape[0])
     ) & path.on_beam[..., None]
@@ -109,11 +113,11 @@ def update_peaks(
     )
 
     def first_loss(earlier):
-        pulls = -forces.reshape(steps, -1, 1, len(GAUSS_NODES), batch_size) < 0
+        tensile = -forces.reshape(steps, -1, 1, len(GAUSS_NODES), batch_size) < 0
         times = (start[:, None] + length[:, None] * jnp.asarray(GAUSS_NODES, length.dtype))[
             :, None, None, :, None
         ]
-        when = jnp.where(pulls & is_load[..., None, None], times, NEVER)
+        when = jnp.where(tensile & is_load[..., None, None], times, NEVER)
         return jnp.minimum(earlier, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
 
     contact_lost_time = jax.lax.cond(
@@ -128,7 +132,7 @@ def update_peaks(
 
 
 def initial_peaks(positions: int, loads: int, batch_size: int, magnitude: Callable) -> RunningPeaks:
-    """Extremes of a run that has not begun, by some size of deflection that is zero at rest."""
+    """Running peaks at rest, before the first step; `magnitude` of a deflection is zero at rest."""
     zeros = jnp.zeros((positions, batch_size))
     return RunningPeaks(
         zeros,

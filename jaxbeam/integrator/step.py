@@ -1,8 +1,8 @@
-"""Steps one after the other: contact forces at the nodes, and the state at the end.
+"""Time steps: contact forces at the Gauss nodes, and the state at the end.
 
-A row of steps without commands has a derivative of its own. A change of a step is linear in that
-of the state before it, so what does not depend on that state is worked out for all steps at once;
-what is left to be done one after the other is little, and is little the other way round, too.
+A sequence of steps without commands has its own derivative rule. The tangent of a step is linear in
+that of the state before it; all other terms are computed for all steps at once, so that little
+remains to be done step by step, in forward and in reverse mode.
 """
 
 import jax
@@ -15,14 +15,12 @@ from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.model.contact import solve_contact_forces
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_small
 
-CHECKPOINT_NAME = (
-    "steps"  # states and forces in rows of steps, which reverse mode need not work out again
-)
+CHECKPOINT_NAME = "steps"  # states and contact forces that are saved for the reverse pass
 
 
 @jax.named_scope("collocation")
 def contact_forces(matrices: StepMatrices, inertia, weight, state, commands):
-    """Contact forces (row, lane) of a step from this state under these commands, if any."""
+    """Contact forces (row, batch) in N of a step from a state, under commands if given."""
 
     def forces():
         acceleration = matvec(matrices.contact_response, state)
@@ -32,13 +30,13 @@ def contact_forces(matrices: StepMatrices, inertia, weight, state, commands):
             matrices.contact_compliance, inertia, weight + inertia * acceleration
         )
 
-    # Between loads and after the last there is nothing to solve, which saves half of such steps.
+    # Without loads on the beam there is nothing to solve, which halves the cost of such steps.
     return jax.lax.cond(matrices.loaded, forces, lambda: jnp.zeros_like(weight))
 
 
 @jax.named_scope("propagation")
 def advance(state, step):
-    """One step of all lanes: the contact forces at the nodes, and the state at the end."""
+    """One step of a batch: the state at its end, and (state at its start, contact forces)."""
     matrices, inertia, weight, commands = step
     forces = contact_forces(matrices, inertia, weight, state, commands)
     next_state = free_response(matrices.transition, state) + matvec(matrices.force_response, forces)
@@ -47,8 +45,8 @@ def advance(state, step):
     return next_state, (state, forces)
 
 
-def free_response(transition: Float[Array, "block side side"], state: Float[Array, "state lane"]):
-    """The state at the end of a step without forces."""
+def free_response(transition: Float[Array, "block side side"], state: Float[Array, "state batch"]):
+    """State at the end of a step without forces and commands."""
     blocks, side, _ = transition.shape
     state_blocks = state.reshape(blocks, side, -1)
     if side == 2:
@@ -62,16 +60,17 @@ def free_response(transition: Float[Array, "block side side"], state: Float[Arra
 
 @jax.custom_jvp
 def advance_unforced(matrices: StepMatrices, inertia, weight, state):
-    """The state after a row of steps without commands, states before each, and contact forces."""
+    """Steps without commands: final state, state before each step, and contact forces."""
     final_state, (states, forces) = jax.lax.scan(advance, state, (matrices, inertia, weight, None))
     return final_state, states, forces
 
 
 @advance_unforced.defjvp
 def _advance_unforced_jvp(primals, tangents):
-    """A step demands f + m (G f + R z) + w = 0 of its forces f, and z' = D z + P f.
+    """Tangents of steps f + m (G f + R z) + w = 0, z' = Phi z + Gamma f, with contact forces f.
 
-    With S = (1 + m G)^-1, their changes are f. = c - S m R z.  and  z.' = D z. - P S m R z. + e.
+    With S = (1 + m G)^-1: f. = c - S m R z.  and  z.' = Phi z. - Gamma S m R z. + e, where c and e
+    do not depend on the tangent z. of the state.
     """
     matrices, inertia, weight, state = primals
     matrix_tangents, inertia_tangent, weight_tangent, state_tangent = tangents
@@ -80,7 +79,7 @@ def _advance_unforced_jvp(primals, tangents):
         checkpoint_name(states, CHECKPOINT_NAME),
         checkpoint_name(forces, CHECKPOINT_NAME),
     )
-    # Systems of all steps and lanes side by side.
+    # Systems of all steps and runs at once.
     rows = forces.shape[1]
     matrix = inertia[:, :, None] * matrices.contact_compliance[..., None] + np.eye(rows)[:, :, None]
     identity = jnp.broadcast_to(np.eye(rows)[:, :, None], matrix.shape)
@@ -103,10 +102,11 @@ def _advance_unforced_jvp(primals, tangents):
         + _matvec_of_steps(matrices.force_response, free_force_tangent)
     )
 
-    def step(change, parts):
-        respond, drift, back, rest = parts
-        seen = matvec(respond, change)
-        return free_response(drift, change) + rest - jnp.sum(back * seen, axis=1), change
+    def step(tangent, parts):
+        contact_response, transition, feedback, free_tangent = parts
+        acceleration = matvec(contact_response, tangent)
+        next_tangent = free_response(transition, tangent) + free_tangent
+        return next_tangent - jnp.sum(feedback * acceleration, axis=1), tangent
 
     parts = matrices.contact_response, matrices.transition, state_feedback, free_state_tangent
     final_tangent, state_tangents = jax.lax.scan(step, state_tangent, parts)
@@ -117,7 +117,7 @@ def _advance_unforced_jvp(primals, tangents):
 
 
 def _matvec_of_steps(
-    matrix: Float[Array, "step row column"], vectors: Float[Array, "step column lane"]
+    matrix: Float[Array, "step row column"], vectors: Float[Array, "step column batch"]
 ):
     return (
         _multiply_and_sum(matrix[..., None], vectors)
@@ -126,5 +126,5 @@ def _matvec_of_steps(
     )
 
 
-def _multiply_and_sum(matrix, vectors: Float[Array, "step column lane"]):
+def _multiply_and_sum(matrix, vectors: Float[Array, "step column batch"]):
     return jnp.sum(matrix * vectors[:, None], axis=2)

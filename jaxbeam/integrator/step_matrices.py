@@ -1,8 +1,9 @@
-"""What a chunk of steps needs of the path and the rig alone, the same for all its lanes.
+"""Step matrices shared by all runs of a batch; they depend on load path and model only.
 
-Within a step every contact force is the polynomial through its values at the Gauss nodes, and so
-is every command; the rig answers both exactly (`exponentials`). Here the answers become matrices:
-what the contact law feels at the nodes, the state at the end, the watched deflections.
+Within a step, contact forces and commands are polynomials through their values at the Gauss nodes,
+under which the model is propagated exactly (`propagators`). The matrices map these values, and the
+state at the start, to the acceleration under the loads at the nodes, the state at the end and the
+deflections at monitored positions.
 """
 
 import dataclasses
@@ -23,18 +24,18 @@ from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import LoadSet, contact_rows
 from jaxbeam.model.modal_model import ModalModel
 
-CHUNK_STEPS = 16  # steps that are tabulated at once
+CHUNK_STEPS = 16  # steps whose matrices are computed together
 
 
 class CommandMatrices(eqx.Module):
-    """How commands at the nodes act: on the contact law, and on the state at the end."""
+    """From commands at the nodes to the acceleration under the loads and the state at the end."""
 
     contact_response: Float[Array, "step row command"]
     input_matrix: Float[Array, "step state command"]
 
 
 class NodeMatrices(eqx.Module):
-    """The states at the nodes, from the state at the start, contact forces and commands."""
+    """From state at the start, contact forces and commands to the states at the Gauss nodes."""
 
     transition: Float[Array, "step node_state state"]
     force_response: Float[Array, "step node_state row"]
@@ -42,10 +43,11 @@ class NodeMatrices(eqx.Module):
 
 
 class StepMatrices(eqx.Module):
-    """Matrices of each step of a chunk. Rows are (slot, node), commands (node, actuator).
+    """Matrices of the steps of a chunk; rows are (load, node), commands (node, actuator).
 
-    What is watched follows from state at the start, contact forces and commands, one after the
-    other. Steps are active with a load on the beam.
+    `contact_response` maps the state at the start to the acceleration under the loads at the
+    nodes, `contact_compliance` the contact forces. `monitored` acts on state at the start, contact
+    forces and commands, one after the other. A step is `loaded` with a load on the beam.
     """
 
     contact_response: Float[Array, "step row state"]
@@ -59,11 +61,12 @@ class StepMatrices(eqx.Module):
 
 
 class DiscreteModel(eqx.Module):
-    """A rig on a grid: its propagators, and the rows that give the watched deflections.
+    """Modal model on a time grid: propagators of each step length, rows of monitored deflections.
 
-    `flexibility` is the static deflection at each watched place under a unit force there, which
-    bounds the deflection by the energy. `with_node_states` asks for the states at the nodes too. `magnitude` is
-    what makes a watched deflection large; see `signed_both_ways`.
+    `flexibility` is the static deflection (m/N) at each monitored position under a unit force
+    there; it bounds the deflection by the energy. With `with_node_states`, step matrices include
+    the states at the nodes. Peaks are those of the `magnitude` of a deflection, by default its
+    absolute value.
     """
 
     model: ModalModel
@@ -78,7 +81,7 @@ class DiscreteModel(eqx.Module):
 
     @property
     def position_count(self) -> int:
-        """How many places are watched."""
+        """Number of monitored positions."""
         return 0 if self.flexibility is None else self.flexibility.shape[0]
 
 
@@ -88,7 +91,10 @@ def discrete_model(
     positions: Float[Array, " position"] | None,
     policy: AbstractInputPolicy | None = None,
 ) -> DiscreteModel:
-    """Propagators for all step lengths of a grid; deflections are watched at some places (m)."""
+    """Modal model on a time grid, with deflections monitored at `positions` (m), if any.
+
+    An input policy adds the commands, and the states at the nodes if it is implicit.
+    """
     with_commands = policy is not None
     with_node_states = policy is not None and policy.implicit
     step_propagators = propagators(model, grid.lengths, with_commands)
@@ -139,9 +145,9 @@ def _peak_node_rows(propagators: Propagators, rows):
 def _static_flexibility(
     model: ModalModel, shapes: Float[Array, "position mode"]
 ) -> Float[Array, " position"]:
-    """Static deflection at places under a unit force there; not finite if a mode has no stiffness.
+    """Static deflection (m/N) at positions under a unit force there; infinite for rigid-body modes.
 
-    Modes that nothing couples need no factorisation, which takes longer than all the rest.
+    Uncoupled modes need no factorisation, which would dominate the time.
     """
     if model.modes_per_block == 1:
         return jnp.sum(shapes**2 / -model.state_matrix[:, 1, 0], axis=1)
@@ -150,7 +156,7 @@ def _static_flexibility(
 
 
 def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
-    """A rigging that watches every place twice: how far up the beam goes, then how far down."""
+    """Same model with each position monitored twice: upward deflections, then downward ones."""
 
     def both_signs(rows):
         split = rows.reshape(
@@ -169,10 +175,10 @@ def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
 
 
 class LoadPath(eqx.Module):
-    """Where the loads are in each step of a chunk, and what the contact law feels of the rig there.
+    """Load path in the steps of a chunk: shape and contact rows at the loads, zero off the beam.
 
-    `length_index` says which of the grid's lengths a step has; the times of its start and its length are in
-    s. Rows of idle slots are zero.
+    `length_index` is the index of a step's length among those of the grid; start and length are in
+    s. `loads` are the indices of the loads in the rows.
     """
 
     length_index: Int[Array, " step"]
@@ -188,7 +194,7 @@ class LoadPath(eqx.Module):
 def load_path(
     discrete: DiscreteModel, loads: LoadSet, max_loads: int, index: Int[Array, " step"]
 ) -> LoadPath:
-    """The path of the loads in the steps with the given indices."""
+    """Load path in the steps with the given indices, for at most `max_loads` loads on the beam."""
     model, grid = discrete.model, discrete.grid
     panel, start, length_index = grid.locate_steps(index)
     length = grid.lengths[length_index]
@@ -197,7 +203,7 @@ def load_path(
     position, speed, acceleration = (jnp.moveaxis(p, 0, 1) for p in loads.kinematics(times))
     on_beam = grid.loads_on_beam[panel]  # step, load
     if max_loads < len(loads.trajectories):
-        # Loads on the beam first; those that find no slot are off the beam.
+        # Loads on the beam first; those beyond the largest number are off the beam.
         load_index = jnp.argsort(~on_beam, axis=1)[:, :max_loads]
         selection = load_index[:, :, None]
         position, speed, acceleration = (
@@ -213,8 +219,8 @@ def load_path(
 
 @jax.named_scope("load_path")
 def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
-    """Tables of the steps of a chunk."""
-    # Chosen out here, because derivatives of what a branch chooses from go all the way into it.
+    """Matrices of the steps of a chunk."""
+    # Chosen outside the branches: inside, derivatives would pass through all lengths.
     first_propagators = _propagators_of(discrete, path.length_index[0])
 
     def equal_lengths(_):
@@ -225,14 +231,14 @@ def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
     def mixed_lengths(_):
         def single_step(step):
             kind, shape, rows = step
-            tables = _matrices_of_one_length(
+            matrices = _matrices_of_one_length(
                 discrete, _propagators_of(discrete, kind), shape[None], rows[None]
             )
-            return jax.tree.map(lambda table: table[0], tables)
+            return jax.tree.map(lambda matrix: matrix[0], matrices)
 
         return jax.lax.map(single_step, (path.length_index, path.shape_rows, path.contact_rows))
 
-    # Mostly all steps of a chunk are equally long, and then share their propagators.
+    # In most chunks all steps are equally long and share their propagators.
     matrices: Any = jax.lax.cond(
         jnp.all(path.length_index == path.length_index[0]), equal_lengths, mixed_lengths, None
     )
@@ -240,15 +246,15 @@ def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
 
 
 def _propagators_of(discrete: DiscreteModel, length_index):
-    """Propagators of steps of one length, and what they do to what is watched."""
+    """Propagators of steps of one length, and their rows of monitored deflections."""
     return jax.tree.map(
-        lambda table: jax.lax.dynamic_index_in_dim(table, length_index, keepdims=False),
+        lambda part: jax.lax.dynamic_index_in_dim(part, length_index, keepdims=False),
         (discrete.propagators, discrete.monitored_transition, discrete.monitored_input),
     )
 
 
 def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
-    """Tables of steps of one length, from the shape and contact rows (step, slot, node, ...)."""
+    """Matrices of steps of one length, from the shape and contact rows (step, load, node, ...)."""
     of_states, deflection_transition, deflection_force_response = propagators
     steps, load_count, nodes, _, modes = shape.shape
     size = load_count * nodes
@@ -262,9 +268,9 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
     force_coupling = force_coupling + direct[..., None] * np.eye(nodes)[:, None, :]
     force_response = jnp.einsum("tqfbm,fbim->tbiqf", shape, of_states.input_end[..., :modes])
 
-    def for_all_steps(table, *shape):
-        table = table.reshape(shape or table.shape)
-        return jnp.broadcast_to(table, (steps, *table.shape))
+    def for_all_steps(matrix, *shape):
+        matrix = matrix.reshape(shape or matrix.shape)
+        return jnp.broadcast_to(matrix, (steps, *matrix.shape))
 
     matrices = (
         contact_response.reshape(steps, size, states),
@@ -290,7 +296,7 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
         matrices = (*matrices, jnp.concatenate(parts, axis=2))
     commands = node_states = None
     if discrete.modal_command_matrix is not None:
-        # A rig that takes commands is a single block.
+        # The model of a run with commands is a single block.
         command_count = nodes * discrete.modal_command_matrix.shape[1]
         command_responses = of_states.input_nodes[:, :, 0, :, modes:]
         command_to_acceleration = jnp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], command_responses)

@@ -1,9 +1,8 @@
-"""Where the time steps lie: panels of equal steps between events and saved samples.
+"""Time grid: panels of equal steps between events and samples.
 
-An event is a time at which the motion is not smooth: a load enters, leaves, stops, or passes a
-support or the edge of a patch. Steps never straddle one. The number of panels is fixed by the
-case's structure, so it can be compiled; their edges are numbers like any other, and a panel of
-no length does no harm.
+A load event is a time at which the motion is not smooth: a load enters, leaves, stops, or passes
+a support or the end of a patch. No step contains one inside. The structure of the case fixes the
+number of panels, so the grid can be compiled; a panel of zero length has no effect.
 """
 
 import equinox as eqx
@@ -18,16 +17,16 @@ from jaxbeam.model.modal_model import ModalModel
 
 
 class TimeGrid(eqx.Module):
-    """Panels, each with a number of equal steps; step lengths are shared among panels.
+    """Panels between `boundaries` (s), each with a number of equal steps.
 
-    `counts` are the numbers of steps in the panels, `cumulative_counts` those up to the end of each: added up
-    once, because a loop over many panels must not add them up in every turn. `length_index` says which of
-    `lengths` (s) the steps of a panel have. The last of the lengths is zero: it belongs to the
-    steps after the end, which fill up a chunk. `event` is the edge of the schedule at which a panel
-    starts, -1 for an event; `event_panels` is where edges of the schedule are.
+    `counts` are the numbers of steps of the panels, `cumulative_counts` those up to the end of
+    each. `length_index` is the index of a panel's step length among `lengths` (s), whose last is
+    zero: that of the steps after the end, which fill the last chunk. `event` is the index of the
+    scheduled event at which a panel starts, -1 for a load event; `event_panels` is the panel that
+    starts at each scheduled event. `on_beam_intervals` are entry and exit of each load (s).
     """
 
-    boundaries: Float[Array, " event_at"]
+    boundaries: Float[Array, " boundary"]
     counts: Int[Array, " panel"]
     cumulative_counts: Int[Array, " panel"]
     length_index: Int[Array, " panel"]
@@ -35,7 +34,7 @@ class TimeGrid(eqx.Module):
     loads_on_beam: Bool[Array, "panel load"]
     on_beam_intervals: Float[Array, "load 2"]
     event: Int[Array, " panel"] | None = None
-    event_panels: Int[Array, " planned"] | None = None
+    event_panels: Int[Array, " event"] | None = None
 
     @property
     def last_exit(self) -> Float[Array, ""]:
@@ -48,13 +47,13 @@ class TimeGrid(eqx.Module):
         return self.cumulative_counts[-1]
 
     def locate_steps(self, index: Int[Array, " step"]):
-        """Panel, start time (s) and kind of length of the steps with these indices."""
+        """Panel, start time (s) and index of the length of the steps with these indices."""
         after_end = index >= self.step_count
         if self.event is None:
             panel = jnp.searchsorted(
                 self.cumulative_counts, index, side="right", method="compare_all"
             )
-        else:  # there may be many, all alike
+        else:  # all panels of a schedule have the same number of steps
             panel = index // self.counts[0]
         panel = jnp.minimum(panel, self.counts.shape[0] - 1)
         length_index = jnp.where(after_end, self.lengths.shape[0] - 1, self.length_index[panel])
@@ -65,18 +64,18 @@ class TimeGrid(eqx.Module):
         return panel, jnp.where(after_end, self.boundaries[-1], start), length_index
 
     def event_at(self, index: Int[Array, " step"]) -> Int[Array, " step"]:
-        """Edge of the schedule at which each of some steps starts, -1 for none."""
+        """Index of the scheduled event at which each of some steps starts, -1 for none."""
         panel, _, _ = self.locate_steps(index)
         starts = (index == self._first_step(panel)) & (index < self.step_count)
         return jnp.where(starts, self.event[panel], -1)
 
     def _first_step(self, panel):
-        """The first step of a panel."""
+        """Index of the first step of a panel."""
         return self.cumulative_counts[panel] - self.counts[panel]
 
 
 def _load_events(case: Case, model: ModalModel):
-    """Entry and exit of every load (load, 2), and all events (event,), in s."""
+    """Entry and exit of each load (load, 2), and all load events (event,), in s."""
     inner_nodes = model.modes.nodes[1:-1]
     trajectories = [trajectory(load, case.beam.length) for load in case.loads]
     if not trajectories:
@@ -87,7 +86,7 @@ def _load_events(case: Case, model: ModalModel):
 
 
 def _loads_on_beam(windows, boundaries):
-    """Which loads are on the beam in each panel (panel, load)."""
+    """Whether each load is on the beam in each panel, (panel, load)."""
     middle = (boundaries[1:] + boundaries[:-1]) / 2
     return (windows[:, 0] < middle[:, None]) & (middle[:, None] < windows[:, 1])
 
@@ -95,10 +94,10 @@ def _loads_on_beam(windows, boundaries):
 def grid_by_step_length(
     case: Case, model: ModalModel, max_step: Float[Array, ""], extra_steps: int | Int[Array, ""] = 0
 ) -> TimeGrid:
-    """Panels from event to event, with as many steps as keep them below `max_step` (s), and `extra_steps`.
+    """Panels between load events, with steps of at most `max_step` (s).
 
-    To see what finer steps change, `extra_steps` is one: a short panel has the same whole number of steps
-    of many lengths.
+    `extra_steps` are added to each panel. An error estimate takes one: a smaller `max_step` may
+    leave the number of steps of a short panel unchanged.
     """
     windows, events = _load_events(case, model)
     end = case.run.duration
@@ -119,21 +118,21 @@ def grid_by_step_length(
 def grid_by_schedule(
     case: Case, model: ModalModel, schedule: EventSchedule, substeps: int | Int[Array, ""]
 ) -> TimeGrid:
-    """Panels from edge to edge of a schedule (or event between), each of `substeps` steps.
+    """Panels between the events of a schedule and the load events, of `substeps` steps each.
 
-    Nearly all panels then share a few step lengths, and with them their propagators.
+    Nearly all panels share a few step lengths, hence their propagators.
     """
     times = schedule.times
     windows, events = _load_events(case, model)
     if schedule.control_sample is not None:
-        # A step of no length after the end lets the controller act there once more.
+        # A step of zero length after the end: the controller acts at the last event too.
         events = jnp.append(events, times[-1])
     boundary_times = jnp.concatenate([times, jnp.clip(events, times[0], times[-1])])
     order = jnp.argsort(boundary_times)
     boundaries = boundary_times[order]
     panel_lengths = jnp.diff(boundaries)
     is_scheduled = order < times.shape[0]
-    # The others lie beside an event: at most two for each.
+    # The other panels adjoin a load event: at most two each.
     between_scheduled = is_scheduled[1:] & is_scheduled[:-1]
     length_count = schedule.lengths.shape[0]
     length_index = jnp.where(

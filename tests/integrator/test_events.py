@@ -1,4 +1,4 @@
-"""Schedules: everything due happens at its own time, and memories are long enough for it."""
+"""Schedules: every event is at its time, and buffers are long enough for readings and commands."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 
-from jaxbeam.integrator.events import merged, sampled, stacked
+from jaxbeam.integrator.events import controller_schedule, sample_schedule, stack_schedules
 
 MILLI = 1e-3
 
@@ -19,46 +19,50 @@ MILLI = 1e-3
     spacing=st.integers(1, 50),
 )
 def test_commands_and_readings_come_when_they_are_due(period, delay, clock, late, spacing):
-    """Followed edge by edge with plain lists, in whole milliseconds."""
+    """Followed event by event with plain lists, in whole milliseconds."""
     end = 200 // spacing * spacing
     samples = MILLI * np.arange(0, end + 1, spacing)
     ticks, clocks = MILLI * np.arange(0, end + 1, period), MILLI * np.arange(0, end + 1, clock)
-    knot = np.array([0.0777])
-    found = merged(samples, ticks, MILLI * delay, [clocks], [MILLI * late], knot)
+    breakpoints = np.array([0.0777])
+    found = controller_schedule(
+        samples, ticks, MILLI * delay, [clocks], [MILLI * late], breakpoints
+    )
     times = np.asarray(found.times)
     assert np.all(np.diff(times) > 0) and times[0] == 0 and times[-1] == samples[-1]
-    assert_allclose(times[np.asarray(found.samples)], samples, rtol=0, atol=0)
+    assert_allclose(times[np.asarray(found.sample_events)], samples, rtol=0, atol=0)
     assert (samples[-1] >= 0.0777) == np.any(np.abs(times - 0.0777) < 1e-12)
-    gaps = np.asarray(found.lengths)[np.asarray(found.gaps)]
+    gaps = np.asarray(found.lengths)[np.asarray(found.length_index)]
     assert_allclose(gaps, np.diff(times), rtol=0, atol=1e-10)
 
-    made, seen = [], [("rest", -1)] * (found.newest + 1)
-    for edge, time in enumerate(times):
+    made, seen = [], [("rest", -1)] * (found.max_age + 1)
+    for event, time in enumerate(times):
         now = time / MILLI
-        number = int(found.reads[edge, 0])
+        number = int(found.reading[event, 0])
         if number >= 0:
             assert_allclose(number * clock - late, now, atol=1e-6)
             seen.insert(0, ("read", number))
-        if found.tick[edge] >= 0:
-            assert_allclose(int(found.tick[edge]) * period, now, atol=1e-6)
-            made.insert(0, int(found.tick[edge]))
+        if found.control_sample[event] >= 0:
+            assert_allclose(int(found.control_sample[event]) * period, now, atol=1e-6)
+            made.insert(0, int(found.control_sample[event]))
         arrived = int(np.floor(now / clock + 1e-6))
         expected = ("read", arrived) if arrived * clock - late >= 0 else ("rest", -1)
-        assert found.age[edge, 0] <= found.newest
-        assert seen[int(found.age[edge, 0])] == expected
-        begins = int(found.apply[edge])
+        assert found.reading_age[event, 0] <= found.max_age
+        assert seen[int(found.reading_age[event, 0])] == expected
+        begins = int(found.command_age[event])
         if begins >= 0:
-            assert begins <= found.waiting
+            assert begins <= found.max_waiting
             assert_allclose(made[begins] * period + delay, now, atol=1e-6)
-    assert np.sum(np.asarray(found.tick) >= 0) == ticks.size
-    assert np.sum(np.asarray(found.apply) >= 0) == np.sum(
+    assert np.sum(np.asarray(found.control_sample) >= 0) == ticks.size
+    assert np.sum(np.asarray(found.command_age) >= 0) == np.sum(
         ticks + MILLI * delay <= end * MILLI + 1e-9
     )
 
 
 def test_schedules_of_one_shape_are_stacked():
-    two = [sampled(jnp.linspace(0, end, 5), even) for end, even in ((1.0, True), (2.0, False))]
-    whole = stacked(two)
+    two = [
+        sample_schedule(jnp.linspace(0, end, 5), even) for end, even in ((1.0, True), (2.0, False))
+    ]
+    whole = stack_schedules(two)
     assert whole.times.shape == (2, 5) and whole.lengths.shape == (2, 4)
-    with pytest.raises(ValueError, match="differ in the number of their edges"):
-        stacked([two[0], sampled(jnp.linspace(0, 1, 4), True)])
+    with pytest.raises(ValueError, match="differ in the number of events or samples"):
+        stack_schedules([two[0], sample_schedule(jnp.linspace(0, 1, 4), True)])

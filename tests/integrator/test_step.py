@@ -1,4 +1,4 @@
-"""Rows of steps without commands: their derivative by hand against that of every operation."""
+"""Steps without commands: their own derivative rule against that of every operation."""
 
 import jax
 import jax.numpy as jnp
@@ -6,41 +6,44 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.integrator.step import advance, undriven
-from jaxbeam.integrator.step_matrices import Tables
+from jaxbeam.integrator.step import advance, advance_unforced
+from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.simulation.simulate import simulate_readings
 from tests.runs import plan_of
 
-STEPS, LANES = 5, 3
+STEPS, BATCH_SIZE = 5, 3
 
 
 def random_steps(blocks: int, side: int, rows: int):
-    """Tables of a few steps, the last but one without a load, and loads; changes of all of them."""
+    """Step matrices, inertia, weight and state, with tangents of all of them.
+
+    The last step but one is without a load.
+    """
     rng, states = np.random.default_rng(blocks * side), blocks * side
     root = rng.normal(size=(STEPS, rows, rows))
     sizes = {
-        "respond": (rows, states),
-        "drift": (blocks, side, side),
-        "push": (states, rows),
+        "contact_response": (rows, states),
+        "transition": (blocks, side, side),
+        "force_response": (states, rows),
     }
     parts = {name: rng.normal(size=(STEPS, *shape)) for name, shape in sizes.items()}
     active = np.arange(STEPS) != STEPS - 2
-    tables = Tables(
+    matrices = StepMatrices(
         **jax.tree.map(jnp.asarray, parts),
-        gains=jnp.asarray(root @ root.swapaxes(1, 2)),
-        watch=None,
+        contact_compliance=jnp.asarray(root @ root.swapaxes(1, 2)),
+        monitored=None,
         commands=None,
-        inner=None,
-        active=jnp.asarray(active),
+        nodes=None,
+        loaded=jnp.asarray(active),
     )
     on = active[:, None, None]
-    loads = tuple(on * rng.uniform(0.1, 1.0, (STEPS, rows, LANES)) for _ in range(2))
-    given = tables, *loads, rng.normal(size=(states, LANES))
+    loads = tuple(on * rng.uniform(0.1, 1.0, (STEPS, rows, BATCH_SIZE)) for _ in range(2))
+    given = matrices, *loads, rng.normal(size=(states, BATCH_SIZE))
 
     def changed(leaf):
         if leaf.dtype == bool:
             return np.zeros(leaf.shape, jax.dtypes.float0)
-        # What is no load stays none.
+        # A step without a load stays without.
         here = on if leaf.shape == loads[0].shape else 1.0
         return jnp.asarray(here * rng.normal(size=leaf.shape))
 
@@ -48,27 +51,27 @@ def random_steps(blocks: int, side: int, rows: int):
     return given, jax.tree.map(changed, given)
 
 
-def one_by_one(tables, inertia, weight, state):
+def one_by_one(matrices, inertia, weight, state):
     """The same steps, differentiated operation by operation."""
-    after, (states, forces) = jax.lax.scan(advance, state, (tables, inertia, weight, None))
+    after, (states, forces) = jax.lax.scan(advance, state, (matrices, inertia, weight, None))
     return after, states, forces
 
 
-# One block a mode, more terms than are spelt out, and a rig whose modes are coupled.
+# One block a mode, more terms than are spelt out, and a model whose modes are coupled.
 SHAPES = [(3, 2, 6), (8, 2, 12), (1, 7, 6)]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_changes_of_steps(shape):
+def test_tangents_of_steps_are_those_of_every_operation(shape):
     given, changes = random_steps(*shape)
-    found = jax.jvp(undriven, given, changes)
+    found = jax.jvp(advance_unforced, given, changes)
     wanted = jax.jvp(one_by_one, given, changes)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(b).max())
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_changes_of_steps_are_differences(shape):
+def test_tangents_of_steps_are_differences(shape):
     given, changes = random_steps(*shape)
     size = 1e-6
 
@@ -76,28 +79,31 @@ def test_changes_of_steps_are_differences(shape):
         def shifted(a, b):
             return a if a.dtype == bool else a + by * b
 
-        return undriven(*jax.tree.map(shifted, given, changes))
+        return advance_unforced(*jax.tree.map(shifted, given, changes))
 
-    found = jax.jvp(undriven, given, changes)[1]
+    found = jax.jvp(advance_unforced, given, changes)[1]
     for a, up, down in zip(found, moved(size), moved(-size), strict=True):
         change = (up - down) / (2 * size)
         np.testing.assert_allclose(a, change, rtol=1e-6, atol=1e-7 * np.abs(change).max())
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_backward_is_forward_turned_round(shape):
-    """Along a change the slope is the same in both modes, and so is the slope of the slope."""
-    (tables, *rest), (tables_change, *rest_change) = random_steps(*shape)
-    wanted = [np.random.default_rng(7).normal(size=part.shape) for part in undriven(tables, *rest)]
+def test_reverse_mode_is_the_transpose_of_forward_mode(shape):
+    """First and second derivatives along a direction are the same in both modes."""
+    (matrices, *rest), (matrix_tangents, *rest_tangents) = random_steps(*shape)
+    found = advance_unforced(matrices, *rest)
+    wanted = [np.random.default_rng(7).normal(size=part.shape) for part in found]
 
-    def misfit(respond, gains, drift, push, *rest):
-        moved = Tables(respond, gains, drift, push, None, None, None, tables.active)
-        found = undriven(moved, *rest)
+    names = "contact_response", "contact_compliance", "transition", "force_response"
+
+    def misfit(*parts):
+        parts, rest = parts[: len(names)], parts[len(names) :]
+        moved = StepMatrices(*parts, None, None, None, matrices.loaded)
+        found = advance_unforced(moved, *rest)
         return sum(jnp.sum((a - b) ** 2) for a, b in zip(found, wanted, strict=True))
 
-    names = "respond", "gains", "drift", "push"
-    given = (*(getattr(tables, name) for name in names), *rest)
-    changes = (*(getattr(tables_change, name) for name in names), *rest_change)
+    given = (*(getattr(matrices, name) for name in names), *rest)
+    changes = (*(getattr(matrix_tangents, name) for name in names), *rest_tangents)
     slope = jax.grad(misfit, argnums=tuple(range(len(given))))
 
     def along(*given):
@@ -108,8 +114,8 @@ def test_backward_is_forward_turned_round(shape):
     np.testing.assert_allclose(jax.jvp(along, given, changes)[1], bend, rtol=1e-9)
 
 
-def test_backward_keeps_little_of_each_step():
-    """Its state and its forces, 12 numbers, and what the result has; its matrices alone are 150."""
+def test_reverse_mode_stores_states_and_forces_of_each_step_only():
+    """12 numbers, and those of the result; the matrices of a step alone are 150."""
     beam = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
     load = jb.MovingMass(mass=0.5, speed=1.0)
     case = jb.Case(beam, sensors=[jb.Sensor(0.3)], loads=[load], run=jb.Run(0.5))
