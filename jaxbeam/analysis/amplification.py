@@ -1,4 +1,4 @@
-"""Envelopes of the deflection along the beam, and how far they exceed static loading."""
+"""Deflection envelopes along the beam, and dynamic amplification over static loading."""
 
 import dataclasses
 from typing import NamedTuple
@@ -17,19 +17,28 @@ from jaxbeam.simulation.simulate import integration_setup
 
 
 class Envelope(NamedTuple):
-    """How far a beam goes down and up (m) at some places: nowhere above zero, nowhere below."""
+    """Lowest and highest deflection (m) at given positions: at most zero, and at least zero."""
 
-    lowest: Float[Array, " place"]
-    highest: Float[Array, " place"]
+    lowest: Float[Array, " position"]
+    highest: Float[Array, " position"]
 
 
 def envelope(case: Case, x, tolerance: float = TOLERANCE) -> Envelope:
     """Lowest and highest deflection (m) at positions x (m) during a run, between samples too.
 
-    Found while integrating, without storing histories; free vibration and control are included.
-    The beam begins at rest, so zero is always reached. `tolerance` is relative to the largest
-    deflection. Raises ValueError for a faulty case or positions off the beam, RuntimeError if no
-    time step meets the tolerance.
+    Free vibration and control are included; histories are not stored. The beam starts at rest, so
+    zero is always among the deflections. `tolerance` is relative to the largest deflection. Raises
+    ValueError for an invalid case or positions off the beam, RuntimeError if no time step meets
+    the tolerance.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),
+    ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    ... )
+    >>> low, high = jb.envelope(case, x=[0.3])
+    >>> print(f"{1e3 * low[0]:.2f} mm")
+    -2.00 mm
     """
     x = jnp.asarray(x, float)
     plan = integration_plan(case, tolerance=tolerance)
@@ -47,13 +56,21 @@ def _compiled_envelope(case, plan, times, x):
     return Envelope(-lowest, highest)
 
 
-def amplification(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, " place"]:
+def amplification(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, " position"]:
     """Dynamic amplification at positions x (m): largest dynamic over largest static deflection.
 
-    Static is the same traffic without inertia of beam and loads, by `static.static_peak`, which
-    is exact; the dynamic deflection has the modes of the case, so a few modes make the ratio of a
-    slow crossing fall a little short of one. Raises as `envelope`, and ValueError for a beam that
-    can move as a rigid body.
+    The static deflection is that of the same loads without inertia of beam and loads, exact (see
+    `static_peak`). The dynamic one has the modes of the case only, so with few modes the ratio of
+    a slow crossing is slightly below one. Raises as `envelope`, and ValueError for a beam that can
+    move as a rigid body.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),
+    ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    ... )
+    >>> print(f"{jb.amplification(case, x=[0.3])[0]:.2f}")
+    1.06
     """
     lowest, highest = envelope(case, x, tolerance)
     return jnp.maximum(-lowest, highest) / static_peak(case, jnp.asarray(x, float))

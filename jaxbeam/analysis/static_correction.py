@@ -1,9 +1,8 @@
-"""Static correction: what the modes that were left out would add to a response.
+"""Static correction: quasi-static response of the truncated modes; section forces.
 
-A few modes carry the motion, but a force at a point and the couples of a patch also bend the beam
-locally, in high modes that follow without delay. Their share is the exact static response less
-that of the modes which were kept. The deflection hardly needs it; curvature and the third
-derivative, from which section forces follow, do.
+Point forces and the couples of a patch also bend the beam locally, in high modes that respond
+quasi-statically: by the exact static response less that of the modes kept. The correction of the
+deflection is small; curvature and third derivative, hence section forces, need it.
 """
 
 import jax.numpy as jnp
@@ -19,11 +18,11 @@ from jaxbeam.simulation.record import Record
 
 def residual_actuator_gain(
     case: Case, x, derivative: int = 0, layout: Layout | None = None
-) -> Float[Array, "actuator *place"]:
-    """What the modes of the rig miss of `static_deflection_per_command` at x (m), in m/V or m/N.
+) -> Float[Array, "actuator *position"]:
+    """Residual of the modes in `static_deflection_per_command` at x (m), in m/V or m/N.
 
-    `derivative` (up to 3) gives that x-derivative instead. Suspensions act on both, the exact
-    beam and the modes. Raises ValueError as `static_deflection_per_command` does.
+    `derivative` (up to 3) gives that x-derivative instead. Suspensions act on both, the exact beam
+    and the modes. Raises ValueError as `static_deflection_per_command` does.
     """
     layout = mesh_layout(case) if layout is None else layout
     exact = static_deflection_per_command(case, x, derivative, layout)
@@ -41,9 +40,9 @@ def _modal_actuator_gain(case: Case, layout: Layout, x, derivative: int):
 def residual_flexibility(
     case: Case, x, load_positions, derivative: int = 0, layout: Layout | None = None
 ) -> Float[Array, "..."]:
-    """What the modes of the rig miss of `influence_line`, in m/N: (position..., place...).
+    """Residual flexibility: residual of the modes in `influence_line`, (load position..., x...).
 
-    The rest is as for `residual_actuator_gain`.
+    In m/N, or of an x-derivative as there. Raises ValueError as `influence_line` does.
     """
     layout = mesh_layout(case) if layout is None else layout
     exact = influence_line(case, x, load_positions, derivative, layout)
@@ -62,13 +61,13 @@ def _modal_influence_line(case: Case, layout: Layout, x, load_positions, derivat
 
 def corrected_deflection(
     record: Record, x, derivative: int = 0, layout: Layout | None = None
-) -> Float[Array, "time *place"]:
-    """History of a record's deflection at x (m), statically corrected, in m.
+) -> Float[Array, "time *position"]:
+    """Statically corrected history of a record's deflection at x (m), in m.
 
-    The sum of the modes, and what they miss of the deflection under the contact forces and the
-    commands of each instant; `derivative` (up to 3) gives that x-derivative instead. Good where
-    forces and commands change slowly beside the first mode that was left out. Raises ValueError
-    as `influence_line` does.
+    Sum of the modes, plus the residual of the modes under the contact forces and commands of each
+    instant; `derivative` (up to 3) gives that x-derivative instead. Accurate where forces and
+    commands change slowly compared with the first truncated mode. Raises ValueError as
+    `influence_line` does.
     """
     case, x = record.case, jnp.asarray(x, float)
     shapes = record.modes.shapes(x, derivative)
@@ -87,32 +86,41 @@ def corrected_deflection(
 
 
 def bending_moment(case: Case, x, curvature, commands=None) -> Float[Array, "..."]:
-    """Moment in the section at x (m), beam and patches together, in N m; sagging is positive.
+    """Bending moment of the section at x (m), patches included, in N m; sagging is positive.
 
-    M = E I w'' + the moments that patches over x make themselves, so that it balances what acts
-    on the beam from outside: a patch alone leaves none in a statically determinate beam.
-    `curvature` (..., *place) is w'' in 1/m, from `static_deflection_per_command`, `corrected_deflection` or `influence_line`;
-    `commands` (..., actuator) are in V or N, zero if left out. At the edge of a patch it is the
-    moment to the right.
+    M = E I w'' + active moments of the patches over x: in equilibrium with the external forces,
+    hence zero for a patch alone on a statically determinate beam. `curvature` (..., *position) is
+    w'' in 1/m, the second derivative of `corrected_deflection`, `static_deflection_per_command` or
+    `influence_line`. `commands` (..., actuator) are in V or N, by default zero. At the end of a
+    patch, the moment to the right of it.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Case(jb.Beam(length=2.0, flexural_rigidity=6.0, mass_per_length=1.0))
+    >>> curvature = jb.influence_line(beam, x=0.5, load_positions=1.0, derivative=2)
+    >>> print(f"{jb.bending_moment(beam, 0.5, curvature):.3f} N m")  # F x / 2
+    0.250 N m
     """
     x = jnp.asarray(x, float)
-    info = _bending_stiffness(case, x) * curvature
+    moment = _bending_stiffness(case, x) * curvature
     for i, actuator in enumerate(case.actuators if commands is not None else ()):
         # Couples come in opposite pairs, and the section between them carries them.
         couples = [
-            (place, factor) for place, order, factor in actuator.displacement_map() if order == 1
+            (position, factor)
+            for position, order, factor in actuator.displacement_map()
+            if order == 1
         ]
-        inside = sum((f * _unit_step(case, x, place) for place, f in couples), jnp.zeros(x.shape))
+        steps = (factor * _unit_step(case, x, position) for position, factor in couples)
+        inside = sum(steps, jnp.zeros(x.shape))
         couple = actuator.attachment().static_gain * jnp.asarray(commands, float)[..., i]
-        info = info + jnp.tensordot(couple, inside, axes=0)
-    return info
+        moment = moment + jnp.tensordot(couple, inside, axes=0)
+    return moment
 
 
 def shear_force(case: Case, x, third_derivative) -> Float[Array, "..."]:
-    """Shear force in the section at x (m) in N: the slope of the bending moment along the beam.
+    """Shear force of the section at x (m) in N: the x-derivative of the bending moment.
 
-    `third_derivative` (..., *place) is the third x-derivative of the deflection in 1/m^2. At a point force
-    it is that to the right.
+    `third_derivative` (..., *position) is that of the deflection by x, in 1/m^2. At a point force,
+    the shear force to the right of it.
     """
     return _bending_stiffness(case, jnp.asarray(x, float)) * third_derivative
 
@@ -127,5 +135,5 @@ def _bending_stiffness(case: Case, x):
 
 
 def _unit_step(case: Case, x, position):
-    """1 from a place on, 0 before it; the right end belongs to what lies left of it."""
+    """1 from a position on, 0 before it; at the right end, the value left of it."""
     return jnp.where((x >= position) & (position < case.beam.length), 1.0, 0.0)
