@@ -173,6 +173,13 @@ def figure_path(output: Path | None, source: Path) -> Path:
     return (output or Path(source.name)).with_suffix(".png")
 
 
+def check_exists(kind: str, *paths: Path) -> None:
+    """Raise FileNotFoundError if one of the files, of a kind such as "log file", is missing."""
+    for path in paths:
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: there is no such {kind}")
+
+
 def check_suffix(path: Path | None, suffix: str, content: str) -> None:
     """Raise ValueError if a file has not the suffix of its content."""
     if path and path.suffix != suffix:

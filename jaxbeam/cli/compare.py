@@ -9,6 +9,7 @@ from cyclopts import Parameter
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix, parse_sweep_values, refuse_option
 from jaxbeam.cli.options import CaseOptions, Output, Over, table
+from jaxbeam.files.toml_file import read_toml
 
 if TYPE_CHECKING:
     from jaxbeam.analysis.compare import Comparison, MetricsOverCases, PerformanceMetrics
@@ -43,6 +44,8 @@ def compare(
     check_suffix(output, ".png", "a comparison")
     refuse_option(bool(output and over), "a picture shows one load case: leave out -o or --over")
     options.check_outputs(output)
+    for file in controllers:
+        read_toml(file)
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.compare import compare, metrics_over_cases
@@ -115,7 +118,7 @@ def _to_dict(comparison: "Comparison") -> dict:
 
 
 def _metrics_to_dict(metrics: "PerformanceMetrics") -> dict:
-    margin = metrics.reserve
+    margin = metrics.stability_margin
     unstable = margin.unstable
     stability_margin = {
         "gain": margin.gain,
@@ -131,7 +134,7 @@ def _metrics_to_dict(metrics: "PerformanceMetrics") -> dict:
     }
     limit_cycles = [
         {"extra": one.extra, "frequency": one.frequency, "at_limits": one.at_limits}
-        for one in metrics.swings
+        for one in metrics.limit_cycles
     ]
     return {
         "peak": metrics.peak,
@@ -175,13 +178,13 @@ def _lines(comparison: "Comparison") -> list[str]:
                 f"{metrics.after_exit:.4g}",
                 " ".join(f"{effort:.4g}" for effort in metrics.effort),
                 " ".join(f"{share:.1%}" for share in metrics.saturated),
-                _margin_text(metrics, metrics.reserve.gain),
-                _margin_text(metrics, metrics.reserve.delay),
+                _margin_text(metrics, metrics.stability_margin.gain),
+                _margin_text(metrics, metrics.stability_margin.delay),
             )
             for name, metrics in comparison.metrics.items()
         ],
     )
-    obstacles = {name: metrics.reserve.obstacle for name, metrics in comparison.metrics.items()}
+    obstacles = {name: metrics.stability_margin.obstacle for name, metrics in comparison.metrics.items()}
     for obstacle in dict.fromkeys(filter(None, obstacles.values())):
         names = [name for name, found in obstacles.items() if found == obstacle]
         lines.append(f"no margin of {', '.join(names)}: {obstacle}")
@@ -192,9 +195,9 @@ def _lines(comparison: "Comparison") -> list[str]:
 
 
 def _margin_text(metrics: "PerformanceMetrics", number: float) -> str:
-    if metrics.reserve.obstacle:
+    if metrics.stability_margin.obstacle:
         return "-"
-    return "unstable" if metrics.reserve.gain == 0 else f"{number:.3g}"
+    return "unstable" if metrics.stability_margin.gain == 0 else f"{number:.3g}"
 
 
 def _overall_to_dict(metrics: "MetricsOverCases") -> dict:

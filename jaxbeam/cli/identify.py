@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from jaxbeam.cli.arguments import (
+    check_exists,
     figure_path,
     parse_assignment,
     parse_bounds,
@@ -87,6 +88,7 @@ def identify(
         if report:
             check_report_folder(report, options.overwrite)
         arguments = _prior_arguments(free, prior, scale)
+        check_exists("log file", *logs)
         options.check_case(case)
 
         import tuning  # sets XLA's threads, therefore before the case is read
@@ -120,6 +122,7 @@ def identify(
         any(given),
         "the options of fits are for fitting a case; name what is free with --free ADDRESS",
     )
+    check_exists("log file", *logs)
     if case:
         print_message(
             f"nothing is named with --free, so {case} is not used; modes of the free decay:"

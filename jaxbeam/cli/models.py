@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import parse_assignment, parse_bounds, refuse_option
+from jaxbeam.cli.arguments import check_exists, parse_assignment, parse_bounds, refuse_option
 from jaxbeam.cli.options import (
     CaseOptions,
     Free,
@@ -36,6 +36,8 @@ def compare_models(
     )
     names = [path.stem for path in fits]
     refuse_option(len(set(names)) < len(names), "two fits have the same name; rename one")
+    check_exists("fit", *fits)
+    check_exists("log file", *held_out)
     enable_compile_cache()
     import tuning
 

@@ -6,6 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from jaxbeam.cli.arguments import (
+    check_exists,
     check_suffix,
     figure_path,
     named_number,
@@ -133,6 +134,9 @@ def tune(
     bounds = dict(parse_bounds(text) for text in free)
     files = _output_files(output, len(pareto_limits[1]) if pareto_limits else 0)
     options.check_outputs(*files, picture)
+    check_exists("file of load cases", cases)
+    if fit is not None:
+        check_exists("fit", fit.with_suffix(".npz"))
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import parse_bounds, parse_range, refuse_option
+from jaxbeam.cli.arguments import check_exists, parse_bounds, parse_range, refuse_option
 from jaxbeam.cli.options import CaseOptions, Free, Output
 
 
@@ -36,6 +36,7 @@ def weigh(
     """
     options.check_outputs(output)
     speed_range = parse_range("--speeds", speeds, "m/s, such as 0.5:3")
+    check_exists("log file", log)
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read
@@ -76,6 +77,7 @@ def identify_responses(
     options.check_outputs(output)
     refuse_option(not free, "name what to identify with --free ADDRESS")
     bounds = dict(map(parse_bounds, free))
+    check_exists("log file", log)
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read

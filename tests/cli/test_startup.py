@@ -27,6 +27,8 @@ LINES = {
     "export case.toml -o gains.txt": "gains are written to .csv",
     "tune case.toml --cases loads.toml --posterior": "it needs --fit",
     "identify case.toml log.csv --free beam.length=2:1": "bounds are LOW:HIGH",
+    "identify case.toml none.csv --free beam.length": "none.csv: there is no such log file",
+    "compare case.toml --controllers none.toml": "cannot read the case file none.toml",
     "weigh case.toml log.csv --speeds fast": "--speeds takes LOW:HIGH",
     "compare-models fit.npz": "one fit alone",
     "reproduce": "name an experiment",
