@@ -184,7 +184,9 @@ def _lines(comparison: "Comparison") -> list[str]:
             for name, metrics in comparison.metrics.items()
         ],
     )
-    obstacles = {name: metrics.stability_margin.obstacle for name, metrics in comparison.metrics.items()}
+    obstacles = {
+        name: metrics.stability_margin.obstacle for name, metrics in comparison.metrics.items()
+    }
     for obstacle in dict.fromkeys(filter(None, obstacles.values())):
         names = [name for name, found in obstacles.items() if found == obstacle]
         lines.append(f"no margin of {', '.join(names)}: {obstacle}")

@@ -45,8 +45,8 @@ def identify(
 ) -> None:
     """Identify parameters of a case from logs; without --free, the modes of a free decay.
 
-    A parameter with a value in every log, such as the speed of its load, is free at the address
-    logs.*.loads.0.speed.
+    Parameters of the logs have addresses such as logs.*.loads.0.speed: the speed of the load in
+    every log.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def identify(
     draws
         Number of draws from the posterior in each of four chains (extra bayes).
     noise
-        held at the levels of the fit, or estimated with each draw.
+        Noise levels of the draws: held at those of the fit, or estimated with each draw.
     validate
         Predict each log from a fit to the others (cross-validation).
     report

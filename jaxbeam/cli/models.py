@@ -5,7 +5,6 @@ from pathlib import Path
 from jaxbeam.cli.arguments import check_exists, parse_assignment, parse_bounds, refuse_option
 from jaxbeam.cli.options import (
     CaseOptions,
-    Free,
     Output,
     PrintOptions,
     enable_compile_cache,
@@ -83,7 +82,7 @@ def design_experiment(
     case: Path,
     /,
     *,
-    free: Free = (),
+    free: tuple[str, ...] = (),
     vary: tuple[str, ...] = (),
     target: str | None = None,
     noise: float = 1e-5,
@@ -96,6 +95,8 @@ def design_experiment(
     ----------
     case
         Case file, TOML, with likely values of the free parameters.
+    free
+        ADDRESS: a parameter that will be identified from the experiment; repeat it for more.
     vary
         ADDRESS=LOW:HIGH: a parameter of the experiment to choose, such as the position of a sensor
         or a speed; repeat it for more.

@@ -83,9 +83,9 @@ def tune(
     max_real_part
         Largest real part (1/s) allowed for poles with loads frozen along the crossings.
     extra_delay
-        With --max-real-part: delay (s) beyond the controller's own for which it must hold.
+        With --max-real-part: delay (s), beyond that of the controller, with which it holds too.
     parameter_tolerance
-        With --max-real-part: ADDRESS=SHARE, relative error of a parameter for which it must hold,
+        With --max-real-part: ADDRESS=SHARE, relative error of a parameter with which it holds too,
         such as beam.flexural_rigidity=0.1; repeat it for more.
     method
         adam, lbfgs (optax) or bfgs (optimistix). If left out, lbfgs with --pareto and
