@@ -1,7 +1,7 @@
-"""jaxbeam: structures under moving loads, simulated and differentiated with JAX.
+"""jaxbeam: beams under moving loads, simulated, controlled and differentiated with JAX.
 
-The public names are listed in `__init__.pyi`; each is imported when it is first used, so that
-`import jaxbeam` and the help of the command line need not wait for JAX.
+The public names are listed in `__init__.pyi`. Each is imported when it is first used, so that
+`import jaxbeam` and the help of the command line do not import JAX, which takes a second.
 """
 
 import os
@@ -9,8 +9,10 @@ import sys
 
 import lazy_loader
 
-# Matrices are small here and runs share the cores: threads of LAPACK would wait for each other, on
-# a busy machine for minutes. LAPACK reads this when it is loaded; a setting by the user prevails.
+from jaxbeam.case.aliases import NAMES, warn_renamed
+
+# Matrices are small and runs share the cores: threads of LAPACK would wait for each other, on a
+# busy machine for minutes. LAPACK reads this when it is loaded; a setting by the user prevails.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Peaks to one part in a million need double precision. JAX reads this when it is imported; a
@@ -20,4 +22,11 @@ if "JAX_ENABLE_X64" not in os.environ:
     if "jax" in sys.modules:
         sys.modules["jax"].config.update("jax_enable_x64", True)
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str):
+    if name in NAMES and name not in __all__:
+        warn_renamed(f"jaxbeam.{name}", f"jaxbeam.{NAMES[name]}")
+        name = NAMES[name]
+    return _import_name(name)

@@ -9,44 +9,44 @@ from .analysis.static_correction import (
     corrected_deflection as corrected_deflection,
     shear_force as shear_force,
 )
-from .case.actuators import (
-    Electrodynamic as Electrodynamic,
-    Patch as Patch,
-    PointForce as PointForce,
-    Shaker as Shaker,
-    SpringDamper as SpringDamper,
-)
+from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
+from .case.actuators.patch import Patch as Patch
+from .case.actuators.point import PointForce as PointForce
+from .case.actuators.shaker import Shaker as Shaker
+from .case.actuators.spring import SpringDamper as SpringDamper
 from .case.beam import Beam as Beam, Support as Support
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
 from .case.filters import Filter as Filter
 from .case.loads import MovingForce as MovingForce, MovingMass as MovingMass
 from .case.sensors import Sensor as Sensor
-from .control import (
-    LQR as LQR,
-    MPC as MPC,
+from .control.compensators import (
     PD as PD,
-    AugmentedLQR as AugmentedLQR,
-    DiscreteLQR as DiscreteLQR,
-    Feedback as Feedback,
-    FiniteLQR as FiniteLQR,
     Lead as Lead,
-    Passage as Passage,
     PositivePositionFeedback as PositivePositionFeedback,
-    Prescribed as Prescribed,
-    Recognition as Recognition,
-    Relief as Relief,
-    ScheduledFeedback as ScheduledFeedback,
-    ScheduledLQR as ScheduledLQR,
-    StateFeedback as StateFeedback,
+)
+from .control.feedback import Feedback as Feedback
+from .control.feedforward import Feedforward as Feedforward
+from .control.internal_model import InternalModel as InternalModel
+from .control.load_identification import (
+    LoadIdentification as LoadIdentification,
+    identified_load as identified_load,
+)
+from .control.optimal.crossing_lqr import (
+    AugmentedLQR as AugmentedLQR,
+    FiniteLQR as FiniteLQR,
     StepLQR as StepLQR,
-    recognised as recognised,
-    sampling_limit as sampling_limit,
 )
-from .estimation import (
-    Inversion as Inversion,
-    Kalman as Kalman,
-    Observer as Observer,
-)
+from .control.optimal.lqr import LQR as LQR
+from .control.optimal.sampled_lqr import DiscreteLQR as DiscreteLQR
+from .control.optimal.sampling_loss import sampling_limit as sampling_limit
+from .control.optimal.scheduled_lqr import ScheduledLQR as ScheduledLQR
+from .control.predictive.mpc import MPC as MPC
+from .control.prescribed import Prescribed as Prescribed
+from .control.scheduled_feedback import ScheduledFeedback as ScheduledFeedback
+from .control.state_feedback import StateFeedback as StateFeedback
+from .estimation.inversion import Inversion as Inversion
+from .estimation.kalman import Kalman as Kalman
+from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
 from .model.frequency_response import (
     accelerance as accelerance,

@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from jaxbeam.case.actuators import Shaker
+from jaxbeam.case.actuators.shaker import Shaker
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads import MovingMass
-from jaxbeam.control import Feedback, StateFeedback
+from jaxbeam.control.feedback import Feedback
+from jaxbeam.control.state_feedback import StateFeedback
 from tests.oracles import closed_loop
 from tests.oracles.loads import Load
 from tests.oracles.modal_equations import Span

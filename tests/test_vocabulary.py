@@ -7,7 +7,7 @@ import re
 import pytest
 
 import jaxbeam.files.case_file  # noqa: F401  (imports every kind of part)
-from jaxbeam.case.actuators import AbstractActuator
+from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Run
 from jaxbeam.case.controller import AbstractController

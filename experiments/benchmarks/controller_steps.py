@@ -17,11 +17,10 @@ import warnings
 
 import jaxbeam as jb
 from experiments.benchmarks.common import parser, print_row, print_table
-from jaxbeam.analysis.computing_time import ComputingTimes, computing_times
-from jaxbeam.case.controller import AbstractController
+from experiments.benchmarks.computing_time import ComputingTimes, computing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.kinds import kinds
-from jaxbeam.control import SamplingWarning
+from jaxbeam.control.optimal.sampling_loss import SamplingWarning
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 PERIOD, MODES = 0.01, 5
@@ -30,20 +29,20 @@ FINITE_HORIZON = {**WEIGHTS, "points": 600}
 PREDICTIVE = {"move_weight": 1e-11, "period": PERIOD}
 MPC_4 = {"horizon": 6, "moves": 4, **PREDICTIVE}
 NOISE = {"process_noise": 0.02, "measurement_noise": 1e-5}
-GATE_IDENTIFICATION = jb.Recognition(gates=[-0.2, -0.1], until=0.3)
+GATE_IDENTIFICATION = jb.LoadIdentification(gates=[-0.2, -0.1], until=0.3)
 SCHEDULE_GRID = {"masses": [0.2, 0.4, 0.6], "speeds": [1.0, 1.5]}
 CONTROLLERS = {
     "prescribed": jb.Prescribed(offsets=[1.0], period=PERIOD),
-    "feedforward": jb.Passage(
+    "feedforward": jb.Feedforward(
         gates=[-0.2, -0.1], shares=[0.0, 0.5, 1.0], values=[[1.0, 6.0, 1.0]], period=PERIOD
     ),
-    "internal-model": jb.Relief(
+    "internal-model": jb.InternalModel(
         readings=[-1e-3, 0.0], values=[[7.0, 0.0]], notches=[18.0], period=PERIOD
     ),
     "feedback, linear": jb.Feedback(gains=[2e3], period=PERIOD),
     "feedback, cubic": jb.Feedback(gains=[2e9], power=3, period=PERIOD),
     "feedback-scheduled, load identified": jb.ScheduledFeedback(
-        masses=[0.2, 0.6], gains=[[2e3, 4e3]], recognition=GATE_IDENTIFICATION, period=PERIOD
+        masses=[0.2, 0.6], gains=[[2e3, 4e3]], load_identification=GATE_IDENTIFICATION, period=PERIOD
     ),
     "pd": jb.PD(gains=[2e3], rate_gains=20.0, lag=0.02, period=PERIOD),
     "lead": jb.Lead(gains=[2e3], zero=2.0, pole=8.0, period=PERIOD),
@@ -66,7 +65,7 @@ CONTROLLERS = {
     "lqr-finite": jb.FiniteLQR(**FINITE_HORIZON),
     "lqr-augmented": jb.AugmentedLQR(**FINITE_HORIZON),
     "lqr-scheduled, load identified": jb.ScheduledLQR(
-        **FINITE_HORIZON, **SCHEDULE_GRID, recognition=GATE_IDENTIFICATION
+        **FINITE_HORIZON, **SCHEDULE_GRID, load_identification=GATE_IDENTIFICATION
     ),
     "mpc, unconstrained": jb.MPC(**MPC_4, solver="unconstrained"),
     "mpc, 4 variables": jb.MPC(**MPC_4),

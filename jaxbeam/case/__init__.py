@@ -1,1 +1,1 @@
-"""What a user describes: beam, loads, actuators, sensors, controller and estimator interfaces."""
+"""The case: beam, supports, loads, actuators, sensors; interfaces of controllers and estimators."""

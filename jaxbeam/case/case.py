@@ -2,7 +2,9 @@
 
 import dataclasses
 import difflib
-from collections.abc import Sequence
+import functools
+import typing
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,16 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.actuators import AbstractActuator
+from jaxbeam.case.actuators.base import AbstractActuator
+from jaxbeam.case.aliases import current_address
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, number
 from jaxbeam.case.loads import AbstractLoad, trajectory
-from jaxbeam.case.sensors import QUANTITIES, Sensor
+from jaxbeam.case.sensors import Sensor
 
 
 class Run(eqx.Module):
-    """How long to simulate, and how often to save a sample."""
+    """Duration of a run, sampling rate of its record, gravity, and seed of the sensor noise."""
 
     duration: Float[Array, ""] = number("s", "simulated time, from 0", POSITIVE)
     sample_rate: Float[Array, ""] = number(
@@ -29,14 +32,14 @@ class Run(eqx.Module):
     gravity: Float[Array, ""] = number(
         "m/s^2", "acceleration of gravity", NOT_NEGATIVE, default=9.81
     )
-    seed: int = count("which noise the sensors draw", minimum=0, default=0)
+    seed: int = count("seed of the noise of the sensors", minimum=0, default=0)
 
 
 class Case(eqx.Module):
     """Beam, supports, actuators, sensors, loads, controller and run settings.
 
-    A plain tree: make a changed copy with `replace(case, {"loads.0.mass": 0.3})` or
-    `equinox.tree_at`. Every number has an address, its dotted path.
+    An immutable tree: `replace(case, {"loads.0.mass": 0.3})` or `equinox.tree_at` return a changed
+    copy. Every number has an address, its dotted path. Its fields are the keys of a case file.
     """
 
     beam: Beam
@@ -46,7 +49,7 @@ class Case(eqx.Module):
     loads: tuple[AbstractLoad, ...] = ()
     controller: AbstractController | None = None
     run: Run | None = None
-    title: str = choice("free text", default="")
+    title: str = choice("title of the case", default="")
 
     def __init__(
         self,
@@ -70,12 +73,46 @@ class Case(eqx.Module):
 
     @property
     def sensor_positions(self) -> Float[Array, " sensor"]:
-        """Where the sensors are along the beam (m)."""
+        """Positions of the sensors, distances from the left end (m)."""
         return jnp.array([sensor.position for sensor in self.sensors]).reshape(-1)
 
 
+class PartClass(typing.NamedTuple):
+    """Class of the parts at a key of a case; `listed` if the key holds any number of them."""
+
+    part_class: type
+    listed: bool
+
+
+@functools.cache
+def part_classes() -> dict[str, PartClass]:
+    """Classes of the parts of a case by their keys, in the order of a case file.
+
+    They follow from the annotations of `Case`; an abstract class has its kinds in `kinds`.
+    """
+    classes = {}
+    for key, annotation in typing.get_type_hints(Case).items():
+        arguments = typing.get_args(annotation)  # of tuple[X, ...] or X | None
+        part_class = arguments[0] if arguments else annotation
+        if dataclasses.is_dataclass(part_class):
+            listed = typing.get_origin(annotation) is tuple
+            classes[key] = PartClass(typing.cast(type, part_class), listed)
+    return classes
+
+
+def parts(case: Case) -> Iterator[tuple[str, Any, type]]:
+    """Parts of a case: address, part, and the class that it must have."""
+    for key, (part_class, listed) in part_classes().items():
+        value = getattr(case, key)
+        if listed:
+            for i, part in enumerate(value):
+                yield f"{key}.{i}", part, part_class
+        elif value is not None:
+            yield key, value, part_class
+
+
 def _key_name(key) -> str:
-    """The word or number in one step of a tree path."""
+    """Name or index in one step of a tree path."""
     return str(getattr(key, "name", getattr(key, "idx", getattr(key, "key", key))))
 
 
@@ -85,11 +122,10 @@ def _leaves_by_address(case: Case) -> dict[str, Any]:
 
 
 def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
-    """All numbers of a case by address; each entry of a list has its own address too.
+    """All numbers of a case by address, in SI units.
 
-    `beam.damping_ratio` given as a list is addressed as a whole and as `beam.damping_ratio.0`, ...;
-    an entry of a matrix by row and column, `controller.gain.0.2`.
-    Values are in the SI unit of the field.
+    A list has an address as a whole, `beam.damping_ratio`, and one for each entry,
+    `beam.damping_ratio.0`; an entry of a matrix has row and column, `controller.gain.0.2`.
     """
     numbers = {}
     for address, leaf in _leaves_by_address(case).items():
@@ -101,7 +137,7 @@ def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
 
 
 def unknown_address_error(case: Case, address: str) -> ValueError:
-    """The error for an address that the case does not have, with the nearest one it has."""
+    """Error for an address that a case does not have, with the nearest one that it has."""
     names = list(addresses(case))
     nearest = difflib.get_close_matches(address, names, n=1, cutoff=0.5)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it has {', '.join(names)}"
@@ -109,11 +145,11 @@ def unknown_address_error(case: Case, address: str) -> ValueError:
 
 
 def value_at(case: Case, address: str) -> Float[Array, "..."]:
-    """Return the number at an address.
+    """The number at an address, in SI units.
 
-    Raises ValueError, with the nearest known address, if there is none there.
+    Raises ValueError, with the nearest address of the case, if there is none.
     """
-    leaves = _leaves_by_address(case)
+    leaves, address = _leaves_by_address(case), current_address(address)
     parent, entry = _parent_and_entry(address, leaves)
     if parent is None or (entry and not _has_entry(leaves[parent], entry)):
         raise unknown_address_error(case, address)
@@ -123,27 +159,27 @@ def value_at(case: Case, address: str) -> Float[Array, "..."]:
 def unit_at(case: Case, address: str) -> str:
     """SI unit of the number at an address; "" or "1" if it has none."""
     unit, part = "", case
-    for name in address.split("."):
+    for name in current_address(address).split("."):
         if isinstance(part, tuple):
             part = part[int(name)]
         elif dataclasses.is_dataclass(part):
             unit = type(part).__dataclass_fields__[name].metadata.get("unit", "")
             if isinstance(part, Sensor) and unit == "unit of quantity":
-                unit = QUANTITIES[part.quantity]
+                unit = part.unit
             part = getattr(part, name)
     return unit
 
 
 def replace(case: Case, values: dict[str, Any]) -> Case:
-    """Return a copy of the case with other numbers at some addresses (SI units).
+    """A copy of a case with other numbers at some addresses (SI units).
 
-    Differentiable in the values. Raises ValueError for an unknown address or a wrong shape.
+    It is differentiable by the values. Raises ValueError for an unknown address or a wrong shape.
     """
     paths, structure = jax.tree_util.tree_flatten_with_path(case)
     leaves = [leaf for _, leaf in paths]
     index = {".".join(_key_name(key) for key in path): i for i, (path, _) in enumerate(paths)}
     for address, value in values.items():
-        value = jnp.asarray(value, float)
+        value, address = jnp.asarray(value, float), current_address(address)
         parent, entry = _parent_and_entry(address, index)
         if address in index:
             current = leaves[index[address]]
@@ -162,7 +198,10 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
 
 
 def _parent_and_entry(address: str, leaves: dict[str, Any]) -> tuple[str | None, tuple[int, ...]]:
-    """The address of the list or matrix in which an entry is, and its place there."""
+    """Address of the list or matrix that has an entry, and the indices of the entry in it.
+
+    An address of a whole number or list has no indices; (None, ()) if there is none.
+    """
     parent, entry = address, ()
     while parent not in leaves:
         parent, _, last = parent.rpartition(".")
@@ -173,28 +212,28 @@ def _parent_and_entry(address: str, leaves: dict[str, Any]) -> tuple[str | None,
 
 
 def _has_entry(leaf, entry: tuple[int, ...]) -> bool:
-    """Tell whether a list or matrix has an entry at a place."""
+    """Whether a list or matrix has an entry of these indices."""
     shape = jnp.shape(leaf)
     return len(entry) == len(shape) and all(i < n for i, n in zip(entry, shape, strict=True))
 
 
 def concrete_case(case: Case) -> Case:
-    """The same case with plain numbers, also while it is being differentiated.
+    """The case with concrete numbers, also while it is differentiated.
 
-    Raises `jax.errors.ConcretizationTypeError` inside `jit` or `vmap`.
+    Raises `jax.errors.ConcretizationTypeError` if it is traced by `jit` or `vmap`.
     """
     return jax.tree.map(lambda leaf: jnp.asarray(concrete(leaf)), case)
 
 
 def stack_cases(cases: Sequence[Case]) -> Case:
-    """One case with the numbers of several along a first axis; all must be alike in structure."""
+    """Cases of the same structure as one, whose numbers have the cases as their first axis."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
 
 
 def crossing_times(case: Case) -> Float[np.ndarray, "load 2"]:
-    """Times (s) at which each load enters and leaves the beam; `NEVER` for one that stays on it.
+    """Times (s) at which each load enters and leaves the beam; it leaves at `NEVER` if it stays.
 
-    The numbers of the case must be concrete.
+    Raises `jax.errors.ConcretizationTypeError` if the case is traced.
     """
     windows = [trajectory(load, case.beam.length).entry_exit_times() for load in case.loads]
     return np.array([[float(concrete(time)) for time in window] for window in windows]).reshape(

@@ -1,11 +1,12 @@
-"""Faults of the parts of a case: what their fields declare, and what several parts have in common.
+"""Validation by declarations of fields: type, shape, unit and range of each.
 
-Numbers that are not known yet (a case inside `jit` or `vmap`) are passed over. What belongs
-together within one part, that part says itself: its method `fault(address)` gives the sentence.
+Numbers traced by `jit` or `vmap` are skipped. Rules that concern several fields of a part are in
+its method `validate(address)`; those that several parts share are here.
 """
 
 import dataclasses
 import difflib
+import inspect
 import reprlib
 from collections.abc import Iterable
 from typing import Any
@@ -24,17 +25,18 @@ from jaxbeam.case.fields import (
     fits_shape,
     is_concrete,
 )
+from jaxbeam.case.kinds import kinds
 
-SHORT_REPR = reprlib.Repr()  # what is wrong is quoted, but not without end
+SHORT_REPR = reprlib.Repr()  # shortens wrong values, which error messages quote
 SHORT_REPR.maxstring, SHORT_REPR.maxlist, SHORT_REPR.maxdict = 80, 10, 10
 
 POSITION_TOLERANCE = 1e-9  # of the length: 3 * 0.2 is still on a beam of 0.6 m
 
 
 def check_on_beam(name: str, positions: Any, length: Float[Array, ""]) -> None:
-    """Check that positions lie on a beam of a length, all in m, as far as they are known.
+    """Raise ValueError, with the name, if positions are not on a beam of a length (all in m).
 
-    Raises ValueError with the name of the positions.
+    Traced numbers are skipped.
     """
     if not (is_concrete(positions) and is_concrete(length)):
         return
@@ -49,49 +51,44 @@ def check_on_beam(name: str, positions: Any, length: Float[Array, ""]) -> None:
 
 
 def suggestion(word: str, allowed: Iterable[str]) -> str:
-    """The end of a sentence about an unknown word: the nearest known one, or all of them."""
+    """End of an error message about an unknown word: the nearest allowed one, or all of them."""
     allowed = list(allowed)
     nearest = difflib.get_close_matches(word, allowed, n=1)
     return f"did you mean {nearest[0]!r}?" if nearest else f"it may be {', '.join(allowed)}"
 
 
 def missing_error(address: str, field: dataclasses.Field) -> ValueError:
-    """The error for a field that was not given and has no default."""
+    """Error for a field that is left out and has no default."""
     return ValueError(
         f"{address} is missing; give the {field.metadata['meaning']}{_in_unit(field)}"
     )
 
 
 def check_fields(address: str, part: Any) -> None:
-    """Check every field of a part of a case by what its declaration says.
-
-    Raises ValueError naming the address.
-    """
+    """Raise ValueError, with the address, if a field of a part contradicts its declaration."""
     values = vars(part)  # attributes of a module take many times as long to get
     for field in dataclasses.fields(part):
         check_field(f"{address}.{field.name}", values[field.name], field)
 
 
 def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
-    """Check one field of a part of a case by what its declaration says.
-
-    Raises ValueError naming the address.
-    """
+    """Raise ValueError, with the address, if a value contradicts the declaration of its field."""
     if "unit" in field.metadata:
         _check_number(address, value, field)
-    elif "least" in field.metadata:
-        minimum = field.metadata["least"]
+    elif "minimum" in field.metadata:
+        minimum = field.metadata["minimum"]
         if value is None and field.default is None:
             return
         if not isinstance(value, int) or isinstance(value, bool) or value < minimum:
             raise ValueError(
-                f"{address} must be a whole number, {minimum} or more; it is {describe_value(value)}"
+                f"{address} must be a whole number, {minimum} or more; it is"
+                f" {describe_value(value)}"
             )
     elif "part" in field.metadata:
-        kind = field.metadata["part"]
-        kinds = tuple(kind.values()) if isinstance(kind, dict) else (kind,)
-        if value is not None and not isinstance(value, kinds):
-            names = " or ".join(made.__name__ for made in kinds)
+        part_class = field.metadata["part"]
+        if value is not None and not isinstance(value, part_class):
+            members = kinds(part_class).values() if inspect.isabstract(part_class) else [part_class]
+            names = " or ".join(member.__name__ for member in members)
             raise ValueError(
                 f"{address} holds {describe_value(value)}; it takes a table of its own, in Python a"
                 f" {names}"
@@ -115,9 +112,10 @@ def validate_direct_or_derived(
     exclusive_sources: tuple[str, ...],
     shared_sources: tuple[str, ...] = (),
 ) -> str | None:
-    """The fault of a property given neither directly nor by all that it follows from, or by both.
+    """Error of a property that is not given by exactly one of two ways, or None.
 
-    What is `shared_sources` serves other properties too, so it may stand beside the direct number.
+    The property is given by the field `direct`, or derived from all of the sources.
+    `shared_sources` serve other properties too, so they may stand beside `direct`.
     """
     if getattr(part, direct) is not None:
         for name in exclusive_sources:
@@ -137,7 +135,7 @@ def validate_direct_or_derived(
 
 
 def validate_exactly_one(address: str, part: Any, first: str, second: str) -> str | None:
-    """The fault of two fields of which both are given, or none."""
+    """Error of two fields of which both or none are given, or None."""
     given = [name for name in (first, second) if getattr(part, name) is not None]
     if len(given) == 1:
         return None
@@ -161,7 +159,7 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
         return
     numbers = np.atleast_1d(concrete(value))
     names = [f"{address}.{i}" for i in range(numbers.size)] if np.ndim(value) else [address]
-    constraint, unit = field.metadata["must"], _unit_suffix(field)
+    constraint, unit = field.metadata["constraint"], _unit_suffix(field)
     for name, x in zip(names, numbers.flat, strict=True):
         if not np.isfinite(x):
             raise ValueError(f"{name} must be a finite number; it is {x}")
@@ -182,7 +180,7 @@ def _check_increasing(names: list[str], numbers: np.ndarray, unit: str) -> None:
 
 
 def _unit_suffix(field: dataclasses.Field) -> str:
-    """The unit to put after a number."""
+    """Unit of a field as it follows a number, with a space before it."""
     unit = field.metadata.get("unit", "1")
     return "" if unit in ("1", "unit of quantity") else f" {unit}"
 
@@ -192,7 +190,7 @@ def _in_unit(field: dataclasses.Field) -> str:
 
 
 def describe_value(value: Any) -> str:
-    """A wrong value in the words of an error message."""
+    """A wrong value as error messages quote it."""
     if isinstance(value, str | bool | int | float | list | dict):
         return SHORT_REPR.repr(value)
     return f"a {type(value).__name__}"

@@ -1,8 +1,8 @@
 """Field declarations shared by all data classes of a case.
 
 A number of a case is a JAX array leaf, so that it can be traced, batched and differentiated;
-names and counts are static. The metadata carries the SI unit and one line of meaning, which
-error messages, tables and plots read, so that each is written once.
+words and counts are static. The metadata of a field holds its SI unit and its meaning, which
+error messages, tables and plots read.
 """
 
 import functools
@@ -16,7 +16,7 @@ import numpy as np
 
 
 def _as_array(value):
-    """Make a float array leaf of a number; leave tracers and placeholders alone."""
+    """A number as a float array; tracers and placeholders of JAX as they are."""
     if isinstance(value, int | float | np.ndarray | np.generic):
         return jnp.asarray(np.asarray(value, float))  # half of the time that JAX takes for both
     return jnp.asarray(value, float) if isinstance(value, list | tuple) else value
@@ -26,7 +26,7 @@ def _as_optional_array(value):
     return None if value is None else _as_array(value)
 
 
-# What a number must do, in the words of the error message; `checks` enforces it.
+# Constraints of numbers, phrased to follow "must" in error messages; see `declared_checks`.
 POSITIVE = "be positive"
 NOT_NEGATIVE = "not be negative"
 ON_BEAM = "lie on the beam"
@@ -34,45 +34,43 @@ INCREASING = "increase"
 
 
 def number(unit: str, meaning: str, constraint: str = "", **options):
-    """Declare a number of a case: a differentiable leaf with its SI unit and its meaning.
+    """Field for a number of a case: a differentiable leaf with its SI unit and its meaning.
 
-    With `default=None` the number may be left out; its absence is part of the structure. `constraint`
-    is one of the rules above (none: any finite value).
+    With `default=None` the number may be left out; its absence is part of the tree's structure.
+    `constraint` is one of the above; without one any finite value is allowed.
     """
     converter = _as_optional_array if options.get("default", 0.0) is None else _as_array
-    metadata = {"unit": unit, "meaning": meaning, "must": constraint}
+    metadata = {"unit": unit, "meaning": meaning, "constraint": constraint}
     return eqx.field(converter=converter, metadata=metadata, **options)
 
 
 def choice(meaning: str, *allowed: str, **options):
-    """Declare a word of a case, one of `allowed` (any word if none is named)."""
+    """Field for a word of a case, one of `allowed`; any word if none is named."""
     metadata = {"meaning": meaning, "allowed": allowed}
     return eqx.field(static=True, metadata=metadata, **options)
 
 
 def count(meaning: str, minimum: int = 1, **options):
-    """Declare a whole number of a case, `minimum` or more; static, for it may decide shapes."""
-    return eqx.field(static=True, metadata={"meaning": meaning, "least": minimum}, **options)
+    """Field for a whole number of a case, `minimum` or more; static, as shapes may depend on it."""
+    return eqx.field(static=True, metadata={"meaning": meaning, "minimum": minimum}, **options)
 
 
-def part(meaning: str, class_or_registry: type | dict[str, type], **options):
-    """Declare a part within a part of a case, a table of its own that may be left out.
+def part(meaning: str, part_class: type, **options):
+    """Field for a part within a part of a case, a table of its own that may be left out.
 
-    `class_or_registry` is its class, or the registry in which its key `class_or_registry` is looked up.
+    `part_class` is its class; or an abstract class, of which the table's `kind` names a subclass.
     """
-    return eqx.field(
-        metadata={"meaning": meaning, "part": class_or_registry}, default=None, **options
-    )
+    return eqx.field(metadata={"meaning": meaning, "part": part_class}, default=None, **options)
 
 
 def axis_names(field) -> str:
-    """The axes in the annotation of a number: "" for one number, "2", "point", "*modes"."""
+    """Axes in the annotation of a number: "" for one number, "2", "point", "*modes"."""
     return next(iter(typing.get_args(field.type)), field.type).dim_str
 
 
 @functools.cache
 def fits_shape(field, shape: tuple[int, ...]) -> bool:
-    """Tell whether a number declared by this field may have this shape."""
+    """Whether the declaration of a number allows a shape."""
     axes = axis_names(field).split()
     if axes and axes[0].startswith("*"):
         return len(shape) <= 1
@@ -81,7 +79,7 @@ def fits_shape(field, shape: tuple[int, ...]) -> bool:
 
 
 def describe_shape(field) -> str:
-    """What a number declared by this field consists of, for error messages."""
+    """Shape that the declaration of a number asks for, as a phrase for error messages."""
     axes = axis_names(field).split()
     if not axes:
         return "one number"
@@ -93,7 +91,7 @@ def describe_shape(field) -> str:
 
 
 def is_concrete(value) -> bool:
-    """Tell whether `value` has numbers one can look at now (it is not an abstract tracer)."""
+    """True unless `value` is traced by `jit` or `vmap`; a traced value has no numbers yet."""
     if not isinstance(value, jax.core.Tracer):
         return True
     try:
@@ -104,9 +102,9 @@ def is_concrete(value) -> bool:
 
 
 def concrete(value) -> np.ndarray:
-    """Return the numbers behind `value`, also while it is being differentiated.
+    """A value as an array of floats, also while it is differentiated (`grad`, `jvp`).
 
-    Raises `jax.errors.ConcretizationTypeError` inside `jit` or `vmap`, where there are none yet.
+    Raises `jax.errors.ConcretizationTypeError` if it is traced by `jit` or `vmap`.
     """
     if isinstance(value, jax.core.Tracer):
         value = jax.extend.core.concrete_or_error(None, value)

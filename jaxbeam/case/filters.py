@@ -1,9 +1,8 @@
 """Low-pass filters of sensors: Butterworth, digital or analogue.
 
-Both kinds come from one prototype, the poles that scipy gives a filter of cutoff 1 rad/s, and are
-cascades of sections of second order (and one of first order if the order is odd), each with gain
-one at rest. Everything after the prototype is arithmetic, so cutoff and sampling period may be
-traced, batched and differentiated like all numbers of a case.
+Both are cascades of second-order sections (and one of first order if the order is odd), each with
+a static gain of one, that follow from the poles of the prototype with a cutoff of 1 rad/s. Cutoff
+and sampling period may be traced, batched and differentiated.
 """
 
 import functools
@@ -19,24 +18,45 @@ from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, 
 
 
 class Filter(eqx.Module):
-    """A low-pass filter: 1 at low frequency, 1 / sqrt(2) at the cutoff.
+    """Low-pass filter with gain 1 at low frequency and 1 / sqrt(2) at the cutoff.
 
     An analogue filter acts on the signal before it is sampled, a digital one on the samples.
     """
 
-    cutoff: Float[Array, ""] = number("Hz", "frequency at which it passes 1 / sqrt(2)", POSITIVE)
+    cutoff: Float[Array, ""] = number("Hz", "frequency at which the gain is 1 / sqrt(2)", POSITIVE)
     order: int = count("order of the filter", default=2)
     kind: str = choice("characteristic", "butterworth", default="butterworth")
-    realisation: str = choice("how it is made", "digital", "analogue", default="digital")
+    realisation: str = choice("realisation", "digital", "analogue", default="digital")
+
+
+def nyquist_error(
+    name: str, frequency: Float[Array, ""], period: Float[Array, ""] | float
+) -> str | None:
+    """Error of a frequency (Hz) that is not below half the sampling frequency, or None.
+
+    `period` (s) is that of sampling; traced numbers are skipped.
+    """
+    if not (is_concrete(frequency) and is_concrete(period)):
+        return None
+    nyquist, value = 0.5 / float(concrete(period)), float(concrete(frequency))
+    if value < nyquist:
+        return None
+    return (
+        f"{name} must be below half the sampling frequency, {nyquist:g} Hz; it is {value:g} Hz:"
+        " lower it, or sample faster"
+    )
 
 
 @functools.cache
 def _prototype_damping_ratios(order: int) -> tuple[np.ndarray, bool]:
-    """Damping ratios of the second-order sections at 1 rad/s, and whether one of first order."""
-    from scipy.signal import buttap  # here, as it takes half a second and most cases have no filter
+    """Damping ratios of the second-order sections of the prototype with a cutoff of 1 rad/s.
+
+    The flag is True if a first-order section precedes them.
+    """
+    from scipy.signal import buttap  # half a second, and most cases have no filter
 
     _, poles, _ = buttap(order)
-    # Well-damped sections first: the resonant ones then see what is already filtered.
+    # Sections of high damping first, so that the resonant ones receive a filtered signal.
     return np.sort(-poles[poles.imag > 1e-9].real)[::-1], order % 2 == 1
 
 
@@ -45,18 +65,14 @@ def second_order_sections(
 ) -> Float[Array, "section 6"]:
     """Second-order sections (b0, b1, b2, 1, a1, a2) of a digital filter at a sampling period (s).
 
-    The bilinear transform of the analogue filter, warped to meet it at the cutoff: what
-    `scipy.signal.butter(order, cutoff, fs=1 / period, output="sos")` makes, except that each
-    section has gain one at rest. Raises ValueError if the cutoff is not below half the sampling
-    frequency (where both are known).
+    Bilinear transform of the analogue filter, prewarped at the cutoff: the filter of
+    `scipy.signal.butter(order, cutoff, fs=1 / period, output="sos")`, except that each section has
+    a static gain of one. Raises ValueError if the cutoff is not below half the sampling frequency
+    (where both are concrete).
     """
-    if is_concrete(filter.cutoff) and is_concrete(period):
-        nyquist = 0.5 / float(concrete(period))
-        if float(concrete(filter.cutoff)) >= nyquist:
-            raise ValueError(
-                f"the filter's cutoff must be below half the sampling frequency, {nyquist:g} Hz;"
-                f" it is {float(concrete(filter.cutoff)):g} Hz: lower it, or sample faster"
-            )
+    error = nyquist_error("the filter's cutoff", filter.cutoff, period)
+    if error is not None:
+        raise ValueError(error)
     ratios, odd = _prototype_damping_ratios(filter.order)
     warped = jnp.tan(jnp.pi * filter.cutoff * period)
     rows = []
@@ -76,8 +92,8 @@ def second_order_sections(
 
 def steady_filter_state(
     sections: Float[Array, "section 6 ..."], value
-) -> Float[Array, "section 2 *lane"]:
-    """Memory of a digital filter that has long been fed a constant value, which it gives back."""
+) -> Float[Array, "section 2 *batch"]:
+    """State of a digital filter in steady state under a constant input, which is its output."""
     value = jnp.asarray(value, float)
     rows = [jnp.stack([(1 - s[0]) * value, (s[2] - s[5]) * value]) for s in sections]
     return jnp.stack(rows)
@@ -85,13 +101,13 @@ def steady_filter_state(
 
 def filter_step(
     sections: Float[Array, "section 6 ..."],
-    filter_state: Float[Array, "section 2 *lane"],
-    sample: Float[Array, " *lane"],
-) -> tuple[Float[Array, " *lane"], Float[Array, "section 2 *lane"]]:
-    """Put one sample through a digital filter; return its output and its memory afterwards.
+    filter_state: Float[Array, "section 2 *batch"],
+    sample: Float[Array, " *batch"],
+) -> tuple[Float[Array, " *batch"], Float[Array, "section 2 *batch"]]:
+    """Output of a digital filter for a sample, and its next state.
 
-    Direct form II transposed, as in `scipy.signal.sosfilt`. Sections may be shared by all lanes
-    or have lanes of their own.
+    Direct form II transposed, as in `scipy.signal.sosfilt`. Sections are shared by the batch, or
+    have a batch axis as their last one.
     """
     next_state = []
     for s, (first, second) in zip(sections, filter_state, strict=True):
@@ -105,23 +121,24 @@ def filter_step(
 
 def filter_history(
     sections: Float[Array, "section 6 ..."],
-    filter_state: Float[Array, "section 2 *lane"],
-    samples: Float[Array, "time *lane"],
+    filter_state: Float[Array, "section 2 *batch"],
+    samples: Float[Array, "time *batch"],
     new_samples: Bool[Array, " time"] | None = None,
-) -> Float[Array, "time *lane"]:
-    """Output of a digital filter for a whole history, from a given memory.
+) -> Float[Array, "time *batch"]:
+    """Output of a digital filter for a history of samples, from an initial state.
 
-    With `new_samples`, only the samples so marked enter the filter; in between its output is held. The
-    first one must be.
+    With `new_samples`, only the samples marked True enter the filter, and its output is held in
+    between; the first must be True.
     """
 
     def step(carry, at):
-        held, memory = carry
+        held_output, state = carry
         sample, new = at
-        output, after = filter_step(sections, memory, sample)
+        output, next_state = filter_step(sections, state, sample)
         if new is not None:
-            output, after = jnp.where(new, output, held), jnp.where(new, after, memory)
-        return (output, after), output
+            output = jnp.where(new, output, held_output)
+            next_state = jnp.where(new, next_state, state)
+        return (output, next_state), output
 
     start = (jnp.zeros(samples.shape[1:]), filter_state)
     return jax.lax.scan(step, start, (samples, new_samples))[1]
@@ -132,24 +149,24 @@ def analogue_state_space(
 ) -> tuple[
     Float[Array, "state state"], Float[Array, " state"], Float[Array, " state"], Float[Array, ""]
 ]:
-    """Continuous state space (A, B, C, D) of an analogue filter: x' = A x + B u, y = C x + D u.
+    """State space (A, B, C, D) of an analogue filter: x' = A x + B u, y = C x + D u with D = 0.
 
-    D is zero. Each section has its output as a state, and the rate of that over the cutoff
-    frequency as another if it is of second order: all states are of the size of the signal.
+    States of a section are its output and, if it is of second order, the rate of its output divided
+    by the cutoff frequency (rad/s); all have the unit of the signal.
     """
     matrix, column, row, _ = _prototype_state_space(filter.order)
     cutoff = 2 * jnp.pi * filter.cutoff
     return cutoff * matrix, cutoff * column, jnp.asarray(row), jnp.zeros(())
 
 
-def analogue_steady_state(filter: Filter, value) -> Float[Array, "state *lane"]:
-    """State of an analogue filter that has long been fed a constant value."""
+def analogue_steady_state(filter: Filter, value) -> Float[Array, "state *batch"]:
+    """State of an analogue filter in steady state under a constant input."""
     return jnp.multiply.outer(_prototype_state_space(filter.order)[3], jnp.asarray(value, float))
 
 
 @functools.cache
 def _prototype_state_space(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A, B and C of the analogue filter with a cutoff of 1 rad/s, and its state at rest under 1."""
+    """A, B, C and the steady state under a unit input, for a cutoff of 1 rad/s."""
     ratios, odd = _prototype_damping_ratios(order)
     first = [np.array([[-1.0]])] if odd else []
     blocks = first + [np.array([[0.0, 1.0], [-1.0, -2 * ratio]]) for ratio in ratios]

@@ -1,11 +1,11 @@
-"""Loads that travel along the beam: what they weigh, and how they move.
+"""Loads that travel along the beam: masses and forces.
 
-A load is a mass or a force; how it travels (constant deceleration or a table of positions) is a
-separate matter, see `trajectory`. Both kinds answer the same three questions: what inertia presses
-with the load, what it weighs, and how it moves.
+A load has an inertia (kg), a weight (N) and a trajectory x(t) (m): constant deceleration, or a
+table of positions (see `jaxbeam.case.trajectory`).
 """
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,8 +21,9 @@ from jaxbeam.case.trajectory import (
 
 
 class AbstractLoad(eqx.Module):
-    """Interface of all travelling loads."""
+    """Interface of loads. A subclass that declares a `kind` is one of case files."""
 
+    kind: ClassVar[str]
     speed: eqx.AbstractVar[Float[Array, ""] | None]
     entry_time: eqx.AbstractVar[Float[Array, ""]]
     deceleration: eqx.AbstractVar[Float[Array, ""]]
@@ -31,14 +32,14 @@ class AbstractLoad(eqx.Module):
 
     @abc.abstractmethod
     def inertia(self) -> Float[Array, ""]:
-        """Mass that follows the deflection of the beam, in kg."""
+        """Mass (kg) that follows the deflection of the beam."""
 
     @abc.abstractmethod
     def weight(self, gravity: Float[Array, ""]) -> Float[Array, ""]:
-        """Force with which it presses on a beam at rest, in N, positive downwards."""
+        """Force (N) on a beam at rest, positive downwards; `gravity` in m/s^2."""
 
     def validate(self, address: str) -> str | None:
-        """What does not go together in it, as a sentence, or None."""
+        """First inconsistency between its fields as an error message, or None."""
         if (self.times is None) != (self.positions is None):
             absent = "times" if self.times is None else "positions"
             return f"{address}.{absent} is missing; a table has both times and positions"
@@ -64,24 +65,26 @@ class AbstractLoad(eqx.Module):
             value = getattr(self, name)
             if is_concrete(value) and concrete(value) != 0:
                 return (
-                    f"{address}.{name} would have no effect: the load follows its table; leave it"
-                    " out"
+                    f"{address}.{name} would have no effect: a table of times and positions gives"
+                    " the trajectory; leave it out"
                 )
         return None
 
 
 class MovingMass(AbstractLoad):
-    """A mass that stays on the beam: it presses with its weight and with its inertia.
+    """Mass in permanent contact with the beam: its weight and its inertia act on the beam.
 
-    Its acceleration is the full convective one along its path (corrected eq. 2.3 of the thesis).
-    Give `speed` (negative: it enters at the right end and travels left), `entry_time` and
-    `deceleration`; or a table of `times` and `positions`.
+    Its vertical acceleration has all convective terms, w_tt + 2 v w_xt + v^2 w_xx + a w_x
+    (corrected eq. (2.3) of the thesis). Give `speed` (negative: it enters at the right end and
+    travels left), `entry_time` and `deceleration`; or a table of `times` and `positions`.
     """
+
+    kind: ClassVar[str] = "mass"
 
     mass: Float[Array, ""] = number("kg", "mass", NOT_NEGATIVE)
     speed: Float[Array, ""] | None = number("m/s", "speed at entry", default=None)
     entry_time: Float[Array, ""] = number("s", "time of entry", default=0.0)
-    deceleration: Float[Array, ""] = number("m/s^2", "constant braking", default=0.0)
+    deceleration: Float[Array, ""] = number("m/s^2", "constant deceleration", default=0.0)
     times: Float[Array, " point"] | None = number("s", "table: times", INCREASING, default=None)
     positions: Float[Array, " point"] | None = number("m", "table: positions", default=None)
 
@@ -93,11 +96,13 @@ class MovingMass(AbstractLoad):
 
 
 class MovingForce(AbstractLoad):
-    """A constant force that travels: weight without inertia.
+    """Constant force that travels along the beam: weight without inertia.
 
-    Give the `force` in N (positive downwards), or the `mass` whose weight it is; the rest is as
-    for a moving mass.
+    Give the `force` in N (positive downwards), or the `mass` whose weight it is; its trajectory is
+    given as for `MovingMass`.
     """
+
+    kind: ClassVar[str] = "force"
 
     mass: Float[Array, ""] | None = number(
         "kg", "mass whose weight it is", NOT_NEGATIVE, default=None
@@ -105,7 +110,7 @@ class MovingForce(AbstractLoad):
     force: Float[Array, ""] | None = number("N", "force, positive downwards", default=None)
     speed: Float[Array, ""] | None = number("m/s", "speed at entry", default=None)
     entry_time: Float[Array, ""] = number("s", "time of entry", default=0.0)
-    deceleration: Float[Array, ""] = number("m/s^2", "constant braking", default=0.0)
+    deceleration: Float[Array, ""] = number("m/s^2", "constant deceleration", default=0.0)
     times: Float[Array, " point"] | None = number("s", "table: times", INCREASING, default=None)
     positions: Float[Array, " point"] | None = number("m", "table: positions", default=None)
 
@@ -119,11 +124,8 @@ class MovingForce(AbstractLoad):
         return self.force if self.force is not None else self.mass * gravity
 
 
-KINDS = {"mass": MovingMass, "force": MovingForce}
-
-
 def trajectory(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewiseTrajectory:
-    """How the load travels along a beam of the given length (m)."""
+    """Trajectory of a load along a beam of a length (m)."""
     if load.times is not None:
         return TabulatedTrajectory(load.times, load.positions, length)
     return BrakingTrajectory(load.speed, load.entry_time, load.deceleration, length)

@@ -77,8 +77,8 @@ class Sensor(eqx.Module):
         at_fibre = QUANTITIES[self.quantity].at_fibre
         if at_fibre and self.fibre_distance is None:
             return (
-                f"{address}.fibre_distance is missing: {self.quantity} needs the height of the gauge"
-                " above the neutral axis in m"
+                f"{address}.fibre_distance is missing: {self.quantity} needs the height of the"
+                " gauge above the neutral axis in m"
             )
         if not at_fibre and self.fibre_distance is not None:
             return (

@@ -1,4 +1,4 @@
-"""How a load travels: position, speed and acceleration along the beam at any time."""
+"""Trajectories of loads: position, speed and acceleration along the beam over time."""
 
 import abc
 
@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-NEVER = 1e30  # s, never reached; finite, in single precision too: its arithmetic has derivatives
+NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that derivatives exist
 
 
 class AbstractTrajectory(eqx.Module):
-    """A path x(t) over the beam, entered once and left at most once."""
+    """Trajectory x(t) of a load, on the beam from one entry to at most one exit."""
 
     length: eqx.AbstractVar[Float[Array, ""]]
 
@@ -21,29 +21,32 @@ class AbstractTrajectory(eqx.Module):
 
     @abc.abstractmethod
     def entry_exit_times(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Times of entry and exit in s; the exit is `NEVER` where the load stays on the beam."""
+        """Times of entry and exit (s); the exit is `NEVER` if the load stays on the beam."""
 
     @abc.abstractmethod
-    def passage_times(self, positions: Float[Array, " place"]) -> Float[Array, " kink"]:
-        """Times in s at which the motion is not smooth, or passes one of the places (m)."""
+    def passage_times(self, positions: Float[Array, " position"]) -> Float[Array, " time"]:
+        """Times (s) of passing the positions (m), and of a discontinuous speed or acceleration.
+
+        `NEVER` stands for what does not happen.
+        """
 
 
 class AbstractPiecewiseTrajectory(AbstractTrajectory):
-    """A path that is made of cubic polynomials in time."""
+    """Trajectory of cubic polynomials in time."""
 
     @abc.abstractmethod
     def cubics(self) -> tuple[Float[Array, " piece"], Float[Array, "piece 4"]]:
-        """The path as cubic polynomials in the time since each of some times (s), from then on.
+        """Breakpoints (s) and coefficients (m/s^power, ascending) of the cubic after each.
 
-        Coefficients are in m/s^power, lowest power first. They hold while the load is on the beam.
+        A cubic is in the time since its breakpoint. They hold while the load is on the beam.
         """
 
 
 class BrakingTrajectory(AbstractPiecewiseTrajectory):
     """Constant deceleration from the speed at entry: x = v t - a t^2 / 2 until it stops.
 
-    A negative speed enters at the right end and travels left. A negative deceleration speeds the
-    load up.
+    A load of negative speed enters at the right end and travels left. A negative deceleration
+    accelerates the load.
     """
 
     speed: Float[Array, ""]
@@ -52,13 +55,13 @@ class BrakingTrajectory(AbstractPiecewiseTrajectory):
     length: Float[Array, ""]
 
     def _stopping_time(self):
-        """Time from entry until it stands still."""
+        """Time from entry to standstill (s)."""
         braking = self.deceleration > 0
         deceleration = jnp.where(braking, self.deceleration, 1.0)
         return jnp.where(braking, jnp.abs(self.speed) / deceleration, NEVER)
 
     def _time_to_cover(self, distance):
-        """Time from entry until `distance` is covered: the smaller root of the parabola."""
+        """Time from entry (s) to cover a distance (m): the smaller root of the parabola."""
         speed = jnp.abs(self.speed)
         squared_speed = speed**2 - 2 * self.deceleration * distance
         final_speed = jnp.where(
@@ -105,11 +108,11 @@ class BrakingTrajectory(AbstractPiecewiseTrajectory):
 
 
 class TabulatedTrajectory(AbstractPiecewiseTrajectory):
-    """A path through given positions at given times: a not-a-knot cubic spline.
+    """Not-a-knot cubic spline through positions at times.
 
-    The load is put on the beam at the first time (or enters when it passes an end) and, when the
-    table ends on the beam, stays where it is. Positions must run one way for the times at which
-    it passes supports to be step boundaries; a path that turns round is followed all the same.
+    The load is on the beam from the first time, or from the time at which it passes an end; where
+    the table ends on the beam it stays. Passage times are exact for monotonic positions; where the
+    load turns round they are those of the first passage only.
     """
 
     times: Float[Array, " point"]
@@ -117,7 +120,7 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
     length: Float[Array, ""]
 
     def _second_derivatives(self):
-        """Second derivatives of the spline at its knots."""
+        """Second derivatives (m/s^2) of the spline at its breakpoints."""
         t, x = self.times, self.positions
         n = t.shape[0]
         h, slope = jnp.diff(t), jnp.diff(x) / jnp.diff(t)
@@ -163,9 +166,9 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
         return position, jnp.where(inside, velocity, 0.0), jnp.where(inside, acceleration, 0.0)
 
     def _passage_time(self, target):
-        """First time at which the path passes a place: bisection, then one Newton step.
+        """First time (s) of passing a position (m), by bisection.
 
-        The Newton step leaves the value as it is and gives it its derivative.
+        A Newton step of value zero gives it its derivative.
         """
         passed = jnp.sign(self.positions - target) * jnp.sign(self.positions[0] - target) <= 0
         last = jnp.argmax(passed)

@@ -1,7 +1,6 @@
-"""Checks of a case in plain Python, before anything compiles.
+"""Validation of a case in plain Python, before anything compiles.
 
-The first fault raises an error that names the address and says how to mend it. Numbers that are
-not known yet (a case inside `jit` or `vmap`) are passed over, so a case may be checked anywhere.
+The first error names the address and the remedy. Numbers traced by `jit` or `vmap` are skipped.
 """
 
 import dataclasses
@@ -12,10 +11,9 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from jaxbeam.case.actuators import AbstractActuator
+from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
-from jaxbeam.case.case import Case, Run
-from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.case import Case, parts
 from jaxbeam.case.declared_checks import (
     POSITION_TOLERANCE,
     check_fields,
@@ -23,30 +21,32 @@ from jaxbeam.case.declared_checks import (
     describe_value,
 )
 from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
+from jaxbeam.case.filters import nyquist_error
 from jaxbeam.case.loads import AbstractLoad
 from jaxbeam.case.sensors import Sensor
 
-# Parts that say themselves what belongs together within them.
+# Parts with a method `validate(address)`.
 SELF_VALIDATING = Beam | AbstractActuator | Sensor | AbstractLoad
 
 
 def check_case(case: Case) -> None:
-    """Check a case; units as declared by its fields, addresses as in `case.addresses`.
+    """Validate a case; units as declared by its fields, addresses as in `case.addresses`.
 
-    Raises ValueError at the first fault: a number that is missing, not finite, of the wrong shape
-    or out of its range; a place off the beam; contradicting or missing descriptions of section,
-    load or sensor; two rigid supports at one place. Beams that can move as a rigid body, such as
-    free-free, are allowed.
+    Raises ValueError at the first error: a number that is missing, not finite, of the wrong shape
+    or out of its range; a position off the beam; contradicting or missing descriptions of section,
+    load or sensor; two rigid supports at one position; a controller that contradicts actuators or
+    sensors. Beams that can move as a rigid body, such as free-free, are allowed.
     """
-    for address, part, kind in _parts(case):
-        if not isinstance(part, kind):
+    for address, part, part_class in parts(case):
+        if not isinstance(part, part_class):
             raise ValueError(
-                f"{address} holds {describe_value(part)}; it takes objects of type {kind.__name__}"
+                f"{address} holds {describe_value(part)}; it takes objects of type"
+                f" {part_class.__name__}"
             )
         check_fields(address, part)
         _check_positions(address, part, case.beam.length)
-    for address, part, _ in _parts(case):
-        # A method of a module takes longer to get than most of these take to run.
+    for address, part, _ in parts(case):
+        # Looking up a method on a module takes longer than most of these take to run.
         error = type(part).validate(part, address) if isinstance(part, SELF_VALIDATING) else None
         if error is not None:
             raise ValueError(error)
@@ -57,23 +57,6 @@ def check_case(case: Case) -> None:
         _check_controller(case)
 
 
-def _parts(case: Case) -> Iterator[tuple[str, Any, type]]:
-    """The parts of a case with their addresses and the types they must have."""
-    yield "beam", case.beam, Beam
-    yield "run", case.run, Run
-    if case.controller is not None:
-        yield "controller", case.controller, AbstractController
-    lists = {
-        "supports": Support,
-        "actuators": AbstractActuator,
-        "sensors": Sensor,
-        "loads": AbstractLoad,
-    }
-    for name, kind in lists.items():
-        for i, part in enumerate(getattr(case, name)):
-            yield f"{name}.{i}", part, kind
-
-
 def _check_positions(address: str, part: Any, length: Float[Array, ""]) -> None:
     for name in _position_fields(type(part)):
         value = getattr(part, name)
@@ -82,9 +65,10 @@ def _check_positions(address: str, part: Any, length: Float[Array, ""]) -> None:
 
 
 @functools.cache
-def _position_fields(kind: type) -> list[str]:
-    """Fields that must lie on the beam."""
-    return [f.name for f in dataclasses.fields(kind) if f.metadata.get("must") == ON_BEAM]
+def _position_fields(part_class: type) -> list[str]:
+    """Names of the fields that are positions on the beam."""
+    fields = dataclasses.fields(part_class)
+    return [field.name for field in fields if field.metadata.get("constraint") == ON_BEAM]
 
 
 def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> None:
@@ -102,7 +86,7 @@ def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> 
 
 
 def _check_sampling(address: str, sensor: Sensor, case: Case) -> None:
-    """The sensor samples within the run, and fast enough for its digital filter."""
+    """Validate the sampling period of a sensor: within the run, and short enough for its filter."""
     period, run = sensor.sampling_period, case.run
     if period is not None:
         if (
@@ -118,31 +102,26 @@ def _check_sampling(address: str, sensor: Sensor, case: Case) -> None:
         period = case.controller.period
     elif case.controller is None or case.controller.open_loop:
         period = 1 / concrete(run.sample_rate) if is_concrete(run.sample_rate) else None
-    filter = sensor.filter
-    if filter is None or filter.realisation != "digital" or period is None:
-        return
-    if is_concrete(filter.cutoff) and is_concrete(period):
-        nyquist = 0.5 / concrete(period)
-        if concrete(filter.cutoff) >= nyquist:
-            raise ValueError(
-                f"{address}.filter.cutoff must be below half the sampling frequency,"
-                f" {nyquist:g} Hz; it is {concrete(filter.cutoff):g} Hz: lower it, or sample faster"
-            )
+    if sensor.has_digital_filter and period is not None:
+        error = nyquist_error(f"{address}.filter.cutoff", sensor.filter.cutoff, period)
+        if error is not None:
+            raise ValueError(error)
 
 
 def _check_controller(case: Case) -> None:
     controller = case.controller
     if not case.actuators:
         raise ValueError("controller has nothing to command: add an actuator, or leave it out")
-    error = controller.validate(case)
+    nominal = controller.nominal_plant
+    error = controller.validate(case if nominal is None else nominal.case)
     if error is not None:
         raise ValueError(f"controller.{error}")
     for i, sensor in enumerate(case.sensors):
-        analogue = sensor.filter is not None and sensor.filter.realisation == "analogue"
-        if analogue and sensor.quantity == "acceleration" and not controller.open_loop:
+        analogue = sensor.filter is not None and not sensor.has_digital_filter
+        if analogue and sensor.has_feedthrough and not controller.open_loop:
             raise ValueError(
-                f"sensors.{i}.filter cannot be analogue on an acceleration that a controller looks"
-                " at: make it digital"
+                f"sensors.{i}.filter cannot be analogue on an {sensor.quantity} that a controller"
+                " uses: make it digital"
             )
     period, duration = controller.period, case.run.duration
     if period is not None:
@@ -152,27 +131,18 @@ def _check_controller(case: Case) -> None:
                 f" it is {concrete(period):g} s"
             )
         return
-    # What acts at every instant can neither wait nor remember.
-    needs_sampling = {
-        "controller.delay": controller.delay is not None,
-        "controller.resolution": controller.resolution is not None,
-        "the controller's memory": not controller.stateless,
-    }
+    for feature in _sampled_features(case):
+        raise ValueError(f"{feature} needs a controller that samples: give controller.period")
+
+
+def _sampled_features(case: Case) -> Iterator[str]:
+    """What a controller in continuous time cannot have, nor its actuators and sensors."""
+    for name in ("delay", "resolution"):
+        if getattr(case.controller, name) is not None:
+            yield f"controller.{name}"
     for i, actuator in enumerate(case.actuators):
-        needs_sampling[f"the rate limit of actuators.{i}"] = (
-            actuator.command_rate_limit() is not None
-        )
-    if not controller.open_loop:
+        if actuator.command_rate_limit() is not None:
+            yield f"the rate limit of actuators.{i}"
+    if not case.controller.open_loop:
         for i, sensor in enumerate(case.sensors):
-            digital = sensor.filter is not None and sensor.filter.realisation == "digital"
-            needs_sampling |= {
-                f"sensors.{i}.filter, which is digital,": digital,
-                f"sensors.{i}.sampling_period": sensor.sampling_period is not None,
-                f"sensors.{i}.delay": sensor.delay is not None,
-                f"sensors.{i}.noise": sensor.noise is not None,
-                f"sensors.{i}.resolution": sensor.resolution is not None,
-                f"the acceleration of sensors.{i}": sensor.quantity == "acceleration",
-            }
-    for name, given in needs_sampling.items():
-        if given:
-            raise ValueError(f"{name} needs a controller that samples: give controller.period")
+            yield from sensor.sampled_features(f"sensors.{i}")

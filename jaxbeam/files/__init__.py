@@ -1,1 +1,1 @@
-"""Cases as TOML, reports, gains for real controllers."""
+"""Files: cases as TOML, reports as Markdown and HTML, gains for real controllers."""

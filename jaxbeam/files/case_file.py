@@ -1,45 +1,34 @@
 """Cases as TOML files and as plain dictionaries, both ways.
 
-Everything follows from the declared fields: a new actuator or load needs a name in its `KINDS`
-and nothing here.
+Keys follow from the fields of the classes, kinds from the classes that declare one in a module of
+`jaxbeam.case`, `jaxbeam.control` or `jaxbeam.estimation`: nothing is registered here.
 """
 
 import dataclasses
+import inspect
 import os
 from typing import Any
 
 import tomli_w
 
-from jaxbeam import control
-from jaxbeam.case import actuators, loads
-from jaxbeam.case.beam import Beam, Support
-from jaxbeam.case.case import Case, Run, unknown_address_error
+from jaxbeam.case.aliases import current_address, current_keys, current_kind
+from jaxbeam.case.case import Case, part_classes, unknown_address_error
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.declared_checks import check_field, describe_value, missing_error, suggestion
 from jaxbeam.case.fields import concrete, describe_shape, fits_shape
-from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.kinds import import_modules, kind_of, kinds
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.toml_file import read_toml
 
-ClassOrRegistry = (
-    type | dict[str, type]
-)  # one class, or the registry in which a `kind` is looked up
-
-TABLES: dict[str, ClassOrRegistry] = {"beam": Beam, "controller": control.KINDS, "run": Run}
-ARRAYS_OF_TABLES: dict[str, ClassOrRegistry] = {
-    "supports": Support,
-    "actuators": actuators.KINDS,
-    "sensors": Sensor,
-    "loads": loads.KINDS,
-}
-KEY_ORDER = ("beam", "supports", "actuators", "sensors", "loads", "controller", "run")
+for package in ("jaxbeam.case", "jaxbeam.control", "jaxbeam.estimation"):
+    import_modules(package)
 
 
 def load_case(path: str | os.PathLike) -> Case:
-    """Read a case from a TOML file and check it.
+    """The validated case of a TOML file.
 
-    Raises ValueError, naming the file and the address or line, for invalid TOML, unknown keys or
-    kinds, wrong types and whatever `check_case` refuses; OSError if the file cannot be read.
+    Raises ValueError, with the file and the address or line, for invalid TOML, unknown keys or
+    kinds, wrong types and the errors of `check_case`; OSError if the file cannot be read.
     """
     content = read_toml(path)
     try:
@@ -51,31 +40,27 @@ def load_case(path: str | os.PathLike) -> Case:
 
 
 def load_controller(path: str | os.PathLike) -> AbstractController:
-    """Read a controller from a TOML file: a case file that has one, or its [controller] alone.
+    """The controller of a TOML file: a case file, or one with the table [controller] alone.
 
-    Whether it suits a case is not asked. Raises ValueError, naming the file and the address or
-    line, for invalid TOML and unknown keys or kinds; OSError if the file cannot be read.
+    It is not validated against a case. Raises ValueError, with the file and the address or line,
+    for invalid TOML and unknown keys or kinds; OSError if the file cannot be read.
     """
     content = read_toml(path)
     try:
         if "controller" not in content:
             raise ValueError("has no controller; write a table [controller]")
         if set(content) - {"title", "controller"}:
-            controller = case_from_dict(content).controller
-            assert controller is not None  # the table is there
-            return controller
-        if not isinstance(content["controller"], dict):
-            raise ValueError("controller must be one table; write [controller]")
-        return read_part("controller", content["controller"], control.KINDS)
+            case_from_dict(content)  # to validate the other tables
+        return _read_key("controller", content["controller"])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
 def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> None:
-    """Write a case to a TOML file, with the unit of every number beside it.
+    """Write a case to a TOML file, with the unit of each number in a comment.
 
-    Reading the file back gives the same numbers, to the last bit. Raises FileExistsError if the
-    file exists and `overwrite` is not set, ValueError if the case holds a part of no known kind.
+    `load_case` returns the same numbers to the last bit. Raises FileExistsError if the file exists
+    and `overwrite` is not set, ValueError if a part of the case has no kind.
     """
     text = _as_toml(case)
     try:
@@ -88,25 +73,16 @@ def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> N
 
 
 def case_from_dict(content: dict[str, Any]) -> Case:
-    """Build a case from the tables of a case file: numbers in SI units, lists and words.
+    """The case that the tables of a case file describe: numbers in SI units, lists and words.
 
-    Raises ValueError, naming the address, for keys and kinds that are unknown or missing and for
-    values of the wrong type or shape. The values themselves are the business of `check_case`.
+    Raises ValueError, with the address, for keys and kinds that are unknown or missing and for
+    values of the wrong type or shape. `check_case` validates the values.
     """
     known_keys = [field.name for field in dataclasses.fields(Case)]
     parts = {}
     for key, value in content.items():
-        if key in TABLES:
-            if not isinstance(value, dict):
-                raise ValueError(f"{key} must be one table; write [{key}]")
-            parts[key] = read_part(key, value, TABLES[key])
-        elif key in ARRAYS_OF_TABLES:
-            if not isinstance(value, list) or not all(isinstance(v, dict) for v in value):
-                raise ValueError(f"{key} must be a list of tables; write [[{key}]]")
-            parts[key] = tuple(
-                read_part(f"{key}.{i}", table, ARRAYS_OF_TABLES[key])
-                for i, table in enumerate(value)
-            )
+        if key in part_classes():
+            parts[key] = _read_key(key, value)
         elif key == "title":
             if not isinstance(value, str):
                 raise ValueError(f"title must be text in quotes, not {describe_value(value)}")
@@ -118,34 +94,45 @@ def case_from_dict(content: dict[str, Any]) -> Case:
     return Case(**parts)
 
 
-def case_to_dict(case: Case) -> dict[str, Any]:
-    """Return the tables of a case file for a case, without what was left out.
+def _read_key(key: str, value: Any) -> Any:
+    """The part, or the tuple of parts, at a key of a case file."""
+    part_class, listed = part_classes()[key]
+    if not listed:
+        if not isinstance(value, dict):
+            raise ValueError(f"{key} must be one table; write [{key}]")
+        return read_part(key, value, part_class)
+    if not isinstance(value, list) or not all(isinstance(table, dict) for table in value):
+        raise ValueError(f"{key} must be a list of tables; write [[{key}]]")
+    return tuple(read_part(f"{key}.{i}", table, part_class) for i, table in enumerate(value))
 
-    Raises ValueError if the case holds a part whose class has no kind in its registry.
+
+def case_to_dict(case: Case) -> dict[str, Any]:
+    """Tables of a case file for a case; optional numbers that are None are left out.
+
+    Raises ValueError if a part has no kind, though its table needs one.
     """
     content: dict[str, Any] = {"title": case.title} if case.title else {}
-    for key in KEY_ORDER:
+    for key, (part_class, listed) in part_classes().items():
         value = getattr(case, key)
-        if key in TABLES and value is not None:
-            content[key] = _write_part(key, value, TABLES[key])
-        elif key in ARRAYS_OF_TABLES and value:
+        if listed and value:
             content[key] = [
-                _write_part(f"{key}.{i}", part, ARRAYS_OF_TABLES[key])
-                for i, part in enumerate(value)
+                _write_part(f"{key}.{i}", part, part_class) for i, part in enumerate(value)
             ]
+        elif not listed and value is not None:
+            content[key] = _write_part(key, value, part_class)
     return content
 
 
 def with_settings(case: Case, settings: dict[str, Any]) -> Case:
-    """Return a copy of a case with other entries at addresses, as if the file had said so.
+    """A validated copy of a case with other entries at some addresses, as in its case file.
 
-    Unlike `case.replace` this also sets words, counts and numbers that were left out, and it
-    checks the result; it takes plain values (SI units), not traced ones. Raises ValueError for
-    an address that no case file could have, and for whatever `check_case` refuses.
+    Unlike `case.replace` it also sets words, counts and optional numbers that were left out; values
+    are concrete (SI units), not traced. Raises ValueError for an address that no case file could
+    have, and for the errors of `check_case`.
     """
     content = case_to_dict(case)
     for address, value in settings.items():
-        *path, last = address.split(".")
+        *path, last = current_address(address).split(".")
         node: Any = content
         for key in path:
             node = _child(node, key)
@@ -161,7 +148,7 @@ def with_settings(case: Case, settings: dict[str, Any]) -> Case:
 
 
 def _child(node: Any, key: str) -> Any:
-    """What a table or list holds at one step of an address; None if nothing."""
+    """Entry of a table or list at one step of an address; None if there is none."""
     if isinstance(node, dict):
         return node.get(key)
     if isinstance(node, list) and key.isdigit() and int(key) < len(node):
@@ -169,15 +156,17 @@ def _child(node: Any, key: str) -> Any:
     return None
 
 
-def read_part(address: str, table: dict[str, Any], class_or_registry: ClassOrRegistry) -> Any:
-    """Build one part of a case from its table; `class_or_registry` is its class, or the registry of its kind.
+def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
+    """The part of a case that a table describes.
 
-    Raises ValueError, naming the address, for what `case_from_dict` refuses.
+    `part_class` is its class, or an abstract class of which the table's `kind` names a subclass.
+    Raises ValueError, with the address, as `case_from_dict` does.
     """
     values = dict(table)
-    if isinstance(class_or_registry, dict):
-        class_or_registry = _class_of_kind(address, values.pop("kind", None), class_or_registry)
-    fields = {field.name: field for field in dataclasses.fields(class_or_registry)}
+    if inspect.isabstract(part_class):
+        part_class = _class_of_kind(address, values.pop("kind", None), part_class)
+    fields = {field.name: field for field in dataclasses.fields(part_class)}
+    values = current_keys(address, values, fields)
     for key, value in values.items():
         if key not in fields:
             raise ValueError(
@@ -191,20 +180,23 @@ def read_part(address: str, table: dict[str, Any], class_or_registry: ClassOrReg
     for name, field in fields.items():
         if field.default is dataclasses.MISSING and name not in values:
             raise missing_error(f"{address}.{name}", field)
-    return class_or_registry(**values)
+    return part_class(**values)
 
 
-def _class_of_kind(address: str, kind: Any, registry: dict[str, type]) -> type:
+def _class_of_kind(address: str, kind: Any, family: type) -> type:
+    classes = kinds(family)
     if kind is None:
-        raise ValueError(f"{address}.kind is missing; it may be {', '.join(registry)}")
-    if not isinstance(kind, str) or kind not in registry:
-        hint = suggestion(str(kind), registry)
+        raise ValueError(f"{address}.kind is missing; it may be {', '.join(classes)}")
+    if isinstance(kind, str) and kind not in classes:
+        kind = current_kind(address, kind)
+    if not isinstance(kind, str) or kind not in classes:
+        hint = suggestion(str(kind), classes)
         raise ValueError(f"{address}.kind cannot be {describe_value(kind)}; {hint}")
-    return registry[kind]
+    return classes[kind]
 
 
 def _check_type(address: str, value: Any, field: dataclasses.Field) -> None:
-    """Check what a file says for a field before it becomes an array."""
+    """Validate the entry of a field in a file, before it becomes an array."""
     if "unit" not in field.metadata:
         check_field(address, value, field)
         return
@@ -216,7 +208,7 @@ def _check_type(address: str, value: Any, field: dataclasses.Field) -> None:
 def _shape(value: Any) -> tuple[int, ...] | None:
     """Shape of a number or of nested lists of numbers; None for anything else.
 
-    No number is a whole one that is too large for a float.
+    A whole number that is too large for a float is not a number here.
     """
     if not isinstance(value, list):
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -226,16 +218,16 @@ def _shape(value: Any) -> tuple[int, ...] | None:
     return None if shapes or entry_shape is None else (len(value), *entry_shape)
 
 
-def _write_part(address: str, part: Any, class_or_registry: ClassOrRegistry) -> dict[str, Any]:
+def _write_part(address: str, part: Any, part_class: type) -> dict[str, Any]:
     table = {}
-    if isinstance(class_or_registry, dict):
-        names = [name for name, made in class_or_registry.items() if type(part) is made]
-        if not names:
+    if inspect.isabstract(part_class):
+        kind = kind_of(type(part))
+        if kind is None:
             raise ValueError(
                 f"{address} is a {type(part).__name__}, which has no kind in case files;"
-                " add it to the registry of its family"
+                ' declare one in its class: kind: ClassVar[str] = "..."'
             )
-        table["kind"] = names[0]
+        table["kind"] = kind
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
         if value is None:

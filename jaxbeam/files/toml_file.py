@@ -1,4 +1,4 @@
-"""TOML files as dictionaries; imports nothing heavy, so that a wrong file is told at once."""
+"""TOML files as dictionaries; no heavy imports, so that errors in a file appear at once."""
 
 import os
 import tomllib
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def read_toml(path: str | os.PathLike) -> dict[str, Any]:
-    """Tables of a case file, of which only the TOML is checked.
+    """Tables of a case file, validated as TOML only.
 
     Raises OSError if the file cannot be read, ValueError if it is not UTF-8 or not valid TOML;
     both name the file.

@@ -20,7 +20,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.case.actuators import AbstractActuator, Electrodynamic
+from jaxbeam.case.actuators.base import AbstractActuator
+from jaxbeam.case.actuators.electrodynamic import Electrodynamic
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.quantities import QUANTITIES

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.path import Path
 
-from jaxbeam.case.actuators import AbstractActuator
+from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, colour, separate_labels

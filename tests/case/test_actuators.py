@@ -1,4 +1,4 @@
-"""Actuators by themselves: what they say of their limits, and the physics of coil and patch."""
+"""Actuators: limits of commands, moment of a patch, electromechanics of a coil."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ MATERIAL = {
 V4 = jb.Electrodynamic(0.5, 0.82, 5e-5, 4.2, mass=0.02, stiffness=9700.0, damping=0.55)  # table 2.3
 
 
-def test_moment_per_volt_of_a_material():
+def test_moment_per_volt_from_material():
     patch = jb.Patch(0.2575, 0.3425, correction=0.32, amplifier_gain=200.0, **MATERIAL)
     assert_allclose(patch.moment_constant, 8.2924e-4, rtol=1e-5)
     direct = jb.Patch(0.2575, 0.3425, patch.moment_constant, correction=0.32, amplifier_gain=200.0)
@@ -32,7 +32,7 @@ def test_moment_per_volt_of_a_material():
     assert_allclose(patch.attachment().static_gain, 8.2924e-4 * 0.32 * 200, rtol=1e-5)
 
 
-def test_every_number_of_a_material_has_an_address():
+def test_material_numbers_have_addresses():
     case = jb.Case(jb.Beam(0.6, 13.211, 0.812), actuators=[jb.Patch(0.2575, 0.3425, **MATERIAL)])
     found = addresses(case)
     for name, value in MATERIAL.items():
@@ -51,7 +51,7 @@ def test_every_number_of_a_material_has_an_address():
         ([-1.0, 10.0], 200.0, [-1.0, 7.5]),
     ],
 )
-def test_commands_spare_the_polarisation_of_a_patch(given, gain, expected):
+def test_command_limits_of_a_patch_include_depolarisation(given, gain, expected):
     patch = jb.Patch(
         start=0.2, end=0.3, moment_per_volt=1e-3, amplifier_gain=gain, limits=given, rate_limit=50.0
     )
@@ -59,7 +59,7 @@ def test_commands_spare_the_polarisation_of_a_patch(given, gain, expected):
     assert patch.command_rate_limit() == 50.0
 
 
-def test_other_actuators_say_their_limits_in_the_same_way():
+def test_command_limits_of_other_actuators():
     limited = [jb.PointForce(position=0.1, limits=[-1, 2]), jb.Shaker(position=0.1, limits=[-1, 2])]
     for actuator in limited:
         assert_allclose(actuator.command_limits(), [-1, 2])
@@ -70,8 +70,8 @@ def test_other_actuators_say_their_limits_in_the_same_way():
 
 
 @pytest.mark.parametrize("back_emf", [None, 4.2, 3.0])
-def test_energy_into_a_coil_heats_it_moves_the_beam_or_stays(back_emf):
-    """u I = R I^2 + damping + d/dt of the stored energy, of any state, where K_v is K_f."""
+def test_power_balance_of_a_coil(back_emf):
+    """u I = R I^2 + damping + d/dt of the stored energy for any state, if K_v = K_f."""
     shaker = jb.Electrodynamic(0.5, 0.82, 5e-5, 4.2, back_emf, 0.02, 9700.0, 0.55)
     case = jb.Case(jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03), actuators=[shaker])
     model = eqx.filter_jit(modal_model)(case, mesh_layout(case))
@@ -79,8 +79,8 @@ def test_energy_into_a_coil_heats_it_moves_the_beam_or_stays(back_emf):
     state = np.random.default_rng(1).standard_normal(7)
     volts, current, rates = 3.0, state[6], state[1:6:2]
     change = matrix @ state + np.asarray(model.command_matrix)[:, 0] * volts
-    places, stiffness = state[0:6:2], np.asarray(model.stiffness())
-    stored = rates @ change[1:6:2] + places @ stiffness @ rates + 5e-5 * current * change[6]
+    displacements, stiffness = state[0:6:2], np.asarray(model.stiffness())
+    stored = rates @ change[1:6:2] + displacements @ stiffness @ rates + 5e-5 * current * change[6]
     lost = -rates @ matrix[1:6:2, 1:6:2] @ rates + 0.82 * current**2
     assert lost > 0
     created = ((4.2 - (4.2 if back_emf is None else back_emf)) * current) * float(
@@ -90,8 +90,8 @@ def test_energy_into_a_coil_heats_it_moves_the_beam_or_stays(back_emf):
 
 
 @pytest.mark.slow
-def test_a_ball_crosses_a_beam_with_a_shorted_coil():
-    """Coupled electromechanical equations, written out for sines and integrated by scipy."""
+def test_crossing_mass_on_a_beam_with_a_shorted_coil():
+    """Against the coupled electromechanical equations of sine modes, integrated by scipy."""
     beam = {"length": 0.6, "rigidity": 11.68, "density": 0.535, "ratio": 0.03}
     case = jb.Case(
         jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03),
@@ -133,7 +133,7 @@ def test_a_ball_crosses_a_beam_with_a_shorted_coil():
     assert_allclose(record.deflection[:, 0], expected, atol=2e-6 * np.abs(expected).max())
 
 
-def test_a_steady_voltage_makes_a_steady_force():
+def test_static_gains():
     assert_allclose(V4.attachment().static_gain, 4.2 / 0.82, rtol=1e-15)
     assert_allclose(jb.Shaker(0.1, force_per_volt=4.6).attachment().static_gain, 4.6, rtol=1e-15)
     assert jnp.ndim(jb.PointForce(0.1).attachment().static_gain) == 0

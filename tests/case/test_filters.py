@@ -13,8 +13,8 @@ from jaxbeam.case.filters import (
     analogue_steady_state,
     filter_history,
     filter_step,
-    steady_filter_state,
     second_order_sections,
+    steady_filter_state,
 )
 from jaxbeam.numerics.discretisation import c2d
 from tests.differences import central
@@ -25,13 +25,13 @@ SIGNAL = np.random.default_rng(7).normal(size=(400, 3)).cumsum(axis=0)
 
 
 def designed(order, cutoff):
-    """The same digital filter, by scipy."""
+    """Sections of the same digital filter by scipy."""
     return scipy.signal.butter(order, cutoff, fs=1 / PERIOD, output="sos")
 
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("cutoff", [10.0, 120.0, 480.0])
-def test_sections_respond_as_those_of_scipy(order, cutoff):
+def test_frequency_response_of_a_digital_filter(order, cutoff):
     frequencies = np.linspace(0.01, 499.0, 200)
     ours = np.asarray(second_order_sections(Filter(cutoff, order), PERIOD))
     found = scipy.signal.sosfreqz(ours, frequencies, fs=1 / PERIOD)[1]
@@ -44,7 +44,7 @@ def test_sections_respond_as_those_of_scipy(order, cutoff):
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("cutoff", [10.0, 120.0])
-def test_a_history_is_that_of_sosfilt(order, cutoff):
+def test_history_equals_sosfilt(order, cutoff):
     rows = second_order_sections(Filter(cutoff, order), PERIOD)
     rest = steady_filter_state(rows, np.zeros(3))
     expected = scipy.signal.sosfilt(designed(order, cutoff), SIGNAL, axis=0)
@@ -54,22 +54,22 @@ def test_a_history_is_that_of_sosfilt(order, cutoff):
 
 def test_steps_add_up_to_the_history():
     rows = second_order_sections(Filter(40.0, 5), PERIOD)
-    memory = steady_filter_state(rows, np.ones(3))
-    expected = filter_history(rows, memory, jnp.asarray(SIGNAL[:20]))
+    state = steady_filter_state(rows, np.ones(3))
+    expected = filter_history(rows, state, jnp.asarray(SIGNAL[:20]))
     for sample, output in zip(SIGNAL[:20], expected, strict=True):
-        found, memory = filter_step(rows, memory, jnp.asarray(sample))
+        found, state = filter_step(rows, state, jnp.asarray(sample))
         assert_allclose(found, output, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_a_filter_at_rest_stays_there(order):
+def test_steady_state_is_kept_under_a_constant_input(order):
     rows = second_order_sections(Filter(20.0, order), PERIOD)
     level = np.array([2.0, -3.0, 0.5])
     found = filter_history(rows, steady_filter_state(rows, level), jnp.broadcast_to(level, (50, 3)))
     assert_allclose(found, np.broadcast_to(level, (50, 3)), rtol=1e-9)
 
 
-def test_lanes_may_have_filters_of_their_own():
+def test_each_run_of_a_batch_may_have_its_own_filter():
     cutoffs = jnp.array([10.0, 50.0, 200.0])
     rows = jax.vmap(lambda c: second_order_sections(Filter(c, 3), PERIOD), out_axes=-1)(cutoffs)
     found = filter_history(rows, steady_filter_state(rows, np.zeros(3)), jnp.asarray(SIGNAL))
@@ -78,23 +78,24 @@ def test_lanes_may_have_filters_of_their_own():
         assert_allclose(found[:, i], expected, rtol=0, atol=1e-11 * np.max(np.abs(SIGNAL)))
 
 
-def test_between_fresh_samples_the_output_is_held():
+def test_output_is_held_between_new_samples():
     rows = second_order_sections(Filter(50.0, 4), 5 * PERIOD)
-    fresh = np.arange(400) % 5 == 0
-    found = filter_history(rows, steady_filter_state(rows, np.zeros(3)), jnp.asarray(SIGNAL), jnp.array(fresh))
-    slow = filter_history(rows, steady_filter_state(rows, np.zeros(3)), jnp.asarray(SIGNAL[::5]))
+    new, start = jnp.array(np.arange(400) % 5 == 0), steady_filter_state(rows, np.zeros(3))
+    found = filter_history(rows, start, jnp.asarray(SIGNAL), new)
+    slow = filter_history(rows, start, jnp.asarray(SIGNAL[::5]))
     assert_allclose(found, np.repeat(slow, 5, axis=0), rtol=0, atol=0)
 
 
-def test_a_cutoff_above_half_the_sampling_frequency_is_refused():
+def test_cutoff_above_half_the_sampling_frequency_is_refused():
     with pytest.raises(ValueError, match="below half the sampling frequency, 500 Hz; it is 500 Hz"):
         second_order_sections(Filter(500.0, 2), PERIOD)
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_an_analogue_filter_responds_as_that_of_scipy(order):
+def test_frequency_response_of_an_analogue_filter(order):
     cutoff = 30.0
-    matrix, column, row, direct = analogue_state_space(Filter(cutoff, order, realisation="analogue"))
+    analogue = Filter(cutoff, order, realisation="analogue")
+    matrix, column, row, direct = analogue_state_space(analogue)
     omega = 2 * np.pi * np.logspace(-1, 3, 60)
     inverse = np.linalg.inv(1j * omega[:, None, None] * np.eye(order) - np.asarray(matrix))
     found = np.einsum("i,wij,j->w", row, inverse, column) + direct
@@ -108,35 +109,35 @@ def test_an_analogue_filter_responds_as_that_of_scipy(order):
 
 
 @pytest.mark.parametrize("order", [1, 4, 7])
-def test_holds_are_exact(order):
-    """Zero order against cont2discrete, first order against lsim, cubics against both halves."""
+def test_discretisation_with_polynomial_holds_is_exact(order):
+    """Zero order against cont2discrete, first order against lsim, cubics against half steps."""
     matrix, column, row, direct = analogue_state_space(Filter(30.0, order))
     system = matrix, column[:, None], row[None], direct[None, None]
-    drift, push = c2d(matrix, column[:, None], PERIOD)
+    transition, inputs = c2d(matrix, column[:, None], PERIOD)
     discrete = scipy.signal.cont2discrete([np.asarray(x) for x in system], PERIOD)
-    assert_allclose(drift, discrete[0], rtol=1e-12, atol=1e-13)
-    assert_allclose(push[0], discrete[1], rtol=1e-10, atol=1e-14)
+    assert_allclose(transition, discrete[0], rtol=1e-12, atol=1e-13)
+    assert_allclose(inputs[0], discrete[1], rtol=1e-10, atol=1e-14)
 
-    drift, push = c2d(matrix, column[:, None], PERIOD, degree=1)
+    transition, inputs = c2d(matrix, column[:, None], PERIOD, degree=1)
     times, signal = PERIOD * np.arange(400), SIGNAL[:, 0]
     expected = scipy.signal.lsim([np.asarray(x) for x in system], signal, times)[2]
     state, found = np.zeros(order), [np.zeros(order)]
     for value, rise in zip(signal[:-1], np.diff(signal), strict=True):
-        state = drift @ state + push[0, :, 0] * value + push[1, :, 0] * rise
+        state = transition @ state + inputs[0, :, 0] * value + inputs[1, :, 0] * rise
         found.append(state)
     assert_allclose(found, np.asarray(expected).reshape(400, order), rtol=0, atol=1e-9)
 
     cubic = np.array([1.0, -2.0, 0.5, 3.0])  # in s / h; its halves in s / (h / 2), from the start
     second = np.polynomial.Polynomial(cubic)(np.polynomial.Polynomial([0.5, 0.5])).coef
-    drift, push = c2d(matrix, column[:, None], 0.02, degree=3)
-    half_drift, half_push = c2d(matrix, column[:, None], 0.01, degree=3)
-    middle = np.tensordot(cubic * 0.5 ** np.arange(4), half_push[..., 0], axes=1)
-    expected = half_drift @ middle + np.tensordot(second, half_push[..., 0], axes=1)
-    assert_allclose(np.tensordot(cubic, push[..., 0], axes=1), expected, rtol=1e-11)
+    transition, inputs = c2d(matrix, column[:, None], 0.02, degree=3)
+    half_transition, half_inputs = c2d(matrix, column[:, None], 0.01, degree=3)
+    middle = np.tensordot(cubic * 0.5 ** np.arange(4), half_inputs[..., 0], axes=1)
+    expected = half_transition @ middle + np.tensordot(second, half_inputs[..., 0], axes=1)
+    assert_allclose(np.tensordot(cubic, inputs[..., 0], axes=1), expected, rtol=1e-11)
 
 
 @pytest.mark.parametrize("order", [3, 10])
-def test_derivatives_by_the_cutoff(order):
+def test_derivatives_with_respect_to_the_cutoff(order):
     def digital(cutoff):
         rows = second_order_sections(Filter(cutoff[0], order), PERIOD)
         return filter_history(rows, steady_filter_state(rows, 0.3), jnp.asarray(SIGNAL[:80, 0]))

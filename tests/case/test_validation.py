@@ -1,4 +1,4 @@
-"""A bad case is refused before anything compiles, by address and with a way out."""
+"""Validation of cases: errors name the address and the remedy, before anything compiles."""
 
 import re
 import time
@@ -9,7 +9,11 @@ import jax.numpy as jnp
 import pytest
 from hypothesis import given
 
-from jaxbeam.case.actuators import Electrodynamic, Patch, PointForce, Shaker, SpringDamper
+from jaxbeam.case.actuators.electrodynamic import Electrodynamic
+from jaxbeam.case.actuators.patch import Patch
+from jaxbeam.case.actuators.point import PointForce
+from jaxbeam.case.actuators.shaker import Shaker
+from jaxbeam.case.actuators.spring import SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run, replace
 from jaxbeam.case.loads import MovingForce, MovingMass
@@ -42,17 +46,17 @@ def test_valid_cases_pass(case):
     check_case(case)
 
 
-def test_our_own_case_passes():
+def test_example_case_passes():
     check_case(CASE)
 
 
 @pytest.mark.parametrize("left", END_CONDITIONS)
 @pytest.mark.parametrize("right", END_CONDITIONS)
-def test_all_ends_pass(left, right):
+def test_all_end_conditions_pass(left, right):
     check_case(Case(Beam(**RIG, ends=f"{left}-{right}")))
 
 
-# Replaced numbers, and what the message must say.
+# Address, its new value, and a part of the error message.
 NUMBERS = [
     ("beam.length", 0.0, "beam.length must be positive; it is 0 m"),
     ("beam.length", jnp.nan, "beam.length must be a finite number; it is nan"),
@@ -85,11 +89,11 @@ NUMBERS = [
 
 
 @pytest.mark.parametrize(("address", "value", "message"), NUMBERS)
-def test_bad_numbers_are_refused(address, value, message):
+def test_invalid_numbers_are_refused(address, value, message):
     refuses(replace(CASE, {address: value}), message)
 
 
-# Cases that contradict themselves, and what the message must say.
+# Inconsistent cases, and a part of the error message.
 TABLE = {"times": [0.0, 1.0], "positions": [0.0, 0.6]}
 CASES = [
     (Case(Beam(length=1.0)), "beam.flexural_rigidity is missing; give it, or all of width, height"),
@@ -174,7 +178,7 @@ def test_contradictions_are_refused(case, message):
 
 
 def test_wrong_shapes_and_types_are_refused():
-    """What gets past the constructors, whose shapes are only checked in these tests."""
+    """Constructors do not check shapes outside of tests; `tree_at` goes past them here."""
     lengths = eqx.tree_at(lambda c: c.beam.length, CASE, jnp.ones(2))
     refuses(lengths, "beam.length must be one number, not an array of shape (2,)")
     nothing = eqx.tree_at(lambda c: c.beam.length, CASE, None)
@@ -185,13 +189,13 @@ def test_wrong_shapes_and_types_are_refused():
     refuses(limit, "actuators.0.limits must be a list of 2 numbers, not one number")
 
 
-def test_negative_speed_and_rounded_places_pass():
+def test_negative_speed_and_rounded_positions_pass():
     check_case(replace(CASE, {"loads.0.speed": -0.5, "sensors.0.position": 3 * 0.2}))
     check_case(Case(BEAM, actuators=[SpringDamper(0.0, 1.0)], supports=[Support(0.6)]))
 
 
-def test_unknown_numbers_are_passed_over():
-    """Inside jit and vmap a case is checked as far as its numbers are known."""
+def test_traced_numbers_are_skipped():
+    """Inside jit and vmap a case is validated as far as its numbers are concrete."""
 
     def length(value):
         case = replace(CASE, {"beam.length": value, "loads.0.speed": 0 * value})
@@ -204,16 +208,16 @@ def test_unknown_numbers_are_passed_over():
         jax.grad(length)(-1.0)
 
 
-def test_a_check_takes_milliseconds():
+def test_validation_takes_milliseconds():
     check_case(CASE)
     start = time.perf_counter()
     for _ in range(10):
         check_case(CASE)
-    assert time.perf_counter() - start < 0.5, "ten checks should take far less than 50 ms"
+    assert time.perf_counter() - start < 0.5, "ten should take far less than 50 ms"
 
 
 def refuses(case, message):
-    """The case is refused with one sentence that contains the message."""
+    """Assert that the case is refused with one line that contains the message."""
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         check_case(case)
     assert "\n" not in str(caught.value)

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.control.test_controllers import HELD
@@ -74,7 +74,7 @@ FAULTS = [
                 jb.Sensor(0.3, "acceleration", filter=jb.Filter(9.0, realisation="analogue")),
             )
         },
-        "sensors.0.filter cannot be analogue on an acceleration that a controller looks at",
+        "sensors.0.filter cannot be analogue on an acceleration that a controller uses",
     ),
     (
         {"actuators": (dataclasses.replace(ACTUATOR, limits=jnp.array([1.0, -1.0])),)},
@@ -118,7 +118,7 @@ def test_faulty_loops_are_refused(changes, message):
     if isinstance(changes.get("controller"), jb.Prescribed):
         changes = {"sensors": (), **changes}
     case = dataclasses.replace(HELD, **changes)
-    for look in (check, jb.simulate):
+    for look in (check_case, jb.simulate):
         with pytest.raises(ValueError, match=re.escape(message)) as caught:
             look(case)
         assert "\n" not in str(caught.value)

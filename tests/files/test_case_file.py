@@ -1,4 +1,4 @@
-"""Case files: read exactly, written exactly, and refused with a sentence that helps."""
+"""Case files: exact round trips, and error messages that name the address and the remedy."""
 
 import re
 import tomllib
@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from jaxbeam.case.actuators import Patch, PointForce, Shaker
+from jaxbeam.case.actuators.patch import Patch
+from jaxbeam.case.actuators.point import PointForce
+from jaxbeam.case.actuators.shaker import Shaker
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.loads import MovingForce, MovingMass
@@ -74,13 +76,13 @@ SMALL = {"beam": {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 
 
 @pytest.fixture
 def full(tmp_path):
-    """A case file that uses every table."""
+    """A case file with every table."""
     path = tmp_path / "case.toml"
     path.write_text(FULL)
     return path
 
 
-def test_file_and_python_describe_the_same_case(full):
+def test_case_file_equals_the_case_built_in_python(full):
     written = Case(
         Beam(0.6, 11.68, 0.535, 0.03, modes=3),
         supports=[Support(0.6, 2e6)],
@@ -125,7 +127,7 @@ def test_file_round_trip_is_exact(tmp_path_factory, case):
     assert eqx.tree_equal(load_case(path), case)
 
 
-def test_saved_file_says_units(tmp_path, full):
+def test_saved_file_has_units_in_comments(tmp_path, full):
     save_case(load_case(full), tmp_path / "copy.toml")
     text = (tmp_path / "copy.toml").read_text()
     assert "flexural_rigidity = 11.68  # N m^2\n" in text
@@ -133,7 +135,7 @@ def test_saved_file_says_units(tmp_path, full):
     assert tomllib.loads(text)["loads"][1]["times"] == [0.0, 1.0, 2.0]
 
 
-def test_saving_never_overwrites_unasked(full):
+def test_existing_file_is_overwritten_only_on_request(full):
     case = load_case(full)
     before = full.read_text()
     with pytest.raises(FileExistsError, match=r"case\.toml exists already; .* overwrite"):
@@ -144,7 +146,7 @@ def test_saving_never_overwrites_unasked(full):
 
 
 class Jack(PointForce):
-    """A kind of actuator that no registry knows."""
+    """Actuator that declares no kind of its own."""
 
 
 def test_part_without_a_kind_is_not_written():
@@ -153,7 +155,7 @@ def test_part_without_a_kind_is_not_written():
         case_to_dict(case)
 
 
-# What is changed in the file above, and what the message must then say.
+# Text in the file above, what replaces it, and a part of the error message.
 REFUSED = [
     ("[beam]", "[bean]", "a case has no 'bean'; did you mean 'beam'?"),
     ("length = 0.6", "lenght = 0.6", "beam has no key 'lenght'; did you mean 'length'?"),
@@ -173,11 +175,11 @@ REFUSED = [
     (
         'kind = "shaker"',
         "",
-        "actuators.0.kind is missing; it may be point, shaker, electrodynamic, patch",
+        "actuators.0.kind is missing; it may be electrodynamic, patch, point, shaker, spring",
     ),
     ('"shaker"', '"shakr"', "actuators.0.kind cannot be 'shakr'; did you mean 'shaker'?"),
-    ('"mass"', '"car"', "loads.0.kind cannot be 'car'; it may be mass, force"),
-    ('"mass"', "1", "loads.0.kind cannot be 1; it may be mass, force"),
+    ('"mass"', '"car"', "loads.0.kind cannot be 'car'; it may be force, mass"),
+    ('"mass"', "1", "loads.0.kind cannot be 1; it may be force, mass"),
     ("speed = 0.55", "sped = 0.55", "loads.0 has no key 'sped'; did you mean 'speed'?"),
     ("[-2.5, 7.5]", "7.5", "actuators.1.limits must be a list of 2 numbers, not 7.5"),
     ("[-2.5, 7.5]", "[1, 2, 3]", "actuators.1.limits must be a list of 2 numbers, not [1, 2, 3]"),
@@ -190,7 +192,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("old", "new", "message"), REFUSED)
-def test_bad_files_are_refused_by_name(tmp_path, old, new, message):
+def test_invalid_case_file_is_refused_with_its_address(tmp_path, old, new, message):
     path = tmp_path / "case.toml"
     assert old in FULL
     path.write_text(FULL.replace(old, new, 1))
@@ -201,14 +203,14 @@ def test_bad_files_are_refused_by_name(tmp_path, old, new, message):
     assert "\n" not in str(caught.value)
 
 
-def test_invalid_toml_names_the_line(tmp_path):
+def test_invalid_toml_is_refused_with_its_line(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text("[beam]\nlength = 0.6 m\n")
     with pytest.raises(ValueError, match="not valid TOML: .*line 2"):
         load_case(path)
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_unreadable_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="cannot read the case file .*none.toml: no such"):
         load_case(tmp_path / "none.toml")
     (tmp_path / "log.bin").write_bytes(b"\xff\xfe\x00")
@@ -226,12 +228,12 @@ def test_whole_numbers_become_floats():
     assert case.beam.length.dtype == np.float64
 
 
-def test_what_is_left_out_stays_out():
+def test_optional_keys_are_not_written():
     assert "stiffness" not in case_to_dict(Case(Beam(1, 1, 1), [Support(0.5)]))["supports"][0]
     assert set(case_to_dict(case_from_dict(SMALL))) == {"beam", "run"}
 
 
-def test_settings_change_anything_a_file_may_say(full):
+def test_settings_change_numbers_words_and_counts(full):
     case = load_case(full)
     settings = {
         "beam.modes": 2,
@@ -265,6 +267,6 @@ def test_settings_change_anything_a_file_may_say(full):
         ("bean.length", 1.0, "no number at address 'bean.length'; did you mean 'beam.length'?"),
     ],
 )
-def test_settings_are_checked(full, address, value, message):
+def test_invalid_settings_are_refused(full, address, value, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         with_settings(load_case(full), {address: value})

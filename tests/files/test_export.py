@@ -1,4 +1,4 @@
-"""Gains in files: they come back bit for bit, a C program gives the same commands, damage shows."""
+"""Files of gains: exact round trips, equal commands of the C header, damage is detected."""
 
 import dataclasses
 import importlib.util
@@ -20,9 +20,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.cli import main
-from jaxbeam.control import DiscreteLQR, Feedback, FiniteLQR, ScheduledLQR
+from jaxbeam.control.feedback import Feedback
+from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
+from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
+from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
 from jaxbeam.files.export import Gains, export_gains, read_gains, write_gains
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 
 RANDOM = np.random.default_rng(0)
 SIGNALS = (tuple((f"q_{i}", "m kg^0.5") for i in range(4)), (("u_0", "V"), ("u_1", "N")))
@@ -30,28 +33,28 @@ FILTER = np.insert(scipy.signal.butter(3, 0.1, output="sos"), 0, 1.0, axis=1)
 POINTS = np.sort(np.append(RANDOM.uniform(0, 1, 9), [0.0, 1.0]))
 
 
-def made(masses, speeds, fade=np.inf, between="interpolated") -> Gains:
-    """Some gains."""
+def random_gains(masses, speeds, decay_time=np.inf, interpolation="interpolated") -> Gains:
+    """Gains of four states and two actuators at 11 shares."""
     masses, speeds = np.array(masses), np.array(speeds)
     grid = masses.size, speeds.size
     table = 1e3 * RANDOM.normal(size=(*grid, POINTS.size, 2, 4))
     rest = RANDOM.normal(size=(*grid, 2, 4))
-    numbers = 2e-3, 0.6, fade, between
+    numbers = 2e-3, 0.6, decay_time, interpolation
     return Gains(masses, speeds, POINTS, table, rest, FILTER, *numbers, *SIGNALS)
 
 
-TABLE = made([0.0], [0.0])
-FAMILY = made([0.2, 0.3, 0.5], [1.0, 2.5], fade=0.07)
-NEAREST = dataclasses.replace(FAMILY, between="nearest")
+TABLE = random_gains([0.0], [0.0])
+FAMILY = random_gains([0.2, 0.3, 0.5], [1.0, 2.5], decay_time=0.07)
+NEAREST = dataclasses.replace(FAMILY, interpolation="nearest")
 CONSTANT = dataclasses.replace(
     TABLE,
     shares=np.zeros(1),
     table=TABLE.rest[:, :, None],
     filters=np.zeros((0, 7)),
-    crossing=0.0,
+    crossing_time=0.0,
 )
-# Five states of which four are fed back, two commands, three readings.
-ESTIMATED = dataclasses.replace(CONSTANT, estimator=RANDOM.normal(size=(8, 12)), readings=3)
+# Estimator of five states, of which four are fed back; two commands, three readings.
+ESTIMATED = dataclasses.replace(CONSTANT, estimator=RANDOM.normal(size=(8, 12)), reading_count=3)
 EVERY = {
     "table": TABLE,
     "constant": CONSTANT,
@@ -78,7 +81,7 @@ def same(found, expected):
 
 @every
 @pytest.mark.parametrize("ending", [".csv", ".mat", pytest.param(".tdms", marks=TDMS)])
-def test_what_is_read_back_runs_identically(gains, ending, tmp_path):
+def test_gains_of_a_file_give_the_same_commands(gains, ending, tmp_path):
     path = tmp_path / f"gains{ending}"
     write_gains(gains, path)
     back = read_gains(path)
@@ -90,15 +93,15 @@ def test_what_is_read_back_runs_identically(gains, ending, tmp_path):
 
 
 @every
-def test_commands_are_interpolated(gains):
-    """As numpy and scipy interpolate; nothing before the entry, the last gain after the exit."""
-    method = "nearest" if gains.between == "nearest" else "linear"
+def test_gains_are_interpolated(gains):
+    """As by numpy and scipy; no command before the entry, the decaying gain after the exit."""
+    method = "nearest" if gains.interpolation == "nearest" else "linear"
     grid, points = gains.rest.shape[:2], gains.shares.size
     along = np.moveaxis(gains.table, 2, -1).reshape(-1, points)
     for (share, since, mass, speed), state in zip(INPUTS, STATES, strict=True):
         members = np.array([np.interp(share, gains.shares, one) for one in along])
         if share >= 1 and points > 1:
-            members = gains.rest.ravel() * np.exp(-since / gains.fade)
+            members = gains.rest.ravel() * np.exp(-since / gains.decay_time)
         members = members.reshape(gains.rest.shape)
         gain = members[0, 0]
         if grid != (1, 1):
@@ -110,7 +113,7 @@ def test_commands_are_interpolated(gains):
         assert_allclose(found, expected, rtol=1e-11, atol=1e-10)
 
 
-def test_other_programs_can_read_them(tmp_path):
+def test_files_are_readable_by_other_programs(tmp_path):
     write_gains(TABLE, tmp_path / "gains.mat")
     content = scipy.io.loadmat(tmp_path / "gains.mat")
     assert_array_equal(content["table"], TABLE.table)
@@ -129,7 +132,7 @@ def test_other_programs_can_read_them(tmp_path):
 
 
 @pytest.mark.parametrize("ending", [".csv", ".mat"])
-def test_damage_is_noticed(ending, tmp_path):
+def test_changed_numbers_are_refused(ending, tmp_path):
     path = tmp_path / f"gains{ending}"
     write_gains(TABLE, path)
     number = TABLE.table[0, 0, 3, 1, 2]
@@ -139,13 +142,13 @@ def test_damage_is_noticed(ending, tmp_path):
         content = scipy.io.loadmat(path)
         content["table"][0, 0, 3, 1, 2] += 1e-9
         scipy.io.savemat(path, {k: v for k, v in content.items() if not k.startswith("__")})
-    with pytest.raises(ValueError, match="do not give the check values"):
+    with pytest.raises(ValueError, match="contradict the check values"):
         read_gains(path)
 
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
 @every
-def test_a_c_program_gives_the_same_commands(gains, tmp_path):
+def test_c_header_gives_the_same_commands(gains, tmp_path):
     write_gains(gains, tmp_path / "gains.h")
     calls = "".join(
         f"{{ double z[] = {{{', '.join(map(repr, state.tolist()))}}};\n"
@@ -184,7 +187,7 @@ def sampled():
     return case, export_gains(case)
 
 
-def test_the_command_line_writes_what_was_designed(sampled, tmp_path, capsys):
+def test_command_line_exports_the_designed_gains(sampled, tmp_path, capsys):
     case, gains = sampled
     jb.save_case(case, tmp_path / "case.toml")
     path = tmp_path / "gains.csv"
@@ -202,9 +205,9 @@ def test_the_command_line_writes_what_was_designed(sampled, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_tables_are_those_of_the_design():
+def test_table_has_the_gains_of_the_design():
     case = rig(FiniteLQR(**WEIGHTS, points=210, after="hold"))
-    gains, layout = export_gains(case, 51), lay_out(case)
+    gains, layout = export_gains(case, 51), mesh_layout(case)
 
     @eqx.filter_jit
     def designed(case):
@@ -213,19 +216,19 @@ def test_tables_are_those_of_the_design():
 
     found = gains.table[0, 0, [0, 25, 49, 50]]
     assert_allclose(found, designed(case), rtol=1e-9, atol=1e-9 * np.max(np.abs(found)))
-    assert gains.crossing == pytest.approx(0.6)
+    assert gains.crossing_time == pytest.approx(0.6)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("between", ["interpolated", "nearest"])
-def test_families_run_as_in_a_simulation(between, tmp_path):
-    """Between masses, along the crossing, and while the gain fades."""
+def test_gain_family_gives_the_commands_of_the_controller(between, tmp_path):
+    """Between masses of the grid, along the crossing, and during the decay after it."""
     end = {"terminal_weight": [1e3, 1e2, 0.1, 0.01, 1e-3], "after": "fade", "fade_time": 0.05}
     family = {"masses": [0.2, 0.4], "between": between, "loads": "known"}
     law = ScheduledLQR(**WEIGHTS, **end, **family, points=210)
     case = jb.replace(rig(law), {"loads.0.mass": 0.25})
     write_gains(export_gains(case, 11), tmp_path / "gains.csv")
-    gains, layout = read_gains(tmp_path / "gains.csv"), lay_out(case)
+    gains, layout = read_gains(tmp_path / "gains.csv"), mesh_layout(case)
     shares = np.array([-0.1, 0.2, 0.5, 1.0 + 1e-9, 1.5])
     states = RANDOM.normal(size=(shares.size, 5)) * [1e-3, 1e-4, 0.03, 0.01, 0.2]
 
@@ -245,7 +248,7 @@ def test_families_run_as_in_a_simulation(between, tmp_path):
         found = gains.command(np.append(state, weight), share, since, 0.25, 1.0)
         assert_allclose(found, command, rtol=1e-9)
     assert gains.columns[-1] == ("load_0", "N")
-    assert gains.crossing == pytest.approx(0.6) and gains.fade == 0.05
+    assert gains.crossing_time == pytest.approx(0.6) and gains.decay_time == 0.05
 
 
 @pytest.mark.parametrize(
@@ -260,17 +263,17 @@ def test_families_run_as_in_a_simulation(between, tmp_path):
         (jb.LQR(**WEIGHTS, estimator=jb.Inversion()), "controller.estimator cannot be exported"),
     ],
 )
-def test_what_cannot_be_exported(controller, message):
+def test_controllers_that_cannot_be_exported(controller, message):
     case = dataclasses.replace(rig(controller), sensors=(jb.Sensor(0.2),))
     with pytest.raises(ValueError, match=message):
         export_gains(case)
 
 
-def test_unknown_endings_are_refused(tmp_path):
+def test_unknown_suffixes_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"gains are written to .csv, .mat, .tdms, .h"):
         write_gains(TABLE, tmp_path / "gains.txt")
     with pytest.raises(ValueError, match=r"gains are read from .csv, .mat, .tdms"):
         read_gains(tmp_path / "gains.h")
     (tmp_path / "other.csv").write_text("time [s]\n1.0\n")
-    with pytest.raises(ValueError, match="this is no file of gains"):
+    with pytest.raises(ValueError, match="not a file of gains"):
         read_gains(tmp_path / "other.csv")

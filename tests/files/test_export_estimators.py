@@ -1,4 +1,4 @@
-"""Estimators in files: a C program and what is read back estimate as in a simulation."""
+"""Exported estimators: the C header and a file that is read estimate as in a simulation."""
 
 import dataclasses
 import subprocess
@@ -14,7 +14,7 @@ from tests.files.test_export import COMPILER, ESTIMATED, WEIGHTS, rig
 
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
-def test_a_c_program_estimates_the_same(tmp_path):
+def test_c_header_gives_the_same_estimate(tmp_path):
     write_gains(ESTIMATED, tmp_path / "gains.h")
     (tmp_path / "run.c").write_text(
         '#include <stdio.h>\n#include "gains.h"\nint main(void) {\n'
@@ -38,8 +38,8 @@ def test_a_c_program_estimates_the_same(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", [jb.Kalman(0.02, 1e-5), jb.Observer(speed=2.0)])
-def test_estimators_run_as_in_a_simulation(estimator, tmp_path):
-    """A filter and a delay in the loop: from readings alone, the commands of the run."""
+def test_exported_estimator_gives_the_commands_of_a_simulation(estimator, tmp_path):
+    """From the readings of a run alone, with a digital filter and a delay in the loop."""
     law = jb.LQR(**WEIGHTS, delay=1e-3, estimator=estimator)
     case = rig(law)
     if isinstance(estimator, jb.Kalman):
@@ -49,8 +49,8 @@ def test_estimators_run_as_in_a_simulation(estimator, tmp_path):
     gains = read_gains(tmp_path / "gains.csv")
     times = 2e-3 * jnp.arange(60)
     record = jb.simulate(case, times)
-    # A command begins half a period after its tick: at the next tick it acts, and not before.
-    sent, state = [np.zeros(1), np.zeros(1)], np.zeros(gains.estimated)
+    # A command begins half a period after its sample, so it acts at the next sample.
+    sent, state = [np.zeros(1), np.zeros(1)], np.zeros(gains.estimator_size)
     for reading in np.asarray(record.measured):
         state = gains.estimate(state, sent[-2], sent[-1], reading)
         sent.append(gains.command(state[: len(gains.columns)]))

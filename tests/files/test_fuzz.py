@@ -1,4 +1,4 @@
-"""Whatever is in a case file, a log or a command line: it works, or it ends in one sentence."""
+"""Random case files, logs and command lines: each is accepted or ends in one error message."""
 
 import contextlib
 import io
@@ -16,7 +16,7 @@ from tests.files.test_case_file import FULL
 from tests.tuning.logs import test_readers as readers
 from tuning import read_logs
 
-# Something of everything.
+# A case with every table and many optional keys.
 CASE = tomllib.loads(FULL) | {
     "beam": {
         "length": 0.6,
@@ -56,7 +56,7 @@ def folder(tmp_path_factory):
 @settings(max_examples=300)
 @given(mutations.trees(CASE))
 @example({"beam": CASE["beam"] | {"length": 10**400}})
-def test_a_case_file_is_read_or_refused(folder, tree):
+def test_random_case_file_is_read_or_refused(folder, tree):
     path = folder / "case.toml"
     path.write_text(tomli_w.dumps(tree), encoding="utf-8")
     try:
@@ -72,7 +72,7 @@ def test_a_case_file_is_read_or_refused(folder, tree):
 @given(mutations.contents(tomli_w.dumps(CASE).encode()))
 @example(b"title = " + b"[" * 100_000)
 @example(b"modes = " + b"1" * 5000)
-def test_what_is_no_case_file_is_refused(folder, content):
+def test_damaged_case_file_is_refused(folder, content):
     path = folder / "case.toml"
     path.write_bytes(content)
     with contextlib.suppress(ValueError):
@@ -99,7 +99,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("name", [*TEXTS, *readers.FORMATS])
-def test_a_log_is_read_or_refused(folder, name, capfd):
+def test_damaged_log_is_read_or_refused(folder, name, capfd):
     path = folder / name
     if name in TEXTS:
         path.write_text(TEXTS[name])
@@ -117,12 +117,12 @@ def test_a_log_is_read_or_refused(folder, name, capfd):
             assert_one_sentence(error, str(path))
 
     check()
-    assert capfd.readouterr().err == "", "libraries keep what they think to themselves"
+    assert capfd.readouterr().err == "", "libraries print nothing"
 
 
-# Two wrong counts that end the whole process in scipy's reader, or keep it busy for a minute.
+# Wrong counts that crash the process in the reader of scipy, or keep it busy for a minute.
 @pytest.mark.parametrize(("place", "byte"), [(145, 8), (163, 0x74), (160, 0xFF)])
-def test_a_matlab_file_that_contradicts_itself_is_refused(folder, place, byte):
+def test_inconsistent_matlab_file_is_refused(folder, place, byte):
     path = folder / "run.mat"
     readers.mat(path, ("",))
     content = bytearray(path.read_bytes())
@@ -159,7 +159,7 @@ WRONG = """
     st.lists(st.sampled_from(WRONG.split()), min_size=1, max_size=3),
     st.data(),
 )
-def test_a_wrong_command_line_ends_in_one_sentence(folder, line, words, data):
+def test_invalid_command_line_ends_in_one_error_message(folder, line, words, data):
     (folder / "folder").mkdir(exist_ok=True)
     (folder / "bad.toml").write_text("[beam\n")
     (folder / "case.toml").write_text(SMALL)
@@ -167,7 +167,7 @@ def test_a_wrong_command_line_ends_in_one_sentence(folder, line, words, data):
     given = line.split()
     for word in words:
         given.insert(data.draw(st.integers(1, len(given))), word)
-    # Most changes are faults; the few lines left that are right would only cost time.
+    # Makes the few valid lines invalid too, which would take long to run.
     given += ["--set", "beam.length=-1"]
     said, printed = io.StringIO(), io.StringIO()
     with (
@@ -192,8 +192,8 @@ SETTINGS = (
 
 
 @pytest.mark.slow
-def test_absurd_numbers_end_in_a_verdict(folder, capsys):
-    """Each within seconds: as a run, or in a sentence that says why it cannot be one."""
+def test_extreme_numbers_run_or_are_refused(folder, capsys):
+    """Each ends within seconds, with a result or an error message."""
     (folder / "case.toml").write_text(SMALL)
     for setting in SETTINGS:
         with contextlib.chdir(folder), pytest.raises(SystemExit) as ended:

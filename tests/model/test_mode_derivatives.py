@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.case.actuators import Patch
+from jaxbeam.case.actuators.patch import Patch
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.model.modes import Modes, mesh_layout, modes

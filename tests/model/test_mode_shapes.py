@@ -5,20 +5,20 @@ import pytest
 from numpy.polynomial import legendre
 from numpy.testing import assert_allclose
 
-from jaxbeam.case.actuators import Patch
+from jaxbeam.case.actuators.patch import Patch
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles.closed_forms import single_span_parameters
-from tests.solved_modes import PAIRS, PATCHED, STUFF, held, parameters, solve
+from tests.solved_modes import PAIRS, PATCHED, PROPERTIES, parameters, solve, supported_beam
 
 
 @pytest.mark.parametrize("derivative", [0, 1, 2, 3])
 def test_shapes_of_pinned_beams_are_sines(derivative):
     x, n = np.linspace(0.0, 0.6, 41), np.arange(1, 7)
     wave = n * np.pi / 0.6
-    found = solve(Case(Beam(0.6, **STUFF, modes=6))).shapes(x, derivative)
+    found = solve(Case(Beam(0.6, **PROPERTIES, modes=6))).shapes(x, derivative)
     expected = np.sqrt(2 / (0.535 * 0.6)) * np.imag(
         np.exp(1j * np.outer(x, wave)) * (1j * wave) ** derivative
     )
@@ -41,7 +41,7 @@ def products(case: Case) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "case",
-    [PATCHED, held(1e4), held(None), Case(Beam(0.6, **STUFF, ends="free-free", modes=6))],
+    [PATCHED, supported_beam(1e4), supported_beam(None), Case(Beam(0.6, **PROPERTIES, ends="free-free", modes=6))],
     ids=["patched", "spring", "two spans", "free"],
 )
 def test_shapes_are_orthonormal_and_join(case):
@@ -67,13 +67,13 @@ def test_derivatives_of_shapes_are_their_slopes():
 
 @pytest.mark.parametrize("ends", PAIRS)
 def test_shapes_are_positive_near_the_left_end(ends):
-    found = solve(Case(Beam(0.6, **STUFF, ends=ends, modes=12)))
+    found = solve(Case(Beam(0.6, **PROPERTIES, ends=ends, modes=12)))
     assert np.all(found.shapes(0.01) > 0)
 
 
 def test_fifty_modes_stay_exact_and_bounded():
     """The shapes of a cantilever reach 2 at its tip, where hyperbolic functions would overflow."""
-    case = Case(Beam(1.2, **STUFF, ends="clamped-free", modes=50))
+    case = Case(Beam(1.2, **PROPERTIES, ends="clamped-free", modes=50))
     assert_allclose(parameters(case, 1.2), single_span_parameters("clamped-free", 50), rtol=1e-12)
     shapes = np.asarray(solve(case).shapes(np.linspace(0.0, 1.2, 2001))) * np.sqrt(0.535 * 1.2)
     assert_allclose(np.abs(shapes).max(axis=0), 2.0, rtol=1e-6)

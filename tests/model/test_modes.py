@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 
-from jaxbeam.case.actuators import Patch
+from jaxbeam.case.actuators.patch import Patch
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case
 from tests.as_oracle import as_oracle

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.case.actuators import Patch, Shaker, SpringDamper
+from jaxbeam.case.actuators.patch import Patch
+from jaxbeam.case.actuators.shaker import Shaker
+from jaxbeam.case.actuators.spring import SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.loads import MovingForce, MovingMass, trajectory

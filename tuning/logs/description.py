@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from jaxbeam.case.loads import KINDS, AbstractLoad
+from jaxbeam.case.loads import AbstractLoad
 from jaxbeam.files.case_file import read_part
 
 _KEYS = ("loads", "columns", "time", "runs")
@@ -109,7 +109,7 @@ def _loads(path, prefix, table) -> tuple[AbstractLoad, ...]:
     """Loads from their tables, as in a case file."""
     try:
         return tuple(
-            read_part(f"{prefix}loads.{i}", entry, KINDS)
+            read_part(f"{prefix}loads.{i}", entry, AbstractLoad)
             for i, entry in enumerate(table.get("loads", ()))
         )
     except ValueError as error:

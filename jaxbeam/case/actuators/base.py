@@ -1,6 +1,7 @@
-"""What every actuator says about itself: one linear attachment to the beam."""
+"""Interface of actuators: one linear attachment to the beam."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,15 +9,15 @@ from jaxtyping import Array, Float
 
 
 class Attachment(eqx.Module):
-    """A linear device attached to the beam through one generalised coordinate.
+    """Linear device that acts on the beam along one generalised displacement s.
 
-    With s the stroke (the beam's deflection or difference of slopes where the device acts,
-    s = shape . q) and r the generalised force it exerts on the beam along s,
+    s is the displacement at its port, a deflection or a difference of slopes of the beam (see
+    `displacement_map`), u the command, z the states of the device and r its generalised force on
+    the beam, so that r s' is the power into the beam:
 
         z' = A z + B u + E s',      r = C z + D u - mass s'' - damping s' - stiffness s
 
-    so that power flowing into the beam is r s'. States z are the device's own; `mass` is None
-    where the device has none, which saves the modes from being coupled by it.
+    `mass` is None for a device without inertia, which then does not couple the modes.
     """
 
     state_matrix: Float[Array, "state state"]
@@ -30,13 +31,13 @@ class Attachment(eqx.Module):
 
     @property
     def static_gain(self) -> Float[Array, ""]:
-        """Generalised force per unit of a steady command, the stroke at rest."""
+        """Generalised force per unit of a steady command, with the port at rest."""
         steady_states = jnp.linalg.solve(self.state_matrix, self.input_matrix)
         return self.feedthrough - self.output_matrix @ steady_states
 
 
 class SectionStiffening(eqx.Module):
-    """What a bonded actuator adds to the section of the beam between two positions (m)."""
+    """Bending stiffness (N m^2) and mass per length (kg/m) added between two positions (m)."""
 
     start: Float[Array, ""]
     end: Float[Array, ""]
@@ -45,42 +46,43 @@ class SectionStiffening(eqx.Module):
 
 
 class AbstractActuator(eqx.Module):
-    """Interface of all actuators.
+    """Interface of actuators.
 
-    To add one, write a file with a subclass and name it in `jaxbeam.case.actuators.KINDS`.
+    To add one, write a file in `jaxbeam.case.actuators` with a subclass that declares its `kind`.
     """
 
+    kind: ClassVar[str]
     limits: eqx.AbstractVar[Float[Array, "2"] | None]
 
     @abc.abstractmethod
     def displacement_map(self) -> tuple[tuple[Float[Array, ""], int, float], ...]:
-        """Where it acts: terms (position in m, derivative of the deflection, factor).
+        """Displacement at the port, a sum of factor * d^n w / dx^n (x): terms (x in m, n, factor).
 
         A point force acts on the deflection at its position: ((x, 0, 1.0),); a patch on the
-        difference of slopes over its length: ((x1, 1, 1.0), (x2, 1, -1.0)).
+        difference of the slopes at its ends: ((x1, 1, 1.0), (x2, 1, -1.0)).
         """
 
     @abc.abstractmethod
     def attachment(self) -> Attachment:
-        """Its linear model, from command (V or N) to generalised force."""
+        """Linear model from command (V or N) and displacement to generalised force."""
 
     def section_stiffening(self) -> SectionStiffening | None:
-        """Bending stiffness (N m^2) and mass per length (kg/m) added; they shape the modes."""
+        """Section of a bonded actuator, which enters the modes of the beam; None if not bonded."""
         return None
 
     @property
     def command_unit(self) -> str:
-        """SI unit of a command, V or N; "1" for a passive device, which takes none."""
+        """SI unit of the command, V or N; "1" for a passive device, which takes none."""
         return type(self).__dataclass_fields__["limits"].metadata["unit"]
 
     def command_limits(self) -> Float[Array, "2"] | None:
-        """Smallest and largest command it takes, in the unit of a command; None if any."""
+        """Smallest and largest command, in the unit of the command; None if unlimited."""
         return self.limits
 
     def validate(self, address: str) -> str | None:
-        """What does not go together in it, as a sentence naming its address, or None."""
+        """First inconsistency between its fields as an error message, or None."""
         return None
 
     def command_rate_limit(self) -> Float[Array, ""] | None:
-        """Fastest change of the command it can follow, per second; None if any."""
+        """Largest rate of change of the command, per second; None if unlimited."""
         return None

@@ -1,4 +1,6 @@
-"""Electrodynamic shaker with its coil: what the voltage drives is a current, not a force."""
+"""Electrodynamic shaker with the dynamics of its coil, from voltage through current to force."""
+
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,19 +10,21 @@ from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, num
 
 
 class Electrodynamic(AbstractActuator):
-    """Electrodynamic shaker: coil, moving mass and suspension, on the beam at `position`.
+    """Electrodynamic shaker with coil, moving mass and suspension, fixed to the beam at `position`.
 
-    L I' = u - R I - K_v w',   force = K_f I - m w'' - c w' - k w, which is eqs (2.26) to (2.34)
-    of the thesis in the time domain. Its own state is the current I. Positive voltage lifts the
-    beam. A command of zero shorts the coil, whose back-EMF then brakes the beam.
+    L I' = u - R I - K_v w',   force = K_f I - m w'' - c w' - k w: eqs (2.26) to (2.34) of the
+    thesis in the time domain. Its state is the current I. A positive voltage lifts the beam. A
+    command of zero shorts the coil; its back-EMF then damps the beam.
     """
+
+    kind: ClassVar[str] = "electrodynamic"
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
     resistance: Float[Array, ""] = number("ohm", "coil resistance R", POSITIVE)
     inductance: Float[Array, ""] = number("H", "coil inductance L", POSITIVE)
     force_constant: Float[Array, ""] = number("N/A", "coil force per current K_f")
     back_emf: Float[Array, ""] | None = number(
-        "V s/m", "voltage per speed K_v; the force constant if left out", default=None
+        "V s/m", "back-EMF constant K_v; K_f if left out", default=None
     )
     mass: Float[Array, ""] = number("kg", "moving mass", NOT_NEGATIVE, default=0.0)
     stiffness: Float[Array, ""] = number("N/m", "suspension stiffness", NOT_NEGATIVE, default=0.0)

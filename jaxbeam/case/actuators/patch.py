@@ -1,5 +1,7 @@
 """Piezoelectric macro-fibre patch bonded to the beam, 33 mode."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -15,7 +17,7 @@ from jaxbeam.case.fields import (
     number,
 )
 
-# What the moment per volt follows from, where it is not given itself.
+# Fields from which the moment per volt is derived where it is not given.
 MOMENT_SOURCES = (
     "d33",
     "modulus",
@@ -30,13 +32,15 @@ class Patch(AbstractActuator):
     """Piezoelectric patch from `start` to `end`: a pair of opposite moments at its edges.
 
     The moment is `moment_per_volt` x `correction` x patch voltage, and the patch voltage is
-    `amplifier_gain` x command, eqs (2.43) and (2.46) of the thesis. Positive voltage lifts the
+    `amplifier_gain` x command, eqs (2.43) and (2.46) of the thesis. A positive voltage lifts the
     beam. Give either `moment_per_volt` or all that it follows from (see `moment_constant`).
-    `added_mass` and `added_rigidity` act over its length and shape the modes.
+    `added_mass` and `added_rigidity` act over its length and enter the modes.
 
-    Commands stay within `limits` and within what the patch takes without losing its
-    polarisation, `depolarisation`; `rate_limit` says how fast the amplifier can change them.
+    Commands stay within `limits` and within the voltages `depolarisation`, beyond which the patch
+    loses its polarisation; `rate_limit` is that of the amplifier.
     """
+
+    kind: ClassVar[str] = "patch"
 
     start: Float[Array, ""] = number("m", "left edge", ON_BEAM)
     end: Float[Array, ""] = number("m", "right edge", ON_BEAM)
@@ -50,7 +54,7 @@ class Patch(AbstractActuator):
         "1", "patch volts per volt of command", POSITIVE, default=1.0
     )
     limits: Float[Array, "2"] | None = number(
-        "V", "smallest and largest command, at the amplifier's input", INCREASING, default=None
+        "V", "smallest and largest command, at the input of the amplifier", INCREASING, default=None
     )
     added_mass: Float[Array, ""] | None = number(
         "kg/m", "mass per length added", NOT_NEGATIVE, default=None
@@ -76,14 +80,14 @@ class Patch(AbstractActuator):
         "V", "smallest and largest voltage at the patch", INCREASING, default=(-500.0, 1500.0)
     )
     rate_limit: Float[Array, ""] | None = number(
-        "V/s", "fastest change of the command", POSITIVE, default=None
+        "V/s", "largest rate of change of the command", POSITIVE, default=None
     )
 
     @property
     def moment_constant(self) -> Float[Array, ""]:
-        """Moment per volt at the patch in N m/V, given or C_0 of eq. (2.43) of the thesis.
+        """Moment per volt at the patch (N m/V), given or C_0 of eq. (2.43) of the thesis.
 
-        C_0 = d33 E_p / L_e x h / 2 x h_p b_p, for a thin patch: h_p much smaller than h.
+        C_0 = d33 E_p / L_e x h / 2 x h_p b_p for a thin patch, h_p much smaller than h.
         """
         if self.moment_per_volt is not None:
             return self.moment_per_volt
@@ -95,8 +99,8 @@ class Patch(AbstractActuator):
 
     def attachment(self) -> Attachment:
         no_states, zero = jnp.zeros(0), jnp.zeros(())
-        info = self.moment_constant * self.correction * self.amplifier_gain
-        return Attachment(jnp.zeros((0, 0)), no_states, no_states, no_states, info, zero, zero)
+        moment = self.moment_constant * self.correction * self.amplifier_gain
+        return Attachment(jnp.zeros((0, 0)), no_states, no_states, no_states, moment, zero, zero)
 
     def section_stiffening(self) -> SectionStiffening | None:
         if self.added_mass is None and self.added_rigidity is None:
@@ -109,10 +113,8 @@ class Patch(AbstractActuator):
         depolarisation_limits = self.depolarisation / self.amplifier_gain
         if self.limits is None:
             return depolarisation_limits
-        lowest, highest = (
-            jnp.maximum(depolarisation_limits[0], self.limits[0]),
-            jnp.minimum(depolarisation_limits[1], self.limits[1]),
-        )
+        lowest = jnp.maximum(depolarisation_limits[0], self.limits[0])
+        highest = jnp.minimum(depolarisation_limits[1], self.limits[1])
         return jnp.stack([lowest, highest])
 
     def command_rate_limit(self) -> Float[Array, ""] | None:

@@ -1,4 +1,6 @@
-"""A force applied at a point, exactly as commanded."""
+"""Ideal force at a point, equal to the command."""
+
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,7 +10,9 @@ from jaxbeam.case.fields import INCREASING, ON_BEAM, number
 
 
 class PointForce(AbstractActuator):
-    """An ideal point force: a command of 1 N pushes the beam up with 1 N."""
+    """Ideal point force: a command of 1 N pushes the beam up with 1 N."""
+
+    kind: ClassVar[str] = "point"
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
     limits: Float[Array, "2"] | None = number(

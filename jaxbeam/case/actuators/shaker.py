@@ -1,4 +1,6 @@
-"""Electrodynamic shaker as a first-order lag on a suspension."""
+"""Electrodynamic shaker as a first-order lag from voltage to force, with a suspension."""
+
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -10,16 +12,20 @@ from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, num
 class Shaker(AbstractActuator):
     """Electrodynamic shaker: voltage to force through a first-order lag, with its suspension.
 
-    z' = bandwidth (u - z), force = force_per_volt z - stiffness w - damping w', eqs (2.35) and
-    (2.36) of the thesis with alpha = beta = bandwidth. Positive voltage lifts the beam. With no
-    command it is the spring and damper of its suspension.
+    z' = bandwidth (u - z), force = force_per_volt z - stiffness w - damping w': eqs (2.35) and
+    (2.36) of the thesis with alpha = beta = bandwidth. A positive voltage lifts the beam. Without a
+    command only the spring and damper of its suspension act.
     """
+
+    kind: ClassVar[str] = "shaker"
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
     stiffness: Float[Array, ""] = number("N/m", "suspension stiffness", NOT_NEGATIVE, default=0.0)
     damping: Float[Array, ""] = number("N s/m", "suspension damping", NOT_NEGATIVE, default=0.0)
     force_per_volt: Float[Array, ""] = number("N/V", "steady force per volt", default=4.6)
-    bandwidth: Float[Array, ""] = number("1/s", "first-order lag", POSITIVE, default=1e4)
+    bandwidth: Float[Array, ""] = number(
+        "1/s", "bandwidth of the first-order lag", POSITIVE, default=1e4
+    )
     limits: Float[Array, "2"] | None = number(
         "V", "smallest and largest voltage", INCREASING, default=None
     )

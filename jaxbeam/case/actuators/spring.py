@@ -1,4 +1,6 @@
-"""A passive spring and damper to ground, acting on the modes as they are."""
+"""Passive spring and damper to ground, which leaves the modes as they are."""
+
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,17 +10,19 @@ from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number
 
 
 class SpringDamper(AbstractActuator):
-    """A spring and damper from the beam to ground; it takes no command.
+    """Spring and damper from the beam to ground; it takes no command.
 
-    Unlike a support it does not shape the modes: it couples those of the beam without it, as in
-    eq. (2.17) of the thesis. The result depends on the number of modes kept.
+    Unlike an elastic support it does not enter the modes: it couples the modes of the beam without
+    it, as in eq. (2.17) of the thesis, so results converge with the number of modes.
     """
+
+    kind: ClassVar[str] = "spring"
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
     stiffness: Float[Array, ""] = number("N/m", "spring", NOT_NEGATIVE, default=0.0)
     damping: Float[Array, ""] = number("N s/m", "damper", NOT_NEGATIVE, default=0.0)
     limits: Float[Array, "2"] | None = number(
-        "1", "unused: takes no command", INCREASING, default=None
+        "1", "without effect: it takes no command", INCREASING, default=None
     )
 
     def displacement_map(self):

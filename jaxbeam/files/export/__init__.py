@@ -1,4 +1,4 @@
-"""Gains and filters for real controllers, as CSV, .mat, TDMS or a C header; and read back."""
+"""Gains, estimators and filters for real controllers, as CSV, .mat, TDMS or a C header."""
 
 from jaxbeam.files.export.designed import export_gains
 from jaxbeam.files.export.files import WRITERS, read_gains, write_gains

@@ -1,4 +1,4 @@
-"""The gains of the controller of a case, designed and tabulated."""
+"""Export of the controller of a case: design of gains and estimator, tabulated."""
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +7,12 @@ import numpy as np
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
-from jaxbeam.control import DiscreteLQR, StateFeedback
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.control.optimal.lqr import LQR, AbstractScheduledRegulator
+from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
 from jaxbeam.control.optimal.scheduled_lqr import GainScheduleGrid, ScheduledLQR
-from jaxbeam.estimation import Observer
+from jaxbeam.control.state_feedback import StateFeedback
+from jaxbeam.estimation.observer import Observer
 from jaxbeam.files.export.gains import Gains
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensor_signals import sensor_sections
@@ -20,14 +21,14 @@ from jaxbeam.runtime.compiling import compiled
 
 
 def export_gains(case: Case, points: int = 1001) -> Gains:
-    """The gains of a case's controller, designed, its estimator, and its sensors' digital filters.
+    """Gains of the controller of a case, its constant-gain estimator and its sensors' filters.
 
-    Gains that change over the crossing are tabulated at so many `points`. Where the controller
-    recognises its loads, that is left to the one who runs the table: there is no command before
-    the second gate, and the lightest mass is taken until the mass is told. An estimator whose gain
-    does not change goes along, with what it knows of filters and delays of the sensors; before it
-    runs, the filters do. Raises ValueError for a faulty case, a controller without a period, one
-    that is no table of gains, and another estimator.
+    Gains that vary along the crossing are tabulated at a number of `points`. Load identification
+    is not exported: mass and speed are arguments of `Gains.command`, to be zero before the second
+    gate, with the smallest mass of the grid until the mass is identified. The readings are filtered
+    by the digital filters before they enter the estimator, whose model includes filters and delays.
+    Raises ValueError for an invalid case, a controller without a period or without a gain table,
+    an estimator of varying gain, and fewer than two points.
     """
     check_case(case)
     law = case.controller
@@ -81,7 +82,7 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
 
 
 def _digital_filters(case: Case) -> np.ndarray:
-    """The digital filters of the sensors: rows of a sensor's index and one of its sections."""
+    """Sections of the sensors' digital filters: rows of sensor index, b0, b1, b2, a0, a1, a2."""
     rows = np.zeros((0, 7))
     for i, sensor in enumerate(case.sensors):
         sections = sensor_sections(sensor, case.controller.period)
@@ -92,7 +93,7 @@ def _digital_filters(case: Case) -> np.ndarray:
 
 @compiled
 def _design_gains(case: Case, layout, shares):
-    """What gains are made of, see `_tabulate_gains`, and the estimator (see `Gains`)."""
+    """Results of `_tabulate_gains`, and the matrix `estimator` of `Gains`."""
     plant, law = state_space(case, layout=layout), case.controller
     design_plant = law.design_plant(plant)
     estimator = jnp.zeros((0, 0))
@@ -108,9 +109,9 @@ def _design_gains(case: Case, layout, shares):
 
 
 def _tabulate_gains(law, plant, design_plant, shares):
-    """The plant designed for; masses and speeds; gains over a crossing and after it; its time (s).
+    """Design plant, masses and speeds, gains along and after the crossing, crossing time (s).
 
-    Tables and gains have a mass and a speed as their first axes.
+    Gains have mass and speed as their first axes.
     """
     memory = law.gain if isinstance(law, StateFeedback) else law.prepare(plant, design_plant)
     no_grid = jnp.zeros(1), jnp.zeros(1)

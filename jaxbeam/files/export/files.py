@@ -1,7 +1,7 @@
-"""Gains in files, by their ending; read back they run identically.
+"""Files of gains, in the format of their suffix; reading one returns the same numbers.
 
-Every file says the sampling period, the units and two check values: the CRC-32 of all numbers as
-little-endian doubles, and the commands that answer a stated test input.
+Each file holds the sampling period, the units and the check values: the CRC-32 of all numbers as
+little-endian doubles, and commands and estimate for a stated input.
 """
 
 import csv
@@ -23,9 +23,9 @@ SECTION_COEFFICIENTS = ("b0", "b1", "b2", "a0", "a1", "a2")
 
 
 def write_gains(gains: Gains, path: str | os.PathLike, overwrite: bool = False) -> None:
-    """Write gains to a file; its ending says how: .csv, .mat, .tdms or .h.
+    """Write gains to a file with the suffix .csv, .mat, .tdms or .h, which selects the format.
 
-    Raises ValueError for another ending, FileExistsError if the file exists and `overwrite` is not
+    Raises ValueError for another suffix, FileExistsError if the file exists and `overwrite` is not
     set, ImportError for .tdms without the package npTDMS.
     """
     path = Path(path)
@@ -42,10 +42,10 @@ def write_gains(gains: Gains, path: str | os.PathLike, overwrite: bool = False) 
 
 
 def read_gains(path: str | os.PathLike) -> Gains:
-    """Read gains from a .csv, .mat or .tdms file; they run as those that were written, bit for bit.
+    """Gains of a .csv, .mat or .tdms file, with the same numbers to the last bit.
 
-    Raises ValueError for another ending, a file of something else, and numbers that do not give the
-    check values in the file; ImportError for .tdms without the package npTDMS.
+    Raises ValueError for another suffix, a file that `write_gains` did not write, and numbers that
+    contradict the check values of the file; ImportError for .tdms without the package npTDMS.
     """
     path = Path(path)
     if path.suffix not in READERS:
@@ -53,15 +53,15 @@ def read_gains(path: str | os.PathLike) -> Gains:
     try:
         gains, check_values = _gains_from_file(*READERS[path.suffix](path))
     except (ValueError, KeyError, TypeError):
-        raise ValueError(f"{path}: this is no file of gains that jaxbeam wrote") from None
+        raise ValueError(f"{path}: not a file of gains written by jaxbeam") from None
     computed = gains.checksum, gains.test_command.tolist(), gains.test_estimate.tolist()
     if computed != check_values:
-        raise ValueError(f"{path}: the numbers do not give the check values; the file was changed")
+        raise ValueError(f"{path}: the numbers contradict the check values; the file was changed")
     return gains
 
 
 def _gains_from_file(metadata: dict[str, Any], arrays: dict[str, Any]) -> tuple[Gains, tuple]:
-    """The gains of a file, and the check values in it."""
+    """Gains of a file, and its check values."""
     columns, commands = (
         tuple((signal, unit) for signal, unit in metadata[name]) for name in ("columns", "commands")
     )
@@ -87,7 +87,7 @@ def _gains_from_file(metadata: dict[str, Any], arrays: dict[str, Any]) -> tuple[
 
 
 def _metadata(gains: Gains) -> dict[str, Any]:
-    """What a file says beside the numbers."""
+    """Metadata of a file of gains."""
     return {
         "format": FORMAT,
         "law": "u = -K(mass, speed, share) z",
@@ -111,10 +111,7 @@ def _metadata(gains: Gains) -> dict[str, Any]:
 
 
 def _to_csv(gains: Gains) -> bytes:
-    """A comment with all that is said, then rows: what it is, mass and speed, share, and numbers.
-
-    In a row of a filter the sensor is in the place of the share.
-    """
+    """Metadata as a comment, then rows: name, mass, speed, share (or sensor index), numbers."""
     pairs = [f"K {u}/{z} [{a}/({b})]" for u, a in gains.commands for z, b in gains.columns]
     rows = [["row", "mass [kg]", "speed [m/s]", "share or sensor", *pairs]]
     for i, mass in enumerate(gains.masses):
@@ -167,7 +164,7 @@ def _from_mat(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _to_tdms(gains: Gains) -> bytes:
-    """The group "gains" with a channel for each array, row after row."""
+    """TDMS file with a channel for each array, in C order, in the group "gains"."""
     nptdms = _nptdms()
     file = io.BytesIO()
     root = nptdms.RootObject({"about": json.dumps(_metadata(gains)), "period_s": gains.period})

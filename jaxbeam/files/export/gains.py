@@ -1,4 +1,4 @@
-"""Gain tables as a controller runs them, and the numbers by which copies of them are checked."""
+"""Gain tables as a controller evaluates them, and the check values of files."""
 
 import dataclasses
 import math
@@ -9,28 +9,29 @@ from numpy.typing import ArrayLike
 
 ARRAYS = ("masses", "speeds", "shares", "table", "rest", "filters", "estimator")
 TEST_SHARE = 0.37  # of the crossing
-TEST_FRACTION = 0.3  # of the way from the smallest to the largest mass, and speed
+TEST_FRACTION = 0.3  # of the ranges of mass and speed
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Gains:
-    """Gain tables as a controller runs them: u = -K(mass, speed, share) z.
+    """Gain tables as a controller evaluates them: u = -K(mass, speed, share) z.
 
-    `table` (mass, speed, share, actuator, column) has K at the `masses` (kg), `speeds` (m/s) and
-    `shares` of the crossing, from the entry of the first load to the exit of the last; `rest`
-    (mass, speed, actuator, column) is from the exit on, and dies away with the time constant `decay_time`
-    (s) if that is finite. K is linear between the shares, and `interpolation` masses and speeds either
-    "interpolated", too, or that of the "nearest"; beyond the grid it is held. A table for one load
-    has one mass and one speed, zero, which nobody asks for; a constant gain has one share as well.
+    `table` (mass, speed, share, actuator, column) is K at the `masses` (kg), `speeds` (m/s) and
+    `shares` of the crossing, from 0 at the entry of the first load to 1 at the exit of the last;
+    `rest` (mass, speed, actuator, column) is K after the exit, which decays with the time constant
+    `decay_time` (s) if that is finite. K is interpolated linearly over the share, and over mass and
+    speed either linearly too (`interpolation` "interpolated") or by the "nearest" design; beyond
+    the grid it is constant. A design for one load has one mass and one speed, both 0; a constant
+    gain has one share as well.
 
-    `crossing_time` (s) is that of the load designed for, zero for a constant gain; a crossing of another
-    length stretches the table. `columns` and `commands` are (name, unit). Rows of `filters` are the
-    index of a sensor and its section b0, b1, b2, a0, a1, a2.
+    `crossing_time` (s) is that of the design, 0 for a constant gain. `columns` (of z) and
+    `commands` are pairs of name and unit. Rows of `filters` are the index of a sensor and a section
+    b0, b1, b2, a0, a1, a2 of its digital filter.
 
-    The `estimator`, empty if there is none, is [[A, B, B', L], [C, 0, D, o]]: from tick to tick its
-    states x become A x + B u + B' u', u being the commands that acted until the tick before and u'
-    those until this, and then, with so many `reading_count` y, by L (y - C x - D u' - o) more (o is the
-    first column of its block). The first of them are the first `columns`.
+    `estimator` = [[A, B, B', L], [C, 0, D, o]], empty if there is none, has at each sample k the
+    prediction x- = A x + B u[k-1] + B' u[k] and the update x = x- + L (y - C x- - D u[k] - o), with
+    `reading_count` readings y, commands u[k] that acted until sample k, and o the first column of
+    its block. Its first states are the first of z.
     """
 
     masses: np.ndarray
@@ -56,12 +57,12 @@ class Gains:
         mass: float = 0.0,
         speed: float = 0.0,
     ) -> np.ndarray:
-        """Commands for a state, in the order of `columns`, at a share of the crossing.
+        """Commands for a state z, in the order of `columns`, at a share of the crossing.
 
-        From the exit on, which was `since_exit` s ago, the share is 1 or more. `mass` (kg) and
-        `speed` (m/s, its size) are those of the load. Zero before the entry. Products are added one
-        by one, as the C header does, so results agree to the last bit (with a `fade`, where both
-        take exp from the same library).
+        The share is negative before the entry, where commands are zero, and 1 or more from the exit
+        on, which was `since_exit` s ago. `mass` (kg) and `speed` (m/s, absolute) are those of the
+        load. Products are added in the order of the function `jaxbeam_command` of the C header, so
+        results agree to the last bit (with a finite `decay_time`, if both use the same `exp`).
         """
         total = np.zeros(len(self.commands))
         if share < 0:
@@ -76,7 +77,7 @@ class Gains:
 
     @property
     def estimator_size(self) -> int:
-        """How many states the estimator has."""
+        """Number of states of the estimator."""
         return self.estimator.shape[0] - self.reading_count
 
     def estimate(
@@ -86,10 +87,10 @@ class Gains:
         current_command: ArrayLike,
         readings: ArrayLike,
     ) -> np.ndarray:
-        """The estimator's states at a tick, from those at the tick before; zero at the start.
+        """State estimate at a sample, from that at the previous sample; zero initially.
 
-        `previous_command` are the commands that acted until the tick before, `current_command` those until this one. Sums
-        are taken one by one, as the C header does.
+        `previous_command` acted until the previous sample, `current_command` until this one. Sums
+        are in the order of the function `jaxbeam_estimate` of the C header.
         """
         size, inputs = self.estimator_size, len(self.commands)
         if not size:
@@ -106,7 +107,7 @@ class Gains:
         return _accumulate(prior, self.estimator[:size, offset_column:], innovation)
 
     def _gain_at(self, i: int, j: int, share: float, since_exit: float) -> np.ndarray:
-        """The gain of one mass and speed of the grid."""
+        """Gain of one mass and speed of the grid."""
         if share >= 1 and self.shares.size > 1:
             decay = (
                 math.exp(-since_exit / self.decay_time) if math.isfinite(self.decay_time) else 1.0
@@ -117,7 +118,7 @@ class Gains:
         return low + fraction * (self.table[i, j, min(k + 1, self.shares.size - 1)] - low)
 
     def _grid_weights(self, grid: np.ndarray, value: float) -> list[tuple[int, float]]:
-        """Designs of a grid that contribute at a value, and what each contributes."""
+        """Indices into a grid and their weights, for the interpolation at a value."""
         if self.interpolation == "nearest":
             return [(int(np.argmin(np.abs(grid - value))), 1.0)]
         i, fraction = _index_and_fraction(grid, value)
@@ -125,7 +126,7 @@ class Gains:
 
     @property
     def test_input(self) -> dict:
-        """The input of the check: state 1, 1/2, 1/3, ..., and what else `command` takes."""
+        """Arguments of `command` for its check value: the state is 1, 1/2, 1/3, ..."""
         grids = self.masses, self.speeds
         mass, speed = (float(g[0] + TEST_FRACTION * (g[-1] - g[0])) for g in grids)
         state = (1 / np.arange(1.0, len(self.columns) + 1)).tolist()
@@ -134,32 +135,32 @@ class Gains:
 
     @property
     def test_command(self) -> np.ndarray:
-        """The commands that answer the test input."""
+        """Check value: commands for the test input."""
         return self.command(**self.test_input)
 
     @property
     def test_estimate(self) -> np.ndarray:
-        """The estimator's states after 1, 1/2, 1/3, ... in each: states, commands and readings."""
+        """Check value: estimate for states, commands and readings of 1, 1/2, 1/3, ... each."""
         counts = self.estimator_size, len(self.commands), len(self.commands)
         return self.estimate(*(1 / np.arange(1.0, n + 1) for n in (*counts, self.reading_count)))
 
     @property
     def checksum(self) -> int:
-        """CRC-32 of period, crossing, fade and all arrays in turn, as little-endian doubles."""
+        """CRC-32 of period, crossing time, decay time and all arrays, as little-endian doubles."""
         numbers = [self.period, self.crossing_time, self.decay_time]
         parts = [numbers, *(getattr(self, name) for name in ARRAYS)]
         return zlib.crc32(b"".join(np.ravel(part).astype("<f8").tobytes() for part in parts))
 
 
 def _accumulate(total: np.ndarray, matrix: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """A sum and the products of a matrix, whose further columns do not count, one by one."""
+    """Sum of a total and a matrix times values, column by column; further columns are ignored."""
     for column, value in zip(matrix.T, values, strict=False):
         total = total + column * value
     return total
 
 
 def _index_and_fraction(grid: np.ndarray, value: float) -> tuple[int, float]:
-    """The last point of a grid that is not above a value, and how far on to the next it is."""
+    """Index of the last point of a grid that is not above a value, and fraction to the next."""
     i = max(int(np.searchsorted(grid, value, "right")) - 1, 0)
     if i + 1 >= grid.size or value <= grid[i]:
         return i, 0.0

@@ -1,4 +1,4 @@
-"""Gains as plain C: arrays, and a function that gives the commands."""
+"""Gains as a C header: arrays, and the functions `jaxbeam_command` and `jaxbeam_estimate`."""
 
 import json
 import math
@@ -10,7 +10,10 @@ from jaxbeam.files.export.gains import ARRAYS, Gains
 
 
 def c_header(gains: Gains, metadata: dict[str, Any]) -> str:
-    """The text of a C header with the gains; `metadata` stands in a comment at its top."""
+    """Text of a C header with the gains, and the metadata in a comment at its top.
+
+    Its functions are those of `Gains.command` and `Gains.estimate`.
+    """
     comment = json.dumps(metadata, indent=1).replace("*/", "* /")
     masses, speeds, points, actuators, columns = gains.table.shape
     test = gains.test_input
@@ -26,16 +29,13 @@ def c_header(gains: Gains, metadata: dict[str, Any]) -> str:
     defines = [f"#define JAXBEAM_{name} {value}" for name, value in macros.items()]
     arrays = {name: getattr(gains, name) for name in ARRAYS}
     arrays |= {"test_command": gains.test_command, "test_estimate": gains.test_estimate}
-    texts = [
-        f"static const double jaxbeam_{name}[] = {{{', '.join(map(_c_number, np.ravel(numbers)))}}};"
-        for name, numbers in arrays.items()
-        if numbers.size
-    ]
+    texts = [_c_array(name, numbers) for name, numbers in arrays.items() if numbers.size]
     return "\n".join([f"/* {comment} */", *defines, *texts, C_FUNCTIONS])
 
 
-def _c_number(value: float) -> str:
-    return repr(float(value))
+def _c_array(name: str, numbers: np.ndarray) -> str:
+    values = ", ".join(repr(float(number)) for number in np.ravel(numbers))
+    return f"static const double jaxbeam_{name}[] = {{{values}}};"
 
 
 C_FUNCTIONS = """
@@ -43,53 +43,53 @@ C_FUNCTIONS = """
 #include <math.h>
 #endif
 
-/* The last point of a grid that is not above a value, and how far on to the next it is. */
-static inline int jaxbeam_bracket(const double *grid, int count, double value, double *part)
+/* Index of the last point of a grid that is not above a value, and the fraction to the next. */
+static inline int jaxbeam_index(const double *grid, int count, double value, double *fraction)
 {
     int i = 0;
-    *part = 0.0;
+    *fraction = 0.0;
     while (i + 1 < count && grid[i + 1] <= value) i++;
-    if (i + 1 < count && value > grid[i]) *part = (value - grid[i]) / (grid[i + 1] - grid[i]);
+    if (i + 1 < count && value > grid[i]) *fraction = (value - grid[i]) / (grid[i + 1] - grid[i]);
     return i;
 }
 
-/* Two designs of a grid, and what each contributes at a value. */
+/* Two designs of a grid and their weights, for the interpolation at a value. */
 static inline void jaxbeam_designs(
     const double *grid, int count, double value, int design[2], double weight[2])
 {
-    double part, far, least = -1.0;
-    int i = jaxbeam_bracket(grid, count, value, &part);
+    double fraction, distance, smallest = -1.0;
+    int i = jaxbeam_index(grid, count, value, &fraction);
     design[0] = i;
     design[1] = i + 1 < count ? i + 1 : i;
-    weight[0] = 1.0 - part;
-    weight[1] = part;
+    weight[0] = 1.0 - fraction;
+    weight[1] = fraction;
     if (!JAXBEAM_NEAREST) return;
     weight[0] = 1.0;
     weight[1] = 0.0;
     for (i = 0; i < count; i++) {
-        far = value > grid[i] ? value - grid[i] : grid[i] - value;
-        if (least >= 0.0 && far >= least) continue;
-        least = far;
+        distance = value > grid[i] ? value - grid[i] : grid[i] - value;
+        if (smallest >= 0.0 && distance >= smallest) continue;
+        smallest = distance;
         design[0] = design[1] = i;
     }
 }
 
-/* Commands for a state at a share of the crossing, the exit having been since_exit s ago, and for
-   the mass (kg) and speed (m/s) of the load. Compile with -ffp-contract=off for results that agree
-   to the last bit. */
+/* Commands for a state at a share of the crossing (negative before the entry, 1 or more after the
+   exit, which was since_exit s ago), for a load of this mass (kg) and speed (m/s). Results agree
+   with Gains.command of jaxbeam to the last bit if compiled with -ffp-contract=off. */
 static inline void jaxbeam_command(double mass, double speed, double share, double since_exit,
                                    const double *state, double *command)
 {
     const int size = JAXBEAM_ACTUATORS * JAXBEAM_COLUMNS;
-    double masses[2], speeds[2], part, left = 1.0;
-    int heavy[2], fast[2], point, next, over, a, c, i, j, k, which;
-    jaxbeam_designs(jaxbeam_masses, JAXBEAM_MASSES, mass, heavy, masses);
-    jaxbeam_designs(jaxbeam_speeds, JAXBEAM_SPEEDS, speed, fast, speeds);
-    point = jaxbeam_bracket(jaxbeam_shares, JAXBEAM_POINTS, share, &part);
+    double mass_weight[2], speed_weight[2], fraction, decay = 1.0;
+    int mass_index[2], speed_index[2], point, next, after_exit, a, c, i, j, k, design;
+    jaxbeam_designs(jaxbeam_masses, JAXBEAM_MASSES, mass, mass_index, mass_weight);
+    jaxbeam_designs(jaxbeam_speeds, JAXBEAM_SPEEDS, speed, speed_index, speed_weight);
+    point = jaxbeam_index(jaxbeam_shares, JAXBEAM_POINTS, share, &fraction);
     next = point + 1 < JAXBEAM_POINTS ? point + 1 : point;
-    over = share >= 1.0 && JAXBEAM_POINTS > 1;
+    after_exit = share >= 1.0 && JAXBEAM_POINTS > 1;
 #ifdef JAXBEAM_FADE
-    if (over) left = exp(-since_exit / JAXBEAM_FADE);
+    if (after_exit) decay = exp(-since_exit / JAXBEAM_FADE);
 #else
     (void)since_exit;
 #endif
@@ -101,14 +101,14 @@ static inline void jaxbeam_command(double mass, double speed, double share, doub
             for (i = 0; i < 2; i++) {
                 for (j = 0; j < 2; j++) {
                     const double *table, *rest;
-                    double low, own;
-                    which = heavy[i] * JAXBEAM_SPEEDS + fast[j];
-                    table = jaxbeam_table + which * JAXBEAM_POINTS * size;
-                    rest = jaxbeam_rest + which * size;
+                    double low, value;
+                    design = mass_index[i] * JAXBEAM_SPEEDS + speed_index[j];
+                    table = jaxbeam_table + design * JAXBEAM_POINTS * size;
+                    rest = jaxbeam_rest + design * size;
                     low = table[point * size + k];
-                    own = low + part * (table[next * size + k] - low);
-                    if (over) own = left * rest[k];
-                    gain += masses[i] * speeds[j] * own;
+                    value = low + fraction * (table[next * size + k] - low);
+                    if (after_exit) value = decay * rest[k];
+                    gain += mass_weight[i] * speed_weight[j] * value;
                 }
             }
             command[a] -= gain * state[c];
@@ -117,33 +117,34 @@ static inline void jaxbeam_command(double mass, double speed, double share, doub
 }
 
 #ifdef JAXBEAM_ESTIMATED
-/* The estimator's states from those at the tick before, for the commands that acted until then and
-   until now, and the readings. Zero at the start; the first of them are those of the gains. */
-static inline void jaxbeam_estimate(double *state, const double *before, const double *now,
-                                    const double *readings)
+/* State estimate at a sample, in place of that at the previous sample, for the commands that acted
+   until the previous sample and until this one, and the readings. Zero initially; the first states
+   are those of the gains. */
+static inline void jaxbeam_estimate(double *state, const double *previous_command,
+                                    const double *current_command, const double *readings)
 {
     const int size = JAXBEAM_ESTIMATED, inputs = JAXBEAM_ACTUATORS;
-    const int wide = size + 2 * inputs + JAXBEAM_READINGS;
-    double prior[JAXBEAM_ESTIMATED], surprise[JAXBEAM_READINGS];
+    const int width = size + 2 * inputs + JAXBEAM_READINGS;
+    double prior[JAXBEAM_ESTIMATED], innovation[JAXBEAM_READINGS];
     const double *row;
     int i, j;
     for (i = 0; i < size; i++) {
-        row = jaxbeam_estimator + i * wide;
+        row = jaxbeam_estimator + i * width;
         prior[i] = 0.0;
         for (j = 0; j < size; j++) prior[i] += row[j] * state[j];
-        for (j = 0; j < inputs; j++) prior[i] += row[size + j] * before[j];
-        for (j = 0; j < inputs; j++) prior[i] += row[size + inputs + j] * now[j];
+        for (j = 0; j < inputs; j++) prior[i] += row[size + j] * previous_command[j];
+        for (j = 0; j < inputs; j++) prior[i] += row[size + inputs + j] * current_command[j];
     }
     for (i = 0; i < JAXBEAM_READINGS; i++) {
-        row = jaxbeam_estimator + (size + i) * wide;
-        surprise[i] = readings[i] - row[size + 2 * inputs];
-        for (j = 0; j < size; j++) surprise[i] -= row[j] * prior[j];
-        for (j = 0; j < inputs; j++) surprise[i] -= row[size + inputs + j] * now[j];
+        row = jaxbeam_estimator + (size + i) * width;
+        innovation[i] = readings[i] - row[size + 2 * inputs];
+        for (j = 0; j < size; j++) innovation[i] -= row[j] * prior[j];
+        for (j = 0; j < inputs; j++) innovation[i] -= row[size + inputs + j] * current_command[j];
     }
     for (i = 0; i < size; i++) {
-        row = jaxbeam_estimator + i * wide + size + 2 * inputs;
+        row = jaxbeam_estimator + i * width + size + 2 * inputs;
         state[i] = prior[i];
-        for (j = 0; j < JAXBEAM_READINGS; j++) state[i] += row[j] * surprise[j];
+        for (j = 0; j < JAXBEAM_READINGS; j++) state[i] += row[j] * innovation[j];
     }
 }
 #endif

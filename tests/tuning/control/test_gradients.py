@@ -9,7 +9,8 @@ import pytest
 
 import jaxbeam as jb
 import tuning
-from jaxbeam.control import KINDS
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.kinds import kinds
 from tests.differences import central
 from tuning.control.run_set import make_run_set
 
@@ -50,7 +51,7 @@ LOOPS = {
         {"controller.frequency": 17.0, "controller.damping_ratio": 0.3},
     ),
     "relief": (
-        jb.Relief(
+        jb.InternalModel(
             [-4e-4, -1e-4, 1e-4], [[6.0, 2.0, -0.5]], notches=[18.0], period=0.01, delay=0.01
         ),
         {
@@ -91,7 +92,7 @@ LOOPS = {
         {"controller.values.0.1": 6.0, "controller.offsets.0": 1.0},
     ),
     "passage": (
-        jb.Passage([-0.2, -0.1], [0.0, 0.4, 1.0], [[1.0, 6.0, 2.0]], period=0.01, lead=0.012),
+        jb.Feedforward([-0.2, -0.1], [0.0, 0.4, 1.0], [[1.0, 6.0, 2.0]], period=0.01, lead=0.012),
         {"controller.values.0.1": 6.0, "controller.lead": 0.012},
     ),
 }
@@ -112,7 +113,9 @@ ELSEWHERE = {jb.MPC, jb.StepLQR, jb.AugmentedLQR}  # in test_mpc and test_regula
 
 
 def test_all_kinds_of_controllers_are_tested():
-    assert {type(law) for law, _ in LOOPS.values()} | ELSEWHERE == set(KINDS.values())
+    assert {type(law) for law, _ in LOOPS.values()} | ELSEWHERE == set(
+        kinds(AbstractController).values()
+    )
 
 
 @pytest.mark.slow
@@ -120,7 +123,7 @@ def test_all_kinds_of_controllers_are_tested():
 def test_gradients_through_the_closed_loop(kind):
     controller, start = LOOPS[kind]
     case = rig(controller)
-    if kind not in ("feedback", "relief"):  # without the filter it compiles faster
+    if kind not in ("feedback", "internal model"):  # without the filter it compiles faster
         case = dataclasses.replace(case, sensors=[jb.Sensor(0.25)])
     run_set = make_run_set(case, RUNS)
     sizes = np.array(list(start.values()))

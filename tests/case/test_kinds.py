@@ -1,0 +1,110 @@
+"""Kinds: a class that declares one is found by it, without being registered anywhere."""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import pytest
+from jaxtyping import Array, Float
+
+from jaxbeam.case.case import Case, part_classes
+from jaxbeam.case.fields import POSITIVE, number
+from jaxbeam.case.kinds import kind_of, kinds
+from jaxbeam.files.case_file import read_part
+
+
+class AbstractMassDamper(eqx.Module):
+    """A family of parts that exists in this file only."""
+
+    kind: ClassVar[str]
+
+    @abc.abstractmethod
+    def frequency(self) -> Float[Array, ""]:
+        """Natural frequency in Hz."""
+
+
+class Tuned(AbstractMassDamper):
+    """A member with a kind."""
+
+    kind: ClassVar[str] = "tuned"
+
+    tuning: Float[Array, ""] = number("Hz", "natural frequency", POSITIVE)
+
+    def frequency(self):
+        return self.tuning
+
+
+class Untuned(Tuned):
+    """A member that declares no kind of its own."""
+
+
+def test_class_is_found_by_its_kind():
+    assert kinds(AbstractMassDamper) == {"tuned": Tuned}
+    damper = read_part("dampers.0", {"kind": "tuned", "tuning": 3}, AbstractMassDamper)
+    assert type(damper) is Tuned and damper.tuning == 3.0
+    with pytest.raises(ValueError, match=r"dampers.0.kind cannot be 'tund'; did you mean 'tuned'"):
+        read_part("dampers.0", {"kind": "tund"}, AbstractMassDamper)
+
+
+def test_kind_is_not_inherited():
+    assert kind_of(Tuned) == "tuned" and kind_of(Untuned) is None
+
+
+def test_class_defined_again_takes_the_place_of_the_former_one():
+    def define():
+        class Rubber(AbstractMassDamper):
+            kind: ClassVar[str] = "rubber"
+
+        return Rubber
+
+    former, latter = define(), define()
+    assert former is not latter and kinds(AbstractMassDamper)["rubber"] is latter
+
+
+def test_two_classes_of_one_kind_are_refused():
+    class AbstractSpring(eqx.Module):
+        @abc.abstractmethod
+        def stiffness(self): ...
+
+    class Coil(AbstractSpring):
+        kind: ClassVar[str] = "spring"
+
+    class Leaf(AbstractSpring):
+        kind: ClassVar[str] = "spring"
+
+    with pytest.raises(TypeError, match=r"'spring' is declared by both .*Coil and .*Leaf"):
+        kinds(AbstractSpring)
+    assert Leaf is not Coil
+
+
+def test_parts_of_a_case_follow_from_its_fields():
+    classes = {key: found.part_class.__name__ for key, found in part_classes().items()}
+    assert classes == {
+        "beam": "Beam",
+        "supports": "Support",
+        "actuators": "AbstractActuator",
+        "sensors": "Sensor",
+        "loads": "AbstractLoad",
+        "controller": "AbstractController",
+        "run": "Run",
+    }
+    assert {*classes, "title"} == set(Case.__dataclass_fields__)
+    assert [key for key, found in part_classes().items() if found.listed] == [
+        *("supports", "actuators", "sensors", "loads")
+    ]
+
+
+@pytest.mark.parametrize("key", ["actuators", "loads", "controller"])
+def test_every_class_of_a_case_has_a_kind(key):
+    family = part_classes()[key].part_class
+    found = {each for each in kinds(family).values() if each.__module__.startswith("jaxbeam.")}
+    public = {
+        each
+        for each in _subclasses(family)
+        if each.__module__.startswith("jaxbeam.") and not each.__name__.startswith("Abstract")
+    }
+    assert public == found
+
+
+def _subclasses(part_class):
+    return {deep for each in part_class.__subclasses__() for deep in {each, *_subclasses(each)}}
