@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.integrator.discrete_model import signed_both_ways
 from jaxbeam.integrator.integrate import integrate_peaks
-from jaxbeam.integrator.step_matrices import signed_both_ways
 from jaxbeam.model.statics import static_peak
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times

@@ -16,17 +16,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.loads import AbstractLoad, MovingMass
+from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.running_peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.step import CHECKPOINT_NAME, advance, advance_unforced, contact_forces
-from jaxbeam.integrator.step_matrices import (
-    CHUNK_STEPS,
-    DiscreteModel,
-    LoadPath,
-    load_path,
-    step_matrices,
-)
+from jaxbeam.integrator.step_matrices import CHUNK_STEPS, LoadPath, load_path, step_matrices
 from jaxbeam.model.contact import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks as plain_march
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
@@ -27,7 +28,7 @@ from jaxbeam.integrator.propagators import (
     lagrange_coefficients,
 )
 from jaxbeam.integrator.running_peaks import PEAK_MARGIN, Peaks
-from jaxbeam.integrator.step_matrices import CHUNK_STEPS, discrete_model
+from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import LoadSet
 from jaxbeam.model.modal_model import ModalModel

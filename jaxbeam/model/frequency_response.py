@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Complex, Float
 
 from jaxbeam.case.case import Case
@@ -22,7 +21,7 @@ from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row
-from jaxbeam.model.modal_model import ModalModel, compiled_modal_model, modal_model
+from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.runtime.compiling import compiled
 
@@ -115,7 +114,7 @@ def frequency_response(
     check_case(case)
     frequencies, masses = (
         _checked_frequencies(frequencies),
-        _stationary_masses(case, stationary_masses),
+        checked_masses(case, stationary_masses),
     )
     checked_pairs = check_pairs(case, common_pairs(case) if pairs is None else pairs)
     layout = mesh_layout(case) if layout is None else layout
@@ -152,12 +151,12 @@ def _state_responses(
     model: ModalModel, stationary, frequencies, input_matrix
 ) -> Complex[Array, "frequency state input"]:
     """States per unit of each input (column of the input matrix), at every frequency (Hz)."""
-    A, E = _descriptor_matrices(model, stationary)
+    A, E = descriptor_matrices(model, stationary)
     s = 2j * jnp.pi * frequencies[:, None, None]
     return jnp.linalg.solve(s * E - A, input_matrix + 0j)
 
 
-def _descriptor_matrices(model: ModalModel, stationary):
+def descriptor_matrices(model: ModalModel, stationary):
     """A and E of the model with stationary masses: (positions in m, masses in kg)."""
     positions, kilograms = stationary
     shapes = model.shapes(positions, (0,))[0]
@@ -182,7 +181,7 @@ def receptance(
     check_case(case)
     frequencies, masses = (
         _checked_frequencies(frequencies),
-        _stationary_masses(case, stationary_masses),
+        checked_masses(case, stationary_masses),
     )
     layout = mesh_layout(case) if layout is None else layout
     x, y = _checked_position(case, "x", x), _checked_position(case, "y", y)
@@ -253,47 +252,6 @@ def resonances_and_antiresonances(
     return extrema
 
 
-def poles(case: Case, stationary_masses: StationaryMasses = ()) -> Complex[np.ndarray, " state"]:
-    """Poles of beam, supports and actuators in rad/s, in order of magnitude.
-
-    Not differentiable. Raises ValueError as `frequency_response` does.
-    """
-    check_case(case)
-    A, E = _descriptor_matrices(
-        compiled_modal_model(case), _stationary_masses(case, stationary_masses)
-    )
-    return _sort_by_magnitude(scipy.linalg.eigvals(np.asarray(A), np.asarray(E)))
-
-
-def zeros(
-    case: Case, pair: tuple[str, str], stationary_masses: StationaryMasses = ()
-) -> Complex[np.ndarray, " zero"]:
-    """Transmission zeros of a pair (input, output) in rad/s, in order of magnitude.
-
-    Those for the input `actuators.I.active_force` are those for the command. Not differentiable.
-    Raises ValueError as `frequency_response` does.
-    """
-    check_case(case)
-    (checked_pair,) = check_pairs(case, [pair])
-    model = compiled_modal_model(case)
-    A, E = _descriptor_matrices(model, _stationary_masses(case, stationary_masses))
-    input_vector, command = input_column(case, model, checked_pair.excitation)
-    state_row, rate_row, feedthrough_row = output_row(case, model, checked_pair.output)
-    feedthrough = jnp.atleast_1d(feedthrough_row @ command)
-    pencil_A = jnp.block([[A, input_vector[:, None]], [state_row, feedthrough]])
-    pencil_E = jnp.block([[E, jnp.zeros_like(input_vector)[:, None]], [-rate_row, jnp.zeros(1)]])
-    eigenvalues = scipy.linalg.eigvals(np.asarray(pencil_A), np.asarray(pencil_E))
-    # Zeros at infinity are computed as infinite or as numbers far beyond the poles.
-    largest_pole = np.abs(scipy.linalg.eigvals(np.asarray(A))).max()
-    return _sort_by_magnitude(eigenvalues[np.abs(eigenvalues) < 1e4 * largest_pole])
-
-
-def _sort_by_magnitude(values):
-    """In order of magnitude; of conjugates, equal up to rounding, the negative frequency first."""
-    sizes = np.array([float(f"{size:.9g}") for size in np.abs(values)])
-    return values[np.lexsort((values.imag, sizes))]
-
-
 def _checked_frequencies(frequencies):
     frequencies = jnp.atleast_1d(jnp.asarray(frequencies, float))
     if frequencies.ndim != 1:
@@ -308,7 +266,7 @@ def _checked_frequencies(frequencies):
     return frequencies
 
 
-def _stationary_masses(case: Case, stationary_masses: StationaryMasses):
+def checked_masses(case: Case, stationary_masses: StationaryMasses):
     """Positions (mass,) in m and masses (mass,) in kg, after checks.
 
     Raises ValueError for a negative mass and a position off the beam.

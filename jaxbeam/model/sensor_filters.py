@@ -1,21 +1,26 @@
 """Modal model augmented by the analogue filters of its sensors and of the controller."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
+from jaxbeam.case.controller import ControllerFilter
 from jaxbeam.case.filters import analogue_state_space
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.model.state_space import Plant
 
 
-def with_sensor_filters(plant: Plant) -> tuple[ModalModel, Float[Array, "sensor state"]]:
+def with_sensor_filters(
+    plant: Plant, controller_filters: Sequence[ControllerFilter] = ()
+) -> tuple[ModalModel, Float[Array, "sensor state"]]:
     """Modal model with states of the analogue filters, and rows from its states to their outputs.
 
-    Rows are those of the sensors, then those of the controller's own filters. Rows of acceleration
+    Rows are those of the sensors, then those of the filters of a control law. Rows of acceleration
     sensors are zero: accelerations depend on contact forces and commands too.
     """
     case, model = plant.case, plant.modal_model
@@ -29,7 +34,7 @@ def with_sensor_filters(plant: Plant) -> tuple[ModalModel, Float[Array, "sensor 
         filter_inputs.append((len(state_matrices), column, {0: row}))
         rows.append({len(state_matrices): output})
         state_matrices.append(matrix)
-    for controller_filter in () if case.controller is None else case.controller.own_filters():
+    for controller_filter in controller_filters:
         filter_input = rows[controller_filter.sensor]
         filter_inputs.append((len(state_matrices), controller_filter.B, filter_input))
         rows.append(

@@ -17,10 +17,10 @@ from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads import trajectory
 from jaxbeam.case.validation import check_case
+from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.integrate import integrate_at_events, integrate_peaks, max_stable_step
 from jaxbeam.integrator.running_peaks import RunningPeaks
-from jaxbeam.integrator.step_matrices import discrete_model
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model

@@ -11,12 +11,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
 from jaxbeam.integrator.running_peaks import Peaks
-from jaxbeam.integrator.step_matrices import DiscreteModel, discrete_model
 from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.contact import LoadSet, contact_at, load_set
 from jaxbeam.model.measurement import sensor_readings
@@ -182,9 +182,7 @@ def integration_setup(
         )
     else:
         schedule = plan.schedule
-        policy = closed_loop(case, layout, loads, schedule)
-        if not noisy:
-            policy = dataclasses.replace(policy, noise=None)
+        policy = closed_loop(case, layout, loads, schedule, noisy)
         model = policy.model
     grid = grid_by_schedule(case, model, schedule, plan.substeps)
     discrete = discrete_model(model, grid, positions, policy)

@@ -17,9 +17,9 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.loads import trajectory
 from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.integrate import integrate_history, integrate_peaks, max_stable_step
-from jaxbeam.integrator.step_matrices import discrete_model
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model

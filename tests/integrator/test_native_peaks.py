@@ -21,12 +21,12 @@ import jaxbeam as jb
 from jaxbeam.case.case import replace
 from jaxbeam.cli import main
 from jaxbeam.integrator import native_peaks
-from jaxbeam.integrator.integrate import march
-from jaxbeam.integrator.propagators import LOOKED
-from jaxbeam.integrator.step_matrices import make_rigging
-from jaxbeam.integrator.time_grid import even_grid
-from jaxbeam.model.contact import traffic
-from jaxbeam.model.modal_model import rig
+from jaxbeam.integrator.discrete_model import discrete_model
+from jaxbeam.integrator.integrate import integrate_peaks
+from jaxbeam.integrator.propagators import PEAK_NODES
+from jaxbeam.integrator.time_grid import grid_by_step_length
+from jaxbeam.model.contact import load_set
+from jaxbeam.model.modal_model import modal_model
 from jaxbeam.numerics import peak_search
 from jaxbeam.runtime import native_library
 from jaxbeam.simulation.integration_plan import static_shapes
@@ -169,12 +169,12 @@ def marched(case, by_hand, longest=1e-3):
 
     def peaks(mass):
         varied = replace(case, {"loads.0.mass": mass})
-        assembled = rig(varied, known.layout, known.coupled)
-        grid, places = even_grid(varied, assembled, jnp.asarray(longest)), varied.sensor_places
-        loads = traffic(varied)
+        assembled = modal_model(varied, known.layout, known.coupled)
+        grid, places = grid_by_step_length(varied, assembled, jnp.asarray(longest)), varied.sensor_positions
+        loads = load_set(varied)
         if not by_hand:
-            best, _ = march(make_rigging(assembled, grid, places), loads, slots=known.max_loads)
-            return best.peak()[0][:, 0]
+            best, _ = integrate_peaks(discrete_model(assembled, grid, places), loads, max_loads=known.max_loads)
+            return best.refined_peak()[0][:, 0]
         given = jnp.ones((), bool), assembled, grid, places, loads
         of_one = jax.tree.map(lambda leaf: leaf[None], given)
         return native_peaks.integrate_peaks(known.max_loads, *of_one).peak_deflection[0, 0]
@@ -291,9 +291,9 @@ void seek(const double *samples, const double *through, double *heights, int cou
 
 def test_places_of_peaks_are_as_high_as_those_found_without_it(tmp_path):
     """Of curves through any samples, many of which go up and down within a step."""
-    curves = np.random.default_rng(0).normal(size=(len(LOOKED), 2, 5000))
+    curves = np.random.default_rng(0).normal(size=(len(PEAK_NODES), 2, 5000))
     curves[:, 1] = np.cumsum(curves[:, 1], axis=0)  # less wild
-    curves = curves.reshape(len(LOOKED), -1)
+    curves = curves.reshape(len(PEAK_NODES), -1)
     (tmp_path / "seek.c").write_text(SEEK)
     headers = native_library.C_FOLDER
     words = [
@@ -308,6 +308,6 @@ def test_places_of_peaks_are_as_high_as_those_found_without_it(tmp_path):
     seek = ctypes.CDLL(str(tmp_path / "seek.so")).seek
     seek.argtypes = [pointer, pointer, pointer, ctypes.c_int]
     heights = np.empty(curves.shape[1])
-    through = np.ascontiguousarray(peak_search.interpolation_matrix(LOOKED)[: len(LOOKED)].T)
+    through = np.ascontiguousarray(peak_search.interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T)
     seek(curves, through, heights, heights.size)
-    assert_allclose(heights, peak_search.refine_peak(jnp.asarray(curves), LOOKED)[0], rtol=1e-11)
+    assert_allclose(heights, peak_search.refine_peak(jnp.asarray(curves), PEAK_NODES)[0], rtol=1e-11)

@@ -17,13 +17,12 @@ from jaxbeam.model.frequency_response import (
     accelerance,
     frequency_response,
     mobility,
-    poles,
     receptance,
     resonances_and_antiresonances,
-    zeros,
 )
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.poles_zeros import poles, zeros
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import finite_elements

@@ -41,7 +41,12 @@ def products(case: Case) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "case",
-    [PATCHED, supported_beam(1e4), supported_beam(None), Case(Beam(0.6, **PROPERTIES, ends="free-free", modes=6))],
+    [
+        PATCHED,
+        supported_beam(1e4),
+        supported_beam(None),
+        Case(Beam(0.6, **PROPERTIES, ends="free-free", modes=6)),
+    ],
     ids=["patched", "spring", "two spans", "free"],
 )
 def test_shapes_are_orthonormal_and_join(case):

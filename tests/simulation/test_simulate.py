@@ -13,8 +13,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_history
-from jaxbeam.integrator.step_matrices import discrete_model
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import load_set
 from jaxbeam.model.modal_model import modal_model

@@ -1,0 +1,55 @@
+"""Poles and transmission zeros of beam, supports and actuators, with stationary masses."""
+
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Complex
+
+from jaxbeam.case.case import Case
+from jaxbeam.case.validation import check_case
+from jaxbeam.model.channels import check_pairs, input_column, output_row
+from jaxbeam.model.frequency_response import (
+    StationaryMasses,
+    checked_masses,
+    descriptor_matrices,
+)
+from jaxbeam.model.modal_model import compiled_modal_model
+
+
+def poles(case: Case, stationary_masses: StationaryMasses = ()) -> Complex[np.ndarray, " state"]:
+    """Poles of beam, supports and actuators in rad/s, in order of magnitude.
+
+    Not differentiable. Raises ValueError as `frequency_response` does.
+    """
+    check_case(case)
+    A, E = descriptor_matrices(compiled_modal_model(case), checked_masses(case, stationary_masses))
+    return _sort_by_magnitude(scipy.linalg.eigvals(np.asarray(A), np.asarray(E)))
+
+
+def zeros(
+    case: Case, pair: tuple[str, str], stationary_masses: StationaryMasses = ()
+) -> Complex[np.ndarray, " zero"]:
+    """Transmission zeros of a pair (input, output) in rad/s, in order of magnitude.
+
+    Those for the input `actuators.I.active_force` are those for the command. Not differentiable.
+    Raises ValueError as `frequency_response` does.
+    """
+    check_case(case)
+    (checked_pair,) = check_pairs(case, [pair])
+    model = compiled_modal_model(case)
+    A, E = descriptor_matrices(model, checked_masses(case, stationary_masses))
+    input_vector, command = input_column(case, model, checked_pair.excitation)
+    state_row, rate_row, feedthrough_row = output_row(case, model, checked_pair.output)
+    feedthrough = jnp.atleast_1d(feedthrough_row @ command)
+    pencil_A = jnp.block([[A, input_vector[:, None]], [state_row, feedthrough]])
+    pencil_E = jnp.block([[E, jnp.zeros_like(input_vector)[:, None]], [-rate_row, jnp.zeros(1)]])
+    eigenvalues = scipy.linalg.eigvals(np.asarray(pencil_A), np.asarray(pencil_E))
+    # Zeros at infinity are computed as infinite or as numbers far beyond the poles.
+    largest_pole = np.abs(scipy.linalg.eigvals(np.asarray(A))).max()
+    return _sort_by_magnitude(eigenvalues[np.abs(eigenvalues) < 1e4 * largest_pole])
+
+
+def _sort_by_magnitude(values):
+    """In order of magnitude; of conjugates, equal up to rounding, the negative frequency first."""
+    sizes = np.array([float(f"{size:.9g}") for size in np.abs(values)])
+    return values[np.lexsort((values.imag, sizes))]
