@@ -4,8 +4,7 @@ Each function returns a matplotlib figure, which the caller saves. Figures are n
 pyplot: none is shown, and none needs to be closed.
 """
 
-import warnings
-
+from jaxbeam.case.aliases import warn_renamed
 from jaxbeam.plot.animation import animate
 from jaxbeam.plot.compare import plot_comparison
 from jaxbeam.plot.fit import FitPanel, plot_fit
@@ -38,7 +37,5 @@ OLD_NAMES = {"plot_frequency": "plot_frequency_response", "plot_front": "plot_pa
 def __getattr__(name: str):
     if name not in OLD_NAMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warnings.warn(
-        f"jaxbeam.plot.{name} is called {OLD_NAMES[name]} now", DeprecationWarning, stacklevel=2
-    )
+    warn_renamed(f"jaxbeam.plot.{name}", f"jaxbeam.plot.{OLD_NAMES[name]}")
     return globals()[OLD_NAMES[name]]

@@ -233,5 +233,5 @@ def test_labels_do_not_overlap():
 
 @pytest.mark.parametrize(("old", "new"), jaxbeam.plot.OLD_NAMES.items())
 def test_old_names_warn(old, new):
-    with pytest.warns(DeprecationWarning, match=f"{old} is called {new} now"):
+    with pytest.warns(DeprecationWarning, match=f"{old} is called jaxbeam.plot.{new} now"):
         assert getattr(jaxbeam.plot, old) is getattr(jaxbeam.plot, new)
