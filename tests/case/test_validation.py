@@ -21,8 +21,8 @@ from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from tests.strategies import cases
 
-RIG = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}
-BEAM = Beam(**RIG, damping_ratio=[0.03, 0.02, 0.01])
+SECTION = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}
+BEAM = Beam(**SECTION, damping_ratio=[0.03, 0.02, 0.01])
 CASE = Case(
     BEAM,
     supports=[Support(0.3), Support(0.5, 2e6)],
@@ -53,7 +53,7 @@ def test_example_case_passes():
 @pytest.mark.parametrize("left", END_CONDITIONS)
 @pytest.mark.parametrize("right", END_CONDITIONS)
 def test_all_end_conditions_pass(left, right):
-    check_case(Case(Beam(**RIG, ends=f"{left}-{right}")))
+    check_case(Case(Beam(**SECTION, ends=f"{left}-{right}")))
 
 
 # Address, its new value, and a part of the error message.
@@ -103,20 +103,20 @@ CASES = [
         "(of which height is missing)",
     ),
     (
-        Case(Beam(**RIG, youngs_modulus=2e11)),
+        Case(Beam(**SECTION, youngs_modulus=2e11)),
         "beam.flexural_rigidity and beam.youngs_modulus contradict each other; leave one out",
     ),
-    (Case(Beam(**RIG, density=7850.0)), "beam.mass_per_length and beam.density contradict"),
-    (Case(Beam(**RIG, height=0.01)), "beam.height would have no effect: leave it out"),
-    (Case(Beam(**RIG, damping_ratio=[0.1, 0.1])), "lists 2 values for 3 modes; give one for each"),
+    (Case(Beam(**SECTION, density=7850.0)), "beam.mass_per_length and beam.density contradict"),
+    (Case(Beam(**SECTION, height=0.01)), "beam.height would have no effect: leave it out"),
+    (Case(Beam(**SECTION, damping_ratio=[0.1, 0.1])), "lists 2 values for 3 modes; give one for each"),
     (
-        Case(Beam(**RIG, damping_ratio=0.1, rayleigh_damping=[0.1, 0.0])),
+        Case(Beam(**SECTION, damping_ratio=0.1, rayleigh_damping=[0.1, 0.0])),
         "beam has both damping_ratio and rayleigh_damping; leave one out",
     ),
-    (Case(Beam(**RIG, modes=0)), "beam.modes must be a whole number, 1 or more; it is 0"),
-    (Case(Beam(**RIG, ends="pinned-fixed")), "no end is called 'fixed'; it may be pinned, clamped"),
-    (Case(Beam(**RIG, ends="clampd-free")), "no end is called 'clampd'; did you mean 'clamped'?"),
-    (Case(Beam(**RIG, ends="pinned")), "must name the left and the right end, such as"),
+    (Case(Beam(**SECTION, modes=0)), "beam.modes must be a whole number, 1 or more; it is 0"),
+    (Case(Beam(**SECTION, ends="pinned-fixed")), "no end is called 'fixed'; it may be pinned, clamped"),
+    (Case(Beam(**SECTION, ends="clampd-free")), "no end is called 'clampd'; did you mean 'clamped'?"),
+    (Case(Beam(**SECTION, ends="pinned")), "must name the left and the right end, such as"),
     (
         Case(BEAM, [Support(0.2), Support(0.4, 10.0), Support(0.4), Support(0.2)]),
         "supports.0 and supports.3 both hold the beam rigidly at 0.2 m; remove one",

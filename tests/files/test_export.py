@@ -171,7 +171,8 @@ def test_c_header_gives_the_same_commands(gains, tmp_path):
     assert_array_equal(found, [*expected, gains.test_command])
 
 
-def rig(controller):
+def shaker_case(controller):
+    """Beam with a shaker, two sensors, of which one has a filter, and a crossing mass."""
     return jb.Case(
         jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
         actuators=[jb.Shaker(0.25, 2000.0, 5.0)],
@@ -183,7 +184,7 @@ def rig(controller):
 
 @pytest.fixture(scope="module")
 def sampled():
-    case = rig(DiscreteLQR(**WEIGHTS, delay=1e-3))
+    case = shaker_case(DiscreteLQR(**WEIGHTS, delay=1e-3))
     return case, export_gains(case)
 
 
@@ -206,12 +207,12 @@ def test_command_line_exports_the_designed_gains(sampled, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_table_has_the_gains_of_the_design():
-    case = rig(FiniteLQR(**WEIGHTS, points=210, after="hold"))
+    case = shaker_case(FiniteLQR(**WEIGHTS, points=210, after="hold"))
     gains, layout = export_gains(case, 51), mesh_layout(case)
 
     @eqx.filter_jit
     def designed(case):
-        table = case.controller.gains(jb.state_space(case, layout=layout))
+        table = case.controller.gain_table(jb.state_space(case, layout=layout))
         return jnp.stack([table(jnp.asarray(share)) for share in (0.0, 0.5, 0.98, 1.0)])
 
     found = gains.table[0, 0, [0, 25, 49, 50]]
@@ -225,23 +226,24 @@ def test_gain_family_gives_the_commands_of_the_controller(between, tmp_path):
     """Between masses of the grid, along the crossing, and during the decay after it."""
     end = {"terminal_weight": [1e3, 1e2, 0.1, 0.01, 1e-3], "after": "fade", "fade_time": 0.05}
     family = {"masses": [0.2, 0.4], "between": between, "loads": "known"}
-    law = ScheduledLQR(**WEIGHTS, **end, **family, points=210)
-    case = jb.replace(rig(law), {"loads.0.mass": 0.25})
+    controller = ScheduledLQR(**WEIGHTS, **end, **family, points=210)
+    case = jb.replace(shaker_case(controller), {"loads.0.mass": 0.25})
     write_gains(export_gains(case, 11), tmp_path / "gains.csv")
     gains, layout = read_gains(tmp_path / "gains.csv"), mesh_layout(case)
     shares = np.array([-0.1, 0.2, 0.5, 1.0 + 1e-9, 1.5])
     states = RANDOM.normal(size=(shares.size, 5)) * [1e-3, 1e-4, 0.03, 0.01, 0.2]
 
     @eqx.filter_jit
-    def asked(case, states, times):
-        memory = law.init(jb.state_space(case, layout=layout))
+    def commands(case, states, times):
+        law = case.controller.law(jb.state_space(case, layout=layout))
 
-        def one(state, t):
-            return law.step(memory, Measurement(jnp.zeros(2), state, jnp.zeros(1)), t)[0]
+        def command(state, t):
+            measurement = Measurement(jnp.zeros(2), state, jnp.zeros(1))
+            return law.step(law.initial_state(), measurement, t).command
 
-        return jax.vmap(one)(states, times)
+        return jax.vmap(command)(states, times)
 
-    expected = asked(case, jnp.asarray(states), jnp.asarray(0.6 * shares))
+    expected = commands(case, jnp.asarray(states), jnp.asarray(0.6 * shares))
     weight = 0.25 * 9.81
     for state, share, command in zip(states, shares, expected, strict=True):
         since = max(0.0, 0.6 * (share - 1))
@@ -264,7 +266,7 @@ def test_gain_family_gives_the_commands_of_the_controller(between, tmp_path):
     ],
 )
 def test_controllers_that_cannot_be_exported(controller, message):
-    case = dataclasses.replace(rig(controller), sensors=(jb.Sensor(0.2),))
+    case = dataclasses.replace(shaker_case(controller), sensors=(jb.Sensor(0.2),))
     with pytest.raises(ValueError, match=message):
         export_gains(case)
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.files.export import export_gains, read_gains, write_gains
-from tests.files.test_export import COMPILER, ESTIMATED, WEIGHTS, rig
+from tests.files.test_export import COMPILER, ESTIMATED, WEIGHTS, shaker_case
 
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
@@ -41,7 +41,7 @@ def test_c_header_gives_the_same_estimate(tmp_path):
 def test_exported_estimator_gives_the_commands_of_a_simulation(estimator, tmp_path):
     """From the readings of a run alone, with a digital filter and a delay in the loop."""
     law = jb.LQR(**WEIGHTS, delay=1e-3, estimator=estimator)
-    case = rig(law)
+    case = shaker_case(law)
     if isinstance(estimator, jb.Kalman):
         late = dataclasses.replace(case.sensors[0], delay=jnp.asarray(1e-3))
         case = dataclasses.replace(case, sensors=(late, case.sensors[1]))

@@ -121,12 +121,12 @@ def test_damaged_log_is_read_or_refused(folder, name, capfd):
 
 
 # Wrong counts that crash the process in the reader of scipy, or keep it busy for a minute.
-@pytest.mark.parametrize(("place", "byte"), [(145, 8), (163, 0x74), (160, 0xFF)])
-def test_inconsistent_matlab_file_is_refused(folder, place, byte):
+@pytest.mark.parametrize(("offset", "byte"), [(145, 8), (163, 0x74), (160, 0xFF)])
+def test_inconsistent_matlab_file_is_refused(folder, offset, byte):
     path = folder / "run.mat"
     readers.mat(path, ("",))
     content = bytearray(path.read_bytes())
-    content[place] = byte
+    content[offset] = byte
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"run\.mat: the file is damaged or cut off: "):
         read_logs(path)

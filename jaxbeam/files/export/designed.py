@@ -1,23 +1,35 @@
 """Export of the controller of a case: design of gains and estimator, tabulated."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.kinds import kinds
 from jaxbeam.case.validation import check_case
+from jaxbeam.control.optimal.crossing_lqr import AbstractCrossingRegulator
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
-from jaxbeam.control.optimal.lqr import LQR, AbstractScheduledRegulator
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
-from jaxbeam.control.optimal.scheduled_lqr import GainScheduleGrid, ScheduledLQR
+from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw, ScheduledLQR
 from jaxbeam.control.state_feedback import StateFeedback
+from jaxbeam.control.state_law import AbstractStateLaw, GainLaw
+from jaxbeam.estimation.constant_gain import ConstantGainFilter
 from jaxbeam.estimation.observer import Observer
+from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.files.export.gains import Gains
+from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensor_signals import sensor_sections
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
+
+EXPORTABLE = (LQR, DiscreteLQR, StateFeedback, AbstractCrossingRegulator)
 
 
 def export_gains(case: Case, points: int = 1001) -> Gains:
@@ -32,12 +44,17 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
     """
     check_case(case)
     law = case.controller
-    is_scheduled = isinstance(law, AbstractScheduledRegulator)
-    if not (is_scheduled or isinstance(law, LQR | DiscreteLQR | StateFeedback)):
+    if not isinstance(law, EXPORTABLE):
+        words = [
+            repr(kind)
+            for kind, controller in kinds(AbstractController).items()
+            if issubclass(controller, EXPORTABLE)
+        ]
         raise ValueError(
-            "controller.kind cannot be exported: tables are made of 'state', 'lqr', 'dlqr',"
-            " 'lqr-finite', 'lqr-step', 'lqr-augmented' and 'lqr-scheduled'"
+            "controller.kind cannot be exported: tables are made of"
+            f" {', '.join(words[:-1])} and {words[-1]}"
         )
+    varies = isinstance(law, AbstractCrossingRegulator)
     if law.period is None:
         raise ValueError("controller.period is missing: a real controller samples; give its period")
     estimator_settings = law.estimator
@@ -52,32 +69,30 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
         )
     if points < 2:
         raise ValueError(f"a table needs at least two points, not {points}")
-    shares = np.linspace(0, 1, points) if is_scheduled else np.zeros(1)
-    (system, grid, table, rest, crossing), estimator = _design_gains(
-        case, mesh_layout(case), shares
-    )
-    columns, commands = system.states, system.inputs
-    extra_columns = table.shape[-1] - len(columns)
-    if extra_columns and is_scheduled:
+    shares = np.linspace(0, 1, points) if varies else np.zeros(1)
+    design = _design_gains(case, mesh_layout(case), shares)
+    columns, commands = design.system.states, design.system.inputs
+    extra_columns = design.table.shape[-1] - len(columns)
+    if extra_columns and varies:
         columns += tuple((f"load_{i}", "N") for i in range(extra_columns))
     elif extra_columns:
         columns += tuple((f"last_{name}", unit) for name, unit in commands)
-    decay_time, (masses, speeds) = getattr(law, "fade_time", None), grid
+    decay_time = getattr(law, "fade_time", None)
     return Gains(
-        np.asarray(masses),
-        np.asarray(speeds),
-        shares,
-        np.asarray(table),
-        np.asarray(rest),
-        _digital_filters(case),
-        float(concrete(law.period)),
-        float(crossing),
-        np.inf if decay_time is None else float(concrete(decay_time)),
-        law.between if isinstance(law, ScheduledLQR) else "interpolated",
-        tuple(tuple(column) for column in columns),
-        tuple(tuple(command) for command in commands),
-        np.asarray(estimator),
-        len(case.sensors) if estimator.size else 0,
+        masses=np.asarray(design.masses),
+        speeds=np.asarray(design.speeds),
+        shares=shares,
+        table=np.asarray(design.table),
+        rest=np.asarray(design.rest),
+        filters=_digital_filters(case),
+        period=float(concrete(law.period)),
+        crossing_time=float(design.crossing_time),
+        decay_time=np.inf if decay_time is None else float(concrete(decay_time)),
+        interpolation=law.between if isinstance(law, ScheduledLQR) else "interpolated",
+        columns=tuple(tuple(column) for column in columns),
+        commands=tuple(tuple(command) for command in commands),
+        estimator=np.asarray(design.estimator),
+        reading_count=len(case.sensors) if design.estimator.size else 0,
     )
 
 
@@ -91,42 +106,53 @@ def _digital_filters(case: Case) -> np.ndarray:
     return rows
 
 
+class GainDesign(NamedTuple):
+    """Numbers of a gain table as they are designed; see `Gains`."""
+
+    system: StateSpace
+    masses: Float[Array, " mass"]
+    speeds: Float[Array, " speed"]
+    table: Float[Array, "mass speed share actuator column"]
+    rest: Float[Array, "mass speed actuator column"]
+    crossing_time: Float[Array, ""]
+    estimator: Float[Array, "row entry"]
+
+
 @compiled
-def _design_gains(case: Case, layout, shares):
-    """Results of `_tabulate_gains`, and the matrix `estimator` of `Gains`."""
-    plant, law = state_space(case, layout=layout), case.controller
-    design_plant = law.design_plant(plant)
+def _design_gains(case: Case, layout, shares) -> GainDesign:
+    """Design of the controller of a case, tabulated at shares of the crossing."""
+    controller = case.controller
+    plant = state_space(case, layout=layout)
+    design_plant = controller.design_plant(plant)
     estimator = jnp.zeros((0, 0))
-    if law.estimator is not None:
-        filter_design = law.estimator.init(design_plant)
-        transition, sensor_count = filter_design.transition, filter_design.C.shape[0]
-        offset = jnp.zeros((sensor_count, sensor_count)).at[:, 0].set(filter_design.offset)
-        estimator = jnp.block([
-            [transition.drift, transition.before, transition.after, filter_design.gain],
-            [filter_design.C, jnp.zeros_like(filter_design.D), filter_design.D, offset],
-        ])  # fmt: skip
-    return _tabulate_gains(law, plant, design_plant, shares), estimator
+    if controller.estimator is not None:
+        timing = sample_timing(controller)
+        estimator = _estimator_matrix(controller.estimator.sampled_filter(design_plant, timing))
+    law = controller.design_state_law(plant, design_plant)
+    return GainDesign(design_plant.unloaded, *_tabulated(law, shares), estimator)
 
 
-def _tabulate_gains(law, plant, design_plant, shares):
-    """Design plant, masses and speeds, gains along and after the crossing, crossing time (s).
+def _estimator_matrix(filter: ConstantGainFilter) -> Float[Array, "row entry"]:
+    """Matrix [[A, B, B', L], [C, 0, D, o]] of a filter; see `Gains`."""
+    transition, sensors = filter.transition, filter.C.shape[0]
+    offset = jnp.zeros((sensors, sensors)).at[:, 0].set(filter.offset)
+    prediction = transition.matrix, transition.previous_input_matrix, transition.input_matrix
+    return jnp.block(
+        [[*prediction, filter.gain], [filter.C, jnp.zeros_like(filter.D), filter.D, offset]]
+    )
 
-    Gains have mass and speed as their first axes.
-    """
-    memory = law.gain if isinstance(law, StateFeedback) else law.prepare(plant, design_plant)
+
+def _tabulated(
+    law: AbstractStateLaw, shares: Float[Array, " share"]
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Masses (kg), speeds (m/s), gains at the shares and after the crossing, crossing time (s)."""
     no_grid = jnp.zeros(1), jnp.zeros(1)
-    if isinstance(memory, GainScheduleGrid):
-        tables = jax.vmap(jax.vmap(lambda each: jax.vmap(each.table)(shares)))(memory.schedules)
-        crossing = memory.length / memory.given[1]
-        grid = memory.masses, memory.speeds
-        return design_plant.unloaded, grid, tables, memory.schedules.final_gain, crossing
-    if isinstance(memory, GainSchedule):
-        table, crossing = jax.vmap(memory.table)(shares), memory.end - memory.start
-        return (
-            design_plant.unloaded,
-            no_grid,
-            table[None, None],
-            memory.final_gain[None, None],
-            crossing,
-        )
-    return design_plant.unloaded, no_grid, memory[None, None, None], memory[None, None], 0.0
+    if isinstance(law, GainLaw):
+        return *no_grid, law.gain[None, None, None], law.gain[None, None], jnp.zeros(())
+    if isinstance(law, GainSchedule):
+        table = jax.vmap(law.table)(shares)
+        return *no_grid, table[None, None], law.final_gain[None, None], law.end - law.start
+    assert isinstance(law, ScheduledGainLaw)
+    tables = jax.vmap(jax.vmap(lambda schedule: jax.vmap(schedule.table)(shares)))(law.schedules)
+    crossing_time = law.length / law.design_speed
+    return law.masses, law.speeds, tables, law.schedules.final_gain, crossing_time
