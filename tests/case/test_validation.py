@@ -108,14 +108,23 @@ CASES = [
     ),
     (Case(Beam(**SECTION, density=7850.0)), "beam.mass_per_length and beam.density contradict"),
     (Case(Beam(**SECTION, height=0.01)), "beam.height would have no effect: leave it out"),
-    (Case(Beam(**SECTION, damping_ratio=[0.1, 0.1])), "lists 2 values for 3 modes; give one for each"),
+    (
+        Case(Beam(**SECTION, damping_ratio=[0.1, 0.1])),
+        "lists 2 values for 3 modes; give one for each",
+    ),
     (
         Case(Beam(**SECTION, damping_ratio=0.1, rayleigh_damping=[0.1, 0.0])),
         "beam has both damping_ratio and rayleigh_damping; leave one out",
     ),
     (Case(Beam(**SECTION, modes=0)), "beam.modes must be a whole number, 1 or more; it is 0"),
-    (Case(Beam(**SECTION, ends="pinned-fixed")), "no end is called 'fixed'; it may be pinned, clamped"),
-    (Case(Beam(**SECTION, ends="clampd-free")), "no end is called 'clampd'; did you mean 'clamped'?"),
+    (
+        Case(Beam(**SECTION, ends="pinned-fixed")),
+        "no end is called 'fixed'; it may be pinned, clamped",
+    ),
+    (
+        Case(Beam(**SECTION, ends="clampd-free")),
+        "no end is called 'clampd'; did you mean 'clamped'?",
+    ),
     (Case(Beam(**SECTION, ends="pinned")), "must name the left and the right end, such as"),
     (
         Case(BEAM, [Support(0.2), Support(0.4, 10.0), Support(0.4), Support(0.2)]),
