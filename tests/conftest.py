@@ -33,8 +33,8 @@ if importlib.metadata.version("jaxlib").startswith(("0.10.", "0.11.0")):
 # is also their cache folder, as what a user compiled by `jaxbeam native` must not change a test.
 if "PYTEST_XDIST_WORKER" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="compiled", ignore_cleanup_errors=True)
-    os.environ["XDG_CACHE_HOME"] = _cache.name
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _cache.name)
+    os.environ["XDG_CACHE_HOME"] = os.path.abspath(os.environ["JAX_COMPILATION_CACHE_DIR"])
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 

@@ -1,13 +1,15 @@
-"""Old names of public functions, keyword arguments and words; each works, with a warning."""
+"""Old names of public functions, keyword arguments and attributes; each works, with a warning."""
 
 import functools
-import warnings
 from collections.abc import Callable, Mapping
 from typing import TypeVar, cast
 
-Target = TypeVar("Target", bound=Callable)
+from jaxbeam.case.aliases import renamed_property, warn_renamed
 
-# Old name in the package `tuning`: the name that took its place.
+Target = TypeVar("Target", bound=Callable)
+Class = TypeVar("Class", bound=type)
+
+# Old name in the package `tuning`: the name that replaced it.
 OLD_NAMES = {
     "Belief": "Prior",
     "Stable": "StabilityConstraint",
@@ -21,15 +23,10 @@ OLD_NAMES = {
 }
 
 
-def warn_of_old_name(old: str, new: str, stacklevel: int = 3) -> None:
-    """Warn that a name is out of use, and which one took its place."""
-    warnings.warn(f"{old} is now called {new}", DeprecationWarning, stacklevel=stacklevel)
-
-
 def accepts_old_arguments(**new_names: str) -> Callable[[Target], Target]:
     """Decorator for a function, or a class, that takes old keyword arguments as well.
 
-    `new_names` gives the keyword argument that took the place of each old one.
+    `new_names` gives the keyword argument that replaced each old one.
     """
 
     def decorate(target: Target) -> Target:
@@ -40,8 +37,8 @@ def accepts_old_arguments(**new_names: str) -> Callable[[Target], Target]:
             for old in new_names.keys() & options.keys():
                 new = new_names[old]
                 if new in options:
-                    raise TypeError(f"{old} is now called {new}: give one of them, not both")
-                warn_of_old_name(f"the argument {old} of {target.__name__}", new)
+                    raise TypeError(f"{old} is called {new} now: give one of them, not both")
+                warn_renamed(f"the argument {old} of {target.__name__}", new)
                 options[new] = options.pop(old)
             return function(*given, **options)
 
@@ -53,9 +50,20 @@ def accepts_old_arguments(**new_names: str) -> Callable[[Target], Target]:
     return decorate
 
 
+def has_old_attributes(**new_names: str) -> Callable[[Class], Class]:
+    """Decorator for a class with old attributes; `new_names` gives those that replaced them."""
+
+    def decorate(target: Class) -> Class:
+        for old, new in new_names.items():
+            setattr(target, old, renamed_property(old, new))
+        return target
+
+    return decorate
+
+
 def current_word(word: str, new_words: Mapping[str, str], what: str) -> str:
-    """The word, or the one that took its place, with a warning; `what` says what it is for."""
+    """The word, or the one that replaced it, with a warning; `what` says what it is for."""
     if word not in new_words:
         return word
-    warn_of_old_name(f"{what} {word!r}", repr(new_words[word]), stacklevel=4)
+    warn_renamed(f"{what} {word!r}", repr(new_words[word]), stacklevel=4)
     return new_words[word]

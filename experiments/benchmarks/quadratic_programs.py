@@ -36,7 +36,7 @@ from experiments.benchmarks.common import (
     time_call,
 )
 from experiments.benchmarks.controller_steps import PREDICTIVE, patch_case
-from jaxbeam.control import SamplingWarning
+from jaxbeam.control.optimal.sampling_loss import SamplingWarning
 from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.compiling import compiled
@@ -59,19 +59,18 @@ def crossing_programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
         for kind in (ContactLossWarning, SamplingWarning):
             warnings.simplefilter("ignore", kind)
         record = jb.simulate(case, tolerance=1e-4)
-    law, _ = case.controller.init(state_space(case))
-    design = law.design
+    law = case.controller.law(state_space(case)).law
     states = jnp.concatenate([record.coordinates, record.rates], axis=1)
     before = jnp.concatenate([jnp.zeros((1, 1)), record.command[:-1]])
 
     @compiled
-    def program(design, state, last, before):
-        predicted_state = design.plant.A @ last + design.plant.B @ before
-        prediction_inputs = jnp.concatenate([state, state - predicted_state, before, jnp.ones(1)])
-        return case.controller.program(design, design.prediction, prediction_inputs, before)
+    def program(law, state, last, before):
+        predicted_state = law.sampled_plant.A @ last + law.sampled_plant.B @ before
+        known = jnp.concatenate([state, state - predicted_state, before, jnp.ones(1)])
+        return law.quadratic_program(law.prediction, known, before)
 
     last = jnp.concatenate([jnp.zeros((1, states.shape[1])), states[:-1]])
-    found = [program(design, *each) for each in zip(states, last, before, strict=True)]
+    found = [program(law, *each) for each in zip(states, last, before, strict=True)]
     H, f, M, gamma = (np.array(part) for part in zip(*found, strict=True))
     return H[0], f, M[0], gamma
 

@@ -22,7 +22,7 @@ import numpy as np
 
 import jaxbeam as jb
 from experiments.benchmarks.common import parser, print_row, print_table
-from jaxbeam.control.optimal.lqr import finite_horizon_gains
+from jaxbeam.control.optimal.crossing_lqr import finite_horizon_gains
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.riccati import lqr
 from jaxbeam.runtime.compiling import xla_options

@@ -85,12 +85,12 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
         rows.append((name, timing, float(error)))
 
     add_row("jaxbeam", by_jaxbeam, REPEATS)
-    if native_library.compiler() is None:
+    if native_library.find_compiler() is None:
         print("jaxbeam native is left out: there is no C compiler")
     else:
         with tempfile.TemporaryDirectory() as folder:
             with with_cache_folder(folder):
-                native_peaks.build()
+                native_peaks.LIBRARY.build()
 
             def by_native_steps():
                 with with_cache_folder(folder):

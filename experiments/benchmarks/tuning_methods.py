@@ -50,7 +50,7 @@ def tuning_problem() -> tuple[jb.Case, dict[str, tuple[float, float]]]:
     """The case to tune, and its free values with their bounds."""
     shares = np.linspace(0.0, 1.0, BREAKPOINTS)
     values = [np.interp(shares, *table) for table in INITIAL_TABLES["B"]]
-    law = jb.Passage(gates=GATES, shares=shares, values=values, period=PERIOD, lead=LEAD)
+    law = jb.Feedforward(gates=GATES, shares=shares, values=values, period=PERIOD, lead=LEAD)
     case = jb.replace(rigs.load("B"), {"loads.0.entry_time": ENTRY_TIME})
     case = dataclasses.replace(case, controller=law, run=jb.Run(duration=1.4, sample_rate=200.0))
     free = {f"controller.values.0.{k}": COMMAND_LIMITS for k in range(BREAKPOINTS)}

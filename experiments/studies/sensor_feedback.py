@@ -42,7 +42,7 @@ from experiments.thesis.cases import with_modes
 from experiments.thesis.chapter6.patch_rigs import with_feedback
 from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.analysis.stability import frozen_poles
-from jaxbeam.case.case import known_case
+from jaxbeam.case.case import concrete_case
 from jaxbeam.model.modes import mesh_layout
 from tuning.control.fixed_design import with_fixed_design
 from tuning.control.load_cases import run_case
@@ -148,7 +148,7 @@ def worst_real_parts(rig: str, case: jb.Case) -> tuple[float, float]:
     return worst(laws), worst([zero_table])
 
 
-def largest_real_part(bench: jb.Case, law: jb.Relief, load: dict[str, float]) -> float:
+def largest_real_part(bench: jb.Case, law: jb.InternalModel, load: dict[str, float]) -> float:
     """Largest real part (1/s) along one crossing, on beams as designed for, stiffer and softer."""
     case = run_case(dataclasses.replace(bench, controller=law), load)
     span = float(case.beam.length) / load["loads.0.speed"]
@@ -157,7 +157,7 @@ def largest_real_part(bench: jb.Case, law: jb.Relief, load: dict[str, float]) ->
     real_parts = []
     for factor in (1.0, *RIGIDITY_ERRORS.values()):
         plant = jb.replace(case, {RIGIDITY: factor * design[RIGIDITY]})
-        plant = with_fixed_design(plant, design, mesh_layout(known_case(plant)))
+        plant = with_fixed_design(plant, design, mesh_layout(concrete_case(plant)))
         real_parts.append(frozen_poles(plant, times).largest_real_part.max())
     return float(max(real_parts))
 

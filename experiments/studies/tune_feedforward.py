@@ -37,10 +37,10 @@ SAMPLE_RATE = {"B": 200.0, "C": 100.0}  # Hz: enough for a smooth peak
 MODES = 3  # of the model in tuning; the studies use those of the rig
 
 
-def initial_law(rig: str) -> jb.Passage:
+def initial_law(rig: str) -> jb.Feedforward:
     """The law that tuning starts from on rig B or C."""
     shares = np.linspace(0.0, 1.0, BREAKPOINTS[rig])
-    return jb.Passage(
+    return jb.Feedforward(
         gates=GATES,
         shares=shares,
         values=[np.interp(shares, *table) for table in INITIAL_TABLES[rig]],

@@ -60,13 +60,13 @@ def with_noise_and_filters(rig: str, case: jb.Case, seed: int = 0) -> jb.Case:
     return dataclasses.replace(case, sensors=tuple(sensors), run=run)
 
 
-def initial_law(rig: str) -> jb.Relief:
+def initial_law(rig: str) -> jb.InternalModel:
     """The law that tuning starts from on rig B or C: a table that is steep, then flat."""
     saturation_reading, below, above = INITIAL_TABLE[rig]
     readings = READING_BREAKPOINTS[rig]
     row = np.interp(readings, [-saturation_reading, 0.0, saturation_reading], [below, 0.0, above])
     actuators = len(rigs.load(rig).actuators)
-    return jb.Relief(
+    return jb.InternalModel(
         readings=readings,
         values=[row] * actuators,
         notches=NOTCHES[rig],
@@ -92,7 +92,7 @@ def shifted_tables(readings: np.ndarray) -> list[dict[str, float]]:
     ]
 
 
-def stability_constraint(law: jb.Relief) -> tuning.StabilityConstraint:
+def stability_constraint(law: jb.InternalModel) -> tuning.StabilityConstraint:
     """Bound on the real parts of poles along crossings, with either slope of the table at rest.
 
     The loads are slow: fast ones of half the beam's mass move poles to the right without control.

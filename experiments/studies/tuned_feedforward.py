@@ -81,7 +81,7 @@ def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
     )
 
 
-def with_bench_delay(law: jb.Passage, extra_delay: float = 0.0) -> jb.Passage:
+def with_bench_delay(law: jb.Feedforward, extra_delay: float = 0.0) -> jb.Feedforward:
     """The law with the delay of the bench, compensated by an equal lead.
 
     `extra_delay` (s) is not compensated.

@@ -19,7 +19,7 @@ from experiments.validation.check import Check, max_entrywise_error, max_relativ
 from jaxbeam import rigs
 from jaxbeam.analysis.bound.input_influence import input_influence
 from jaxbeam.case.filters import filter_history, second_order_sections, steady_filter_state
-from jaxbeam.estimation import kalman_gain, sampled_kalman_gain
+from jaxbeam.estimation.gains import kalman_gain, sampled_kalman_gain
 from tests import loop_as_oracle
 
 
@@ -41,7 +41,7 @@ def loops() -> Iterator[Check]:
     A, B = np.asarray(plant.unloaded.A), np.asarray(plant.unloaded.B)
     Q, R = np.diag([1e6] * 3 + [1.0] * 3), np.array([[1e-4]])
     P = scipy.linalg.solve_continuous_are(A, B, Q, R)
-    gain = jb.LQR(state_weight=np.diag(Q), command_weight=np.diag(R)).gains(plant)
+    gain = jb.LQR(state_weight=np.diag(Q), command_weight=np.diag(R)).time_invariant_gain(plant)
     yield Check(
         "gain of the regulator",
         "scipy, algebraic Riccati equation",

@@ -1,7 +1,7 @@
-"""Several controllers on the same case, beside no control and the best that is possible.
+"""Comparison of controllers on one case, with the uncontrolled run and the least achievable peak.
 
-To add a figure of merit, give `PerformanceMetrics` a field, `performance_metrics` its value and the table of
-`jaxbeam compare` (in `cli.compare`) a column.
+A new metric takes a field of `PerformanceMetrics`, its value in `performance_metrics`, and a column
+and a key in `jaxbeam.cli.compare`.
 """
 
 import dataclasses
@@ -14,24 +14,24 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, Bound, bound
-from jaxbeam.analysis.computing_time import ComputingTimes, computing_times
 from jaxbeam.analysis.crossing_margin import StabilityMargin, stability_margin
 from jaxbeam.analysis.limit_cycles import CommandOscillation, command_oscillations
-from jaxbeam.case.case import Case
+from jaxbeam.case.aliases import renamed_property
+from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.loads import trajectory
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
 
 class PerformanceMetrics(NamedTuple):
-    """How a controller does on a case; deflections are those of the sensor where they are largest.
+    """Performance metrics of a controller on a case.
 
-    Peak (m), at samples and in between; root mean square (m) over the run; largest deflection (m)
-    after the last load has left, NaN if the run ends before; effort of each actuator (the integral
-    of its squared command); share of the run that each spends at a limit; times (s) that steps take
-    to compute; share of the attainable reduction of the peak; stability margins; and how each
-    command swings more often than the beam does without control.
+    Deflections are those at the sensors, the largest of all: `peak` (m) in continuous time, `rms`
+    (m) over the samples of the run, `after_exit` (m) the largest after the last load has left, NaN
+    if the run ends before. For each actuator `effort` is the integral of the squared command over
+    the run (command^2 s), `saturated` the share of samples at a limit. `share` is that of the
+    attainable reduction of the peak (see `Bound.share`), `stability_margin` the margin along the
+    crossing, `limit_cycles` the oscillation of each command.
     """
 
     peak: float
@@ -39,16 +39,18 @@ class PerformanceMetrics(NamedTuple):
     after_exit: float
     effort: Float[np.ndarray, " actuator"]
     saturated: Float[np.ndarray, " actuator"]
-    step_times: ComputingTimes
     share: float
-    reserve: StabilityMargin
-    swings: tuple[CommandOscillation, ...]
+    stability_margin: StabilityMargin
+    limit_cycles: tuple[CommandOscillation, ...]
+
+    reserve = renamed_property("reserve", "stability_margin")
+    swings = renamed_property("swings", "limit_cycles")
 
 
 class Comparison(eqx.Module):
-    """What `compare` returns: the bound, and by name records and merits of the controllers.
+    """Result of `compare`: records and metrics of the controllers by name, and the bound.
 
-    `uncontrolled` is the run without control, `optimal` that with the commands of the `bound`.
+    `uncontrolled` is the run without controller, `optimal` the run with the commands of the bound.
     """
 
     case: Case
@@ -58,26 +60,34 @@ class Comparison(eqx.Module):
     metrics: dict[str, PerformanceMetrics]
     bound: Bound
 
+    free = renamed_property("free", "uncontrolled")
+    best = renamed_property("best", "optimal")
+    merits = renamed_property("merits", "metrics")
+    loop = renamed_property("loop", "loop_summary")
+
     def loop_summary(self, name: str) -> str:
-        """In words: how much a controller is at its limits, and whether its loop holds still."""
-        merits = self.metrics[name]
+        """Sentence on saturation, instability under stationary loads and oscillation of commands.
+
+        Empty if there is none of them.
+        """
+        metrics = self.metrics[name]
         parts = []
-        if merits.saturated.any():
-            shares = ", ".join(f"{share:.1%}" for share in merits.saturated)
-            parts.append(f"at its limits {shares} of the run")
-        unstable = merits.reserve.unstable
+        if metrics.saturated.any():
+            shares = ", ".join(f"{share:.1%}" for share in metrics.saturated)
+            parts.append(f"at the limits {shares} of the run")
+        unstable = metrics.stability_margin.unstable
         if unstable is not None:
             parts.append(
-                f"unstable with the loads parked where they are from t = {unstable.start:.3g} to"
-                f" {unstable.end:.3g} s: deviations grow by {unstable.rate:.3g} 1/s at {unstable.frequency:.3g}"
-                " Hz, so lower the gains, or shorten filters and delays"
+                f"unstable with stationary loads at their positions of t = {unstable.start:.3g} to"
+                f" {unstable.end:.3g} s: deviations grow by {unstable.rate:.3g} 1/s at"
+                f" {unstable.frequency:.3g} Hz, so lower the gains, or shorten filters and delays"
             )
-        for i, one in enumerate(merits.swings):
-            if one.oscillates:
-                how = "in a limit cycle" if one.limit_cycle else "to and fro"
+        for i, oscillation in enumerate(metrics.limit_cycles):
+            if oscillation.oscillates:
+                how = "is in a limit cycle" if oscillation.limit_cycle else "oscillates"
                 parts.append(
-                    f"command {i} swings {how}, {one.extra} times more than the beam without"
-                    f" control, at {one.frequency:.3g} Hz"
+                    f"command {i} {how}, with {oscillation.extra} turning points more than the"
+                    f" uncontrolled deflection, at {oscillation.frequency:.3g} Hz"
                 )
         return "; ".join(parts)
 
@@ -85,14 +95,14 @@ class Comparison(eqx.Module):
 def compare(
     case: Case, controllers: dict[str, AbstractController], period: float | None = None
 ) -> Comparison:
-    """Run several controllers on the same case, and the commands that attain its bound.
+    """Simulate a case under controllers, without control, and with the commands of its bound.
 
-    The bound is for commands held over `period` (s), by default the shortest of the controllers'
-    own, or 0.01 s; it holds for those that begin at its multiples. The case's own controller is
-    left out unless it is among those given. Loads that would have to pull are named by the verdicts
-    of the records, not by warnings.
+    The bound is that of commands held over `period` (s), by default the shortest period of the
+    controllers, or 0.01 s, starting at its multiples. A controller of the case itself is left out
+    unless it is given too. Contact loss is in the verdicts of the records; there is no warning.
 
-    Raises ValueError for a case that is faulty, with one of the controllers (named) or for a bound.
+    Raises ValueError without controllers, for a case that is invalid with one of them (which it
+    names), and as `bound`.
     """
     if not controllers:
         raise ValueError("there is nothing to compare: give at least one controller")
@@ -113,11 +123,11 @@ def compare(
 
 
 class MetricsOverCases(NamedTuple):
-    """How a controller does over several load cases.
+    """Performance metrics of a controller over several load cases.
 
-    Its largest peak (m); the least and the mean share of the attainable reduction; the largest
-    deflection (m) after the last exit, NaN if a run ends before; the largest share of a run that an
-    actuator spends at a limit.
+    `peak` (m), `after_exit` (m, NaN if a run ends before the last exit) and `saturated` (share of a
+    run that an actuator is at a limit) are the largest of all cases, `worst_share` and
+    `mean_share` the least and the mean share of the attainable reduction.
     """
 
     peak: float
@@ -128,17 +138,17 @@ class MetricsOverCases(NamedTuple):
 
 
 def metrics_over_cases(comparisons: Sequence[Comparison]) -> dict[str, MetricsOverCases]:
-    """By controller, how it does over comparisons of the same controllers on several load cases."""
+    """Metrics by controller over comparisons of the same controllers on several load cases."""
     table = {}
     for name in comparisons[0].metrics:
-        metrics = [one.metrics[name] for one in comparisons]
-        shares = [merits.share for merits in metrics]
+        metrics = [comparison.metrics[name] for comparison in comparisons]
+        shares = [one.share for one in metrics]
         table[name] = MetricsOverCases(
-            peak=float(np.max([merits.peak for merits in metrics])),
+            peak=float(np.max([one.peak for one in metrics])),
             worst_share=float(np.min(shares)),
             mean_share=float(np.mean(shares)),
-            after_exit=float(np.max([merits.after_exit for merits in metrics])),
-            saturated=float(np.max([merits.saturated for merits in metrics])),
+            after_exit=float(np.max([one.after_exit for one in metrics])),
+            saturated=float(np.max([one.saturated for one in metrics])),
         )
     return table
 
@@ -153,21 +163,16 @@ def _simulate_with(case: Case, name: str, controller: AbstractController) -> Rec
 def performance_metrics(
     record: Record, uncontrolled: Record, least_peak: Bound
 ) -> PerformanceMetrics:
-    """The merits of a run, held against the run without control and the bound of its case."""
+    """Metrics of a run, given the uncontrolled run and the bound of its case."""
     deflection, times = np.asarray(record.deflection), np.asarray(record.times)
-    exit_times = [
-        trajectory(load, record.case.beam.length).entry_exit_times()[1]
-        for load in record.case.loads
-    ]
-    after_exit = np.abs(deflection[times > max(float(end) for end in exit_times)])
+    after_exit = np.abs(deflection[times > crossing_times(record.case)[:, 1].max()])
     return PerformanceMetrics(
         peak=float(np.max(record.peak_deflection)),
         rms=float(np.sqrt(np.mean(deflection**2, axis=0)).max()),
         after_exit=float(after_exit.max()) if after_exit.size else np.nan,
         effort=np.asarray(record.effort),
         saturated=np.asarray(record.saturated).mean(axis=0),
-        step_times=computing_times(record),
         share=least_peak.share(record),
-        reserve=stability_margin(record.case),
-        swings=command_oscillations(record, uncontrolled),
+        stability_margin=stability_margin(record.case),
+        limit_cycles=command_oscillations(record, uncontrolled),
     )

@@ -1,4 +1,4 @@
-"""How far a closed loop is from instability along a crossing, in one pair of numbers; or beyond."""
+"""Stability margin along a crossing: the smallest over positions of stationary loads."""
 
 import dataclasses
 from typing import NamedTuple
@@ -10,20 +10,20 @@ import numpy as np
 from jaxbeam.analysis.frozen_loop import LoopDynamics, loop_dynamics
 from jaxbeam.analysis.linearised_loop import LinearisedLoop, linearise, loop_timing
 from jaxbeam.analysis.margins import margins
-from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.case import Case, concrete_case, crossing_times
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import trajectory
-from jaxbeam.control import MPC
+from jaxbeam.control.predictive.mpc import MPC
 from jaxbeam.model.modes import mesh_layout
 
-LOAD_POSITIONS = 13  # of the loads along a crossing, at which margins are looked for
-MIN_RATE = 1e-6  # 1/s: what moves at a smaller rate neither grows nor dies out
+LOAD_POSITIONS = 13  # load positions along a crossing at which margins are computed
+MIN_RATE = 1e-6  # 1/s; a pole whose real part is smaller counts as marginally stable
 
 
 class UnstableInterval(NamedTuple):
-    """Where a loop is unstable with its loads parked: at their places from `start` to `end` (s).
+    """Time interval in which a loop with stationary loads at their positions is unstable.
 
-    `rate` (1/s) is the fastest growth of small deviations, at a `frequency` (Hz).
+    From the first such time, `start` (s), to the last, `end` (s). `rate` (1/s) is the largest real
+    part of the poles in between, `frequency` (Hz) that of its pole.
     """
 
     start: float
@@ -33,12 +33,11 @@ class UnstableInterval(NamedTuple):
 
 
 class StabilityMargin(NamedTuple):
-    """How much more gain (a factor) and delay (s) a loop bears at any one of its commands.
+    """Gain margin (factor) and delay margin (s) at one command, the smallest along the crossing.
 
-    The loads are parked, in several places along the crossing, of which the worst counts; a law
-    that is not linear is taken as it answers small deviations from the rest under these loads, and
-    limits of the actuators are left out. Both are zero where the loop is `unstable` as it is, and
-    NaN where `obstacle` says why there are none.
+    Loads are stationary, at LOAD_POSITIONS positions; a nonlinear law is linearised about the
+    equilibrium under them, and limits of the actuators are left out. Both margins are zero if the
+    loop is `unstable`, NaN if there are none, with the reason in `obstacle`.
     """
 
     gain: float
@@ -48,16 +47,16 @@ class StabilityMargin(NamedTuple):
 
 
 def stability_margin(case: Case) -> StabilityMargin:
-    """The stability margins of the loop of a case, the worst along the crossing.
+    """Stability margin of the closed loop of a case, the smallest along the crossing.
 
-    Parked loads lack the terms of their motion, which act as damping of either sign: what those do
-    within a crossing is for `stability.growth` to tell, a margin belongs to a loop that stays.
+    Stationary loads lack the velocity terms of moving ones, which act as damping of either sign;
+    `stability.growth` includes these.
     """
     controller = case.controller
     if controller is None or controller.open_loop:
         return _no_margin("commands that do not depend on readings close no loop")
     if isinstance(controller, MPC) and controller.solver != "unconstrained":
-        return _no_margin("a law that heeds limits bends at them: no linear loop stands for it")
+        return _no_margin("a constrained MPC law is not linear at its limits")
     try:
         timing = loop_timing(case)
     except ValueError as error:
@@ -69,10 +68,10 @@ def stability_margin(case: Case) -> StabilityMargin:
             linearise(_with_stationary_loads(loop, t), timing, jnp.asarray(t))
         )
         if not np.all(np.isfinite(stationary.closed_matrix)):
-            return _no_margin("the law finds no rest under loads that are parked")
+            return _no_margin("the law has no equilibrium under stationary loads")
         rightmost = complex(stationary.poles()[0])
         if abs(rightmost.real) < MIN_RATE:
-            return _no_margin("a part of the loop, as a mode without damping, never comes to rest")
+            return _no_margin("the loop has a marginally stable pole, as of a mode without damping")
         if rightmost.real > 0:
             unstable.append((float(t), rightmost.real, abs(rightmost.imag) / (2 * np.pi)))
         loops.append(stationary)
@@ -81,7 +80,7 @@ def stability_margin(case: Case) -> StabilityMargin:
         return StabilityMargin(
             0.0, 0.0, "", UnstableInterval(unstable[0][0], unstable[-1][0], rate, frequency)
         )
-    with np.errstate(divide="ignore"):  # a loop without gain bears any
+    with np.errstate(divide="ignore"):  # infinite margin of a loop without gain
         margins_found = [margins(one, i) for one in loops for i in range(len(case.actuators))]
     return StabilityMargin(
         min(one.gain for one in margins_found), min(one.delay for one in margins_found)
@@ -93,7 +92,7 @@ def _no_margin(obstacle: str) -> StabilityMargin:
 
 
 def _with_stationary_loads(loop: LoopDynamics, t: float) -> LoopDynamics:
-    """The loop with its loads at rest where they are at t (s)."""
+    """Loop with stationary loads at their positions of t (s)."""
     loop, zero = loop.freeze_loads(jnp.asarray(t)), jnp.zeros(())
     stationary = tuple(
         dataclasses.replace(load, speed=zero, acceleration=zero)
@@ -103,7 +102,7 @@ def _with_stationary_loads(loop: LoopDynamics, t: float) -> LoopDynamics:
 
 
 def _without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:
-    """A sampled loop without what stays as it is from tick to tick, such as a law's counters."""
+    """Sampled loop without constant states, such as those of a completed load identification."""
     if loop.period is None:
         return loop
     size = loop.A.shape[0]
@@ -115,9 +114,8 @@ def _without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:
 
 
 def _crossing_times(case: Case) -> np.ndarray:
-    """Instants (s) from the first entry to the last exit, or the end of the run."""
+    """Times (s) from the first entry to the last exit, at most the end of the run."""
     if not case.loads:
         return np.zeros(1)
-    windows = [trajectory(load, case.beam.length).entry_exit_times() for load in case.loads]
-    entries, exits = concrete(jnp.array(windows)).T
+    entries, exits = crossing_times(case).T
     return np.linspace(entries.min(), min(exits.max(), concrete(case.run.duration)), LOAD_POSITIONS)

@@ -16,7 +16,9 @@ from numpy.typing import ArrayLike
 from jaxbeam.analysis.crossing_margin import stability_margin
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import concrete
-from jaxbeam.control import Feedback, Recognition, ScheduledFeedback
+from jaxbeam.control.feedback import Feedback
+from jaxbeam.control.load_identification import LoadIdentification
+from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from jaxbeam.model.statics import influence_line, static_deflection_per_command
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
@@ -117,7 +119,7 @@ def scheduled_controller(
     case: Case,
     best: list[BestGain],
     between: str = "interpolated",
-    load_identification: Recognition | None = None,
+    load_identification: LoadIdentification | None = None,
 ) -> ScheduledFeedback:
     """The controller with the gains that `best_gains` found for a case, all else as in its own.
 
@@ -132,7 +134,7 @@ def scheduled_controller(
         gains=[[each.gain for each in best]] * len(case.actuators),
         power=controller.power,
         between=between,
-        recognition=load_identification,
+        load_identification=load_identification,
         period=controller.period,
         delay=controller.delay,
         resolution=controller.resolution,

@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.controller import Measurement
+from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
 from jaxbeam.case.trajectory import NEVER, AbstractTrajectory
 from jaxbeam.model.modal_model import compiled_modal_model
 from jaxbeam.model.modes import Layout
@@ -59,14 +59,14 @@ class FrozenTrajectory(AbstractTrajectory):
 class LoopDynamics(eqx.Module):
     """The plant with the filters of its sensors, and the law, as functions of their states.
 
-    `augmented_plant` is the plant with those filters as further states, `output_rows` what the sensors see of it;
-    `initial_memory` is the law's at the start, of which only the leaves that `changes` marks ever change.
+    `augmented_plant` is the plant with those filters as further states, `output_rows` are rows on
+    its states of the inputs of the sensors.
     """
 
     plant: Plant
     augmented_plant: Plant
     output_rows: Float[Array, "sensor state"]
-    initial_memory: Any
+    law: AbstractSampledLaw | AbstractContinuousLaw
 
     def freeze_loads(self, t) -> "LoopDynamics":
         """The same with the loads stopped in mid-motion."""
@@ -84,24 +84,21 @@ class LoopDynamics(eqx.Module):
         States of its own that a law has are the last, about those at the start of a run.
         """
         system, command_count = self.augmented_plant.at(t), len(self.plant.case.actuators)
-        controller, size = self.plant.case.controller, system.A.shape[0]
-        zero_command = jnp.zeros(command_count)
+        size, zero_command = system.A.shape[0], jnp.zeros(command_count)
 
-        def control_law(state, limited):
-            # The sensors are ideal here; what filters of the law's own give follows.
+        def measure(state):
+            # Sensors are ideal in continuous time; outputs of the law's filters follow.
             inner, own = state[:size], state[size:]
-            measurement = self._measurement(
-                self._sensor_inputs(inner, zero_command, t), inner, zero_command
-            )
-            return controller.flow(self.initial_memory, own, measurement, t, limited)
+            readings = self._sensor_inputs(inner, zero_command, t)
+            return own, self._measurement(readings, inner, zero_command)
 
         def command(state):
-            return control_law(state, lambda wanted: wanted)[0]
+            return self.law.command(*measure(state), t)
 
         def rates(state, given):
-            return control_law(state, lambda wanted: given)[1]
+            return self.law.rates(*measure(state), given, t)
 
-        controller_states = controller.own_states(self.initial_memory)
+        controller_states = self.law.state_count
         zero_state = jnp.zeros(size + controller_states)
         controller_rows, controller_inputs = jax.jacfwd(rates, argnums=(0, 1))(
             zero_state, zero_command
@@ -133,7 +130,7 @@ class LoopDynamics(eqx.Module):
                 state,
                 filters,
                 signal_history,
-                self._state_of_memory(self.initial_memory),
+                self.law.initial_state(),
                 command_queue,
             )
         )
@@ -144,7 +141,7 @@ class LoopDynamics(eqx.Module):
         The commands given are used in place of those of the law. Moving loads are followed in
         `substeps` between any two changes of the command.
         """
-        plant_state, filters, signal_history, controller_memory, command_queue = state
+        plant_state, filters, signal_history, law_state, command_queue = state
         case, signal_history, states, readings = self.plant.case, list(signal_history), [], []
         whole_periods, share, _ = _split_delay(timing.delay / timing.period)
         signals = self._sensor_inputs(plant_state, command_queue[whole_periods], t)
@@ -163,13 +160,8 @@ class LoopDynamics(eqx.Module):
             states.append(after)
             signal_history[i] = signal_history[i][:history_length]
         readings = jnp.stack(readings) if readings else jnp.zeros(0)
-        controller_command, controller_memory = self._controller_step(
-            self._memory_with_state(controller_memory),
-            readings,
-            plant_state,
-            command_queue[whole_periods],
-            t,
-        )
+        measurement = self._measurement(readings, plant_state, command_queue[whole_periods])
+        controller_command, law_state, _ = self.law.step(law_state, measurement, t)
         command_queue = jnp.concatenate(
             [(controller_command if command_given is None else command_given)[None], command_queue]
         )
@@ -192,7 +184,7 @@ class LoopDynamics(eqx.Module):
             plant_state,
             states,
             signal_history,
-            self._state_of_memory(controller_memory),
+            law_state,
             command_queue[: whole_periods + 1],
         ), controller_command
 
@@ -225,41 +217,9 @@ class LoopDynamics(eqx.Module):
         )
         return jnp.where(has_feedthrough, accelerations, signals)
 
-    def _controller_step(self, memory, readings, state, command, t):
-        measurement = self._measurement(readings, state, command)
-        return self.plant.case.controller.step(memory, measurement, t)
-
     def _measurement(self, readings, state, command):
         model_state = self.augmented_plant.to_modal(state)[: self.plant.modal_model.state_count]
         return Measurement(readings, self.plant.from_modal(model_state), command)
-
-    def _changing_leaves(self) -> list[bool]:
-        """Which leaves of the law's memory its steps change; the others are its design."""
-        case, leaves = self.plant.case, jax.tree.leaves(self.initial_memory)
-        state = jnp.zeros(self.augmented_plant.modal_model.state_count)
-        readings, command = jnp.zeros(len(case.sensors)), jnp.zeros(len(case.actuators))
-
-        def after(leaves):
-            memory = jax.tree.unflatten(jax.tree.structure(self.initial_memory), leaves)
-            return jax.tree.leaves(
-                self._controller_step(memory, readings, state, command, jnp.zeros(()))[1]
-            )
-
-        traced = jax.make_jaxpr(after)(leaves).jaxpr
-        return [a is not b for a, b in zip(traced.invars, traced.outvars, strict=True)]
-
-    def _state_of_memory(self, memory):
-        """The leaves of a memory of the law that its steps change."""
-        pairs = zip(jax.tree.leaves(memory), self._changing_leaves(), strict=True)
-        return [leaf for leaf, changes in pairs if changes]
-
-    def _memory_with_state(self, state):
-        """The law's memory with these leaves in place of those that change."""
-        leaves, structure = jax.tree.flatten(self.initial_memory)
-        fresh = iter(state)
-        pairs = zip(leaves, self._changing_leaves(), strict=True)
-        leaves = [next(fresh) if changes else leaf for leaf, changes in pairs]
-        return jax.tree.unflatten(structure, leaves)
 
 
 def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
@@ -270,9 +230,11 @@ def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
 @compiled
 def _loop_dynamics(case, model):
     plant = build_plant(case, model)
-    augmented_model, output_rows = with_sensor_filters(plant)
+    law = case.controller.law(plant)
+    filters = law.filters if case.controller.period is None else ()
+    augmented_model, output_rows = with_sensor_filters(plant, filters)
     augmented_plant = eqx.tree_at(lambda m: m.modal_model, plant, augmented_model)
-    return LoopDynamics(plant, augmented_plant, output_rows, case.controller.init(plant))
+    return LoopDynamics(plant, augmented_plant, output_rows, law)
 
 
 def propagate(matrix, t, duration, substeps: int, start):

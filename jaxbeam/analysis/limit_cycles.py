@@ -1,4 +1,4 @@
-"""Whether commands swing to and fro as those of an unstable loop do, and in a limit cycle."""
+"""Oscillation of commands: turning points beyond those of the uncontrolled deflection."""
 
 from typing import NamedTuple
 
@@ -7,15 +7,16 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.simulation.record import Record
 
-MIN_SWING = 0.2  # of the whole span of a history: what turns back after less has not turned
-MIN_EXTRA_SWINGS = 4  # swings more than without control: two whole cycles
+MIN_SWING = 0.2  # of the range of a history: smaller reversals are no turning points
+MIN_EXTRA_TURNS = 4  # turning points more than without control: two cycles
 
 
 class CommandOscillation(NamedTuple):
-    """How a command swings: how often more than the deflection at its sensor does without control.
+    """Oscillation of a command, compared with that of the uncontrolled deflection.
 
-    `frequency` (Hz) is that of its swings, NaN if there are not two; `at_limits` counts those that
-    end at a limit of the actuator.
+    `extra` is the number of turning points beyond those of the uncontrolled deflection, `at_limits`
+    the number of turning points at a limit of the actuator, `frequency` (Hz) that of the turning
+    points, half their rate (by the median interval), NaN if there are fewer than two.
     """
 
     extra: int
@@ -24,21 +25,20 @@ class CommandOscillation(NamedTuple):
 
     @property
     def oscillates(self) -> bool:
-        """Whether it swings to and fro at least twice, on account of the loop."""
-        return self.extra >= MIN_EXTRA_SWINGS
+        """Whether the loop makes the command oscillate for two cycles or more."""
+        return self.extra >= MIN_EXTRA_TURNS
 
     @property
     def limit_cycle(self) -> bool:
-        """Whether it is the limits that hold the swings: four or more of them end there."""
-        return self.oscillates and self.at_limits >= MIN_EXTRA_SWINGS
+        """Whether the limits bound the oscillation: four turning points or more are at a limit."""
+        return self.oscillates and self.at_limits >= MIN_EXTRA_TURNS
 
 
 def command_oscillations(record: Record, uncontrolled: Record) -> tuple[CommandOscillation, ...]:
-    """How each command of a run swings, beside the run without control.
+    """Oscillation of each command of a run, compared with the run without control.
 
-    The first command is held against the first sensor, the second against the second, and so on;
-    further ones against the last. What the passing loads themselves make a command do is left out
-    by that.
+    Command i is compared with the uncontrolled deflection at sensor i, or at the last sensor if
+    there are fewer: turning points that follow the passing loads do not count.
     """
     deflection, last = np.asarray(uncontrolled.deflection), len(uncontrolled.case.sensors) - 1
     columns = zip(np.asarray(record.command).T, np.asarray(record.saturated).T, strict=True)
@@ -54,7 +54,7 @@ def count_oscillations(
     saturated: Bool[np.ndarray, " time"],
     deflection: Float[np.ndarray, " time"],
 ) -> CommandOscillation:
-    """How a command swings, at a limit where it is `saturated`, beside a deflection of the beam."""
+    """Oscillation of a command, `saturated` where at a limit, beside an uncontrolled deflection."""
     command_turns, deflection_turns = turning_points(command), turning_points(deflection)
     gaps = np.diff(times[command_turns])
     frequency = float(1 / (2 * np.median(gaps))) if gaps.size else np.nan
@@ -66,13 +66,16 @@ def count_oscillations(
 
 
 def turning_points(history: Float[np.ndarray, " time"]) -> list[int]:
-    """Where a history turns back by more than a share of its whole span: places of its extremes."""
+    """Indices of extremes of a history, followed by a reversal of more than MIN_SWING of its range.
+
+    Empty for a history that is constant or not finite.
+    """
     if not np.all(np.isfinite(history)) or np.ptp(history) == 0:
         return []
     min_swing, turns, extreme, direction = MIN_SWING * np.ptp(history), [], 0, 0.0
     for k, value in enumerate(history):
         change = value - history[extreme]
-        if direction == 0:  # until it has moved at all
+        if direction == 0:  # no change beyond MIN_SWING so far
             if abs(change) > min_swing:
                 direction, extreme = np.sign(change), k
         elif direction * change >= 0:

@@ -1,10 +1,9 @@
-"""The closed loop made linear: how small deviations from a run go on.
+"""Linearised closed loop with frozen loads.
 
-Limits and the steps of sensors and commands are left out. A loop without a sampling period is
-z' = A z + B u, u = K z; one with a period goes from tick to tick, y_(k+1) = A y_k + B u_k, where
-y also holds what filters, estimators and laws remember and the commands that wait for their
-delay. All of it follows from the parts of the case by differentiation, so it holds for every
-controller.
+In continuous time z' = A z + B u, u = K z; with a sampling period z_(k+1) = A z_k + B u_k from
+sample to sample, where z also holds the states of filters, estimators and laws and the queue of
+delayed commands. The matrices are derivatives of the loop's dynamics, so every controller has
+them. Limits, ranges and resolution are left out.
 """
 
 import equinox as eqx
@@ -21,15 +20,15 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.compiling import compiled
 
-NEWTON_ITERATIONS = 8  # steps of Newton's method towards the state about which a law is made linear
-EIGENVALUE_OFFSET = 1e-10  # to an eigenvalue, relative: where inverse iteration is centred
+NEWTON_ITERATIONS = 8  # towards the equilibrium about which the loop is linearised
+EIGENVALUE_OFFSET = 1e-10  # of the shift of inverse iteration from an eigenvalue, relative
 
 
 class LinearisedLoop(eqx.Module):
-    """Matrices of the loop at an instant, opened at the commands: u = K z closes it.
+    """Matrices of the loop at one time, opened at the commands; u = K z closes it.
 
-    With a `period` (s) they take deviations from tick to tick. `modal_states` is the number of leading
-    states that are coordinates of modes and their rates (continuous time: in the order of
+    With a `period` (s) they are those of a sampled loop, else of a continuous one. The first
+    `modal_states` states are modal coordinates and their rates (in continuous time in the order of
     `state_space`).
     """
 
@@ -41,19 +40,19 @@ class LinearisedLoop(eqx.Module):
 
     @property
     def closed_matrix(self) -> Float[Array, "state state"]:
-        """The state matrix of the closed loop."""
+        """State matrix A + B K of the closed loop."""
         return self.A + self.B @ self.K
 
     def growth_rate(self) -> Float[Array, ""]:
-        """The largest real part of the poles in 1/s; differentiable to first order, on a CPU.
+        """Largest real part of the poles in 1/s; differentiable to first order, on a CPU.
 
-        Other poles may coincide, as those of a delay do; the rightmost must be a simple one.
+        The rightmost pole must be simple; others may coincide, as those of a delay do.
         """
         constant_matrix = jax.lax.stop_gradient(self.closed_matrix)
         values, vectors = jnp.linalg.eig(constant_matrix)
         dominant = jnp.argmax(values.real if self.period is None else jnp.abs(values))
         value, right = values[dominant], vectors[:, dominant]
-        # The left eigenvector by inverse iteration: those of other poles may not exist.
+        # Left eigenvector by inverse iteration: multiple poles may have too few eigenvectors.
         shifted = constant_matrix.T - value * (1 + EIGENVALUE_OFFSET) * jnp.eye(
             constant_matrix.shape[0]
         )
@@ -64,24 +63,23 @@ class LinearisedLoop(eqx.Module):
         return value.real if self.period is None else jnp.log(jnp.abs(value)) / self.period
 
     def poles(self) -> np.ndarray:
-        """Poles of the closed loop in 1/s, by largest real part first.
+        """Poles of the closed loop in 1/s, the largest real part first.
 
-        Those of a sampled loop are log(z) / period, with frequencies up to half the sampling's.
+        Those of a sampled loop are log(z) / period, with frequencies up to half the sampling rate.
         """
         poles = np.linalg.eigvals(concrete(self.closed_matrix)).astype(complex)
         if self.period is not None:
-            # What a delay lets vanish at once would be at minus infinity.
+            # Delays have z = 0, whose logarithm is minus infinity.
             tiny = np.finfo(float).tiny
             poles = np.log(np.where(poles == 0, tiny, poles)) / self.period
         return poles[np.argsort(-poles.real)]
 
 
 def linearised_loop(case: Case, t: float) -> LinearisedLoop:
-    """The loop of a case with its loads frozen at a time t (s), about the rest they cause there.
+    """Linearised loop of a case with loads frozen at a time t (s), about the equilibrium there.
 
-    Frozen loads keep place, speed and acceleration. A law that is not linear is made so about the
-    deflection under the frozen weights. Raises ValueError for a faulty case, one without a
-    controller, and one whose sensors are not read at the controller's own ticks.
+    Frozen loads keep position, speed and acceleration. Raises ValueError for an invalid case, one
+    without a controller, or a sensor with a sampling period other than the controller's.
     """
     timing = loop_timing(case)
     return linearise(
@@ -90,9 +88,9 @@ def linearised_loop(case: Case, t: float) -> LinearisedLoop:
 
 
 def loop_timing(case: Case) -> LoopTiming | None:
-    """Check that the loop of a case can be made linear, and give its clock, if it has one.
+    """Sampling period and delays of the loop of a case; None in continuous time.
 
-    Raises ValueError as `linearised_loop` does.
+    Raises ValueError as `linearised_loop`.
     """
     check_case(case)
     controller = case.controller
@@ -109,7 +107,7 @@ def loop_timing(case: Case) -> LoopTiming | None:
         ):
             raise ValueError(
                 f"sensors.{i}.sampling_period must be the controller's, {period:g} s, for the loop"
-                f" to repeat itself from tick to tick; it is {float(concrete(sampling_period)):g} s"
+                f" to be periodic; it is {float(concrete(sampling_period)):g} s"
             )
     sensor_delays = tuple(
         0.0 if s.delay is None else float(concrete(s.delay)) for s in case.sensors
@@ -120,7 +118,7 @@ def loop_timing(case: Case) -> LoopTiming | None:
 
 @compiled
 def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoop:
-    """A loop with its loads frozen at t (s), linear about the rest under their weights."""
+    """Loop with loads frozen at t (s), linearised about the equilibrium under their weights."""
     loop, modal_states = loop.freeze_loads(t), 2 * loop.plant.coordinate_scale.shape[0]
     if timing is None:
         A, input_matrix, weight_rates, command = loop.continuous_dynamics(t)
@@ -142,12 +140,12 @@ def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoo
 
 
 def _equilibrium(change, start):
-    """Where nothing changes, by Newton's method; the start if there is no such place near."""
+    """State of zero change, by Newton's method from a start; the start if it does not converge."""
 
     def newton_step(state, _):
         step = jnp.linalg.lstsq(jax.jacfwd(change)(state), -change(state))[0]
         return state + step, None
 
     found = jax.lax.scan(newton_step, start, length=NEWTON_ITERATIONS)[0]
-    # Where it lies moves the poles of a law that is not linear; derivatives pass over that.
+    # Derivatives of the poles by the equilibrium, non-zero for a nonlinear law, are left out.
     return jax.lax.stop_gradient(jnp.where(jnp.all(jnp.isfinite(found)), found, start))

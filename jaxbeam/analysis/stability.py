@@ -1,9 +1,9 @@
-"""Is a closed loop stable while loads cross? Frozen poles, growth, streams, margins.
+"""Stability of closed loops under moving loads.
 
-With the loads frozen the loop has poles, one set for each place of the loads. They say what a
-slow crossing does; no set of frozen poles decides what a loop that changes with time does. That
-is decided by its transition matrix: by how much a deviation can grow over the crossing, and, for
-equal loads that follow each other for ever, by the multipliers of one period (Floquet).
+Frozen poles, those of the loop with its loads frozen in one position, describe slow crossings only:
+the stability of a time-varying loop does not follow from them. It follows from the transition
+matrix: the growth of deviations over a crossing, and the Floquet multipliers of a periodic stream
+of equal loads.
 """
 
 import dataclasses
@@ -20,22 +20,20 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.analysis.frozen_loop import LoopDynamics, LoopTiming, loop_dynamics, propagate
 from jaxbeam.analysis.linearised_loop import linearise, loop_timing
-from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.case import Case, concrete_case, crossing_times
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.compiling import compiled
 
-MAX_PHASE_PER_STEP = 0.15  # rad by which the fastest mode may turn in a step along a transition
+MAX_PHASE_PER_STEP = 0.15  # rad: phase of the fastest mode per step of the transition matrix
 
 
 class FrozenPoles(NamedTuple):
-    """Poles of the closed loop with its loads frozen, at times along a run.
+    """Poles (1/s) of the closed loop with frozen loads, at `times` (s) of a run.
 
-    Column by column the poles (1/s) of one branch are followed from time to time. `largest_real_part` is
-    the largest real part at each time; above zero, the loop would be unstable if the loads
-    stopped in mid-motion there.
+    Each column of `poles` follows one branch. Where `largest_real_part` is positive, the loop with
+    loads frozen at that time is unstable.
     """
 
     times: Float[np.ndarray, " time"]
@@ -48,11 +46,11 @@ class FrozenPoles(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """How much deviations can grow from the start of a run to each of some times (s).
+    """Growth of deviations from the start of a crossing to `times` (s).
 
-    `factor` is the largest ratio of the root of mechanical energy then to that at the start,
-    over all deviations of the beam; a run of a stable beam without control stays near one or
-    below. Filters, actuators and laws start undisturbed.
+    `factor` is the largest ratio of the square root of the mechanical energy to that at the start,
+    over all initial deviations of the beam; states of filters, actuators and laws start at rest.
+    For an uncontrolled stable beam it is near one or below.
     """
 
     times: Float[np.ndarray, " time"]
@@ -60,9 +58,9 @@ class Growth(NamedTuple):
 
 
 class Stream(NamedTuple):
-    """What one period of an endless stream of equal loads multiplies deviations by.
+    """Floquet multipliers of a loop under a periodic stream of equal loads with a `period` (s).
 
-    Stable if all `multipliers` lie within the unit circle. `period` is in s.
+    The loop is stable if all `multipliers` lie within the unit circle.
     """
 
     multipliers: Complex[np.ndarray, " state"]
@@ -75,14 +73,14 @@ class Stream(NamedTuple):
 
     @property
     def stable(self) -> bool:
-        """Whether every deviation dies out."""
+        """Whether all multipliers lie within the unit circle."""
         return self.largest_multiplier < 1
 
 
 def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) -> FrozenPoles:
-    """Poles of the closed loop at ascending times (s), the loads frozen there (Figs 5.17, 5.18).
+    """Poles of the closed loop with loads frozen at ascending times (s) (Figs 5.17, 5.18).
 
-    The times are 101 over the crossing if left out. Raises ValueError as `linearised_loop`.
+    Default: 100 times of the crossing. Raises ValueError as `linearised_loop`.
     """
     timing = loop_timing(case)
     if times is None:
@@ -100,9 +98,9 @@ def _frozen_loops(loop, timing, times):
 
 
 def growth(case: Case, points: int = 100) -> Growth:
-    """The growth of deviations over a crossing, in energy, at some times from start to end.
+    """Growth of deviations over a crossing, at `points` intervals or at the sampling instants.
 
-    The loop is linear about rest, where a cubic law has no gain. Raises ValueError as
+    The loop is linearised about rest, where a cubic law has no gain. Raises ValueError as
     `linearised_loop`, and for a case without loads.
     """
     timing = loop_timing(case)
@@ -125,17 +123,17 @@ def growth(case: Case, points: int = 100) -> Growth:
 
 
 def stream(case: Case, spacing: float) -> Stream:
-    """Floquet multipliers of the loop while equal loads follow each other, `spacing` (s) apart.
+    """Floquet multipliers of the loop under a periodic stream of loads, `spacing` (s) apart.
 
-    The case has one load, which travels over the whole beam; it is repeated for ever. A law must
-    not depend on time. Raises ValueError for other cases, for a spacing that is not a whole
-    number of sampling periods, and as `linearised_loop`.
+    The load of the case, which travels over the whole beam, is repeated; a law must not depend on
+    time. Raises ValueError for a case without exactly one load, one that stays on the beam, or a
+    spacing that is not a multiple of the sampling period, and as `linearised_loop`.
     """
     timing = loop_timing(case)
     if len(case.loads) != 1:
         raise ValueError(f"a stream repeats the one load of a case; this has {len(case.loads)}")
     start, end = _crossing_interval(case)
-    if trajectory(case.loads[0], case.beam.length).entry_exit_times()[1] >= NEVER:
+    if crossing_times(case)[0, 1] >= NEVER:
         raise ValueError("the load of a stream must leave the beam; loads.0 stays on it")
     if not spacing > 0:
         raise ValueError(f"spacing must be positive, in s; it is {spacing:g}")
@@ -165,19 +163,16 @@ def stream(case: Case, spacing: float) -> Stream:
 
 
 def _crossing_interval(case: Case) -> tuple[float, float]:
-    """From the first entry to the last exit, in s; loads that stay end with the run."""
+    """First entry and last exit (s); the end of the run if a load stays."""
     if not case.loads:
         raise ValueError("there is no crossing: the case has no loads")
-    windows = [trajectory(load, case.beam.length).entry_exit_times() for load in case.loads]
-    entries, exits = concrete(jnp.array(windows)).T
-    last = min(float(exits.max()), float(concrete(case.run.duration)))
-    if exits.max() < NEVER:
-        last = float(exits.max())
-    return float(entries.min()), last
+    entries, exits = crossing_times(case).T
+    end = exits.max() if exits.max() < NEVER else concrete(case.run.duration)
+    return float(entries.min()), float(end)
 
 
 def _substeps(loop, timing, times) -> int:
-    """Substeps between any two of the times in which the fastest mode turns a little only."""
+    """Steps between two of the times, short enough for MAX_PHASE_PER_STEP."""
     fastest = float(jnp.max(loop.plant.modal_model.modes.angular_frequencies))
     longest = float(np.max(np.diff(times))) if timing is None else timing.period
     return max(1, math.ceil(fastest * longest / MAX_PHASE_PER_STEP))
@@ -185,7 +180,7 @@ def _substeps(loop, timing, times) -> int:
 
 @compiled
 def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, substeps: int):
-    """Transition matrices from the first time to each, and the energy's matrix of q and q'."""
+    """Transition matrices (time, state, state) from the first time; energy matrix of q and q'."""
     model, modes = loop.plant, loop.plant.coordinate_scale.shape[0]
     stiffness = model.modal_model.stiffness() / jnp.outer(
         model.coordinate_scale, model.coordinate_scale
@@ -208,7 +203,7 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
         transitions = jax.lax.scan(advance, start, spans)[1]
     else:
         rest_state, rebuild = loop.rest_state(timing)
-        # About rest: without the weights.
+        # Deviations from rest: weights left out.
         unweighted = eqx.tree_at(
             lambda loop: loop.augmented_plant.loads.weight,
             loop,
@@ -217,9 +212,9 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
 
         def advance_sample(whole, t):
             def after(state):
-                return ravel_pytree(unweighted.sampling_step(timing, rebuild(state), t, None, substeps)[0])[
-                    0
-                ]
+                return ravel_pytree(
+                    unweighted.sampling_step(timing, rebuild(state), t, None, substeps)[0]
+                )[0]
 
             whole = jax.jacfwd(after)(rest_state) @ whole
             return whole, whole
@@ -232,10 +227,10 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
 def _tracked_branches(
     poles: Complex[np.ndarray, "time state"],
 ) -> Complex[np.ndarray, "time state"]:
-    """The poles in columns that each follow one branch, by the nearest continuation in time."""
+    """Poles ordered so that each column follows one branch: the nearest continuation in time."""
     ordered = poles.copy()
     for i in range(1, len(ordered)):
-        # Straight ahead where two branches cross.
+        # Linear extrapolation tells branches apart where they cross.
         predicted = ordered[i - 1] if i == 1 else 2 * ordered[i - 1] - ordered[i - 2]
         distances = np.abs(predicted[:, None] - poles[i][None])
         ordered[i] = poles[i][scipy.optimize.linear_sum_assignment(distances)[1]]

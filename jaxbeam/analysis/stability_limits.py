@@ -1,4 +1,4 @@
-"""At which value of a number a loop turns unstable: margins in mass and in speed, by search."""
+"""Stability limits: the value of a number of the case at which its loop turns unstable."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,15 +10,15 @@ from jaxbeam.analysis.stability import frozen_poles, stream
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import concrete
 
-# What is above zero for an unstable case.
+# Function of a case that is positive if its loop is unstable.
 StabilityMeasure = Callable[[Case], float]
 
 
 class LoadStabilityLimits(NamedTuple):
-    """From which mass (kg) and which speed (m/s, its size) of its load a loop is unstable.
+    """Mass (kg) and speed (m/s, absolute) of a load above which a loop is unstable.
 
-    Infinite where no limit was found, zero where all that was tried is unstable; None where the
-    load has no such number.
+    Infinite if no limit was found, zero if all values tried are unstable, None if the load has no
+    such number.
     """
 
     mass: float | None
@@ -26,12 +26,12 @@ class LoadStabilityLimits(NamedTuple):
 
 
 def largest_frozen_pole(case: Case) -> float:
-    """The largest real part (1/s) of the frozen poles over the crossing."""
+    """Largest real part (1/s) of the frozen poles over the crossing."""
     return float(frozen_poles(case).largest_real_part.max())
 
 
 def stream_excess(spacing: float) -> StabilityMeasure:
-    """By how much the largest multiplier of a stream, loads a `spacing` (s) apart, exceeds one."""
+    """Stability measure: largest Floquet multiplier less one, with loads a `spacing` (s) apart."""
     return lambda case: stream(case, spacing).largest_multiplier - 1
 
 
@@ -43,14 +43,13 @@ def stability_limit(
     measure: StabilityMeasure = largest_frozen_pole,
     points: int = 25,
 ) -> float | None:
-    """The least value of a number of the case between two at which the loop turns unstable.
+    """Smallest value of a number of the case at which its loop turns unstable; None without one.
 
-    For the margin in mass or speed give `loads.0.mass` or `loads.0.speed`. `measure` is above
-    zero for an unstable case: `largest_frozen_pole`, `streaming(spacing)`, or any other, such as
-    `lambda case: growth(case).factor.max() - 10` (by choice). Values at `points` steps are tried,
-    then the first change is bracketed to 1e-6. The bounds have the sign of the number, the larger
-    size last. None if there is no such value. Raises ValueError for an address that is not there,
-    and if the case is unstable already at `low`.
+    `measure` is positive for an unstable case: `largest_frozen_pole`, `stream_excess(spacing)`, or
+    a function such as `lambda case: growth(case).factor.max() - 10`. It is evaluated at `points`
+    values from `low` to `high` in equal ratios; its first change of sign is then refined to 1e-6
+    (relative). Negative bounds are given by increasing size. Raises ValueError for an unknown
+    address, for bounds that do not ascend, and if the loop is unstable at `low`.
     """
     if not 0 < low < high and not high < low < 0:
         raise ValueError(f"low and high must be positive and ascend; they are {low:g}, {high:g}")
@@ -73,11 +72,11 @@ def load_stability_limits(
     factor: float = 10.0,
     points: int = 12,
 ) -> LoadStabilityLimits:
-    """From which mass and which speed of its first load a loop is unstable, all else kept.
+    """Mass and speed of the first load above which a loop is unstable, each with the other kept.
 
-    Tried are values up to `factor` times as large as that of the case, or, where the case is unstable
-    as it is, down to as many times smaller ones. Laws are designed anew for each. Raises ValueError
-    for a case without loads, and as `measure`.
+    The search goes up to `factor` times the value of the case, or from a `factor` below up to it if
+    the case is unstable. The law is designed anew for each value. Raises ValueError for a case
+    without loads, and as `measure`.
     """
     if not case.loads:
         raise ValueError("there is no load whose mass or speed could have a limit; add one")

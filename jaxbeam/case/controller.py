@@ -1,55 +1,123 @@
-"""What a controller is: something that turns measurements into commands, at its own pace.
+"""Controllers: the settings in a case, and the two interfaces of the control laws they design.
 
-The controllers themselves are in `control`.
+A controller holds the settings of a case file. For a plant it designs a control law, which turns
+measurements into commands: at samples, or in continuous time. Controllers are in `jaxbeam.control`.
 """
 
 import abc
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 
+Command = Float[Array, " actuator"]
+Time = Float[Array, ""]
+
 
 class Measurement(eqx.Module):
-    """What a controller may look at: the readings of the sensors, each in its own SI unit.
+    """Inputs of a control law at one time: readings of the sensors, each in its own SI unit.
 
     `state` is the true state of the plant in the order of `state_space`, for laws that assume full
-    knowledge; no sensor gives it. `command` is what the actuators have been given until now,
-    limits and resolution applied.
+    state information; no sensor measures it. `command` is the last command of the actuators, after
+    limits and resolution.
     """
 
     readings: Float[Array, " sensor"]
     state: Float[Array, " state"]
-    command: Float[Array, " actuator"]
+    command: Command
 
 
-class ControllerFilter(NamedTuple):
-    """A filter of the readings y of one sensor: x' = A x + B y, output C x + D y."""
+class ControllerFilter(eqx.Module):
+    """Filter of the readings y of one sensor in continuous time: x' = A x + B y, output C x + D y."""
 
-    sensor: int
+    sensor: int = eqx.field(static=True)
     A: Float[Array, "state state"]
     B: Float[Array, " state"]
     C: Float[Array, " state"]
     D: Float[Array, ""]
 
 
-class AbstractController(eqx.Module):
-    """Interface of all controllers.
+class ControlStep(NamedTuple):
+    """Result of one sample of a law: command, its state afterwards, and whether it was solved.
 
-    With a sampling `period` (s) a controller acts at 0, period, 2 period, ...; its command begins
-    `delay` (s) later and is held until the next one. Without a period it acts at every instant,
-    the limit of ever faster sampling; its memory then stays as it was at the start, so it must be
-    `stateless`, but for filters and states of its own, which join those of the plant. Commands are
-    rounded to `resolution` and kept within the actuators' limits by the loop. To add a controller,
-    write a file with a subclass and name it in `jaxbeam.control.KINDS`.
+    A law that solves a problem at each sample says False where it found no solution and fell back.
     """
 
+    command: Command
+    state: Any
+    solved: Bool[Array, ""] | bool = True
+
+
+class AbstractSampledLaw(eqx.Module):
+    """Control law at samples, (u_k, x_k+1) = step(x_k, y_k, t_k), with a state x of any structure.
+
+    Fields of the class are the design; they do not change during a run.
+    """
+
+    def initial_state(self) -> Any:
+        """State at the start of a run; empty for a static law."""
+        return ()
+
+    @abc.abstractmethod
+    def step(self, state: Any, measurement: Measurement, t: Time) -> ControlStep:
+        """Command, in the units of the actuators, and next state at a sample at t (s)."""
+
+
+class AbstractContinuousLaw(eqx.Module):
+    """Control law in continuous time, u = command(x, y, t), x' = rates(x, y, u, t), from x = 0.
+
+    Its states are integrated together with those of the plant. Outputs of its `filters` follow the
+    readings of the sensors in the measurement.
+    """
+
+    @property
+    def filters(self) -> tuple[ControllerFilter, ...]:
+        """Filters of single readings, integrated with the plant."""
+        return ()
+
+    @property
+    def state_count(self) -> int:
+        """Number of states x, without those of the filters."""
+        return 0
+
+    @abc.abstractmethod
+    def command(self, state: Float[Array, " own"], measurement: Measurement, t: Time) -> Command:
+        """Command at t (s), before limits, in the units of the actuators."""
+
+    def rates(
+        self, state: Float[Array, " own"], measurement: Measurement, command: Command, t: Time
+    ) -> Float[Array, " own"]:
+        """Rates of the states (1/s) under the command that the actuators receive."""
+        return jnp.zeros_like(state)
+
+
+class AbstractStaticLaw(AbstractSampledLaw, AbstractContinuousLaw):
+    """Control law without a state: the same command at samples and in continuous time."""
+
+    def step(self, state, measurement, t):
+        return ControlStep(self.command(state, measurement, t), state)
+
+
+class AbstractController(eqx.Module):
+    """Settings of a controller.
+
+    With a sampling `period` (s) its law acts at 0, period, 2 period, ...; a command begins `delay`
+    (s) later and is held until the next one. Without a period the law acts in continuous time.
+    Commands are rounded to `resolution` and kept within the limits of the actuators by the closed
+    loop. Where `nominal_plant` is given, the law is designed for that plant instead of the plant
+    of its case; no key of a case file.
+
+    To add a controller, write a file in `jaxbeam.control` with a subclass that names its `kind`.
+    """
+
+    kind: ClassVar[str]
+    open_loop: ClassVar[bool] = False  # whether the command depends on time alone
+
     period: Float[Array, ""] | None = number(
-        "s", "sampling period; at every instant if left out", POSITIVE, default=None, kw_only=True
+        "s", "sampling period; continuous time if left out", POSITIVE, default=None, kw_only=True
     )
     delay: Float[Array, ""] | None = number(
         "s", "from measurement to command", NOT_NEGATIVE, default=None, kw_only=True
@@ -57,65 +125,39 @@ class AbstractController(eqx.Module):
     resolution: Float[Array, ""] | None = number(
         "unit of a command", "step between commands", POSITIVE, default=None, kw_only=True
     )
-
-    @property
-    def stateless(self) -> bool:
-        """Whether `step` leaves the memory as it is, so that it may act at every instant."""
-        return False
-
-    @property
-    def open_loop(self) -> bool:
-        """Whether the command depends on time alone."""
-        return False
+    nominal_plant: Any = eqx.field(default=None, kw_only=True)
 
     @property
     def design_depends_on_loads(self) -> bool:
-        """Whether what `init` prepares depends on masses and weights of the loads."""
+        """Whether the design depends on masses and weights of the loads."""
         return True
 
     @abc.abstractmethod
-    def init(self, plant: Any) -> Any:
-        """Memory at the start of a run, of any structure; gains may be designed here.
+    def design_law(self, plant: Any) -> Any:
+        """Law designed for a plant, a `jaxbeam.model.state_space.Plant`.
 
-        `plant` is the `statespace.LoadedBeam` of the case.
+        An `AbstractSampledLaw` if the controller has a period, else an `AbstractContinuousLaw`.
         """
 
-    @abc.abstractmethod
-    def step(
-        self, memory: Any, measurement: Measurement, t: Float[Array, ""]
-    ) -> tuple[Float[Array, " actuator"], Any]:
-        """Commands, in the units of the actuators, at time t (s), and the memory after it."""
-
-    def own_filters(self) -> tuple[ControllerFilter, ...]:
-        """Its filters where it acts at every instant; their outputs follow the readings."""
-        return ()
-
-    def own_states(self, memory: Any) -> int:
-        """How many states of its own it has where it acts at every instant; they start at zero."""
-        return 0
-
-    def flow(
-        self,
-        memory: Any,
-        states: Float[Array, " own"],
-        measurement: Measurement,
-        t: Float[Array, ""],
-        saturate: Callable[[Array], Array],
-    ) -> tuple[Float[Array, " actuator"], Float[Array, " own"]]:
-        """Commands at every instant, and the rates of the states of its own.
-
-        `saturate` takes the commands that are wanted to those that the actuators are given.
-        """
-        return saturate(self.step(memory, measurement, t)[0]), states
+    def law(self, plant: Any) -> Any:
+        """Law designed for the nominal plant, or for the plant of the case if there is none."""
+        return self.design_law(plant if self.nominal_plant is None else self.nominal_plant)
 
     def validate(self, case: Any) -> str | None:
-        """What is wrong with it in a case, as "key must ...", before anything compiles; or None."""
+        """Error of these settings in a case, as "key must ...", or None; before any compilation."""
         return None
 
-    def failures(self, memory: Any) -> Float[Array, ""]:
-        """How many steps until now found no solution and fell back, for what solves at each."""
-        return jnp.zeros(())
-
-    def breakpoints(self, case: Any) -> Float[Array, " knot"] | None:
-        """Times (s) at which the command bends or jumps by itself in a run; steps end there."""
+    def breakpoints(self, case: Any) -> Float[Array, " breakpoint"] | None:
+        """Times (s) at which the command bends or jumps by itself; integration steps end there."""
         return None
+
+
+class AbstractStaticController(AbstractController, AbstractStaticLaw):
+    """Controller that is its own law: there is nothing to design and no state."""
+
+    @property
+    def design_depends_on_loads(self) -> bool:
+        return False
+
+    def design_law(self, plant):
+        return self

@@ -1,60 +1,91 @@
-"""What an estimator is: something that turns measurements into the state of the plant.
+"""Estimators of the state: the settings in a case, and the two interfaces of the filters.
 
-It stands in front of a law that feeds back the state. The estimators are in `estimation`.
+An estimator holds the settings of a case file. For a plant it designs a filter, which turns
+readings into an estimate of the state, at samples or in continuous time, for a law that feeds back
+the state. Estimators are in `jaxbeam.estimation`.
 """
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxbeam.case.controller import Measurement
+from jaxbeam.case.controller import Command, Measurement, Time
 
 
 class Estimate(eqx.Module):
-    """What is believed of the plant: its state, and the weights of the loads (N) if sought too.
+    """Estimate of the state of the plant, and of the weights of the loads (N) if estimated too.
 
-    The states are those of the model that the estimator was given. `weights` has one entry for
-    each load of the case, zero while it is off the beam; None leaves them to be known otherwise.
+    The state is that of the plant for which the filter is designed. `weights` has one entry for
+    each load of the case, zero while it is off the beam; None where weights are not estimated.
     """
 
     state: Float[Array, " state"]
     weights: Float[Array, " load"] | None = None
 
 
-class AbstractEstimator(eqx.Module):
-    """Interface of all estimators.
+class AbstractSampledFilter(eqx.Module):
+    """Filter at samples: (estimate, x_k+1) = update(x_k, y_k, t_k), with a state x of any structure.
 
-    They run at the sampling period of the controller that they serve, which is that of
-    `model.case.controller`. Without a period those that `flow` have a memory that is a
-    `estimation.flowing.Flowing`. To add one, write a file with a subclass and name it in
-    `jaxbeam.estimation.KINDS`.
+    Fields of the class are the design; they do not change during a run.
     """
 
-    @property
-    def continuous_time(self) -> bool:
-        """Whether it may act at every instant."""
-        return False
+    def initial_state(self) -> Any:
+        """State of the filter at the start of a run."""
+        return ()
 
     @abc.abstractmethod
-    def init(self, plant: Any) -> Any:
-        """Memory at the start of a run, of any structure; gains may be designed here.
+    def update(self, state: Any, measurement: Measurement, t: Time) -> tuple[Estimate, Any]:
+        """Estimate at a sample at t (s), and the next state of the filter."""
 
-        `plant` is the `statespace.LoadedBeam` that the controller is designed for.
+
+class AbstractContinuousFilter(eqx.Module):
+    """Filter in continuous time, x' = rates(x, y, u, t), from x = 0, integrated with the plant."""
+
+    @property
+    def state_count(self) -> int:
+        """Number of states x."""
+        return 0
+
+    @abc.abstractmethod
+    def estimate(self, state: Float[Array, " own"], measurement: Measurement, t: Time) -> Estimate:
+        """Estimate at t (s)."""
+
+    @abc.abstractmethod
+    def rates(
+        self, state: Float[Array, " own"], measurement: Measurement, command: Command, t: Time
+    ) -> Float[Array, " own"]:
+        """Rates of the states x (1/s) under a command."""
+
+
+class AbstractEstimator(eqx.Module):
+    """Settings of an estimator; it acts at the samples of its controller.
+
+    To add one, write a file in `jaxbeam.estimation` with a subclass that names its `kind`.
+    """
+
+    kind: ClassVar[str]
+    continuous_time: ClassVar[bool] = False  # whether it has a filter in continuous time
+
+    @abc.abstractmethod
+    def sampled_filter(self, plant: Any, timing: Any) -> AbstractSampledFilter:
+        """Filter at samples, designed for a `jaxbeam.model.state_space.Plant`.
+
+        `timing` is the `jaxbeam.estimation.sampled_plant.SampleTiming` of the controller.
         """
 
-    @abc.abstractmethod
-    def step(
-        self, memory: Any, measurement: Measurement, t: Float[Array, ""]
-    ) -> tuple[Estimate, Any]:
-        """The estimate at time t (s), and the memory after it; `measurement.state` is not used."""
+    def continuous_filter(self, plant: Any) -> AbstractContinuousFilter:
+        """Filter in continuous time, designed for a plant.
+
+        Raises NotImplementedError if the estimator acts at samples only.
+        """
+        raise NotImplementedError(f"{type(self).__name__} acts at samples only")
 
     def validate(self, case: Any, system: Any) -> str | None:
-        """What is wrong with it in a case, as "key must ...", before a run compiles; or None.
+        """Error of these settings in a case, as "key must ...", or None; before any compilation.
 
-        Asked twice: with None for the plant, before that is computed; then, if its numbers are
-        known (they are not inside `jit`), with the design model without loads, a
-        `statespace.StateSpace`.
+        Called twice: with None for the system; then, where all numbers are concrete (not inside
+        `jit`), with the plant of the design without loads, a `state_space.StateSpace`.
         """
         return None

@@ -15,11 +15,10 @@ def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> N
     """
     from jaxbeam.integrator import native_peaks
 
-    path = native_peaks.library_path()
     if remove:
-        native_peaks.remove()
+        path = native_peaks.LIBRARY.remove()
         line = f"removed {path}: sweeps use XLA"
     else:
-        native_peaks.build()
+        path = native_peaks.LIBRARY.build()
         line = f"compiled {path}: sweeps on this machine use it from now on"
     options.report({"path": str(path), "compiled": not remove}, [line])

@@ -111,21 +111,13 @@ class CaseOptions(OutputOptions):
 
 
 def enable_compile_cache() -> None:
-    """Keep compiled programs of this command for later ones, in the user's cache folder.
+    """Cache the compiled programs of this command for later ones.
 
-    JAX_COMPILATION_CACHE_DIR names another folder, or none if it is empty. Imports JAX (half a
-    second), so that commands call it after their checks.
+    Imports JAX (half a second), so that commands call it after their checks.
     """
-    import os
+    from jaxbeam.runtime.compile_cache import switch_on
 
-    import jax
-
-    from jaxbeam.runtime.compile_cache import cache_folder
-
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
-    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    switch_on()
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:

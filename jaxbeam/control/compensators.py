@@ -1,19 +1,26 @@
-"""Feedback of readings through a filter of each loop's own: PD, lead, positive position feedback.
+"""Collocated compensators: PD, lead, positive position feedback.
 
-Each is given by its continuous transfer function. With a period it is made sampled by the bilinear
-transform, so a stable filter stays stable at every period; without one it acts at every instant,
-and its states join those of the plant. To add one, write a subclass with its `transfer`.
+Each is given by its transfer function. With a period it is discretised by the bilinear transform,
+so that a stable filter is stable at every period; in continuous time its states are integrated
+with those of the plant. To add one, write a subclass with its `transfer_function`.
 """
 
 import abc
 import dataclasses
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import polynomial
 
-from jaxbeam.case.controller import AbstractController, ControllerFilter
+from jaxbeam.case.controller import (
+    AbstractContinuousLaw,
+    AbstractController,
+    AbstractSampledLaw,
+    ControllerFilter,
+    ControlStep,
+)
 from jaxbeam.case.fields import POSITIVE, axis_names, concrete, is_concrete, number
 from jaxbeam.case.filters import filter_step
 from jaxbeam.control.feedback import pairing_error
@@ -22,10 +29,10 @@ Polynomials = Float[Array, "power actuator"]  # in s (rad/s), the coefficients a
 
 
 class AbstractCompensator(AbstractController):
-    """Each actuator answers the readings y of its own sensor through a filter: u(s) = H(s) y(s).
+    """Feedback of each actuator's own sensor through a transfer function: u(s) = H(s) y(s).
 
-    The first actuator listens to the first sensor, the second to the second, and so on. Before its
-    first tick the filters have seen nothing but zero.
+    The first actuator is fed by the first sensor, the second by the second, and so on. Filters
+    start from zero.
     """
 
     gains: Float[Array, " actuator"] = number("command per reading", "one gain for each actuator")
@@ -33,10 +40,6 @@ class AbstractCompensator(AbstractController):
     @property
     def design_depends_on_loads(self) -> bool:
         return False
-
-    @property
-    def stateless(self) -> bool:
-        return self.period is None
 
     @abc.abstractmethod
     def transfer_function(self) -> tuple[Polynomials, Polynomials]:
@@ -68,45 +71,60 @@ class AbstractCompensator(AbstractController):
                 return f"period must be given, as sensors.{i} has an offset or a range"
         return None
 
-    def own_filters(self):
-        if self.period is not None:
-            return ()
+    def design_law(self, plant):
         numerator, denominator = self.transfer_function()
-        return tuple(
-            _reading_filter(i, numerator[:, i], denominator[:, i])
-            for i in range(self.gains.shape[0])
-        )
-
-    def init(self, plant):
         if self.period is None:
-            return None
+            loops = range(self.gains.shape[0])
+            return ContinuousCompensator(
+                tuple(_reading_filter(i, numerator[:, i], denominator[:, i]) for i in loops)
+            )
         numerator, denominator = (
-            _bilinear_transform(part, self.bilinear_factor()) for part in self.transfer_function()
+            _bilinear_transform(part, self.bilinear_factor()) for part in (numerator, denominator)
         )
         section = jnp.concatenate([numerator, denominator]) / denominator[0]
-        return section[None], jnp.zeros((1, 2, self.gains.shape[0]))
-
-    def step(self, memory, measurement, t):
-        if self.period is None:
-            return measurement.readings[-self.gains.shape[0] :], memory
-        sections, filter_states = memory
-        readings = measurement.readings[: self.gains.shape[0]]
-        command, filter_states = filter_step(sections, filter_states, readings)
-        return command, (sections, filter_states)
+        return SampledCompensator(section[None])
 
     def _per_loop(self, *coefficients) -> Polynomials:
-        """Coefficients, each one number or one for each loop, as rows of such for each."""
+        """Coefficients as rows with an entry for each loop; one number serves all loops."""
         return jnp.stack([jnp.broadcast_to(row, self.gains.shape) for row in coefficients])
 
 
+class SampledCompensator(AbstractSampledLaw):
+    """Second-order section of each loop; the state is that of the sections."""
+
+    sections: Float[Array, "1 6 actuator"]
+
+    def initial_state(self):
+        return jnp.zeros((1, 2, self.sections.shape[-1]))
+
+    def step(self, state, measurement, t):
+        readings = measurement.readings[: self.sections.shape[-1]]
+        return ControlStep(*filter_step(self.sections, state, readings))
+
+
+class ContinuousCompensator(AbstractContinuousLaw):
+    """Filter of the reading of each loop; the commands are the outputs of the filters."""
+
+    reading_filters: tuple[ControllerFilter, ...]
+
+    @property
+    def filters(self):
+        return self.reading_filters
+
+    def command(self, state, measurement, t):
+        return measurement.readings[-len(self.reading_filters) :]
+
+
 class PD(AbstractCompensator):
-    """Proportional feedback and a rate that is smoothed: u = -(g + r s / (lag s + 1)) y."""
+    """Proportional feedback and a smoothed rate: u = -(g + r s / (lag s + 1)) y."""
+
+    kind: ClassVar[str] = "pd"
 
     rate_gains: Float[Array, " *actuator"] = number(
         "command per reading per s", "gain of the rate of the reading"
     )
     lag: Float[Array, " *actuator"] = number(
-        "s", "time constant with which the rate is smoothed", POSITIVE
+        "s", "time constant of the lag that smooths the rate", POSITIVE
     )
 
     def transfer_function(self):
@@ -117,28 +135,32 @@ class PD(AbstractCompensator):
 class Lead(AbstractCompensator):
     """Phase lead: u = -g (1 + s / z) / (1 + s / p) y; a phase lag if the zero z is above p."""
 
-    zero: Float[Array, " *actuator"] = number("Hz", "where the gain starts to rise", POSITIVE)
-    pole: Float[Array, " *actuator"] = number("Hz", "where it stops to rise", POSITIVE)
+    kind: ClassVar[str] = "lead"
+
+    zero: Float[Array, " *actuator"] = number(
+        "Hz", "corner frequency of the zero, where the gain starts to rise", POSITIVE
+    )
+    pole: Float[Array, " *actuator"] = number(
+        "Hz", "corner frequency of the pole, where the gain stops to rise", POSITIVE
+    )
 
     def transfer_function(self):
-        zero_time_constant, pole_time_constant = (
-            1 / (2 * jnp.pi * self.zero),
-            1 / (2 * jnp.pi * self.pole),
-        )
-        return self._per_loop(-self.gains, -self.gains * zero_time_constant), self._per_loop(
-            1.0, pole_time_constant
-        )
+        zero_time, pole_time = (1 / (2 * jnp.pi * part) for part in (self.zero, self.pole))
+        numerator = self._per_loop(-self.gains, -self.gains * zero_time)
+        return numerator, self._per_loop(1.0, pole_time)
 
 
 class PositivePositionFeedback(AbstractCompensator):
-    """A damped oscillator, driven by the reading, that pushes with it.
+    """Positive position feedback: a damped oscillator driven by the reading.
 
         u = g w^2 / (s^2 + 2 zeta w s + w^2) y
 
-    (Goh and Caughey, International Journal of Control 41, 1985). Tuned to a mode it damps that,
-    and adds nothing to the gain above it; at rest it lowers the stiffness. The bilinear transform
-    is warped to meet it at its frequency.
+    (Goh and Caughey, International Journal of Control 41, 1985). Tuned to a mode it damps that
+    mode and rolls off above it; at rest it lowers the stiffness. The bilinear transform is warped
+    to be exact at the frequency of the oscillator.
     """
+
+    kind: ClassVar[str] = "ppf"
 
     frequency: Float[Array, " *actuator"] = number("Hz", "frequency of the oscillator", POSITIVE)
     damping_ratio: Float[Array, " *actuator"] = number(
@@ -170,19 +192,17 @@ class PositivePositionFeedback(AbstractCompensator):
 def _reading_filter(
     sensor: int, numerator: Float[Array, " power"], denominator: Float[Array, " power"]
 ) -> ControllerFilter:
-    """States of a transfer function: x1 follows the reading, x2 is its rate over a frequency.
+    """Realisation of a transfer function of degree 1 or 2: x1 follows the reading, x2 = x1' / w.
 
-    At rest x1 is the reading; denominators are of degree 1 or 2.
+    At rest x1 is the reading.
     """
     feedthrough = numerator[-1] / denominator[-1]
     output_row = (numerator - feedthrough * denominator)[:-1] / denominator[0]
     if denominator.shape[0] == 2:
         rate = (denominator[0] / denominator[1])[None]
         return ControllerFilter(sensor, -rate[None], rate, output_row, feedthrough)
-    angular_frequency, damping_rate = (
-        jnp.sqrt(denominator[0] / denominator[2]),
-        denominator[1] / denominator[2],
-    )
+    angular_frequency = jnp.sqrt(denominator[0] / denominator[2])
+    damping_rate = denominator[1] / denominator[2]
     zero = jnp.zeros(())
     matrix = jnp.stack(
         [jnp.stack([zero, angular_frequency]), jnp.stack([-angular_frequency, -damping_rate])]

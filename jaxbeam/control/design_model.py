@@ -1,4 +1,4 @@
-"""What a controller is designed for, where that differs from the rig it is used on."""
+"""Design model: plant parameters of the design of a controller where they differ from the case."""
 
 import dataclasses
 from typing import Any
@@ -16,11 +16,11 @@ LOAD_FIELDS = ("mass", "speed", "entry_time")
 
 
 class DesignModel(eqx.Module):
-    """Numbers of actuators and loads as the designer believes them to be, and how many modes.
+    """Parameters of actuators and loads in the design of a controller, and its number of modes.
 
-    Each is one number for all that have it, or a list with one for each actuator (or load).
-    What is left out is as in the case. `stiffness = 0` leaves the suspension of shakers out of
-    the design; `modes` keeps only the lowest modes of the beam in it.
+    Each is one number for all parts that have it, or a list with one for each actuator (or load);
+    what is left out is as in the case. `stiffness = 0` leaves the suspension of shakers out of the
+    design; `modes` keeps only the lowest modes of the beam in it.
     """
 
     force_per_volt: Float[Array, " *actuator"] | None = number(
@@ -40,12 +40,12 @@ class DesignModel(eqx.Module):
     )
     speed: Float[Array, " *load"] | None = number("m/s", "speeds of loads", default=None)
     entry_time: Float[Array, " *load"] | None = number(
-        "s", "when loads are predicted to enter", default=None
+        "s", "predicted entry times of loads", default=None
     )
-    modes: int | None = count("modes of the beam that are modelled", default=None)
+    modes: int | None = count("lowest modes of the beam in the design", default=None)
 
     def validate(self, case: Any) -> str | None:
-        """What is wrong with them in a case, as "key must ...", or None."""
+        """Error of these numbers in a case, as "key must ...", or None."""
         if self.modes is not None and self.modes > case.beam.modes:
             return f"modes must be at most {case.beam.modes}, the modes of the beam: raise those"
         for names, parts in ((ACTUATOR_FIELDS, case.actuators), (LOAD_FIELDS, case.loads)):
@@ -60,7 +60,7 @@ class DesignModel(eqx.Module):
         return None
 
     def design_plant(self, plant: Plant, coordinates: str) -> Plant:
-        """The state space of the case as believed, on the same modes of the beam or the first."""
+        """Plant with the design parameters, on the modes of the given plant or the lowest of them."""
         case, modes = plant.case, plant.modal_model.modes
         if self.modes is not None:
             case = eqx.tree_at(lambda c: c.beam, case, _with_modes(case.beam, self.modes))
@@ -70,11 +70,11 @@ class DesignModel(eqx.Module):
         return build_plant(case, assemble_modal_model(case, modes), coordinates)
 
     def design_loads(self, case: Any) -> tuple:
-        """The loads of a case as believed."""
+        """Loads of a case with the design parameters."""
         return self._with_design_values(case.loads, LOAD_FIELDS)
 
     def _with_design_values(self, parts, names) -> tuple:
-        """Parts of a case with those of these numbers that are believed to be others."""
+        """Parts of a case with the design parameters of these names."""
         for name in names:
             value = getattr(self, name)
             if value is None:
@@ -85,7 +85,7 @@ class DesignModel(eqx.Module):
 
 
 def _with_modes(beam, mode_count):
-    """The beam with fewer modes, for which a list of damping ratios loses its last ones."""
+    """Beam with its lowest modes only, and their damping ratios."""
     ratio = beam.damping_ratio
     if ratio is not None and ratio.ndim:
         ratio = ratio[:mode_count]
@@ -99,6 +99,6 @@ def _with_value(part, name, value):
 
 
 def _has_effect(part, name) -> bool:
-    """Whether a number has a say in a part: a load that follows a table enters when that says."""
+    """Whether a part has a number in use; the entry time of a load with a table is that of the table."""
     tabulated = name == "entry_time" and part.times is not None
     return getattr(part, name, None) is not None and not tabulated

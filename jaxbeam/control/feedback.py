@@ -1,14 +1,16 @@
-"""Feedback of what the sensors read, through a power law or an odd polynomial."""
+"""Feedback of sensor readings through a power law or an odd polynomial."""
+
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.controller import AbstractStaticController
 from jaxbeam.case.fields import count, number
 
 
 def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
-    """What is wrong with gains of loops from each sensor to the actuator of its number; or None."""
+    """Error of one gain for each actuator, fed by the sensor of the same number; or None."""
     loops, actuators = gains.shape[0], len(case.actuators)
     if loops != actuators:
         return f"gains must list one gain for each of {actuators} actuators, not {loops}"
@@ -17,15 +19,24 @@ def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
     return None
 
 
-class Feedback(AbstractController):
-    """Each actuator answers the reading y of its own sensor: u = -sum_k g_k y |y|^(p_k - 1).
+def power_law(
+    gains: Float[Array, " actuator"], power: int, readings: Float[Array, " actuator"]
+) -> Float[Array, " actuator"]:
+    """Commands -k y |y|^(power - 1); the derivative at y = 0 is finite for every power."""
+    magnitude = jnp.abs(readings) ** (power - 1) if power > 1 else 1.0
+    return -gains * readings * magnitude
 
-    The first actuator listens to the first sensor, the second to the second, and so on. The first
+
+class Feedback(AbstractStaticController):
+    """Feedback of the reading y of each actuator's own sensor: u = -sum_k g_k y |y|^(p_k - 1).
+
+    The first actuator is fed by the first sensor, the second by the second, and so on. The first
     term has `gains` and `power`: 1 is linear feedback, 3 the cubic law of chapter 6 of the thesis
     (corrected sign: eq. 2.46 with u = -k w). Row after row, `higher_gains` are those of the powers
-    power + 2, power + 4, ...: linear and cubic feedback mixed has power 1 and one row, and more
-    rows make any odd polynomial.
+    power + 2, power + 4, ...: linear plus cubic feedback has power 1 and one row.
     """
+
+    kind: ClassVar[str] = "feedback"
 
     gains: Float[Array, " actuator"] = number(
         "command per reading^power", "one gain for each actuator"
@@ -36,14 +47,6 @@ class Feedback(AbstractController):
         "row of gains for each further odd power",
         default=None,
     )
-
-    @property
-    def stateless(self) -> bool:
-        return True
-
-    @property
-    def design_depends_on_loads(self) -> bool:
-        return False
 
     def validate(self, case):
         actuators = len(case.actuators)
@@ -57,15 +60,10 @@ class Feedback(AbstractController):
             )
         return None
 
-    def init(self, plant):
-        return None
-
-    def step(self, memory, measurement, t):
-        reading = measurement.readings[: self.gains.shape[0]]
+    def command(self, state, measurement, t):
+        readings = measurement.readings[: self.gains.shape[0]]
         rows = [self.gains, *([] if self.higher_gains is None else self.higher_gains)]
-        gain = rows[-1]
+        gains = rows[-1]
         for row in rows[-2::-1]:  # Horner's scheme in y^2
-            gain = row + gain * reading**2
-        # Spelt so that the derivative at zero is finite for every power.
-        magnitude = jnp.abs(reading) ** (self.power - 1) if self.power > 1 else 1.0
-        return -gain * reading * magnitude, memory
+            gains = row + gains * readings**2
+        return power_law(gains, self.power, readings)

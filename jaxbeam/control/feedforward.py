@@ -1,52 +1,48 @@
-"""Commands that go with the load: a table over its way, clocked by two gates.
+"""Position-scheduled feedforward: commands tabulated over the position of the load.
 
-Where voltage and not knowledge is the limit, a load need not be weighed: what a light one may be
-given at each place does for a heavy one too. It is enough to know where the load is.
+Where voltage limits the control, what a light load allows at each position suits a heavy one too:
+the position of the load suffices, its mass is not needed.
 """
+
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.model.state_space import Plant
 
 
-class Passage(AbstractController):
-    """Commands tabulated over the share of the way of a load that two gates have announced.
+class Feedforward(AbstractController):
+    """Commands tabulated over the relative position of a load, extrapolated from two gate times.
 
-    The commands at the `shares` (0 at the end where the load enters, 1 at the other) are joined by
-    straight lines and zero outside; those of several loads are added. Gates may be before the beam
-    (a negative position if loads enter at the left). A load is taken to keep the speed that it
-    has between them, and commands begin when it has passed the second. The table is read `lead`
-    seconds ahead of the load, to make up for delay and hold. No sensor of the beam and no mass is
-    used: there is no loop that could become unstable.
+    The commands at the `shares` of the crossing (0 at the end where the load enters, 1 at the
+    other) are interpolated linearly and zero outside; those of several loads are added. Gates may
+    lie before the beam (at a negative position if loads enter at the left). A load is assumed to
+    keep the speed that it has between them; commands begin when it has passed the second gate. The
+    table is read `lead` seconds ahead of the load, to compensate delay and hold. No sensor of the
+    beam and no mass is used, so that no loop is closed that could become unstable.
     """
 
-    gates: Float[Array, "2"] = number("m", "where the gates are, in the order they are passed")
-    shares: Float[Array, " knot"] = number("1", "shares of the way", INCREASING)
-    values: Float[Array, "actuator knot"] = number(
-        "unit of a command", "a list of commands for each actuator"
+    kind: ClassVar[str] = "feedforward"
+    open_loop: ClassVar[bool] = True
+
+    gates: Float[Array, "2"] = number("m", "positions of the gates, in the order of passage")
+    shares: Float[Array, " breakpoint"] = number("1", "shares of the crossing", INCREASING)
+    values: Float[Array, "actuator breakpoint"] = number(
+        "unit of a command", "commands of the table, a row for each actuator"
     )
     lead: Float[Array, ""] = number(
-        "s", "how far ahead of the load the table is read", NOT_NEGATIVE, default=0.0
+        "s", "time by which the table is read ahead of the load", NOT_NEGATIVE, default=0.0
     )
-
-    @property
-    def open_loop(self) -> bool:
-        return True
-
-    @property
-    def stateless(self) -> bool:
-        return True
 
     def validate(self, case):
         if self.period is None:
-            return "period must be given: kind 'passage' acts at its ticks"
+            return "period must be given: kind 'feedforward' acts at samples"
         if not case.loads:
             return "kind needs loads that pass the gates; add one, or take kind 'prescribed'"
         if self.values.shape != (len(case.actuators), self.shares.shape[0]):
@@ -57,31 +53,44 @@ class Passage(AbstractController):
         if not all(is_concrete(leaf) for leaf in jax.tree.leaves((self.gates, case))):
             return None
         if np.any(~(np.diff(_gate_times(self.gates, case.loads, case.beam.length)) > 0)):
-            return "gates must be two places that every load passes, the first before the other"
+            return "gates must be two positions that every load passes, the first before the other"
         return None
 
-    def init(self, plant: Plant):
+    def design_law(self, plant):
         gate_times = jnp.stack(
             [path.passage_times(self.gates)[:2] for path in plant.loads.trajectories]
         )
-        return gate_times, plant.case.beam.length
+        return FeedforwardLaw(
+            self.gates, self.shares, self.values, self.lead, gate_times, plant.case.beam.length
+        )
 
-    def step(self, memory, measurement, t):
-        gate_times, length = memory
-        speeds = jnp.diff(self.gates) / jnp.diff(gate_times, axis=1)[:, 0]
-        gate_distance = jnp.where(speeds < 0, length - self.gates[1], self.gates[1])
-        distance = gate_distance + (t + self.lead - gate_times[:, 1]) * jnp.abs(speeds)
+
+class FeedforwardLaw(AbstractSampledLaw):
+    """Table of commands and the times (s) at which each load passes the two gates."""
+
+    gates: Float[Array, "2"]
+    shares: Float[Array, " breakpoint"]
+    values: Float[Array, "actuator breakpoint"]
+    lead: Float[Array, ""]
+    gate_times: Float[Array, "load 2"]
+    length: Float[Array, ""]
+
+    def step(self, state, measurement, t):
+        speeds = jnp.diff(self.gates) / jnp.diff(self.gate_times, axis=1)[:, 0]
+        gate_distance = jnp.where(speeds < 0, self.length - self.gates[1], self.gates[1])
+        distance = gate_distance + (t + self.lead - self.gate_times[:, 1]) * jnp.abs(speeds)
 
         def interpolate(row):
-            return jnp.interp(distance / length, self.shares, row, left=0.0, right=0.0)
+            return jnp.interp(distance / self.length, self.shares, row, left=0.0, right=0.0)
 
-        commands = jnp.where(t >= gate_times[:, 1], jax.vmap(interpolate)(self.values), 0.0)
-        return jnp.sum(commands, axis=1), memory
+        commands = jax.vmap(interpolate)(self.values)
+        commands = jnp.where(t >= self.gate_times[:, 1], commands, 0.0)
+        return ControlStep(jnp.sum(commands, axis=1), state)
 
 
 def _gate_times(gates, loads, length) -> Float[np.ndarray, "load 2"]:
-    """When loads pass the gates (s), NaN where they do not."""
-    found = np.stack(
+    """Times (s) at which each load passes the gates; NaN where it does not."""
+    times = np.stack(
         [concrete(trajectory(load, length).passage_times(gates))[:2] for load in loads]
     )
-    return np.where(found < NEVER, found, np.nan)
+    return np.where(times < NEVER, times, np.nan)

@@ -1,6 +1,6 @@
-"""Which load is coming: its speed from two gates or from how the beam sinks at first, as its mass.
+"""Load identification: settings of a case file, and its replay on the record of a run.
 
-In a simulation the gates are passed when the load's path says so; the law is told those two times.
+In a simulation the gate times are those of the trajectory of the load; the law receives both.
 """
 
 from typing import Any, NamedTuple
@@ -14,46 +14,49 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.fields import POSITIVE, concrete, is_concrete, number
-from jaxbeam.control.load_position import DeflectionIdentifier
-from jaxbeam.control.load_update import AbstractLoadIdentifier
+from jaxbeam.control.load_identifiers import (
+    AbstractLoadIdentifier,
+    DeflectionIdentifier,
+    GateIdentifier,
+)
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.observability import deflection_outputs
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import Plant, state_space
 from jaxbeam.runtime.compiling import compiled
 
-INFLUENCE_POSITIONS = 201  # at which influence lines are kept
+INFLUENCE_POSITIONS = 201  # along the beam, of the influence lines
 
 
-class Recognition(eqx.Module):
-    """How a load is recognised: how much of the crossing is listened to, and what tells the speed.
+class LoadIdentification(eqx.Module):
+    """Settings for identifying speed and mass of a load while it crosses.
 
-    That are two `gates`, which may be before the beam (a negative position if the load enters at
-    the left); the speed is taken to be constant from there on. Without gates it is the deflections
-    (see `following`), of two sensors or more, where they exceed a `threshold`. While the load is on
-    the first part of the beam, `until`, its weight is the one whose static deflections fit the
-    readings of the sensors of deflection best, those that the commands cause subtracted. The beam
-    must be held.
+    The speed follows from two `gates`, which may lie before the beam (at a negative position if the
+    load enters at the left), and is assumed to stay constant; or, without gates, from the
+    deflections at two sensors or more where they exceed a `threshold`. While the load is on the
+    first part of the crossing, `until`, its weight is the one whose static deflections fit the
+    readings of the deflection sensors best, less the static deflections due to the commands. The
+    beam must not be able to move as a rigid body.
     """
 
     gates: Float[Array, "2"] | None = number(
-        "m", "where the gates are, in the order they are passed", default=None
+        "m", "positions of the gates, in the order of passage", default=None
     )
     until: Float[Array, ""] = number(
-        "1", "share of the way after which the mass is told", POSITIVE, default=0.3
+        "1", "share of the crossing after which the mass is identified", POSITIVE, default=0.3
     )
     threshold: Float[Array, ""] | None = number(
-        "m", "deflection that tells of a load, without gates", POSITIVE, default=None
+        "m", "deflection above which a load is on the beam, without gates", POSITIVE, default=None
     )
 
     def validate(self, case: Any) -> str | None:
-        """What is wrong with it in a case, as "key must ...", or None."""
-        if not any(sensor.quantity == "deflection" for sensor in case.sensors):
+        """Error of these settings in a case, as "key must ...", or None."""
+        deflection_sensors = sum(sensor.quantity == "deflection" for sensor in case.sensors)
+        if not deflection_sensors:
             return "until has no use without a sensor of deflection; add one"
         if (self.gates is None) == (self.threshold is None):
             return "gates or threshold must be given, and not both"
         if self.gates is None:
-            deflection_sensors = sum(sensor.quantity == "deflection" for sensor in case.sensors)
             if deflection_sensors < 2:
                 return "threshold needs two sensors of deflection or more; add one, or give gates"
             return None
@@ -63,81 +66,52 @@ class Recognition(eqx.Module):
         gates, until, length, speed = (concrete(value) for value in numbers)
         gate_shares = np.sign(speed) * (gates - (length if speed < 0 else 0.0)) / length
         if gate_shares[1] <= gate_shares[0]:
-            return "gates must be two places, that which the load passes first before the other"
+            return (
+                "gates must be two positions, the one that the load passes first before the other"
+            )
         if not gate_shares[1] < until <= 1:
-            return f"until must be beyond the second gate, at {gate_shares[1]:.3g} of the way, and at most 1"
+            return (
+                f"until must be beyond the second gate, at {gate_shares[1]:.3g} of the crossing,"
+                " and at most 1"
+            )
         return None
 
     def identifier(self, plant: Plant, design_plant: Plant) -> AbstractLoadIdentifier:
-        """The recogniser of the first load of a model; deflections are those of the design."""
+        """Identifier of the first load of a plant, with the deflections of the design plant."""
         system, modes = design_plant.unloaded, design_plant.coordinate_scale.shape[0]
-        length = plant.case.beam.length
-        static_response = jnp.linalg.solve(system.A.T, system.C[deflection_outputs(system)].T).T
-        shapes = design_plant.modal_model.shapes(
-            length * np.linspace(0, 1, INFLUENCE_POSITIONS), (0,)
-        )[0]
-        sensor_indices = deflection_outputs(system)
+        length, sensor_indices = plant.case.beam.length, deflection_outputs(system)
+        positions = length * np.linspace(0, 1, INFLUENCE_POSITIONS)
+        shapes = design_plant.modal_model.shapes(positions, (0,))[0]
+        response = system.static_response(sensor_indices)
         common = {
             "length": length,
             "gravity": design_plant.case.run.gravity,
-            "line": static_response[:, modes : 2 * modes]
+            # Weights act downwards, against the deflection.
+            "influence_lines": -response[:, modes : 2 * modes]
             @ (design_plant.coordinate_scale[:, None] * shapes.T),
-            "lift": -static_response @ system.B,
+            "static_lift": response @ system.B,
             "offset": sensor_offsets(design_plant)[sensor_indices],
-            "seen": tuple(int(i) for i in sensor_indices),
+            "until": self.until,
+            "sensor_indices": tuple(int(i) for i in sensor_indices),
         }
         if self.gates is None:
-            settings = {"until": self.until, "threshold": self.threshold}
-            return DeflectionIdentifier(sums=jnp.zeros(8), **settings, **common)
-        times = plant.loads.trajectories[0].passage_times(self.gates)[:2]
-        return GateIdentifier(settings=self, gate_times=times, sums=jnp.zeros(2), **common)
+            return DeflectionIdentifier(threshold=self.threshold, **common)
+        gate_times = plant.loads.trajectories[0].passage_times(self.gates)[:2]
+        return GateIdentifier(gates=self.gates, gate_times=gate_times, **common)
 
 
-class GateIdentifier(AbstractLoadIdentifier):
-    """What is known of a load by now; `gate_times` (s) are when it passes the gates."""
-
-    settings: Recognition
-    gate_times: Float[Array, "2"]
-
-    @property
-    def speed(self) -> Float[Array, ""]:
-        """The speed (m/s), negative to the left; it is known from the second gate on."""
-        return jnp.diff(self.settings.gates)[0] / jnp.diff(self.gate_times)[0]
-
-    @property
-    def entry_time(self) -> Float[Array, ""]:
-        """When the load enters the beam (s), if it keeps its speed."""
-        start = jnp.where(self.speed < 0, self.length, 0.0)
-        return self.gate_times[1] + (start - self.settings.gates[1]) / self.speed
-
-    @property
-    def mass(self) -> Float[Array, ""]:
-        """The mass (kg) that fits what was heard; zero where nothing was."""
-        return self.fitted_mass(*self.sums)
-
-    def crossing_share(self, t: Float[Array, ""]) -> Float[Array, ""]:
-        """The share of the way that is behind the load at a time (s)."""
-        return (t - self.entry_time) * jnp.abs(self.speed) / self.length
-
-    def identified(self, t: Float[Array, ""]) -> tuple[Array, Array]:
-        """Whether speed and mass are known at a time (s)."""
-        speed_identified = t >= self.gate_times[1]
-        return speed_identified, speed_identified & (self.crossing_share(t) >= self.settings.until)
-
-    def innovation(self, deflections, t):
-        share = self.crossing_share(t)
-        passed, done = self.identified(t)
-        relative_position = jnp.where(self.speed < 0, 1 - share, share)
-        positions = np.linspace(0, 1, INFLUENCE_POSITIONS)
-        influence = jax.vmap(lambda each: jnp.interp(relative_position, positions, each))(
-            self.influence_lines
-        )
-        active = passed & ~done & (share > 0)
-        return jnp.where(active, jnp.stack([influence @ deflections, influence @ influence]), 0.0)
+def identification_error(controller: Any, case: Any) -> str | None:
+    """Error of the `load_identification` of a controller in a case, as "key must ...", or None."""
+    if controller.load_identification is None:
+        return None
+    if controller.period is None:
+        return "period must be given: load identification acts at samples"
+    error = controller.load_identification.validate(case)
+    return None if error is None else f"load_identification.{error}"
 
 
-class Recognised(NamedTuple):
-    """What was made of a load: mass (kg) and speed (m/s), and their errors over the truth."""
+class IdentifiedLoad(NamedTuple):
+    """Identified mass (kg) and speed (m/s) of a load, and their relative errors."""
 
     mass: float
     speed: float
@@ -145,36 +119,37 @@ class Recognised(NamedTuple):
     speed_error: float
 
 
-def recognised(record: Any, settings: Recognition) -> Recognised:
-    """What the readings and commands of a record say of its first load, and how wrong that is.
+def identified_load(record: Any, settings: LoadIdentification) -> IdentifiedLoad:
+    """Mass and speed of the first load, identified from the readings and commands of a record.
 
-    As the law hears them, if the record has a sample at every tick and commands change at ticks
-    only. The true speed is that at entry. Raises ValueError for settings that do not suit the case.
+    The same as in the control loop if the record has a sample at every sample of the controller,
+    and commands change at these samples only. Errors refer to the speed at entry.
+
+    Raises ValueError for settings that do not suit the case.
     """
     case = record.case
     error = settings.validate(case)
     if error is not None:
-        raise ValueError(f"recognition.{error}")
-    mass, speed = _replay(settings, case, mesh_layout(case), record)
-    truth = float(case.loads[0].mass), float(case.loads[0].speed)
-    found = float(mass), float(speed)
-    errors = [value / true - 1 for value, true in zip(found, truth, strict=True)]
-    return Recognised(*found, *errors)
+        raise ValueError(f"load_identification.{error}")
+    mass, speed = (float(value) for value in _replay(settings, case, mesh_layout(case), record))
+    true_mass, true_speed = float(case.loads[0].mass), float(case.loads[0].speed)
+    return IdentifiedLoad(mass, speed, mass / true_mass - 1, speed / true_speed - 1)
 
 
 @compiled
-def _replay(settings: Recognition, case: Case, layout, record):
+def _replay(settings: LoadIdentification, case: Case, layout, record):
+    """Mass (kg) and speed (m/s) after the last sample of a record."""
     plant = state_space(case, layout=layout)
     identifier = settings.identifier(plant, plant)
-    zero_state = jnp.zeros(plant.modal_model.state_count)
+    no_state = jnp.zeros(plant.modal_model.state_count)
 
-    def tick(fit, at):
-        readings, command, t = at
-        current = eqx.tree_at(lambda r: r.fit, identifier, fit)
-        return current.update(Measurement(readings, zero_state, command), t).fit, None
+    def update(sums, sample):
+        readings, command, t = sample
+        return identifier.update(sums, Measurement(readings, no_state, command), t)[1], None
 
-    # A sample holds the command from its tick on; the law heard the one before.
+    # A sample of a record holds the command that begins there; the law measured the one before.
     previous_commands = jnp.concatenate([jnp.zeros_like(record.command[:1]), record.command[:-1]])
-    fit, _ = jax.lax.scan(tick, identifier.sums, (record.measured, previous_commands, record.times))
-    final = eqx.tree_at(lambda r: r.fit, identifier, fit)
-    return final.mass, final.speed
+    samples = record.measured, previous_commands, record.times
+    sums, _ = jax.lax.scan(update, identifier.initial_state(), samples)
+    estimate = identifier.estimate(sums, record.times[-1])
+    return estimate.mass, estimate.speed

@@ -1,23 +1,30 @@
-"""Commands that are known beforehand: sums of sines, tables, logs."""
+"""Open-loop commands prescribed over time: sums of sines and tables, such as those of a log."""
+
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.controller import AbstractStaticController
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, number
 
 
-class Prescribed(AbstractController):
-    """Open loop: the commands follow given signals, whatever the beam does.
+class Prescribed(AbstractStaticController):
+    """Commands as given functions of time.
 
-    To every actuator, offset + sum of amplitudes sin(2 pi frequency t + phase) is given, and to
-    it a table of values is added, joined by straight lines and zero outside its times (to hold a
-    value, end the table late). Leave out what is not needed.
+    Each actuator receives its offset + sum of amplitudes sin(2 pi frequency t + phase), plus a
+    table of values, interpolated linearly between its times and zero outside them (to hold a
+    value, end the table after the run). Parts may be left out.
     """
 
-    offsets: Float[Array, " actuator"] = number("unit of a command", "constant for each actuator")
+    kind: ClassVar[str] = "prescribed"
+    open_loop: ClassVar[bool] = True
+
+    offsets: Float[Array, " actuator"] = number(
+        "unit of a command", "constant command of each actuator"
+    )
     amplitudes: Float[Array, "actuator sine"] | None = number(
-        "unit of a command", "amplitudes of sines, a list for each actuator", default=None
+        "unit of a command", "amplitudes of the sines, a row for each actuator", default=None
     )
     frequencies: Float[Array, " sine"] | None = number(
         "Hz", "frequencies of the sines", NOT_NEGATIVE, default=None
@@ -25,22 +32,12 @@ class Prescribed(AbstractController):
     phases: Float[Array, "actuator sine"] | None = number(
         "rad", "phases of the sines at t = 0", default=None
     )
-    times: Float[Array, " point"] | None = number("s", "table: times", INCREASING, default=None)
-    values: Float[Array, "actuator point"] | None = number(
-        "unit of a command", "table: a list of commands for each actuator", default=None
+    times: Float[Array, " point"] | None = number(
+        "s", "times of the table", INCREASING, default=None
     )
-
-    @property
-    def stateless(self) -> bool:
-        return True
-
-    @property
-    def design_depends_on_loads(self) -> bool:
-        return False
-
-    @property
-    def open_loop(self) -> bool:
-        return True
+    values: Float[Array, "actuator point"] | None = number(
+        "unit of a command", "commands of the table, a row for each actuator", default=None
+    )
 
     def validate(self, case):
         count = len(case.actuators)
@@ -62,10 +59,7 @@ class Prescribed(AbstractController):
             return "values must have a column for each of the times"
         return None
 
-    def init(self, plant):
-        return None
-
-    def step(self, memory, measurement, t):
+    def command(self, state, measurement, t):
         command = self.offsets
         if self.amplitudes is not None:
             angle = 2 * jnp.pi * self.frequencies * t
@@ -74,7 +68,7 @@ class Prescribed(AbstractController):
         if self.times is not None:
             tabulated = [jnp.interp(t, self.times, row, left=0.0, right=0.0) for row in self.values]
             command = command + jnp.stack(tabulated)
-        return command, memory
+        return command
 
     def breakpoints(self, case):
         return self.times

@@ -1,9 +1,9 @@
-"""Feedback of readings with gains k(m) over the mass of the load, told or recognised: Fig. 6.7.
+"""Feedback of readings with gains scheduled over the mass of the load, k(m), as in Fig. 6.7.
 
-What gains to schedule, `jaxbeam.analysis.derived_gains` works out.
+`jaxbeam.analysis.derived_gains` computes such gains.
 """
 
-from typing import Any
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -11,41 +11,42 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.controller import (
+    AbstractContinuousLaw,
+    AbstractController,
+    AbstractSampledLaw,
+    ControlStep,
+)
 from jaxbeam.case.fields import INCREASING, choice, concrete, count, is_concrete, number, part
-from jaxbeam.control.feedback import Feedback, pairing_error
-from jaxbeam.control.load_identification import Recognition
-from jaxbeam.control.load_update import AbstractLoadIdentifier
-
-
-class ScheduledFeedbackState(eqx.Module):
-    """Memory of `ScheduledFeedback`: the mass (kg) as it is told, and what recognises it."""
-
-    mass: Float[Array, ""]
-    identifier: AbstractLoadIdentifier | None
+from jaxbeam.control.feedback import pairing_error, power_law
+from jaxbeam.control.load_identification import LoadIdentification, identification_error
+from jaxbeam.control.load_identifiers import AbstractLoadSource, given_load
 
 
 class ScheduledFeedback(AbstractController):
-    """Each actuator answers the reading y of its own sensor: u = -k(m) y |y|^(power - 1).
+    """Feedback of each actuator's own sensor with a gain for the load: u = -k(m) y |y|^(power - 1).
 
-    The first actuator listens to the first sensor, the second to the second, and so on. Each has a
+    The first actuator is fed by the first sensor, the second by the second, and so on. Each has a
     row of `gains`, one for each of the `masses` m of the load. Between these they are
-    "interpolated" linearly, or, "stepped", kept from each mass to the next as in Fig. 6.7 of the
-    thesis; beyond the first and last they stay. The mass is that of the single load of the case,
-    or what the `recognition` finds; until that has told it, the lightest is assumed.
+    "interpolated" linearly, or "stepped": constant from each mass to the next, as in Fig. 6.7 of
+    the thesis; beyond the first and last mass they are constant. The mass is that of the single
+    load of the case, or the one that `load_identification` finds; until it has, the lightest mass
+    is assumed.
     """
+
+    kind: ClassVar[str] = "feedback-scheduled"
 
     masses: Float[Array, " mass"] = number("kg", "masses for which there are gains", INCREASING)
     gains: Float[Array, "actuator mass"] = number(
-        "command per reading^power", "a list for each actuator, a gain for each mass"
+        "command per reading^power", "gains, a row for each actuator, a column for each mass"
     )
     power: int = count("power of the reading", default=1)
-    between: str = choice("between the masses", "interpolated", "stepped", default="interpolated")
-    recognition: Recognition | None = part("how the mass is found", Recognition)
-
-    @property
-    def stateless(self) -> bool:
-        return self.recognition is None
+    between: str = choice(
+        "gains between the masses", "interpolated", "stepped", default="interpolated"
+    )
+    load_identification: LoadIdentification | None = part(
+        "how the mass is identified", LoadIdentification
+    )
 
     def validate(self, case):
         if len(case.loads) != 1 or case.loads[0].mass is None:
@@ -59,31 +60,46 @@ class ScheduledFeedback(AbstractController):
                 f"gains must list in each row a gain for each of {self.masses.shape[0]} masses,"
                 f" not {self.gains.shape[1]}"
             )
-        error = pairing_error(self.gains[:, 0], case)
-        if error is not None or self.recognition is None:
-            return error
-        if self.period is None:
-            return "period must be given: the recognition of loads remembers"
-        error = self.recognition.validate(case)
-        return None if error is None else f"recognition.{error}"
+        return pairing_error(self.gains[:, 0], case) or identification_error(self, case)
 
-    def init(self, plant: Any) -> ScheduledFeedbackState:
-        identifier = None if self.recognition is None else self.recognition.identifier(plant, plant)
-        return ScheduledFeedbackState(jnp.asarray(plant.case.loads[0].mass), identifier)
+    def design_law(self, plant):
+        if self.load_identification is None:
+            source = given_load(plant.case.loads[0])
+        else:
+            source = self.load_identification.identifier(plant, plant)
+        return ScheduledFeedbackLaw(
+            self.masses, self.gains, source, self.power, self.between == "interpolated"
+        )
+
+
+class ScheduledFeedbackLaw(AbstractSampledLaw, AbstractContinuousLaw):
+    """Gains over the mass (kg), and the source of the mass, whose state is that of the law.
+
+    In continuous time for a given load only, which has no state.
+    """
+
+    masses: Float[Array, " mass"]
+    gains: Float[Array, "actuator mass"]
+    load_source: AbstractLoadSource
+    power: int = eqx.field(static=True)
+    interpolated: bool = eqx.field(static=True)
+
+    def initial_state(self):
+        return self.load_source.initial_state()
 
     def gains_at(self, mass: Float[Array, ""]) -> Float[Array, " actuator"]:
-        """The gains for a mass (kg)."""
-        if self.between == "interpolated":
+        """Gains for a mass (kg)."""
+        if self.interpolated:
             return jax.vmap(lambda row: jnp.interp(mass, self.masses, row))(self.gains)
         last = self.masses.shape[0] - 1
         interval = jnp.searchsorted(self.masses, mass, side="right") - 1
         return self.gains[:, jnp.clip(interval, 0, last)]
 
-    def step(self, memory, measurement, t):
-        mass = memory.mass
-        if memory.identifier is not None:
-            identifier = memory.identifier.update(measurement, t)
-            memory = eqx.tree_at(lambda m: m.identifier.fit, memory, identifier.fit)
-            mass = jnp.where(identifier.told(t)[1], identifier.mass, self.masses[0])
-        law = Feedback(self.gains_at(mass), self.power)
-        return law.step(None, measurement, t)[0], memory
+    def step(self, state, measurement, t):
+        load, state = self.load_source.update(state, measurement, t)
+        mass = jnp.where(load.mass_identified, load.mass, self.masses[0])
+        readings = measurement.readings[: self.gains.shape[0]]
+        return ControlStep(power_law(self.gains_at(mass), self.power, readings), state)
+
+    def command(self, state, measurement, t):
+        return self.step(self.initial_state(), measurement, t).command

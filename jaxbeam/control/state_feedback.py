@@ -1,21 +1,22 @@
 """Feedback of the whole state with a given gain."""
 
+from typing import ClassVar
+
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import number
-from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.control.state_controller import AbstractStateController
+from jaxbeam.control.state_law import GainLaw
 
 
-class StateFeedback(AbstractStateLaw):
+class StateFeedback(AbstractStateController):
     """u = -K z with the state z, in the order and units of `state_space(case, coordinates)`."""
+
+    kind: ClassVar[str] = "state"
 
     gain: Float[Array, "actuator state"] = number(
         "unit of a command per state", "gain, a row for each actuator"
     )
-
-    @property
-    def design_depends_on_loads(self) -> bool:
-        return self.estimator is not None
 
     def validate(self, case):
         shape = (len(case.actuators), self.state_count(case))
@@ -23,8 +24,5 @@ class StateFeedback(AbstractStateLaw):
             return f"gain must have a row for each actuator, a column for each state: {shape}"
         return super().validate(case)
 
-    def prepare(self, plant, design_plant):
-        return None
-
-    def command(self, memory, estimate, measurement, t):
-        return -self.gain @ estimate.state, memory
+    def design_state_law(self, plant, design_plant):
+        return GainLaw(self.gain)

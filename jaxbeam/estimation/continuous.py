@@ -1,70 +1,88 @@
-"""Estimators at every instant: the model, and a gain times what surprises it, as rates.
+"""Filters in continuous time, integrated together with the plant.
 
-    x' = A(t) x + B u + L(t) (y - C x - offset)
-
-The estimate x joins the states of the plant, so it is integrated with them, to the same accuracy.
+x' = A(t) x + B u + L(t) (y - C x - D u - offset)
 """
 
-from typing import Any
+import abc
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbeam.case.estimator import Estimate
+from jaxbeam.case.estimator import AbstractContinuousFilter, Estimate
 from jaxbeam.estimation.sensor_chain import FilteredPlant
-from jaxbeam.model.state_space import StateSpace
+from jaxbeam.model.linear_system import StateSpace
+from jaxbeam.numerics.gain_table import GainTable
 
 
-class ContinuousEstimator(eqx.Module):
-    """Memory of an estimator at every instant: its model and its gain, neither of which changes.
+class AbstractLinearFilter(AbstractContinuousFilter):
+    """x' = A(t) x + B u + L(t) (y - C x - D u - offset) from x = `initial`.
 
-    The estimate starts at `initial_state`; its first `plant_states` states are those of the plant. Either a `unloaded`
-    model without loads has a constant `gain`. Or the loads are followed in a `filtered_plant`, and the gain
-    is a `gain_table` (`GainTable`) along the run, transposed and backward, over `duration` (s): then
-    states of analogue filters follow those of the plant, and the weights of the loads, which are
-    told if `estimates_weights`.
+    The states that are integrated are x - `initial`. The first `plant_states` states x are those of
+    the plant; states of analogue filters may follow.
     """
 
     offset: Float[Array, " sensor"]
-    initial_state: Float[Array, " state"]
+    initial: Float[Array, " state"]
     plant_states: int = eqx.field(static=True)
-    unloaded: StateSpace | None = None
-    gain: Float[Array, "state sensor"] | None = None
-    filtered_plant: FilteredPlant | None = None
-    gain_table: Any = None
-    duration: Float[Array, ""] | None = None
-    estimates_weights: bool = eqx.field(static=True, default=False)
 
+    @property
+    def state_count(self):
+        return self.initial.shape[0]
+
+    @abc.abstractmethod
     def system_at(self, t: Float[Array, ""]) -> StateSpace:
-        """The model at a time (s), its outputs what the sensors see."""
-        if self.unloaded is not None:
-            return self.unloaded
-        return self.filtered_plant.with_filtered_outputs(self.filtered_plant.plant.augmented(t))
+        """A, B, C and D at t (s); the outputs are the inputs of the sensors."""
 
-    def estimate(self, deviation: Float[Array, " state"], t: Float[Array, ""]) -> Estimate:
-        """What is believed at a time (s), `deviation` being how far it has come from the start."""
-        state = self.initial_state + deviation
-        if not self.estimates_weights:
-            return Estimate(state[: self.plant_states])
-        plant = self.filtered_plant.plant
-        weights = state[plant.modal_model.state_count :]
-        return Estimate(state[: self.plant_states], jnp.where(plant.loads.on_beam(t), weights, 0.0))
-
-    def rates(
-        self,
-        deviation: Float[Array, " state"],
-        readings: Float[Array, " sensor"],
-        command: Float[Array, " actuator"],
-        t: Float[Array, ""],
-    ) -> Float[Array, " state"]:
-        """Rates of the estimate for readings and commands at a time (s)."""
-        system, state = self.system_at(t), self.initial_state + deviation
-        innovation = readings - self.offset - system.C @ state - system.D @ command
-        return system.A @ state + system.B @ command + self.gain_at(t) @ innovation
-
+    @abc.abstractmethod
     def gain_at(self, t: Float[Array, ""]) -> Float[Array, "state sensor"]:
-        """The gain at a time (s)."""
-        if self.gain is not None:
-            return self.gain
-        return self.gain_table(1 - t / self.duration).T
+        """Gain L at t (s)."""
+
+    def estimate(self, state, measurement, t):
+        return Estimate((self.initial + state)[: self.plant_states])
+
+    def rates(self, state, measurement, command, t):
+        system, x = self.system_at(t), self.initial + state
+        innovation = measurement.readings - self.offset - system.C @ x - system.D @ command
+        return system.A @ x + system.B @ command + self.gain_at(t) @ innovation
+
+
+class TimeInvariantFilter(AbstractLinearFilter):
+    """Filter for a plant without loads, with a constant gain."""
+
+    system: StateSpace
+    gain: Float[Array, "state sensor"]
+
+    def system_at(self, t):
+        return self.system
+
+    def gain_at(self, t):
+        return self.gain
+
+
+class ContinuousCrossingFilter(AbstractLinearFilter):
+    """Filter for a plant with its moving loads, with a gain that varies over the run.
+
+    The weights of the loads are the last states x; the estimate includes them if
+    `estimates_weights`. `dual_gain` is the transposed gain over the time back from the end of the
+    run, of `duration` (s).
+    """
+
+    filtered: FilteredPlant
+    dual_gain: GainTable
+    duration: Float[Array, ""]
+    estimates_weights: bool = eqx.field(static=True)
+
+    def system_at(self, t):
+        return self.filtered.with_filtered_outputs(self.filtered.plant.augmented(t))
+
+    def gain_at(self, t):
+        return self.dual_gain(1 - t / self.duration).T
+
+    def estimate(self, state, measurement, t):
+        estimate = super().estimate(state, measurement, t)
+        if not self.estimates_weights:
+            return estimate
+        plant = self.filtered.plant
+        weights = (self.initial + state)[plant.modal_model.state_count :]
+        return Estimate(estimate.state, jnp.where(plant.loads.on_beam(t), weights, 0.0))

@@ -1,4 +1,4 @@
-"""Gains of estimators of time-invariant models: Kalman filters and placed poles."""
+"""Gains of time-invariant estimators: Kalman filters and pole placement."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -34,16 +34,16 @@ def sampled_kalman_gain(A: Square, C: Rows, Q: Square, R: Outputs) -> Gain:
 
 
 def filter_gain(covariance: Square, C: Rows, R: Outputs) -> Float[Array, "state output"]:
-    """The gain K = P C' (C P C' + R)^-1 for a prediction of covariance P."""
+    """Gain K = P C' (C P C' + R)^-1 for a prediction of covariance P."""
     return jnp.linalg.solve(C @ covariance @ C.T + R, C @ covariance).T
 
 
 def placed_gain(A: Square, C: Rows, desired: Square) -> Float[Array, "state output"]:
     """L with which A - L C has the eigenvalues of the matrix `desired`; differentiable.
 
-    From A'X - X wanted = C'C and L' = C X^-1 (Bhattacharyya and de Souza, Systems & Control
-    Letters 1, 1982). A and `desired` must have no eigenvalue in common, and both be observable
-    through C; the answer is nan or useless otherwise.
+    From A'X - X desired = C'C and L' = C X^-1 (Bhattacharyya and de Souza, Systems & Control
+    Letters 1, 1982). A and `desired` must have no common eigenvalue, and both be observable through
+    C; otherwise the result is NaN or meaningless.
     """
     scale = balance(A)
     A, desired = A * scale / scale[:, None], desired * scale / scale[:, None]

@@ -1,15 +1,14 @@
-"""Modal coordinates from deflections by the mode shapes, rates by differences."""
+"""Modal coordinates from deflections by inverting the mode shapes, rates by differences."""
 
-import dataclasses
 import warnings
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.case.controller import Measurement
-from jaxbeam.case.estimator import AbstractEstimator, Estimate
+from jaxbeam.case.estimator import AbstractEstimator, AbstractSampledFilter, Estimate
 from jaxbeam.case.fields import POSITIVE, concrete, number
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.observability import (
@@ -19,34 +18,36 @@ from jaxbeam.estimation.observability import (
     deflection_mode_shapes,
     deflection_outputs,
 )
-from jaxbeam.estimation.sampled_plant import Transition, sample_timing
+from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.numerics.discretisation import balance
 
-MAX_CONDITION_NUMBER = 100.0  # conditioning beyond which there is a warning
+MAX_CONDITION_NUMBER = 100.0  # of the mode shapes at the sensors; beyond, there is a warning
 
 
 class Inversion(AbstractEstimator):
-    """The coordinates q of the modes with which the deflections read fit best, eq. (4.8).
+    """Modal coordinates q that fit the deflection readings best, eq. (4.8) of the thesis.
 
-    By least squares where there are more sensors of deflection than modes; of all that fit, the
-    ones with the least sum of squares where there are fewer. Other sensors are not used. Rates are
-    differences between ticks, smoothed by a first-order lag of `time_constant`. States of
-    actuators follow from the commands. It knows nothing of the loads, and needs not to.
+    By least squares where there are more sensors of deflection than modes; the least-norm solution
+    where there are fewer. Other sensors are not used. Rates are differences between samples,
+    smoothed by a first-order lag of `time_constant`. States of actuators follow from the commands.
+    The loads do not enter.
     """
 
+    kind: ClassVar[str] = "inversion"
+
     time_constant: Float[Array, ""] | None = number(
-        "s", "of the lag that smooths the rates", POSITIVE, default=None
+        "s", "time constant of the lag that smooths the rates", POSITIVE, default=None
     )
 
-    def init(self, plant):
+    def sampled_filter(self, plant, timing):
         system = plant.unloaded
         rows = deflection_mode_shapes(system)
         modes, modal_states = rows.shape[1], 2 * rows.shape[1]
         inverse = jnp.zeros((modes, system.C.shape[0]))
         inverse = inverse.at[:, deflection_outputs(system)].set(jnp.linalg.pinv(rows))
-        timing, actuator_transition = sample_timing(plant.case.controller), None
+        actuator_transition = None
         if system.A.shape[0] > modal_states:
-            # The states of actuators see the beam's, held, and then the commands, as inputs.
+            # Inputs of the states of actuators are the states of the beam, held, then the commands.
             inputs = jnp.concatenate(
                 [system.A[modal_states:, :modal_states], system.B[modal_states:]], axis=1
             )
@@ -57,20 +58,14 @@ class Inversion(AbstractEstimator):
             0.0 if self.time_constant is None else jnp.exp(-timing.period / self.time_constant)
         )
         difference_gain = (1 - jnp.asarray(smoothing, float)) / timing.period
-        state, command = jnp.zeros(system.A.shape[0]), jnp.zeros(system.B.shape[1])
-        return InversionState(
+        return InversionFilter(
             inverse,
             difference_gain,
             timing.period,
             actuator_transition,
             sensor_offsets(plant),
-            state,
-            command,
+            *system.B.shape,
         )
-
-    def step(self, memory, measurement, t):
-        memory = memory.fitted(measurement)
-        return Estimate(memory.state), memory
 
     def validate(self, case, system):
         if not any(sensor.quantity == "deflection" for sensor in case.sensors):
@@ -84,25 +79,26 @@ class Inversion(AbstractEstimator):
             or concrete(conditioning(system)) > 1 / UNOBSERVABLE
         ):
             return (
-                f"kind needs sensors of deflection that tell all {column_norms.size} modes apart; move"
-                " one off the nodes of the modes, or design for fewer modes"
+                f"kind needs sensors of deflection that distinguish all {column_norms.size} modes;"
+                " move one off the nodes of the modes, or design for fewer modes"
             )
         condition_number = float(concrete(conditioning(system)))
         if condition_number > MAX_CONDITION_NUMBER:
             warnings.warn(
-                f"the sensors of deflection hardly tell some modes apart: errors of readings grow"
-                f" {condition_number:.3g} times; move sensors, or design for fewer modes",
+                f"the modes are ill-conditioned at the sensors of deflection: errors of readings"
+                f" grow {condition_number:.3g} times; move sensors, or design for fewer modes",
                 ConditioningWarning,
                 stacklevel=2,
             )
         return None
 
 
-class InversionState(eqx.Module):
-    """Memory of the inversion: its design, the state it found last, the command before.
+class InversionFilter(AbstractSampledFilter):
+    """Inverse of the mode shapes, and lagged differences; its state is x and the last command.
 
-    `difference_gain` (1/s) is the weight of a difference in the rates, `period` (s) that between ticks;
-    `actuator_transition` takes the states of the actuators on, None if they have none.
+    `difference_gain` (1/s) is the weight of a difference of coordinates in the rates, `period` (s)
+    the time between samples; `actuator_transition` is that of the states of actuators over a
+    period, None if there are none.
     """
 
     mode_shape_inverse: Float[Array, "mode sensor"]
@@ -110,20 +106,22 @@ class InversionState(eqx.Module):
     period: Float[Array, ""]
     actuator_transition: Transition | None
     offset: Float[Array, " sensor"]
-    state: Float[Array, " state"]
-    command: Float[Array, " actuator"]
+    plant_states: int = eqx.field(static=True)
+    commands: int = eqx.field(static=True)
 
-    def update(self, measurement: Measurement) -> "InversionState":
-        """The memory after the next tick."""
-        modes, current_command = self.mode_shape_inverse.shape[0], measurement.command
-        before, rates = self.state[:modes], self.state[modes : 2 * modes]
+    def initial_state(self):
+        return jnp.zeros(self.plant_states), jnp.zeros(self.commands)
+
+    def update(self, state, measurement, t):
+        x, previous_command = state
+        modes, command = self.mode_shape_inverse.shape[0], measurement.command
+        previous, rates = x[:modes], x[modes : 2 * modes]
         coordinates = self.mode_shape_inverse @ (measurement.readings - self.offset)
         smoothing = 1 - self.difference_gain * self.period
-        parts = [coordinates, smoothing * rates + self.difference_gain * (coordinates - before)]
+        parts = [coordinates, smoothing * rates + self.difference_gain * (coordinates - previous)]
         if self.actuator_transition is not None:
-            beam, actuator_states = self.state[: 2 * modes], self.state[2 * modes :]
-            inputs = (
-                jnp.concatenate([beam, command]) for command in (self.command, current_command)
-            )
+            beam, actuator_states = x[: 2 * modes], x[2 * modes :]
+            inputs = (jnp.concatenate([beam, each]) for each in (previous_command, command))
             parts.append(self.actuator_transition.predict(actuator_states, *inputs))
-        return dataclasses.replace(self, state=jnp.concatenate(parts), command=current_command)
+        x = jnp.concatenate(parts)
+        return Estimate(x), (x, command)

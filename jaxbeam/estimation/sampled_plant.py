@@ -1,7 +1,7 @@
-"""A plant from one tick of a sampled controller to the next, with the noise that gathers.
+"""Sampled plant: transition from one sample of a controller to the next, with process noise.
 
-The command of a tick begins a delay later: within each period, first the command before acts,
-then the one that acts at its end.
+A command begins a delay after its sample: within each period the previous command acts first, then
+the one that acts at the end of the period.
 """
 
 import functools
@@ -16,11 +16,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.controller import AbstractController
 
-DOUBLINGS = 14  # of a short part of a period, until it is the whole
-SERIES_TERMS = (
-    10  # of the series for that part: it is right to rounding while its norm is below 0.05
-)
-PERIOD_ROUNDING = 1e-9  # of a period: a shorter delay beyond whole periods is none
+DOUBLINGS = 14  # of the short interval of the series, up to the whole
+SERIES_TERMS = 10  # exact to rounding while the norm of the matrix over the interval is below 0.05
+PERIOD_ROUNDING = 1e-9  # of a period; a delay counts as whole periods if it exceeds them by less
 
 Square = Float[Array, "state state"]
 Number = Float[Array, ""]
@@ -29,7 +27,10 @@ StateAndInputMatrices = Callable[[Number], tuple[Float[Array, "..."], Float[Arra
 
 
 class Transition(eqx.Module):
-    """What a period does: x becomes drift x + before u_before + after u_now + noise."""
+    """Transition over a period: x+ = matrix x + previous_input_matrix u_previous + input_matrix u + w.
+
+    `noise_covariance` is that of w.
+    """
 
     matrix: Square
     previous_input_matrix: Float[Array, "state input"]
@@ -37,7 +38,7 @@ class Transition(eqx.Module):
     noise_covariance: Square
 
     def predict(self, state, previous_input, input) -> Float[Array, " state"]:
-        """The state at the end of the period, where there is no noise."""
+        """State at the end of the period without noise."""
         return (
             self.matrix @ state
             + self.previous_input_matrix @ previous_input
@@ -45,11 +46,11 @@ class Transition(eqx.Module):
         )
 
     def predict_covariance(self, covariance: Square) -> Square:
-        """The covariance at the end of the period, for that at its start."""
+        """Covariance of the state at the end of the period, from that at its start."""
         return self.matrix @ covariance @ self.matrix.T + self.noise_covariance
 
     def compose(self, later: "Transition") -> "Transition":
-        """This one and, of the same period, what comes after it."""
+        """Composition with a later transition in the same period."""
         return Transition(
             later.matrix @ self.matrix,
             later.matrix @ self.previous_input_matrix + later.previous_input_matrix,
@@ -59,7 +60,7 @@ class Transition(eqx.Module):
 
 
 class SampleTiming(eqx.Module):
-    """The period of a controller (s), and how far into it new commands begin; None: at once."""
+    """Sampling period (s), and the delay (s) within it after which a command begins; None for none."""
 
     period: Number
     input_delay: Number | None
@@ -71,11 +72,11 @@ class SampleTiming(eqx.Module):
         scale: Float[Array, " state"],
         t: Number | float = 0.0,
     ) -> Transition:
-        """From the tick before t (s) to that at t, white noise of this intensity acting on x'.
+        """Transition to the sample at t (s) from the one before, with white noise on x'.
 
-        Exact for a plant that stays as it is; else by Magnus' method of order 4, with
-        one exponential between any two changes of the command. In states over their `scale`, from
-        `holds.balance`, numbers should be of like size.
+        Exact for a time-invariant plant; else by Magnus' method of order 4, with one exponential
+        between any two changes of the command. `scale` are the magnitudes of the states, from
+        `numerics.discretisation.balance`.
         """
         parts, _, _ = self.transitions(matrices_at, noise_intensity, scale, t)
         return functools.reduce(Transition.compose, parts)
@@ -88,9 +89,10 @@ class SampleTiming(eqx.Module):
         t: Number | float = 0.0,
         breaks: Sequence[Number] = (),
     ) -> tuple[list[Transition], Float[Array, " part"], Bool[Array, " part"]]:
-        """The same in parts, cut where the command changes and at some `breaks` (s into the period).
+        """The same in parts, split where the command changes and at `breaks` (s into the period).
 
-        And where in the period each part ends (s), and whether the command before acts in it.
+        Returns the parts, the time in the period at which each ends (s), and whether the previous
+        command acts in it.
         """
         input_delay = jnp.zeros(()) if self.input_delay is None else self.input_delay
         cuts = [*breaks, *([] if self.input_delay is None else [input_delay])]
@@ -111,16 +113,19 @@ class SampleTiming(eqx.Module):
 
 
 def sample_timing(controller: AbstractController) -> SampleTiming:
-    """The ticks of a controller that has a sampling period."""
+    """Timing of a controller with a sampling period; whole periods of its delay are left out."""
     period, delay = controller.period, controller.delay
-    if delay is None:
-        return SampleTiming(period, None)
+    return SampleTiming(period, None if delay is None else split_delay(delay, period)[1])
+
+
+def split_delay(delay: Number, period: Number) -> tuple[Number, Number]:
+    """Number of whole periods in a delay (s), and the rest (s); the number has no derivative."""
     whole = jax.lax.stop_gradient(jnp.floor(delay / period + PERIOD_ROUNDING))
-    return SampleTiming(period, jnp.maximum(delay - whole * period, 0.0))
+    return whole, jnp.maximum(delay - whole * period, 0.0)
 
 
 def _magnus_step(matrices_at: StateAndInputMatrices, noise_intensity, scale, start, span):
-    """Drift of the state, push of a held input and covariance of the noise over a span (s)."""
+    """Transition matrix, matrix of a held input, and covariance of the noise over a span (s)."""
     middle, node_offset = start + span / 2, math.sqrt(3) / 6 * span
     nodes = jnp.stack([middle - node_offset, middle + node_offset])
     early, late = jax.vmap(lambda time: _augmented_matrix(matrices_at, time, scale))(nodes)
@@ -140,7 +145,7 @@ def _magnus_step(matrices_at: StateAndInputMatrices, noise_intensity, scale, sta
 
 
 def _augmented_matrix(matrices_at: StateAndInputMatrices, time, scale):
-    """The plant with its inputs as further, constant states; in scaled states."""
+    """Matrix of the plant with its inputs as further, constant states; in scaled states."""
     A, B = matrices_at(time)
     top = jnp.concatenate([A * scale / scale[:, None], B / scale[:, None]], axis=1)
     return jnp.pad(top, ((0, B.shape[1]), (0, 0)))
@@ -149,8 +154,8 @@ def _augmented_matrix(matrices_at: StateAndInputMatrices, time, scale):
 def exponential_and_gramian(matrix: Square, intensity: Square) -> tuple[Square, Square]:
     """exp(M) and the integral of exp(M s) N exp(M's) over s from 0 to 1.
 
-    Summed as series of a small fraction of M, which is joined to itself: unlike the blocks of one
-    larger exponential (Van Loan's), that holds however fast the plant decays.
+    By the series of a small fraction of M and doubling: unlike the blocks of one larger exponential
+    (Van Loan's), this is accurate however fast the plant decays.
     """
     scaled_matrix = matrix / 2**DOUBLINGS
     scaled_intensity = intensity / 2**DOUBLINGS

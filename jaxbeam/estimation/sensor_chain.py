@@ -1,8 +1,8 @@
-"""From the beam to the readings: samples under way and digital filters, as states at the ticks.
+"""Sensor chain from the plant to the readings: delays and digital filters as discrete states.
 
-The states just before a tick are z = (x, h, m, v): those x of the plant with the sensors' analogue
-filters; for a sensor with a delay what it saw when it last looked, when it looked before, and so
-on; the memories m of digital filters; and the noise v of the samples that these take at the tick.
+The states just before a sample of the controller are z = (x, h, m, v): x of the plant with the
+analogue filters of the sensors; h, for a sensor with a delay, its last samples, newest first; the
+states m of digital filters; and the noise v of the samples that these filters receive.
 """
 
 from collections.abc import Callable
@@ -14,27 +14,28 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.filters import filter_step
-from jaxbeam.estimation.sampled_plant import PERIOD_ROUNDING, SampleTiming, Transition
+from jaxbeam.estimation.sampled_plant import SampleTiming, Transition, split_delay
+from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import Sections, sensor_sections
-from jaxbeam.model.state_space import Plant, StateSpace
+from jaxbeam.model.state_space import Plant
 
-# Of the noise of its samples, what a digital filter is taken to add to its output. Without it the
-# filter would be undone exactly, and what it all but stops be taken for known.
+# Noise that a digital filter is assumed to add to its output, relative to that of its samples.
+# Without it the filter would be inverted exactly, and attenuated components count as known.
 FILTER_NOISE_RATIO = 1e-3
 
-# The plant at a time (s), its outputs what the sensors see.
+# The plant at a time (s); its outputs are the inputs of the sensors.
 SystemAtTime = Callable[[Float[Array, ""]], StateSpace]
 
 
 class FilteredPlant(eqx.Module):
-    """A loaded beam with its sensors' analogue filters: `output_rows` is what they make of its states."""
+    """Plant with the analogue filters of its sensors; `output_rows` are those of the filtered outputs."""
 
     plant: Plant
     output_rows: Float[Array, "sensor state"]
 
     def with_filtered_outputs(self, system: StateSpace) -> StateSpace:
-        """A system of the model, its outputs behind the analogue filters."""
+        """System of the plant with its outputs behind the analogue filters."""
         filters = [sensor.filter for sensor in self.plant.case.sensors]
         analogue = np.array([f is not None and f.realisation == "analogue" for f in filters])
         if not analogue.any():
@@ -49,17 +50,17 @@ class FilteredPlant(eqx.Module):
 
 
 def filtered_plant(plant: Plant) -> FilteredPlant:
-    """A model with the analogue filters of its sensors."""
+    """Plant with the analogue filters of its sensors."""
     filtered_model, output_rows = with_sensor_filters(plant)
     return FilteredPlant(eqx.tree_at(lambda m: m.modal_model, plant, filtered_model), output_rows)
 
 
 class SensorChain(eqx.Module):
-    """Which states the sensors add to `plant_states` of the plant, and how they go on.
+    """States that the sensors add to the `plant_states` of the plant, and their transition.
 
-    `filter_sections` are those of digital filters, `delays` (s) the delays of the sensors, None where there
-    is none; `variance` is that of the noise of their samples. A delay may reach back over `max_delay_periods`
-    periods.
+    `filter_sections` are those of digital filters, `delays` (s) those of the sensors, None where
+    there is none; `variance` is that of the noise of their samples. Delays are at most
+    `max_delay_periods` periods.
     """
 
     filter_sections: tuple[Sections, ...]
@@ -71,25 +72,25 @@ class SensorChain(eqx.Module):
 
     @property
     def state_count(self) -> int:
-        """The number of all states."""
+        """Number of all states."""
         return self._state_layout()[-1]
 
     @property
     def noise_covariance(self) -> Float[Array, "sensor sensor"]:
-        """Covariance of the noise that readings have beside that among the states."""
+        """Covariance of the noise of readings that is not among the states."""
         digital = np.array([part is not None for part in self.filter_sections])
         return jnp.diag(jnp.where(digital, FILTER_NOISE_RATIO**2, 1.0) * self.variance)
 
     def output_matrices(
         self, C, D
     ) -> tuple[Float[Array, "sensor all"], Float[Array, "sensor actuator"]]:
-        """What takes the states just before a tick, and the commands, to the readings."""
+        """C and D of the readings on the states just before a sample and the commands."""
         return self._jacobians(C, D, 0)
 
     def transition(self, system_at: SystemAtTime, intensity, scale, t=0.0) -> Transition:
-        """The states from just before the tick a period before t (s) to just before that at t.
+        """Transition of the states to just before the sample at t (s) from just before the previous.
 
-        White noise of this intensity acts on the rates of the plant; see `Ticks.transition`.
+        White noise of this intensity acts on the rates of the plant; see `SampleTiming.transition`.
         """
         sensor_states = self.state_count - self.plant_states
 
@@ -117,8 +118,8 @@ class SensorChain(eqx.Module):
             )
             noise = jnp.pad(part.noise_covariance, ((0, sensor_states), (0, sensor_states)))
             transition = transition.compose(Transition(padded, previous_inputs, after, noise))
-            for i, look in sampling_offsets.items():
-                system, is_sampled = system_at(start + ends[k]), ends[k] == look
+            for i, offset in sampling_offsets.items():
+                system, is_sampled = system_at(start + ends[k]), ends[k] == offset
                 transition = transition.compose(
                     self._sampling_update(
                         i, system.C[i], system.D[i], is_sampled, before_command[k]
@@ -128,11 +129,13 @@ class SensorChain(eqx.Module):
         for index, variance in zip(self._state_layout()[2], self.variance, strict=True):
             sample_noise = sample_noise if index is None else sample_noise.at[index].set(variance)
         return eqx.tree_at(
-            lambda w: w.noise, transition, transition.noise_covariance + jnp.diag(sample_noise)
+            lambda w: w.noise_covariance,
+            transition,
+            transition.noise_covariance + jnp.diag(sample_noise),
         )
 
     def _sampling_update(self, sensor, row, feedthrough, is_sampled, before_command) -> Transition:
-        """What a look of a sensor adds, if it is now: its signal becomes the latest sample."""
+        """Transition at which a sensor takes a sample, if `is_sampled`: the newest of its samples h."""
         index = self._state_layout()[0][sensor]
         identity = jnp.eye(self.state_count)
         seen = jnp.pad(row, (0, self.state_count - self.plant_states))
@@ -145,15 +148,15 @@ class SensorChain(eqx.Module):
         return Transition(matrix, before, after, jnp.zeros_like(identity))
 
     def _jacobians(self, C, D, which: int):
-        """What takes states and commands to the readings (0), or to the states after a tick (1)."""
+        """Jacobians on states and commands of the readings (0), or of the states after a sample (1)."""
 
-        def tick(state, command):
+        def sample(state, command):
             return self._sample(state, C @ state[: self.plant_states] + D @ command)[which]
 
-        return jax.jacfwd(tick, (0, 1))(jnp.zeros(self.state_count), jnp.zeros(D.shape[1]))
+        return jax.jacfwd(sample, (0, 1))(jnp.zeros(self.state_count), jnp.zeros(D.shape[1]))
 
     def _sample(self, state, signals):
-        """Readings of the states just before a tick, and the states just after it."""
+        """Readings, and the states just after a sample, from the states just before it."""
         delay_starts, filter_starts, noise_starts, _ = self._state_layout()
         readings, after = [], state
         for i, sections in enumerate(self.filter_sections):
@@ -177,13 +180,12 @@ class SensorChain(eqx.Module):
         return jnp.stack(readings), after
 
     def _split_delay(self, delay) -> tuple[Array, Array]:
-        """Whole periods in a delay, and how far into each period (s) the sensor looks."""
-        whole = jax.lax.stop_gradient(jnp.floor(delay / self.timing.period + PERIOD_ROUNDING))
-        fraction = jnp.maximum(delay - whole * self.timing.period, 0.0)
-        return whole.astype(int), self.timing.period - fraction
+        """Whole periods of a delay, and the time in each period (s) at which the sensor samples."""
+        whole, rest = split_delay(delay, self.timing.period)
+        return whole.astype(int), self.timing.period - rest
 
     def _state_layout(self) -> tuple[list, list, list, int]:
-        """Where samples, memories and noises of each sensor begin, None for none; and the end."""
+        """First samples h, filter states m and noise v of each sensor, None for none; and the end."""
         end = self.plant_states
         starts = [], [], []
         for sections, delay in zip(self.filter_sections, self.delays, strict=True):
@@ -192,8 +194,8 @@ class SensorChain(eqx.Module):
                 0 if sections is None else 2 * sections.shape[0],
                 0 if sections is None else 1,
             )
-            for places, length in zip(starts, lengths, strict=True):
-                places.append(end if length else None)
+            for indices, length in zip(starts, lengths, strict=True):
+                indices.append(end if length else None)
                 end += length
         return *starts, end
 
@@ -205,7 +207,7 @@ def sensor_chain(
     plant_states: int,
     max_delay_periods: int,
 ) -> SensorChain:
-    """The chain of a case's sensors behind so many states of a plant."""
+    """Chain of the sensors of a case, for a plant with this number of states."""
     sensors = plant.case.sensors
     sections = tuple(sensor_sections(sensor, timing.period) for sensor in sensors)
     delays = tuple(sensor.delay for sensor in sensors)

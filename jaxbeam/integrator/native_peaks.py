@@ -8,7 +8,6 @@ controller, in double precision, on CPUs. Nobody needs it.
 
 import ctypes
 import functools
-import pathlib
 import sys
 
 import jax
@@ -61,31 +60,11 @@ C_CONSTANTS = {
 }
 HEADERS = ("exponentials", "lanes", "matrices", "path", "peaks", "steps", "tables", "work")
 LIBRARY = Library(
-    name="native",
     sources=("native.c",),
     headers=tuple(f"native_{part}.h" for part in HEADERS),
     constants=tuple(C_CONSTANTS.items()),
     targets=("march",),
 )
-
-
-def library_path() -> pathlib.Path:
-    """Where the compiled C is, or would be: a file for this source, this machine and this JAX."""
-    return LIBRARY.library_path()
-
-
-def build() -> pathlib.Path:
-    """Compile the C for this machine and return the library's path; sweeps use it from then on.
-
-    Raises RuntimeError without a C compiler, or with what it complains of; OSError if the cache
-    folder cannot be written.
-    """
-    return LIBRARY.build()
-
-
-def remove() -> None:
-    """Remove what was compiled for this machine, if it was: sweeps do without again."""
-    LIBRARY.remove()
 
 
 def supports(case: Case) -> bool:
@@ -94,7 +73,7 @@ def supports(case: Case) -> bool:
 
 
 def available() -> bool:
-    """Whether the C is compiled for this machine, and of use: computing on a CPU."""
+    """Whether the C integrator is compiled for this machine, and JAX computes on a CPU."""
     return LIBRARY.available()
 
 

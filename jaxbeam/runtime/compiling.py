@@ -1,11 +1,10 @@
-"""Compiling, with settings that suit programs of many small kernels."""
+"""Compilation of functions by XLA, with options for programs of many small kernels."""
 
 import dataclasses
 import functools
 import os
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import equinox as eqx
 import jax
@@ -13,18 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.runtime import compile_cache
+from jaxbeam.runtime.program_key import program_name
 
 # XLA's newer code generator for CPUs takes twice as long to compile the programs here, and its
-# last level of optimisation a third longer; they run no faster for the one, 3 % for the other. In
-# the 32 parts into which it would cut a program, a quarter more work is done than in two.
+# last level of optimisation a third longer; they run no faster for the one, 3 % for the other.
+# Code generation in 32 parts, the default, does a quarter more work than in two.
 XLA_OPTIONS = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_backend_optimization_level": 2,
     "xla_cpu_parallel_codegen_split_count": 2,
 }
-# For programs that are compiled side by side and leave no core to spare.
+# For programs that are compiled at the same time, on all cores.
 PARALLEL_COMPILATION = {"xla_cpu_parallel_codegen_split_count": 1}
-# For a program that takes longer to compile well than it will ever run.
+# For programs whose run time is less than the compile time that optimisation costs.
 LOW_OPTIMISATION = {"xla_backend_optimization_level": 0}
 
 P = ParamSpec("P")
@@ -32,9 +32,9 @@ R = TypeVar("R")
 
 
 def xla_options(**settings: bool | int) -> dict[str, bool | int]:
-    """Settings for `jax.jit` and `Lowered.compile` on this machine, some of them set otherwise.
+    """Compiler options for `jax.jit` and `Lowered.compile`: XLA_OPTIONS changed by `settings`.
 
-    Those of XLA_FLAGS prevail.
+    Options that this version of XLA does not have, or that XLA_FLAGS sets, are left out.
     """
     user_flags, supported = os.environ.get("XLA_FLAGS", ""), _supported_options()
     chosen = supported | {name: value for name, value in settings.items() if name in supported}
@@ -42,60 +42,60 @@ def xla_options(**settings: bool | int) -> dict[str, bool | int]:
 
 
 class _StaticOutputs(eqx.Module):
-    """What a function returns beside arrays."""
+    """Outputs of a function that are not arrays, and their tree structure."""
 
     static: Any = eqx.field(static=True)
 
 
 class Compiled(Generic[P, R]):
-    """A function compiled anew for every structure of its arguments; see `compiled`."""
+    """A function with one program for each structure of its arguments; see `compiled`."""
 
     def __init__(self, function: Callable[P, R], settings: dict[str, bool | int]):
         functools.update_wrapper(self, function)
         self.settings = settings
 
-        def program(arrays, given):
-            args, kwargs = _combine(arrays, *given)
+        def program(arrays, static):
+            args, kwargs = _combine(arrays, *static)
             arrays, *rest = _partition(function(*args, **kwargs))  # type: ignore[call-arg]
             return arrays, _StaticOutputs(tuple(rest))
 
         self._program = program
+        # Within another program, which has its own compiler options.
         self._jitted_inner = jax.jit(_renamed(program, function.__name__), static_argnums=1)
 
     @functools.cached_property
-    def jitted(self):  # at the first call, because to ask for the options starts JAX's machinery
-        """The function as JAX compiles it, of arrays and constants apart."""
+    def jitted(self):  # at the first call, since `xla_options` starts XLA
+        """The function of (arrays, static arguments) under `jax.jit`."""
         return self.jitted_as(self.__name__)
 
     def jitted_as(self, name: str):
-        """The same, as a program of that name."""
-        compiler_settings = xla_options(**self.settings)
-        return jax.jit(
-            _renamed(self._program, name), static_argnums=1, compiler_options=compiler_settings
-        )
+        """`jitted`, with another name of the program."""
+        options = xla_options(**self.settings)
+        return jax.jit(_renamed(self._program, name), static_argnums=1, compiler_options=options)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         arrays, *rest = _partition((args, kwargs))
         if _is_tracing(arrays):
-            arrays, kept = self._jitted_inner(arrays, tuple(rest))
-        elif compile_cache.program_folder() and (entry := self._entry(arrays, rest)).cache_path:
+            arrays, outputs = self._jitted_inner(arrays, tuple(rest))
+        elif compile_cache.enabled() and (entry := self._entry(arrays, rest)).cache_name:
             self._compilation(entry, arrays, rest)()
-            arrays, kept = entry.program(arrays)
+            arrays, outputs = entry.program(arrays)
         else:
-            arrays, kept = self.jitted(arrays, tuple(rest))
-        return _combine(arrays, *kept.static)
+            arrays, outputs = self.jitted(arrays, tuple(rest))
+        return _combine(arrays, *outputs.static)
 
     def precompile(self, *args: P.args, **kwargs: P.kwargs) -> Callable[[], Any]:
-        """Trace for arguments of the structure and shapes of these; what it returns compiles.
+        """Trace for arguments of this structure, and return a function that compiles.
 
-        Calls then need not. Tracing holds Python's lock, compiling leaves it to others. Done once,
-        it need not be done again, nor if an earlier process has (`kept_programs`).
+        Tracing holds Python's global lock, compiling does not, so the latter may run in a thread.
+        Calls with such arguments then do neither. A program in the cache (`compile_cache`) is not
+        traced but loaded.
         """
         arrays, *rest = _partition((args, kwargs))
         return self._compilation(self._entry(arrays, rest), arrays, rest)
 
     def _compilation(self, entry, arrays, rest):
-        """See `ahead`."""
+        """The function that `precompile` returns."""
         if entry.compiled:
             return lambda: None
         if not entry.cached_code:
@@ -114,20 +114,22 @@ class Compiled(Generic[P, R]):
         return load_or_compile
 
     def _compile(self, entry, lowered):
-        program = lowered.compile()
-        if entry.cache_path is not None:
-            compile_cache.save_program(entry.cache_path, program, lowered.out_info)
-            entry.program = program
+        if entry.cache_name is None:
+            lowered.compile()
+        else:
+            with compile_cache.jax_cache_off():
+                entry.program = lowered.compile()
+            compile_cache.save_program(entry.cache_name, entry.program, lowered.out_info)
         entry.compiled = True
 
     def template(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """What a call would return, with zeros for its numbers: known without compiling."""
+        """Outputs of a call, with zeros for its numbers, without compiling."""
         arrays, *rest = _partition((args, kwargs))
         entry = self._entry(arrays, rest)
-        outputs = entry.outputs or entry.jitted.eval_shape(arrays, tuple(rest))
-        entry.outputs = shapes, kept = outputs
+        entry.outputs = entry.outputs or entry.jitted.eval_shape(arrays, tuple(rest))
+        shapes, outputs = entry.outputs
         zeros = [None if leaf is None else np.zeros(leaf.shape, leaf.dtype) for leaf in shapes]
-        return _combine(zeros, *kept.static)
+        return _combine(zeros, *outputs.static)
 
     def _entry(self, arrays, rest):
         return _program_entry(self, _signature(arrays, rest))
@@ -135,61 +137,67 @@ class Compiled(Generic[P, R]):
 
 @dataclasses.dataclass(eq=False)
 class _ProgramEntry:
-    """What is known of a function for some arguments."""
+    """State of a function for one argument signature."""
 
     function: Compiled
-    cache_path: Path | None  # where the program is kept for later processes
-    cached_code: bytes  # the program that an earlier process has kept, if there is one
-    outputs: tuple[list, _StaticOutputs] | None  # shapes of what it returns
+    cache_name: str | None  # in the cache of programs; None if it cannot or is not to be cached
+    cached_code: bytes  # from the cache, or empty
+    outputs: tuple[list, _StaticOutputs] | None  # shapes of the arrays, and the rest
     compiled: bool = False
-    program: Any = None  # if it is not found by calling `quick`
+    program: Any = None  # if it has a name in the cache; others are in the cache of `jitted`
 
     @functools.cached_property
     def jitted(self):
-        """What is compiled, with JAX's own cache or to be kept."""
-        if self.cache_path is None:
+        """The function under `jax.jit`, from which this program is lowered."""
+        if self.cache_name is None or not jax.config.jax_compilation_cache_dir:
             return self.function.jitted
-        # What JAX reads from its own cache cannot be kept once more: no name is used twice.
+        # A program that JAX finds in its own cache cannot be serialised, so it must not find it.
         return self.function.jitted_as(f"{self.function.__name__}_{os.urandom(8).hex()}")
 
 
 @functools.cache
 def _program_entry(function: Compiled, identity: tuple) -> _ProgramEntry:
-    """What is known of a function for some arguments; JAX takes a hundred times as long to tell."""
-    cache_path = compile_cache.cache_path(function, identity)
-    cached = None if cache_path is None else compile_cache.read_program(cache_path)
-    return _ProgramEntry(function, cache_path, *(cached or (b"", None)))
+    """Entry of a function for an argument signature; a hundred times faster than JAX's own."""
+    name = program_name(function, identity) if compile_cache.enabled() else None
+    cached = None if name is None else compile_cache.read_program(name)
+    return _ProgramEntry(function, name, *(cached or (b"", None)))
 
 
 def clear_caches() -> None:
-    """Drop all that was compiled in this process: programs of many cases take gigabytes."""
+    """Free all programs compiled in this process; those of many cases take gigabytes."""
     jax.clear_caches()
     _program_entry.cache_clear()
 
 
-def compiled(function: Callable[P, R]) -> Compiled[P, R]:
-    """Compile a function for the arrays among its arguments, with settings that make that quick.
+@overload
+def compiled(function: Callable[P, R], **settings: bool | int) -> Compiled[P, R]: ...
 
-    As with `equinox.filter_jit`, what is no array is constant. Called within another function that
-    is being traced, it becomes part of that one.
+
+@overload
+def compiled(**settings: bool | int) -> Callable[[Callable[P, R]], Compiled[P, R]]: ...
+
+
+def compiled(function=None, **settings):
+    """Compile a function of arrays and static arguments with `xla_options(**settings)`.
+
+    A decorator, with or without settings. As with `equinox.filter_jit`, arguments that are not
+    arrays are static: a program is compiled for each of their values. Called while another function
+    is traced, the function becomes part of that program.
     """
-    return Compiled(function, {})
-
-
-def compiled_with(**settings: bool | int) -> Callable[[Callable[P, R]], Compiled[P, R]]:
-    """`compiled`, with some settings of XLA of its own."""
-    return lambda function: Compiled(function, settings)
+    if function is None:
+        return lambda function: Compiled(function, settings)
+    return Compiled(function, settings)
 
 
 def _renamed(program, name: str):
-    """A function under the name that it has in what JAX tells of it."""
+    """A function under another name, which is that of its program in profiles and logs."""
     program = functools.partial(program)
     program.__name__ = program.__qualname__ = name  # type: ignore[attr-defined]
     return program
 
 
 def _partition(tree) -> tuple[list, tuple, Any]:
-    """Leaves that are arrays, those that are not, each None where it is the other, and the tree."""
+    """Leaves that are arrays, leaves that are not, each None where it is the other, and the tree."""
     leaves, structure = jax.tree.flatten(tree)
     array_mask = [eqx.is_array(leaf) for leaf in leaves]
     arrays = [leaf if is_array else None for leaf, is_array in zip(leaves, array_mask, strict=True)]
@@ -199,20 +207,21 @@ def _partition(tree) -> tuple[list, tuple, Any]:
     return arrays, rest, structure
 
 
-def _signature(arrays, rest) -> tuple:
-    """What tells programs apart: all but the numbers in the arrays, and the mode of precision."""
-    shapes = tuple(None if leaf is None else (leaf.shape, leaf.dtype) for leaf in arrays)
-    return shapes, *rest, jax.config.jax_enable_x64
-
-
 def _combine(arrays, rest, structure):
+    """Inverse of `_partition`."""
     pairs = zip(arrays, rest, strict=True)
     return jax.tree.unflatten(structure, [b if a is None else a for a, b in pairs])
 
 
+def _signature(arrays, rest) -> tuple:
+    """Shapes and dtypes of arrays, other arguments, tree structure and precision mode."""
+    shapes = tuple(None if leaf is None else (leaf.shape, leaf.dtype) for leaf in arrays)
+    return shapes, *rest, jax.config.jax_enable_x64
+
+
 def _is_tracing(arrays) -> bool:
     """Whether a call with these arrays is part of a function being traced."""
-    given = [*arrays, _zero()]  # which is one too, where all that is done is
+    given = [*arrays, _zero()]  # a tracer where everything is traced, as under jax.jit
     return any(isinstance(leaf, jax.core.Tracer) for leaf in given)
 
 
@@ -221,7 +230,7 @@ _zero = jax.jit(lambda: 0.0)  # a seventh of the time that jnp.zeros takes
 
 @functools.cache
 def _supported_options() -> dict[str, bool | int]:
-    """The settings that this version of XLA knows; they come and go."""
+    """XLA_OPTIONS that this version of XLA has; they come and go."""
 
     def supports(settings):
         try:

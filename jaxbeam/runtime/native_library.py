@@ -1,7 +1,7 @@
-"""Hand-written C, compiled for this machine when asked for, and found by later processes.
+"""Optional C code: compiled on request, stored in the cache folder, called by XLA.
 
-A library lies in the user's cache folder under a name that tells its sources, the machine and the
-version of JAX. Functions that are called by XLA are its targets. Nobody needs it.
+A library is named by a hash of its source, its compiler flags, the machine and the version of JAX.
+Its functions are targets of XLA's foreign function interface. Everything also runs without it.
 """
 
 import ctypes
@@ -12,20 +12,29 @@ import pathlib
 import shutil
 import subprocess
 import tempfile
+import warnings
 from typing import NamedTuple
 
 import jax
 
-from jaxbeam.runtime.compile_cache import cache_folder, machine_description
+from jaxbeam.runtime.cache_folder import (
+    LIBRARY_PREFIX,
+    CacheError,
+    cache_folder,
+    machine_description,
+    private_folder,
+    read_file,
+    temporary_file,
+    write_file,
+)
 
 C_FOLDER = pathlib.Path(__file__).parent / "native"
 COMPILER_FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC")
 
 
 class Library(NamedTuple):
-    """A library: its sources and headers, numbers that the C is told, and functions for XLA."""
+    """A C library: file names in C_FOLDER, macros, and names of the functions that XLA calls."""
 
-    name: str
     sources: tuple[str, ...]
     headers: tuple[str, ...]
     constants: tuple[tuple[str, float], ...]
@@ -33,98 +42,106 @@ class Library(NamedTuple):
 
     @property
     def compiler_flags(self) -> tuple[str, ...]:
-        """What the compiler is told, beside the sources."""
+        """Arguments of the compiler, without the sources."""
         return (*COMPILER_FLAGS, *(f"-D{name}={value}" for name, value in self.constants))
 
+    @property
+    def file_name(self) -> str:
+        """Name of the compiled library in the cache folder."""
+        return f"{LIBRARY_PREFIX}{_fingerprint(self)}"
+
     def library_path(self) -> pathlib.Path:
-        """Where the compiled C is, or would be: a file for this C, this machine and this JAX."""
-        return cache_folder() / f"{self.name}-{_fingerprint(self)}.so"
+        """Path of the compiled library, built or not. Raises CacheError without a cache folder."""
+        return cache_folder() / self.file_name
 
     def ffi_name(self, name: str) -> str:
-        """The name under which XLA knows a function of the library."""
+        """Name under which a function of the library is registered with XLA."""
         return f"jaxbeam_{name}_{_fingerprint(self)}"
 
     def build(self) -> pathlib.Path:
-        """Compile the C for this machine and return the library's path.
+        """Compile the library for this machine; its path.
 
-        Raises RuntimeError without a C compiler, or with what it complains of; OSError if the cache
-        folder cannot be written.
+        Raises RuntimeError if there is no C compiler, it fails, or the cache folder cannot be used.
         """
-        command = find_compiler()
-        if command is None:
-            raise RuntimeError(
-                "there is no C compiler here: install gcc or clang, or name one in CC"
-            )
-        target = self.library_path()
-        target.parent.mkdir(parents=True, exist_ok=True)
-        sources = [str(C_FOLDER / name) for name in self.sources]
-        # Made beside its place and moved there, so that nobody ever loads half of it.
-        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-            temporary_file = pathlib.Path(folder) / target.name
-            command_line = [
-                *command.split(),
-                *sources,
-                *self.compiler_flags,
-                "-I",
-                jax.ffi.include_dir(),
-            ]
-            try:
-                process = subprocess.run(
-                    [*command_line, "-o", str(temporary_file)], capture_output=True, text=True
-                )
-            except OSError as error:
-                raise RuntimeError(f"the C compiler {command} cannot be run: {error}") from None
-            if process.returncode or not temporary_file.exists():
-                error_text = process.stderr.strip()[-500:]
-                raise RuntimeError(
-                    f"the C compiler {command} cannot compile {' '.join(sources)}: {error_text}"
-                )
-            _digest_path(target).write_text(hashlib.sha256(temporary_file.read_bytes()).hexdigest())
-            os.replace(temporary_file, target)
-        return target
+        try:
+            with tempfile.TemporaryDirectory(dir=private_folder()) as folder:
+                compiled = pathlib.Path(folder) / "library.so"
+                _compile(self, compiled)
+                return write_file(self.file_name, compiled.read_bytes())
+        except (CacheError, OSError) as error:
+            raise RuntimeError(f"the C code cannot be stored: {error}") from None
 
-    def remove(self) -> None:
-        """Remove what was compiled for this machine, if it was."""
-        for path in (self.library_path(), _digest_path(self.library_path())):
+    def remove(self) -> pathlib.Path:
+        """Delete the compiled library, if there is one; its path. Raises RuntimeError on failure."""
+        try:
+            path = self.library_path()
             path.unlink(missing_ok=True)
+            return path
+        except (CacheError, OSError) as error:
+            raise RuntimeError(f"the C code cannot be removed: {error}") from None
 
     def available(self) -> bool:
-        """Whether the C is compiled for this machine, and of use: computing on a CPU."""
-        path = self.library_path()
+        """Whether the library is compiled, authentic and loadable, and JAX computes on a CPU.
+
+        Warns of a library that is refused.
+        """
         try:
-            file_status = path.stat()
-        except OSError:
+            status = self.library_path().lstat()
+        except (CacheError, OSError):
             return False
-        intact = _is_intact(path, file_status.st_mtime_ns, file_status.st_size)
-        return jax.default_backend() == "cpu" and intact and bool(_load(self))
+        return jax.default_backend() == "cpu" and _is_usable(
+            self, self.library_path(), status.st_ctime_ns, status.st_size
+        )
 
     def load(self) -> ctypes.CDLL:
-        """The library, of whose functions XLA has been told; only if it is `available`."""
+        """The library, with its targets registered; only where it is `available`."""
         return _load(self)
 
 
 def find_compiler() -> str | None:
-    """The C compiler of this machine: that named in CC, or cc, gcc or clang, if there is one."""
+    """Command of the C compiler: that in CC, else cc, gcc or clang; None if there is none."""
     found = (shutil.which(name) for name in ("cc", "gcc", "clang"))
     return os.environ.get("CC") or next(filter(None, found), None)
 
 
-@functools.cache
-def _is_intact(path: pathlib.Path, modified: int, size: int) -> bool:
-    """Whether a library is undamaged: to load one that is not would end the process.
-
-    Looked into once for what was written then.
-    """
+def _compile(library: Library, target: pathlib.Path) -> None:
+    """Compile a library. Raises RuntimeError with the compiler's message."""
+    command = find_compiler()
+    if command is None:
+        raise RuntimeError("there is no C compiler here: install gcc or clang, or name one in CC")
+    sources = [str(C_FOLDER / name) for name in library.sources]
+    include = ["-I", jax.ffi.include_dir()]
+    arguments = [*command.split(), *sources, *library.compiler_flags, *include, "-o", str(target)]
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest() == _digest_path(path).read_text()
-    except OSError:
+        process = subprocess.run(arguments, capture_output=True, text=True)
+    except OSError as error:
+        raise RuntimeError(f"the C compiler {command} cannot be run: {error}") from None
+    if process.returncode or not target.exists():
+        message = process.stderr.strip()[-500:]
+        raise RuntimeError(
+            f"the C compiler {command} cannot compile {' '.join(sources)}: {message}"
+        )
+
+
+@functools.cache
+def _is_usable(library: Library, path: pathlib.Path, changed: int, size: int) -> bool:
+    """Whether a library file is authentic and loads; examined once unless the file changes."""
+    try:
+        return read_file(path.name) is not None and bool(_load(library))
+    except (CacheError, OSError) as error:
+        warnings.warn(f"C code not used: {error}; `jaxbeam native` compiles it anew", stacklevel=2)
         return False
 
 
 @functools.cache
 def _load(library: Library) -> ctypes.CDLL:
-    """Load a library and tell XLA of it, which takes each name once in a process."""
-    loaded = ctypes.CDLL(str(library.library_path()))
+    """Load a library and register its targets with XLA, which accepts each name once a process.
+
+    The bytes that were verified are loaded, from a file of this process.
+    """
+    content = read_file(library.file_name) or b""
+    with temporary_file(private_folder(), content) as path:
+        loaded = ctypes.CDLL(path)
     for name in library.targets:
         jax.ffi.register_ffi_target(
             library.ffi_name(name), jax.ffi.pycapsule(getattr(loaded, name))
@@ -132,14 +149,9 @@ def _load(library: Library) -> ctypes.CDLL:
     return loaded
 
 
-def _digest_path(path: pathlib.Path) -> pathlib.Path:
-    """Where the check value of a library is."""
-    return path.with_suffix(".sha256")
-
-
 @functools.cache
 def _fingerprint(library: Library) -> str:
-    """A number for the C, the machine and JAX."""
+    """Hash of source, compiler flags, JAX version and machine."""
     texts = [(C_FOLDER / name).read_text() for name in library.sources + library.headers]
     parts = [*texts, *library.compiler_flags, jax.__version__, machine_description()]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

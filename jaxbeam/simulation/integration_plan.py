@@ -1,7 +1,7 @@
-"""What must be decided before a run is compiled: shapes, orders and step lengths.
+"""Integration plan of a case: array shapes and step size, chosen before compilation.
 
-Decisions are made from known numbers, in plain Python, and handed on as static data; the compiled
-code then works for any numbers for which the decisions hold.
+It is made from concrete numbers and is static in the compiled code, which then holds for all
+numbers that suit the plan.
 """
 
 import dataclasses
@@ -29,18 +29,19 @@ from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 
 TOLERANCE = 1e-7  # relative to the largest deflection
-MAX_STEPS = 10**8  # samples or time steps of a run: more would fill any memory, or take days
-MAX_STEPS_PER_SAMPLE = 10**5  # time steps from one sample of a controlled run to the next
-MAX_DIVERGED_HALVINGS = 6  # halvings of a step after which a run that still overflows is given up
-SPACING_TOLERANCE = 1e-6  # of the spacing: more even samples are taken for equally spaced
-TRIAL_POSITIONS = (0.13, 0.29, 0.47, 0.62, 0.88)  # of the length: where errors are looked for
+MAX_STEPS = 10**8  # samples or time steps of a run; more exceed memory or take days
+MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
+MAX_DIVERGED_HALVINGS = 6  # halvings of the step after which a run that overflows is given up
+SPACING_TOLERANCE = 1e-6  # largest deviation of equally spaced samples, relative to the spacing
+TRIAL_POSITIONS = (0.13, 0.29, 0.47, 0.62, 0.88)  # x / length at which errors are measured
 
 
 @dataclasses.dataclass(frozen=True)
 class StaticShapes:
-    """What decides array shapes: order of the supports, coupling, loads on the beam at once.
+    """Static data that fix array shapes.
 
-    And whether steps without a driver are those written by hand, see `native`.
+    Layout of supports and patches, coupling of modes, largest number of loads on the beam at once;
+    and whether runs without an input policy are integrated in C (`native`).
     """
 
     layout: Layout
@@ -50,28 +51,28 @@ class StaticShapes:
 
 
 def static_shapes(case: Case) -> StaticShapes:
-    """The form of a case, from the numbers known now (not inside `jit`)."""
+    """Static shapes of a case with concrete numbers (not inside `jit`)."""
     case = concrete_case(case)
     layout = mesh_layout(case)
-    _, repeated, windows = _model_limits(case, layout)
+    _, repeated, entry_exit = _model_limits(case, layout)
     return StaticShapes(
-        layout, has_coupling(case) or bool(repeated), max_concurrent_loads(np.asarray(windows))
+        layout, has_coupling(case) or bool(repeated), max_concurrent_loads(np.asarray(entry_exit))
     )
 
 
 @compiled
 def _model_limits(case: Case, layout: Layout):
-    """Longest step (s), whether modes are repeated, and when loads enter and leave."""
+    """Longest stable step (s), whether frequencies repeat, entry and exit times (load, 2) in s."""
     model = modal_model(case, layout)
     trajectories = [trajectory(load, case.beam.length) for load in case.loads]
-    windows = jnp.array([path.entry_exit_times() for path in trajectories]).reshape(-1, 2)
-    return max_stable_step(model, case.loads), model.modes.has_repeated, windows
+    entry_exit = jnp.array([path.entry_exit_times() for path in trajectories]).reshape(-1, 2)
+    return max_stable_step(model, case.loads), model.modes.has_repeated, entry_exit
 
 
-def max_concurrent_loads(windows: np.ndarray) -> int:
-    """How many loads are on the beam at once, at most; at least one if there are any."""
-    entries, exits = windows.T
-    # The count only rises when a load enters.
+def max_concurrent_loads(entry_exit_times: Float[np.ndarray, "load 2"]) -> int:
+    """Largest number of loads on the beam at once; at least one if there are any."""
+    entries, exits = entry_exit_times.T
+    # The number increases only when a load enters.
     on_beam = (entries[None, :] <= entries[:, None]) & (entries[:, None] < exits[None, :])
     return max(min(1, entries.size), int(np.max(on_beam.sum(axis=1), initial=0)))
 
@@ -83,9 +84,9 @@ def run_peaks(
     positions: Float[Array, " sensor"],
     load_batch: LoadSet | None = None,
 ) -> RunningPeaks:
-    """Peaks and contact forces of a run, with steps no longer than `max_step` (s).
+    """Running peaks of an uncontrolled run at positions (m), with steps of at most `max_step` (s).
 
-    `load_batch` gives the loads of several runs that differ in nothing else; without, the case's own.
+    `load_batch` holds the loads of several runs of the case; default: those of the case.
     """
     model = modal_model(case, shapes.layout, shapes.coupled)
     grid = grid_by_step_length(case, model, max_step)
@@ -96,12 +97,13 @@ def run_peaks(
 
 
 class IntegrationPlan(eqx.Module):
-    """How a case is to be run: its form, steps from sample to sample, and their error.
+    """Integration plan: static shapes, steps per sample interval, estimated error.
 
-    Holds for cases that differ in numbers only, as long as these change neither the order of
-    supports and loads nor the frequencies much; make a new one otherwise. `lead_samples` samples are
-    added before the first one asked for, back to the start of the run. With a controller the
-    `schedule` holds its clock and the samples, which are part of the plan then.
+    Valid for cases that differ in numbers only, if these keep the order of supports and loads and
+    change frequencies little. `substeps` is the number of steps from sample to sample (with a
+    controller from event to event), `error` relative to the largest deflection. `lead_samples` are
+    added before the first sample, back to the start of the run. With a controller the `schedule`
+    holds its events and the samples.
     """
 
     shapes: StaticShapes = eqx.field(static=True)
@@ -115,11 +117,10 @@ class IntegrationPlan(eqx.Module):
 def integration_plan(
     case: Case, times: Float[Array, " time"] | None = None, tolerance: float = TOLERANCE
 ) -> IntegrationPlan:
-    """Choose form and time steps for a case, from the numbers known now.
+    """Integration plan of a case with concrete numbers, for samples at `times` (s).
 
-    `times` (s) are those of the wanted samples, the run's own if left out; `tolerance` is the
-    error allowed, relative to the largest deflection. Raises ValueError for a faulty case, and
-    RuntimeError if no time step meets the tolerance.
+    Default times are those of the run. `tolerance` is relative to the largest deflection. Raises
+    ValueError for an invalid case, RuntimeError if no time step meets the tolerance.
     """
     check_case(case)
     case = concrete_case(case)
@@ -141,10 +142,10 @@ def integration_plan(
 
 
 def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> IntegrationPlan:
-    """Plan for several cases that differ in numbers only: as many loads and steps as any needs.
+    """Plan for several cases that differ in numbers only: the largest number of loads and steps.
 
-    Its error is the largest of all; the schedule is that of the first. Raises ValueError, which
-    says `what` is planned, if they differ in the order of positions along the beam.
+    The error is the largest of all, the schedule that of the first. Raises ValueError, which names
+    the cases by `what`, if they differ in the order of positions along the beam.
     """
     first = plans[0]
     if any(plan.shapes.layout != first.shapes.layout for plan in plans):
@@ -167,15 +168,15 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
 
 
 def sample_times(case: Case) -> Float[Array, " time"]:
-    """Times (s) at which a run saves samples: from 0 to its duration at its sample rate.
+    """Times (s) of the samples of a run: from 0 to its duration at its sample rate.
 
-    Raises ValueError if these are more than can be kept.
+    Raises ValueError if there are more than MAX_STEPS.
     """
     duration, rate = float(concrete(case.run.duration)), float(concrete(case.run.sample_rate))
     if duration * rate > MAX_STEPS:
         raise ValueError(
             f"run.duration ({duration:g} s) and run.sample_rate ({rate:g} Hz) make"
-            f" {duration * rate:.3g} samples, and a run may have {MAX_STEPS:.0e}: lower one of them"
+            f" {duration * rate:.3g} samples, more than {MAX_STEPS:.0e}: lower one of them"
         )
     return jnp.arange(max(2, int(np.floor(duration * rate * (1 + 1e-12))) + 1)) / rate
 
@@ -187,28 +188,28 @@ def _trial_run(case, shapes, max_step, load_batch):
 
 
 def _check_step_count(count: float, step: float) -> None:
-    """Raises RuntimeError if a run needs too many time steps, such as these (s)."""
+    """Raise RuntimeError if a run has more than MAX_STEPS time steps, of `step` (s)."""
     if not count <= MAX_STEPS:
         raise RuntimeError(
-            f"the run takes {count:.1e} time steps of {step:.1e} s, and {MAX_STEPS:.0e} are the most:"
+            f"the run takes {count:.1e} time steps of {step:.1e} s, more than {MAX_STEPS:.0e}:"
             " check stiffnesses, masses and damping, shorten the run, or keep fewer modes"
             " (beam.modes)"
         )
 
 
 def _max_step(case: Case, shapes: StaticShapes) -> float:
-    """The longest step (s) that may be tried."""
+    """Longest step (s) of trial runs."""
     return min(float(_model_limits(case, shapes.layout)[0]), float(concrete(case.run.duration)))
 
 
 def choose_step_size(
     case: Case, shapes: StaticShapes, tolerance: float, load_batch: LoadSet | None = None
 ) -> tuple[float, float]:
-    """Longest step (s) whose peaks at some places are right to `tolerance`, and their error.
+    """Longest step (s) whose peaks at TRIAL_POSITIONS meet the `tolerance`, and their error.
 
-    Found by halving the step until halving it once more changes no peak by more than the
-    tolerance, relative to the largest peak; the error is that change. Raises RuntimeError if no
-    step down to a millionth of the run will do.
+    The step is halved until halving it once more changes no peak by more than the tolerance,
+    relative to the largest peak; the error is that change. Raises RuntimeError if no step down to a
+    millionth of the run meets it.
     """
     case = concrete_case(case)
     step = _max_step(case, shapes)
@@ -222,12 +223,12 @@ def choose_step_size(
 
 
 def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, tolerance: float):
-    """How many steps to take from edge to edge of a schedule, and the error of the deflection."""
+    """Number of steps between events of a schedule, and the relative error of the deflection."""
     step, interval = _max_step(case, shapes), float(schedule.lengths.max())
     if interval / step > MAX_STEPS_PER_SAMPLE:
         raise RuntimeError(
-            f"the {interval:g} s from one sample to the next are too long to bridge: they take"
-            f" {interval / step:.1e} time steps of {step:.1e} s, and {MAX_STEPS_PER_SAMPLE:.0e} are the most;"
+            f"the interval of {interval:g} s between samples takes {interval / step:.1e} time steps"
+            f" of {step:.1e} s, more than {MAX_STEPS_PER_SAMPLE:.0e};"
             " give a shorter controller.period or a higher run.sample_rate"
         )
     _check_step_count(schedule.times.size * interval / step, step)
@@ -239,8 +240,8 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
             _closed_loop_trial_run(case, shapes, schedule, jnp.asarray(min_substeps * 2**halvings))
         )
 
-    # A loop that diverges does so with any step; how far it has come by then is not the question.
-    # A stiff law at every instant may only seem to, with steps that are too long for it.
+    # A loop that diverges does so with any step, and its error has no meaning. A stiff law in
+    # continuous time may also overflow because the steps are too long.
     confirming_halvings = 6 if case.controller.period is None else 1
     if np.isnan(response(1)).any() and np.isnan(response(confirming_halvings)).any():
         return 2 * min_substeps, np.nan
@@ -250,10 +251,10 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
 
 @compiled
 def _closed_loop_trial_run(case, shapes, schedule, substeps):
-    """Deflections at some places and all edges of the schedule (edge and place, lane).
+    """Deflections (m) at TRIAL_POSITIONS and all events, as (event and position, batch).
 
-    Not peaks, as without a controller: where a law saturates its command has a kink, whose error
-    shows everywhere but at a peak, which is flat.
+    Peaks would hide errors: where a command saturates, the deflection has its error everywhere but
+    at a peak, where it is stationary.
     """
     positions = case.beam.length * jnp.array(TRIAL_POSITIONS)
     loads = load_set(case)
@@ -269,7 +270,10 @@ def _closed_loop_trial_run(case, shapes, schedule, substeps):
 def _halve_until_converged(
     response: Callable[[int], np.ndarray], tolerance: float, max_halvings: int
 ) -> tuple[int, float]:
-    """How often to halve a step until halving it again changes little seen, and that change."""
+    """Number of halvings of a step until one more changes the response within the tolerance.
+
+    And that change, relative to the largest response. Raises RuntimeError if there is none.
+    """
     coarse = response(0)
     for halvings in range(max_halvings):
         fine = response(halvings + 1)
@@ -283,8 +287,8 @@ def _halve_until_converged(
             break
         coarse = fine
     raise RuntimeError(
-        f"no time step makes the response agree to {tolerance:g}; it grows without bound, or its "
+        f"no time step makes the response agree to {tolerance:g}; it is unstable, or its "
         "frequencies are too far apart: check stiffnesses, masses and damping, or keep fewer modes "
-        "(beam.modes); or a law at every instant switches too often: give it a period, or ask for "
-        "a larger tolerance"
+        "(beam.modes); or a law in continuous time switches too often: give it a period, or a "
+        "larger tolerance"
     )

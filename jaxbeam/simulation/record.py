@@ -1,4 +1,4 @@
-"""What a simulation returns: labelled histories, peaks, and how far to trust them."""
+"""Record of one simulated run: histories, peaks, error estimate; stored as xarray and netCDF."""
 
 import json
 import os
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
@@ -21,19 +22,17 @@ if TYPE_CHECKING:
 
 
 class Record(eqx.Module):
-    """One simulated run.
+    """Record of one simulated run.
 
-    Deflection is positive upwards. Samples at a time at which a load enters or leaves are those
-    just after. `load_position` (m) and `contact_force` (N, positive where the load presses on the
-    beam) are NaN and zero while a load is off the beam. Peaks are those of the deflection between
-    and at samples. `contact_lost_time` (s) and `contact_lost_position` (m) tell where a load would
-    first have to pull, which the model lets it do; NaN where it never would. `command` is what the
-    actuators are given, within their limits; at a time at which it changes, that just after.
-    `failures` counts the steps until then in which the controller found no solution of what it
-    solves at each, and fell back.
-    Where a control loop diverges the samples are NaN from then on, and the peaks are NaN.
-    `error_estimate` is relative to the largest deflection. `controller_readings` is what the sensors have told
-    a controller that samples by then, None without one.
+    Deflection is positive upwards. Samples at an entry or exit of a load are those just after.
+    `load_position` (m) and `contact_force` (N, positive under compression) are NaN and zero while a
+    load is off the beam. Peaks are those in continuous time. `contact_lost_time` (s) and
+    `contact_lost_position` (m) are those of the first negative contact force, which the bilateral
+    model allows; NaN without one. `command` is that of the actuators, within their limits; at a
+    change, the one just after. `failures` counts the steps of the controller so far without a
+    solution of its optimisation. If the closed loop diverges the samples are NaN from then on, and
+    so are the peaks. `error_estimate` is relative to the largest deflection. `controller_readings`
+    are the readings that a sampled controller has received, None without one.
     """
 
     case: Case
@@ -55,11 +54,13 @@ class Record(eqx.Module):
     steps: int = eqx.field(static=True)
     controller_readings: Float[Array, "time sensor"] | None = None
 
-    def at(self, x, quantity: str = "deflection", fibre_distance=None) -> Float[Array, "time ..."]:
-        """History of a quantity at positions x (m) of any shape, in SI units.
+    shown = renamed_property("shown", "controller_readings")
 
-        Strain is that of the fibre `fibre_distance` (m) above the neutral axis, -z w_xx. Raises
-        ValueError for an unknown quantity, or strain without a fibre.
+    def at(self, x, quantity: str = "deflection", fibre_distance=None) -> Float[Array, "time ..."]:
+        """History of a quantity at positions x (m) of any shape: (time, *shape of x), in SI units.
+
+        Strain is that of the fibre at `fibre_distance` z (m) above the neutral axis, -z w_xx.
+        Raises ValueError for an unknown quantity, or strain without a fibre distance.
         """
         coordinates = self.coordinates, self.rates, self.accelerations
         return quantity_history(self.modes, coordinates, x, quantity, fibre_distance)
@@ -69,7 +70,7 @@ class Record(eqx.Module):
 
     @property
     def deflection(self) -> Float[Array, "time sensor"]:
-        """Deflection at the sensors in m, whatever they measure."""
+        """Deflection at the positions of the sensors in m."""
         return self._at_sensors("deflection")
 
     @property
@@ -89,7 +90,7 @@ class Record(eqx.Module):
 
     @property
     def strain(self) -> Float[Array, "time sensor"]:
-        """Bending strain at the sensors; NaN for those without a fibre distance."""
+        """Bending strain at the sensors; NaN at those without a fibre distance."""
         columns = [
             self.at(s.position, "strain", jnp.nan if s.fibre_distance is None else s.fibre_distance)
             for s in self.case.sensors
@@ -98,12 +99,12 @@ class Record(eqx.Module):
 
     @property
     def measured(self) -> Float[Array, "time sensor"]:
-        """What each sensor reads, in the SI unit of its quantity, noise and filter included.
+        """Readings of the sensors in the SI units of their quantities, with filters and noise.
 
-        With a controller that samples these are the readings it had; without, the sensors sample
-        at these times where they have no clock of their own.
+        With a sampled controller these are its readings; otherwise sensors without a sampling
+        period of their own sample at `times`.
 
-        Raises ValueError for a filter that samples at these times do not suit (see `sense`).
+        Raises ValueError if these times do not suit a filter (see `sensor_readings`).
         """
         if self.controller_readings is not None:
             return self.controller_readings
@@ -112,7 +113,7 @@ class Record(eqx.Module):
 
     @property
     def saturated(self) -> Bool[Array, "time actuator"]:
-        """Whether each command is at a limit of its actuator."""
+        """Whether each command is at a limit of its actuator, to 1e-9 of its range."""
         columns = [jnp.zeros(self.times.shape, bool) for _ in self.case.actuators]
         for i, actuator in enumerate(self.case.actuators):
             limits, command = actuator.command_limits(), self.command[:, i]
@@ -128,18 +129,18 @@ class Record(eqx.Module):
 
     @property
     def effort(self) -> Float[Array, " actuator"]:
-        """Integral of the squared command over the run, by the trapezoidal rule between samples."""
+        """Integral of the squared command over the run (command^2 s), by the trapezoidal rule."""
         return jnp.trapezoid(self.command**2, self.times, axis=0)
 
     @property
     def diverged_time(self) -> Float[Array, ""]:
-        """Time (s) of the first sample after the control loop diverged, NaN if it did not."""
+        """Time (s) of the first sample after the closed loop diverged, NaN if it did not."""
         diverged = jnp.any(jnp.isnan(self.coordinates), axis=1)
         return jnp.where(jnp.any(diverged), self.times[jnp.argmax(diverged)], jnp.nan)
 
     @property
     def verdict(self) -> str:
-        """In words: whether the loop holds, contact, steps without a solution, the error."""
+        """Sentence on divergence, contact, controller steps without a solution, and the error."""
         diverged = float(concrete(self.diverged_time))
         if np.isfinite(diverged):
             return (
@@ -150,7 +151,7 @@ class Record(eqx.Module):
         where = np.asarray(concrete(self.contact_lost_position))
         lowest_force = np.asarray(concrete(self.lowest_contact_force))
         contact_losses = [
-            f"load {i} would have to pull, first at t = {lost[i]:.4g} s, x = {where[i]:.4g} m "
+            f"load {i} loses contact, first at t = {lost[i]:.4g} s, x = {where[i]:.4g} m "
             f"(smallest contact force {lowest_force[i]:.4g} N)"
             for i in np.flatnonzero(np.isfinite(lost))
         ]
@@ -166,14 +167,14 @@ class Record(eqx.Module):
         return "; ".join(parts)
 
     def to_xarray(self) -> "xarray.Dataset":
-        """Labelled dataset with units; `from_xarray` restores the record exactly."""
+        """Labelled dataset with units; `record_from_xarray` restores the record exactly."""
         import xarray
 
         variables = {
             name: (dims, np.asarray(getattr(self, name)), {"units": unit, "long_name": words})
             for name, (dims, unit, words) in _VARIABLES.items()
         }
-        # Found anew, the modes of repeated frequencies might be turned.
+        # Modes of repeated frequencies are not unique, so they are stored.
         variables |= {
             f"mode_{name}": (
                 dims,
@@ -199,13 +200,13 @@ class Record(eqx.Module):
     def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the labelled dataset to a netCDF file.
 
-        Raises FileExistsError if the file exists and `overwrite` is not set.
+        Raises FileExistsError if the file exists, without `overwrite`.
         """
         if not overwrite and os.path.exists(path):
             raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
         dataset = self.to_xarray()
         empty = [name for name, variable in dataset.variables.items() if variable.size == 0]
-        # The format takes an empty axis for an unlimited one.
+        # An empty dimension would become an unlimited one in the file.
         dataset.drop_vars(empty).to_netcdf(path, engine="scipy")
 
 
@@ -218,37 +219,38 @@ _VARIABLES = {
     "rates": (("time", "mode"), "m kg^0.5/s", "rate of the modal coordinate"),
     "accelerations": (("time", "mode"), "m kg^0.5/s^2", "acceleration of the modal coordinate"),
     "load_position": (("time", "load"), "m", "position of the load"),
-    "contact_force": (("time", "load"), "N", "force with which the load presses on the beam"),
+    "contact_force": (("time", "load"), "N", "contact force, positive under compression"),
     "command": (("time", "actuator"), "unit of a command", "command to the actuator"),
-    "failures": (("time",), "1", "steps of the controller without a solution until then"),
+    "failures": (("time",), "1", "steps of the controller without a solution so far"),
     "peak_deflection": (("sensor",), "m", "largest absolute deflection"),
     "peak_time": (("sensor",), "s", "time of the largest absolute deflection"),
     "lowest_contact_force": (("load",), "N", "smallest contact force"),
-    "contact_lost_time": (("load",), "s", "first time at which the load would have to pull"),
-    "contact_lost_position": (("load",), "m", "where the load would first have to pull"),
+    "contact_lost_time": (("load",), "s", "time of the first negative contact force"),
+    "contact_lost_position": (("load",), "m", "position of the first negative contact force"),
 }
 _MODE_VARIABLES = {
     "stiffness": (("mode",), "1/s^2", "stiffness of the mode"),
     "damping": (("mode",), "1/s", "damping of the mode"),
     "coupling": (("mode", "other_mode"), "1/s^2", "stiffness between repeated modes"),
     "damping_coupling": (("mode", "other_mode"), "1/s", "damping between repeated modes"),
-    "nodes": (("node",), "m", "where the segments of the mode shapes meet"),
+    "nodes": (("node",), "m", "ends of the segments of the mode shapes"),
     "series": (("segment", "degree", "mode"), "kg^-0.5", "Chebyshev series of the mode shapes"),
     "unit": ((), "1/s^2", "flexural rigidity / (mass per length x length^4)"),
 }
-_MODE_FIELDS = {"unit": "stiffness_unit"}  # fields of `Modes` by the names in files, where they differ
+# Fields of `Modes` by their names in files, where they differ.
+_MODE_FIELDS = {"unit": "stiffness_unit"}
 _STORED_VARIABLES = [name for name in _VARIABLES if name in Record.__annotations__]
 
 
 def record_from_xarray(dataset: "xarray.Dataset") -> Record:
-    """Restore a record from the dataset made by `Record.to_xarray` (or read from its file).
+    """Record from a dataset of `Record.to_xarray`, or read from its file.
 
-    Raises ValueError if the dataset was not made by a record.
+    Raises ValueError if the dataset is not that of a record.
     """
     if "case" not in dataset.attrs:
         raise ValueError("not a record of jaxbeam: it lacks its case")
     case = case_from_dict(json.loads(dataset.attrs["case"]))
-    # A file does not hold what there is no sensor or load for.
+    # Without sensors or loads a file lacks their variables.
     sizes = {
         "sensor": len(case.sensors),
         "load": len(case.loads),
@@ -290,9 +292,9 @@ def _is_sampled(case: Case) -> bool:
 
 
 def read_record(path: str | os.PathLike) -> Record:
-    """Read a record from a netCDF file written by `Record.to_netcdf`.
+    """Record from a netCDF file written by `Record.to_netcdf`.
 
-    Raises OSError if it cannot be read, ValueError if it holds something else.
+    Raises OSError if the file cannot be read, ValueError if it is not that of a record.
     """
     import xarray
 
@@ -301,5 +303,5 @@ def read_record(path: str | os.PathLike) -> Record:
 
 
 def sensor_labels(case: Case) -> np.ndarray:
-    """A name for each sensor: its number and quantity, as in "0: deflection"."""
+    """Labels of the sensors: number and quantity, as in "0: deflection"."""
     return np.array([f"{i}: {s.quantity}" for i, s in enumerate(case.sensors)], dtype=str)

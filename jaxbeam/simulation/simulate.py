@@ -1,4 +1,4 @@
-"""One case to one record."""
+"""Simulation of one case: a record, or only readings or histories for fits."""
 
 import dataclasses
 import warnings
@@ -23,6 +23,7 @@ from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.closed_loop import closed_loop
+from jaxbeam.simulation.command_limits import command_ranges
 from jaxbeam.simulation.integration_plan import (
     TOLERANCE,
     IntegrationPlan,
@@ -33,7 +34,7 @@ from jaxbeam.simulation.record import Record
 
 
 class ContactLossWarning(UserWarning):
-    """A load would have to pull on the beam to stay on it, and in the model it does."""
+    """Warning of a negative contact force, at which the load would lift off the beam."""
 
 
 def simulate(
@@ -42,23 +43,24 @@ def simulate(
     plan: IntegrationPlan | None = None,
     tolerance: float = TOLERANCE,
 ) -> Record:
-    """Simulate a case: the beam at rest at t = 0, then crossed by the loads.
+    """Simulate a case: the beam, at rest at t = 0, under the moving loads.
 
-    q'' + D q' + K q = sum of shapes(x_a) r_a, with r_a the contact forces (see `dynamics`),
-    integrated to `tolerance` (relative to the largest deflection) by exponential collocation.
-    Samples are at the run's own rate or at the given ascending `times` (s); they do not depend on
-    the time step. Differentiable in every number of the case, forward and in reverse. Inside
-    `jit` or `vmap`, give the `plan` made outside by `jaxbeam.simulation.integration_plan.integration_plan`.
+    Integrates q'' + D q' + K q = sum of shapes(x_a) r_a, with r_a the contact forces (see
+    `jaxbeam.model.contact`), to `tolerance` (relative to the largest deflection) by exponential
+    collocation. Samples are at the sample rate of the run or at ascending `times` (s); they do not
+    depend on the time step. Differentiable in every number of the case, forward and in reverse.
+    Inside `jit` or `vmap`, give a `plan` made outside by
+    `jaxbeam.simulation.integration_plan.integration_plan`.
 
-    Raises ValueError for a faulty case or times, RuntimeError if no time step meets the
-    tolerance; warns (ContactLossWarning) if a load would have to pull on the beam.
+    Raises ValueError for an invalid case or times, RuntimeError if no time step meets the
+    tolerance; warns (ContactLossWarning) of negative contact forces.
     """
     if times is not None:
         _check_times(times)
     if plan is None:
         plan = integration_plan(case, times, tolerance)
     times = sample_times(case) if times is None else jnp.asarray(times, float)
-    # Plans that differ in their error alone share what is compiled.
+    # Plans that differ in their error only share compiled programs.
     record = _simulate_record(
         case, dataclasses.replace(plan, error=0.0), times, jnp.asarray(plan.error)
     )
@@ -74,11 +76,9 @@ def _check_times(times) -> None:
         return
     times = concrete(times)
     if times.ndim != 1 or times.size < 2:
-        raise ValueError(
-            f"times must be a list of at least two numbers, not of shape {times.shape}"
-        )
+        raise ValueError(f"times must be a list of two or more numbers; its shape is {times.shape}")
     if not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
-        raise ValueError("times must be finite and ascend, in s from the start of the run")
+        raise ValueError("times (s from the start of the run) must be finite and ascend")
 
 
 @compiled
@@ -119,11 +119,10 @@ def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
 def simulate_readings(
     case: Case, times: Float[Array, " time"], plan: IntegrationPlan
 ) -> Float[Array, "time sensor"]:
-    """What the sensors read at ascending times (s), and nothing else: `Record.measured`.
+    """Readings of the sensors at ascending times (s), as `Record.measured` but without noise.
 
-    Without noise, which is not known of a log, neither in the readings nor in what a controller
-    sees of them. Lean in compiling and differentiating, for fits; see `simulate`, which checks and
-    warns.
+    The controller has no noise either, as that of a log is unknown. For fits: less to compile and
+    differentiate than `simulate`, without its checks and warnings.
     """
     _, outputs, modal, _ = _integrate(case, plan, times, None, noisy=False)
     coordinates, rates, accelerations, *_, controller_readings, _ = outputs
@@ -133,9 +132,9 @@ def simulate_readings(
 
 
 class Histories(NamedTuple):
-    """Deflection (m) at some places, commands, and contact forces (N) of a run, at sample times."""
+    """Deflection (m) at given positions, commands and contact forces (N) of a run."""
 
-    deflection: Float[Array, "time place"]
+    deflection: Float[Array, "time position"]
     command: Float[Array, "time actuator"]
     contact_force: Float[Array, "time load"]
 
@@ -144,9 +143,9 @@ def simulate_histories(
     case: Case,
     times: Float[Array, " time"],
     plan: IntegrationPlan,
-    positions: Float[Array, " place"],
+    positions: Float[Array, " position"],
 ) -> Histories:
-    """Histories at ascending times (s) and places (m), and nothing else; as `simulate_readings`, lean."""
+    """Histories at ascending times (s) and positions (m); see `simulate_readings`."""
     _, outputs, modal, _ = _integrate(case, plan, times, None)
     coordinates, _, _, _, forces, commands, *_ = outputs
     if commands is None:
@@ -155,9 +154,10 @@ def simulate_histories(
 
 
 class IntegrationSetup(NamedTuple):
-    """All that an integration needs: a rig on its grid, its loads, and what drives it, if any.
+    """Input of one integration: discrete model, loads, input policy (None without controller).
 
-    `sample_steps` are the steps with which the samples begin, `steps` is how many steps there are.
+    `sample_steps` are the indices of the steps that start at the samples, `steps` is the number of
+    steps.
     """
 
     model: DiscreteModel
@@ -170,11 +170,11 @@ class IntegrationSetup(NamedTuple):
 def integration_setup(
     case: Case, plan: IntegrationPlan, times, positions, noisy: bool = True
 ) -> IntegrationSetup:
-    """A case made ready to be integrated as planned, watching deflections at some places (m)."""
+    """Setup of a planned integration with peaks at positions (m); without noise unless `noisy`."""
     loads, layout = load_set(case), plan.shapes.layout
     if case.controller is None:
         model, policy = modal_model(case, layout, plan.shapes.coupled), None
-        # From rest at the start to the first sample in steps like those between samples.
+        # From rest at t = 0 to the first sample in steps as those between samples.
         spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
         lead_times = times[0] - spacing * jnp.arange(plan.lead_samples, 0, -1)
         schedule = sample_schedule(
@@ -193,7 +193,7 @@ def integration_setup(
 
 
 def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
-    """Extremes, outputs at the sample times, modes, and the number of steps."""
+    """Running peaks, outputs at the sample times, modes, and the number of steps."""
     discrete, loads, policy, sample_steps, steps = integration_setup(
         case, plan, times, positions, noisy
     )
@@ -206,7 +206,7 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
         (None, None) if observed is None else (part[sample_steps, ..., 0] for part in observed)
     )
     if policy is not None:
-        # A law at every instant is asked itself: its polynomials are less exact at their ends.
+        # In continuous time from the law itself: extrapolation from the Gauss nodes is less exact.
         commands = (
             policy.commands_at(states[..., 0], times)
             if policy.implicit
@@ -219,26 +219,24 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
 
 
 def _commands_at_steps(case: Case, commands, steps):
-    """Commands (time, actuator) with which the steps at some edges begin, as they took effect."""
+    """Commands (time, actuator) at the starts of steps, by extrapolation from their Gauss nodes."""
     histories = commands[..., 0].reshape(commands.shape[0], NODE_COUNT, -1)
     commands_at_start = jnp.tensordot(histories, end_weights()[:, 0], axes=[1, 0])[steps]
-    limits = [actuator.command_limits() for actuator in case.actuators]
-    low = jnp.array([-jnp.inf if pair is None else pair[0] for pair in limits])
-    high = jnp.array([jnp.inf if pair is None else pair[1] for pair in limits])
+    low, high, _ = command_ranges(case)
     return jnp.clip(commands_at_start, low, high)
 
 
 def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states, commands):
-    """Modal coordinates, rates and accelerations, loads' places and contact forces, commands."""
+    """Modal coordinates, rates and accelerations, load positions, contact forces, commands."""
 
     def outputs_at(time, state, command):
         column = None if command is None else command[:, None]
-        force, pushed = contact_at(model, loads, time, state, column)
-        return force[:, 0], pushed[:, 0]
+        force, accelerations = contact_at(model, loads, time, state, column)
+        return force[:, 0], accelerations[:, 0]
 
     force, accelerations = jax.vmap(outputs_at)(times, states, commands)
-    states_count = 2 * accelerations.shape[1]
-    coordinates = (states[:, 0:states_count:2, 0], states[:, 1:states_count:2, 0], accelerations)
+    count = 2 * accelerations.shape[1]
+    coordinates = states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations
     if model.mode_map is not None:
         coordinates = tuple(part @ model.mode_map.T for part in coordinates)
     position = loads.kinematics(times)[0].T

@@ -27,7 +27,6 @@ from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
     compiled,
-    compiled_with,
 )
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.integration_plan import StaticShapes
@@ -77,7 +76,7 @@ class Program(NamedTuple):
         return discrete_model(model, self.grid(model, shared_values, step_size), positions, policy)
 
 
-@compiled_with(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
+@compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
 def modal_models(program: Program, shared_values):
     """Rigs of some tasks, and the longest step (s) each allows."""
 
@@ -101,7 +100,7 @@ def entry_exit_times(case, addresses, shared_values):
     return jax.vmap(entry_exit_times_of)(shared_values)
 
 
-@compiled_with(**PARALLEL_COMPILATION)
+@compiled(**PARALLEL_COMPILATION)
 def discrete_models(program: Program, mask, models, shared_values, step_size):
     """Rigs on the steps of some tasks; a single rig is that of all, and stays single."""
     shared_model, own_models = _split_shared_model(models)

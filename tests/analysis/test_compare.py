@@ -1,4 +1,4 @@
-"""Controllers compared: merits against the records, the picture, the command."""
+"""Comparison of controllers: metrics against the records, the picture, the command."""
 
 import dataclasses
 import json
@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.compare import compare
-from jaxbeam.analysis.computing_time import computing_times
 from jaxbeam.analysis.crossing_margin import LOAD_POSITIONS, stability_margin
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import load_controller
@@ -46,19 +45,19 @@ speed = 2.0
 duration = 0.4
 sample_rate = 500.0
 """
-WEAK = """
+LOW_GAIN = """
 [controller]
 kind = "feedback"
 gains = [2000.0]
 period = 0.01
 """
-WILD = """
+UNSTABLE = """
 [controller]
 kind = "feedback"
 gains = [-8000.0]
 period = 0.01
 """
-TOLD = """
+OPEN_LOOP = """
 [controller]
 kind = "prescribed"
 offsets = [1.0]
@@ -67,11 +66,11 @@ offsets = [1.0]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with a case that has a controller, and a controller alone."""
+    """Folder with a case that has a controller, and two files of controllers."""
     path = tmp_path_factory.mktemp("compare")
-    (path / "weak.toml").write_text(CASE + WEAK)
-    (path / "wild.toml").write_text(WILD)
-    (path / "told.toml").write_text(TOLD)
+    (path / "weak.toml").write_text(CASE + LOW_GAIN)
+    (path / "wild.toml").write_text(UNSTABLE)
+    (path / "told.toml").write_text(OPEN_LOOP)
     return path
 
 
@@ -81,64 +80,60 @@ def found(folder):
     return compare(case, {"weak": case.controller, "wild": load_controller(folder / "wild.toml")})
 
 
-def test_merits_are_those_of_the_records(found):
-    assert list(found.records) == list(found.merits) == ["weak", "wild"]
+def test_metrics_match_the_records(found):
+    assert list(found.records) == list(found.metrics) == ["weak", "wild"]
     assert found.case.controller is None
-    assert found.free.case.controller is None
+    assert found.uncontrolled.case.controller is None
     for name, record in found.records.items():
-        merits, deflection = found.merits[name], np.asarray(record.deflection)[:, 0]
-        assert merits.peak == record.peak_deflection[0]
-        assert_allclose(merits.rms**2, np.mean(deflection**2), rtol=1e-12)
-        assert merits.after_exit == np.max(np.abs(deflection[np.asarray(record.times) > 0.3]))
-        assert merits.saturated.shape == merits.effort.shape == (1,)
-        assert_allclose(merits.effort[0], np.trapezoid(record.command[:, 0] ** 2, record.times))
-        taken = found.bound.uncontrolled - merits.peak
+        metrics, deflection = found.metrics[name], np.asarray(record.deflection)[:, 0]
+        assert metrics.peak == record.peak_deflection[0]
+        assert_allclose(metrics.rms**2, np.mean(deflection**2), rtol=1e-12)
+        assert metrics.after_exit == np.max(np.abs(deflection[np.asarray(record.times) > 0.3]))
+        assert metrics.saturated.shape == metrics.effort.shape == (1,)
+        assert_allclose(metrics.effort[0], np.trapezoid(record.command[:, 0] ** 2, record.times))
+        taken = found.bound.uncontrolled - metrics.peak
         whole = found.bound.uncontrolled - found.bound.peak
-        assert_allclose(merits.share, taken / whole, rtol=1e-12)
-        times = merits.step_times
-        assert 1e-9 < times.median <= times.worst < 1e-2
-        assert 1e-9 < times.batched <= times.batched_worst < 1e-2
-    assert 0 < found.merits["weak"].share < 1
-    assert found.merits["wild"].share < 0
-    assert found.merits["wild"].saturated[0] > 0.1 > found.merits["weak"].saturated[0]
-    assert found.bound.share(found.best) > 0.99
-    assert np.all(np.isnan(computing_times(found.free)))
+        assert_allclose(metrics.share, taken / whole, rtol=1e-12)
+    assert 0 < found.metrics["weak"].share < 1
+    assert found.metrics["wild"].share < 0
+    assert found.metrics["wild"].saturated[0] > 0.1 > found.metrics["weak"].saturated[0]
+    assert found.bound.share(found.optimal) > 0.99
 
 
-def critical_gain(case: jb.Case, place: float) -> float:
-    """The gain with which the sampled loop turns unstable while the mass is parked at a place."""
+def critical_gain(case: jb.Case, position: float) -> float:
+    """Gain at which the sampled loop turns unstable with the mass stationary at a position (m)."""
     span, mass, period = span_of(case), 0.509, 0.01
-    n, under, seen = span.modes, span.shapes(place), span.shapes(0.3)
-    pull = 8.292e-4 * 0.32 * 200.0 * (span.shapes(0.2575, 1) - span.shapes(0.3425, 1))
+    n, under, output = span.modes, span.shapes(position), span.shapes(0.3)
+    forces = 8.292e-4 * 0.32 * 200.0 * (span.shapes(0.2575, 1) - span.shapes(0.3425, 1))
     mobility = np.linalg.inv(np.eye(n) + mass * np.outer(under, under))
     damping = np.diag(2 * 0.03 * span.frequencies)
     lower = -mobility @ np.hstack([np.diag(span.frequencies**2), damping])
-    a = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
-    b, c = np.append(np.zeros(n), mobility @ pull)[:, None], np.append(seen, np.zeros(n))[None]
-    system = scipy.signal.cont2discrete((a, b, c, np.zeros((1, 1))), period)
-    drift, push = np.asarray(system[0]), np.asarray(system[1])
+    A = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+    B, C = np.append(np.zeros(n), mobility @ forces)[:, None], np.append(output, np.zeros(n))[None]
+    system = scipy.signal.cont2discrete((A, B, C, np.zeros((1, 1))), period)
+    transition, force_response = np.asarray(system[0]), np.asarray(system[1])
 
-    def beyond(gain):
-        return np.abs(np.linalg.eigvals(drift - gain * push @ c)).max() - 1
+    def excess(gain):
+        return np.abs(np.linalg.eigvals(transition - gain * force_response @ C)).max() - 1
 
-    return scipy.optimize.brentq(beyond, 0.0, 2e4)
+    return scipy.optimize.brentq(excess, 0.0, 2e4)
 
 
-def test_the_margin_is_that_of_the_worst_place_of_the_parked_mass(found):
+def test_margin_is_the_smallest_over_stationary_positions(found):
     gains = [
         critical_gain(found.records["weak"].case, x) for x in np.linspace(0, 0.6, LOAD_POSITIONS)
     ]
-    assert_allclose(found.merits["weak"].reserve.gain, min(gains) / 2000.0, rtol=1e-9)
-    assert 0 < found.merits["weak"].reserve.delay < 0.01
-    assert found.merits["weak"].reserve.obstacle == ""
+    assert_allclose(found.metrics["weak"].stability_margin.gain, min(gains) / 2000.0, rtol=1e-9)
+    assert 0 < found.metrics["weak"].stability_margin.delay < 0.01
+    assert found.metrics["weak"].stability_margin.obstacle == ""
 
 
-def test_what_is_no_linear_loop_has_no_margin(found, folder):
+def test_loops_without_a_margin_name_the_obstacle(found, folder):
     slow = dataclasses.replace(found.case.sensors[0], sampling_period=jnp.asarray(0.02))
-    told = load_controller(folder / "told.toml")
+    open_loop = load_controller(folder / "told.toml")
     for changes, obstacle in (
-        ({"controller": told}, "do not depend on readings"),
-        ({"controller": jb.MPC(4, 2, 1e-9, period=0.01)}, "heeds limits"),
+        ({"controller": open_loop}, "do not depend on readings"),
+        ({"controller": jb.MPC(4, 2, 1e-9, period=0.01)}, "not linear at its limits"),
         (
             {"controller": found.records["weak"].case.controller, "sensors": (slow,)},
             "sensors.0.sampling_period must be the controller's",
@@ -149,35 +144,45 @@ def test_what_is_no_linear_loop_has_no_margin(found, folder):
         assert obstacle in missing.obstacle
 
 
-def test_the_picture_names_every_run(found):
+def test_picture_names_every_run(found):
     figure = plot_comparison(found)
     written = words(figure)
     for part in ("no control", "weak", "wild", "best possible", "limit 7.50", "command (V)"):
         assert part in written
-    assert f"({found.merits['weak'].share:.0%})" in written
+    assert f"({found.metrics['weak'].share:.0%})" in written
     top = figure.axes[0]
     lines = {line.get_label(): line.get_ydata() for line in top.get_lines()}
     assert_allclose(lines["weak"], 1e3 * found.records["weak"].deflection[:, 0])
     assert any(np.allclose(y, -1e3 * found.bound.peak) for y in lines.values() if len(y) == 2)
 
 
-def test_diverging_controllers_are_said_to(found):
-    gone = jnp.full(found.free.deflection.shape[:1] + (2,), jnp.nan)
-    lost = jnp.full(1, jnp.nan)
-    parts = {"coordinates": gone, "peak_deflection": lost, "peak_time": lost}
+def test_picture_marks_diverging_controllers(found):
+    diverged = jnp.full(found.uncontrolled.deflection.shape[:1] + (2,), jnp.nan)
+    unknown = jnp.full(1, jnp.nan)
+    parts = {"coordinates": diverged, "peak_deflection": unknown, "peak_time": unknown}
     record = dataclasses.replace(found.records["wild"], **parts)
     comparison = dataclasses.replace(found, records={"wild": record})
     assert "wild diverges" in words(plot_comparison(comparison))
 
 
-def test_nothing_to_compare_is_refused(found):
+def test_comparison_needs_a_controller(found):
     with pytest.raises(ValueError, match="give at least one controller"):
         compare(found.case, {})
 
 
-def test_a_controller_that_does_not_fit_is_named(found):
+def test_invalid_controller_is_named(found):
     with pytest.raises(ValueError, match="two: controller.gains must list one gain for each of 1"):
         compare(found.case, {"two": jb.Feedback([1.0, 2.0], period=0.01)})
+
+
+def test_former_names_warn(found):
+    for old, new in (("free", "uncontrolled"), ("best", "optimal"), ("merits", "metrics")):
+        with pytest.warns(DeprecationWarning, match=f"Comparison.{old} is called {new} now"):
+            assert getattr(found, old) is getattr(found, new)
+    metrics = found.metrics["weak"]
+    for old, new in (("reserve", "stability_margin"), ("swings", "limit_cycles")):
+        with pytest.warns(DeprecationWarning, match=f"{old} is called {new} now"):
+            assert getattr(metrics, old) is getattr(metrics, new)
 
 
 def run(line: str, folder, monkeypatch, capsys) -> tuple[int, str, str]:
@@ -189,15 +194,15 @@ def run(line: str, folder, monkeypatch, capsys) -> tuple[int, str, str]:
 
 
 @pytest.mark.slow
-def test_the_command_prints_and_draws(found, folder, monkeypatch, capsys):
+def test_command_prints_and_draws(found, folder, monkeypatch, capsys):
     line = "compare weak.toml --controllers wild.toml told.toml"
     code, printed, wrong = run(f"{line} -o out.png", folder, monkeypatch, capsys)
     assert code == 0, wrong
     assert f"below {found.bound.peak:.6g} m" in printed
-    assert f"{found.merits['weak'].share:.1%}" in printed
+    assert f"{found.metrics['weak'].share:.1%}" in printed
     assert "told: every load presses on the beam throughout" in printed
-    assert f"wild: {found.loop('wild')}; every load presses on the beam" in printed
-    assert f"{found.merits['weak'].reserve.gain:.3g}" in printed
+    assert f"wild: {found.loop_summary('wild')}; every load presses on the beam" in printed
+    assert f"{found.metrics['weak'].stability_margin.gain:.3g}" in printed
     assert "no margin of told: commands that do not depend on readings close no loop" in printed
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
     code, printed, wrong = run(f"{line} --json --period 0.02", folder, monkeypatch, capsys)
@@ -205,12 +210,12 @@ def test_the_command_prints_and_draws(found, folder, monkeypatch, capsys):
     answer = json.loads(printed)
     assert answer["held_for"] == 0.02
     assert answer["least_peak"] >= found.bound.peak * (1 - 1e-6)
-    assert answer["controllers"]["weak"]["peak"] == found.merits["weak"].peak
-    assert answer["controllers"]["wild"]["stability_margin"]["gain"] is None  # any: it is infinite
+    assert answer["controllers"]["weak"]["peak"] == found.metrics["weak"].peak
+    assert answer["controllers"]["wild"]["stability_margin"]["gain"] is None  # infinite
 
 
 @pytest.mark.slow
-def test_several_load_cases_are_compared_and_summed_up(found, folder, monkeypatch, capsys):
+def test_metrics_over_several_load_cases(found, folder, monkeypatch, capsys):
     line = "compare weak.toml --over loads.0.mass=0.3,0.509"
     code, printed, wrong = run(f"{line} --json", folder, monkeypatch, capsys)
     assert code == 0, wrong
@@ -220,7 +225,7 @@ def test_several_load_cases_are_compared_and_summed_up(found, folder, monkeypatc
         {"loads.0.mass": 0.3},
         {"loads.0.mass": 0.509},
     ]
-    assert heavy["peak"] == pytest.approx(found.merits["weak"].peak, rel=1e-6)
+    assert heavy["peak"] == pytest.approx(found.metrics["weak"].peak, rel=1e-6)
     summary = answer["over_all"]["weak"]
     assert summary["peak"] == max(light["peak"], heavy["peak"])
     assert summary["worst_share"] == min(light["share"], heavy["share"])
@@ -249,7 +254,7 @@ def test_several_load_cases_are_compared_and_summed_up(found, folder, monkeypatc
         ("compare weak.toml -o out.pdf", "a comparison is written to a .png file"),
     ],
 )
-def test_wrong_lines_are_refused(folder, monkeypatch, capsys, line, message):
+def test_errors_are_named(folder, monkeypatch, capsys, line, message):
     (folder / "bare.toml").write_text(CASE)
     (folder / "odd.toml").write_text("controller = 1")
     code, printed, wrong = run(line, folder, monkeypatch, capsys)

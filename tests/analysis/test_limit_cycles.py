@@ -1,4 +1,4 @@
-"""Commands that swing as those of an unstable loop do; loops that parked loads make unstable."""
+"""Oscillation of commands in unstable loops; loops that stationary loads make unstable."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ from jaxbeam.simulation.integration_plan import integration_plan
 TIMES = np.arange(2001) / 1000
 
 
-def test_turning_points_are_extremes_that_count():
+def test_turning_points_leave_out_small_reversals():
     small = 0.05 * np.sin(2 * np.pi * 40 * TIMES)
     slow = np.sin(2 * np.pi * 1.0 * TIMES)
     turns = turning_points(slow + small)
@@ -24,18 +24,18 @@ def test_turning_points_are_extremes_that_count():
     assert turning_points(np.where(TIMES > 1, np.nan, slow)) == []
 
 
-def test_swings_are_counted_beside_those_of_the_beam():
-    growing, still = np.exp(TIMES) * np.sin(2 * np.pi * 9.0 * TIMES), np.zeros(TIMES.size)
-    free = count_oscillations(TIMES, growing, still > 0, still)
+def test_oscillations_are_counted_beyond_those_of_the_deflection():
+    growing, zero = np.exp(TIMES) * np.sin(2 * np.pi * 9.0 * TIMES), np.zeros(TIMES.size)
+    free = count_oscillations(TIMES, growing, zero > 0, zero)
     assert free.oscillates and not free.limit_cycle
     assert_allclose(free.frequency, 9.0, rtol=0.02)
-    held = count_oscillations(TIMES, np.clip(growing, -2, 2), np.abs(growing) >= 2, still)
+    held = count_oscillations(TIMES, np.clip(growing, -2, 2), np.abs(growing) >= 2, zero)
     assert held.limit_cycle and held.at_limits > 10
-    forced = count_oscillations(TIMES, -growing, still > 0, growing)
+    forced = count_oscillations(TIMES, -growing, zero > 0, growing)
     assert forced.extra == 0 and not forced.oscillates
 
 
-def unstable_rig(gain: float, delay: float | None, damping: float) -> jb.Case:
+def unstable_case(gain: float, delay: float | None, damping: float) -> jb.Case:
     """Two spans under the cubic law, through filters of 20 Hz, as in section 6.2."""
     case = load("C")
     filtered = jb.Filter(20.0, order=10, realisation="analogue")
@@ -45,8 +45,8 @@ def unstable_rig(gain: float, delay: float | None, damping: float) -> jb.Case:
     return jb.replace(case, {"beam.damping_ratio": damping})
 
 
-def test_growth_with_a_parked_load_is_that_of_the_reference():
-    """0.509 kg in the middle of one span, linear, k = 2, through 10 Hz: rightmost pole, 5 modes."""
+def test_growth_rate_with_stationary_load_against_reference():
+    """Rightmost pole of 0.509 kg at midspan, linear law with k = 2, filter of 10 Hz, 5 modes."""
     case = jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=5),
         actuators=[jb.Patch(0.2575, 0.3425, 2.65358032154821e-4, amplifier_gain=200.0)],
@@ -55,20 +55,20 @@ def test_growth_with_a_parked_load_is_that_of_the_reference():
         controller=jb.Feedback([2e3]),
         run=jb.Run(1.2),
     )
-    lost = stability_margin(case).unstable
-    assert lost is not None and lost.start < 0.6 < lost.end
-    assert_allclose(lost.rate, 0.6891684603605122, rtol=1e-6)
-    assert_allclose(2 * np.pi * lost.frequency, 62.83126204745206, rtol=1e-6)
+    unstable = stability_margin(case).unstable
+    assert unstable is not None and unstable.start < 0.6 < unstable.end
+    assert_allclose(unstable.rate, 0.6891684603605122, rtol=1e-6)
+    assert_allclose(2 * np.pi * unstable.frequency, 62.83126204745206, rtol=1e-6)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
-def test_too_high_a_gain_ends_in_a_limit_cycle_as_published():
-    """k = 3 is unstable from 0.322 kg on, with 30 ms of delay and little damping; 0.261 kg is not.
+def test_high_gain_has_published_limit_cycle():
+    """k = 3, 30 ms of delay and low damping: unstable from 0.322 kg, not at 0.261 kg.
 
-    That swings, too, but no limit holds it.
+    With 0.261 kg the commands oscillate within the limits.
     """
-    case = unstable_rig(3.0, 0.03, 0.01)
+    case = unstable_case(3.0, 0.03, 0.01)
     free = dataclasses.replace(case, controller=None)
     plan, plain = integration_plan(case, None, 1e-4), integration_plan(free, None, 1e-4)
     for mass, cycles in ((0.261, False), (0.322, True), (0.509, True)):
@@ -78,6 +78,6 @@ def test_too_high_a_gain_ends_in_a_limit_cycle_as_published():
             jb.simulate(jb.replace(free, heavy), plan=plain),
         )
         assert [one.limit_cycle for one in found] == [cycles, cycles]
-    lost = stability_margin(jb.replace(case, {"loads.0.mass": 0.322})).unstable
-    assert lost is not None and lost.rate > 1
-    assert_allclose(found[0].frequency, lost.frequency, rtol=0.25)
+    unstable = stability_margin(jb.replace(case, {"loads.0.mass": 0.322})).unstable
+    assert unstable is not None and unstable.rate > 1
+    assert_allclose(found[0].frequency, unstable.frequency, rtol=0.25)

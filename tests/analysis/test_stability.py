@@ -1,4 +1,4 @@
-"""Poles, growth and Floquet multipliers against matrices written out and integrated by scipy."""
+"""Poles, growth and Floquet multipliers against modal equations integrated by scipy."""
 
 import dataclasses
 import json
@@ -10,20 +10,19 @@ import scipy.linalg
 
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
-from jaxbeam.analysis.margins import gramians, margins
+from jaxbeam.analysis.margins import margins
 from jaxbeam.analysis.stability import _tracked_branches, frozen_poles, growth, stream
 from jaxbeam.analysis.stability_limits import stability_limit
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.model.state_space import state_space
 from tests.modules import DATA
 
 REFERENCE = json.loads((DATA / "optimal_control.json").read_text())
 LENGTH, RIGIDITY, DENSITY, RATIO = 0.6, 11.68, 0.535, 0.03
-SPRING, DAMPER, PLACE, LAG = 12000.0, 80.0, 0.5, 1e4
+SPRING, DAMPER, SHAKER_POSITION, BANDWIDTH = 12000.0, 80.0, 0.5, 1e4
 MASS, SPEED = 0.509, 0.55
 
 
-def rig(controller, modes=3, force_per_volt=4.6, loads=None, sensors=1):
+def shaker_case(controller, modes=3, force_per_volt=4.6, loads=None, sensors=1):
     beam = jb.Beam(
         length=LENGTH,
         flexural_rigidity=RIGIDITY,
@@ -32,11 +31,11 @@ def rig(controller, modes=3, force_per_volt=4.6, loads=None, sensors=1):
         modes=modes,
     )
     shaker = jb.Shaker(
-        position=PLACE,
+        position=SHAKER_POSITION,
         stiffness=SPRING,
         damping=DAMPER,
         force_per_volt=force_per_volt,
-        bandwidth=LAG,
+        bandwidth=BANDWIDTH,
     )
     loads = [jb.MovingMass(mass=MASS, speed=SPEED)] if loads is None else loads
     return jb.Case(
@@ -49,12 +48,12 @@ def rig(controller, modes=3, force_per_volt=4.6, loads=None, sensors=1):
     )
 
 
-def written_out(x, speed, mass, force_per_volt, modes=3):
-    """State and command matrices in amplitudes of sines, eqs (2.11) and (2.36) corrected."""
+def state_matrices(x, speed, mass, force_per_volt, modes=3):
+    """State and input matrices in the sine basis, eqs (2.11) and (2.36) corrected."""
     n = np.arange(1, modes + 1) * np.pi / LENGTH
     half = DENSITY * LENGTH / 2
     omega = n**2 * np.sqrt(RIGIDITY / DENSITY)
-    shaker, here = np.sin(n * PLACE), np.sin(n * x)
+    shaker, here = np.sin(n * SHAKER_POSITION), np.sin(n * x)
     slope, bend = n * np.cos(n * x), -(n**2) * np.sin(n * x)
     M = half * np.eye(modes) + mass * np.outer(here, here)
     C = half * np.diag(2 * RATIO * omega) + DAMPER * np.outer(shaker, shaker)
@@ -66,9 +65,9 @@ def written_out(x, speed, mass, force_per_volt, modes=3):
     A[modes:-1, :modes] = -np.linalg.solve(M, K)
     A[modes:-1, modes:-1] = -np.linalg.solve(M, C)
     A[modes:-1, -1] = np.linalg.solve(M, shaker)
-    A[-1, -1] = -LAG
+    A[-1, -1] = -BANDWIDTH
     B = np.zeros((2 * modes + 1, 1))
-    B[-1] = LAG * force_per_volt
+    B[-1] = BANDWIDTH * force_per_volt
     return A, B
 
 
@@ -80,15 +79,15 @@ def regulator(**options):
     )  # fmt: skip
 
 
-def test_frozen_poles_of_the_published_regulator():
-    case = rig(regulator())
+def test_frozen_poles_of_published_regulator():
+    case = shaker_case(regulator())
     times = np.array([0.05, 0.25, 0.44]) / SPEED
     found = frozen_poles(case, times)
-    A, B = written_out(0.0, 0.0, 0.0, 4.6)
+    A, B = state_matrices(0.0, 0.0, 0.0, 4.6)
     Q = np.diag([1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0])
     P = scipy.linalg.solve_continuous_are(A, B, Q, [[9e-5]])
     for i, t in enumerate(times):
-        A, _ = written_out(SPEED * t, SPEED, MASS, 4.6)
+        A, _ = state_matrices(SPEED * t, SPEED, MASS, 4.6)
         poles = np.linalg.eigvals(A - B @ B.T @ P / 9e-5)
         np.testing.assert_allclose(
             np.sort_complex(found.poles[i]), np.sort_complex(poles), rtol=1e-7
@@ -99,8 +98,8 @@ def test_frozen_poles_of_the_published_regulator():
     assert found.largest_real_part[2] == pytest.approx(found.poles[2].real.max())
 
 
-def test_pole_of_the_published_filtered_loop():
-    # `frozen_eig` of the reference numbers: 0.509 kg parked in the middle, filter of 10 Hz.
+def test_pole_of_published_loop_with_filter():
+    # `frozen_eig` of the reference numbers: 0.509 kg stationary at midspan, filter of 10 Hz.
     beam = jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.03, modes=5)
     patch = jb.Patch(start=0.2575, end=0.3425, moment_per_volt=0.000265358032154821)
     filter = jb.Filter(cutoff=10.0, order=10, realisation="analogue")
@@ -116,7 +115,7 @@ def test_pole_of_the_published_filtered_loop():
     assert loop.growth_rate() == pytest.approx(rightmost.real, rel=1e-9)
 
 
-def test_branches_are_followed_through_a_crossing():
+def test_crossing_branches_are_tracked():
     t = np.linspace(-1, 1, 21)
     up, down = -1 + 0.5 * t + 3j, -1 - 0.4 * t + 3j + 0.05j
     sorted_by_size = np.sort(np.stack([up, down], axis=1), axis=1)
@@ -124,10 +123,10 @@ def test_branches_are_followed_through_a_crossing():
     np.testing.assert_array_equal(followed[:, 0], np.where(followed[0, 0] == up[0], up, down))
 
 
-def test_sampled_poles_are_those_of_the_simulated_decay():
-    # A delay of one and a half periods, a late sensor and a digital filter, all in the loop.
+def test_sampled_poles_match_simulated_decay():
+    # The loop has a delay of one and a half periods, a delayed sensor and a digital filter.
     filter = jb.Filter(cutoff=60.0, order=2)
-    case = rig(
+    case = shaker_case(
         jb.Feedback([200.0], period=0.004, delay=0.006),
         modes=2,
         loads=[jb.MovingForce(force=2.0, speed=3.0)],
@@ -153,7 +152,7 @@ GAIN = np.array([[300.0, -800.0, 12.0, 0.5, 0.0]])
 
 
 def closed(x, speed, mass):
-    A, B = written_out(x, speed, mass, 4.6, modes=2)
+    A, B = state_matrices(x, speed, mass, 4.6, modes=2)
     return A - B @ GAIN
 
 
@@ -170,19 +169,19 @@ def over_crossing(speed, end):
 
 
 def test_growth_against_scipy():
-    found = growth(rig(jb.StateFeedback(gain=GAIN, coordinates="sine"), modes=2), points=20)
+    found = growth(shaker_case(jb.StateFeedback(gain=GAIN, coordinates="sine"), modes=2), points=20)
     end = 0.05 * LENGTH / SPEED
     assert found.times[1] == pytest.approx(end, rel=1e-12) and found.factor[0] == 1.0
     n = np.array([1, 2]) * np.pi / LENGTH
-    shaker, half = np.sin(n * PLACE), DENSITY * LENGTH / 2
+    shaker, half = np.sin(n * SHAKER_POSITION), DENSITY * LENGTH / 2
     stiffness = half * np.diag(n**4 * RIGIDITY / DENSITY) + SPRING * np.outer(shaker, shaker)
     root = np.linalg.cholesky(scipy.linalg.block_diag(stiffness, half * np.eye(2))).T
     part = root @ over_crossing(SPEED, end)[:4, :4] @ np.linalg.inv(root)
     assert found.factor[1] == pytest.approx(np.linalg.norm(part, ord=2), rel=1e-4)
 
 
-def test_multipliers_of_a_stream_against_scipy():
-    case = rig(jb.StateFeedback(gain=GAIN, coordinates="sine"), modes=2)
+def test_floquet_multipliers_against_scipy():
+    case = shaker_case(jb.StateFeedback(gain=GAIN, coordinates="sine"), modes=2)
     found = stream(jb.replace(case, {"loads.0.speed": 20.0}), 0.04)
     alone = scipy.linalg.expm(0.01 * closed(0.0, 0.0, 0.0))
     expected = np.linalg.eigvals(alone @ over_crossing(20.0, 0.03))
@@ -193,22 +192,22 @@ def test_multipliers_of_a_stream_against_scipy():
     assert found.stable and found.period == 0.04
 
 
-def test_sampled_stream_comes_to_the_continuous_one():
+def test_sampled_multipliers_converge_to_continuous():
     def largest(period):
         law = jb.StateFeedback(gain=GAIN, coordinates="sine", period=period)
         return stream(
-            jb.replace(rig(law, modes=2), {"loads.0.speed": 20.0}), 0.04
+            jb.replace(shaker_case(law, modes=2), {"loads.0.speed": 20.0}), 0.04
         ).largest_multiplier
 
-    # A hold is late by half a period: the difference is of first order.
+    # A hold delays by half a period: the difference is of first order.
     exact = largest(None)
     far, near = (largest(period) - exact for period in (4e-4, 2e-4))
     assert far / near == pytest.approx(2.0, abs=0.15)
 
 
 def test_limit_of_a_gain_is_its_gain_margin():
-    # A feather of a load leaves the loop as it is.
-    case = rig(
+    # The mass of the load is negligible.
+    case = shaker_case(
         jb.Feedback([100.0], period=0.004), modes=2, loads=[jb.MovingMass(mass=1e-9, speed=SPEED)]
     )
 
@@ -226,7 +225,7 @@ def test_limit_of_a_gain_is_its_gain_margin():
 
 def test_margins_against_python_control():
     control = pytest.importorskip("control")
-    loop = linearised_loop(rig(jb.Feedback([3000.0]), modes=2), 0.0)
+    loop = linearised_loop(shaker_case(jb.Feedback([3000.0]), modes=2), 0.0)
     found = margins(loop)
     system = control.ss(*(np.asarray(part) for part in (loop.A, loop.B, -loop.K)), 0)
     gain, phase, distance, _, crossover, _ = control.stability_margins(system)
@@ -234,14 +233,14 @@ def test_margins_against_python_control():
     assert found.phase == pytest.approx(np.radians(phase), rel=1e-6)
     assert found.delay == pytest.approx(np.radians(phase) / crossover, rel=1e-6)
     assert found.modulus_margin == pytest.approx(distance, rel=1e-6)
-    # Nothing that is fed back comes round: no gain and no delay of it matters.
-    silent = dataclasses.replace(loop, K=0.0 * loop.K)
-    assert margins(silent) == (np.inf, 0.0, np.inf, np.inf, 1.0)
+    # Without feedback the margins are infinite.
+    open_loop = dataclasses.replace(loop, K=0.0 * loop.K)
+    assert margins(open_loop) == (np.inf, 0.0, np.inf, np.inf, 1.0)
 
 
-def test_at_the_gain_margin_a_pole_is_on_the_limit():
-    # Here it leaves through -1, at half the sampling frequency.
-    loop = linearised_loop(rig(regulator(period=0.002)), 0.0)
+def test_pole_is_on_unit_circle_at_gain_margin():
+    # It crosses at -1, half the sampling frequency.
+    loop = linearised_loop(shaker_case(regulator(period=0.002)), 0.0)
     A, B, K = (np.asarray(part) for part in (loop.A, loop.B, loop.K))
     gain = margins(loop).gain
     assert np.abs(np.linalg.eigvals(A + gain * B @ K)).max() == pytest.approx(1.0, abs=1e-9)
@@ -249,53 +248,31 @@ def test_at_the_gain_margin_a_pole_is_on_the_limit():
         assert np.abs(np.linalg.eigvals(A + (1 + share * (gain - 1)) * B @ K)).max() < 1
 
 
-def test_delay_margin_is_the_delay_that_destabilises():
-    found = margins(linearised_loop(rig(jb.Feedback([1500.0], period=0.002), modes=2), 0.0))
+def test_delay_beyond_its_margin_destabilises():
+    found = margins(linearised_loop(shaker_case(jb.Feedback([1500.0], period=0.002), modes=2), 0.0))
     for share, stable in ((0.98, True), (1.02, False)):
         later = jb.Feedback([1500.0], period=0.002, delay=share * found.delay)
-        poles = linearised_loop(rig(later, modes=2), 0.0).poles()
+        poles = linearised_loop(shaker_case(later, modes=2), 0.0).poles()
         assert (poles.real.max() < 0) == stable
 
 
-def test_gramians_against_scipy():
-    plant = state_space(rig(regulator(), sensors=1)).unloaded
-    A, B, C = (np.asarray(part) for part in (plant.A, plant.B, plant.C))
-    reach = scipy.linalg.solve_continuous_lyapunov(A, -B @ B.T)
-    view = scipy.linalg.solve_continuous_lyapunov(A.T, -C.T @ C)
-    found = gramians(plant)
-    scale = np.sqrt(np.outer(np.diag(reach), np.diag(reach)))
-    product = np.asarray(found.controllability @ found.controllability.T)
-    np.testing.assert_allclose(product / scale, reach / scale, atol=1e-10)
-    np.testing.assert_allclose(found.reachable_size, np.sqrt(np.diag(reach)), rtol=1e-9)
-    np.testing.assert_allclose(found.observable_size, np.sqrt(np.diag(view)), rtol=1e-6)
-    expected = np.sort(np.sqrt(np.abs(np.linalg.eigvals(reach @ view))))[::-1]
-    np.testing.assert_allclose(found.hankel[:6], expected[:6], rtol=1e-6)
-    sampled = plant.discretize(0.003)
-    A, B = np.asarray(sampled.A), np.asarray(sampled.B)
-    reach = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
-    np.testing.assert_allclose(gramians(sampled).reachable_size, np.sqrt(np.diag(reach)), rtol=1e-8)
-
-
-def test_what_has_no_answer_is_refused():
-    case = rig(jb.Feedback([1.0], period=0.01))
+def test_errors_are_named():
+    case = shaker_case(jb.Feedback([1.0], period=0.01))
     with pytest.raises(ValueError, match="there is no loop: the case has no controller"):
-        linearised_loop(rig(None), 0.0)
+        linearised_loop(shaker_case(None), 0.0)
     with pytest.raises(ValueError, match="spacing must be a whole number of the controller's"):
         stream(case, 0.0155)
     with pytest.raises(ValueError, match="a stream repeats the one load of a case; this has 0"):
-        stream(rig(jb.Feedback([1.0]), loads=[]), 1.0)
+        stream(shaker_case(jb.Feedback([1.0]), loads=[]), 1.0)
     with pytest.raises(ValueError, match="there is no crossing: the case has no loads"):
-        growth(rig(jb.Feedback([1.0]), loads=[]))
+        growth(shaker_case(jb.Feedback([1.0]), loads=[]))
     with pytest.raises(ValueError, match="low and high must be positive and ascend"):
         stability_limit(case, "loads.0.mass", 2.0, 1.0)
-    with pytest.raises(ValueError, match="the loop is unstable as it is"):
-        margins(linearised_loop(rig(jb.Feedback([-1e6], period=0.01)), 0.0))
+    with pytest.raises(ValueError, match="margins need a stable closed loop"):
+        margins(linearised_loop(shaker_case(jb.Feedback([-1e6], period=0.01)), 0.0))
     slow = jb.Case(
         beam=case.beam, actuators=case.actuators, controller=case.controller,
         sensors=[jb.Sensor(0.25, sampling_period=0.02)], run=case.run,
     )  # fmt: skip
     with pytest.raises(ValueError, match="sensors.0.sampling_period must be the controller's"):
         linearised_loop(slow, 0.0)
-    free = jb.Case(beam=jb.Beam(1.0, 1.0, 1.0, modes=2), sensors=[jb.Sensor(0.2)])
-    with pytest.raises(ValueError, match="Gramians need a stable system"):
-        gramians(state_space(free).unloaded)

@@ -73,7 +73,9 @@ def test_a_patch_lifts_a_pinned_beam_as_the_closed_form_says():
 def test_slope_curvature_and_third_derivative_of_a_pinned_beam():
     x = np.array([0.1, 0.2, 0.3, 0.35, 0.5])
     over = np.array([0, 1, 1, 0, 0])  # at the edges, what lies to the right
-    assert_allclose(static_deflection_per_command(PLAIN, x, 2)[0], -1e-3 / 13.211 * over, rtol=1e-12, atol=1e-18)
+    assert_allclose(
+        static_deflection_per_command(PLAIN, x, 2)[0], -1e-3 / 13.211 * over, rtol=1e-12, atol=1e-18
+    )
     assert_allclose(static_deflection_per_command(PLAIN, x, 3)[0], 0.0, atol=1e-15)
     slopes = central(lambda y: static_deflection_per_command(PLAIN, y[0])[0], [0.3], 1e-3)
     assert_allclose(static_deflection_per_command(PLAIN, 0.3, 1)[0], slopes[0], rtol=1e-9)
@@ -158,7 +160,10 @@ def test_a_patch_leaves_no_moment_in_a_determinate_beam():
     for ends in ("pinned-pinned", "clamped-free"):
         beam = dataclasses.replace(PLAIN.beam, ends=ends)
         case, x = jb.Case(beam, actuators=[patch]), np.linspace(0.0, 0.6, 13)
-        curvature, third = static_deflection_per_command(case, x, 2)[0], static_deflection_per_command(case, x, 3)[0]
+        curvature, third = (
+            static_deflection_per_command(case, x, 2)[0],
+            static_deflection_per_command(case, x, 3)[0],
+        )
         assert_allclose(bending_moment(case, x, curvature, [1.0]), 0.0, atol=1e-14)
         assert_allclose(shear_force(case, x, third), 0.0, atol=1e-12)
 
@@ -173,7 +178,9 @@ def test_moment_of_a_patch_on_a_beam_clamped_at_both_ends():
     p, q = np.linalg.solve(system, own * np.array([b - a, (b**2 - a**2) / 2]))
     found = bending_moment(case, x, static_deflection_per_command(case, x, 2)[0], [1.0])
     assert_allclose(found, p + q * x, rtol=1e-11)
-    assert_allclose(shear_force(case, x, static_deflection_per_command(case, x, 3)[0]), q, rtol=1e-10)
+    assert_allclose(
+        shear_force(case, x, static_deflection_per_command(case, x, 3)[0]), q, rtol=1e-10
+    )
 
 
 @pytest.mark.parametrize("x", [0.0, 0.12, 0.6])

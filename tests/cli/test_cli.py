@@ -193,5 +193,5 @@ def test_identify_a_case(run, folder):
 
 def test_contact_loss_is_printed_once(run):
     printed = run("simulate case.toml --set loads.0.speed=6 --set loads.0.mass=3")
-    assert printed.count("load 0 would have to pull") == 1
+    assert printed.count("load 0 loses contact") == 1
     assert "lowest contact force (N)" in printed

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.controller import Measurement
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.loop_as_oracle import expected, span_of
@@ -255,13 +255,13 @@ FAULTS = [
 def test_faulty_compensators_are_refused(change, message):
     law = dataclasses.replace(COMPENSATORS["pd"][0], **change)
     with pytest.raises(ValueError, match=re.escape(message)):
-        check(dataclasses.replace(CASE, controller=law))
+        check_case(dataclasses.replace(CASE, controller=law))
 
 
 def test_an_offset_needs_samples():
     sensors = [jb.Sensor(0.19, offset=1e-3), jb.Sensor(0.4)]
     with pytest.raises(ValueError, match=r"controller.period must be given, as sensors.0 has"):
-        check(at_every_instant("pd", sensors=sensors))
+        check_case(at_every_instant("pd", sensors=sensors))
 
 
 def test_an_oscillator_too_quick_for_the_sampling_is_refused():
@@ -269,7 +269,7 @@ def test_an_oscillator_too_quick_for_the_sampling_is_refused():
     with pytest.raises(
         ValueError, match=r"below half the sampling frequency, 41.6667 Hz; it is 45"
     ):
-        check(dataclasses.replace(CASE, controller=law))
+        check_case(dataclasses.replace(CASE, controller=law))
 
 
 @pytest.mark.parametrize("name", COMPENSATORS)

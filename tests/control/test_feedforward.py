@@ -15,7 +15,7 @@ from jaxbeam.files.case_file import case_from_dict, case_to_dict
 
 SHARES = [0.0, 0.2, 0.7, 1.0]
 VALUES = [[0.5, 6.0, 4.0, 1.0]]
-LAW = jb.Passage(gates=[-0.2, -0.1], shares=SHARES, values=VALUES, period=0.01, lead=0.02)
+LAW = jb.Feedforward(gates=[-0.2, -0.1], shares=SHARES, values=VALUES, period=0.01, lead=0.02)
 
 
 ONE = (jb.MovingMass(mass=0.4, speed=1.0, entry_time=0.3),)

@@ -15,7 +15,7 @@ LENGTH, RIGIDITY, MODES = 0.6, 13.2, 3
 START, END, MOMENT = 0.25, 0.35, 8.3e-4 * 0.3 * 200
 READINGS = 1e-3 * np.array([-0.4, -0.1, 0.0, 0.2])
 VALUES = [[7.0, 3.0, 0.0, -2.0]]
-LAW = jb.Relief(READINGS, VALUES, compensation=0.9, period=0.01, delay=0.02)
+LAW = jb.InternalModel(READINGS, VALUES, compensation=0.9, period=0.01, delay=0.02)
 SMOOTH = jb.Filter(10.0, order=4)
 
 
@@ -71,7 +71,7 @@ def test_notches_are_the_analogue_ones_warped_to_their_frequencies():
 def test_it_may_be_steep_where_plain_feedback_of_the_same_slope_is_not_stable():
     steep, times = 3e4, np.zeros(1)  # V/m; the load is not on the beam yet
     readings, values = [-2e-4, 2e-4], [[6.0, -6.0]]
-    relief = jb.Relief(readings, values, period=0.01, delay=0.02)
+    relief = jb.InternalModel(readings, values, period=0.01, delay=0.02)
     plain = jb.Feedback([steep], period=0.01, delay=0.02)
     smooth = jb.Filter(10.0, order=10)
     rates = [

@@ -1,4 +1,4 @@
-"""Gains of feedback over the mass of the load: the law, and where its gains come from."""
+"""Feedback with gains scheduled over the mass of the load, and derivation of such gains."""
 
 import dataclasses
 
@@ -16,8 +16,8 @@ from jaxbeam.analysis.derived_gains import (
     scheduled_controller,
 )
 from jaxbeam.case.controller import Measurement
-from jaxbeam.case.validation import check
-from jaxbeam.control import ScheduledFeedback
+from jaxbeam.case.validation import check_case
+from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.analysis.test_compare import critical_gain
 from tests.loop_as_oracle import expected, span_of
@@ -46,7 +46,12 @@ def law(**settings) -> ScheduledFeedback:
 # The law
 
 
-def test_gains_are_those_for_the_mass():
+def gains_at(controller, case, mass):
+    """Gains (actuator,) of the law for a mass (kg)."""
+    return controller.law(jb.state_space(case)).gains_at(jnp.asarray(mass))
+
+
+def test_gains_by_interpolation_and_in_steps():
     two = ScheduledFeedback([0.2, 0.4], [[1.0, 3.0], [8.0, 4.0]], power=3)
     stepped = dataclasses.replace(two, between="stepped")
     for mass, line, steps in (
@@ -55,60 +60,63 @@ def test_gains_are_those_for_the_mass():
         (0.4, [3.0, 4.0], [3.0, 4.0]),
         (0.9, [3.0, 4.0], [3.0, 4.0]),
     ):
-        assert_allclose(two.gains_at(jnp.asarray(mass)), line, rtol=1e-14)
-        assert_allclose(stepped.gains_at(jnp.asarray(mass)), steps, rtol=1e-14)
+        assert_allclose(gains_at(two, rig(), mass), line, rtol=1e-14)
+        assert_allclose(gains_at(stepped, rig(), mass), steps, rtol=1e-14)
     readings = jnp.array([-2.0, 0.5])
-    memory = eqx.tree_at(lambda m: m.mass, two.init(jb.state_space(rig())), jnp.asarray(0.25))
-    command, _ = two.step(memory, Measurement(readings, jnp.zeros(0), jnp.zeros(2)), 0.0)
+    law = two.law(jb.state_space(rig(mass=0.25)))
+    measurement = Measurement(readings, jnp.zeros(0), jnp.zeros(2))
+    command = law.step(law.initial_state(), measurement, 0.0).command
     assert_allclose(command, [1.5 * 8.0, -7.0 * 0.125], rtol=1e-14)
 
 
 @pytest.fixture(scope="module")
-def heard():
-    """A run in which the mass is recognised, its sensors and gates without error."""
-    recognition = jb.Recognition(gates=[-0.1, -0.05], until=0.3)
-    return jb.simulate(rig(law(recognition=recognition), mass=0.4))
+def record():
+    """Run with load identification from gates; sensors and gates have no error."""
+    identification = jb.LoadIdentification(gates=[-0.1, -0.05], until=0.3)
+    return jb.simulate(rig(law(load_identification=identification), mass=0.4))
 
 
-def test_the_lightest_is_assumed_until_the_mass_is_recognised(heard):
-    """Then it is that whose static deflections fit the readings best, by two modes, in numpy."""
-    times, readings = np.asarray(heard.times), np.asarray(heard.measured)[:, 0]
-    given = np.append(0.0, np.asarray(heard.command)[:-1, 0])  # until each tick
-    span, share = span_of(heard.case), (times - 0.05) * 2.0 / 0.6
-    seen = span.shapes(0.3) / span.frequencies**2
-    pull = 8.292e-4 * 0.32 * 200.0 * (span.shapes(0.2575, 1) - span.shapes(0.3425, 1))
-    heeded = (share > 0) & (share < 0.3 - 1e-9)
-    line = np.array([-seen @ span.shapes(0.6 * x) for x in share[heeded]])
-    rest = readings[heeded] - (seen @ pull) * given[heeded]
-    mass = line @ rest / (line @ line) / 9.81
+def test_gain_before_and_after_the_mass_is_identified(record):
+    """First for the lightest mass, then for that fitted to static deflections of two modes."""
+    times, readings = np.asarray(record.times), np.asarray(record.measured)[:, 0]
+    commands = np.append(0.0, np.asarray(record.command)[:-1, 0])  # before each sample
+    span, share = span_of(record.case), (times - 0.05) * 2.0 / 0.6
+    compliance = span.shapes(0.3) / span.frequencies**2
+    force = 8.292e-4 * 0.32 * 200.0 * (span.shapes(0.2575, 1) - span.shapes(0.3425, 1))
+    used = (share > 0) & (share < 0.3 - 1e-9)
+    line = np.array([-compliance @ span.shapes(0.6 * x) for x in share[used]])
+    deflection = readings[used] - (compliance @ force) * commands[used]
+    mass = line @ deflection / (line @ line) / 9.81
     assert_allclose(mass, 0.4, rtol=0.15)
     gains = np.where(share < 0.3 - 1e-9, 1000.0, np.interp(mass, MASSES, GAINS[0]))
-    wanted = np.clip(-gains * readings, -2.5, 7.5)
-    assert np.ptp(wanted) > 0.5
-    # Influence lines are read from 201 places: to (pi / 200)^2 / 8 of their size.
-    assert_allclose(heard.command[:, 0], wanted, rtol=4e-5, atol=1e-12)
+    expected_command = np.clip(-gains * readings, -2.5, 7.5)
+    assert np.ptp(expected_command) > 0.5
+    # Influence lines are interpolated between 201 positions: to (pi / 200)^2 / 8 of their size.
+    assert_allclose(record.command[:, 0], expected_command, rtol=4e-5, atol=1e-12)
 
 
-def test_a_record_replayed_tells_the_mass_that_the_law_was_told(heard):
-    """Read off the gains with which the law answered; without what it commanded, it is another."""
-    recognition = heard.case.controller.recognition
-    times, readings = np.asarray(heard.times), np.asarray(heard.measured)[:, 0]
-    told = (times - 0.05) * 2.0 / 0.6 > 0.3 + 1e-9
+def test_mass_from_a_record_is_that_of_the_loop(record):
+    """Compared by the gains of the law; without the commands of the record it differs."""
+    identification = record.case.controller.load_identification
+    times, readings = np.asarray(record.times), np.asarray(record.measured)[:, 0]
+    after = (times - 0.05) * 2.0 / 0.6 > 0.3 + 1e-9
 
-    def answers(mass):
+    def commands(mass):
         gains = np.interp(mass, MASSES, GAINS[0])
-        return np.clip(-gains * readings[told], -2.5, 7.5)
+        return np.clip(-gains * readings[after], -2.5, 7.5)
 
-    mass = jb.recognised(heard, recognition).mass
-    assert np.sum((answers(mass) < 7.5) & (answers(mass) > 0.1)) >= 3
-    assert_allclose(heard.command[told, 0], answers(mass), rtol=1e-10, atol=1e-12)
-    deaf = eqx.tree_at(lambda r: r.command, heard, jnp.zeros_like(heard.command))
-    assert abs(jb.recognised(deaf, recognition).mass / mass - 1) > 0.02
+    mass = jb.identified_load(record, identification).mass
+    assert np.sum((commands(mass) < 7.5) & (commands(mass) > 0.1)) >= 3
+    assert_allclose(record.command[after, 0], commands(mass), rtol=1e-10, atol=1e-12)
+    without_commands = eqx.tree_at(lambda r: r.command, record, jnp.zeros_like(record.command))
+    assert abs(jb.identified_load(without_commands, identification).mass / mass - 1) > 0.02
 
 
-def test_a_case_file_keeps_it():
-    case = rig(law(between="stepped", recognition=jb.Recognition(gates=[-0.1, -0.05])))
-    check(case)
+def test_case_file_keeps_the_controller():
+    case = rig(
+        law(between="stepped", load_identification=jb.LoadIdentification(gates=[-0.1, -0.05]))
+    )
+    check_case(case)
     assert case_to_dict(case)["controller"]["kind"] == "feedback-scheduled"
     assert eqx.tree_equal(case, case_from_dict(case_to_dict(case)))
 
@@ -117,36 +125,43 @@ def test_a_case_file_keeps_it():
     ("change", "words"),
     [
         ({"loads": ()}, "kind needs a single load, with a mass"),
-        ({"controller": law(period=None, recognition=jb.Recognition(threshold=1e-4))}, "period"),
+        (
+            {
+                "controller": law(
+                    period=None, load_identification=jb.LoadIdentification(threshold=1e-4)
+                )
+            },
+            "period",
+        ),
         ({"controller": ScheduledFeedback([0.2], GAINS)}, "a gain for each of 1 masses, not 3"),
         ({"controller": ScheduledFeedback(MASSES, GAINS * 2)}, "for each of 1 actuators, not 2"),
         ({"controller": ScheduledFeedback([], [[]])}, "masses must list at least one"),
         (
-            {"controller": law(recognition=jb.Recognition(threshold=1e-4))},
-            "recognition.threshold needs two sensors",
+            {"controller": law(load_identification=jb.LoadIdentification(threshold=1e-4))},
+            "load_identification.threshold needs two sensors",
         ),
     ],
 )
-def test_what_does_not_fit_is_refused(change, words):
+def test_errors_of_settings(change, words):
     with pytest.raises(ValueError, match=words):
-        check(dataclasses.replace(rig(law()), **change))
+        check_case(dataclasses.replace(rig(law()), **change))
 
 
-# Where its gains come from
+# Derivation of gains
 
 
 def test_printed_gains_follow_from_statics():
     """Fig. 6.7: 2 V/mm up to 0.345 kg, 3 up to 0.45, then 3.6, in place of 2 V/mm^3.
 
-    A pinned beam sinks by g L^3 / (48 E I) per kilogram; w = 1 mm, where k w = 2 w^3 at k = 2, and
-    w = 1.2247 mm at k = 3 tell the masses, with the lift of a patch at midspan.
+    The static deflection of a pinned beam is g L^3 / (48 E I) per kilogram; w = 1 mm, where k w = 2
+    w^3 at k = 2, and w = 1.2247 mm at k = 3 give the masses, with the lift of a patch at midspan.
     """
     case = jb.replace(rig(), {"actuators.0.correction": 0.502})
-    sunk = 9.81 * 0.6**3 / (48 * 13.211)
+    deflection_per_mass = 9.81 * 0.6**3 / (48 * 13.211)
     # A moment between 0.2575 m and its mirror image: w(L/2) is the integral of x M / (E I) from
     # the support to the middle.
     lift = 200.0 * 0.502 * 8.292e-4 * (0.3**2 - 0.2575**2) / 2 / 13.211
-    masses = [(w + lift * 2e9 * w**3) / sunk for w in (1e-3, np.sqrt(1.5) * 1e-3)]
+    masses = [(w + lift * 2e9 * w**3) / deflection_per_mass for w in (1e-3, np.sqrt(1.5) * 1e-3)]
     assert_allclose(masses, [0.344, 0.4486], atol=1e-3)
     assert_allclose(equivalent_gains(case, masses, 2e9), [[2000.0, 3000.0]], rtol=1e-6)
     assert_allclose(equivalent_gains(case, [0.509], 2e9), [[3596.0]], rtol=2e-3)
@@ -158,7 +173,7 @@ def loop():
 
 
 @pytest.mark.slow
-def test_the_best_gain_is_lowest_by_the_oracle(loop):
+def test_best_gain_has_the_lowest_peak_by_the_oracle(loop):
     """The peak at the samples, by scipy, is higher with a seventh less gain and with more."""
     light, heavy = best_gains(loop, [0.05, 0.2], 1e5)
     times = np.asarray(jb.simulate(loop).times)
@@ -174,13 +189,13 @@ def test_the_best_gain_is_lowest_by_the_oracle(loop):
         for other in (0.85, 1.18):
             assert peak(other * found.gain, found.mass) > lowest
     made = scheduled_controller(loop, [light, heavy], "stepped")
-    assert_allclose(made.gains_at(jnp.asarray(0.1)), [light.gain], rtol=1e-12)
-    check(dataclasses.replace(loop, controller=made))
+    assert_allclose(gains_at(made, loop, 0.1), [light.gain], rtol=1e-12)
+    check_case(dataclasses.replace(loop, controller=made))
 
 
 @pytest.mark.slow
-def test_gains_keep_a_margin_where_one_is_asked_for(loop):
-    """Against the critical gain with the mass parked, by scipy."""
+def test_best_gain_with_a_margin(loop):
+    """Against the critical gain with the mass at rest, by scipy."""
     case = jb.replace(loop, {"loads.0.mass": 0.509})
     (found,) = best_gains(case, [0.509], 1e4, margin=2.0)
     critical = min(critical_gain(case, x) for x in np.linspace(0, 0.6, 13))
@@ -189,7 +204,7 @@ def test_gains_keep_a_margin_where_one_is_asked_for(loop):
         best_gains(case, [0.509], 1e4, margin=1e6)
 
 
-def test_other_laws_are_refused():
+def test_other_controllers_are_refused():
     with pytest.raises(ValueError, match="kind 'feedback' with one power"):
         best_gains(rig(law()), [0.2], 1.0)
     with pytest.raises(ValueError, match="only 0 sensors for 1 actuators"):

@@ -17,9 +17,11 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.estimation import Inversion, Kalman, Observer
+from jaxbeam.estimation.inversion import Inversion
+from jaxbeam.estimation.kalman import Kalman
+from jaxbeam.estimation.observer import Observer
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
@@ -207,4 +209,4 @@ def test_faults_are_named(estimator, period, message):
     period = None if period is None else jnp.asarray(period)
     law = dataclasses.replace(case.controller, period=period)
     with pytest.raises(ValueError, match=message):
-        check(dataclasses.replace(case, controller=law))
+        check_case(dataclasses.replace(case, controller=law))

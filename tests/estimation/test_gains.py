@@ -9,7 +9,7 @@ import scipy.linalg
 import scipy.signal
 from numpy.testing import assert_allclose
 
-from jaxbeam.estimation import kalman_gain, placed_gain, sampled_kalman_gain
+from jaxbeam.estimation.gains import kalman_gain, placed_gain, sampled_kalman_gain
 from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.numerics.discretisation import balance
 from tests.differences import central
@@ -96,7 +96,9 @@ def test_transitions_of_a_plant_that_stays_as_it_is(late):
     after = push[period] if late is None else push[period - late]
     scale = np.sqrt(np.diag(noise))
     outer = scale * scale[:, None]
-    assert_allclose(step.transition * scale / scale[:, None], drift * scale / scale[:, None], atol=1e-11)
+    assert_allclose(
+        step.transition * scale / scale[:, None], drift * scale / scale[:, None], atol=1e-11
+    )
     assert_allclose(step.noise / outer, noise / outer, rtol=0, atol=1e-10)
     assert_allclose(step.after / scale[:, None], after / scale[:, None], rtol=1e-9, atol=1e-9)
     whole = (step.before + step.after) / scale[:, None]

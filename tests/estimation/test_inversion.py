@@ -11,11 +11,14 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.estimation import ConditioningWarning, Inversion, Kalman, Observer, conditioning
+from jaxbeam.estimation.inversion import Inversion
+from jaxbeam.estimation.kalman import Kalman
+from jaxbeam.estimation.observability import ConditioningWarning, conditioning
+from jaxbeam.estimation.observer import Observer
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.model.modes import lay_out
+from jaxbeam.model.modes import mesh_layout
 from tests.differences import central
 from tests.loop_as_oracle import span_of
 
@@ -40,7 +43,7 @@ def loop(places, estimator=None, modes=3, quantity="deflection", design=None):
 
 def estimates(case, readings, commands):
     """States (tick, state) found from readings and commands (tick, ...)."""
-    inversion, layout = case.controller.estimator, lay_out(case)
+    inversion, layout = case.controller.estimator, mesh_layout(case)
 
     @jax.jit
     def run(case):
@@ -90,7 +93,7 @@ def test_conditioning():
     @jax.jit
     def worst(places):
         moved = {f"sensors.{i}.position": places[i] for i in range(3)}
-        model = jb.state_space(jb.replace(case, moved), layout=lay_out(case))
+        model = jb.state_space(jb.replace(case, moved), layout=mesh_layout(case))
         return conditioning(model.unloaded)
 
     places = jnp.array([0.15, 0.25, 0.35])
@@ -128,13 +131,13 @@ NODES = [
 @pytest.mark.parametrize(("case", "message"), NODES)
 def test_sets_of_sensors_that_will_not_do_are_refused(case, message):
     with pytest.raises(ValueError, match=f"^controller.estimator.{message}"):
-        check(case)
+        check_case(case)
 
 
 def test_sensors_near_a_node_are_warned_about():
     case = loop([THIRD + 2e-4, 2 * THIRD, 0.1995])
     with pytest.warns(ConditioningWarning, match="hardly tell some modes apart: errors of"):
-        check(case)
+        check_case(case)
 
 
 def test_a_design_of_fewer_modes_asks_less_of_the_sensors():
@@ -142,7 +145,7 @@ def test_a_design_of_fewer_modes_asks_less_of_the_sensors():
     case = loop([THIRD, 2 * THIRD], Kalman(1e-2, 1e-5), design=DesignModel(modes=2))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check(case)
+        check_case(case)
     again = case_from_dict(case_to_dict(case))
     assert case_to_dict(again) == case_to_dict(case)
     assert case_to_dict(case)["controller"]["estimator"]["kind"] == "kalman"

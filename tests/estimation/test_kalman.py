@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.estimation import Kalman
+from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.model.modes import mesh_layout
 from tests.differences import central
 from tests.loop_as_oracle import parts_of

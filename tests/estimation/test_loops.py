@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.estimation import Kalman
+from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.differences import central

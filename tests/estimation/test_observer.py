@@ -10,7 +10,7 @@ import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.estimation import Observer
+from jaxbeam.estimation.observer import Observer
 from jaxbeam.model.modes import mesh_layout
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant

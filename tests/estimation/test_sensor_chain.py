@@ -12,9 +12,9 @@ from scipy.stats import chi2, norm
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.case.validation import check
-from jaxbeam.estimation import Kalman
-from jaxbeam.model.modes import lay_out
+from jaxbeam.case.validation import check_case
+from jaxbeam.estimation.kalman import Kalman
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.loop_as_oracle import parts_of
@@ -40,7 +40,7 @@ CASE = jb.Case(
     controller=jb.Prescribed([0.0], period=PERIOD, delay=DELAY),
 )
 ESTIMATED = Kalman(FORCES, loads="estimated", weight_deviation=DEVIATION, reach=2)
-LAYOUT = lay_out(CASE)
+LAYOUT = mesh_layout(CASE)
 TICKS, RUNS = 14, 100
 
 
@@ -199,4 +199,4 @@ def test_longer_delays_than_are_modelled_are_refused():
     case = dataclasses.replace(CASE, sensors=late, controller=law)
     message = "estimator.reach must be at least 2, the periods of sensors.0.delay"
     with pytest.raises(ValueError, match=message):
-        check(case)
+        check_case(case)

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.estimation import Kalman
+from jaxbeam.estimation.kalman import Kalman
 from tests.estimation.test_kalman import CASE, FORCES, NOISE, OFFSET, PERIOD, filtered, signals
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant, conditioned

@@ -91,15 +91,15 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         assert not native_peaks.available()
-        assert native_peaks.build() == native_peaks.library_path()
+        assert native_peaks.LIBRARY.build() == native_peaks.LIBRARY.library_path()
         assert native_peaks.available()
-        yield native_peaks.library_path().parent
+        yield native_peaks.LIBRARY.library_path().parent
 
 
 def swept(case, over):
     with_it = jb.sweep(case, over, progress=False)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(native_peaks, "ready", lambda: False)
+        patch.setattr(native_peaks, "available", lambda: False)
         return with_it, jb.sweep(case, over, progress=False)
 
 
@@ -135,10 +135,10 @@ def test_a_beam_without_loads_stays_at_rest():
 NARROW = """
 import sys
 import jaxbeam as jb
-from jaxbeam import native, native_library
+from jaxbeam.integrator import native_peaks
 from tests.integrator.test_native_peaks import COUPLED, GRID
-native.build()
-assert native.ready()
+native_peaks.LIBRARY.build()
+assert native_peaks.available()
 jb.sweep(COUPLED, GRID, progress=False).to_netcdf(sys.argv[1], engine="h5netcdf")
 """
 
@@ -151,7 +151,7 @@ def test_narrower_machines_compute_the_same(without, tmp_path, monkeypatch):
     monkeypatch.setenv("CC", f"{native_library.find_compiler()} -mno-{without}")
     path = tmp_path / "found.nc"
     subprocess.run([sys.executable, "-c", NARROW, str(path)], check=True, cwd=ROOT)
-    monkeypatch.setattr(native_peaks, "ready", lambda: False)
+    monkeypatch.setattr(native_peaks, "available", lambda: False)
     plain = jb.sweep(COUPLED, GRID, progress=False).peak_deflection
     with xarray.open_dataset(path, engine="h5netcdf") as found:
         assert_allclose(found.peak_deflection, plain, rtol=1e-11)
@@ -170,10 +170,15 @@ def marched(case, by_hand, longest=1e-3):
     def peaks(mass):
         varied = replace(case, {"loads.0.mass": mass})
         assembled = modal_model(varied, known.layout, known.coupled)
-        grid, places = grid_by_step_length(varied, assembled, jnp.asarray(longest)), varied.sensor_positions
+        grid, places = (
+            grid_by_step_length(varied, assembled, jnp.asarray(longest)),
+            varied.sensor_positions,
+        )
         loads = load_set(varied)
         if not by_hand:
-            best, _ = integrate_peaks(discrete_model(assembled, grid, places), loads, max_loads=known.max_loads)
+            best, _ = integrate_peaks(
+                discrete_model(assembled, grid, places), loads, max_loads=known.max_loads
+            )
             return best.refined_peak()[0][:, 0]
         given = jnp.ones((), bool), assembled, grid, places, loads
         of_one = jax.tree.map(lambda leaf: leaf[None], given)
@@ -215,7 +220,7 @@ def test_a_resumed_sweep_keeps_to_what_began_it():
     def marks(histories, precision, case=PLAIN):
         for ready in (True, False):
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(native_peaks, "ready", lambda ready=ready: ready)
+                patch.setattr(native_peaks, "available", lambda ready=ready: ready)
                 order = sweep_specification(case, GRID, False, histories, 1e-7, precision)
                 yield order.fingerprint()
 
@@ -232,9 +237,9 @@ def test_a_resumed_sweep_keeps_to_what_began_it():
 
 def test_what_cannot_be_loaded_is_left_alone(folder, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native_peaks.library_path().parent.mkdir()
-    native_peaks.library_path().write_bytes(
-        (folder / native_peaks.library_path().name).read_bytes()[:1000]
+    native_peaks.LIBRARY.library_path().parent.mkdir()
+    native_peaks.LIBRARY.library_path().write_bytes(
+        (folder / native_peaks.LIBRARY.library_path().name).read_bytes()[:1000]
     )
     assert not native_peaks.available()
 
@@ -251,15 +256,15 @@ def test_compilers_that_fail_are_told_of(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CC", "false")
     with pytest.raises(RuntimeError, match="the C compiler false cannot compile .*native.c"):
-        native_peaks.build()
+        native_peaks.LIBRARY.build()
     monkeypatch.setenv("CC", "/nowhere/cc")
     with pytest.raises(RuntimeError, match="the C compiler /nowhere/cc cannot be run"):
-        native_peaks.build()
+        native_peaks.LIBRARY.build()
     monkeypatch.delenv("CC")
     monkeypatch.setattr(shutil, "which", lambda _: None)
     with pytest.raises(RuntimeError, match="there is no C compiler here: install gcc or clang"):
-        native_peaks.build()
-    assert not native_peaks.library_path().exists()
+        native_peaks.LIBRARY.build()
+    assert not native_peaks.LIBRARY.library_path().exists()
 
 
 def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
@@ -267,12 +272,12 @@ def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["native", "--json"])
     answer = json.loads(capsys.readouterr().out)
-    assert answer == {"path": str(native_peaks.library_path()), "compiled": True}
-    assert native_peaks.library_path().exists() and native_peaks.available()
+    assert answer == {"path": str(native_peaks.LIBRARY.library_path()), "compiled": True}
+    assert native_peaks.LIBRARY.library_path().exists() and native_peaks.available()
     with pytest.raises(SystemExit, match="0"):
         main(["native", "--remove"])
-    assert "sweeps do without" in capsys.readouterr().out
-    assert not native_peaks.library_path().exists()
+    assert "sweeps use XLA" in capsys.readouterr().out
+    assert not native_peaks.LIBRARY.library_path().exists()
 
 
 SEEK = """
@@ -308,6 +313,10 @@ def test_places_of_peaks_are_as_high_as_those_found_without_it(tmp_path):
     seek = ctypes.CDLL(str(tmp_path / "seek.so")).seek
     seek.argtypes = [pointer, pointer, pointer, ctypes.c_int]
     heights = np.empty(curves.shape[1])
-    through = np.ascontiguousarray(peak_search.interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T)
+    through = np.ascontiguousarray(
+        peak_search.interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T
+    )
     seek(curves, through, heights, heights.size)
-    assert_allclose(heights, peak_search.refine_peak(jnp.asarray(curves), PEAK_NODES)[0], rtol=1e-11)
+    assert_allclose(
+        heights, peak_search.refine_peak(jnp.asarray(curves), PEAK_NODES)[0], rtol=1e-11
+    )

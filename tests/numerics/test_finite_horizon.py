@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
-from jaxbeam.control import FiniteLQR
+from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
 
 SHARES = np.array([0.0, 0.123, 0.25, 0.377, 0.5, 0.61, 0.75, 0.9, 0.97, 0.9999])
 

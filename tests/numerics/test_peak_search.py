@@ -9,10 +9,10 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import jaxbeam.numerics.peak_search
-from jaxbeam.integrator.propagators import LOOKED
+from jaxbeam.integrator.propagators import PEAK_NODES
 
 EQUAL = tuple(float(share) for share in np.linspace(0.0, 1.0, 7))
-EITHER = pytest.mark.parametrize("points", [EQUAL, LOOKED], ids=["equal", "of a step"])
+EITHER = pytest.mark.parametrize("points", [EQUAL, PEAK_NODES], ids=["equal", "of a step"])
 refine, vertex = (
     jax.jit(function, static_argnames="points")
     for function in (

@@ -147,7 +147,7 @@ def test_the_verdict_tells_of_contact_and_error(record):
         record,
         (jnp.array([nan, 0.25]), jnp.array([nan, 0.9]), jnp.array([1.0, -0.5])),
     )
-    assert "load 1 would have to pull, first at t = 0.25 s, x = 0.9 m" in lost.verdict
+    assert "load 1 loses contact, first at t = 0.25 s, x = 0.9 m" in lost.verdict
     assert "(smallest contact force -0.5 N)" in lost.verdict
     assert "load 0" not in lost.verdict
 

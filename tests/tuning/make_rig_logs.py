@@ -1,8 +1,8 @@
 """Make the logs that `jaxbeam reproduce identification` fits: python -m tests.tuning.make_rig_logs
 
-The published rigs with the numbers that the thesis fitted by hand, as finite elements with twelve
-modes, integrated by scipy: crossed by the heaviest load while their actuators are driven by sweeps
-of sines, read with white noise. Not one number of it is computed by jaxbeam.
+The published rigs with the parameters fitted by hand in the thesis, as finite elements with twelve
+modes, integrated by scipy: crossed by the heaviest load while their actuators are driven by sine
+sweeps, with white noise in the readings. Nothing of it is computed by jaxbeam.
 """
 
 from pathlib import Path
@@ -55,8 +55,8 @@ def make(name: str) -> np.ndarray:
     return np.column_stack([times, 1e3 * readings, commands])
 
 
-def beside(name: str) -> str:
-    """The description of a log: what its columns are, and what crossed."""
+def description(name: str) -> str:
+    """Description of a log: its columns and loads."""
     case = rigs.load(name)
     lines = [f"# Rig {name} of finite elements, by tests/tuning/make_rig_logs.py"]
     for kind, letter, parts in (("sensor", "d", case.sensors), ("actuator", "u", case.actuators)):
@@ -76,7 +76,7 @@ def main() -> None:
         heading = ",".join(["time [s]", *names])
         path = FOLDER / f"{name}.csv"
         np.savetxt(path, make(name), fmt="%.5f", delimiter=",", header=heading, comments="")
-        path.with_suffix(".toml").write_text(beside(name), encoding="utf-8")
+        path.with_suffix(".toml").write_text(description(name), encoding="utf-8")
 
 
 if __name__ == "__main__":

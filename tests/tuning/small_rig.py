@@ -1,4 +1,4 @@
-"""The smallest rig with a patch on which a controller can be tuned."""
+"""A small rig with a patch, for tests of controller tuning."""
 
 import jaxbeam as jb
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from jaxbeam.case.case import Case
-from tuning.aliases import accepts_old_arguments
+from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import METRICS, Objective
 from tuning.control.stability_constraint import StabilityConstraint
@@ -14,6 +14,7 @@ from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments
 from tuning.control.tuning_result import TuningResult
 
 
+@has_old_attributes(merit="metric")
 @dataclasses.dataclass(frozen=True, eq=False)
 class ParetoFront:
     """Tunings for one objective under ever tighter limits on one metric, loosest first."""
@@ -31,8 +32,8 @@ class ParetoFront:
         heads = ("limit", self.metric, "objective", f"{self.metric} held out", "objective held out")
         lines = ["".join(f"{head:>24}" for head in heads)]
         rows = zip(self.limits, self.points(), self.points(held_out=True), strict=True)
-        for limit, trained, proven in rows:
-            lines.append("".join(f"{x:>24.5g}" for x in (limit, *trained, *proven)))
+        for limit, training, held_out in rows:
+            lines.append("".join(f"{x:>24.5g}" for x in (limit, *training, *held_out)))
         return "\n".join(lines)
 
     def plot(self):

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.control.optimal.lqr import AbstractRegulator
+from tuning.aliases import has_old_attributes
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.tune import ParameterBounds, tune
@@ -19,6 +20,7 @@ SHARE_PENALTY = 10.0  # added to the objective if the sum of the shares is off b
 CANDIDATE_COUNT = 3  # states tried as the last one to be fed back
 
 
+@has_old_attributes(kept="fed_back")
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReducedFeedback:
     """Indices of the states that are fed back, and all `shares` of the relaxed search.
@@ -65,10 +67,10 @@ def tune_reduced(
     Raises ValueError for a controller that is no regulator, for more states than it has, and as
     `tune` does.
     """
-    law = case.controller
-    if not isinstance(law, AbstractRegulator):
+    controller = case.controller
+    if not isinstance(controller, AbstractRegulator):
         raise ValueError("only regulators, such as kind 'lqr', have states to leave out")
-    states = int(law.state_weight.shape[0])
+    states = int(controller.state_weight.shape[0])
     if not 1 <= keep < states:
         raise ValueError(f"keep must be 1 to {states - 1} of the {states} states; it is {keep}")
     if any(address.startswith(FEEDBACK_ADDRESS) for address in free) or "checkpoint" in options:
@@ -112,5 +114,5 @@ def tune_reduced(
 
 def _with_feedback(case: Case, shares: Float[np.ndarray, " state"]) -> Case:
     """The case with other shares of its controller's states fed back."""
-    law = dataclasses.replace(case.controller, feedback=shares)
-    return dataclasses.replace(case, controller=law)
+    controller = dataclasses.replace(case.controller, feedback=shares)
+    return dataclasses.replace(case, controller=controller)

@@ -18,7 +18,7 @@ from jaxtyping import Complex, Float
 from jaxbeam.case.case import Case, replace
 from jaxbeam.model.frequency_response import StationaryMasses, frequency_response
 from jaxbeam.model.modes import mesh_layout
-from tuning.aliases import accepts_old_arguments
+from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares
 from tuning.fit.uncertainty.covariance import confidence_intervals
 from tuning.logs.log import Log
@@ -140,6 +140,12 @@ class _ResponseData:
         return predict
 
 
+@has_old_attributes(
+    numbers="parameters",
+    unseen="unidentifiable",
+    freedom="degrees_of_freedom",
+    misfit="relative_misfit",
+)
 @dataclasses.dataclass(frozen=True, eq=False)
 class ResponseFit:
     """Parameters fitted to frequency responses (SI units), named as in `tuning.Fit`.

@@ -10,7 +10,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads import AbstractLoad
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.control import Prescribed
+from jaxbeam.control.prescribed import Prescribed
 from tuning.logs.log import Log
 
 MAX_START_DURATIONS = 10.0  # first time of a log, in its durations, that is simulated from 0 on

@@ -10,7 +10,7 @@ import dataclasses
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads import AbstractLoad, MovingMass
-from tuning.aliases import accepts_old_arguments
+from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.fit.identify import identify
 from tuning.fit.model_validation import ModelCriteria, compare_fits
 from tuning.fit.residuals import WHITENESS_SIGNIFICANCE
@@ -25,6 +25,7 @@ _MAX_MISFIT_RATIO = 0.7
 _MAX_RESIDUAL_SHARE = 0.65
 
 
+@has_old_attributes(counts="load_counts")
 @dataclasses.dataclass(frozen=True, eq=False)
 class Weighing:
     """Loads found in a log: the best fit, and criteria of all load counts tried, best first.

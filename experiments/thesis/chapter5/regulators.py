@@ -6,9 +6,7 @@ electromechanical model instead of the first-order one.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
-
-import equinox as eqx
+from typing import NamedTuple
 
 import jaxbeam as jb
 from experiments.thesis.cases import data_physics_v4
@@ -17,7 +15,6 @@ from experiments.thesis.verdicts import LITERAL
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import integration_plan
 
 MASSES, SPEEDS = (0.261, 0.371, 0.509), (0.3, 0.55)  # kg, m/s
@@ -51,23 +48,6 @@ INTERPRETATIONS = {
 }
 FULL_SHAKER = "full model of the shaker, Table 2.3"
 REFITTED_SHAKER = "full model, 12000 N/m and 80 N s/m with its back-EMF"
-
-
-class PredesignedController(AbstractController):
-    """A control law with a memory designed for another plant: `init` returns that memory."""
-
-    law: AbstractController = eqx.field(kw_only=True)
-    memory: Any = eqx.field(kw_only=True)
-
-    @property
-    def stateless(self):
-        return self.law.stateless
-
-    def init(self, plant):
-        return self.memory
-
-    def step(self, memory, measurement, t):
-        return self.law.step(memory, measurement, t)
 
 
 def regulator(
@@ -149,9 +129,10 @@ class RegulatorRuns:
             states = interpretation.feedback if feedback is None else feedback
             law = regulator(kind, interpretation.command_weight, states)
             changes = {} if design_mass is None else {"loads.0.mass": design_mass}
-            memory = _initial_memory(law, jb.replace(design, changes), self.layout)
-            controller = PredesignedController(law=law, memory=memory)
-            plant = dataclasses.replace(plant, controller=controller)
+            nominal = dataclasses.replace(jb.replace(design, changes), controller=law)
+            nominal_plant = jb.state_space(nominal, layout=self.layout)
+            law = dataclasses.replace(law, nominal_plant=nominal_plant)
+            plant = dataclasses.replace(plant, controller=law)
         key = kind, type(actuator)
         if key not in self.plans:
             self.plans[key] = integration_plan(plant, None, TOLERANCE)
@@ -159,9 +140,3 @@ class RegulatorRuns:
         if feedback is None and design_mass is None:
             self.records[name, kind, speed, mass] = record
         return float(record.peak_deflection[SENSOR])
-
-
-@compiled
-def _initial_memory(law: AbstractController, case: jb.Case, layout):
-    """The memory of a law that is designed for a case."""
-    return law.init(jb.state_space(case, layout=layout))

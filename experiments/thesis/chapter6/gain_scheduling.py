@@ -21,7 +21,7 @@ from jaxbeam.analysis.derived_gains import (
     equivalent_gains,
     scheduled_controller,
 )
-from jaxbeam.control import ScheduledFeedback
+from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from jaxbeam.plot.style import colour, set_title, use_style
 
 HIGHER_GAINS = (3.0, 4.5)  # V/mm, of the scheduled linear law

@@ -1,13 +1,13 @@
-"""The limit nobody can beat: the least peak deflection that commands within limits leave.
+"""Lower bound on the peak deflection: the least peak over all commands within the limits.
 
-For known loads the deflection is linear in the commands (`input_influence`), so the least peak over all
-histories of commands is a linear program,
+For given loads the deflection is affine in the held commands u_k (`input_influence`), and its least
+peak p is the optimum of a linear program,
 
-    minimise p   subject to   |free(x, t) + sum_k response_k(x, t) u_k| <= p,
-                              u_min <= u_k <= u_max,   |u_k - u_(k-1)| <= rate x period,
+    minimise p   subject to   |w_0(x, t) + sum_k g_k(x, t) u_k| <= p,
+                              u_min <= u_k <= u_max,   |u_k - u_(k-1)| <= rate * period,
 
-at every place x and instant t. No controller that holds its commands over the same period gets
-below p, however it measures, estimates or predicts.
+at all positions x and times t. No controller that holds its commands over the same period has a
+smaller peak, whatever it measures, estimates or predicts.
 """
 
 import dataclasses
@@ -22,61 +22,69 @@ from numpy.typing import ArrayLike
 
 from jaxbeam.analysis.bound.input_influence import TOLERANCE, input_influence
 from jaxbeam.analysis.bound.linear_program import least_peak
+from jaxbeam.case.aliases import renamed_property, warn_renamed
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.model.channels import accepts_commands
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.simulation.command_limits import command_ranges
 from jaxbeam.simulation.integration_plan import choose_step_size, run_peaks, static_shapes
 from jaxbeam.simulation.record import Record
 
-DEFAULT_PERIOD = 0.01  # s: over which commands are held, where no controller says
+DEFAULT_PERIOD = 0.01  # s, over which commands are held without a sampled controller
 
 _run_peaks = compiled(run_peaks)
 
 
 class ActiveConstraints(NamedTuple):
-    """Where and when the peak cannot be lowered: places (m), instants (s), and weights.
+    """Active constraints of the linear program: positions (m), times (s) and their multipliers.
 
-    The weights, multipliers of the linear program, have the sign of the deflection, and their sizes
-    add to 1. They prove the bound: whatever the commands, the sum of weights times deflections is
-    no less than it, and the largest of these deflections no less than their sum.
+    The `weights`, multipliers with the sign of the deflection, have absolute values of sum 1. They
+    are a certificate of the bound: for any commands within the limits the weighted sum of the
+    deflections is at least the bound, and the largest absolute deflection at least that sum.
     """
 
-    positions: Float[np.ndarray, " binding"]
-    times: Float[np.ndarray, " binding"]
-    weights: Float[np.ndarray, " binding"]
+    positions: Float[np.ndarray, " constraint"]
+    times: Float[np.ndarray, " constraint"]
+    weights: Float[np.ndarray, " constraint"]
+
+    places = renamed_property("places", "positions")
+    instants = renamed_property("instants", "times")
 
 
 class Bound(eqx.Module):
-    """The least achievable peak deflection of a case, and commands that attain it.
+    """Least achievable peak deflection of a case, and commands that attain it.
 
-    `peak` (m) is the largest absolute deflection at the `positions` (m), at instants at most `spacing`
-    (s) apart; that in between may be a little larger. `uncontrolled` (m) is the peak without
-    commands. `commands` start at `times` (s) and are held over `period` (s); of the many that
-    attain the peak (to 1e-5) they are calm ones.
+    `peak` (m) is the largest absolute deflection at the `positions` (m) and at times at most
+    `spacing` (s) apart; that between these times may be slightly larger. `uncontrolled` (m) is the
+    peak without commands. `commands` start at `times` (s) and are held over `period` (s); they
+    attain the peak to 1e-5, with small and smooth commands among those that do.
     """
 
     peak: float
     uncontrolled: float
-    positions: Float[np.ndarray, " place"]
+    positions: Float[np.ndarray, " position"]
     times: Float[np.ndarray, " hold"]
     commands: Float[np.ndarray, "hold actuator"]
     period: float
     spacing: float
     active_constraints: ActiveConstraints
 
+    places = renamed_property("places", "positions")
+    binding = renamed_property("binding", "active_constraints")
+
     @property
     def reduction(self) -> float:
-        """Attainable share of the uncontrolled peak that control can take away, 0 to 1."""
+        """Attainable reduction as a share of the uncontrolled peak, 0 to 1."""
         return 1 - self.peak / self.uncontrolled
 
     def share(self, record: Record) -> float:
         """Share of the attainable reduction that a run achieves: 0 without control, 1 at best.
 
-        It is negative for a run that control makes worse, NaN for one that diverges. Its peak is
-        that at the places of the bound; where these are not the sensors of the run, among samples.
+        Negative for a peak above the uncontrolled one, NaN for a run that diverges. The peak of the
+        run is that at the positions of the bound, over its samples if these are not the sensors.
         """
         sensors = np.array([float(sensor.position) for sensor in record.case.sensors])
         if np.array_equal(sensors, self.positions):
@@ -87,12 +95,12 @@ class Bound(eqx.Module):
         return float((self.uncontrolled - peak) / attainable) if attainable > 0 else np.nan
 
     def controller(self) -> Prescribed:
-        """The controller that gives the commands, whatever the beam does."""
+        """Open-loop controller with these commands."""
         end = self.times[-1] + self.period
         values = np.concatenate([self.commands, self.commands[-1:]]).T
-        nothing = np.zeros(self.commands.shape[1])
+        offsets = np.zeros(self.commands.shape[1])
         table = {"times": np.append(self.times, end), "values": values}
-        return Prescribed(offsets=nothing, period=self.period, **table)
+        return Prescribed(offsets=offsets, period=self.period, **table)
 
 
 def bound(
@@ -100,32 +108,42 @@ def bound(
     positions: ArrayLike | None = None,
     period: float | None = None,
     spacing: float | None = None,
+    places: ArrayLike | None = None,
 ) -> Bound:
-    """The least peak deflection of a case that any controller can achieve, and how.
+    """Least peak deflection over all commands within the limits, and commands that attain it.
 
-    The peak is that at the sensors, or at given `positions` (m from the left end); take many for the
-    whole beam. Commands are held over `period` (s): by default that of the case's controller, or
-    0.01 s. They stay within the limits and rates of the actuators, and are free where there are
-    none; resolution, delay, and the controller of the case play no part. The deflection is looked
-    at every `spacing` (s), by default at the run's sample rate, and wherever commands change.
+    The peak is that at the sensors, or at given `positions` (m from the left end), many for the
+    whole beam. Commands are held over `period` (s), by default that of the case's controller, or
+    0.01 s, within the limits and rates of the actuators, if any; resolution, delay, and the
+    controller of the case have no influence. The deflection is evaluated every `spacing` (s), by
+    default at the run's sample rate, and at changes of the commands. `places` is the former name of
+    `positions`.
 
-    Raises ValueError for a faulty case, one without actuators that take commands, loads or places,
-    for times that are not positive, for limits that rates cannot reach from zero, and under
-    differentiation (it has no derivatives); RuntimeError if the linear program fails.
+    Raises ValueError for an invalid case, one without loads, without positions or without actuators
+    that take commands, for a period or spacing that is not positive, for limits that the rates
+    cannot reach from zero, and under `jit` or differentiation (there are no derivatives);
+    RuntimeError if the linear program fails.
     """
-    found = _bound_without_baseline(case, positions, period, spacing)
-    return dataclasses.replace(found, uncontrolled=_uncontrolled_peak(case, found.positions))
+    if places is not None:
+        if positions is not None:
+            raise TypeError("places is the former name of positions: give one of them")
+        warn_renamed("the argument places of bound", "positions")
+        positions = places
+    least = _bound_without_baseline(case, positions, period, spacing)
+    return dataclasses.replace(least, uncontrolled=_uncontrolled_peak(case, least.positions))
 
 
 def least_achievable_peak(case: Case, positions: ArrayLike | None, period: float) -> float:
-    """The peak of `bound` alone (m), sooner; raises what that raises."""
+    """Peak (m) of `bound` alone, in less time. Raises as `bound`."""
     return _bound_without_baseline(case, positions, period, None).peak
 
 
 def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
-    """The bound of a case, but for the peak without commands."""
+    """Bound of a case, with NaN for the uncontrolled peak."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(case)):
-        raise ValueError("a bound cannot be differentiated or compiled; call it on plain numbers")
+        raise ValueError(
+            "a bound can be neither differentiated nor compiled: call it outside jit and grad"
+        )
     check_case(case)
     own_period = None if case.controller is None else case.controller.period
     period = (
@@ -136,7 +154,7 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
     spacing = 1 / float(case.run.sample_rate) if spacing is None else float(spacing)
     positions = _checked_positions(case, positions)
     if not case.actuators:
-        raise ValueError("without actuators there is nothing to command; add one for a bound")
+        raise ValueError("a bound needs actuators, and the case has none; add one")
     if not any(map(accepts_commands, case.actuators)):
         raise ValueError(
             f"actuators: none of the {len(case.actuators)} takes commands; add one that does"
@@ -146,12 +164,14 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
     if period > float(case.run.duration):
         raise ValueError(f"period {period:g} s is longer than the run, {case.run.duration:g} s")
     if not case.loads:
-        raise ValueError("without loads nothing deflects the beam; add one for a bound")
+        raise ValueError("a bound needs loads, and the case has none; add one")
     influence = input_influence(case, positions, period, spacing)
     if not np.any(influence.unforced @ influence.deflection_rows.T):
-        raise ValueError("no load deflects the beam at these places during the run")
+        raise ValueError("no load deflects the beam at these positions during the run")
     if not np.any(influence.response):
-        raise ValueError("no command moves the beam; move an actuator off the supports and nodes")
+        raise ValueError(
+            "no actuator deflects the beam at these positions; move one off supports and nodes"
+        )
     peak, commands, weights = least_peak(influence, *_command_limits(case, period))
     when, where = np.nonzero(weights)
     return Bound(
@@ -168,22 +188,20 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
     )
 
 
-def _checked_positions(case: Case, positions) -> Float[np.ndarray, " place"]:
+def _checked_positions(case: Case, positions) -> Float[np.ndarray, " position"]:
     if positions is None:
         positions = case.sensor_positions
     positions = np.asarray(positions, float).ravel()
     if positions.size == 0:
-        raise ValueError("nowhere to look at the deflection: add a sensor, or give places (m)")
-    for i, place in enumerate(positions):
-        check_on_beam(f"places.{i}", place, case.beam.length)
+        raise ValueError("a bound needs positions: add a sensor, or give positions (m)")
+    for i, position in enumerate(positions):
+        check_on_beam(f"positions.{i}", position, case.beam.length)
     return positions
 
 
 def _uncontrolled_peak(case: Case, positions) -> float:
-    """The largest deflection (m) at some places without commands, at all times."""
-    uncontrolled_case = eqx.tree_at(
-        lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None
-    )
+    """Largest absolute deflection (m) at the positions (m) without commands, in continuous time."""
+    uncontrolled_case = dataclasses.replace(case, controller=None)
     shapes = static_shapes(uncontrolled_case)
     step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
     running_peaks = _run_peaks(uncontrolled_case, shapes, jnp.asarray(step), jnp.asarray(positions))
@@ -191,9 +209,6 @@ def _uncontrolled_peak(case: Case, positions) -> float:
 
 
 def _command_limits(case: Case, period: float):
-    """Smallest and largest command to each actuator, and its largest change between holds."""
-    limits = [actuator.command_limits() for actuator in case.actuators]
-    rates = [actuator.command_rate_limit() for actuator in case.actuators]
-    pairs = [(-np.inf, np.inf) if pair is None else np.asarray(pair) for pair in limits]
-    low, high = np.array(pairs).T
-    return low, high, np.array([np.inf if r is None else float(r) * period for r in rates])
+    """Lowest and highest command of each actuator, and its largest change from hold to hold."""
+    low, high, rate = (np.asarray(part) for part in command_ranges(case))
+    return low, high, rate * period

@@ -1,26 +1,24 @@
-"""The linear program behind `bound`: the least peak, and calm commands that attain it.
+"""Linear program of `bound`: least peak, and commands that attain it.
 
-The unknowns are the commands, their changes from hold to hold, their sizes, and the peak. Of the
-rows that keep the deflection below the peak only those are taken that would be violated without
-them: they are added until none is, so that a close look at the whole beam costs little. Many
-commands attain the least peak, most of them restless where nothing is at stake; a trifle of a price
-on changes and sizes makes one of the calm ones best, and the rows settle in few rounds.
+The unknowns are the commands, bounds on their changes and absolute values, and the peak. Rows that
+keep the deflection below the peak are generated: those violated are added until none is, so that
+many positions cost little. Many commands attain the least peak; a small penalty on changes and
+absolute values selects smooth ones, and reduces the number of rounds.
 """
 
 import numpy as np
-import scipy  # whose parts are loaded when used: all of them take a third of a second
+import scipy  # loads its parts on first use; all of them take a third of a second
 from jaxtyping import Float
 
 from jaxbeam.analysis.bound.input_influence import InputInfluence
 
-LP_TOLERANCE = 1e-9  # of the largest deflection without commands: how exactly a program is solved
-VIOLATION_TOLERANCE = 1e-7  # of the same: rows that are violated by less are left out
-ACTIVITY_PENALTY = (
-    1e-6  # of the same: price of a change of command by its largest value, or of its average
-)
+# Tolerances and the penalty are relative to the largest deflection without commands.
+LP_TOLERANCE = 1e-9  # feasibility tolerance of the solver
+VIOLATION_TOLERANCE = 1e-7  # rows violated by less are not added
+ACTIVITY_PENALTY = 1e-6  # on a change of a command, or its mean absolute value, of its scale
 MAX_ROUNDS = 100  # of adding rows; about five are usual
-HIGHS_METHODS = ("highs", "highs-ipm")  # the simplex method now and then loses its way
-SOLVED, INFEASIBLE = 0, 2  # by linprog
+HIGHS_METHODS = ("highs", "highs-ipm")  # the simplex method fails on some programs
+SOLVED, INFEASIBLE = 0, 2  # status of linprog
 
 
 def least_peak(
@@ -28,12 +26,11 @@ def least_peak(
     low: Float[np.ndarray, " actuator"],
     high: Float[np.ndarray, " actuator"],
     max_change: Float[np.ndarray, " actuator"],
-) -> tuple[float, Float[np.ndarray, "hold actuator"], Float[np.ndarray, "instant place"]]:
-    """The least peak (m), commands that attain it, and the multipliers of the deflections.
+) -> tuple[float, Float[np.ndarray, "hold actuator"], Float[np.ndarray, "time position"]]:
+    """Least peak (m), commands that attain it to 1e-5, and multipliers of the deflections.
 
-    Commands stay between `low` and `high` and change by no more than `max_change` from hold to hold,
-    beginning at zero. None have a smaller peak; these have one that is larger by a
-    hundred-thousandth at most.
+    Commands stay between `low` and `high` and change by at most `max_change` from hold to hold,
+    starting from zero.
 
     Raises ValueError if no commands meet the limits, RuntimeError if the solver fails.
     """
@@ -45,11 +42,11 @@ def least_peak(
         peak, commands, _ = program.solve(ACTIVITY_PENALTY)
     else:
         raise RuntimeError(
-            f"the linear program for the bound did not settle in {MAX_ROUNDS} rounds"
+            f"the linear program of the bound has not converged in {MAX_ROUNDS} rounds"
         )
-    # With fewer rows than there are the peak is no larger than the least one: a bound in any case.
+    # With a part of the rows the optimum is at most the least peak: a bound in any case.
     peak, _, multipliers = program.solve(0.0)
-    # Programs are solved to rounding; the commands keep to their limits nevertheless.
+    # The solver meets limits to its tolerance; the commands meet them exactly.
     changes = np.clip(np.diff(commands, axis=0, prepend=0.0), -max_change, max_change)
     return (
         peak * program.deflection_scale,
@@ -59,7 +56,7 @@ def least_peak(
 
 
 class _LinearProgram:
-    """The program in scaled unknowns, and the rows taken into it so far."""
+    """Linear program in scaled unknowns, with the rows added so far."""
 
     def __init__(self, influence, low, high, max_change):
         self.influence = influence
@@ -69,10 +66,15 @@ class _LinearProgram:
         self.low, self.high, self.max_change = (
             part / self.command_scale for part in (low, high, max_change)
         )
-        self.active_rows = np.zeros((3, 0), int)  # instant, place, sign of the deflection
+        self.active_rows = np.zeros(
+            (3, 0), int
+        )  # time index, position index, sign of the deflection
 
     def add_violated_rows(self, commands, peak) -> bool:
-        """Take in where along the beam some commands exceed a peak most, whenever they do."""
+        """Add rows at local maxima along the beam where the deflection exceeds a peak.
+
+        Returns whether there are any.
+        """
         deflection = self.influence.deflection(commands) / self.deflection_scale
         size = np.abs(deflection)
         padded = np.pad(size, ((0, 0), (1, 1)), constant_values=-1.0)
@@ -89,7 +91,7 @@ class _LinearProgram:
         return time_index.size > 0
 
     def solve(self, activity_penalty: float):
-        """Least peak plus a price of restless commands: peak, commands, multipliers.
+        """Scaled peak, commands and multipliers that minimise the peak plus activity penalties.
 
         Raises ValueError if no commands meet the limits, RuntimeError if the solver fails.
         """
@@ -111,10 +113,10 @@ class _LinearProgram:
                 break
         if best.status == INFEASIBLE:
             raise ValueError(
-                "no commands, starting from zero, stay within limits and rates of the actuators"
+                "no commands, starting from zero, meet limits and rates of the actuators"
             )
         if best.status != SOLVED:
-            raise RuntimeError(f"the linear program for the bound failed: {best.message}")
+            raise RuntimeError(f"the linear program of the bound failed: {best.message}")
         multipliers = np.zeros((self.influence.times.size, self.influence.deflection_rows.shape[0]))
         when, where, sign = self.active_rows
         row_multipliers = best.ineqlin.marginals[right.size - sign.size :]
@@ -122,10 +124,10 @@ class _LinearProgram:
         return best.x[-1], best.x[:count].reshape(self.shape) * self.command_scale, multipliers
 
     def _constraints(self):
-        """Rows for changes and sizes of the commands, then for the deflections taken in so far."""
+        """Rows for changes and absolute values of commands, then for deflections; right side."""
         sp = scipy.sparse
         holds, actuators = self.shape
-        # Commands begin at zero and, for the sake of calm, end there.
+        # Commands start from zero; the penalty on changes includes the return to zero at the end.
         difference = sp.eye(holds + 1, holds) - sp.eye(holds + 1, holds, k=-1)
         difference, identity = sp.kron(difference, sp.eye(actuators)), sp.eye(holds * actuators)
         change = sp.eye(difference.shape[0])
@@ -134,7 +136,7 @@ class _LinearProgram:
         response = (
             np.einsum("im,imka->ika", rows, self.influence.response[when]) * self.command_scale
         )
-        free = np.sum(rows * self.influence.unforced[when], axis=1)
+        unforced = np.sum(rows * self.influence.unforced[when], axis=1)
         peak_rows = sp.csr_array(response.reshape(sign.size, holds * actuators))
         blocks = [
             [difference, -change, None, None],
@@ -144,7 +146,7 @@ class _LinearProgram:
             [peak_rows, None, None, -np.ones((sign.size, 1))],
         ]
         matrix = sp.block_array(blocks).tocsr()
-        return matrix, np.concatenate([np.zeros(matrix.shape[0] - sign.size), -free])
+        return matrix, np.concatenate([np.zeros(matrix.shape[0] - sign.size), -unforced])
 
     def _bounds(self):
         holds, actuators = self.shape
@@ -158,10 +160,9 @@ class _LinearProgram:
 
 
 def _command_scales(influence, low, high, deflection_scale):
-    """What each command is measured in: its larger limit, or what bends the beam as loads do."""
-    deflection_per_command = np.abs(influence.deflection_rows).max(axis=0) @ np.abs(influence.response).max(
-        axis=(0, 2)
-    )
+    """Scale of each command: its larger limit, or that which deflects the beam as the loads do."""
+    largest_rows = np.abs(influence.deflection_rows).max(axis=0)
+    deflection_per_command = largest_rows @ np.abs(influence.response).max(axis=(0, 2))
     scales = np.where(
         deflection_per_command > 0,
         deflection_scale / np.where(deflection_per_command > 0, deflection_per_command, 1.0),

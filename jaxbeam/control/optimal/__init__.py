@@ -1,1 +1,1 @@
-"""Optimal."""
+"""Linear-quadratic regulators."""

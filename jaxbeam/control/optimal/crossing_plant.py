@@ -1,4 +1,4 @@
-"""The beam under its loads as a plant that changes in time only by the contact forces."""
+"""Beam under moving loads as a constant plant coupled to time-varying contact forces."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +10,11 @@ from jaxbeam.numerics.finite_horizon import CouplingFunction
 
 
 def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, CouplingFunction]:
-    """The rig of a model, and its contact forces r at given times (s), both in its states.
+    """Plant without loads, and the coupling by contact forces r at given times (s), in its states.
 
-    With `with_weights`, those of the loads are further, constant states, as in `LoadedBeam.augmented`.
-    The contact law is r = -W - m (rows z + S (S' r + forces of the commands)), S being the shapes.
+    With `with_weights` the weights W of the loads are further, constant states, as in
+    `Plant.augmented`. The contact law is r = -W - m (rows z + S (S' r + forces of the commands)),
+    with the mode shapes S at the loads.
     """
     modal_model, load_count = plant.modal_model, plant.weights.shape[0]
     modes, states = plant.coordinate_scale.shape[0], modal_model.state_count

@@ -1,19 +1,22 @@
-"""Schedules of gains over the crossing of loads."""
+"""Gain schedules over the crossing of loads, as control laws."""
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.gain_table import GainTable
 
 
-class GainSchedule(eqx.Module):
-    """Gains over a crossing from `start` to `end` (s), and the gain from then on.
+class GainSchedule(AbstractStateLaw):
+    """u = -K(t) x with a table of gains K from `start` to `end` (s), and `final_gain` from then on.
 
-    That dies away with a time constant `fade_time` (s), or does not if that is None. `load_weights` are the
-    weights of the loads (N), which have columns of their own behind the states.
+    The final gain decays with a time constant `fade_time` (s), or stays if that is None. With
+    `load_feedforward` x ends with the weights of the loads (N), estimated ones or `load_weights`;
+    else `load_weights` is empty.
     """
 
     table: GainTable
@@ -22,9 +25,10 @@ class GainSchedule(eqx.Module):
     start: Float[Array, ""]
     end: Float[Array, ""]
     fade_time: Float[Array, ""] | None = None
+    load_feedforward: bool = eqx.field(static=True, default=False)
 
     def gain(self, t: Float[Array, ""]) -> Float[Array, "actuator column"]:
-        """The gain at a time (s); zero before the first load enters."""
+        """Gain at a time (s); zero before the start."""
         crossing_share = (t - self.start) / (self.end - self.start)
         final_gain = self.final_gain
         if self.fade_time is not None:
@@ -32,9 +36,16 @@ class GainSchedule(eqx.Module):
         gain = jnp.where(t < self.end, self.table(crossing_share), final_gain)
         return jnp.where(t < self.start, 0.0, gain)
 
+    def step(self, state, estimate, measurement, t):
+        load_weights = self.load_weights
+        if self.load_feedforward and estimate.weights is not None:
+            load_weights = estimate.weights
+        x = jnp.concatenate([estimate.state, load_weights])
+        return ControlStep(-self.gain(t) @ x, state)
+
 
 def crossing_events(plant: Plant) -> Float[Array, " event"]:
-    """Times (s) at which loads enter and leave, ascending; the run's end for loads that stay."""
+    """Entry and exit times (s) of all loads, ascending; the end of the run for loads that stay."""
     windows = [path.entry_exit_times() for path in plant.loads.trajectories]
     events = jnp.sort(jnp.array(windows).reshape(-1))
     last_event = jnp.max(jnp.where(events < NEVER, events, plant.case.run.duration))

@@ -1,4 +1,6 @@
-"""The linear-quadratic regulator of a plant whose commands are held from sample to sample."""
+"""Discrete linear-quadratic regulator: commands are held from sample to sample."""
+
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,25 +9,29 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.control.optimal.lqr import AbstractRegulator
+from jaxbeam.control.state_law import GainLaw
 from jaxbeam.estimation.sampled_plant import exponential_and_gramian, sample_timing
+from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.intervals import InputMatrix, InputWeight, Square, symmetric_part
 from jaxbeam.numerics.riccati import dlqr
 
-# With the command before among the states.
-AugmentedSquare = Float[Array, "both both"]
-AugmentedInputs = Float[Array, "both input"]
+# With the previous command among the states.
+AugmentedSquare = Float[Array, "augmented augmented"]
+AugmentedInputs = Float[Array, "augmented input"]
 
 
 class DiscreteLQR(AbstractRegulator):
-    """The time-invariant regulator for the rig without loads, designed as it acts: sampled.
+    """Time-invariant regulator for the plant without loads, designed for held commands.
 
     It minimises the same integral as `LQR`, over commands that are held for a `period` and begin a
-    `delay` after the sample: the weights say the same at every period, what happens between the
-    samples counts, and the gain becomes that of `LQR` as the period shrinks. `input_rate_weight`
-    adds the changes of the command, as rates over a period. With it or a delay, the command last
-    given, as the actuators took it, is fed back too.
+    `delay` after the sample: the weights mean the same at every period, the motion between samples
+    counts, and the gain tends to that of `LQR` as the period shrinks. `input_rate_weight` adds the
+    changes of the command, as rates over a period. With it or a delay, the last command, as
+    limited by the actuators, is fed back too.
     """
+
+    kind: ClassVar[str] = "dlqr"
 
     input_rate_weight: Float[Array, " actuator"] | None = number(
         "s^2/unit of a command^2",
@@ -35,15 +41,12 @@ class DiscreteLQR(AbstractRegulator):
     )
 
     @property
-    def design_depends_on_loads(self) -> bool:
-        return self.estimator is not None
-
-    @property
     def feeds_back_command(self) -> bool:
-        """Whether the command last given is among the states."""
+        """Whether the last command is fed back too."""
         return self.delay is not None or self.input_rate_weight is not None
 
-    def gains(self, plant):
+    def sampled_gain(self, plant: Plant) -> Float[Array, "actuator column"]:
+        """Gain designed for a plant, for its states and, if it is fed back, the last command."""
         system, timing = plant.unloaded, sample_timing(self)
         Q, R = self.weights(plant)
         A, B, Q, R, N = discrete_lq_problem(
@@ -60,23 +63,20 @@ class DiscreteLQR(AbstractRegulator):
             A, B, Q, N = A[:states, :states], B[:states], Q[:states, :states], N[:states]
         return dlqr(A, B, Q, R, N)[0]
 
-    def prepare(self, plant, design_plant):
-        gain = self.gains(design_plant)
+    def design_state_law(self, plant, design_plant):
+        gain = self.sampled_gain(design_plant)
         command_shares = jnp.ones(gain.shape[1] - self.feedback_shares.shape[0])
-        return gain * jnp.concatenate([self.feedback_shares, command_shares])
-
-    def command(self, memory, estimate, measurement, t):
-        previous_command = [measurement.command] if self.feeds_back_command else []
-        return -memory @ jnp.concatenate([estimate.state, *previous_command]), memory
+        shares = jnp.concatenate([self.feedback_shares, command_shares])
+        return GainLaw(gain * shares, self.feeds_back_command)
 
     def validate(self, case):
         if self.period is None:
-            return "period must be given: kind 'dlqr' designs for commands that are held so long"
+            return "period must be given: kind 'dlqr' is designed for commands held that long"
         concrete_delay = (
             self.delay is not None and is_concrete(self.delay) and is_concrete(self.period)
         )
         if concrete_delay and concrete(self.delay) >= concrete(self.period):
-            return "delay must be less than the period: one command may be under way, not more"
+            return "delay must be less than the period: the design allows for one pending command"
         rate = self.input_rate_weight
         if rate is not None and rate.shape[0] != len(case.actuators):
             return f"input_rate_weight must have {len(case.actuators)} entries, not {rate.shape[0]}"
@@ -91,11 +91,11 @@ def discrete_lq_problem(
     period: Float[Array, ""],
     input_delay: Float[Array, ""] | None = None,
 ) -> tuple[AugmentedSquare, AugmentedInputs, AugmentedSquare, InputWeight, AugmentedInputs]:
-    """The discrete problem (A, B, Q, R, N) that costs what the integral of x'Qx + u'Ru does.
+    """Discrete problem (A, B, Q, R, N) with the cost of the integral of x'Qx + u'Ru.
 
-    Its states are x and the command before; its sum is of s'Qs + u'Ru + 2 s'Nu over those states s
-    and commands u, which are held for a period (s) and begin `input_delay` (s) after the sample. Exact
-    (Van Loan, IEEE Trans. Automatic Control 23, 1978), differentiable.
+    Its states s are x and the previous command; its cost is the sum of s'Qs + u'Ru + 2 s'Nu over
+    the samples. Commands u are held for a period (s) and begin `input_delay` (s) after the sample.
+    Exact (Van Loan, IEEE Trans. Automatic Control 23, 1978), differentiable.
     """
     states, commands = B.shape
     augmented_matrix = jnp.pad(jnp.concatenate([A, B], axis=1), ((0, commands), (0, 0)))
@@ -104,7 +104,7 @@ def discrete_lq_problem(
     cost_rate = block_diag(Q, R)
 
     def propagator_and_cost(span):
-        """Propagator of x and a held command, and what they cost, over a span (s)."""
+        """Propagator of x and a held command over a span (s), and its cost matrix."""
         matrix = augmented_matrix * scale / scale[:, None] * span
         flow, cost = exponential_and_gramian(matrix.T, span * cost_rate * cost_scale)
         return flow.T * scale[:, None] / scale, cost / cost_scale

@@ -1,7 +1,7 @@
-"""What sampling takes from control: held commands reach fast modes less, some not at all.
+"""Loss of controllability by sampling: held commands act less on fast modes, on some not at all.
 
-A mode with poles a +- i omega cannot be controlled at periods k pi / omega: after each of them its
-state has turned by half a turn, so all commands push it along one and the same line.
+A mode with poles a +- i omega is uncontrollable at periods k pi / omega: in each of them its phase
+advances by a multiple of pi, so that all commands move its state along one line.
 """
 
 import warnings
@@ -14,32 +14,32 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
-from jaxbeam.model.state_space import StateSpace, state_space
+from jaxbeam.model.linear_system import StateSpace
+from jaxbeam.model.state_space import state_space
 
-MIN_REACHABILITY = (
-    0.3  # of the reach of commands: less is worth a warning, so beyond 0.93 of the limit
-)
-UNCONTROLLABLE = 1e-9  # of the largest push that a mode could get: less is none
+MIN_REACHABILITY = 0.3  # of the controllability Gramian; below, there is a warning
+UNCONTROLLABLE = 1e-9  # of the largest possible modal input; below, a mode is uncontrollable
 
 
 class SamplingWarning(UserWarning):
-    """A controller samples so slowly that it hardly reaches a mode it is designed for."""
+    """A mode of the design is hardly controllable at the sampling period."""
 
 
 def sampling_limit(case: Case) -> Float[Array, " mode"]:
-    """Sampling periods pi / omega in s at which control of a mode is lost, slowest mode first.
+    """Sampling periods pi / omega (s) at which a mode is uncontrollable, slowest mode first.
 
     Eq. (5.6) of the thesis: omega is the imaginary part of a pole of the case without its loads,
-    suspensions included; a mode damped beyond oscillation has no limit and no entry. Control is
-    lost at the multiples of the limit too, and poor near it and in between. Not for use inside
-    `jit`. Raises ValueError for a faulty case.
+    suspensions included; an overdamped mode has no limit and no entry. Controllability is lost at
+    multiples of the limit too, and poor near it and in between. Not for use inside `jit`.
+
+    Raises ValueError for a faulty case.
     """
     check_case(case)
     return jnp.asarray(np.pi / _oscillatory_modes(state_space(case).unloaded)[0].imag)
 
 
 def warn_slow_sampling(system: StateSpace, period: float, memory_time: float) -> None:
-    """Warn (SamplingWarning) if commands held for a period (s) hardly reach a mode of a plant.
+    """Warn (SamplingWarning) if a mode of a plant is hardly controllable at a period (s).
 
     `memory_time` (s) is as in `sampled_reachability`.
     """
@@ -47,9 +47,9 @@ def warn_slow_sampling(system: StateSpace, period: float, memory_time: float) ->
     if share >= MIN_REACHABILITY:
         return
     warnings.warn(
-        f"commands held for {period:.4g} s hardly reach the mode at {pole / (2 * np.pi):.4g} Hz,"
-        f" whose sampling limit is pi / omega = {np.pi / pole:.4g} s: {share:.2g} of their reach"
-        " is left; sample faster, or design for fewer modes",
+        f"the mode at {pole / (2 * np.pi):.4g} Hz is hardly controllable at a period of"
+        f" {period:.4g} s: its sampling limit is pi / omega = {np.pi / pole:.4g} s, and the share"
+        f" {share:.2g} of its controllability is left; sample faster, or design for fewer modes",
         SamplingWarning,
         stacklevel=2,
     )
@@ -58,14 +58,13 @@ def warn_slow_sampling(system: StateSpace, period: float, memory_time: float) ->
 def sampled_reachability(
     system: StateSpace, period: float, memory_time: float
 ) -> tuple[float, float]:
-    """Which share of the reach of commands is left when they are held, and the mode it is worst in.
+    """Smallest ratio of sampled to continuous controllability over the modes; omega of that mode.
 
-    The reach of commands is the controllability Gramian of a mode: the states of it that commands
-    of unit energy attain, with a memory that fades over a `memory_time` (s), which keeps that of
-    undamped modes finite. The share is the least over both directions of a mode, so it is zero
-    where the samples lose control of it; the mode is given by omega (1/s). Modes that do not
-    oscillate or that no command reaches are left out; without others the share is 1. In the
-    coordinates of the mode both Gramians are known in closed form.
+    Controllability is the Gramian of a mode: the states that commands of unit energy attain, with
+    forgetting over a `memory_time` (s), which keeps that of undamped modes finite. The ratio is the
+    least over both directions of a mode, hence zero where sampling makes it uncontrollable; omega
+    is in rad/s. Overdamped modes and uncontrollable ones are left out; without others the ratio is
+    1 and omega 0. In modal coordinates both Gramians have a closed form.
     """
     poles, rows = _oscillatory_modes(system)
     modal_inputs = rows @ concrete(system.B)
@@ -84,7 +83,7 @@ def sampled_reachability(
 def _mode_reachability(
     pole: complex, modal_input: np.ndarray, period: float, memory_time: float
 ) -> float:
-    """The share that is left of the reach of a mode, and of its conjugate, with pushes l'B."""
+    """Ratio of the Gramians of a mode and its conjugate, with the modal inputs l'B."""
     pole = pole - 0.5 / memory_time
     pair, modal_input = (
         np.array([pole, np.conj(pole)]),

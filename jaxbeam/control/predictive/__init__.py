@@ -1,1 +1,1 @@
-"""Predictive."""
+"""Model predictive control."""

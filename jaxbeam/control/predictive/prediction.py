@@ -1,7 +1,7 @@
-"""What a sampled plant is going to do: its free response, and its response to moves to come.
+"""Prediction of a sampled plant: its free response, and its response to future moves.
 
 Everywhere  x(k+1) = A_k x(k) + B_k u(k) + E_k W + w,  y(k) = C x(k),  with commands u held over a
-period, weights W of the loads, and w what the model does not explain, taken to stay as it is.
+period, weights W of the loads, and w the unexplained change of the state, assumed to persist.
 Moves are the changes of the commands, u(k+i) = u(k-1) + du(k) + ... + du(k+i).
 """
 
@@ -17,7 +17,7 @@ from jaxbeam.numerics.discretisation import c2d
 class SampledPlant(NamedTuple):
     """A plant over a period, or over several along a first axis; see the module.
 
-    If commands begin late, the ones before are further states.
+    With a delay the previous commands are further states.
     """
 
     A: Float[Array, "*period state state"]
@@ -26,16 +26,16 @@ class SampledPlant(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Outputs to come as Y = F known + Phi variables, eq. (7.4), and where the state ends.
+    """Future outputs Y = F known + Phi variables, eq. (7.4), and the state after the horizon.
 
-    `known` is (x(k), w, u(k-1), 1), with a column of F for each; that of 1 is what the loads do.
-    `terminal` and `terminal_phi` do the same for x(k+N) - x(k+N-1) followed by y(k+N), N the horizon.
+    `known` is (x(k), w, u(k-1), 1), with a column of F for each; that of 1 is the response to the
+    loads. `terminal` and `terminal_phi` give x(k+N) - x(k+N-1), then y(k+N), N the horizon.
     """
 
     F: Float[Array, "horizon output known"]
     Phi: Float[Array, "horizon output variable"]
-    terminal: Float[Array, "both known"]
-    terminal_phi: Float[Array, "both variable"]
+    terminal: Float[Array, "augmented known"]
+    terminal_phi: Float[Array, "augmented variable"]
 
 
 def sampled_plant(
@@ -45,7 +45,7 @@ def sampled_plant(
     period: Float[Array, ""],
     delay: Float[Array, ""] | None = None,
 ) -> SampledPlant:
-    """The plant z' = A z + B u + B_f W over a period (s), its inputs held. Exact.
+    """Plant z' = A z + B u + B_f W over a period (s) with held inputs. Exact.
 
     With a `delay` (s), at most the period, commands begin that much later.
     """
@@ -72,8 +72,12 @@ def incremental_model(
     A: Float[Array, "state state"],
     B: Float[Array, "state actuator"],
     C: Float[Array, "output state"],
-) -> tuple[Float[Array, "both both"], Float[Array, "both actuator"], Float[Array, "output both"]]:
-    """The plant in (x(k) - x(k-1), y(k)), driven by moves: A, B and C of eq. (7.1)."""
+) -> tuple[
+    Float[Array, "augmented augmented"],
+    Float[Array, "augmented actuator"],
+    Float[Array, "output augmented"],
+]:
+    """A, B and C of eq. (7.1): the plant in the states (x(k) - x(k-1), y(k)), driven by moves."""
     states, outputs = A.shape[0], C.shape[0]
     transition = jnp.block([[A, jnp.zeros((states, outputs))], [C @ A, jnp.eye(outputs)]])
     output_rows = jnp.concatenate([jnp.zeros((outputs, states)), jnp.eye(outputs)], axis=1)
@@ -83,10 +87,10 @@ def incremental_model(
 def move_basis(
     horizon: int, terms: int, pole: Float[Array, ""] | None = None
 ) -> Float[Array, "horizon term"]:
-    """Sequences of which moves are made up: one for each of the first moves, or Laguerre's.
+    """Basis of move sequences: unit moves in the first periods, or Laguerre functions.
 
-    With a `pole` a (0 to 1) these are his orthonormal functions in discrete time, of which a few
-    span a long horizon (Wang, J. Process Control 14, 2004); at a = 0 they are the first moves.
+    With a `pole` a (0 to 1) these are the orthonormal Laguerre functions in discrete time, of which
+    a few span a long horizon (Wang, J. Process Control 14, 2004); at a = 0 they are unit moves.
     """
     if pole is None:
         return jnp.eye(horizon, terms)
@@ -105,7 +109,7 @@ def move_basis(
 
 
 def move_maps(basis: Float[Array, "horizon term"], actuators: int) -> Float[Array, "..."]:
-    """Moves (horizon, actuator, variable), with a variable for each term and actuator."""
+    """Moves (horizon, actuator, variable) per variable, one for each basis term and actuator."""
     return jax.vmap(lambda row: jnp.kron(row[None], jnp.eye(actuators)))(basis)
 
 
@@ -115,10 +119,10 @@ def predict(
     move_maps: Float[Array, "horizon actuator variable"],
     load_weights: Float[Array, " load"],
 ) -> Prediction:
-    """F and Phi of a plant given over each of the periods to come, eqs (7.5) and (7.10).
+    """F and Phi of a plant given over each period of the horizon, eqs (7.5) and (7.10).
 
-    `move_maps` are the moves that the variables make, `load_weights` those of the loads (N). For a plant
-    that does not vary, F known is F (x(k) - x(k-1), y(k)) of the thesis.
+    `move_maps` map the variables to moves; `load_weights` are in N. For a time-invariant plant F
+    known equals F (x(k) - x(k-1), y(k)) of the thesis.
     """
     states, actuators = plants.B.shape[-2:]
     known_count = 2 * states + actuators + 1
@@ -146,3 +150,8 @@ def predict(
         terminal[:, :known_count],
         terminal[:, known_count:],
     )
+
+
+def repeat_plant(plant: SampledPlant, periods: int) -> SampledPlant:
+    """The same plant over several periods."""
+    return jax.tree.map(lambda part: jnp.broadcast_to(part, (periods, *part.shape)), plant)

@@ -1,15 +1,14 @@
 """Small dense quadratic programs,  min 1/2 x'H x + f'x  subject to  M x <= gamma,  H positive.
 
-Every problem is first brought to one form: with H = L L' it asks for the point nearest to the
-origin among those with G z <= h, where x = L'^-1 (unit z + z_0), z_0 is the minimiser without
-limits, the rows of G have length one and the unit is the most that z_0 is beyond any limit. In it
-tolerances mean the same for every problem, whatever its units.
+Every problem is first brought to the least-distance form: with H = L L', minimise |z| subject to
+G z <= h, where x = L'^-1 (scale z + z_0), z_0 is the unconstrained minimiser, the rows of G have
+length one, and the scale is the largest violation of a limit by z_0. Tolerances then mean the same
+for every problem, whatever its units.
 
-Derivatives, forward and in reverse, are those of the conditions of optimality at the solution
-(implicit differentiation), whichever method found it. There they are smoothed: slack s and
-multiplier l of each limit obey s l = SMOOTHING instead of 0, in the units above. So where a limit
-is neither active nor idle, and the derivative jumps, it is the mean of both sides; elsewhere the
-smoothing is not felt.
+Derivatives, forward and reverse, are those of the optimality conditions at the solution (implicit
+differentiation), for every method. They are smoothed: slack s and multiplier l of each limit obey
+s l = SMOOTHING instead of 0, in the form above. Where a limit is neither active nor inactive, and
+the derivative jumps, it is the mean of both sides; elsewhere the smoothing is negligible.
 """
 
 from functools import partial
@@ -20,9 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbeam.control.predictive.by_qpax import least_distance
-
-METHODS = ("interior", "hildreth", "qpax")
+METHODS = ("interior", "hildreth")
 SOLVED, INFEASIBLE, UNFINISHED = range(3)
 STATUS_TEXT = {
     SOLVED: "solved",
@@ -32,24 +29,22 @@ STATUS_TEXT = {
 
 TOLERANCE = 1e-12  # of limits, stationarity and complementarity
 HILDRETH_TOLERANCE = 1e-13  # the same for Hildreth's procedure, whose last sweeps change little
-LIMIT_ROUNDING = (
-    1e-13  # share of limits and minimiser by which a limit may be passed and not be felt
-)
-MAX_DISTANCE = 1e8  # distance beyond which no point within the limits is looked for
+LIMIT_ROUNDING = 1e-13  # of limits and minimiser; smaller violations are rounding
+MAX_DISTANCE = 1e8  # |z| beyond which a problem counts as infeasible
 SMOOTHING = 1e-18
-MAX_STEPS = 100  # of the interior-point method, at most
-STEPS_BEFORE_CENTRING = 20  # steps after which every other one is calm
+MAX_STEPS = 100  # of the interior-point method
+STEPS_BEFORE_CENTRING = 20  # after these every other step is a pure centring step
 MAX_SWEEPS = 20000  # of Hildreth's procedure
-DUAL_REGULARISATION = 1e-12  # of the multipliers in a step, so that dependent rows do no harm
+DUAL_REGULARISATION = 1e-12  # of the multipliers in a step, for linearly dependent rows
 
 Rows = Float[Array, "row variable"]
 
 
 class Solution(eqx.Module):
-    """A solution, the multipliers of the limits, the verdict (see `STATUS_TEXT`), and the effort.
+    """Solution x, multipliers of the limits, status (see `STATUS_TEXT`), and number of iterations.
 
-    Where the verdict is not `SOLVED`, x is not to be used. `steps` are those of the interior-point
-    method or the sweeps of Hildreth's procedure, 0 if no limit is felt.
+    x is valid only if the status is `SOLVED`. `steps` are steps of the interior-point method or
+    sweeps of Hildreth's procedure; 0 if the unconstrained minimiser is within the limits.
     """
 
     x: Float[Array, "*batch variable"]
@@ -59,7 +54,7 @@ class Solution(eqx.Module):
 
     @property
     def solved(self) -> Bool[Array, " *batch"]:
-        """Whether x solves the problem."""
+        """Whether the status is `SOLVED`."""
         return self.status == SOLVED
 
 
@@ -70,15 +65,14 @@ def solve_qp(
     gamma: Float[Array, " row"],
     method: str = "interior",
 ) -> Solution:
-    """The x that minimises 1/2 x'H x + f'x subject to M x <= gamma, for a positive definite H.
+    """Minimiser of 1/2 x'H x + f'x subject to M x <= gamma, for a positive definite H.
 
-    By an interior-point method, or by Hildreth's dual procedure, eqs (7.22) and (7.23) of the
-    thesis, swept until it has converged, or by the package qpax (see `by_qpax`), which takes what
-    is infeasible for `UNFINISHED`. Differentiable (see the module), and to be batched by `vmap`;
-    never raises for what the numbers do: look at the verdict. An H that is not positive definite
-    and numbers that are not finite leave it `UNFINISHED`.
+    By the "interior"-point method, or by Hildreth's dual procedure ("hildreth"), eqs (7.22) and
+    (7.23) of the thesis, swept until converged. Differentiable (see the module), also under `vmap`.
+    Numerical failures do not raise; they show in the status, which is `UNFINISHED` for numbers that
+    are not finite and for an H that is not positive definite.
 
-    Raises ValueError for an unknown method, ImportError for qpax where it is not installed.
+    Raises ValueError for an unknown method.
     """
     if method not in METHODS:
         raise ValueError(f"no method {method!r}; there are {', '.join(METHODS)}")
@@ -87,7 +81,7 @@ def solve_qp(
 
 
 class _LeastDistance(NamedTuple):
-    """The problem in its one form: which z with G z <= h is nearest to the origin; see above."""
+    """Problem in the least-distance form of the module."""
 
     G: Rows
     h: Float[Array, " row"]
@@ -119,7 +113,7 @@ def _least_distance(H, f, M, gamma) -> _LeastDistance:
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(method, H, f, M, gamma):
     problem = _least_distance(H, f, M, gamma)
-    solver = {"interior": _interior, "hildreth": _hildreth, "qpax": _by_qpax}[method]
+    solver = {"interior": _interior_point, "hildreth": _hildreth}[method]
     z, multipliers, status, steps = solver(problem.G, problem.h, problem.limits_matter)
     x = problem.inverse_factor.T @ (problem.scale * z + problem.unconstrained)
     return x, problem.scale * multipliers / problem.row_norms, status, steps
@@ -130,10 +124,9 @@ def _solve_jvp(method, primals, tangents):
     """Derivative of H x + f + M'l = 0 and, for each limit, s l = SMOOTHING with s = gamma - M x."""
     H, f, M, gamma = primals
     x, multipliers, status, steps = _solve(method, *primals)
-    scale, row_norms, inverse_factor = (
-        getattr(_least_distance(*primals), n) for n in ("unit", "length", "inverse")
-    )
-    # In the one form, of which the change of L is no concern: the form is frozen.
+    form = _least_distance(*primals)
+    scale, row_norms, inverse_factor = form.scale, form.row_norms, form.inverse_factor
+    # In the least-distance form at the solution, which is held fixed: the result is that of x.
     G = M @ inverse_factor.T / row_norms[:, None]
     multiplier, slack = _smoothed_pair(
         multipliers * row_norms / scale, (gamma - M @ x) / (row_norms * scale)
@@ -152,10 +145,10 @@ def _solve_jvp(method, primals, tangents):
 
 
 def _smoothed_pair(multiplier, slack):
-    """The pair with the same difference whose product is SMOOTHING, scaled to add up to one."""
+    """Pair with the same difference and the product SMOOTHING, scaled to the sum one."""
     half = (multiplier - slack) / 2
     root = jnp.sqrt(half**2 + SMOOTHING)
-    # The smaller of the two from the product: the difference would lose its digits.
+    # The smaller of the two from the product, to avoid cancellation.
     large = root + jnp.abs(half)
     small = SMOOTHING / large
     multiplier, slack = (jnp.where(half > 0, *pair) for pair in ((large, small), (small, large)))
@@ -167,12 +160,12 @@ def _zero_tangent(value):
 
 
 def _status(tolerance, error, z, previous_multipliers, multipliers, h, G):
-    """Solved, or proven to have no point, by the way in which the multipliers grow.
+    """Status of an iterate: solved, or infeasible by the growth r of the multipliers.
 
-    A ray r >= 0 with G'r = 0 and h'r < 0 proves it (Farkas); any other shows that whatever is
-    within the limits is at least -h'r / |G'r| away from the origin.
+    A ray r >= 0 with G'r = 0 and h'r < 0 proves infeasibility (Farkas); for other r >= 0 every
+    feasible point is at least -h'r / |G'r| away from the origin.
     """
-    # XLA's maxima may pass over NaN, so that the error alone does not tell.
+    # XLA's maxima may ignore NaN, so that the error alone is no proof.
     finite = jnp.all(jnp.isfinite(z)) & jnp.all(jnp.isfinite(multipliers))
     solved = finite & (error <= tolerance * (1 + jnp.max(jnp.abs(z))))
     ray = jnp.maximum(multipliers - previous_multipliers, 0.0)
@@ -181,8 +174,8 @@ def _status(tolerance, error, z, previous_multipliers, multipliers, h, G):
     return jnp.where(solved, SOLVED, jnp.where(infeasible, INFEASIBLE, UNFINISHED))
 
 
-def _interior(G, h, limits_matter):
-    """Mehrotra's predictor-corrector method (SIAM J. Optimization 2, 1992), damped in l."""
+def _interior_point(G, h, limits_matter):
+    """Mehrotra's predictor-corrector method (SIAM J. Optimization 2, 1992), regularised in l."""
     rows, variables = G.shape
 
     def optimality_errors(z, weight, slack):
@@ -191,8 +184,8 @@ def _interior(G, h, limits_matter):
         return jnp.maximum(worst, jnp.max(jnp.minimum(weight, slack))), stationary, limits
 
     def unfinished(state):
-        *_, verdict, steps = state
-        return (verdict == UNFINISHED) & (steps < MAX_STEPS)
+        *_, status, steps = state
+        return (status == UNFINISHED) & (steps < MAX_STEPS)
 
     def step(state):
         z, weight, slack, _, steps = state
@@ -212,9 +205,9 @@ def _interior(G, h, limits_matter):
         affine_gap = (weight + length * weight_change) @ (slack + length * slack_change)
         centring_step = (steps > STEPS_BEFORE_CENTRING) & (steps % 2 == 0)
         centring_target = jnp.where(centring_step, 0.3, (affine_gap / gap) ** 3) * gap / rows
-        # The predictor's own error counts only as far as the predictor can be followed: taken in
-        # full, it makes the method cycle where limits nearly exclude each other. A calm step
-        # without it ends the rare cycles that are left.
+        # The second-order correction is scaled by the step length of the predictor: in full, it
+        # makes the method cycle where limits nearly exclude each other. A centring step without it
+        # ends the rare cycles that are left.
         second_order = jnp.where(centring_step, 0.0, length) * weight_change * slack_change
         z_change, weight_change, slack_change = newton(
             weight * slack + second_order - centring_target
@@ -233,26 +226,26 @@ def _interior(G, h, limits_matter):
 
     start = jnp.zeros(variables), jnp.ones(rows), jnp.maximum(h, 0.0) + 1.0
     initial_status = jnp.where(limits_matter, UNFINISHED, SOLVED), jnp.zeros((), int)
-    z, weight, _, verdict, steps = jax.lax.while_loop(unfinished, step, (*start, *initial_status))
-    return z, jnp.where(limits_matter, weight, 0.0), verdict, steps
+    z, weight, _, status, steps = jax.lax.while_loop(unfinished, step, (*start, *initial_status))
+    return z, jnp.where(limits_matter, weight, 0.0), status, steps
 
 
 def _step_length(weight, weight_change, slack, slack_change, boundary_share):
-    """The step, at most 1, that takes weights and slacks this share of the way to zero."""
+    """Step length, at most 1, at which no weight or slack loses more than this share."""
     worst = jnp.maximum(jnp.max(-weight_change / weight), jnp.max(-slack_change / slack))
     return jnp.where(worst > boundary_share, boundary_share / worst, 1.0)
 
 
 def _hildreth(G, h, limits_matter):
-    """Hildreth's procedure: one multiplier after the other is made optimal, and never negative.
+    """Hildreth's procedure: coordinate ascent in the multipliers, which stay not negative.
 
     With rows of length one h_ii = 1, and w_i of eq. (7.23) is l_i + (G z - h)_i at z = -G'l.
     """
     rows, variables = G.shape
 
     def unfinished(state):
-        *_, verdict, sweeps = state
-        return (verdict == UNFINISHED) & (sweeps < MAX_SWEEPS)
+        *_, status, sweeps = state
+        return (status == UNFINISHED) & (sweeps < MAX_SWEEPS)
 
     def sweep(state):
         z, weight, _, sweeps = state
@@ -271,10 +264,3 @@ def _hildreth(G, h, limits_matter):
     initial_status = jnp.where(limits_matter, UNFINISHED, SOLVED), jnp.zeros((), int)
     start = jnp.zeros(variables), jnp.zeros(rows)
     return jax.lax.while_loop(unfinished, sweep, (*start, *initial_status))
-
-
-def _by_qpax(G, h, limits_matter):
-    z, multipliers, solved, steps = least_distance(G, h)
-    verdict = jnp.where(~limits_matter | solved, SOLVED, UNFINISHED)
-    z, multipliers = jnp.where(limits_matter, z, 0.0), jnp.where(limits_matter, multipliers, 0.0)
-    return z, multipliers, verdict, jnp.where(limits_matter, steps, 0)

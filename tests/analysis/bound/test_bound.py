@@ -1,4 +1,4 @@
-"""The least achievable peak: proofs of optimality, another solver, runs that attain it or try."""
+"""Least achievable peak: certificate of optimality, another solver, runs with and without it."""
 
 import dataclasses
 import json
@@ -30,19 +30,19 @@ PATCH = jb.Patch(
 
 
 def patched(modes=5, mass=0.509, speed=1.0, duration=0.6, controller=None) -> jb.Case:
-    """The one-span rig with a patch."""
+    """One-span laboratory beam with a patch."""
     beam = jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.03, modes=modes)
     load = jb.MovingMass(mass=mass, speed=speed)
     return jb.Case(beam, (), [PATCH], [jb.Sensor(0.3)], [load], controller, jb.Run(duration))
 
 
 def shaken(volts: float, damping=0.0) -> jb.Case:
-    """The one-span rig with a shaker."""
+    """One-span laboratory beam with a shaker."""
     beam = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3)
     shaker = jb.Shaker(
         0.5, 3500.0, damping, force_per_volt=4.6, bandwidth=1e4, limits=[-volts, volts]
     )
-    sensors = [jb.Sensor(place) for place in (0.15, 0.25, 0.35)]
+    sensors = [jb.Sensor(x) for x in (0.15, 0.25, 0.35)]
     load = jb.MovingMass(mass=0.509, speed=0.55)
     return jb.Case(beam, (), [shaker], sensors, [load], run=jb.Run(0.6 / 0.55))
 
@@ -54,15 +54,15 @@ def best():
 
 @pytest.fixture(scope="module")
 def found():
-    """What commands do to the rig, at its sensor."""
+    """Influence of the commands at the sensor."""
     return input_influence(patched(), np.array([0.3]), 0.01, 0.001)
 
 
 @pytest.fixture(scope="module")
 def numbers(found):
-    """Free deflection (instant,) and responses (instant, hold) at the sensor of the rig."""
-    response = np.einsum("m,tmk->tk", found.rows[0], found.response[..., 0])
-    return found.free @ found.rows[0], response
+    """Unforced deflection (time,) and responses (time, hold) at the sensor."""
+    response = np.einsum("m,tmk->tk", found.deflection_rows[0], found.response[..., 0])
+    return found.unforced @ found.deflection_rows[0], response
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_reference_numbers(name, modes):
     found = input_influence(case, np.array([0.3]), 0.01, 0.01)
     free = np.max(np.abs(found.deflection(np.zeros((60, 1)))))
     assert_allclose(free, expected["uncontrolled_m"], rtol=2e-9)
-    # Those programs are in metres, and solvers by default keep rows to 1e-7.
+    # The programs of the reference are in metres, with feasibility tolerances of 1e-7.
     assert_allclose(bound(case, spacing=0.01).peak, expected["least_peak_m"], rtol=0, atol=1.1e-7)
 
 
@@ -90,22 +90,22 @@ def test_published_reductions(row):
 
 
 def test_multipliers_prove_the_bound(best, numbers):
-    """Weak duality, which needs no solver: no commands within limits bring the sum below it."""
+    """Weak duality: the weighted sum is at least the bound for all commands within the limits."""
     free, response = numbers
     weights = np.zeros(free.size)
-    instants = np.searchsorted(np.arange(601) / 1000, best.active_constraints.instants - 1e-9)
-    np.add.at(weights, instants, best.active_constraints.weights)
+    indices = np.searchsorted(np.arange(601) / 1000, best.active_constraints.times - 1e-9)
+    np.add.at(weights, indices, best.active_constraints.weights)
     assert np.sum(np.abs(weights)) <= 1 + 1e-9
     slopes = weights @ response
     least = weights @ free + np.sum(np.minimum(-2.5 * slopes, 7.5 * slopes))
     assert_allclose(least, best.peak, rtol=1e-8)
-    # What the proof leaves open: how much more than the bound the commands given need.
+    # The commands attain the bound to 1e-5.
     deflection = free + response @ best.commands[:, 0]
     assert best.peak <= np.max(np.abs(deflection)) < best.peak * (1 + 1e-5)
     assert np.min(best.commands) >= -2.5 and np.max(best.commands) <= 7.5
 
 
-def test_another_solver_finds_the_same(best, numbers):
+def test_another_solver_agrees(best, numbers):
     free, response = numbers
     count = response.shape[1]
     one, scale = np.ones((free.size, 1)), 1e3  # mm
@@ -126,29 +126,29 @@ def test_another_solver_finds_the_same(best, numbers):
 
 
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
-def test_a_run_attains_it(best):
+def test_run_attains_the_bound(best):
     case = dataclasses.replace(patched(), controller=best.controller())
     record = jb.simulate(case, tolerance=1e-9)
     sampled = np.max(np.abs(record.deflection))
     assert_allclose(sampled, best.peak, rtol=1e-5)
-    # Between the instants, a millisecond apart, it is a little more.
+    # Between the times, a millisecond apart, it is slightly larger.
     assert_allclose(record.peak_deflection[0], best.peak, rtol=1e-3)
     assert best.peak < record.peak_deflection[0]
     assert_allclose(best.share(record), 1.0, atol=4e-3)
-    wanted = np.repeat(best.commands[:, 0], 10)
-    nothing = 1e-12 * np.max(np.abs(wanted))
-    assert_allclose(record.command[:-1, 0], wanted, rtol=1e-12, atol=nothing)
+    expected = np.repeat(best.commands[:, 0], 10)
+    rounding = 1e-12 * np.max(np.abs(expected))
+    assert_allclose(record.command[:-1, 0], expected, rtol=1e-12, atol=rounding)
 
 
-def test_shares(best):
+def test_shares_of_attainable_reduction(best):
     free = jb.simulate(patched(), tolerance=1e-9)
     assert_allclose(best.uncontrolled, free.peak_deflection[0], rtol=1e-8)
     assert_allclose(best.share(free), 0.0, atol=1e-7)
     assert_allclose(best.reduction, 1 - best.peak / best.uncontrolled)
-    nearby = dataclasses.replace(best, places=np.array([0.3, 0.31]))
+    nearby = dataclasses.replace(best, positions=np.array([0.3, 0.31]))
     middle = np.max(np.abs(free.at(np.array([0.3, 0.31]))))
-    wanted = (best.uncontrolled - middle) / (best.uncontrolled - best.peak)
-    assert_allclose(nearby.share(free), wanted, rtol=1e-12)
+    expected = (best.uncontrolled - middle) / (best.uncontrolled - best.peak)
+    assert_allclose(nearby.share(free), expected, rtol=1e-12)
 
 
 RIVALS = patched(controller=jb.StateFeedback(np.zeros((1, 10)), period=0.01))
@@ -168,8 +168,8 @@ def rivals_plan():
     strength=st.floats(1.0, 6.0),
     seed=st.integers(0, 10**6),
 )
-def test_no_controller_beats_it(rivals_plan, mass, speed, strength, seed):
-    """Full state feedback of any sense and strength, saturated by the actuator's limits."""
+def test_no_state_feedback_is_below_the_bound(rivals_plan, mass, speed, strength, seed):
+    """Full state feedback with random gains, saturated by the limits of the actuator."""
     gain = np.random.default_rng(seed).standard_normal((1, 10)) * 10**strength
     gain[0, 5:] *= 0.01  # rates in m/s beside deflections in m
     numbers = {"loads.0.mass": mass, "loads.0.speed": speed, "controller.gain": gain}
@@ -181,45 +181,45 @@ def test_no_controller_beats_it(rivals_plan, mass, speed, strength, seed):
     assert least.share(record) <= 1 + 1e-6
 
 
-def test_more_places_raise_it(best):
+def test_more_positions_raise_the_bound(best):
     whole = bound(patched(), positions=np.linspace(0.0, 0.6, 61))
     assert best.peak < whole.peak < best.uncontrolled
     assert whole.uncontrolled >= best.uncontrolled * (1 - 1e-9)
 
 
-def test_slower_actuators_raise_it(best, found):
+def test_slower_actuators_raise_the_bound(best, found):
     low, high, change = np.array([[-2.5], [7.5], [0.1]])
     peak, commands, _ = least_peak(found, low, high, change)
     assert best.peak * 1.001 < peak < best.uncontrolled
     assert np.max(np.abs(np.diff(commands[:, 0], prepend=0.0))) <= 0.1 * (1 + 1e-9)
-    with pytest.raises(ValueError, match="no commands, starting from zero, stay within limits"):
+    with pytest.raises(ValueError, match="no commands, starting from zero, meet limits"):
         least_peak(found, low + 3.0, high, change)
 
 
-def test_a_solver_that_loses_its_way_is_replaced(best, found, monkeypatch):
-    """As the simplex method does now and then, at one program in some hundred."""
+def test_solver_that_fails_is_replaced(best, found, monkeypatch):
+    """The simplex method fails on about one program in some hundred."""
 
-    def stray(*program, method, **options):
+    def failing_simplex(*program, method, **options):
         if method == "highs":
             return OptimizeResult(status=4, message="(HiGHS Status 0: Not Set)")
         return linprog(*program, method=method, **options)
 
-    monkeypatch.setattr("scipy.optimize.linprog", stray)
+    monkeypatch.setattr("scipy.optimize.linprog", failing_simplex)
     peak, *_ = least_peak(found, *np.array([[-2.5], [7.5], [np.inf]]))
     assert_allclose(peak, best.peak, rtol=1e-6)
 
 
-def test_without_limits_one_place_can_be_held_still_once_a_hold(found):
-    parts = {name: getattr(found, name)[::10] for name in ("instants", "free", "response")}
-    endless = np.array([np.inf])
+def test_without_limits_one_position_is_held_at_zero_once_a_hold(found):
+    parts = {name: getattr(found, name)[::10] for name in ("times", "unforced", "response")}
+    unlimited = np.array([np.inf])
     rare = dataclasses.replace(found, **parts)
-    peak, commands, _ = least_peak(rare, -endless, endless, endless)
-    assert peak < 1e-6 * np.max(np.abs(found.free @ found.rows.T))
-    assert np.max(np.abs(rare.deflection(commands))) < 1e-4 * np.max(np.abs(found.free))
+    peak, commands, _ = least_peak(rare, -unlimited, unlimited, unlimited)
+    assert peak < 1e-6 * np.max(np.abs(found.unforced @ found.deflection_rows.T))
+    assert np.max(np.abs(rare.deflection(commands))) < 1e-4 * np.max(np.abs(found.unforced))
 
 
 @pytest.mark.slow
-def test_shorter_holds_lower_it():
+def test_shorter_holds_lower_the_bound():
     case = patched(mass=0.2, speed=3.0, duration=0.2, controller=jb.Feedback([0.0], period=0.01))
     long, short = bound(case, period=0.02), bound(case)
     assert short.period == 0.01
@@ -228,36 +228,49 @@ def test_shorter_holds_lower_it():
 
 
 @pytest.mark.slow
-def test_two_actuators_and_a_hold_cut_short():
+def test_two_actuators_and_a_shorter_last_hold():
     """The last hold ends with the run; every actuator has its own commands."""
     force = jb.PointForce(0.2, [0.0, 1.0])
     case = dataclasses.replace(patched(duration=0.333), actuators=(PATCH, force))
     both = bound(case)
     assert both.commands.shape == (34, 2)
-    # With next to no force, which compiles nothing anew, the patch is on its own.
+    # Limits near zero leave the patch alone, with the compiled programs of both.
     alone = bound(jb.replace(case, {"actuators.1.limits.1": 1e-9}))
     assert both.peak < alone.peak * (1 - 1e-6)
     assert np.all((both.commands[:, 1] >= 0) & (both.commands[:, 1] <= 1))
 
 
-FAULTS = {
-    "without actuators": lambda: bound(dataclasses.replace(patched(), actuators=())),
+ERRORS = {
+    "a bound needs actuators": lambda: bound(dataclasses.replace(patched(), actuators=())),
     "none of the 1 takes commands": lambda: bound(
         dataclasses.replace(patched(), actuators=(jb.SpringDamper(0.2, 100.0),))
     ),
-    "without loads": lambda: bound(dataclasses.replace(patched(), loads=())),
-    "add a sensor, or give places": lambda: bound(dataclasses.replace(patched(), sensors=())),
-    "places.1 must lie on the beam": lambda: bound(patched(), positions=[0.1, 0.7]),
+    "a bound needs loads": lambda: bound(dataclasses.replace(patched(), loads=())),
+    "add a sensor, or give positions": lambda: bound(dataclasses.replace(patched(), sensors=())),
+    "positions.1 must lie on the beam": lambda: bound(patched(), positions=[0.1, 0.7]),
     "must be positive": lambda: bound(patched(), period=-0.01),
     "longer than the run": lambda: bound(patched(), period=1.0),
-    "too many to keep": lambda: bound(patched(), period=1e-4, spacing=1e-5),
-    "cannot be differentiated": lambda: jax.grad(
+    "exceed the memory": lambda: bound(patched(), period=1e-4, spacing=1e-5),
+    "neither differentiated nor compiled": lambda: jax.grad(
         lambda mass: bound(jb.replace(patched(), {"loads.0.mass": mass})).peak
     )(0.5),
 }
 
 
-@pytest.mark.parametrize("words", FAULTS)
-def test_faults_are_named(words):
+@pytest.mark.parametrize("words", ERRORS)
+def test_errors_are_named(words):
     with pytest.raises(ValueError, match=words):
-        FAULTS[words]()
+        ERRORS[words]()
+
+
+def test_former_names_warn(best):
+    with pytest.warns(DeprecationWarning, match="Bound.places is called positions now"):
+        assert best.places is best.positions
+    with pytest.warns(DeprecationWarning, match="Bound.binding is called active_constraints"):
+        constraints = best.binding
+    with pytest.warns(DeprecationWarning, match="ActiveConstraints.instants is called times now"):
+        assert constraints.instants is best.active_constraints.times
+    with pytest.warns(DeprecationWarning, match="the argument places of bound is called positions"):
+        assert bound(patched(), places=[0.3]).peak == pytest.approx(best.peak, rel=1e-9)
+    with pytest.raises(TypeError, match="places is the former name of positions"):
+        bound(patched(), positions=[0.3], places=[0.3])

@@ -1,4 +1,4 @@
-"""The bound of two spans with two patches: the program on an oracle's motion; ours beside it."""
+"""Bound of two spans with two patches, by a model of sines with a spring for the support."""
 
 import json
 
@@ -16,74 +16,77 @@ from tests.modules import DATA
 KNOWN = json.loads((DATA / "bounds.json").read_text())["two spans, one mass"]
 LENGTH, RIGIDITY, DENSITY, RATIO = 1.2, 12.277, 0.7924, 0.03
 STARTS, SENSORS, GRAVITY = (0.2575, 0.8575), (0.3, 0.9), 9.81
-MOMENT = 8.292438504838157e-4 * 0.39  # N m/V that reach the beam
+MOMENT = 8.292438504838157e-4 * 0.39  # N m/V, corrected
 NUMBERS = np.arange(1, KNOWN["sines"] + 1) * np.pi / LENGTH
 HOLDS, SUBSTEPS = 120, 16
 
 
 def shapes(x, derivative=0):
-    """Sines of mass one, or their derivatives."""
+    """Mass-normalised sines at x, or their derivatives."""
     size = np.sqrt(2 / (DENSITY * LENGTH))
     return size * NUMBERS**derivative * np.sin(NUMBERS * x + 0.5 * np.pi * derivative)
 
 
-def rate(t):
-    """Matrix of (q, q', commands, 1): sines, a spring for the support, the mass on its way."""
-    n, turn = NUMBERS.size, NUMBERS**2 * np.sqrt(RIGIDITY / DENSITY)
+def state_matrix(t):
+    """Matrix of z' = A z, z = (q, q', commands, 1), with the mass at its position of t (s)."""
+    n, frequencies = NUMBERS.size, NUMBERS**2 * np.sqrt(RIGIDITY / DENSITY)
     support = KNOWN["support_stiffness_N_per_m"] * np.outer(shapes(0.6), shapes(0.6))
     mass, speed = KNOWN["mass"], KNOWN["speed"]
     under, slope, curvature = (shapes(speed * t, order) for order in range(3))
     force = np.zeros((n, 2 * n + 3))
-    force[:, :n] = -np.diag(turn**2) - support - mass * speed**2 * np.outer(under, curvature)
-    force[:, n : 2 * n] = -np.diag(2 * RATIO * turn) - 2 * mass * speed * np.outer(under, slope)
+    force[:, :n] = -np.diag(frequencies**2) - support - mass * speed**2 * np.outer(under, curvature)
+    force[:, n : 2 * n] = -np.diag(2 * RATIO * frequencies) - 2 * mass * speed * np.outer(
+        under, slope
+    )
     for i, start in enumerate(STARTS):
         force[:, 2 * n + i] = MOMENT * (shapes(start, 1) - shapes(start + 0.085, 1))
     force[:, -1] = -mass * GRAVITY * under
-    moved = np.linalg.solve(np.eye(n) + mass * np.outer(under, under), force)
-    rest = np.eye(n, 2 * n + 3, k=n)
-    return np.vstack([rest, moved, np.zeros((3, 2 * n + 3))])
+    accelerations = np.linalg.solve(np.eye(n) + mass * np.outer(under, under), force)
+    rates = np.eye(n, 2 * n + 3, k=n)
+    return np.vstack([rates, accelerations, np.zeros((3, 2 * n + 3))])
 
 
-def held(k):
-    """What one hold makes of (q, q', commands, 1): exponentials at two Gauss nodes, order 4."""
-    period, near = KNOWN["period_s"], np.sqrt(3) / 6
-    step, whole = period / SUBSTEPS, np.eye(2 * NUMBERS.size + 3)
+def hold_transition(k):
+    """Transition matrix of (q, q', commands, 1) over hold k: Magnus exponentials of order 4."""
+    period, node = KNOWN["period_s"], np.sqrt(3) / 6
+    step, transition = period / SUBSTEPS, np.eye(2 * NUMBERS.size + 3)
     for j in range(SUBSTEPS):
-        early, late = (rate(k * period + (j + 0.5 + sign * near) * step) for sign in (-1, 1))
-        for a, b in ((0.25 + near, 0.25 - near), (0.25 - near, 0.25 + near)):
-            whole = scipy.linalg.expm(step * (a * early + b * late)) @ whole
-    return whole
+        times = (k * period + (j + 0.5 + sign * node) * step for sign in (-1, 1))
+        first, second = map(state_matrix, times)
+        for a, b in ((0.25 + node, 0.25 - node), (0.25 - node, 0.25 + node)):
+            transition = scipy.linalg.expm(step * (a * first + b * second)) @ transition
+    return transition
 
 
-def reached() -> InputInfluence:
-    """Motion of the oracle at the ends of the holds."""
+def reference_influence() -> InputInfluence:
+    """Influence of the commands by the model of sines, at the ends of the holds."""
     n, size = NUMBERS.size, 2 * NUMBERS.size
-    free, response = np.zeros((HOLDS + 1, n)), np.zeros((HOLDS + 1, n, HOLDS, 2))
-    state, units = np.zeros(size), np.zeros((size, HOLDS, 2))
+    unforced, response = np.zeros((HOLDS + 1, n)), np.zeros((HOLDS + 1, n, HOLDS, 2))
+    state, unit_states = np.zeros(size), np.zeros((size, HOLDS, 2))
     for k in range(HOLDS):
-        whole = held(k)
-        state = whole[:size, :size] @ state + whole[:size, -1]
-        units = np.tensordot(whole[:size, :size], units, axes=1)
-        units[:, k] += whole[:size, size : size + 2]
-        free[k + 1], response[k + 1] = state[:n], units[:n]
-    rows, holds = np.array([shapes(x) for x in SENSORS]), np.arange(HOLDS) * KNOWN["period_s"]
-    return InputInfluence(rows, holds, np.arange(HOLDS + 1) * KNOWN["period_s"], free, response)
+        transition = hold_transition(k)
+        state = transition[:size, :size] @ state + transition[:size, -1]
+        unit_states = np.tensordot(transition[:size, :size], unit_states, axes=1)
+        unit_states[:, k] += transition[:size, size : size + 2]
+        unforced[k + 1], response[k + 1] = state[:n], unit_states[:n]
+    rows, times = np.array([shapes(x) for x in SENSORS]), np.arange(HOLDS + 1) * KNOWN["period_s"]
+    return InputInfluence(rows, times[:-1], times, unforced, response)
 
 
-def test_the_program_has_the_bound_of_the_reference():
-    found = reached()
-    free = np.max(np.abs(found.unforced @ found.deflection_rows.T))
-    assert_allclose(free, KNOWN["uncontrolled_m"], rtol=1e-6)
+def test_linear_program_has_the_bound_of_the_reference():
+    found = reference_influence()
+    uncontrolled = np.max(np.abs(found.unforced @ found.deflection_rows.T))
+    assert_allclose(uncontrolled, KNOWN["uncontrolled_m"], rtol=1e-6)
     low, high = np.array([[-2.5, -2.5], [7.5, 7.5]]) * 200
     peak, commands, _ = least_peak(found, low, high, np.full(2, np.inf))
-    # That program is in metres, and solvers by default keep rows to 1e-7.
+    # The program of the reference is in metres, with feasibility tolerances of 1e-7.
     assert_allclose(peak, KNOWN["least_peak_m"], rtol=0, atol=1.1e-7)
     assert_allclose(np.max(np.abs(found.deflection(commands))), peak, rtol=1e-5)
 
 
 @pytest.mark.slow
-def test_our_bound_is_near_it():
-    """With exact modes, of which there are seven where eight sines have a spring for a support."""
+def test_bound_with_exact_modes_is_near_the_reference():
+    """Seven exact modes, for eight sines and the spring of the support."""
     patches = [
         jb.Patch(x, x + 0.085, MOMENT, amplifier_gain=200.0, limits=[-2.5, 7.5]) for x in STARTS
     ]

@@ -1,4 +1,4 @@
-"""Designs over masses, speeds and weights at once, and their slopes by what they follow from."""
+"""Batched designs over masses, speeds and weights, and their derivatives."""
 
 import dataclasses
 
@@ -10,10 +10,13 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.control import DiscreteLQR, ScheduledLQR
-from jaxbeam.control.optimal.lqr import finite_horizon_gains
-from jaxbeam.estimation import Kalman, Observer
-from jaxbeam.model.modes import lay_out
+from jaxbeam.control.optimal.crossing_lqr import finite_horizon_gains
+from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
+from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.estimation.kalman import Kalman
+from jaxbeam.estimation.observer import Observer
+from jaxbeam.estimation.sampled_plant import sample_timing
+from jaxbeam.model.modes import mesh_layout
 from tests.differences import central
 
 WEIGHTS = {"state_weight": [4e5, 1e5, 10.0, 1.0, 0.0], "command_weight": [1e-3]}
@@ -26,7 +29,7 @@ LAWS = {
     "lqr-augmented": jb.AugmentedLQR(**WEIGHTS, points=60),
     "lqr-scheduled": ScheduledLQR(**WEIGHTS, **GRID, points=60),
 }
-# A mass, a speed, a weight of a state, one of the command, and a number of the plant.
+# A mass, a speed, a weight of a state, one of the command, and a parameter of the plant.
 ADDRESSES = (
     "loads.0.mass",
     "loads.0.speed",
@@ -48,107 +51,116 @@ def rig(law):
     )
 
 
-def answers(name):
-    """Commands to a state at three shares of the crossing, as a function of relative numbers."""
+def commands_of(name):
+    """Function from relative numbers to commands for a state at three shares of the crossing."""
     case = rig(LAWS[name])
-    layout = lay_out(case)
+    layout = mesh_layout(case)
 
-    def of(point):
+    def commands(point):
         changed = jb.replace(case, dict(zip(ADDRESSES, point * SIZES, strict=True)))
-        law, model = changed.controller, jb.state_space(changed, layout=layout)
-        memory, length = law.init(model), changed.beam.length / changed.loads[0].speed
+        law = changed.controller.law(jb.state_space(changed, layout=layout))
+        crossing_time = changed.beam.length / changed.loads[0].speed
 
-        def at(share):
-            seen = Measurement(jnp.zeros(1), STATE, jnp.zeros(1))
-            return law.step(memory, seen, share * length)[0][0]
+        def command(share):
+            measurement, t = Measurement(jnp.zeros(1), STATE, jnp.zeros(1)), share * crossing_time
+            if changed.controller.period is None:
+                return law.command(jnp.zeros(0), measurement, t)[0]
+            return law.step(law.initial_state(), measurement, t).command[0]
 
-        return jax.vmap(at)(jnp.array([0.13, 0.52, 0.97]))
+        return jax.vmap(command)(jnp.array([0.13, 0.52, 0.97]))
 
-    return of
+    return commands
 
 
 @pytest.fixture(scope="module", params=LAWS)
 def design(request):
-    """Commands of a design, one at a time and many at once."""
-    of = answers(request.param)
-    return jax.jit(of), jax.jit(jax.vmap(of))
+    """Commands of a design: single, and batched."""
+    commands = commands_of(request.param)
+    return jax.jit(commands), jax.jit(jax.vmap(commands))
 
 
-def test_many_at_once_are_those_designed_one_by_one(design):
-    alone, together = design
+def test_batched_designs_equal_single_ones(design):
+    single, batched = design
     points = 1 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (4, SIZES.size))
-    expected = np.stack([alone(point) for point in points])
-    assert_allclose(together(points), expected, rtol=1e-9)
+    expected = np.stack([single(point) for point in points])
+    assert_allclose(batched(points), expected, rtol=1e-9)
     assert np.all(np.ptp(expected, axis=0) > 1e-3 * np.abs(expected).max(axis=0))
 
 
-def test_slopes_by_loads_weights_and_plant(design):
-    alone, _ = design
+def test_derivatives_by_loads_weights_and_plant(design):
+    single, _ = design
     at = jnp.ones(SIZES.size)
-    found, expected = jax.jit(jax.jacfwd(alone))(at), central(alone, at, 2e-3)
+    found, expected = jax.jit(jax.jacfwd(single))(at), central(single, at, 2e-3)
     assert_allclose(found, expected, rtol=0, atol=1e-6 * np.max(np.abs(expected)))
 
 
 ACTUATORS = {
-    "at once": (jb.PointForce(0.22), 4),
+    "direct": (jb.PointForce(0.22), 4),
     "lagging": (jb.Shaker(0.22, 2000.0, 5.0, force_per_volt=4.6, bandwidth=500.0), 5),
 }
 
 
 @pytest.mark.parametrize("varied", ["loads.0.mass", "controller.command_weight.0"])
 @pytest.mark.parametrize("actuator", ACTUATORS)
-def test_what_designs_share_makes_no_difference(actuator, varied):
-    """Only one number varies from design to design; slopes in reverse, too."""
+def test_batched_designs_with_shared_parameters(actuator, varied):
+    """Only one parameter varies; reverse-mode derivatives too."""
     part, states = ACTUATORS[actuator]
     law = jb.FiniteLQR(WEIGHTS["state_weight"][:states], [1e-3], points=20)
     case = dataclasses.replace(rig(law), actuators=[part])
-    layout, start = lay_out(case), float(jb.addresses(case)[varied])
+    layout, start = mesh_layout(case), float(jb.addresses(case)[varied])
 
-    def pieces(share):
+    def coefficients(share):
         changed = jb.replace(case, {varied: share * start})
         return finite_horizon_gains(changed.controller, jb.state_space(changed, layout=layout))[
             0
         ].coefficients
 
     def size(share):
-        return jnp.sum(pieces(share)[:, 0] ** 2)
+        return jnp.sum(coefficients(share)[:, 0] ** 2)
 
-    shares, alone = np.array([0.8, 1.0, 1.3]), jax.jit(pieces)
-    expected = np.stack([alone(share) for share in shares])
-    found = jax.jit(jax.vmap(pieces))(shares)
+    shares, single = np.array([0.8, 1.0, 1.3]), jax.jit(coefficients)
+    expected = np.stack([single(share) for share in shares])
+    found = jax.jit(jax.vmap(coefficients))(shares)
     assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-    slopes = jax.jit(jax.vmap(jax.grad(size)))(shares)
-    plain = jax.jit(size)
-    expected = [central(lambda x: plain(x[0]), [share], step=1e-3)[0] for share in shares]
-    assert_allclose(slopes, expected, rtol=1e-6)
+    derivatives = jax.jit(jax.vmap(jax.grad(size)))(shares)
+    compiled_size = jax.jit(size)
+    expected = [central(lambda x: compiled_size(x[0]), [share], step=1e-3)[0] for share in shares]
+    assert_allclose(derivatives, expected, rtol=1e-6)
 
 
-NOISY = {
+ESTIMATORS = {
     "kalman": (Kalman(0.02, 1e-5), 2e-3),
-    "kalman at every instant": (Kalman(0.02, measurement_intensity=1e-13), None),
+    "kalman, continuous": (Kalman(0.02, measurement_intensity=1e-13), None),
     "observer": (Observer(speed=2.0), 2e-3),
-    "observer at every instant": (Observer(speed=2.0), None),
+    "observer, continuous": (Observer(speed=2.0), None),
 }
 
 
-@pytest.mark.parametrize("name", NOISY)
+@pytest.mark.parametrize("name", ESTIMATORS)
 def test_gains_of_estimators_over_the_plant(name):
-    """At once for many rigidities and places of the sensor, and their slopes."""
-    estimator, period = NOISY[name]
+    """Batched over rigidities and positions of the sensor, and their derivatives."""
+    estimator, period = ESTIMATORS[name]
     case = rig(jb.LQR(**WEIGHTS, period=period, estimator=estimator))
-    layout = lay_out(case)
+    layout = mesh_layout(case)
 
     def gain(point):
         values = {"beam.flexural_rigidity": 11.68 * point[0], "sensors.0.position": point[1] / 4}
         changed = jb.replace(case, values)
         model = jb.state_space(changed, layout=layout)
-        found = changed.controller.estimator.init(model).gain[:4, 0]
-        return found / jnp.array([1.0, 1.0, 200.0, 800.0])
+        controller = changed.controller
+        if period is None:
+            filter = controller.estimator.continuous_filter(model)
+        else:
+            filter = controller.estimator.sampled_filter(model, sample_timing(controller))
+        return filter.gain[:4, 0] / jnp.array([1.0, 1.0, 200.0, 800.0])
 
-    alone, points = jax.jit(gain), np.array([[1.0, 1.0], [0.8, 1.1], [1.3, 0.7]])
-    expected = np.stack([alone(point) for point in points])
-    together = jax.jit(jax.vmap(gain))(points)
+    single, points = jax.jit(gain), np.array([[1.0, 1.0], [0.8, 1.1], [1.3, 0.7]])
+    expected = np.stack([single(point) for point in points])
+    batched = jax.jit(jax.vmap(gain))(points)
     scale = np.abs(expected).max()
-    assert_allclose(together, expected, rtol=0, atol=1e-9 * scale)
-    slopes, differences = jax.jit(jax.jacfwd(gain))(points[0]), central(alone, points[0], 2e-3)
-    assert_allclose(slopes, differences, rtol=0, atol=1e-6 * np.abs(differences).max())
+    assert_allclose(batched, expected, rtol=0, atol=1e-9 * scale)
+    derivatives, differences = (
+        jax.jit(jax.jacfwd(gain))(points[0]),
+        central(single, points[0], 2e-3),
+    )
+    assert_allclose(derivatives, differences, rtol=0, atol=1e-6 * np.abs(differences).max())

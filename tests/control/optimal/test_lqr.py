@@ -1,4 +1,4 @@
-"""Linear-quadratic regulators: gains and closed loops computed independently, costs, optimality."""
+"""Linear-quadratic regulators: gains and loops against independent ones, cost, optimality."""
 
 import json
 
@@ -10,10 +10,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.validation import check
-from jaxbeam.control import LQR, AugmentedLQR, FiniteLQR, StepLQR
+from jaxbeam.case.validation import check_case
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.optimal.lqr import finite_horizon_gains
+from jaxbeam.control.optimal.crossing_lqr import (
+    AugmentedLQR,
+    FiniteLQR,
+    StepLQR,
+    finite_horizon_gains,
+)
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.modules import DATA
 
@@ -24,9 +29,9 @@ WEIGHTS = {
     "command_weight": [REFERENCE["case"]["R"]],
     "coordinates": "sine",
 }
-FEW = [1, 1, 0, 1, 0, 0, 0]  # q1, q2 and the rate of q1 are fed back
+PARTIAL_FEEDBACK = [1, 1, 0, 1, 0, 0, 0]  # q1, q2 and the rate of q1 are fed back
 DESIGN = DesignModel(force_per_volt=4.6)
-# Deflections (m) of the loop with the finite-time gain, 0.055 and 0.273 s after the exit: P and the
+# Deflections (m) of the loop with the finite-horizon gain, 0.055 and 0.273 s after the exit: P and
 # loop by scipy's Radau to 1e-10 (the same to 1e-11), P as its dense output, on the same A(t), B(t).
 AFTER_EXIT = [4.737544e-07, 7.254085e-11]
 
@@ -49,11 +54,11 @@ def model():
 
 
 def gains_at(regulator, model, shares=SHARES):
-    return eqx.filter_jit(lambda m: jax.vmap(regulator.gains(m))(jnp.asarray(shares)))(model)
+    return eqx.filter_jit(lambda m: jax.vmap(regulator.gain_table(m))(jnp.asarray(shares)))(model)
 
 
 def test_time_invariant_gain(model):
-    gain = LQR(**WEIGHTS).gains(model)
+    gain = LQR(**WEIGHTS).time_invariant_gain(model)
     assert_allclose(gain[0], REFERENCE["time_invariant_gain"], rtol=1e-6)
 
 
@@ -74,15 +79,15 @@ def test_gains_over_the_crossing(model, kind, points, name):
 @pytest.mark.parametrize(
     ("controller", "name"),
     [
-        (LQR(**WEIGHTS, feedback=FEW, design=DESIGN), "time_invariant"),
-        (FiniteLQR(**WEIGHTS, feedback=FEW, design=DESIGN), "finite_time"),
-        (AugmentedLQR(**WEIGHTS, feedback=FEW, design=DESIGN), "augmented"),
+        (LQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN), "time_invariant"),
+        (FiniteLQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN), "finite_time"),
+        (AugmentedLQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN), "augmented"),
     ],
 )
 def test_closed_loops(controller, name):
-    """What follows the exit hangs on a layer of 0.1 ms in the gain, which the table must resolve.
+    """Against scipy; the motion after the exit depends on a boundary layer of 0.1 ms in the gain.
 
-    The reference did not there: it is replaced by `AFTER_EXIT`, and left out where that has none.
+    The reference does not resolve that layer: it is replaced by `AFTER_EXIT`, or left out.
     """
     expected = REFERENCE[f"continuous_closed_loop_{name}"]
     record = jb.simulate(rig(controller, 2.5), times=jnp.array([0.0, *expected["time_s"]]))
@@ -97,14 +102,14 @@ def test_closed_loops(controller, name):
 
 
 @pytest.mark.slow
-def test_predicted_cost_is_the_cost_simulated_and_the_gain_is_optimal(model):
+def test_cost_of_the_optimal_gain(model):
     """z0' P z0 is the cost of the run from z0, and no change of the gains lowers it."""
     regulator = FiniteLQR(**WEIGHTS, points=400)
     Q, R = regulator.weights(model)
     start = jnp.array([1e-3, -2e-4, 1e-4, 0.02, 0.01, -0.03, 0.3])
     table, costs = eqx.filter_jit(lambda m: finite_horizon_gains(regulator, m))(model)
     end = 0.6 / 0.55
-    times = jnp.linspace(0.0, end, 40001)  # a lag of 0.1 ms, by Runge and Kutta's method
+    times = jnp.linspace(0.0, end, 40001)  # a lag of 0.1 ms, by the Runge-Kutta method
     step = times[1]
     bump = jnp.asarray(np.random.default_rng(0).normal(size=(2, 7))) * table(jnp.ones(()) / 2)
 
@@ -134,17 +139,17 @@ def test_predicted_cost_is_the_cost_simulated_and_the_gain_is_optimal(model):
     assert_allclose(slope, 0.0, atol=1e-6 * predicted)
 
 
-def test_case_files_hold_regulators():
-    controller = AugmentedLQR(**WEIGHTS, feedback=FEW, design=DESIGN, after="hold")
+def test_case_file_keeps_the_controller():
+    controller = AugmentedLQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN, after="hold")
     case = rig(controller, 2.5)
-    check(case)
+    check_case(case)
     again = case_from_dict(case_to_dict(case))
     assert eqx.tree_equal(case, again)
 
 
-def test_stretches_are_counted_for_the_modes_that_are_designed_for():
+def test_intervals_needed_follow_from_the_modes_of_the_design():
     few = DesignModel(modes=1)
-    check(rig(FiniteLQR([1.0] * 3, [1.0], points=100, design=few)))
+    check_case(rig(FiniteLQR([1.0] * 3, [1.0], points=100, design=few)))
 
 
 @pytest.mark.parametrize(
@@ -154,8 +159,11 @@ def test_stretches_are_counted_for_the_modes_that_are_designed_for():
         (LQR([1.0] * 7, [0.0]), "command_weight.0 must be positive"),
         (LQR([-1.0] * 7, [1.0]), "state_weight.0 must not be negative"),
         (LQR([1.0] * 7, [1.0, 1.0]), "command_weight must have 1 entries"),
-        (LQR([1.0] * 7, [1.0], places=[0.3]), "places and place_weight belong together"),
-        (LQR([1.0] * 7, [1.0], places=[0.9], place_weight=[1.0]), "places must lie on the beam"),
+        (LQR([1.0] * 7, [1.0], positions=[0.3]), "positions and position_weight belong"),
+        (
+            LQR([1.0] * 7, [1.0], positions=[0.9], position_weight=[1.0]),
+            "positions must lie on the beam",
+        ),
         (
             LQR([1.0] * 7, [1.0], design=DesignModel(correction=0.3)),
             "design.correction has no effect",
@@ -163,6 +171,6 @@ def test_stretches_are_counted_for_the_modes_that_are_designed_for():
         (FiniteLQR([1.0] * 7, [1.0], points=100), "points must be at least"),
     ],
 )
-def test_faults_are_named(controller, message):
+def test_errors_of_settings(controller, message):
     with pytest.raises(ValueError, match=message):
-        check(rig(controller))
+        check_case(rig(controller))

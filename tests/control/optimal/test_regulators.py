@@ -1,4 +1,4 @@
-"""Regulators for several loads at once: against equations of motion written out, and scipy.
+"""Regulators for several loads at once against explicit equations of motion and scipy.
 
 The beam is pinned at both ends; its coordinates are the amplitudes a of sines, and the masses on
 it take part in M a'' + C a' + K a = S(x_c) u - sum of S(x) W, eqs (2.3) to (2.16) of the thesis.
@@ -16,13 +16,13 @@ from scipy.interpolate import BarycentricInterpolator
 from scipy.linalg import block_diag, solve_continuous_are
 
 import jaxbeam as jb
-from jaxbeam.control import AugmentedLQR, StepLQR
+from jaxbeam.control.optimal.crossing_lqr import AugmentedLQR, StepLQR
 from jaxbeam.simulation.closed_loop import loop_schedule
 from tests.differences import central
 from tests.runs import plan_of
 
 LENGTH, RIGIDITY, DENSITY, DAMPING, MODES = 0.6, 11.68, 0.535, 0.03, 2
-PLACE, GRAVITY = 0.22, 9.81
+POSITION, GRAVITY = 0.22, 9.81
 MASSES, SPEEDS, ENTRIES = (0.3, 0.2), (1.5, 2.0), (0.0, 0.12)  # both are on the beam for a while
 EXITS = [entry + LENGTH / speed for entry, speed in zip(ENTRIES, SPEEDS, strict=True)]
 EVENTS = sorted([*ENTRIES, *EXITS])
@@ -38,7 +38,7 @@ Q, R = np.diag(WEIGHTS["state_weight"]), np.diag(WEIGHTS["command_weight"])
 def rig(controller=None):
     return jb.Case(
         jb.Beam(LENGTH, RIGIDITY, DENSITY, DAMPING, modes=MODES),
-        actuators=[jb.PointForce(PLACE)],
+        actuators=[jb.PointForce(POSITION)],
         sensors=[jb.Sensor(0.25)],
         loads=[
             jb.MovingMass(mass=mass, speed=speed, entry_time=entry)
@@ -50,32 +50,32 @@ def rig(controller=None):
 
 
 def plant(time, masses=MASSES, speeds=SPEEDS, entries=ENTRIES):
-    """A, B and B_f at a time, which is not one of the events."""
+    """A, B and B_f at a time (s) other than the events."""
     n = np.arange(1, MODES + 1) * np.pi / LENGTH
     rate = n**2 * np.sqrt(RIGIDITY / DENSITY)
     half = DENSITY * LENGTH / 2
     M, C, K = half * np.eye(MODES), 2 * DAMPING * half * np.diag(rate), half * np.diag(rate**2)
-    pressed = []
+    force_shapes = []
     for mass, speed, entry in zip(masses, speeds, entries, strict=True):
         on = float(entry < time < entry + LENGTH / speed)
         S, slope = np.sin(n * speed * (time - entry)), n * np.cos(n * speed * (time - entry))
         M = M + on * mass * np.outer(S, S)
         C = C + on * mass * 2 * speed * np.outer(S, slope)
         K = K - on * mass * speed**2 * np.outer(S, n**2 * S)
-        pressed.append(-on * S)
-    pushed = np.linalg.solve(M, np.column_stack([np.sin(n * PLACE), *pressed]))
+        force_shapes.append(-on * S)
+    accelerations = np.linalg.solve(M, np.column_stack([np.sin(n * POSITION), *force_shapes]))
     stiff, damped = np.linalg.solve(M, K), np.linalg.solve(M, C)
     A = np.block([[np.zeros((MODES, MODES)), np.eye(MODES)], [-stiff, -damped]])
-    inputs = np.vstack([np.zeros_like(pushed), pushed])
+    inputs = np.vstack([np.zeros_like(accelerations), accelerations])
     return A, inputs[:, :1], inputs[:, 1:]
 
 
-def by_pieces(rate, start, tolerance, backward=False, events=EVENTS):
-    """States at `TIMES` from an ODE that changes at the events, forward or backward."""
+def integrate_between_events(rate, start, tolerance, backward=False, events=EVENTS):
+    """States (time, state) at `TIMES` of an ODE that changes at the events, forward or backward."""
     found, state = {}, start
     stops = np.unique([*TIMES, *events])
-    legs = list(zip(stops[:-1], stops[1:], strict=True))
-    for early, late in reversed(legs) if backward else legs:
+    intervals = list(zip(stops[:-1], stops[1:], strict=True))
+    for early, late in reversed(intervals) if backward else intervals:
         inside = early + 1e-12, late - 1e-12
         found[late if backward else early] = state
         settings = {"method": "LSODA", "rtol": tolerance, "atol": tolerance * 1e-3}
@@ -85,58 +85,62 @@ def by_pieces(rate, start, tolerance, backward=False, events=EVENTS):
 
 @pytest.fixture(scope="module")
 def optimum():
-    """Optimal gains at `TIMES` of states and weights, by the Riccati equation backward in time."""
+    """Optimal gains (time, column) at `TIMES` of states and weights, by the Riccati equation."""
     size = 2 * MODES + len(MASSES)
     Q_all = block_diag(Q, np.zeros((len(MASSES),) * 2))
 
-    def joint(time):
+    def augmented(time):
         A, B, B_f = plant(time)
         below = np.zeros((len(MASSES), size))
         return np.vstack([np.hstack([A, B_f]), below]), np.vstack([B, np.zeros((len(MASSES), 1))])
 
     def rate(time, flat):
-        P, (A, B) = flat.reshape(size, size), joint(time)
+        P, (A, B) = flat.reshape(size, size), augmented(time)
         return -(A.T @ P + P @ A - P @ B @ np.linalg.solve(R, B.T @ P) + Q_all).ravel()
 
-    costs = by_pieces(rate, Q_all.ravel(), 1e-10, backward=True).reshape(-1, size, size)
-    return [np.linalg.solve(R, joint(t)[1].T @ P)[0] for t, P in zip(TIMES, costs, strict=True)]
+    costs = integrate_between_events(rate, Q_all.ravel(), 1e-10, backward=True).reshape(
+        -1, size, size
+    )
+    return [np.linalg.solve(R, augmented(t)[1].T @ P)[0] for t, P in zip(TIMES, costs, strict=True)]
 
 
-def test_masses_that_overlap_are_weighed_in_the_optimal_gains(optimum):
+def test_optimal_gains_for_overlapping_masses(optimum):
     law = AugmentedLQR(**WEIGHTS, points=300)
     model = jb.state_space(rig(), "sine")
-    gains = jax.jit(lambda shares: jax.vmap(law.gains(model))(shares))(TIMES / EVENTS[-1])[:, 0]
+    gains = jax.jit(lambda shares: jax.vmap(law.gain_table(model))(shares))(TIMES / EVENTS[-1])[
+        :, 0
+    ]
     size = np.max(np.abs(optimum), axis=0)
     assert np.all(size > 0)
     assert_allclose(gains / size, optimum / size, atol=1e-6)
 
 
 def frozen_gains(count=60):
-    """Gain at a time, by scipy's algebraic Riccati equation at Chebyshev nodes between events."""
-    legs, nodes = [], np.cos(np.pi * (np.arange(count) + 0.5) / count)
+    """Function of time (s): gain by scipy's Riccati equation at Chebyshev nodes between events."""
+    intervals, nodes = [], np.cos(np.pi * (np.arange(count) + 0.5) / count)
     for early, late in zip(EVENTS[:-1], EVENTS[1:], strict=True):
         times, gains = (early + late) / 2 + (late - early) / 2 * nodes, []
         for time in times:
             A, B, _ = plant(time)
             gains.append(np.linalg.solve(R, B.T @ solve_continuous_are(A, B, Q, R)))
-        legs.append(BarycentricInterpolator(times, gains))
-    return lambda time: legs[np.searchsorted(EVENTS, time) - 1](time)
+        intervals.append(BarycentricInterpolator(times, gains))
+    return lambda time: intervals[np.searchsorted(EVENTS, time) - 1](time)
 
 
-def test_the_loop_of_the_plant_frozen_at_each_time():
+def test_loop_with_gains_of_the_frozen_plant():
     gain = frozen_gains()
 
     def rate(time, state):
         A, B, B_f = plant(time)
         return (A - B @ gain(time)) @ state + B_f @ (GRAVITY * np.array(MASSES))
 
-    def unmoved(time, state):
+    def uncontrolled(time, state):
         A, _, B_f = plant(time)
         return A @ state + B_f @ (GRAVITY * np.array(MASSES))
 
     shape = np.sin(np.arange(1, MODES + 1) * np.pi * 0.25 / LENGTH)
-    deflection = by_pieces(rate, np.zeros(2 * MODES), 1e-8)[:, :MODES] @ shape
-    free = by_pieces(unmoved, np.zeros(2 * MODES), 1e-8)[:, :MODES] @ shape
+    deflection = integrate_between_events(rate, np.zeros(2 * MODES), 1e-8)[:, :MODES] @ shape
+    free = integrate_between_events(uncontrolled, np.zeros(2 * MODES), 1e-8)[:, :MODES] @ shape
     record = jb.simulate(rig(StepLQR(**WEIGHTS, points=60)), jnp.asarray(TIMES))
     peak = np.max(np.abs(deflection))
     assert_allclose(record.deflection[:, 0] / peak, deflection / peak, atol=1e-6)
@@ -144,7 +148,7 @@ def test_the_loop_of_the_plant_frozen_at_each_time():
 
 
 @pytest.mark.parametrize("kind", [StepLQR, AugmentedLQR])
-def test_slopes_of_a_loop_by_what_its_gains_were_designed_from(kind):
+def test_derivatives_of_a_loop_through_the_design_of_its_gains(kind):
     sizes = {
         "controller.state_weight.0": 4e5,
         "controller.command_weight.0": 1e-3,
@@ -162,7 +166,7 @@ def test_slopes_of_a_loop_by_what_its_gains_were_designed_from(kind):
         found = jnp.stack([jnp.sum((1e3 * record.deflection) ** 2), record.effort[0]])
         return found, found
 
-    both = jax.jit(jax.jacfwd(outputs, has_aux=True))  # one program for slopes and differences
+    both = jax.jit(jax.jacfwd(outputs, has_aux=True))  # one program for derivatives and differences
     at = jnp.ones(len(sizes))
     expected = central(lambda point: both(point)[1], at, step=2e-3, order=4)
     assert_allclose(both(at)[0], expected, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""The sampled regulator: against scipy and python-control, its limits, and what it costs."""
+"""Discrete regulator: against scipy and python-control, sampling limits, cost."""
 
 import json
 import warnings
@@ -13,12 +13,12 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
-from jaxbeam.case.validation import check
+from jaxbeam.case.validation import check_case
 from jaxbeam.cli import main
-from jaxbeam.control import LQR, DiscreteLQR, SamplingWarning
-from jaxbeam.control.optimal.sampled_lqr import discrete_lq_problem
-from jaxbeam.control.optimal.sampling_loss import sampled_reachability
-from jaxbeam.model.modes import lay_out
+from jaxbeam.control.optimal.lqr import LQR
+from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR, discrete_lq_problem
+from jaxbeam.control.optimal.sampling_loss import SamplingWarning, sampled_reachability
+from jaxbeam.model.modes import mesh_layout
 
 WEIGHTS = {
     "state_weight": [1e3, 1e2, 10.0, 0.1, 0.01, 0.01, 0.0],
@@ -28,7 +28,7 @@ WEIGHTS = {
 
 
 def rig(controller=None, modes=3, **shaker):
-    """The rig of chapter 5 of the thesis; its shaker stands at 0.5 m."""
+    """Rig of chapter 5 of the thesis, with its shaker at 0.5 m."""
     shaker = {"stiffness": 12000.0, "damping": 80.0, "force_per_volt": 4.6} | shaker
     return jb.Case(
         jb.Beam(0.6, 11.68, 0.535, 0.03, modes=modes),
@@ -40,110 +40,114 @@ def rig(controller=None, modes=3, **shaker):
     )
 
 
-def modelled(case):
-    layout = lay_out(case)
+def plant_of(case):
+    layout = mesh_layout(case)
     return eqx.filter_jit(lambda case: jb.state_space(case, "sine", layout))(case)
 
 
 @pytest.fixture(scope="module")
 def model():
-    return modelled(rig())
+    return plant_of(rig())
 
 
 @eqx.filter_jit
-def designed(law, model):
-    return law.gains(model)
+def designed_gain(controller, plant):
+    sampled = isinstance(controller, DiscreteLQR)
+    return controller.sampled_gain(plant) if sampled else controller.time_invariant_gain(plant)
 
 
-def close(found, expected, tolerance):
+def assert_close(found, expected, tolerance):
     assert_allclose(found, expected, rtol=0, atol=tolerance * np.max(np.abs(expected)))
 
 
-def integrated(A, B, Q, R, spans):
-    """Drift, pushes and cost of (x, u1, u2), u1 held for the first span (s), u2 for the other.
+def integrate(A, B, Q, R, spans):
+    """Transition and cost of (x, u1, u2), u1 held for the first span (s), u2 for the second.
 
-    By Van Loan's blocks, in units in which they are of like size.
+    By Van Loan's block matrices.
     """
     n, m = B.shape
     state, cost = np.eye(n, n + 2 * m), np.zeros((n + 2 * m,) * 2)
     for i, span in enumerate(spans):
         command = np.eye(m, n + 2 * m, n + i * m)
         rate = np.block([[A, B], [np.zeros((m, n + m))]])
-        toll = scipy.linalg.block_diag(Q, R)
-        parts = 64  # short ones: the blocks hold a growing exponential
-        block = np.block([[-rate.T, toll], [np.zeros_like(rate), rate]]) * span / parts
+        cost_rate = scipy.linalg.block_diag(Q, R)
+        parts = 64  # short ones, as the blocks contain a growing exponential
+        block = np.block([[-rate.T, cost_rate], [np.zeros_like(rate), rate]]) * span / parts
         whole = scipy.linalg.expm(block)
-        flow = whole[n + m :, n + m :]
-        spent = flow.T @ whole[: n + m, n + m :]
+        transition = whole[n + m :, n + m :]
+        part_cost = transition.T @ whole[: n + m, n + m :]
         for _ in range(parts):
-            both = np.vstack([state, command])
-            cost = cost + both.T @ spent @ both
-            state = (flow @ both)[:n]
+            augmented = np.vstack([state, command])
+            cost = cost + augmented.T @ part_cost @ augmented
+            state = (transition @ augmented)[:n]
     return state, cost
 
 
-@pytest.mark.parametrize("late", [None, 0.7e-3])
-def test_the_sampled_problem_is_the_integral(model, late):
+@pytest.mark.parametrize("delay", [None, 0.7e-3])
+def test_discrete_problem_against_the_integral(model, delay):
     plant, period = model.unloaded, 2e-3
     Q, R = LQR(**WEIGHTS).weights(model)
     A, B, Qs, Rs, N = discrete_lq_problem(
-        plant.A, plant.B, Q, R, jnp.asarray(period), None if late is None else jnp.asarray(late)
+        plant.A, plant.B, Q, R, jnp.asarray(period), None if delay is None else jnp.asarray(delay)
     )
-    spans = (0.0 if late is None else late, period - (late or 0.0))
-    state, cost = integrated(*map(np.asarray, (plant.A, plant.B, Q, R)), spans)
+    spans = (0.0 if delay is None else delay, period - (delay or 0.0))
+    state, cost = integrate(*map(np.asarray, (plant.A, plant.B, Q, R)), spans)
     units = np.sqrt(cost.diagonal() + 1e-12 * cost.max())
     found = np.block([[Qs, N], [N.T, Rs]])
     assert_allclose(found / np.outer(units, units), cost / np.outer(units, units), atol=1e-9)
-    close(np.hstack([A, B])[:7, :7], state[:, :7], 1e-10)
-    close(np.hstack([A, B])[:7, 7:], state[:, 7:], 1e-10)
+    assert_close(np.hstack([A, B])[:7, :7], state[:, :7], 1e-10)
+    assert_close(np.hstack([A, B])[:7, 7:], state[:, 7:], 1e-10)
 
 
 @pytest.mark.parametrize("period", [2e-4, 2e-3])
-def test_gain_as_scipy_and_python_control_find_it(model, period):
+def test_gain_against_scipy_and_python_control(model, period):
     plant = model.unloaded
     Q, R = LQR(**WEIGHTS).weights(model)
-    state, cost = integrated(*map(np.asarray, (plant.A, plant.B, Q, R)), (0.0, period))
+    state, cost = integrate(*map(np.asarray, (plant.A, plant.B, Q, R)), (0.0, period))
     A, B = state[:, :7], state[:, 8:]
     kept = np.r_[0:7, 8]
     cost = (cost + cost.T)[np.ix_(kept, kept)] / 2
     Q, N, R = cost[:7, :7], cost[:7, 7:], cost[7:, 7:]
     P = scipy.linalg.solve_discrete_are(A, B, Q, R, s=N)
     expected = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + N.T)
-    found = designed(DiscreteLQR(**WEIGHTS, period=period), model)
-    close(found, expected, 1e-6)
-    close(found, control.dlqr(A, B, Q, R, N)[0], 1e-6)
+    found = designed_gain(DiscreteLQR(**WEIGHTS, period=period), model)
+    assert_close(found, expected, 1e-6)
+    assert_close(found, control.dlqr(A, B, Q, R, N)[0], 1e-6)
 
 
-def test_it_becomes_the_continuous_regulator(model):
-    """A hold is late by half a period: the difference is of first order."""
-    exact = designed(LQR(**WEIGHTS), model)
-    far, near = (
-        np.max(np.abs(designed(DiscreteLQR(**WEIGHTS, period=period), model) - exact))
+def test_gain_tends_to_that_of_the_continuous_regulator(model):
+    """Holding delays by half a period: the difference is of first order."""
+    exact = designed_gain(LQR(**WEIGHTS), model)
+    double, period_difference = (
+        np.max(np.abs(designed_gain(DiscreteLQR(**WEIGHTS, period=period), model) - exact))
         / np.max(np.abs(exact))
         for period in (2e-6, 1e-6)
     )
-    assert near < 0.02
-    assert far / near == pytest.approx(2.0, abs=0.1)
+    assert period_difference < 0.02
+    assert double / period_difference == pytest.approx(2.0, abs=0.1)
 
 
 @pytest.mark.parametrize("options", [{"delay": 1.5e-3}, {"input_rate_weight": [1e-6]}, {}])
-def test_no_other_gain_costs_less(model, options):
-    """The cost of runs from a start, by an integration of its own, is lowest for the gain found."""
+def test_gain_has_the_least_cost(model, options):
+    """The cost of runs from an initial state, integrated independently, is least for the gain."""
     law = DiscreteLQR(**WEIGHTS, period=2e-3, **options)
-    gain = np.asarray(designed(law, model))
+    gain = np.asarray(designed_gain(law, model))
     plant = model.unloaded
     A, B = np.asarray(plant.A), np.asarray(plant.B)
     Q, R = (np.asarray(weight) for weight in law.weights(model))
-    late, rate = options.get("delay", 0.0), options.get("input_rate_weight", [0.0])[0]
-    state, spent = integrated(A, B, Q, R, (late, law.period - late))
+    delay, rate = options.get("delay", 0.0), options.get("input_rate_weight", [0.0])[0]
+    state, period_cost = integrate(A, B, Q, R, (delay, law.period - delay))
 
     def cost(gain):
         x, last, total = np.array([1e-3, -4e-4, 2e-4, 0.03, 0.01, -0.1, 0.2]), np.zeros(1), 0.0
         for _ in range(600):
             command = -gain @ np.concatenate([x, last])[: gain.shape[1]]
-            both = np.concatenate([x, last, command])
-            total += both @ spent @ both + rate * np.sum((command - last) ** 2) / law.period
-            x, last = state @ both, command
+            augmented = np.concatenate([x, last, command])
+            total += (
+                augmented @ period_cost @ augmented
+                + rate * np.sum((command - last) ** 2) / law.period
+            )
+            x, last = state @ augmented, command
         return float(total)
 
     least = cost(gain)
@@ -154,8 +158,8 @@ def test_no_other_gain_costs_less(model, options):
         assert abs(up - down) < 0.3 * (up + down)
 
 
-def test_limits_are_those_of_the_thesis():
-    """Eq. (5.6): half a period of each damped mode.
+def test_sampling_limits():
+    """Eq. (5.6) of the thesis: half a period of each damped mode.
 
     Without the suspension: pi / omega, omega_n = (n pi / L)^2 sqrt(EI / m), less the damping.
     """
@@ -167,64 +171,65 @@ def test_limits_are_those_of_the_thesis():
     assert stiffer.shape == (3,) and np.all(stiffer < expected)
 
 
-def test_control_is_lost_at_the_limit():
-    """Of one mode: by its reach, by the rank of (B, A B), and by what the best gain does."""
+def test_controllability_is_lost_at_the_sampling_limit():
+    """Of one mode: by Gramians, by the rank of (B, A B), and by poles under the optimal gain."""
     case = rig(modes=1, stiffness=0.0, damping=0.0, bandwidth=1e5)
-    model = modelled(case)
+    model = plant_of(case)
     plant, limit = model.unloaded, float(jb.sampling_limit(case)[0])
 
-    def smallest(period):
-        """Of the modal Gramian of held commands over that of any, by scipy's equations."""
-        fade = 0.5 / 0.2 * np.eye(3)
-        A, B = np.asarray(plant.A) - fade, np.asarray(plant.B)
-        drift = scipy.linalg.expm(A * period)
-        push = np.linalg.solve(A, (drift - np.eye(3)) @ B)
-        whole = scipy.linalg.solve_continuous_lyapunov(A, -B @ B.T)
-        held = scipy.linalg.solve_discrete_lyapunov(drift, push @ push.T) / period
-        # The coordinates of the mode itself, without what its lag adds.
+    def reachability(period):
+        """Smallest ratio of the sampled to the continuous modal Gramian, by scipy's equations."""
+        forgetting = 0.5 / 0.2 * np.eye(3)
+        A, B = np.asarray(plant.A) - forgetting, np.asarray(plant.B)
+        transition = scipy.linalg.expm(A * period)
+        input_matrix = np.linalg.solve(A, (transition - np.eye(3)) @ B)
+        continuous = scipy.linalg.solve_continuous_lyapunov(A, -B @ B.T)
+        held = scipy.linalg.solve_discrete_lyapunov(transition, input_matrix @ input_matrix.T)
+        # Coordinates of the mode itself, without the lag of the actuator.
         values, rows, *_ = scipy.linalg.eig(A, left=True, right=False)
         row = rows[:, np.argmax(values.imag)].conj()
         rows = np.stack([row.real, row.imag])
-        return scipy.linalg.eigvalsh(rows @ held @ rows.T, rows @ whole @ rows.T)[0]
+        return scipy.linalg.eigvalsh(rows @ held @ rows.T / period, rows @ continuous @ rows.T)[0]
 
-    shares = []
+    ratios = []
     for share in (0.25, 0.5, 0.9, 1.0, 1.25, 2.0):
-        kept, omega = sampled_reachability(plant, share * limit, 0.2)
+        ratio, omega = sampled_reachability(plant, share * limit, 0.2)
         assert omega == pytest.approx(np.pi / limit)
-        assert_allclose(kept, smallest(share * limit), rtol=1e-6, atol=1e-9)
-        shares.append(kept)
-    assert shares[0] > 0.9 and shares[1] > 0.7
-    assert shares[3] < 1e-6 and shares[5] < 1e-6  # at the limit, and at twice that
-    assert shares[2] < 0.5 and shares[4] < 0.5
+        assert_allclose(ratio, reachability(share * limit), rtol=1e-6, atol=1e-9)
+        ratios.append(ratio)
+    assert ratios[0] > 0.9 and ratios[1] > 0.7
+    assert ratios[3] < 1e-6 and ratios[5] < 1e-6  # at the limit, and at twice that
+    assert ratios[2] < 0.5 and ratios[4] < 0.5
 
     sampled = plant.discretize(limit)
     values, rows, *_ = scipy.linalg.eig(plant.A, left=True, right=False)
     row = rows[:, np.argmax(values.imag)].conj()
-    turned = np.stack([row, row.conj()]) @ np.hstack([sampled.B, sampled.A @ sampled.B])
-    sizes = np.linalg.svd(turned)[1]
+    controllability = np.stack([row, row.conj()]) @ np.hstack([sampled.B, sampled.A @ sampled.B])
+    sizes = np.linalg.svd(controllability)[1]
     assert sizes[1] < 1e-9 * sizes[0]
-    # No gain damps the mode there: half of it stays as damped as it was.
+    # No gain damps the mode there: one of its two poles stays.
     weights = {"state_weight": [1e3, 1.0, 0.0], "command_weight": [1e-6], "coordinates": "sine"}
     free = np.abs(np.linalg.eigvals(sampled.A)).max()
     moved = []
     for share in (0.5, 1.0):
         sampled = plant.discretize(share * limit)
-        gain = designed(DiscreteLQR(**weights, period=share * limit), model)
+        gain = designed_gain(DiscreteLQR(**weights, period=share * limit), model)
         moved.append(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ gain)).max() / free**share)
     assert moved[0] < 0.75
     assert moved[1] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_slow_samples_are_warned_of(tmp_path, capsys):
+def test_slow_sampling_warns(tmp_path, capsys):
     """In Python by a warning, on the command line by one sentence, before the run."""
     slow = rig(DiscreteLQR(**WEIGHTS, period=5e-3))
     with pytest.warns(
-        SamplingWarning, match="hardly reach the mode at .* Hz, whose sampling limit"
+        SamplingWarning,
+        match="the mode at .* Hz is hardly controllable at a period of .* limit is pi",
     ):
-        check(slow)
+        check_case(slow)
     with pytest.warns(SamplingWarning):
-        check(rig(LQR(**WEIGHTS, period=5e-3)))
-    check(rig(DiscreteLQR(**WEIGHTS, period=2e-3)))
+        check_case(rig(LQR(**WEIGHTS, period=5e-3)))
+    check_case(rig(DiscreteLQR(**WEIGHTS, period=2e-3)))
     path = tmp_path / "slow.toml"
     jb.save_case(slow, path)
     with warnings.catch_warnings(), pytest.raises(SystemExit) as ended:
@@ -232,8 +237,8 @@ def test_slow_samples_are_warned_of(tmp_path, capsys):
         main(["modes", str(path), "--json"])
     printed = capsys.readouterr()
     assert ended.value.code == 0 and json.loads(printed.out)
-    assert printed.err.count("hardly reach the mode") == 1
-    assert printed.err.startswith("jaxbeam: warning: commands held for 0.005 s")
+    assert printed.err.count("hardly controllable") == 1
+    assert printed.err.startswith("jaxbeam: warning: the mode at ")
 
 
 @pytest.mark.parametrize(
@@ -244,18 +249,23 @@ def test_slow_samples_are_warned_of(tmp_path, capsys):
         ({"period": 1e-3, "input_rate_weight": [1.0, 1.0]}, "must have 1 entries, not 2"),
     ],
 )
-def test_faults_are_named(options, message):
+def test_errors_of_settings(options, message):
     with pytest.raises(ValueError, match=message):
-        check(rig(DiscreteLQR(**WEIGHTS, **options)))
+        check_case(rig(DiscreteLQR(**WEIGHTS, **options)))
 
 
 @pytest.mark.slow
-def test_in_the_loop_it_is_what_was_designed(model):
-    """The poles of the loop from tick to tick are those of the problem of its design, closed."""
+def test_poles_of_the_loop_are_those_of_the_design(model):
+    """Eigenvalues of the transition over a period, delay and rate weight included."""
     law = DiscreteLQR(**WEIGHTS, period=2e-3, delay=5e-4, input_rate_weight=[1e-8])
     plant, (Q, R) = model.unloaded, law.weights(model)
-    state, _ = integrated(*map(np.asarray, (plant.A, plant.B, Q, R)), (5e-4, 1.5e-3))
-    drift, push = np.vstack([state[:, :8], np.zeros((1, 8))]), np.append(state[:, 8:], [[1.0]], 0)
-    expected = np.abs(np.linalg.eigvals(drift - push @ np.asarray(designed(law, model))))
+    state, _ = integrate(*map(np.asarray, (plant.A, plant.B, Q, R)), (5e-4, 1.5e-3))
+    transition, input_matrix = (
+        np.vstack([state[:, :8], np.zeros((1, 8))]),
+        np.append(state[:, 8:], [[1.0]], 0),
+    )
+    expected = np.abs(
+        np.linalg.eigvals(transition - input_matrix @ np.asarray(designed_gain(law, model)))
+    )
     found = np.abs(np.linalg.eigvals(linearised_loop(rig(law), 0.0).closed_matrix))
     assert_allclose(np.sort(found)[-7:], np.sort(expected)[-7:], rtol=1e-7)

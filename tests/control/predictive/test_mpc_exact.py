@@ -1,7 +1,7 @@
-"""Commands of predictive control, tick by tick, against the program written out, solved by others.
+"""Commands of predictive control, sample by sample, against an independent quadratic program.
 
-Along a crossing, with two actuators and two places: what is predicted follows period by period from
-matrices of numpy's, the moves from Clarabel.
+Along a crossing, with two actuators and two positions: predictions by matrices of numpy, moves by
+Clarabel.
 """
 
 import clarabel
@@ -20,23 +20,23 @@ from jaxbeam.case.controller import Measurement
 from tests.loop_as_oracle import span_of
 
 PERIOD, LIMITS, RATE = 0.01, (-4.0, 6.0), 250.0
-STARTS, MOMENT, PLACES, MASS, SPEED = (0.15, 0.4), 0.1, (0.15, 0.4), 0.4, 2.0
-TICKS = 6
-BASE = {"horizon": 5, "moves": 3, "move_weight": [1e-10, 3e-10], "places": PLACES}
-KNOWING = {"loads": "known", "prediction": "time-varying"}
+STARTS, MOMENT, POSITIONS, MASS, SPEED = (0.15, 0.4), 0.1, (0.15, 0.4), 0.4, 2.0
+SAMPLES = 6
+BASE = {"horizon": 5, "moves": 3, "move_weight": [1e-10, 3e-10], "positions": POSITIONS}
+TIME_VARYING = {"loads": "known", "prediction": "time-varying"}
 SETTINGS = {
-    "time-varying, without limits": KNOWING | {"solver": "unconstrained"},
-    "time-varying, within limits and rates": KNOWING,
-    "masses known, weights not": {"prediction": "time-varying"},
+    "time-varying, without limits": TIME_VARYING | {"solver": "unconstrained"},
+    "time-varying, within limits and rates": TIME_VARYING,
+    "masses without weights": {"prediction": "time-varying"},
     "weights of outputs and periods": {
         "output_weight": [1.0, 0.2],
         "horizon_weight": [1.0, 0.5, 2.0, 1.0, 3.0],
     },
     "soft limits": {"soft_limit": [2e-4, 4e-4], "soft_weight": 30.0, "move_weight": 1e-9},
-    "Laguerre functions": {"horizon": 8, "moves": 2, "laguerre_pole": 0.6} | KNOWING,
+    "Laguerre functions": {"horizon": 8, "moves": 2, "laguerre_pole": 0.6} | TIME_VARYING,
     "terminal cost": {"terminal": "riccati"},
 }
-DRAWS = np.random.default_rng(5).normal(size=(TICKS, 4))
+DRAWS = np.random.default_rng(5).normal(size=(SAMPLES, 4))
 STATES = DRAWS * np.array([2e-4, 3e-5, 1e-2, 5e-3]) - np.array([1.5e-4, 0, 0, 0])
 
 
@@ -55,22 +55,24 @@ def rig(**settings) -> jb.Case:
 
 
 def plant(span, t, mass):
-    """A, B, E of a period, the load frozen at its place at t (s); exponentials by scipy."""
+    """A, B, E over a period, the load frozen at its position at t (s); exponentials by scipy."""
     n, on = span.modes, 0.02 <= t < 0.02 + span.length / SPEED
     x = SPEED * (t - 0.02)
     under, slope, curvature = (span.shapes(x, d) if on else np.zeros(n) for d in range(3))
     stiffness = np.diag(span.frequencies**2) + mass * SPEED**2 * np.outer(under, curvature)
     damping = span.damping + 2 * mass * SPEED * np.outer(under, slope)
-    moved = np.linalg.inv(np.eye(n) + mass * np.outer(under, under))
-    drift = np.vstack([np.eye(n, 2 * n, k=n), -moved @ np.hstack([stiffness, damping])])
-    pushes = [MOMENT * (span.shapes(x, 1) - span.shapes(x + 0.05, 1)) for x in STARTS] + [-under]
-    inputs = np.vstack([np.zeros((n, 3)), moved @ np.array(pushes).T])
-    whole = scipy.linalg.expm(PERIOD * np.vstack([np.hstack([drift, inputs]), np.zeros((3, 7))]))
+    compliance = np.linalg.inv(np.eye(n) + mass * np.outer(under, under))
+    state_matrix = np.vstack([np.eye(n, 2 * n, k=n), -compliance @ np.hstack([stiffness, damping])])
+    forces = [MOMENT * (span.shapes(x, 1) - span.shapes(x + 0.05, 1)) for x in STARTS] + [-under]
+    inputs = np.vstack([np.zeros((n, 3)), compliance @ np.array(forces).T])
+    whole = scipy.linalg.expm(
+        PERIOD * np.vstack([np.hstack([state_matrix, inputs]), np.zeros((3, 7))])
+    )
     return whole[:4, :4], whole[:4, 4:6], whole[:4, 6]
 
 
 def sequences(law) -> np.ndarray:
-    """Moves (period, variable) that an actuator may make; Laguerre's by a chain of filters."""
+    """Basis of the moves (period, term) of an actuator; Laguerre functions by chained filters."""
     if law.laguerre_pole is None:
         return np.eye(law.horizon, law.moves)
     pole, pulse = float(law.laguerre_pole), np.eye(law.horizon)[0]
@@ -81,37 +83,40 @@ def sequences(law) -> np.ndarray:
 
 
 class Program:
-    """What a tick asks for: costs as squares of what is linear in the variables, and limits."""
+    """Program of a sample: sum of squares of affine functions of the variables, and limits."""
 
-    def __init__(self, law, plants, weight, state, rest, before, C):
-        self.law, self.plants, self.weight = law, plants, weight
-        self.state, self.rest, self.before, self.C = state, rest, before, C
+    def __init__(self, law, plants, weight, state, unexplained, previous, C):
+        self.law, self.plants, self.weight, self.C = law, plants, weight, C
+        self.state, self.unexplained, self.previous = state, unexplained, previous
         self.shapes = sequences(law)
 
     def future(self, variables):
-        """Moves (period, actuator), commands, states from now on, by variables (term, actuator)."""
+        """Moves (period, actuator), commands, and states, for variables (term, actuator)."""
         moves = self.shapes @ variables.reshape(-1, 2)
-        commands = self.before + np.cumsum(moves, axis=0)
+        commands = self.previous + np.cumsum(moves, axis=0)
         states = [self.state]
         for (A, B, E), command in zip(self.plants, commands, strict=True):
-            states.append(A @ states[-1] + B @ command + E * self.weight + self.rest)
+            states.append(A @ states[-1] + B @ command + E * self.weight + self.unexplained)
         return moves, commands, np.array(states)
 
-    def squares(self, variables):
-        """What is squared and added up; in units that make it some thousands."""
+    def residuals(self, variables):
+        """Terms whose squares are the cost, in units in which they are some thousands."""
         moves, _, states = self.future(variables)
         law, outputs = self.law, states[1:] @ self.C.T
-        ahead = np.ones(law.horizon) if law.horizon_weight is None else law.horizon_weight
-        each = np.ones(2) if law.output_weight is None else law.output_weight
-        weight = np.outer(ahead, each)
+        by_period = np.ones(law.horizon) if law.horizon_weight is None else law.horizon_weight
+        by_output = np.ones(2) if law.output_weight is None else law.output_weight
+        weight = np.outer(by_period, by_output)
         parts = [np.sqrt(np.broadcast_to(law.move_weight, 2)) * moves]
         if law.terminal == "riccati":
             A, B, _ = self.plants[0]
-            wide = np.block([[A, np.zeros((4, 2))], [self.C @ A, np.eye(2)]])
-            push, seen = np.vstack([B, self.C @ B]), np.diag([0.0] * 4 + [1.0] * 2)
-            price = np.diag(np.broadcast_to(law.move_weight, 2))
-            # In micrometres, which is kinder to the solver.
-            P = scipy.linalg.solve_discrete_are(wide, push, 1e12 * seen, 1e12 * price) / 1e12
+            A_incremental = np.block([[A, np.zeros((4, 2))], [self.C @ A, np.eye(2)]])
+            B_incremental, Q = np.vstack([B, self.C @ B]), np.diag([0.0] * 4 + [1.0] * 2)
+            R = np.diag(np.broadcast_to(law.move_weight, 2))
+            # In micrometres, in which the equation is better conditioned.
+            P = (
+                scipy.linalg.solve_discrete_are(A_incremental, B_incremental, 1e12 * Q, 1e12 * R)
+                / 1e12
+            )
             values, vectors = np.linalg.eigh((P + P.T) / 2)
             root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
             parts.append(root @ np.append(states[-1] - states[-2], outputs[-1]))
@@ -120,7 +125,7 @@ class Program:
         return 1e6 * np.concatenate([part.ravel() for part in parts])
 
     def rows(self, variables):
-        """What must not be positive."""
+        """Constraint functions, which must not be positive."""
         moves, commands, _ = self.future(variables)
         last = self.law.horizon if self.law.laguerre_pole is not None else self.law.moves
         moves, commands = moves[:last], commands[:last]
@@ -128,34 +133,35 @@ class Program:
         return np.concatenate([part.ravel() for part in bounds])
 
     def solve(self):
-        """The first command."""
+        """First command."""
         count = 2 * self.shapes.shape[1]
-        squares, slopes = affine(self.squares, count)
+        residuals, slopes = affine(self.residuals, count)
         if self.law.solver == "unconstrained":
-            best = np.linalg.lstsq(slopes, -squares)[0]
+            best = np.linalg.lstsq(slopes, -residuals)[0]
             return self.future(best)[1][0]
-        rows, tilts = affine(self.rows, count)
-        if self.law.soft_limit is not None:  # an excess (um) for each place, and its price
+        rows, row_slopes = affine(self.rows, count)
+        if self.law.soft_limit is not None:  # an excess (um) for each position, and its cost
             extra = 1e6 * np.sqrt(float(self.law.soft_weight)) * 1e-6 * np.eye(2)
             slopes = scipy.linalg.block_diag(slopes, extra)
-            squares = np.append(squares, np.zeros(2))
-            seen, bent = affine(lambda v: 1e6 * self.future(v)[2][1:] @ self.C.T, count)
-            allowed = 1e6 * np.broadcast_to(self.law.soft_limit, seen.shape)
-            bent, excess = bent.reshape(-1, count), np.tile(np.eye(2), (len(seen), 1))
-            tilts = np.vstack(
+            residuals = np.append(residuals, np.zeros(2))
+            outputs, output_slopes = affine(lambda v: 1e6 * self.future(v)[2][1:] @ self.C.T, count)
+            allowed = 1e6 * np.broadcast_to(self.law.soft_limit, outputs.shape)
+            output_slopes = output_slopes.reshape(-1, count)
+            excess = np.tile(np.eye(2), (len(outputs), 1))
+            row_slopes = np.vstack(
                 [
-                    np.hstack([tilts, np.zeros((len(tilts), 2))]),
-                    np.hstack([bent, -excess]),
-                    np.hstack([-bent, -excess]),
+                    np.hstack([row_slopes, np.zeros((len(row_slopes), 2))]),
+                    np.hstack([output_slopes, -excess]),
+                    np.hstack([-output_slopes, -excess]),
                 ]
             )
-            rows = np.concatenate([rows, (seen - allowed).ravel(), (-seen - allowed).ravel()])
-        best = by_clarabel(2 * slopes.T @ slopes, 2 * slopes.T @ squares, tilts, -rows)
+            rows = np.concatenate([rows, (outputs - allowed).ravel(), (-outputs - allowed).ravel()])
+        best = by_clarabel(2 * slopes.T @ slopes, 2 * slopes.T @ residuals, row_slopes, -rows)
         return self.future(best[:count])[1][0]
 
 
 def affine(function, count):
-    """Value at zero, and slopes by each of the variables (..., variable)."""
+    """Value at zero, and derivatives by the variables (..., variable)."""
     start = function(np.zeros(count))
     return start, np.stack([function(one) - start for one in np.eye(count)], axis=-1)
 
@@ -171,46 +177,48 @@ def by_clarabel(H, f, M, gamma):
     return np.array(solver.solve().x)
 
 
-def asked(case) -> np.ndarray:
-    """Commands (tick, actuator) that the law gives to some states, the load on its way."""
+def commands_of(case) -> np.ndarray:
+    """Commands (sample, actuator) of the law for STATES while the load crosses."""
 
     @eqx.filter_jit
     def run(model):
-        def tick(carry, at):
-            given, memory = carry
-            state, t = at
-            seen = Measurement(jnp.zeros(1), state, given)
-            given, memory = case.controller.step(memory, seen, t)
-            return (given, memory), given
+        law = case.controller.law(model)
 
-        start = jnp.zeros(2), case.controller.init(model)
-        times = jnp.arange(TICKS) * PERIOD
-        return jax.lax.scan(tick, start, (jnp.asarray(STATES), times))[1]
+        def step(carry, sample):
+            command, law_state = carry
+            state, t = sample
+            measurement = Measurement(jnp.zeros(1), state, command)
+            command, law_state, _ = law.step(law_state, measurement, t)
+            return (command, law_state), command
+
+        start = jnp.zeros(2), law.initial_state()
+        times = jnp.arange(SAMPLES) * PERIOD
+        return jax.lax.scan(step, start, (jnp.asarray(STATES), times))[1]
 
     return np.asarray(run(jb.state_space(case)))
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_commands_are_those_of_the_program_written_out(name):
+def test_commands_against_an_independent_program(name):
     case = rig(**SETTINGS[name])
-    law, span, found = case.controller, span_of(case), asked(case)
+    law, span, found = case.controller, span_of(case), commands_of(case)
     varying = law.prediction == "time-varying"
     mass = MASS if varying else 0.0
     weight = MASS * 9.81 if law.loads == "known" else 0.0
-    C = np.array([np.append(span.shapes(x), np.zeros(2)) for x in PLACES])
-    past, given = np.zeros(4), np.zeros(2)
+    C = np.array([np.append(span.shapes(x), np.zeros(2)) for x in POSITIONS])
+    past, previous = np.zeros(4), np.zeros(2)
     for k, state in enumerate(STATES):
-        middles = (k + np.arange(-1, law.horizon) + 0.5) * PERIOD
-        times = middles if varying or weight else np.full(middles.shape, -1.0)
+        midpoints = (k + np.arange(-1, law.horizon) + 0.5) * PERIOD
+        times = midpoints if varying or weight else np.full(midpoints.shape, -1.0)
         (A, B, E), *plants = [plant(span, t, mass) for t in times]
-        rest = state - (A @ past + B @ given + E * weight)
-        wanted = Program(law, plants, weight, state, rest, given, C).solve()
-        assert_allclose(found[k], wanted, rtol=0, atol=1e-6)
-        past, given = state, found[k]
+        unexplained = state - (A @ past + B @ previous + E * weight)
+        program = Program(law, plants, weight, state, unexplained, previous, C)
+        assert_allclose(found[k], program.solve(), rtol=0, atol=1e-6)
+        past, previous = state, found[k]
     if law.solver != "unconstrained":
-        felt = np.abs(np.diff(found, axis=0, prepend=0.0)) > 2.5 - 1e-6
-        felt |= (found > LIMITS[1] - 1e-6) | (found < LIMITS[0] + 1e-6)
-        assert 0 < np.mean(felt) < 1, "limits and rates must be felt at times"
+        active = np.abs(np.diff(found, axis=0, prepend=0.0)) > 2.5 - 1e-6
+        active |= (found > LIMITS[1] - 1e-6) | (found < LIMITS[0] + 1e-6)
+        assert 0 < np.mean(active) < 1, "some limits and rate limits must be active, not all"
     if law.soft_limit is not None:
-        firm = asked(rig(**SETTINGS[name] | {"soft_limit": 1.0}))
-        assert np.max(np.abs(found - firm)) > 0.05
+        without = commands_of(rig(**SETTINGS[name] | {"soft_limit": 1.0}))
+        assert np.max(np.abs(found - without)) > 0.05

@@ -1,4 +1,4 @@
-"""Predictive control of two spans in the loop: derivatives of its cost, by weights and horizon."""
+"""Predictive control of two spans: derivatives of the cost of a closed loop by its weights."""
 
 import jax
 import jax.numpy as jnp
@@ -26,13 +26,13 @@ FREE = ("controller.move_weight", "controller.output_weight", "controller.horizo
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::jaxbeam.simulate.ContactLossWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_derivatives_of_a_closed_loop_of_two_spans():
-    """By r_w of each patch, and the weights of sensors and periods, in reverse; limits are felt.
+    """Reverse mode, by r_w of each patch and weights of sensors and periods; limits are active.
 
-    The cost is a sum of squares and so smooth, but for a limit that begins to be felt at a tick:
-    there the program's own derivative is smoothed (see `control.qp`), and no tick is at such a
-    point here, which the agreement of differences of two steps proves.
+    The cost is smooth but where a limit becomes active at a sample, where the derivative of the
+    program is smoothed (see `control.predictive.qp`). No sample is at such a point, as differences
+    of two step sizes agree.
     """
     plan, sizes = integration_plan(CASE, None, 1e-6), [jb.addresses(CASE)[name] for name in FREE]
     ends = np.cumsum([size.size for size in sizes])[:-1]

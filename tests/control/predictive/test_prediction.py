@@ -1,4 +1,4 @@
-"""What a predictive controller foresees: its matrices, and the moves it may choose from."""
+"""Matrices of the prediction, and bases of moves."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +11,7 @@ from jaxbeam.control.predictive.prediction import (
     move_basis,
     move_maps,
     predict,
+    repeat_plant,
     sampled_plant,
 )
 
@@ -22,25 +23,25 @@ def plant(states=4, inputs=2, outputs=2, seed=0):
     return jnp.asarray(A), jnp.asarray(B), jnp.asarray(C)
 
 
-def test_prediction_is_that_of_the_incremental_model():
-    """F and Phi as eq. (7.5) spells them, from the matrices of eq. (7.1)."""
+def test_prediction_against_the_incremental_model():
+    """F and Phi of eq. (7.5) of the thesis, from the matrices of eq. (7.1)."""
     A, B, C = plant()
-    wide, push, seen = map(np.asarray, incremental_model(A, B, C))
-    steps = move_maps(move_basis(5, 3), 2)
-    many = SampledPlant(*(jnp.stack([part] * 5) for part in (A, B, jnp.zeros((4, 0)))))
-    found = predict(many, C, steps, jnp.zeros(0))
-    power = [np.linalg.matrix_power(wide, n) for n in range(6)]
-    F = np.stack([seen @ power[n] for n in range(1, 6)])
+    A_incremental, B_incremental, rows = map(np.asarray, incremental_model(A, B, C))
+    maps = move_maps(move_basis(5, 3), 2)
+    plants = repeat_plant(SampledPlant(A, B, jnp.zeros((4, 0))), 5)
+    found = predict(plants, C, maps, jnp.zeros(0))
+    power = [np.linalg.matrix_power(A_incremental, n) for n in range(6)]
+    F = np.stack([rows @ power[n] for n in range(1, 6)])
     Phi = np.zeros((5, 2, 6))
     for i in range(5):
         for j in range(min(i + 1, 3)):
-            Phi[i, :, 2 * j : 2 * j + 2] = seen @ power[i - j] @ push
+            Phi[i, :, 2 * j : 2 * j + 2] = rows @ power[i - j] @ B_incremental
     assert_allclose(found.Phi, Phi, atol=1e-14)
-    before, now, command = np.random.default_rng(1).normal(size=(3, 4))
+    previous, now, command = np.random.default_rng(1).normal(size=(3, 4))
     command = command[:2]
-    rest = now - A @ before - B @ command
-    free = found.F @ np.concatenate([now, rest, command, [1.0]])
-    assert_allclose(free, F @ np.concatenate([now - before, C @ now]), atol=1e-13)
+    unexplained = now - A @ previous - B @ command
+    free = found.F @ np.concatenate([now, unexplained, command, [1.0]])
+    assert_allclose(free, F @ np.concatenate([now - previous, C @ now]), atol=1e-13)
     assert_allclose(found.terminal[4:], found.F[-1], atol=1e-14)
 
 
@@ -48,19 +49,21 @@ def test_sampling_with_a_delay():
     rng = np.random.default_rng(2)
     A, B, E = (jnp.asarray(rng.normal(size=s)) for s in ((3, 3), (3, 1), (3, 2)))
     found = sampled_plant(A, B, E, jnp.array(0.3), jnp.array(0.1))
-    state, before, command, weights = rng.normal(size=3), *rng.normal(size=2), rng.normal(size=2)
-    for span, u in ((0.1, before), (0.2, command)):  # by the exponential of the forced system
+    state, previous, command, weights = rng.normal(size=3), *rng.normal(size=2), rng.normal(size=2)
+    for span, u in ((0.1, previous), (0.2, command)):  # by the exponential of the forced system
         rate = np.block([[A, (B[:, 0] * u + E @ weights)[:, None]], [np.zeros((1, 4))]])
         if span == 0.1:
             after = (scipy.linalg.expm(span * rate) @ np.append(state, 1.0))[:3]
         else:
             after = (scipy.linalg.expm(span * rate) @ np.append(after, 1.0))[:3]
-    wide = found.A @ np.append(state, before) + found.B @ np.array([command]) + found.E @ weights
-    assert_allclose(wide, np.append(after, command), rtol=1e-12)
+    next_state = (
+        found.A @ np.append(state, previous) + found.B @ np.array([command]) + found.E @ weights
+    )
+    assert_allclose(next_state, np.append(after, command), rtol=1e-12)
 
 
 def test_laguerre_functions():
-    """Orthonormal; the first moves at pole 0."""
+    """Orthonormal; unit moves at pole 0."""
     found = move_basis(200, 5, jnp.array(0.7))
     assert_allclose(found.T @ found, np.eye(5), atol=1e-12)
     assert_array_equal(move_basis(6, 4, jnp.array(0.0)), move_basis(6, 4))

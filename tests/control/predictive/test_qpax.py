@@ -1,52 +1,41 @@
-"""Quadratic programs by qpax beside our own methods: the same solutions, and honest verdicts."""
-
-import importlib
+"""Quadratic programs against qpax: equal solutions, and its flags for infeasible problems."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import qpax
 from numpy.testing import assert_allclose, assert_array_equal
 
-from jaxbeam.case.validation import check
-from jaxbeam.control.predictive import by_qpax
-from jaxbeam.control.predictive.qp import SOLVED, UNFINISHED, solve_qp
+import jaxbeam as jb
+from jaxbeam.control.predictive.qp import solve_qp
 from tests.control.predictive.test_mpc import mpc, rig
+from tests.control.predictive.test_mpc_law import commands
 from tests.control.predictive.test_qp import FEASIBLE, problems
-from tests.differences import central
-
-there = pytest.mark.skipif(not by_qpax.is_installed(), reason="qpax is not installed")
+from tests.oracles import qpax_solver
 
 
 @pytest.fixture(scope="module")
-def solve():
-    def many(method):
-        return jax.jit(jax.vmap(lambda *given: solve_qp(*given, method)))
-
-    return {method: many(method) for method in ("interior", "qpax")}
+def solve_by_qpax():
+    return jax.jit(jax.vmap(qpax_solver.solve))
 
 
-@there
 @pytest.mark.parametrize("kind", FEASIBLE)
-def test_solutions_are_identical_to_1e_8(kind, solve):
-    """Where it converges: not in one in twenty of the vertices without a multiplier."""
+def test_solutions_agree_to_1e_8(kind, solve_by_qpax):
+    """Where qpax converges: not for one in twenty of the vertices with a zero multiplier."""
     given = problems(kind, 6, 12)
-    own, other = (solve[method](*given) for method in ("interior", "qpax"))
-    settled = np.asarray(other.solved)
-    assert np.mean(settled) > (0.9 if kind == "all rows active" else 0.99)
-    assert_array_equal(np.asarray(other.verdict)[~settled], UNFINISHED)
-    assert_allclose(other.x[settled], own.x[settled], rtol=0, atol=1e-8)
+    own = jax.jit(jax.vmap(solve_qp))(*given)
+    x, solved = solve_by_qpax(*given)
+    assert np.mean(solved) > (0.9 if kind == "all rows active" else 0.99)
+    assert_allclose(x[solved], own.x[solved], rtol=0, atol=1e-8)
 
 
-@there
-def test_infeasible_problems_are_never_called_solved(solve):
-    assert_array_equal(solve["qpax"](*problems("infeasible", 6, 12)).verdict, UNFINISHED)
+def test_infeasible_problems_are_never_called_solved(solve_by_qpax):
+    assert not np.any(solve_by_qpax(*problems("infeasible", 6, 12))[1])
 
 
-@there
-def test_its_flag_alone_would_not_do():
-    """Why it is checked: its default algorithm calls the infeasible converged, in batches."""
-    qpax = importlib.import_module("qpax")
+def test_default_algorithm_calls_infeasible_problems_converged():
+    """In batches; hence the oracle confirms its flag."""
 
     def by_default(H, f, M, gamma):
         x, _, _, _, converged, _ = qpax.solve_qp(H, f, jnp.zeros((0, 6)), jnp.zeros(0), M, gamma)
@@ -57,42 +46,25 @@ def test_its_flag_alone_would_not_do():
     assert np.all(np.any(np.isnan(x), axis=1))
 
 
-@there
-def test_limits_that_are_not_felt_cost_nothing():
-    found = solve_qp(2 * jnp.eye(2), jnp.array([1.0, -1.0]), jnp.eye(2), jnp.ones(2), "qpax")
-    assert_allclose(found.x, [-0.5, 0.5], rtol=1e-15)
-    assert found.status == SOLVED and found.steps == 0
-
-
-@there
-def test_derivatives():
-    """Forward, which qpax itself refuses, and in reverse; those of the solution, not of steps."""
-    H, f, M, gamma = (part[5] for part in problems("plain", 3, 8))
+def test_commands_of_predictive_control():
+    """Each command is the one before plus the first move of the program, solved by qpax."""
+    states = jnp.asarray(np.random.default_rng(3).normal(size=(12, 6))) * 1e-3
+    controller = mpc()
+    found = np.asarray(commands(controller, states))
+    assert np.any(np.isclose(found, 7.5))
 
     @jax.jit
-    def solution(change):
-        found = solve_qp(H, f + change, M, gamma + 0.1 * change[0], "qpax")
-        return jnp.concatenate([found.x, found.multipliers])
+    def next_command(plant, state, last_state, previous):
+        law = controller.law(plant).law
+        predicted = law.sampled_plant.A @ last_state + law.sampled_plant.B @ previous
+        known = jnp.concatenate([state, state - predicted, previous, jnp.ones(1)])
+        x, solved = qpax_solver.solve(*law.quadratic_program(law.prediction, known, previous))
+        return previous + law.move_maps[0] @ x, solved
 
-    expected = central(solution, np.zeros(3), 1e-4)
-    for derivative in (jax.jacfwd, jax.jacrev):
-        found = jax.jit(derivative(solution))(jnp.zeros(3))
-        assert_allclose(found, expected, rtol=0, atol=1e-7 * np.max(np.abs(expected)))
-
-
-@there
-def test_predictive_control_gives_the_same_commands():
-    from tests.control.predictive.test_mpc_law import commands
-
-    states = jnp.asarray(np.random.default_rng(3).normal(size=(12, 6))) * 1e-3
-    own, other = (commands(mpc(solver=solver), states) for solver in ("interior", "qpax"))
-    assert np.any(own == 7.5) or np.any(np.isclose(own, 7.5))
-    assert_allclose(other, own, rtol=0, atol=1e-8)
-
-
-def test_where_it_is_missing_it_is_said_what_to_install(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match="pip install 'qpax>=0.1.4'"):
-        by_qpax.least_distance(jnp.ones((1, 1)), jnp.ones(1))
-    with pytest.raises(ValueError, match="controller.solver must be another: qpax is not"):
-        check(rig(mpc(solver="qpax")))
+    plant = jb.state_space(rig(controller))
+    last_state, previous = jnp.zeros(6), jnp.zeros(1)
+    for state, command in zip(states, found, strict=True):
+        expected, solved = next_command(plant, state, last_state, previous)
+        assert solved
+        assert_allclose(command, expected, rtol=0, atol=1e-8)
+        last_state, previous = state, jnp.asarray(command)

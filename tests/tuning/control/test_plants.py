@@ -101,8 +101,7 @@ WEIGHTS = {"state_weight": [1e4, 1.0], "command_weight": [1e-3]}
 def test_controllers_are_designed_for_the_nominal_plant():
     """On a softer beam the commands are those of the gains designed for the stiffer one."""
     law = jb.LQR(**WEIGHTS, period=0.01)
-    model = jb.state_space(rig(law))
-    gain = np.asarray(law.init(model)[0])
+    gain = np.asarray(law.time_invariant_gain(jb.state_space(rig(law))))
     soft = {RIGIDITY: 10.0}
     fixed = jb.StateFeedback(gain=gain.reshape(1, -1), period=0.01)
     expected = jb.simulate(jb.replace(rig(fixed), soft))

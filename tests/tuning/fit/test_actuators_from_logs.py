@@ -1,4 +1,4 @@
-"""Identification of actuators from logs of commands: planted values come back."""
+"""Identification of actuators from logs of commands: true values are recovered."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ SHAKER = {"position": 0.5, "stiffness": 3500.0, "damping": 80.0, "force_per_volt
 BANDWIDTH = 1e4
 PATCH = {"start": 0.2575, "end": 0.3425, "moment_per_volt": 8.292e-4, "correction": 0.32}
 GAIN = 200.0
-PLACES = (0.15, 0.3)
+POSITIONS = (0.15, 0.3)
 
 
 def shapes(x, derivative=0):
@@ -25,7 +25,7 @@ def shapes(x, derivative=0):
 
 
 def respond(times, shaker_volts, patch_volts):
-    """Deflections (m) at the places, by scipy's exact response to straight lines."""
+    """Deflections (m) at the positions, by scipy's exact response to linear inputs."""
     frequencies = (np.arange(1, MODES + 1) * np.pi / LENGTH) ** 2 * np.sqrt(RIGIDITY / DENSITY)
     here = shapes(SHAKER["position"])
     stiffness = np.diag(frequencies**2) + SHAKER["stiffness"] * np.outer(here, here)
@@ -39,13 +39,13 @@ def respond(times, shaker_volts, patch_volts):
     A[2 * n, 2 * n] = -BANDWIDTH
     B = np.zeros((2 * n + 1, 2))
     B[2 * n, 0], B[n : 2 * n, 1] = BANDWIDTH, lift
-    C = np.hstack([[shapes(x) for x in PLACES], np.zeros((2, n + 1))])
+    C = np.hstack([[shapes(x) for x in POSITIONS], np.zeros((2, n + 1))])
     inputs = np.column_stack([shaker_volts, patch_volts])
     return scipy.signal.lsim((A, B, C, np.zeros((2, 2))), inputs, times)[1]
 
 
 def case(**shaker):
-    """The rig, with nominal values that are wrong where the test says so."""
+    """The rig, with wrong values of the shaker where given."""
     return jb.Case(
         jb.Beam(
             length=LENGTH,
@@ -58,7 +58,7 @@ def case(**shaker):
             jb.Shaker(**{**SHAKER, **shaker}, bandwidth=BANDWIDTH),
             jb.Patch(**{**PATCH, "correction": 0.5}, amplifier_gain=GAIN),
         ],
-        sensors=[jb.Sensor(x) for x in PLACES],
+        sensors=[jb.Sensor(x) for x in POSITIONS],
     )
 
 
@@ -84,7 +84,7 @@ def log(shaker_volts, patch_volts, noise=2e-7, seed=0, **about):
 
 
 @pytest.mark.slow
-def test_shaker_and_patch_are_found_together():
+def test_shaker_and_patch_together():
     free = [
         "actuators.0.force_per_volt",
         "actuators.0.stiffness",

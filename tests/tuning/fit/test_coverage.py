@@ -1,4 +1,4 @@
-"""Intervals mean what they say: over many simulated campaigns they cover the truth."""
+"""95 % intervals cover the true values in 95 % of many simulated logs."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from jaxbeam.case.case import replace
 from tests.tuning.fit.test_identify import NOISE, simulated_log, small
 from tests.well_compiled import well_compiled
 from tuning.fit.dataset import make_dataset
-from tuning.fit.identify import fit_result
 from tuning.fit.least_squares import LeastSquares
+from tuning.fit.result import fit_result
 from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.parameters.free import free_parameters
 
@@ -26,24 +26,25 @@ STARTS = {"beam.flexural_rigidity": 11.0, "beam.damping_ratio": 0.02, "loads.0.s
 
 
 class Rehearsal:
-    """Many logs of one rig, fitted by one compiled search that starts beside the truth.
+    """Many logs of one rig, fitted by one compiled problem with starts near the true values.
 
-    The mass of the load is known unless a test says otherwise.
+    The mass of the load is held at its true value unless a test frees it.
     """
 
     def __init__(self):
         self.case = small(duration=0.5, rate=250.0)
         self.clean = np.asarray(jb.simulate(self.case).measured)
         log = simulated_log(self.case, NOISE)
-        campaign = make_dataset(replace(self.case, STARTS), [log])
-        free = [*SMALL, "loads.0.mass"]
-        numbers = free_parameters(campaign.cases, dict.fromkeys(free), np.ptp(self.clean))
-        self.search = LeastSquares(campaign, numbers)
+        dataset = make_dataset(replace(self.case, STARTS), [log])
+        free = dict.fromkeys([*SMALL, "loads.0.mass"])
+        parameters = free_parameters(dataset.cases, free, np.ptp(self.clean))
+        self.least_squares = LeastSquares(dataset, parameters)
 
     def deviations(self, noises):
-        """Errors in half widths of stated intervals (log, free), and the standard errors."""
+        """Errors in half widths of the intervals (log, parameter), and the standard errors."""
         free = np.arange(7) < 6
-        found = [self.search.solve((self.clean + noise)[None], free=free) for noise in noises]
+        problem = self.least_squares
+        found = [problem.solve((self.clean + noise)[None], free=free) for noise in noises]
         errors = np.array([each.uncertainty.errors[:6] for each in found])
         values = np.array([each.values[:6] for each in found])
         assert all(each.converged for each in found)
@@ -53,7 +54,7 @@ class Rehearsal:
 
 @pytest.fixture(scope="module")
 def rehearsal():
-    """Its search is run six hundred times, and so worth compiling well, as for users."""
+    """Its problem is solved six hundred times, so it is compiled with optimisation."""
     made = Rehearsal()
     with well_compiled():
         yield made
@@ -77,7 +78,7 @@ def test_intervals_cover_the_truth(rehearsal):
 
 
 @pytest.mark.slow
-def test_coloured_residuals_widen_intervals(rehearsal):
+def test_autocorrelated_residuals_widen_intervals(rehearsal):
     white = NOISE * np.random.default_rng(6).normal(size=(100, *rehearsal.clean.shape))
     _, narrow = rehearsal.deviations(white[:10])
     errors, wide = rehearsal.deviations(coloured(white, 0.6))
@@ -88,20 +89,19 @@ def test_coloured_residuals_widen_intervals(rehearsal):
 
 
 @pytest.mark.slow
-def test_a_common_scale_is_reported_by_name(rehearsal):
-    """Rigidity, mass per length and the load's mass times anything: the same deflection."""
+def test_a_common_factor_is_reported_as_unidentifiable(rehearsal):
+    """Rigidity, mass per length and load mass times a factor lead to the same deflection."""
     scaled = ["beam.flexural_rigidity", "beam.mass_per_length", "loads.0.mass"]
     noise = NOISE * np.random.default_rng(0).normal(size=rehearsal.clean.shape)
-    search = rehearsal.search
-    found = search.estimate((rehearsal.clean + noise)[None])
-    fit = fit_result(rehearsal.case, search, found)
+    problem = rehearsal.least_squares
+    fit = fit_result(rehearsal.case, problem, problem.solve((rehearsal.clean + noise)[None]))
     (direction,) = fit.unidentifiable
     assert set(direction) == set(scaled)
     values = dict(zip(fit.addresses, fit.values, strict=True))
     shares = [direction[address] / values[address] for address in scaled]
     np.testing.assert_allclose(shares, shares[0], rtol=0.02)
-    blind = [address in scaled for address in fit.addresses]
-    assert np.isinf(fit.errors).tolist() == blind
-    assert np.isinf(fit.intervals[blind]).all()
-    assert str(fit).count("the data cannot tell") == 3
+    unidentifiable = [address in scaled for address in fit.addresses]
+    assert np.isinf(fit.errors).tolist() == unidentifiable
+    assert np.isinf(fit.intervals[unidentifiable]).all()
+    assert str(fit).count("not identifiable\n") == 3
     assert fit.to_dict()["numbers"]["loads.0.mass"]["interval_95"] is None

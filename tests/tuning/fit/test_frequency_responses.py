@@ -1,4 +1,4 @@
-"""Fits to frequency responses that were summed mode by mode with numpy."""
+"""Fits to frequency responses summed mode by mode with numpy."""
 
 import dataclasses
 
@@ -13,18 +13,18 @@ from tuning.fit.frequency_responses import Responses, identify_responses, respon
 from tuning.logs.log import Log
 
 LENGTH, RIGIDITY, DENSITY, DAMPING, MODES = 0.6, 11.68, 0.535, 0.02, 3
-HAMMER, PLACES = 0.2, (0.15, 0.3)
+HAMMER, POSITIONS = 0.2, (0.15, 0.3)
 FREQUENCIES = np.linspace(5, 300, 150)
 
 
 def sum_of_modes(frequencies, rigidity=RIGIDITY, damping=DAMPING):
-    """Receptances at the places: sum of shape(x) shape(a) / (w_i^2 - w^2 + 2 i z w_i w)."""
+    """Receptances at the positions: sum of shape(x) shape(a) / (w_i^2 - w^2 + 2 i z w_i w)."""
     w = 2 * np.pi * frequencies[:, None]
-    total = np.zeros((frequencies.size, len(PLACES)), complex)
+    total = np.zeros((frequencies.size, len(POSITIONS)), complex)
     for i in range(1, MODES + 1):
         own = (i * np.pi / LENGTH) ** 2 * np.sqrt(rigidity / DENSITY)
         here = np.sin(i * np.pi * HAMMER / LENGTH) * 2 / (DENSITY * LENGTH)
-        shape = np.sin(i * np.pi * np.array(PLACES) / LENGTH)
+        shape = np.sin(i * np.pi * np.array(POSITIONS) / LENGTH)
         total += here * shape / (own**2 - w**2 + 2j * damping * own * w)
     return total
 
@@ -32,15 +32,17 @@ def sum_of_modes(frequencies, rigidity=RIGIDITY, damping=DAMPING):
 def measured(noise=0.01, **about):
     values = sum_of_modes(FREQUENCIES)
     rng = np.random.default_rng(0)
-    off = noise * (rng.normal(size=values.shape) + 1j * rng.normal(size=values.shape))
+    relative_error = noise * (rng.normal(size=values.shape) + 1j * rng.normal(size=values.shape))
     pairs = tuple((f"force@{HAMMER}", f"sensors.{i}") for i in range(2))
-    return Responses(FREQUENCIES, values * np.exp(off), pairs, source="hammer.csv", **about)
+    return Responses(
+        FREQUENCIES, values * np.exp(relative_error), pairs, source="hammer.csv", **about
+    )
 
 
 CASE = jb.Case(
     jb.Beam(length=LENGTH, flexural_rigidity=12.4, mass_per_length=DENSITY, damping_ratio=0.03,
             modes=MODES),
-    sensors=[jb.Sensor(x) for x in PLACES],
+    sensors=[jb.Sensor(x) for x in POSITIONS],
 )  # fmt: skip
 
 
@@ -55,8 +57,8 @@ def test_rigidity_and_damping_from_a_hammer():
     assert float(fit.case.beam.flexural_rigidity) == fit.values[0]
 
 
-def test_a_log_of_a_shaker_gives_responses():
-    """Noise as command: what Welch's method estimates from lsim is the response of the rig."""
+def test_responses_estimated_from_a_log_of_a_shaker():
+    """Noise as command, readings by lsim: Welch's method estimates the response of the rig."""
     times = np.arange(60_001) / 1000.0
     volts = scipy.signal.lfilter(*scipy.signal.butter(2, 0.2), np.random.default_rng(0).normal(
         size=times.size))  # fmt: skip
@@ -68,8 +70,8 @@ def test_a_log_of_a_shaker_gives_responses():
     assert found.pairs == (("actuators.0", "sensors.0"), ("actuators.0", "sensors.1"))
     kept = found.frequencies < 100
     exact = frequency_response(rigs.case(), found.frequencies[kept], found.pairs).values
-    off = np.abs(found.values[kept] / np.asarray(exact) - 1)
-    assert np.median(off) < 0.02
+    error = np.abs(found.values[kept] / np.asarray(exact) - 1)
+    assert np.median(error) < 0.02
     with pytest.raises(ValueError, match="responses need one command and at least one sensor"):
         responses_of(dataclasses.replace(log, actuators=(None, None, None)))
 

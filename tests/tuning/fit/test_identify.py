@@ -1,4 +1,4 @@
-"""Identification: planted values come back, intervals cover them, and the blind spots are named."""
+"""Identification: true values are recovered within intervals; others are called unidentifiable."""
 
 import dataclasses
 import json
@@ -48,7 +48,7 @@ def log_of(times, values, **about) -> Log:
 
 
 def simulated_log(case: jb.Case, noise=1e-5, seed=0, **about) -> Log:
-    """What jaxbeam says the sensors read, with white noise (m)."""
+    """Readings simulated by jaxbeam, with white noise (m)."""
     record = jb.simulate(case)
     values = np.asarray(record.measured)
     return log_of(
@@ -59,7 +59,7 @@ def simulated_log(case: jb.Case, noise=1e-5, seed=0, **about) -> Log:
 
 
 def oracle_log(load: Load, offsets, noise=1e-5, duration=0.8, seed=1, **about) -> Log:
-    """What the modal equations, written and integrated apart from jaxbeam, say."""
+    """Readings by modal equations, written and integrated independently of jaxbeam."""
     times = np.arange(round(duration * RATE) + 1) / RATE
     clean = modal_equations.respond(SPAN, [load], (0.15, 0.3), times).deflection + offsets
     values = clean + noise * np.random.default_rng(seed).normal(size=clean.shape)
@@ -106,7 +106,7 @@ def two_logs() -> Fit:
 
 
 @pytest.mark.slow
-def test_planted_values_come_back(two_logs):
+def test_true_values_are_recovered(two_logs):
     assert two_logs.addresses == list(TRUTH)
     assert np.all(np.abs(deviations(two_logs, TRUTH)) < 3)
     np.testing.assert_allclose(two_logs.noise, 1e-5, rtol=0.1)
@@ -121,7 +121,7 @@ def test_planted_values_come_back(two_logs):
 def test_fitted_cases(two_logs):
     value = dict(zip(two_logs.addresses, two_logs.values, strict=True))
     assert float(two_logs.case.beam.flexural_rigidity) == value["beam.flexural_rigidity"]
-    assert float(two_logs.case.loads[0].speed) == 2.0  # that of the case, which no log used
+    assert float(two_logs.case.loads[0].speed) == 2.0  # of the case, not used by any log
     assert float(two_logs.cases[1].loads[0].speed) == value["logs.1.loads.0.speed"]
     assert float(two_logs.case.run.duration) == 0.8
 
@@ -136,11 +136,11 @@ def test_correlation(two_logs):
 
 
 @pytest.mark.slow
-def test_what_is_said(two_logs):
-    said = str(two_logs)
-    first = said.splitlines()[1]
+def test_summary_and_figure(two_logs):
+    summary = str(two_logs)
+    first = summary.splitlines()[1]
     assert first.split()[:4] == ["beam.flexural_rigidity", "N", "m^2", "10"]
-    assert "standard deviation of the residual of run 1: " in said
+    assert "standard deviation of the residual of run 1: " in summary
     plain = json.loads(json.dumps(two_logs.to_dict()))
     assert plain["numbers"]["sensors.0.offset"]["unit"] == "m"
     low, high = plain["numbers"]["logs.1.loads.0.speed"]["interval_95"]
@@ -153,8 +153,8 @@ NOISE = 2e-5
 
 
 @pytest.mark.slow
-def test_a_log_that_ends_at_the_exit_hardly_shows_mass_and_damping():
-    """At 0.5 m/s the deflection is quasi-static: rigidity is seen, the vibration is not."""
+def test_damping_is_not_identifiable_from_a_log_that_ends_at_the_exit():
+    """At 0.5 m/s the deflection is quasi-static: it depends on rigidity, hardly on damping."""
     case = replace(small(duration=1.26), {"loads.0.speed": 0.5})
     log = simulated_log(case, 1e-4)
     free = ["beam.flexural_rigidity", "beam.mass_per_length", "beam.damping_ratio"]
@@ -164,11 +164,11 @@ def test_a_log_that_ends_at_the_exit_hardly_shows_mass_and_damping():
     assert fit.errors[1] > 0.05 * 0.535
     assert fit.errors[2] == np.inf
     assert fit.unidentifiable == [{"beam.damping_ratio": pytest.approx(0.003)}]
-    assert "the data cannot see beam.damping_ratio: give it a value known otherwise" in str(fit)
+    assert "beam.damping_ratio is not identifiable from the data: give it a value" in str(fit)
 
 
 @pytest.mark.slow
-def test_bounds_hold_and_a_bound_reached_is_said():
+def test_bounds_hold_and_are_reported_when_reached():
     case = replace(small(duration=0.6), {"beam.flexural_rigidity": 9.0})
     log = simulated_log(small(duration=0.6), NOISE)
     fit = identify(case, log, {"beam.flexural_rigidity": (8.0, 11.0), "beam.damping_ratio": None})
@@ -179,8 +179,8 @@ def test_bounds_hold_and_a_bound_reached_is_said():
 
 
 @pytest.mark.slow
-def test_elastic_supports_and_their_springs():
-    """The oracle of supports is the finite-element one; here jaxbeam's own log must give back."""
+def test_stiffness_of_an_elastic_support():
+    """From a log simulated by jaxbeam; finite elements are used in test_recovery."""
     case = dataclasses.replace(
         small(sensors=(0.15, 0.45), duration=0.6),
         supports=(jb.Support(position=0.3, stiffness=4e4, damping=2.0),),
@@ -193,7 +193,7 @@ def test_elastic_supports_and_their_springs():
     assert np.all(fit.errors < 0.01 * fit.values)
 
 
-# Faulty input: what is wrong, where, and how to mend it, before anything is compiled.
+# Faulty input is refused before anything is compiled.
 TIMES = np.arange(400) / RATE
 FLAT = np.zeros((400, 2))
 
@@ -253,6 +253,6 @@ def test_case_without_sensors_is_refused():
         identify(one_span(sensors=()), faulty(), ["beam.length"])
 
 
-def test_one_address_may_be_given_alone():
+def test_free_may_be_a_single_address():
     with pytest.raises(ValueError, match="did you mean 'beam.flexural_rigidity'"):
         identify(one_span(), faulty(), "beam.flexural_rigidty")

@@ -1,4 +1,4 @@
-"""The command line of fits: what it asks of the library, what it writes, and how it refuses."""
+"""Command line of fits: calls of the library, files written, and refusals."""
 
 import json
 
@@ -73,11 +73,11 @@ def test_json(call, monkeypatch):
         "identify case.toml runs.csv --free beam.length --mask missing --json"
         " --profile sensors.0.offset --validate"
     )
-    told = json.loads(out)
-    assert code == 0 and len(told["left_out"]) == 3
-    low, high = told["profiles"]["sensors.0.offset"]["interval"]
+    result = json.loads(out)
+    assert code == 0 and len(result["left_out"]) == 3
+    low, high = result["profiles"]["sensors.0.offset"]["interval"]
     assert low < 0.2 < high
-    assert set(told["numbers"]) == set(stand_in.TRUTH)
+    assert set(result["numbers"]) == set(stand_in.TRUTH)
 
 
 REFUSED = [

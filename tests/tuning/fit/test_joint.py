@@ -1,4 +1,4 @@
-"""Logs of unlike kinds in one fit: a crossing that is only watched, and a patch that shakes."""
+"""Logs of different kinds in one fit: a crossing without control, and a patch that excites."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ from tuning.logs.pairing import pad_cases
 
 @pytest.fixture(scope="module")
 def made() -> Plant:
-    """A beam of finite elements with a patch; accelerations need all modes that the plant has."""
+    """A beam of finite elements with a patch; accelerations need all modes of the plant."""
     sensors = [(0.2,), (0.35, "acceleration")]
     rig = plant(1, 13.211, 0.812, [patch(0.2575, 0.32)], [], {}, sensors, 4, "pinned-pinned")
     return dataclasses.replace(rig, modes=4)
@@ -25,13 +25,13 @@ def crossing_and_shaking(made: Plant) -> list[Log]:
     """The deflection while a mass crosses, and the acceleration while the patch is driven."""
     noise = np.random.default_rng(0)
     times = np.arange(round(0.5 * RATE)) / RATE
-    watched = made.readings(times, np.zeros((times.size, 1)))[:, :1]
-    watched = watched + NOISE["deflection"] * noise.normal(size=watched.shape)
+    crossing = made.readings(times, np.zeros((times.size, 1)))[:, :1]
+    crossing = crossing + NOISE["deflection"] * noise.normal(size=crossing.shape)
     voltage = 2.0 * scipy.signal.chirp(times, 2.0, times[-1], 30.0)[:, None]
     shaken = made.readings(times, voltage, loaded=False)[:, 1:]
     shaken = shaken + NOISE["acceleration"] * noise.normal(size=shaken.shape)
     return [
-        Log(times, watched, ("w",), ("deflection",), ("m",), "crossing", sensors=(0,)),
+        Log(times, crossing, ("w",), ("deflection",), ("m",), "crossing", sensors=(0,)),
         Log(
             times,
             np.column_stack([shaken, voltage]),
@@ -47,24 +47,24 @@ def crossing_and_shaking(made: Plant) -> list[Log]:
 
 
 @pytest.mark.slow
-def test_one_rig_is_found_in_both(made):
+def test_one_rig_fitted_to_both(made):
     start = {address: 1.06 * value for address, value in made.truth.items()}
     fit = identify(replace(made.case, start), crossing_and_shaking(made), list(start))
     assert np.all(np.isfinite(fit.errors))
-    far = (fit.values - list(made.truth.values())) / fit.errors
-    assert np.all(np.abs(far) < 3), dict(zip(made.truth, far, strict=True))
-    # Neither tells the rigidity and the correction of the patch alone as well as both do.
+    deviations = (fit.values - list(made.truth.values())) / fit.errors
+    assert np.all(np.abs(deviations) < 3), dict(zip(made.truth, deviations, strict=True))
+    # Either log alone determines rigidity and correction of the patch less well.
     assert np.all(fit.errors / fit.values < [0.01, 0.03, 0.2, 0.03])
 
 
-def test_what_a_log_lacks_is_there_without_effect(made):
+def test_cases_are_padded_without_effect(made):
     times = np.linspace(0.0, 0.5, 6)
     table = jb.MovingMass(mass=0.3, times=[0.1, 0.4], positions=[0.0, 0.6])
     both = dataclasses.replace(made.case, loads=(*made.case.loads, table))
     driven = jb.Prescribed(np.zeros(1), times=times, values=np.ones((1, 6)))
     empty = dataclasses.replace(made.case, loads=(), controller=driven)
-    watched, shaken = pad_cases([both, empty], [times, times])
-    assert watched.loads == both.loads and not np.any(watched.controller.values)
+    crossed, shaken = pad_cases([both, empty], [times, times])
+    assert crossed.loads == both.loads and not np.any(crossed.controller.values)
     assert np.all(shaken.controller.values == 1.0)
     first, second = shaken.loads
     assert first.entry_time == 1.0 and float(second.times[0]) == 1.0

@@ -134,7 +134,7 @@ def test_scales(scale):
 
 
 def test_the_old_word_for_a_linear_scale_warns():
-    with pytest.warns(DeprecationWarning, match="the scale 'plain' is now called 'linear'"):
+    with pytest.warns(DeprecationWarning, match="the scale 'plain' is called 'linear' now"):
         assert Prior(scale="plain") == Prior()
 
 

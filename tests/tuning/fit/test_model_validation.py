@@ -23,7 +23,7 @@ from tests.tuning.stand_in import (
     formula,
     least_squares,
 )
-from tuning.checkpoint import load, save
+from tuning.checkpoint import Checkpoint, load, save
 from tuning.fit import model_validation, storage
 from tuning.fit.model_validation import compare_fits, cross_validate
 from tuning.fit.residuals import residual_remarks, whiteness_p_value

@@ -1,4 +1,4 @@
-"""LabVIEW measurement files, written here after the published description of the format."""
+"""LabVIEW measurement files, written by the tests after the published format."""
 
 import numpy as np
 import pytest
@@ -84,7 +84,7 @@ def test_segments_follow_their_start_times(tmp_path):
         _ = log.sample_rate
 
 
-def test_segments_that_count_on(tmp_path):
+def test_segments_whose_times_continue(tmp_path):
     text = lvm(starts=("23:59:59.5", "23:59:59.5"))
     head, first, second = text.partition("Channels")[0], *text.split("Channels")[1:]
     for old, new in (("0.0024", "0.0060"), ("0.0012", "0.0048"), ("0.0000", "0.0036")):

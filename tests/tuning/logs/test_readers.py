@@ -1,4 +1,4 @@
-"""Binary logs, written by the libraries that own the formats: the same run comes back from each."""
+"""Logs in binary formats, written by other libraries: the same run is read from each."""
 
 import numpy as np
 import pytest
@@ -81,7 +81,7 @@ FORMATS = {
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_same_run_comes_back(tmp_path, name):
+def test_the_same_run_is_read_from_every_format(tmp_path, name):
     FORMATS[name](tmp_path / name)
     log = read_log(tmp_path / name)
     assert log.names == ("d1", "d2") and log.units == ("mm", "mm")
@@ -119,20 +119,20 @@ def test_rows_that_name_their_run(tmp_path):
     np.testing.assert_allclose(second.values[:, 0], [3e-3, 4e-3, 5e-3])
 
 
-def test_what_is_left_out_is_said(tmp_path):
+def test_arrays_left_out_are_noted(tmp_path):
     hdf5(tmp_path / "run.h5")
     assert read_log(tmp_path / "run.h5").notes == (
         "left out, not being 40 samples long: calibration",
     )
 
 
-def test_missing_samples_are_masked_only_when_asked(tmp_path):
+def test_missing_samples_are_masked_only_on_request(tmp_path):
     path = tmp_path / "run.csv"
     path.write_text("t [s],a [mm],b [mm]\n0,1,5\n1,,6\n2,3,nan\n3,4,9\n")
     with pytest.raises(ValueError, match="line 3, column 'a': the cell is empty"):
         read_log(path)
     log = read_log(path, missing="mask")
-    np.testing.assert_allclose(log.values[:, 0], [1e-3, 2e-3, 3e-3, 4e-3])  # a straight line
+    np.testing.assert_allclose(log.values[:, 0], [1e-3, 2e-3, 3e-3, 4e-3])  # interpolated
     assert log.valid.T.tolist() == [[True, False, True, True], [True, True, False, True]]
     assert log.notes[0] == "1 missing samples of a are left out"
     with pytest.raises(ValueError, match='can be "refuse"d or "mask"ed'):
@@ -166,7 +166,7 @@ def test_a_file_cut_off_is_refused_in_one_sentence(tmp_path, name):
             log = read_log(cut)
         except ValueError as error:
             assert str(error).startswith(str(cut)) and "\n" not in str(error)
-        else:  # what can still be read is the truth, and that something is missing is said
+        else:  # samples that can be read are right, and missing ones are noted
             count = log.times.size
             np.testing.assert_allclose(log.times, TIMES[:count], atol=1e-12)
             assert count == TIMES.size or "breaks off" in log.notes[0]
@@ -183,7 +183,7 @@ def test_a_file_that_is_not_what_it_is_called(tmp_path, suffix):
         read_log(path)
 
 
-def test_content_wins_over_the_name(tmp_path):
+def test_the_format_is_decided_by_content(tmp_path):
     mat(tmp_path / "run.csv")
     assert read_log(tmp_path / "run.csv").names == ("d1", "d2")
     (tmp_path / "noise.csv").write_bytes(bytes(range(256)))

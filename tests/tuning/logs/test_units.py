@@ -1,4 +1,4 @@
-"""Units against what they are defined as."""
+"""Units against their definitions."""
 
 import math
 

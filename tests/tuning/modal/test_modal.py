@@ -1,4 +1,4 @@
-"""Modes identified from logs made here, whose modes are known.
+"""Modes identified from synthetic logs whose modes are known.
 
 Decays are sums of damped cosines. Ambient responses are those of an oscillator to white force,
 sampled from its exact recursion at eight times the rate of the log.
@@ -36,7 +36,7 @@ def root(frequency, damping):
 
 
 def decay(seed, noise=0.05, rate=100.0, release=3.0, hum=0.0, drift=0.1, duration=12.0):
-    """Random forcing until `release`, then a free decay of three modes on an offset that drifts."""
+    """Random forcing until `release`, then a free decay of three modes with drift."""
     random = np.random.default_rng(seed)
     times = np.arange(int(duration * rate)) / rate
     values = np.zeros((times.size, 2))
@@ -73,7 +73,7 @@ def covered(fit, frequencies, damping):
 
 
 def test_clean_decay_is_exact():
-    """Without noise nothing but rounding is left, also in a window that cuts the decay off."""
+    """Without noise errors are those of rounding, also in a window that truncates the decay."""
     log = decay(0, noise=0.0, drift=0.0)
     fit = identify_modes(log, window=(3.0, 5.0), band=BAND)
     np.testing.assert_allclose(fit.frequencies, FREQUENCIES, rtol=1e-6)
@@ -116,7 +116,7 @@ def test_noise_has_no_modes(quantity, colour):
 
 @pytest.mark.slow
 def test_decay_intervals_cover_the_truth():
-    """120 logs of three modes each: 95 % intervals hold the truth in 90 to 98 of a hundred."""
+    """120 logs of three modes each: 90 % to 98 % of the intervals cover the true values."""
     fits = [identify_modes(decay(seed), band=BAND, window=(3.0, 9.5)) for seed in range(120)]
     share = np.mean([covered(fit, FREQUENCIES, DAMPING) for fit in fits], axis=(0, 1))
     assert np.all((share >= 0.90) & (share <= 0.98)), share
@@ -124,7 +124,7 @@ def test_decay_intervals_cover_the_truth():
 
 @pytest.mark.slow
 def test_ambient_intervals_cover_the_truth():
-    """Of 100 logs; that these are no free decays, a fifth must find: it takes longest."""
+    """Of 100 logs; for a fifth of them the kind is decided from the log, which takes longest."""
     kinds = [None] * 20 + ["ambient"] * 80
     fits = [identify_modes(ambient(seed), kind=kind) for seed, kind in enumerate(kinds)]
     assert all(fit.kind == "ambient" for fit in fits)
@@ -132,13 +132,13 @@ def test_ambient_intervals_cover_the_truth():
     assert np.all((share >= 0.90) & (share <= 0.98)), share
 
 
-def test_what_a_fit_tells(tmp_path):
+def test_table_json_and_figures_of_a_fit(tmp_path):
     fit = identify_modes(decay(3), band=BAND)
     table = str(fit)
     assert "free decay from" in table and "damping ratio" in table
-    told = json.loads(json.dumps(fit.to_dict()))
-    assert told["frequencies_hz"] == fit.frequencies.tolist()
-    assert told["modes"][0]["damping_95"][0] < told["damping_ratios"][0]
+    result = json.loads(json.dumps(fit.to_dict()))
+    assert result["frequencies_hz"] == fit.frequencies.tolist()
+    assert result["modes"][0]["damping_95"][0] < result["damping_ratios"][0]
     assert identify_modes(decay(3), band=BAND, count=1).frequencies == pytest.approx([5], rel=1e-3)
     fit.plot(tmp_path / "decay.png")
     identify_modes(ambient(1)).plot(tmp_path / "ambient.png")

@@ -1,4 +1,4 @@
-"""Free numbers: looked up, mapped between their bounds, or refused with a reason."""
+"""Free parameters: found by address, mapped between their bounds, or refused."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,21 +29,23 @@ RANGES = [(-1.0, 3.0), (0.5, np.inf), (-np.inf, 2.0), (-np.inf, np.inf)]
 @pytest.mark.parametrize("low, high", RANGES)
 @pytest.mark.parametrize("value", [0.6, 1.0, 1.9])
 def test_mapping_returns_and_stays_within(low, high, value):
-    number = FreeParameter("x", "m", 1.0, low, high, 1.0)
+    parameter = FreeParameter("x", "m", 1.0, low, high, 1.0)
     np.testing.assert_allclose(
-        float(number.from_unbounded(jnp.asarray(number.to_unbounded(value)))), value, rtol=1e-12
+        float(parameter.from_unbounded(jnp.asarray(parameter.to_unbounded(value)))),
+        value,
+        rtol=1e-12,
     )
     for y in (-30.0, -1.0, 0.0, 2.0, 30.0):
-        assert low <= number.from_unbounded(jnp.asarray(y)) <= high
+        assert low <= parameter.from_unbounded(jnp.asarray(y)) <= high
 
 
 @pytest.mark.parametrize("low, high", RANGES[:3])
 def test_a_start_on_a_bound_is_moved_in(low, high):
-    number = FreeParameter("x", "m", 1.0, low, high, 1.0)
+    parameter = FreeParameter("x", "m", 1.0, low, high, 1.0)
     bound = low if np.isfinite(low) else high
-    inner = float(number.from_unbounded(jnp.asarray(number.to_unbounded(bound))))
+    inner = float(parameter.from_unbounded(jnp.asarray(parameter.to_unbounded(bound))))
     assert inner == pytest.approx(bound, abs=2e-3) and inner != bound
-    assert number.at_bound(bound) and not number.at_bound(1.0)
+    assert parameter.at_bound(bound) and not parameter.at_bound(1.0)
 
 
 @pytest.mark.parametrize(
@@ -59,16 +61,26 @@ def test_a_start_on_a_bound_is_moved_in(low, high):
     ],
 )
 def test_ranges_sizes_and_units_without_bounds(address, low, high, size, unit):
-    number = free(address)
-    assert (number.low, number.high, number.typical_size, number.unit) == (low, high, size, unit)
+    parameter = free(address)
+    assert (parameter.low, parameter.high, parameter.typical_size, parameter.unit) == (
+        low,
+        high,
+        size,
+        unit,
+    )
 
 
 def test_bounds_give_the_size():
-    number = free("beam.mass_per_length", (1.0, 4.0))
-    assert (number.low, number.high, number.typical_size, number.start) == (1.0, 4.0, 3.0, 2.0)
+    parameter = free("beam.mass_per_length", (1.0, 4.0))
+    assert (parameter.low, parameter.high, parameter.typical_size, parameter.start) == (
+        1.0,
+        4.0,
+        3.0,
+        2.0,
+    )
 
 
-def test_insert_takes_what_concerns_a_log():
+def test_values_of_one_log():
     values = {"loads.0.mass": 0.7, "logs.1.loads.0.speed": -3.0}
     first, second = (with_values(case, i, values) for i, case in enumerate(CASES))
     assert (float(first.loads[0].mass), float(first.loads[0].speed)) == (0.7, -1.0)
@@ -99,7 +111,7 @@ def test_units_of_all_numbers():
     ],
     ids=lambda value: None if isinstance(value, str) else ",".join(value) or "none",
 )
-def test_refused(bounds, words):
+def test_faulty_addresses_and_bounds_are_refused(bounds, words):
     with pytest.raises(ValueError) as refused:
         free_parameters(CASES, bounds, 0.01)
     assert words in str(refused.value)

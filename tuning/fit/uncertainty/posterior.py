@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tuning.aliases import current_word
+from tuning.aliases import current_word, has_old_attributes
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.result import Fit
 from tuning.optional import import_extra
@@ -24,6 +24,7 @@ MAX_R_HAT = 1.05  # beyond it chains have not mixed
 MIN_EFFECTIVE_DRAWS = 100  # below it intervals are not reliable
 
 
+@has_old_attributes(effective="effective_draws")
 @dataclasses.dataclass(frozen=True, eq=False)
 class Posterior:
     """Draws (chain, draw, parameter) of the free parameters in SI units, with diagnostics.

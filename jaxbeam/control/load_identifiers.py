@@ -1,0 +1,229 @@
+"""Mass, speed and entry time of a load: given beforehand, or identified from deflections.
+
+Identification is by least squares on static influence lines, sample by sample. The position of the
+load follows from two gate times at constant speed, or from the deflections themselves: their ratio
+at two sensors or more depends on the position of a load at rest, not on its mass.
+"""
+
+import abc
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxbeam.case.controller import Measurement, Time
+
+# A line through identified positions is accepted when these scatter by this share of the distance
+# over which they are identified, and their weights add up to this many of the largest weight: at
+# first the beam lags, and its load seems to stand or to jump.
+MIN_TRAVEL_SPREAD, MIN_EFFECTIVE_SAMPLES = 0.1, 8
+INFLUENCE_ROUNDING = 1e-20  # of the largest squared influence; rounding is below
+
+
+class LoadEstimate(NamedTuple):
+    """Mass (kg), speed (m/s, negative to the left) and entry time (s) of a load.
+
+    Entry time and speed are meaningless until `speed_identified`, the mass until `mass_identified`.
+    """
+
+    mass: Float[Array, ""]
+    speed: Float[Array, ""]
+    entry_time: Float[Array, ""]
+    speed_identified: Bool[Array, ""]
+    mass_identified: Bool[Array, ""]
+
+
+class AbstractLoadSource(eqx.Module):
+    """Source of mass, speed and entry time of the load for a scheduled law, with its own state."""
+
+    def initial_state(self) -> Any:
+        """State at the start of a run."""
+        return ()
+
+    @abc.abstractmethod
+    def update(self, state: Any, measurement: Measurement, t: Time) -> tuple[LoadEstimate, Any]:
+        """Estimate at a sample at t (s), and the next state."""
+
+
+class GivenLoad(AbstractLoadSource):
+    """Load with mass (kg), speed (m/s) and entry time (s) given beforehand."""
+
+    mass: Float[Array, ""]
+    speed: Float[Array, ""]
+    entry_time: Float[Array, ""]
+
+    def update(self, state, measurement, t):
+        true = jnp.ones((), bool)
+        return LoadEstimate(self.mass, self.speed, self.entry_time, true, true), state
+
+
+def given_load(load: Any) -> GivenLoad:
+    """Load of a case as given; speed and entry time are NaN where a table of positions replaces them."""
+    numbers = load.mass, load.speed, load.entry_time
+    return GivenLoad(*(jnp.asarray(jnp.nan if x is None else x) for x in numbers))
+
+
+class AbstractLoadIdentifier(AbstractLoadSource):
+    """Least-squares identification of a load from deflections; its state are sums over samples.
+
+    `influence_lines` (m/N) are deflections at the sensors `sensor_indices` under a unit force at
+    positions spaced evenly along the beam, by the modes of the design model (exact ones:
+    `jaxbeam.model.statics.influence_line`); `static_lift` is the static deflection there per unit of
+    each command, `offset` the offset of the readings (m). `until` is the share of the crossing up
+    to which samples are used.
+    """
+
+    length: Float[Array, ""]
+    gravity: Float[Array, ""]
+    influence_lines: Float[Array, "sensor position"]
+    static_lift: Float[Array, "sensor actuator"]
+    offset: Float[Array, " sensor"]
+    until: Float[Array, ""]
+    sensor_indices: tuple[int, ...] = eqx.field(static=True)
+
+    @abc.abstractmethod
+    def estimate(self, sums: Float[Array, " sum"], t: Time) -> LoadEstimate:
+        """Estimate from the sums, at t (s)."""
+
+    @abc.abstractmethod
+    def increments(
+        self, sums: Float[Array, " sum"], deflections: Float[Array, " sensor"], t: Time
+    ) -> Float[Array, " sum"]:
+        """Increments of the sums by the deflections (m) due to the load alone, at t (s)."""
+
+    def update(self, state, measurement, t):
+        readings = measurement.readings[np.array(self.sensor_indices)] - self.offset
+        deflections = readings - self.static_lift @ measurement.command
+        sums = state + self.increments(state, deflections, t)
+        return self.estimate(sums, t), sums
+
+    def fitted_mass(self, cross_sum, square_sum) -> Float[Array, ""]:
+        """Mass (kg) by least squares, sum a y / (g sum a^2) with influence a, reading y; or 0."""
+        observable = square_sum > 0
+        weight = jnp.where(observable, cross_sum / jnp.where(observable, square_sum, 1.0), 0.0)
+        return weight / self.gravity
+
+
+class GateIdentifier(AbstractLoadIdentifier):
+    """Speed and entry time from two gates, mass from deflections after the second gate.
+
+    `gates` (m) are passed at `gate_times` (s). The sums are those of a y and a^2, with the
+    influence a at the position of the load and the deflection y.
+    """
+
+    gates: Float[Array, "2"]
+    gate_times: Float[Array, "2"]
+
+    def initial_state(self):
+        return jnp.zeros(2)
+
+    @property
+    def speed(self) -> Float[Array, ""]:
+        """Speed (m/s), negative to the left."""
+        return jnp.diff(self.gates)[0] / jnp.diff(self.gate_times)[0]
+
+    @property
+    def entry_time(self) -> Float[Array, ""]:
+        """Time (s) at which the load enters the beam at constant speed."""
+        start = jnp.where(self.speed < 0, self.length, 0.0)
+        return self.gate_times[1] + (start - self.gates[1]) / self.speed
+
+    def crossing_share(self, t: Time) -> Float[Array, ""]:
+        """Share of the crossing that is completed at t (s)."""
+        return (t - self.entry_time) * jnp.abs(self.speed) / self.length
+
+    def estimate(self, sums, t):
+        speed_identified = t >= self.gate_times[1]
+        mass_identified = speed_identified & (self.crossing_share(t) >= self.until)
+        mass = self.fitted_mass(*sums)
+        return LoadEstimate(mass, self.speed, self.entry_time, speed_identified, mass_identified)
+
+    def increments(self, sums, deflections, t):
+        share = self.crossing_share(t)
+        *_, passed, done = self.estimate(sums, t)
+        relative_position = jnp.where(self.speed < 0, 1 - share, share)
+        positions = np.linspace(0, 1, self.influence_lines.shape[1])
+        influence = jax.vmap(lambda line: jnp.interp(relative_position, positions, line))(
+            self.influence_lines
+        )
+        active = passed & ~done & (share > 0)
+        return jnp.where(active, jnp.stack([influence @ deflections, influence @ influence]), 0.0)
+
+
+class DeflectionIdentifier(AbstractLoadIdentifier):
+    """Speed, entry time and mass from deflections that exceed a `threshold` (m).
+
+    At each sample the position x is the one whose influence lines fit the deflections best. Speed
+    and entry time follow from a straight line through these positions over time, weighted by the
+    fourth power of the size of the deflections. The sums are those of the weights w, of w t, w t^2,
+    w x and w t x, of a y and a^2 as in `GateIdentifier`, and the largest w.
+    """
+
+    threshold: Float[Array, ""]
+
+    def initial_state(self):
+        return jnp.zeros(8)
+
+    def estimate(self, sums, t):
+        speed, entry_time, determined = self._fitted_line(sums)
+        travelled = (t - entry_time) * jnp.abs(speed)
+        identified = determined & (travelled >= self.until * self.length)
+        mass = self.fitted_mass(*sums[5:7])
+        return LoadEstimate(mass, speed, entry_time, identified, identified)
+
+    def increments(self, sums, deflections, t):
+        position, cross_product, squared_influence = self._best_position(deflections)
+        weight = jnp.sum(deflections**2) ** 2
+        line_sums = weight * jnp.stack([jnp.ones(()), t, t**2, position, t * position])
+        peak_increment = jnp.maximum(weight - sums[7], 0.0)
+        increments = jnp.concatenate(
+            [line_sums, jnp.stack([cross_product, squared_influence, peak_increment])]
+        )
+        identified = self.estimate(sums, t).mass_identified
+        active = ~identified & (jnp.max(jnp.abs(deflections)) > self.threshold)
+        return jnp.where(active, increments, 0.0)
+
+    def _best_position(self, deflections):
+        """Position (m) whose influence lines a fit the deflections y best, with a y and a^2 there.
+
+        The maximum of (a y)^2 / a^2 over the positions, refined by a parabola.
+        """
+        squares = jnp.sum(self.influence_lines**2, axis=0)
+        products = deflections @ self.influence_lines
+        # At a support the lines are zero but for rounding, whose ratio may fit any deflections.
+        observable = squares > INFLUENCE_ROUNDING * jnp.max(squares)
+        explained = jnp.where(observable, products**2 / jnp.where(observable, squares, 1.0), 0.0)
+        best = jnp.clip(jnp.argmax(explained), 1, squares.shape[0] - 2)
+        before, here, after = (explained[best + k] for k in (-1, 0, 1))
+        curvature = before - 2 * here + after
+        concave = curvature < 0
+        vertex = jnp.where(
+            concave, (before - after) / (2 * jnp.where(concave, curvature, -1.0)), 0.0
+        )
+        interval = best + jnp.clip(vertex, -0.5, 0.5)
+        position = interval * self.length / (squares.shape[0] - 1)
+        return position, products[best], squares[best]
+
+    def _fitted_line(self, sums):
+        """Speed (m/s) and entry time (s) of the fitted line, and whether they are determined.
+
+        Until they are, one length per second and zero.
+        """
+        total, t, square, x, product = sums[:5]
+        time_variance = total * square - t**2
+        determined = time_variance > 1e-9 * total * square
+        speed = (total * product - t * x) / jnp.where(determined, time_variance, 1.0)
+        min_travel = MIN_TRAVEL_SPREAD * self.until * self.length
+        determined = (
+            determined
+            & (speed**2 * time_variance > (min_travel * total) ** 2)
+            & (total > MIN_EFFECTIVE_SAMPLES * sums[7])
+        )
+        speed = jnp.where(determined, speed, self.length)
+        start = jnp.where(speed < 0, self.length, 0.0)
+        total = jnp.where(determined, total, 1.0)
+        entry_time = jnp.where(determined, t / total + (start - x / total) / speed, 0.0)
+        return speed, entry_time, determined

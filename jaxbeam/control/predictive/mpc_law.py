@@ -1,0 +1,175 @@
+"""Law of model predictive control: the quadratic program of a sample, and its first move."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.case.controller import ControlStep
+from jaxbeam.control.predictive.prediction import (
+    Prediction,
+    SampledPlant,
+    predict,
+    sampled_plant,
+)
+from jaxbeam.control.predictive.qp import solve_qp
+from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.model.state_space import Plant
+
+
+class CommandLimits(NamedTuple):
+    """Limits and rate limits of commands: rows @ variables <= limits - command_rows @ u(k-1)."""
+
+    rows: Float[Array, "row variable"]
+    limits: Float[Array, " row"]
+    command_rows: Float[Array, "row actuator"]
+
+
+class QuadraticProgram(NamedTuple):
+    """Minimise 1/2 x'H x + f'x subject to M x <= gamma."""
+
+    H: Float[Array, "variable variable"]
+    f: Float[Array, " variable"]
+    M: Float[Array, "row variable"]
+    gamma: Float[Array, " row"]
+
+
+class MPCLaw(AbstractStateLaw):
+    """Predictive law of a design plant; its state is the state of the plant at the last sample.
+
+    `sampled_plant` and `prediction` are those of the unloaded plant; with a `loaded_plant` both are
+    computed at each sample from that plant frozen in the middle of each period, without the weights
+    of the loads if not `known_weights`. `output_weights` are those of squared deflections in each
+    period, `move_weights` those of squared moves.
+    """
+
+    sampled_plant: SampledPlant
+    prediction: Prediction
+    C: Float[Array, "output state"]
+    move_maps: Float[Array, "horizon actuator variable"]
+    limits: CommandLimits
+    output_weights: Float[Array, "horizon output"]
+    move_weights: Float[Array, " actuator"]
+    soft_limit: Float[Array, " *output"] | None
+    soft_weight: Float[Array, ""]
+    terminal_cost: Float[Array, "augmented augmented"] | None
+    loaded_plant: Plant | None
+    period: Float[Array, ""]
+    delay: Float[Array, ""] | None
+    known_weights: bool = eqx.field(static=True)
+    solver: str = eqx.field(static=True)
+
+    def initial_state(self):
+        return jnp.zeros(self.sampled_plant.A.shape[0])
+
+    def step(self, state, estimate, measurement, t):
+        previous_state, previous_command, state = state, measurement.command, estimate.state
+        if self.delay is not None:
+            state = jnp.concatenate([state, previous_command])
+        past_plant, prediction, weights = self._predict(t, estimate)
+        predicted_state = (
+            past_plant.A @ previous_state + past_plant.B @ previous_command + past_plant.E @ weights
+        )
+        known = jnp.concatenate([state, state - predicted_state, previous_command, jnp.ones(1)])
+        move, solved = self._first_move(prediction, known, previous_command)
+        return ControlStep(previous_command + jnp.where(solved, move, 0.0), state, solved)
+
+    def _predict(self, t, estimate):
+        """Plant over the last period, prediction from t (s), and the weights of the loads in it."""
+        if self.loaded_plant is None:
+            return self.sampled_plant, self.prediction, jnp.zeros(0)
+        plant, weights = self.loaded_plant, self.loaded_plant.weights
+        if not self.known_weights:
+            weights = jnp.zeros_like(weights)
+        elif estimate.weights is not None:
+            weights = estimate.weights
+
+        def sample(time):
+            system, actuators = plant.at(time), self.move_weights.shape[0]
+            B, B_f = jnp.split(system.B, [actuators], axis=1)
+            return sampled_plant(system.A, B, B_f, self.period, self.delay)
+
+        horizon = self.move_maps.shape[0]
+        midpoints = t + (jnp.arange(-1, horizon) + 0.5) * self.period
+        plants = jax.vmap(sample)(midpoints)
+        past, future = (jax.tree.map(lambda p, s=s: p[s], plants) for s in (0, slice(1, None)))
+        return past, predict(future, self.C, self.move_maps, weights), weights
+
+    def quadratic_program(self, prediction: Prediction, known, previous_command):
+        """Quadratic program of a sample, in the moves, and in the excesses over soft limits.
+
+        `known` is the state, its unexplained change, the previous command u(k-1), and 1, as in
+        `Prediction`.
+        """
+        free_response = prediction.F @ known
+        weight, Phi, maps = self.output_weights, prediction.Phi, self.move_maps
+        if self.terminal_cost is not None:
+            weight = weight.at[-1].set(0.0)  # included in P
+        move_cost = jnp.einsum("hav,a,haw->vw", maps, self.move_weights, maps)
+        H = jnp.einsum("hov,ho,how->vw", Phi, weight, Phi) + move_cost
+        f = jnp.einsum("hov,ho,ho->v", Phi, weight, free_response)
+        if self.terminal_cost is not None:
+            terminal_gradient = prediction.terminal_phi.T @ self.terminal_cost
+            H = H + terminal_gradient @ prediction.terminal_phi
+            f = f + terminal_gradient @ (prediction.terminal @ known)
+        H, f, M = 2 * H, 2 * f, self.limits.rows
+        gamma = self.limits.limits - self.limits.command_rows @ previous_command
+        if self.solver == "unconstrained":
+            return QuadraticProgram(H, f, M[:0], gamma[:0])
+        if self.soft_limit is not None:
+            return self._with_soft_limits(H, f, M, gamma, Phi, free_response)
+        return QuadraticProgram(H, f, M, gamma)
+
+    def _first_move(self, prediction, known, previous_command):
+        """First move of the solution, and whether there is one."""
+        program = self.quadratic_program(prediction, known, previous_command)
+        maps = self.move_maps
+        if program.M.shape[0] == 0:
+            return maps[0] @ -jnp.linalg.solve(program.H, program.f), jnp.ones((), bool)
+        solution = solve_qp(*program, self.solver)
+        return maps[0] @ solution.x[: maps.shape[2]], solution.solved
+
+    def _with_soft_limits(self, H, f, M, gamma, Phi, free_response):
+        """Program with the excess over the soft limit of each output as a further variable."""
+        horizon, outputs, variables = Phi.shape
+        H = jax.scipy.linalg.block_diag(H, 2 * self.soft_weight * jnp.eye(outputs))
+        excess = jnp.tile(jnp.eye(outputs), (horizon, 1))
+        rows, free_deflections = Phi.reshape(-1, variables), free_response.reshape(-1)
+        limit = jnp.tile(jnp.broadcast_to(self.soft_limit, (outputs,)), horizon)
+        M = jnp.block([[M, jnp.zeros((M.shape[0], outputs))], [rows, -excess], [-rows, -excess]])
+        gamma = jnp.concatenate([gamma, limit - free_deflections, limit + free_deflections])
+        return QuadraticProgram(H, jnp.pad(f, (0, outputs)), M, gamma)
+
+
+def output_weights(
+    horizon: int, outputs: int, horizon_weight, output_weight
+) -> Float[Array, "horizon output"]:
+    """Weights of squared deflections in each period; weights that are None are 1."""
+    by_period = jnp.ones(horizon) if horizon_weight is None else horizon_weight
+    by_output = jnp.ones(outputs) if output_weight is None else output_weight
+    return by_period[:, None] * jnp.broadcast_to(by_output, (outputs,))
+
+
+def command_limits(actuators, maps: Float[Array, "period actuator variable"], period):
+    """Limits and rate limits of actuators over the periods of some move maps, eq. (7.28)."""
+    count, variables = len(actuators), maps.shape[2]
+    rows, limit_values = [jnp.zeros((0, variables))], [jnp.zeros(0)]
+    command_rows, cumulative_moves = [jnp.zeros((0, count))], jnp.cumsum(maps, axis=0)
+    for i, actuator in enumerate(actuators):
+        limits, rate = actuator.command_limits(), actuator.command_rate_limit()
+        bounds = []
+        if limits is not None:
+            bounds += [
+                (cumulative_moves[:, i], limits[1], 1.0),
+                (-cumulative_moves[:, i], -limits[0], -1.0),
+            ]
+        if rate is not None:
+            bounds += [(sign * maps[:, i], rate * period, 0.0) for sign in (1.0, -1.0)]
+        for row, top, sign in bounds:
+            rows.append(row)
+            limit_values.append(jnp.full(row.shape[0], top))
+            command_rows.append(jnp.zeros((row.shape[0], count)).at[:, i].set(sign))
+    parts = (jnp.concatenate(part) for part in (rows, limit_values, command_rows))
+    return CommandLimits(*parts)

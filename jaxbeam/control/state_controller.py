@@ -1,0 +1,150 @@
+"""Controllers whose law feeds back the state of a design model, true or estimated."""
+
+import abc
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbeam.case.case import Case, crossing_times
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.estimator import AbstractEstimator
+from jaxbeam.case.fields import choice, concrete, is_concrete, part
+from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.state_law import (
+    AbstractStateLaw,
+    ContinuousStateLaw,
+    SampledStateLaw,
+    TrueState,
+)
+from jaxbeam.estimation.sampled_plant import sample_timing
+from jaxbeam.model.linear_system import StateSpace
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.output_rows import modal_row
+from jaxbeam.model.state_space import Plant, build_plant, state_space
+from jaxbeam.runtime.compiling import compiled
+
+
+class AbstractStateController(AbstractController):
+    """Settings of a law that is fed by the state of the plant that it is designed for.
+
+    That design plant is the case itself, with the numbers of the `design` model where these
+    differ; its states are those of `state_space` in the chosen coordinates. Without an `estimator`
+    the law receives the true state, of which a design with fewer modes receives the first ones.
+    """
+
+    coordinates: str = choice(
+        "coordinates of the states", "modal", "sine", default="modal", kw_only=True
+    )
+    design: DesignModel | None = part("design model of the plant", DesignModel, kw_only=True)
+    estimator: AbstractEstimator | None = part(
+        "estimator of the state", AbstractEstimator, kw_only=True
+    )
+
+    @property
+    def design_depends_on_loads(self) -> bool:
+        return self.estimator is not None
+
+    @abc.abstractmethod
+    def design_state_law(self, plant: Plant, design_plant: Plant) -> AbstractStateLaw:
+        """Law for runs on `plant`, designed for `design_plant`."""
+
+    def design_plant(self, plant: Plant) -> Plant:
+        """Plant that the law is designed for, in its coordinates."""
+        if self.design is None:
+            return build_plant(plant.case, plant.modal_model, self.coordinates)
+        return self.design.design_plant(plant, self.coordinates)
+
+    def design_loads(self, case: Case) -> tuple:
+        """Loads of a case with the numbers of the design model."""
+        return case.loads if self.design is None else self.design.design_loads(case)
+
+    def design_law(self, plant):
+        design_plant = self.design_plant(plant)
+        law = self.design_state_law(plant, design_plant)
+        if self.estimator is None:
+            filter = TrueState(_design_state_map(plant, design_plant))
+        elif self.period is None:
+            filter = self.estimator.continuous_filter(design_plant)
+        else:
+            filter = self.estimator.sampled_filter(design_plant, sample_timing(self))
+        if self.period is None:
+            return ContinuousStateLaw(law, filter)
+        return SampledStateLaw(law, filter)
+
+    def breakpoints(self, case):
+        """Entry and exit times of the design loads, where the gain of a continuous filter bends."""
+        if self.period is not None or self.estimator is None:
+            return None
+        design_case = eqx.tree_at(lambda c: c.loads, case, self.design_loads(case))
+        return np.ravel(crossing_times(design_case))
+
+    def validate(self, case):
+        stiffened = any(actuator.section_stiffening() is not None for actuator in case.actuators)
+        if self.coordinates == "sine" and (
+            case.beam.ends != "pinned-pinned" or case.supports or stiffened
+        ):
+            return (
+                "coordinates must be 'modal': the modes of this beam are not sin(n pi x / L);"
+                " only a uniform pinned-pinned beam without supports in between has those"
+            )
+        error = None if self.design is None else self.design.validate(case)
+        if error is not None:
+            return f"design.{error}"
+        if self.period is None and self.estimator is None:
+            return None
+        if self.period is None and not self.estimator.continuous_time:
+            return "period must be given: this estimator acts at samples only"
+        error = None if self.estimator is None else self.estimator.validate(case, None)
+        if error is None and all(is_concrete(leaf) for leaf in jax.tree.leaves((self, case))):
+            # Concrete numbers also under differentiation.
+            controller, concrete_case = jax.tree.map(
+                lambda leaf: jnp.asarray(concrete(leaf)),
+                (dataclasses.replace(self, nominal_plant=None), case),
+            )
+            system = _unloaded_design_plant(controller, concrete_case, mesh_layout(concrete_case))
+            if self.period is not None:
+                self.warn(system, case)
+            error = None if self.estimator is None else self.estimator.validate(case, system)
+        return None if error is None else f"estimator.{error}"
+
+    def warn(self, system: StateSpace, case: Case) -> None:
+        """Warn of doubtful settings for the design plant without loads, before a sampled run."""
+
+    def mode_count(self, case: Case) -> int:
+        """Number of modes of the design plant."""
+        design_modes = None if self.design is None else self.design.modes
+        return case.beam.modes if design_modes is None else design_modes
+
+    def state_count(self, case: Case) -> int:
+        """Number of states of the design plant."""
+        actuator_states = sum(
+            actuator.attachment().state_matrix.shape[0] for actuator in case.actuators
+        )
+        return 2 * self.mode_count(case) + actuator_states
+
+
+@compiled
+def _unloaded_design_plant(controller: AbstractStateController, case, layout) -> StateSpace:
+    """Design plant without loads."""
+    return controller.design_plant(state_space(case, layout=layout)).unloaded
+
+
+def _design_state_map(plant: Plant, design_plant: Plant) -> Float[Array, "design_state state"]:
+    """Map of the states of a plant to those of its design plant, the first modes of the same."""
+    modal_states = 2 * plant.coordinate_scale.shape[0]
+    kept = 2 * design_plant.coordinate_scale.shape[0]
+    states = plant.to_modal(jnp.eye(plant.modal_model.state_count))
+    return design_plant.from_modal(jnp.concatenate([states[:kept], states[modal_states:]]))
+
+
+def deflection_rows(
+    plant: Plant, positions: Float[Array, " position"]
+) -> Float[Array, "position state"]:
+    """Rows that map the states of a plant to the deflections at positions (m)."""
+    rows = modal_row(plant.modal_model.shapes, positions, "deflection") / plant.coordinate_scale
+    return jnp.pad(rows, ((0, 0), (0, plant.modal_model.state_count - rows.shape[1])))

@@ -1,0 +1,88 @@
+"""Kalman filter at samples for a plant with its moving loads."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
+from jaxbeam.estimation.constant_gain import sensor_offsets
+from jaxbeam.estimation.gains import filter_gain
+from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
+from jaxbeam.numerics.intervals import symmetric_part
+
+Square = Float[Array, "state state"]
+
+
+class FilterState(NamedTuple):
+    """Estimate x after a sample, its covariance, and the command of that sample."""
+
+    x: Float[Array, " state"]
+    covariance: Square
+    command: Float[Array, " actuator"]
+
+
+class OneStepPrediction(NamedTuple):
+    """Prediction of states and readings at a sample, each with its covariance, and their C."""
+
+    x: Float[Array, " state"]
+    covariance: Square
+    readings: Float[Array, " sensor"]
+    innovation_covariance: Float[Array, "sensor sensor"]
+    C: Float[Array, "sensor state"]
+
+
+class CrossingFilter(AbstractSampledFilter):
+    """Time-varying Kalman filter; its covariance is propagated during the run.
+
+    The first `plant_states` states x are those of the plant; those of analogue filters follow, the
+    weights of the loads, and those of the sensors (see `sensor_chain`). `scale` is the size of the
+    states before those of the sensors, `noise_intensity` that of the white noise in their rates.
+    """
+
+    filtered: FilteredPlant
+    sensor_chain: SensorChain
+    scale: Float[Array, " loaded"]
+    noise_intensity: Float[Array, "loaded loaded"]
+    initial: Float[Array, " state"]
+    initial_covariance: Square
+    plant_states: int = eqx.field(static=True)
+    estimates_weights: bool = eqx.field(static=True)
+
+    def initial_state(self):
+        commands = len(self.filtered.plant.case.actuators)
+        return FilterState(self.initial, self.initial_covariance, jnp.zeros(commands))
+
+    def predict(self, state: FilterState, command, t: Float[Array, ""]) -> OneStepPrediction:
+        """Prediction for the sample at t (s) under the command since the last sample."""
+
+        def system_at(time):
+            return self.filtered.with_filtered_outputs(self.filtered.plant.augmented(time))
+
+        transition = self.sensor_chain.transition(system_at, self.noise_intensity, self.scale, t)
+        x = transition.predict(state.x, state.command, command)
+        covariance = transition.predict_covariance(state.covariance)
+        system = system_at(t)
+        C, D = self.sensor_chain.output_matrices(system.C, system.D)
+        readings = C @ x + D @ command + sensor_offsets(self.filtered.plant)
+        innovation_covariance = C @ covariance @ C.T + self.sensor_chain.noise_covariance
+        return OneStepPrediction(x, covariance, readings, innovation_covariance, C)
+
+    def update(self, state, measurement, t):
+        prediction = self.predict(state, measurement.command, t)
+        noise = self.sensor_chain.noise_covariance
+        gain = filter_gain(prediction.covariance, prediction.C, noise)
+        x = prediction.x + gain @ (measurement.readings - prediction.readings)
+        # Joseph's form: symmetric and not negative, whatever the rounding.
+        error_matrix = jnp.eye(x.shape[0]) - gain @ prediction.C
+        covariance = error_matrix @ prediction.covariance @ error_matrix.T + gain @ noise @ gain.T
+        state = FilterState(x, symmetric_part(covariance), measurement.command)
+        return self._estimate(x, t), state
+
+    def _estimate(self, x, t) -> Estimate:
+        plant = self.filtered.plant
+        if not self.estimates_weights:
+            return Estimate(x[: self.plant_states])
+        weights = x[plant.modal_model.state_count : self.sensor_chain.plant_states]
+        return Estimate(x[: self.plant_states], jnp.where(plant.loads.on_beam(t), weights, 0.0))

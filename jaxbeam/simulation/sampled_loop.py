@@ -1,0 +1,172 @@
+"""Closed loop with a law at samples: readings, law, delayed and held commands.
+
+The law acts at multiples of its period on the readings available by then; its command begins a
+delay later and is held, while the beam moves continuously in between.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.case.controller import AbstractSampledLaw, Measurement
+from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
+from jaxbeam.integrator.propagators import NODE_COUNT
+from jaxbeam.model.contact import LoadSet, contact_at
+from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.output_rows import sensor_rows
+from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state
+from jaxbeam.model.state_space import Plant
+from jaxbeam.simulation.command_limits import limit_commands
+
+
+class LoopMemory(NamedTuple):
+    """Memory of a sampled loop, batch axis last.
+
+    State of the law, command in force, states of the digital filters, readings (newest first) that
+    are not available yet or the latest, commands (newest first) that have not begun yet, and the
+    number of samples at which the law found no solution.
+    """
+
+    law_state: Any
+    command: Float[Array, "actuator batch"]
+    filter_states: list
+    readings: Float[Array, "age sensor batch"]
+    command_queue: Float[Array, "age actuator batch"]
+    failures: Float[Array, " batch"]
+
+
+class SampledLoop(AbstractInputPolicy):
+    """Input policy of a sampled law; runs of a batch share the law, each has its own memory.
+
+    The model includes the analogue filters of the sensors; `filter_sections` are those of the
+    digital ones.
+    """
+
+    plant: Plant
+    law: AbstractSampledLaw
+    model: ModalModel
+    output_rows: Float[Array, "sensor state"]
+    state_bound: Float[Array, " state"]
+    loads: LoadSet
+    schedule: EventSchedule
+    filter_sections: tuple
+    noise: Float[Array, "sample sensor"] | None
+    implicit: bool = eqx.field(static=True, default=False)
+
+    def start(self, batch_size):
+        sensors, zero = self.plant.case.sensors, jnp.zeros(batch_size)
+        pairs = list(zip(sensors, self.filter_sections, strict=True))
+        filter_states = [initial_filter_state(sensor, part, zero) for sensor, part in pairs]
+        readings = [
+            filtered_reading(*pair, state, zero)[0]
+            for pair, state in zip(pairs, filter_states, strict=True)
+        ]
+        readings = jnp.stack(readings) if readings else jnp.zeros((0, batch_size))
+        command = jnp.zeros((len(self.plant.case.actuators), batch_size))
+        return LoopMemory(
+            _broadcast_to_batch(self.law.initial_state(), batch_size),
+            command,
+            filter_states,
+            jnp.broadcast_to(readings, (self.schedule.max_age + 1, *readings.shape)),
+            jnp.zeros((self.schedule.max_waiting + 1, *command.shape)),
+            zero,
+        )
+
+    def inputs(self, memory: LoopMemory, state, info: StepInfo, states):
+        memory = jax.lax.cond(
+            info.event >= 0,
+            lambda memory: self._process_event(memory, state, info),
+            lambda memory: memory,
+            memory,
+        )
+        return jnp.broadcast_to(memory.command, (NODE_COUNT, *memory.command.shape)), memory
+
+    def observe(self, memory, info):
+        """Available readings (sensor, batch), and number of failures of the law (batch)."""
+        return self._available_readings(memory.readings, info.event), memory.failures
+
+    def failures(self, memory) -> Float[Array, " batch"]:
+        """Number of samples at which the law found no solution, up to the end of the run."""
+        return memory.failures
+
+    def _process_event(self, memory, state, info):
+        """Memory after an event: samples of sensors, a step of the law, a command that begins."""
+        schedule, event = self.schedule, info.event
+        filter_states, readings = self._sample_sensors(memory, state, info)
+
+        def step(inputs):
+            law_state, queue, failures = inputs
+            available = self._available_readings(readings, event)
+            wanted, law_state, solved = self._step_law(
+                law_state, available, state, memory.command, info.start
+            )
+            limited = limit_commands(self.plant.case, wanted, queue[0])
+            queue = jnp.roll(queue, 1, axis=0).at[0].set(limited)
+            return law_state, queue, failures + ~solved
+
+        law_state, queue, failures = jax.lax.cond(
+            schedule.control_sample[event] >= 0,
+            step,
+            lambda inputs: inputs,
+            (memory.law_state, memory.command_queue, memory.failures),
+        )
+        age = schedule.command_age[event]
+        command = jnp.where(age >= 0, queue[jnp.maximum(age, 0)], memory.command)
+        return LoopMemory(law_state, command, filter_states, readings, queue, failures)
+
+    def _sample_sensors(self, memory, state, info):
+        """Filter states and readings after the samples that are due at an event."""
+        readings, filter_states = memory.readings, []
+        signals = self._sensor_inputs(state, memory.command, info.start)
+        for i, sensor in enumerate(self.plant.case.sensors):
+            number = self.schedule.reading[info.event, i]
+            noise = None if self.noise is None else self.noise[number, i]
+            reading, filter_state = filtered_reading(
+                sensor, self.filter_sections[i], memory.filter_states[i], signals[i], noise
+            )
+            due = number >= 0
+            reading = jnp.where(due, reading, readings[0, i])
+            filter_states.append(_tree_where(due, filter_state, memory.filter_states[i]))
+            shifted = jnp.where(due, jnp.roll(readings[:, i], 1, axis=0), readings[:, i])
+            readings = readings.at[:, i].set(shifted.at[0].set(reading))
+        return filter_states, readings
+
+    def _available_readings(self, readings, event):
+        """Latest readings (sensor, batch) that are available at an event."""
+        latest = [
+            readings[self.schedule.reading_age[event, i], i] for i in range(readings.shape[1])
+        ]
+        return jnp.stack(latest) if latest else readings[0]
+
+    def _sensor_inputs(self, state, command, time):
+        """Inputs of the sensors (sensor, batch) at a time (s)."""
+        signals, sensors = self.output_rows @ state, self.plant.case.sensors
+        if not any(sensor.has_feedthrough for sensor in sensors):
+            return signals
+        _, accelerations = contact_at(self.model, self.loads, time, state, command)
+        return sensor_rows(self.model, sensors).with_accelerations(signals, accelerations)
+
+    def _step_law(self, law_state, readings, state, command, time):
+        """Step of the law for each run of the batch."""
+
+        def step(law_state, *measured):
+            return self.law.step(law_state, Measurement(*measured), time)
+
+        plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
+        return jax.vmap(step, in_axes=-1, out_axes=-1)(law_state, readings, plant_state, command)
+
+
+def _broadcast_to_batch(state, batch_size: int):
+    """The same state for each run, along a new last axis."""
+    return jax.tree.map(
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf)[..., None], (*jnp.shape(leaf), batch_size)),
+        state,
+    )
+
+
+def _tree_where(condition, new, old):
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
