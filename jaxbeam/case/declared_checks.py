@@ -34,9 +34,9 @@ POSITION_TOLERANCE = 1e-9  # of the length: 3 * 0.2 is still on a beam of 0.6 m
 
 
 def check_on_beam(name: str, positions: Any, length: Float[Array, ""]) -> None:
-    """Raise ValueError, with the name, if positions are not on a beam of a length (all in m).
+    """Validate positions on a beam of a length (all in m); traced numbers are skipped.
 
-    Traced numbers are skipped.
+    Raises ValueError with the name.
     """
     if not (is_concrete(positions) and is_concrete(length)):
         return
@@ -65,14 +65,14 @@ def missing_error(address: str, field: dataclasses.Field) -> ValueError:
 
 
 def check_fields(address: str, part: Any) -> None:
-    """Raise ValueError, with the address, if a field of a part contradicts its declaration."""
+    """Validate the fields of a part by their declarations; raises ValueError with the address."""
     values = vars(part)  # attributes of a module take many times as long to get
     for field in dataclasses.fields(part):
         check_field(f"{address}.{field.name}", values[field.name], field)
 
 
 def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
-    """Raise ValueError, with the address, if a value contradicts the declaration of its field."""
+    """Validate a value by the declaration of its field; raises ValueError with the address."""
     if "unit" in field.metadata:
         _check_number(address, value, field)
     elif "minimum" in field.metadata:
