@@ -201,8 +201,9 @@ def _key(folder: pathlib.Path) -> bytes:
     if not os.path.lexists(path):
         try:
             with temporary_file(folder, secrets.token_bytes(KEY_BYTES)) as temporary:
-                with contextlib.suppress(FileExistsError):  # another process was faster
-                    os.link(temporary, path)
+                os.link(temporary, path)  # not `replace`: the key of another process would be lost
+        except FileExistsError:
+            pass
         except OSError as error:
             raise CacheError(f"{path} cannot be written ({error.strerror})") from None
     key = _read_private(path, OTHERS_ACCESS)

@@ -197,7 +197,7 @@ def _renamed(program, name: str):
 
 
 def _partition(tree) -> tuple[list, tuple, Any]:
-    """Leaves that are arrays, leaves that are not, each None where it is the other, and the tree."""
+    """Arrays among the leaves, other leaves, each with None for the others, and the structure."""
     leaves, structure = jax.tree.flatten(tree)
     array_mask = [eqx.is_array(leaf) for leaf in leaves]
     arrays = [leaf if is_array else None for leaf, is_array in zip(leaves, array_mask, strict=True)]

@@ -72,7 +72,7 @@ class Library(NamedTuple):
             raise RuntimeError(f"the C code cannot be stored: {error}") from None
 
     def remove(self) -> pathlib.Path:
-        """Delete the compiled library, if there is one; its path. Raises RuntimeError on failure."""
+        """Delete the compiled library, if built; its path. Raises RuntimeError if that fails."""
         try:
             path = self.library_path()
             path.unlink(missing_ok=True)

@@ -1,3 +1,3 @@
-"""Many cases at once: batches, blocks, store, step size, cluster."""
+"""Sweeps: many runs of a case in batches and blocks, step sizes, store, cluster."""
 
-MAX_RUNS = 10**9  # of a sweep: more would not fit into any memory
+MAX_RUNS = 10**9  # of a sweep; more exceed any memory

@@ -1,7 +1,7 @@
-"""Many runs arranged for speed: tasks that share a path, lanes within them.
+"""Batches of a sweep: runs on one load path.
 
-Loads that differ only in mass or force cross the beam on the same path; all that depends on the
-path is then computed once for them. A task is one path; its lanes are the runs on it.
+Loads that differ in mass or force only have the same path; step matrices that depend on the path
+are computed once for all runs of a batch.
 """
 
 import dataclasses
@@ -11,30 +11,31 @@ import numpy as np
 from jaxtyping import Float, Int
 
 BATCHED_ADDRESS = re.compile(r"loads\.\d+\.(mass|force)|run\.gravity")
-MAX_BATCH_SIZE = 256  # more lanes in one task fall out of the cache
+MAX_BATCH_SIZE = 256  # runs; more exceed the cache of the processor
 
 
 @dataclasses.dataclass(frozen=True)
 class Batches:
-    """Runs by task and lane: `shared_values` values decide the path and the rig, `batched_values` the loads.
+    """Values of the runs at addresses of the case, in batches with one load path each.
 
-    `run_index` is the number of the run, -1 for lanes that only fill up a task.
+    `shared_values` determine path and model, `batched_values` masses and forces of the loads.
+    `run_index` is the number of each run, -1 for padding.
     """
 
     shared_addresses: tuple[str, ...]
     batched_addresses: tuple[str, ...]
-    shared_values: Float[np.ndarray, "task heavy"]
-    batched_values: Float[np.ndarray, "task lane light"]
-    run_index: Int[np.ndarray, "task lane"]
+    shared_values: Float[np.ndarray, "path shared"]
+    batched_values: Float[np.ndarray, "path batch batched"]
+    run_index: Int[np.ndarray, "path batch"]
 
 
 def make_batches(
     addresses: list[str], runs: Float[np.ndarray, "run address"], one_run_each: bool = False
 ) -> Batches:
-    """Arrange runs, given by their values at the addresses (SI units), into tasks and lanes.
+    """Batches of runs, which are given by their values at the addresses (SI units).
 
-    Runs on one path share a task unless they are to be `one_run_each`: a controller that is designed for
-    the loads is another one in each.
+    Runs on one path share a batch, unless there is to be `one_run_each`, for controllers whose
+    design depends on the loads.
     """
     is_batched = np.array(
         [bool(BATCHED_ADDRESS.fullmatch(address)) and not one_run_each for address in addresses]

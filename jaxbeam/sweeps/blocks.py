@@ -1,9 +1,7 @@
-"""The runs of a sweep, cut into blocks of equal shape that are compiled once."""
+"""Runner of a sweep: its batches in blocks of equal shape, compiled once."""
 
 import contextlib
-import dataclasses
 import os
-import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,58 +10,72 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.case.case import Case, value_at
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.model.modal_model import has_coupling
-from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import StaticShapes, max_concurrent_loads, sample_times
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches
+from jaxbeam.sweeps.common_layout import common_layout
 from jaxbeam.sweeps.step_size import (
-    CONVERGENCE_ORDER,
     choose_step_sizes,
+    initial_step_sizes,
     rounding_error,
     stratified_sample,
 )
 
-MAX_BLOCK_RUNS = 512  # in a block, at most, about: each is one call and one write
-MIN_BLOCKS = 8  # at least, if each then has more runs than are tried at once: for all cores
-MAX_TRIAL_RUNS = 256  # runs, about, at once while time steps are looked for
-MIN_TRIAL_BATCHES = 4  # at which time steps are measured, at least
-POSITION_ADDRESS = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
+MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and one write
+MIN_BLOCKS = 8  # of a large sweep, to use all cores
+MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
+MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
 
 
 class Runner:
-    """All tasks of a sweep, cut into blocks of equal shape.
+    """Runner of all batches of a sweep in blocks of equal shape.
 
-    `single` says that runs are integrated in single precision; rigs and propagators are made in
-    double all the same. Raises ValueError if places along the beam change their order within the
-    sweep.
+    With `single` precision the integration is in float32, models and propagators are made in
+    float64. Raises ValueError if positions along the beam change their order within the sweep.
     """
 
     def __init__(
         self, case: Case, batches: Batches, histories: bool, tolerance: float, single: bool = False
     ):
-        self.case, self.batches, self.histories, self.tolerance = (
-            case,
-            batches,
-            histories,
-            tolerance,
-        )
-        self.single = single
+        self.case, self.batches, self.tolerance = case, batches, tolerance
+        self.histories, self.single = histories, single
         self.schedule = None
         if case.controller is not None:
             self.schedule = loop_schedule(case, np.asarray(sample_times(case)))
         elif histories:
             self.schedule = sample_schedule(sample_times(case), True)
-        count, batch_size = batches.run_index.shape
-        # Twice as many threads as cores: some hand over work while others wait for theirs.
+        # More threads than cores, as some wait for the results of others.
         self.pool = ThreadPoolExecutor(2 * (os.cpu_count() or 1))
-        # What finds the steps is compiled below, all else when it is first wanted.
+        # The variant that measures step sizes is compiled below, others on first use.
         self._compile_lock, self._compiled_variants = threading.Lock(), {(None, False)}
-        # Each device takes an equal part of a block.
+        self._set_block_size()
+        self.addresses = (batches.shared_addresses, batches.batched_addresses)
+        layout = common_layout(case, batches)
+        # Loads, settings of the run and controllers do not change the model, which all batches then
+        # share; not on several devices, each of which has the models of its part of a block.
+        leaves_model_unchanged = ("loads.", "run.", "controller.")
+        same_model = all(name.startswith(leaves_model_unchanged) for name in self.addresses[0])
+        self.same_model = same_model and self.devices == 1
+        # Compilation of the programs for one load need not wait for its entry and exit times.
+        max_loads = len(case.loads)
+        if max_loads > 1:
+            max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times())
+        native = native_peaks.supports(case) and not single
+        self.shapes = StaticShapes(layout, has_coupling(case), max_loads, native)
+        # The C library makes its own step matrices.
+        self.discretise_separately = case.controller is None and not native
+        entries, exits = self._compile_programs()
+        limits = self._make_models()
+        self._set_step_limits(entries, exits, limits)
+
+    def _set_block_size(self):
+        """Numbers of batches per block and per trial; each device takes an equal part of a block."""
+        count, batch_size = self.batches.run_index.shape
         self.devices = len(jax.local_devices())
         max_batches, trial_batches = (
             max(1, runs * self.devices // batch_size) for runs in (MAX_BLOCK_RUNS, MAX_TRIAL_RUNS)
@@ -73,90 +85,77 @@ class Runner:
             self.trial_batches, _round_up(min(count // MIN_BLOCKS, max_batches), self.devices)
         )
         self.block_count = -(-count // self.batches_per_block)
-        self.addresses = (batches.shared_addresses, batches.batched_addresses)
-        layout = _common_layout(case, batches)
-        # Loads, settings of the run and controllers leave the rig as it is: one serves all tasks,
-        # but not on several devices, each of which takes its part of them.
-        leaves_model_unchanged = ("loads.", "run.", "controller.")
-        same_model = all(name.startswith(leaves_model_unchanged) for name in self.addresses[0])
-        self.same_model = same_model and self.devices == 1
-        parts = (
-            [[0]]
-            if self.same_model
-            else np.resize(np.arange(count), (self.block_count, self.batches_per_block))
+
+    def _entry_exit_times(self) -> Float[np.ndarray, "path load 2"]:
+        """Entry and exit times (s) of the loads of all batches."""
+        return np.asarray(
+            programs.entry_exit_times(self.case, self.addresses[0], self.batches.shared_values)
         )
 
-        def windows():
-            return np.asarray(
-                programs.entry_exit_times(case, self.addresses[0], batches.shared_values)
-            )
+    def _model_groups(self) -> list:
+        """Indices of batches whose models are made in one call: one batch if all share a model."""
+        if self.same_model:
+            return [[0]]
+        count = self.batches.run_index.shape[0]
+        return list(np.resize(np.arange(count), (self.block_count, self.batches_per_block)))
 
-        # One load takes one slot, whenever it comes: what is compiled below need not wait for that.
-        max_loads = len(case.loads)
-        if max_loads > 1:
-            max_loads = max(max_concurrent_loads(window) for window in windows())
-        self.shapes = StaticShapes(
-            layout, has_coupling(case), max_loads, native_peaks.supports(case) and not single
-        )
-        # C puts rigs on their steps itself.
-        self.discretise_separately = case.controller is None and not self.shapes.native
+    def _compile_programs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Compile what step sizes need, in parallel; entry and exit times (path, load) meanwhile."""
         program = self.program()
-        # What takes longest to compile goes first; meanwhile the others are made ready for it.
+        first_values = self.batches.shared_values[self._model_groups()[0]]
         compilations = [
-            self.pool.submit(program.precompile(*arguments))
-            for program, arguments in self._programs_to_compile(
-                program, batches.shared_values[parts[0]]
-            )
+            self.pool.submit(compiled_program.precompile(*arguments))
+            for compiled_program, arguments in self._programs_to_compile(program, first_values)
         ]
-        entries, exits = np.moveaxis(windows(), 2, 0)
+        entries, exits = np.moveaxis(self._entry_exit_times(), 2, 0)
         for compilation in compilations:
-            compilation.result()  # raises what went wrong
-        model_groups = [
-            programs.modal_models(program, batches.shared_values[part]) for part in parts
+            compilation.result()  # raises its error, if any
+        return entries, exits
+
+    def _make_models(self) -> Float[np.ndarray, " path"]:
+        """Make the models of all batches; longest stable steps (s), infinite where there is none."""
+        program, count = self.program(), self.batches.run_index.shape[0]
+        groups = [
+            programs.modal_models(program, self.batches.shared_values[group])
+            for group in self._model_groups()
         ]
         if self.same_model:
-            self.models, limit = model_groups[0]
+            self.models, limit = groups[0]
             limits = np.repeat(np.asarray(limit), count)
         else:
-            self.models, limits = jax.tree.map(
-                lambda *leaves: np.concatenate(leaves), *model_groups
-            )
+            self.models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
         limits = limits[:count]
-        limits = np.where(np.isfinite(limits), limits, np.inf)  # else the run fails with any step
-        duration = _values_at(case, batches, "run.duration")
+        return np.where(np.isfinite(limits), limits, np.inf)  # such a run fails with any step
+
+    def _set_step_limits(self, entries, exits, limits):
+        """Crossing rates (1/s), longest steps and initial steps (s) of all batches."""
+        duration = _values_at(self.case, self.batches, "run.duration")
         times_on_beam = np.minimum(exits, duration[:, None]) - entries
         times_on_beam = np.where(times_on_beam > 0, times_on_beam, duration[:, None])
         crossing_time = np.min(times_on_beam, axis=1, initial=np.inf)
         crossing_time = np.where(np.isfinite(crossing_time), crossing_time, duration)
         self.crossing_rates = 1 / crossing_time
         self.max_steps = np.minimum(limits, duration)
-        if case.controller is not None:  # between its samples there is a step at least
+        if self.schedule is not None and self.case.controller is not None:  # steps end at events
             self.max_steps = np.minimum(self.max_steps, self.schedule.lengths.max())
-        # As found for beams of one and two spans, 1 to 12 modes, at fast and slow crossings, errors
-        # of 1e-7.
-        modes = case.beam.modes
-        self.initial_steps = crossing_time / (
-            20 * modes + 1.84 * crossing_time / limits / np.sqrt(modes)
-        )
-        self.initial_steps *= (tolerance / 1e-7) ** (1 / CONVERGENCE_ORDER)
+        modes = self.case.beam.modes
+        self.initial_steps = initial_step_sizes(crossing_time, limits, modes, self.tolerance)
 
-    def choose_step_sizes(self) -> tuple[Float[np.ndarray, " task"], float]:
-        """Time steps (s) of all tasks, and the relative error of peaks seen with them.
+    def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
+        """Step sizes (s) of all batches, and the relative error of peaks measured with them.
 
         Raises RuntimeError if no time step meets the tolerance.
         """
         count = _round_up(MIN_TRIAL_BATCHES, self.trial_batches)
 
-        def peaks(chosen, steps, more=0, single=False):
-            batches = chosen.size // self.trial_batches
-            parts = zip(np.split(chosen, batches), np.split(steps, batches), strict=True)
-            found = [
-                self._integrate(*part, None, single, more)["peak_deflection"] for part in parts
-            ]
-            return np.concatenate(found)
+        def peaks(batch_indices, steps, extra_steps=0, single=False):
+            calls = batch_indices.size // self.trial_batches
+            parts = zip(np.split(batch_indices, calls), np.split(steps, calls), strict=True)
+            results = [self._integrate(*part, None, single, extra_steps) for part in parts]
+            return np.concatenate([result["peak_deflection"] for result in results])
 
-        given = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
-        steps, error = choose_step_sizes(peaks, *given, self.pool.map)
+        search = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
+        steps, error = choose_step_sizes(peaks, *search, self.pool.map)
         if self.single:
             sample = stratified_sample(self.crossing_rates, count)
             error += rounding_error(
@@ -164,42 +163,33 @@ class Runner:
             )
         return steps, error
 
-    def run_count(self, number: int) -> int:
-        """How many runs are in a block, apart from those that only fill it up."""
-        tasks = slice(number * self.batches_per_block, (number + 1) * self.batches_per_block)
-        return int((self.batches.run_index[tasks] >= 0).sum())
+    def run_count(self, block: int) -> int:
+        """Number of runs in a block, without padding."""
+        rows = slice(block * self.batches_per_block, (block + 1) * self.batches_per_block)
+        return int((self.batches.run_index[rows] >= 0).sum())
 
-    def compute_block(
-        self, number: int, steps: Float[np.ndarray, " task"]
-    ) -> dict[str, np.ndarray]:
-        """Results of a block of tasks, (task, lane, ...), with the steps (s) of all tasks."""
-        count = self.batches.run_index.shape[0]
-        batch_indices = (
-            np.arange(number * self.batches_per_block, (number + 1) * self.batches_per_block)
-            % count
-        )
+    def compute_block(self, block: int, steps: Float[np.ndarray, " path"]) -> dict[str, np.ndarray]:
+        """Results (path, batch, ...) of a block by name, with the step sizes (s) of all batches."""
+        first, count = block * self.batches_per_block, self.batches.run_index.shape[0]
+        batch_indices = np.arange(first, first + self.batches_per_block) % count
         substeps = None
         if self.histories:
             substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
         return self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
 
     def _programs_to_compile(self, program, shared_values):
-        """What finds the steps, slowest to compile first, with arguments of the right shapes."""
+        """Programs that step sizes need, the slowest to compile first, and template arguments."""
         model_template, _ = programs.modal_models.template(program, shared_values)
         indices = np.zeros(self.batches_per_block, int)
-        step_size = np.ones(self.batches_per_block), indices
-        mask = indices > 0
-        models = (
-            model_template
-            if self.same_model
-            else jax.tree.map(lambda leaf: leaf[indices], model_template)
-        )
+        step_size, mask = (np.ones(self.batches_per_block), indices), indices > 0
+        models = model_template
+        if not self.same_model:
+            models = jax.tree.map(lambda leaf: leaf[indices], model_template)
         discretise_arguments = program, mask, models, self.batches.shared_values[indices], step_size
-        models = (
-            programs.discrete_models.template(*discretise_arguments)
-            if self.discretise_separately
-            else self._models_without_controller(models)
-        )
+        if self.discretise_separately:
+            models = programs.discrete_models.template(*discretise_arguments)
+        else:
+            models = self._models_without_controller(models)
         yield (
             programs.integrate_block,
             (program, self.devices, mask, models, *self._values_of(indices), step_size),
@@ -209,7 +199,8 @@ class Runner:
         yield programs.modal_models, (program, shared_values)
 
     def _integrate(self, batch_indices, steps, substeps, single, extra_steps=0):
-        # What is not a whole block is spread over it, so that each device has its part.
+        """Results of at most a block of batches by name."""
+        # Fewer batches are spread over the block, so that each device has its part.
         rows = np.arange(batch_indices.size) * self.batches_per_block // batch_indices.size
         mask = np.zeros(self.batches_per_block, bool)
         mask[rows] = True
@@ -217,96 +208,58 @@ class Runner:
         batch_indices, steps = batch_indices[nearest_row], steps[nearest_row]
         step_size = steps, np.full(batch_indices.size, extra_steps)
         program, models = self.program(substeps), self._models_of(batch_indices)
-        discretise_arguments = (
-            program,
-            mask,
-            models,
-            self.batches.shared_values[batch_indices],
-            step_size,
-        )
-        models = (
-            programs.discrete_models(*discretise_arguments)
-            if self.discretise_separately
-            else self._models_without_controller(models)
-        )
-        arguments = program, self.devices, mask, models, *self._values_of(batch_indices), step_size
+        shared_values, batched_values = self._values_of(batch_indices)
+        if self.discretise_separately:
+            models = programs.discrete_models(program, mask, models, shared_values, step_size)
+        else:
+            models = self._models_without_controller(models)
+        arguments = program, self.devices, mask, models, shared_values, batched_values, step_size
         arguments = jax.tree.map(_to_single_precision, arguments) if single else arguments
         with jax.enable_x64(False) if single else contextlib.nullcontext():
-            with (
-                self._compile_lock
-            ):  # others wait for the first, instead of compiling the same again
+            with self._compile_lock:  # other threads wait instead of compiling the same variant
                 if (substeps, single) not in self._compiled_variants:
                     programs.integrate_block.precompile(*arguments)()
                     self._compiled_variants.add((substeps, single))
             results = programs.integrate_block(*arguments)
-        found = {name: np.asarray(values) for name, values in results.items()}
-        # Histories are large, and copied only where some of them were not wanted.
-        return found if mask.all() else {name: found[name][rows] for name in found}
+        arrays = {name: np.asarray(values) for name, values in results.items()}
+        # Histories are large: a full block is not copied.
+        return arrays if mask.all() else {name: values[rows] for name, values in arrays.items()}
 
     def _models_of(self, batch_indices):
-        """Rigs of some tasks."""
-        return (
-            self.models
-            if self.same_model
-            else jax.tree.map(lambda leaf: leaf[batch_indices], self.models)
-        )
+        """Models of batches; one that all share is single."""
+        if self.same_model:
+            return self.models
+        return jax.tree.map(lambda leaf: leaf[batch_indices], self.models)
 
     def _models_without_controller(self, models):
-        """Rigs that `programs.integrate_block` takes; none with a controller, which has one of its own."""
+        """Models for `programs.integrate_block`: None with a controller, whose loop has its own."""
         return models if self.case.controller is None else None
 
     def _values_of(self, batch_indices):
-        """What varies in some tasks, and in their lanes."""
+        """Shared and batched values of batches."""
         return self.batches.shared_values[batch_indices], self.batches.batched_values[batch_indices]
 
     def program(self, substeps: int | None = None) -> programs.Program:
-        """What all tasks share; with `substeps` from sample to sample histories are kept."""
+        """Static data of the compiled programs; with `substeps` per sample interval, histories too."""
         scheduled = substeps is not None or self.case.controller is not None
         sampling = (self.schedule if scheduled else None), substeps
         return programs.Program(self.case, self.shapes, *self.addresses, *sampling)
 
 
 def _round_up(count: int, unit: int) -> int:
-    """The next multiple of a unit."""
+    """Smallest multiple of a unit that is at least a count."""
     return -(-count // unit) * unit
 
 
-def _values_at(case: Case, batches: Batches, address: str) -> np.ndarray:
-    """A number of the case in every task."""
+def _values_at(case: Case, batches: Batches, address: str) -> Float[np.ndarray, " path"]:
+    """Number at an address in each batch."""
     if address in batches.shared_addresses:
         return batches.shared_values[:, batches.shared_addresses.index(address)]
     return np.full(batches.shared_values.shape[0], float(value_at(case, address)))
 
 
-def _common_layout(case: Case, batches: Batches) -> Layout:
-    """One layout for all tasks: the same order of places, degrees high enough for each.
-
-    Raises ValueError if places change their order along the beam within the sweep.
-    """
-    varying_positions = [
-        i for i, name in enumerate(batches.shared_addresses) if POSITION_ADDRESS.fullmatch(name)
-    ]
-    if not varying_positions:
-        return mesh_layout(case)
-    values = np.unique(batches.shared_values[:, varying_positions], axis=0)
-    names = [batches.shared_addresses[i] for i in varying_positions]
-    layouts = [mesh_layout(replace(case, dict(zip(names, row, strict=True)))) for row in values]
-    degrees = (
-        np.max([layout.degrees for layout in layouts], axis=0)
-        if len({len(layout.degrees) for layout in layouts}) == 1
-        else layouts[0].degrees
-    )
-    common = {dataclasses.replace(layout, degrees=tuple(map(int, degrees))) for layout in layouts}
-    if len(common) > 1:
-        raise ValueError(
-            f"places along the beam change their order over {', '.join(names)}: split the sweep "
-            "where supports or patch edges meet"
-        )
-    return common.pop()
-
-
 def _to_single_precision(leaf):
-    """Numbers in half the length."""
+    """Array in float32 or int32; booleans and static values as they are."""
     if not eqx.is_array(leaf) or leaf.dtype == bool:
         return leaf
     return np.asarray(leaf, np.float32 if np.issubdtype(leaf.dtype, np.floating) else np.int32)

@@ -1,9 +1,8 @@
-"""Sweeps beyond one machine: a Dask cluster computes blocks, each worker writes its own.
+"""Sweeps on a Dask cluster: workers compute blocks and write them to the store.
 
-What travels is small: the path of the store and numbers of blocks, there and back. A worker builds
-the sweep from the order that it finds in the store, with the time steps, and writes each block as
-its own chunk, so that no two write one. When workers die, Dask gives what they had not finished to
-others, who leave out what was written.
+Only the path of the store and block numbers are sent. A worker makes the runner from the
+specification and step sizes in the store, and writes each block as a chunk of its own. Dask gives
+unfinished blocks of workers that die to others, which skip the blocks written already.
 """
 
 import threading
@@ -18,12 +17,12 @@ from jaxbeam.sweeps.specification import specification_from_dict
 if TYPE_CHECKING:
     import distributed  # comes with the extra `cluster` only
 
-MAX_BUNDLE = 16  # blocks handed out at once, at most: some tenths of a second
-BUNDLES_PER_THREAD = 4  # bundles for each thread, at least, so that all finish at one time
+MAX_BUNDLE = 16  # blocks sent at once; they take some tenths of a second
+BUNDLES_PER_THREAD = 4  # least number of bundles per thread, so that all threads end together
 
 
 def connect(address: str) -> "distributed.Client":
-    """A client of the Dask scheduler at an address, such as tcp://10.0.0.1:8786.
+    """Client of the Dask scheduler at an address such as tcp://10.0.0.1:8786.
 
     Raises ImportError without Dask, ConnectionError if no scheduler answers there.
     """
@@ -44,10 +43,9 @@ def connect(address: str) -> "distributed.Client":
 def compute_blocks(
     client: "distributed.Client", fingerprint: str, path: Path, blocks: list[int]
 ) -> Iterator[int]:
-    """Have the workers of a cluster compute blocks of a sweep and write them to its store.
+    """Numbers of blocks as the workers of a cluster have computed and stored them.
 
-    `fingerprint` is the fingerprint of the sweep. Gives the number of each block that is done. Raises
-    RuntimeError if there are no workers or they keep dying, and whatever a worker raises.
+    Raises RuntimeError without workers or if they keep dying, and the errors of workers.
     """
     from distributed import KilledWorker, as_completed
 
@@ -70,10 +68,10 @@ def compute_blocks(
 
 
 def compute_and_store(blocks: list[int], fingerprint: str, path: Path) -> list[int]:
-    """Compute blocks and write them to the store at a path; what a worker does.
+    """Compute blocks and write them to the store at a path; returns their numbers. Runs on workers.
 
-    Raises ValueError if the worker's versions differ from those that began the sweep, or if it
-    does not see the store.
+    Raises ValueError if the store is not there, or if the versions of the worker differ from those
+    of the fingerprint.
     """
     if store.status(path) != ("unfinished", fingerprint):
         raise ValueError(
@@ -83,8 +81,8 @@ def compute_and_store(blocks: list[int], fingerprint: str, path: Path) -> list[i
     runner, own_fingerprint = _runner(fingerprint, block_store)
     if own_fingerprint != fingerprint:
         raise ValueError(
-            "a worker has another version of jaxbeam or JAX than that which began the sweep, or"
-            " only one of them has the steps that `jaxbeam native` compiles; install the same"
+            "a worker has another version of jaxbeam or JAX than the machine that started the"
+            " sweep, or only one of them has the C library of `jaxbeam native`; install the same"
             " everywhere"
         )
     for block in blocks:
@@ -98,7 +96,7 @@ _runners: dict[str, tuple[Runner, str]] = {}
 
 
 def _runner(fingerprint: str, block_store: store.ZarrStore) -> tuple[Runner, str]:
-    """The blocks of a sweep, prepared once in each process, and the fingerprint made there."""
+    """Runner of a sweep, made once per process, and its fingerprint in this process."""
     with _runners_lock:
         if fingerprint not in _runners:
             specification = specification_from_dict(block_store.specification())

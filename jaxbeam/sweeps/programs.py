@@ -1,8 +1,7 @@
-"""The programs of a sweep, each compiled once for all its blocks.
+"""Compiled programs of a sweep, the same for all its blocks.
 
-Tasks differ in `heavy` values, which decide the path and the rig, and the lanes of a task in
-`light` ones. Of the tasks that a program is given only those `wanted` are worked out; what the
-others come out as means nothing.
+Batches differ in shared values, which determine path and model, and the runs of a batch in batched
+values. All batches of a block have equal shapes; `mask` marks those whose results count.
 """
 
 import functools
@@ -33,10 +32,10 @@ from jaxbeam.simulation.integration_plan import StaticShapes
 
 
 class Program(NamedTuple):
-    """What all tasks share: the case, its form, and the addresses of what varies.
+    """Static data of the programs of a sweep: case, static shapes, addresses of the values.
 
-    With a `schedule` steps go from edge to edge of it, with `substeps` so many, and histories are
-    kept; otherwise there are as many as the pace of a task asks for.
+    With a `schedule` steps end at its events; with `substeps` there are so many between events, and
+    histories are saved, otherwise the step size of each batch determines their number.
     """
 
     case: Case
@@ -47,11 +46,11 @@ class Program(NamedTuple):
     substeps: int | None = None
 
     def case_with(self, shared_values) -> Case:
-        """The case of a task."""
+        """Case of a batch."""
         return replace(self.case, dict(zip(self.shared_addresses, shared_values, strict=True)))
 
     def loads(self, shared_values, batched_values) -> LoadSet:
-        """The loads of a task, in all its lanes."""
+        """Loads of a batch, in all its runs."""
         varied = self.case_with(shared_values)
 
         def load_parameters(values):
@@ -63,7 +62,7 @@ class Program(NamedTuple):
         return LoadSet(load_set(varied).trajectories, inertia, weight)
 
     def grid(self, model, shared_values, step_size):
-        """The steps of a task. Its pace: the longest (s), and how many more between events."""
+        """Time grid of a batch, for a longest step (s) and a number of extra steps between events."""
         varied, (max_step, extra_steps) = self.case_with(shared_values), step_size
         if self.schedule is None:
             return grid_by_step_length(varied, model, max_step, extra_steps)
@@ -71,26 +70,26 @@ class Program(NamedTuple):
         return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps)
 
     def discretise(self, model, shared_values, step_size, policy=None):
-        """The rig of a task on its steps."""
+        """Discrete model of a batch, with peaks at the sensors."""
         positions = self.case_with(shared_values).sensor_positions
         return discrete_model(model, self.grid(model, shared_values, step_size), positions, policy)
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
 def modal_models(program: Program, shared_values):
-    """Rigs of some tasks, and the longest step (s) each allows."""
+    """Models of batches, and their longest stable steps (s)."""
 
     def model_and_limit(values):
         varied = program.case_with(values)
         model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
         return model, max_stable_step(model, varied.loads)
 
-    return jax.lax.map(model_and_limit, shared_values)  # traced in less time than side by side
+    return jax.lax.map(model_and_limit, shared_values)  # less to trace than vmap
 
 
 @compiled
 def entry_exit_times(case, addresses, shared_values):
-    """Times of entry and exit (task, load, 2) of the loads."""
+    """Entry and exit times (path, load, 2) of the loads in s."""
 
     def entry_exit_times_of(values):
         varied = replace(case, dict(zip(addresses, values, strict=True)))
@@ -102,14 +101,14 @@ def entry_exit_times(case, addresses, shared_values):
 
 @compiled(**PARALLEL_COMPILATION)
 def discrete_models(program: Program, mask, models, shared_values, step_size):
-    """Rigs on the steps of some tasks; a single rig is that of all, and stays single."""
+    """Discrete models of batches; a single model is shared by all and stays single."""
     shared_model, own_models = _split_shared_model(models)
 
-    def discretise_one(own, heavy, pace):
-        return _without_model(program.discretise(shared_model or own, heavy, pace))
+    def discretise_one(own_model, shared, step):
+        return _without_model(program.discretise(shared_model or own_model, shared, step))
 
     if (shared_model or jax.tree.map(lambda leaf: leaf[0], own_models)).modes_per_block == 1:
-        # Modes that nothing couples take so little that calling the kernels is what costs.
+        # Uncoupled modes take little arithmetic, so that calls of kernels dominate: all at once.
         discretised = jax.vmap(discretise_one)(own_models, shared_values, step_size)
     else:
         discretised = _map_masked(
@@ -122,10 +121,10 @@ def discrete_models(program: Program, mask, models, shared_values, step_size):
 def integrate_block(
     program: Program, devices: int, mask, models, shared_values, batched_values, step_size
 ):
-    """Results of some tasks: lanes side by side, tasks one after the other, shared by devices.
+    """Results of a block by name: runs of a batch vectorised, batches in sequence on each device.
 
-    `models` are on their steps, or bare, and are then put on them here; None with a controller, which
-    has a rig of its own.
+    `models` are discrete models, or modal models, which are discretised here; None with a
+    controller, whose closed loop has a model of its own.
     """
     if program.shapes.native and program.substeps is None and batched_values.dtype == jnp.float64:
         integrate = functools.partial(_native_results, program)
@@ -142,19 +141,19 @@ def integrate_block(
 
 
 def _native_results(program: Program, mask, models, shared_values, batched_values, step_size):
-    """Results by C, which wants to know when and where to step, and where to look."""
+    """Results of the C library, from time grids, sensor positions and loads of the batches."""
     shared_model, own_models = _split_shared_model(models)
 
-    def integration_inputs(own, heavy, light, pace):
-        grid = program.grid(shared_model or own, heavy, pace)
-        return grid, program.case_with(heavy).sensor_positions, program.loads(heavy, light)
+    def integration_inputs(own_model, shared, batched, step):
+        grid = program.grid(shared_model or own_model, shared, step)
+        return grid, program.case_with(shared).sensor_positions, program.loads(shared, batched)
 
     inputs = jax.vmap(integration_inputs)(own_models, shared_values, batched_values, step_size)
     return native_peaks.integrate_peaks(program.shapes.max_loads, mask, models, *inputs)._asdict()
 
 
 def _compiled_results(program: Program, mask, discrete, shared_values, batched_values, step_size):
-    """Results by compiled steps."""
+    """Results of the integrator in JAX."""
     if discrete is None:
         return _map_masked(
             lambda values: _closed_loop_results(program, *values),
@@ -163,18 +162,19 @@ def _compiled_results(program: Program, mask, discrete, shared_values, batched_v
         )
     shared_model, own_models = _split_shared_model(discrete.model)
 
-    def task(values):
-        rigging, own, heavy, light = values
-        rigging = _with_model(rigging, shared_model or own)
-        return _results(program, rigging, program.case_with(heavy), program.loads(heavy, light))
+    def batch_results(values):
+        own_discrete, own_model, shared, batched = values
+        own_discrete = _with_model(own_discrete, shared_model or own_model)
+        case, loads = program.case_with(shared), program.loads(shared, batched)
+        return _results(program, own_discrete, case, loads)
 
     return _map_masked(
-        task, mask, (_without_model(discrete), own_models, shared_values, batched_values)
+        batch_results, mask, (_without_model(discrete), own_models, shared_values, batched_values)
     )
 
 
 def _closed_loop_results(program: Program, shared_values, batched_values, step_size):
-    """Results of a task with a controller."""
+    """Results of a batch with a controller."""
     varied, loads = program.case_with(shared_values), program.loads(shared_values, batched_values)
     policy = closed_loop(varied, program.shapes.layout, loads, program.schedule)
     return _results(
@@ -187,7 +187,7 @@ def _closed_loop_results(program: Program, shared_values, batched_values, step_s
 
 
 def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=None):
-    """What is found of a task, by name."""
+    """Results of a batch by name: peaks (batch, ...), histories and controller failures."""
     max_loads, substeps, history = program.shapes.max_loads, program.substeps, {}
     if substeps is None:
         running_peaks, memory = integrate_peaks(discrete, loads, max_loads=max_loads, policy=policy)
@@ -207,30 +207,26 @@ def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=No
 
 
 def _map_masked(function, mask, values):
-    """What `function` makes of each of the values that are wanted, one after the other."""
-    function = jax.jit(function)  # which is then traced once
+    """Values of a function for each marked batch in sequence; zeros for the others."""
+    function = jax.jit(function)  # traced once
     shapes = jax.eval_shape(function, jax.tree.map(lambda leaf: leaf[0], values))
 
-    def zeros(values):
+    def zeros(_):
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-    return jax.lax.map(
-        lambda given: jax.lax.cond(given[0], function, zeros, given[1]), (mask, values)
-    )
+    return jax.lax.map(lambda row: jax.lax.cond(row[0], function, zeros, row[1]), (mask, values))
 
 
 def _split_shared_model(models: ModalModel):
-    """The rig that all tasks share, if they do, and what each has of its own."""
+    """Model that all batches share, or None, and the models of each, or None."""
     if models.state_matrix.shape[0] > 1:
         return None, models
     return jax.tree.map(lambda leaf: leaf[0], models), None
 
 
 def _without_model(discrete):
-    return eqx.tree_at(lambda rigging: rigging.model, discrete, None)
+    return eqx.tree_at(lambda d: d.model, discrete, None)
 
 
 def _with_model(discrete, model):
-    return eqx.tree_at(
-        lambda rigging: rigging.model, discrete, model, is_leaf=lambda leaf: leaf is None
-    )
+    return eqx.tree_at(lambda d: d.model, discrete, model, is_leaf=lambda leaf: leaf is None)

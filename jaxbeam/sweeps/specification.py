@@ -1,4 +1,4 @@
-"""What is to be swept, checked before anything compiles, and known again by its fingerprint."""
+"""Specification of a sweep: case, values at addresses and settings, checked; its fingerprint."""
 
 import dataclasses
 import functools
@@ -22,14 +22,14 @@ from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
 
-# Whether these are right depends on each other: places, and entries of a list.
+# Positions and entries of lists are valid or not together.
 JOINTLY_CHECKED = re.compile(
     r"beam\.length|(supports|actuators|sensors)\.\d+\.(position|start|end)|.*\.\d+"
 )
 
 PRECISIONS = ("double", "single")
 
-# What decides when a controller acts and its sensors are read.
+# Numbers that determine the schedule of a closed loop.
 CLOCK_ADDRESS = re.compile(
     r"run\.(duration|sample_rate)|controller\.(period|delay|times\.\d+)"
     r"|sensors\.\d+\.(sampling_period|delay)"
@@ -38,11 +38,11 @@ CLOCK_ADDRESS = re.compile(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SweepSpecification:
-    """A case, the values at some of its addresses, and how they are to be run.
+    """Case, values at some of its addresses, and settings of the runs.
 
-    Either all combinations of the values, or with `paired` the first of each, the second of each,
-    and so on; `tolerance` is the relative error allowed of peaks, apart from that of rounding in
-    `single` precision.
+    The runs are all combinations of the values, or with `paired` the first of each address, the
+    second, and so on. `tolerance` is the relative error allowed of peaks, rounding in `single`
+    precision excluded.
     """
 
     case: Case
@@ -54,7 +54,7 @@ class SweepSpecification:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """How many values there are along each dimension of the results."""
+        """Sizes of the dimensions of the results."""
         sizes = tuple(values.size for values in self.axes.values())
         return sizes[:1] if self.paired else sizes
 
@@ -64,32 +64,32 @@ class SweepSpecification:
         return ("run",) if self.paired else tuple(self.axes)
 
     def runs(self) -> Float[np.ndarray, "run address"]:
-        """The values of every run."""
+        """Values of all runs (SI units)."""
         values = self.axes.values()
         columns = values if self.paired else np.meshgrid(*values, indexing="ij")
         return np.stack([column.ravel() for column in columns], axis=-1)
 
     def batches(self) -> Batches:
-        """The runs, arranged into tasks."""
+        """Batches of the runs."""
         one_run_each = (
             self.case.controller is not None and self.case.controller.design_depends_on_loads
         )
         return make_batches(list(self.axes), self.runs(), one_run_each)
 
     def runner(self) -> Runner:
-        """The runs, cut into blocks.
+        """Runner of the batches in blocks.
 
-        Raises ValueError if places along the beam change their order within the sweep.
+        Raises ValueError if positions along the beam change their order within the sweep.
         """
         return Runner(self.case, self.batches(), self.histories, self.tolerance, self.single)
 
     @functools.cached_property
     def case_dict(self) -> dict[str, Any]:
-        """The case in plain words and numbers."""
+        """Case as a dictionary of plain values (see `case_to_dict`)."""
         return case_to_dict(self.case)
 
     def to_dict(self) -> dict[str, Any]:
-        """The order in plain words and numbers, which `specification_from_dict` makes an order again."""
+        """Dictionary of plain values; `specification_from_dict` is the inverse."""
         return {
             "case": self.case_dict,
             "axes": {address: values.tolist() for address, values in self.axes.items()},
@@ -97,7 +97,7 @@ class SweepSpecification:
         }
 
     def fingerprint(self) -> str:
-        """A number for all that shapes the results: case, values, settings and versions."""
+        """SHA-256 of all that determines the results: case, values, settings and versions."""
         native_steps = native_peaks.supports(self.case) and not (self.histories or self.single)
         content = self.to_dict() | {
             "blocks": [MAX_BLOCK_RUNS, MAX_BATCH_SIZE, len(jax.local_devices())],
@@ -112,7 +112,7 @@ def _version() -> str:
 
 
 def specification_from_dict(content: dict[str, Any]) -> SweepSpecification:
-    """An order from its plain words and numbers, taken to be right."""
+    """Specification from the dictionary of `SweepSpecification.to_dict`, without checks."""
     axes = {address: np.asarray(values, float) for address, values in content["axes"].items()}
     return SweepSpecification(case_from_dict(content["case"]), axes, *content["settings"])
 
@@ -125,10 +125,10 @@ def sweep_specification(
     tolerance: float,
     precision: str,
 ) -> SweepSpecification:
-    """Check a case and the values it is to be swept over, and put them together.
+    """Specification of a sweep of a case, checked before compilation.
 
-    Raises ValueError for an unknown address, faulty or too many values, a case without sensors, or
-    a precision that there is not.
+    Raises ValueError for an unknown address, invalid or too many values, a case without sensors, or
+    an unknown precision.
     """
     check_case(case)
     if precision not in PRECISIONS:
@@ -138,7 +138,7 @@ def sweep_specification(
     single = precision == "single"
     if single and case.controller is not None:
         raise ValueError(
-            "controllers need double precision: they are designed anew for every run; leave out"
+            "controllers need double precision, as they are designed for every run: leave out"
             " precision, or the controller"
         )
     if not over:
@@ -157,12 +157,12 @@ def sweep_specification(
     specification = SweepSpecification(case, axes, paired, histories, tolerance, single)
     if math.prod(specification.shape) > MAX_RUNS:
         raise ValueError(
-            f"{math.prod(specification.shape):.1e} combinations of values are too many; a sweep may have"
-            f" {MAX_RUNS:.0e} runs: split it"
+            f"{math.prod(specification.shape):.1e} combinations of values are more than the"
+            f" {MAX_RUNS:.0e} runs of a sweep: split it"
         )
     jointly_checked = [name for name in axes if JOINTLY_CHECKED.fullmatch(name)]
-    # What each number may be is a range: the ends of its values tell. In a grid these meet those of
-    # others, and are checked with them; of paired values they may never.
+    # The valid values of one number are a range, so its smallest and largest value are checked: in
+    # a grid with those of the other addresses, in paired values, where these may not meet, alone.
     ranges = {
         name: (axes[name].min(), axes[name].max()) for name in axes if name not in jointly_checked
     }
@@ -182,7 +182,7 @@ def sweep_specification(
 
 
 def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.ndarray, " value"]:
-    """The values of an address, as far as they can be checked without those of others."""
+    """Values of one address as an array, with the checks that need no other address."""
     if np.ndim(value_at(case, address)):
         raise ValueError(f"{address} is a list; sweep over one of its entries, {address}.0")
     try:
@@ -195,11 +195,11 @@ def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.nda
         raise ValueError(f"{address} takes a list of values, not one of shape {values.shape}")
     if case.controller is not None and CLOCK_ADDRESS.fullmatch(address):
         raise ValueError(
-            f"{address} sets the clock of the run, which all runs with a controller share:"
+            f"{address} determines the schedule, which all runs with a controller share:"
             " make a sweep for each of its values"
         )
     if not JOINTLY_CHECKED.fullmatch(address):
-        # Zero may be left out of what is allowed.
+        # A range may exclude zero.
         for value in values[~np.isfinite(values) | (values == 0)][:1]:
             check_case(replace(case, {address: value}))
     return values

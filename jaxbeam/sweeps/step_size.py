@@ -1,10 +1,10 @@
-"""Time steps for many runs: measured on a few of them, checked on others.
+"""Step sizes of the batches of a sweep, measured on a few of them and checked on others.
 
-The longest step that meets a tolerance shrinks with the pace of the loads, at a rate that depends
-on the rig; it is measured at a few paces, and between two of them the shorter holds. What was
-measured is then tried on runs drawn at random. Runs that are not tried may err more, where the
-response changes sharply from run to run: a heavy mass near its critical speed leaves the beam with
-ten times the error of one that is a little slower.
+The longest step that meets a tolerance falls with the crossing rate of the loads, in a way that
+depends on the model. It is measured at a few crossing rates; in between, the shorter of the two
+next steps holds. The steps are then checked on a stratified sample of batches. Batches outside the
+sample may have larger errors where the response changes sharply from run to run: that of a heavy
+mass near its critical speed is ten times that of a slightly slower one.
 """
 
 from collections.abc import Callable
@@ -12,30 +12,42 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
-CONVERGENCE_ORDER = 9  # at which errors are taken to fall with the step; the true order is higher
-REFINEMENT = 1.25  # how much finer the runs are with which others are compared
+CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
+REFINEMENT = 1.25  # ratio of a step to the finer step with which its error is measured
 MAX_ROUNDS = 12
-SAFETY_FACTOR = (
-    6  # how much smaller errors must be where they are looked for than they may be elsewhere
-)
-TARGET_ERROR = 0.6  # of the error allowed: what longer steps aim at
-MIN_USEFUL_ERROR = (
-    3e-3  # of the error allowed: with less, longer steps are measured before they are trusted
-)
-LIMIT_RATIO = 1.3  # how far a guess must exceed the limit of a step for that to be taken unmeasured
-SAMPLE_DIVISOR = 4  # those tried grow with the root of the number of tasks, divided by this
-NEGLIGIBLE_PEAK = 1e-6  # of a run's largest peak: smaller ones need not be right to the tolerance
+SAFETY_FACTOR = 6  # tolerance / largest error allowed in the sample
+TARGET_ERROR = 0.6  # aim of a longer step, relative to the error allowed
+MIN_USEFUL_ERROR = 3e-3  # relative to the error allowed; below, extrapolated steps are measured
+LIMIT_RATIO = 1.3  # initial step / longest step from which on the longest is taken unmeasured
+SAMPLE_DIVISOR = 4  # the sample grows with the square root of the number of batches over this
+NEGLIGIBLE_PEAK = 1e-6  # of a run's largest peak; errors of smaller peaks are relative to this
 
-# Of tasks, their steps (s), and how many steps more between events.
-PeaksFunction = Callable[[Int[np.ndarray, " task"], Float[np.ndarray, " task"], int], np.ndarray]
+# Peaks (path, batch, sensor) of batches for their steps (s) and a number of extra steps per event.
+PeaksFunction = Callable[[Int[np.ndarray, " path"], Float[np.ndarray, " path"], int], np.ndarray]
+
+
+def initial_step_sizes(
+    crossing_times: Float[np.ndarray, " path"],
+    max_steps: Float[np.ndarray, " path"],
+    modes: int,
+    tolerance: float,
+) -> Float[np.ndarray, " path"]:
+    """Initial steps (s) of batches, from crossing times (s) and longest stable steps (s).
+
+    A fit to beams of one and two spans with 1 to 12 modes at slow and fast crossings, for errors of
+    1e-7, scaled with CONVERGENCE_ORDER.
+    """
+    steps = crossing_times / (20 * modes + 1.84 * crossing_times / max_steps / np.sqrt(modes))
+    return steps * (tolerance / 1e-7) ** (1 / CONVERGENCE_ORDER)
 
 
 def log_spaced_sample(
-    crossing_rates: Float[np.ndarray, " task"], count: int
-) -> Int[np.ndarray, " chosen"]:
-    """`count` tasks (some maybe twice) from slow ones to the fastest, evenly in log pace.
+    crossing_rates: Float[np.ndarray, " path"], count: int
+) -> Int[np.ndarray, " sample"]:
+    """Indices of `count` batches, spaced evenly in the logarithm of the crossing rate.
 
-    The slowest of all are left out: they take longest, and their errors tell least of the others.
+    The fastest is among them, the slowest are not: they take longest, and their errors are least
+    like those of others. An index may occur twice.
     """
     order = np.argsort(crossing_rates, kind="stable")
     logs = np.log(crossing_rates[order])
@@ -47,29 +59,28 @@ def log_spaced_sample(
 
 def step_errors(
     peaks: PeaksFunction, batches, steps, map_function=map
-) -> Float[np.ndarray, " task"]:
-    """How much the peaks of tasks, (task, lane, sensor), change with finer steps than these (s).
+) -> Float[np.ndarray, " path"]:
+    """Largest relative change of the peaks of each batch with steps REFINEMENT times finer.
 
-    The largest relative change in each task. Runs that fail are left out; NaN if all do. Finer is
-    one step more between events at least, or between samples of a loop: there may be few of them.
-    `map_function` calls a function as `map` does, maybe side by side.
+    At least one step is added between events, of which there may be few. Runs that fail are left
+    out; NaN if all do. `map_function` has the interface of `map` and may run in parallel.
     """
-    # The finer take longer, and go first.
+    # The finer runs take longer and start first.
     fine, coarse = map_function(peaks, (batches, batches), (steps / REFINEMENT, steps), (1, 0))
     return _relative_changes(coarse, fine)
 
 
-def rounding_error(exact: Float[np.ndarray, "task lane sensor"], rounded: np.ndarray) -> float:
-    """The largest relative error of peaks computed with rounded numbers, where any run works."""
+def rounding_error(exact: Float[np.ndarray, "path batch sensor"], rounded: np.ndarray) -> float:
+    """Largest relative error of peaks in single precision, over the runs that do not fail."""
     return float(np.nanmax(_relative_changes(rounded, exact), initial=0.0))
 
 
 def stratified_sample(
-    crossing_rates: Float[np.ndarray, " task"], count: int
-) -> Int[np.ndarray, " chosen"]:
-    """`count` tasks (some maybe twice), one from each of as many equal parts of all, by pace.
+    crossing_rates: Float[np.ndarray, " path"], count: int
+) -> Int[np.ndarray, " sample"]:
+    """Indices of `count` batches, one at random from each of `count` quantiles of crossing rates.
 
-    At random within these parts, and the same each time.
+    The random numbers are the same each time. An index may occur twice.
     """
     quantiles = (
         (np.arange(count) + np.random.default_rng(0).random(count)) * crossing_rates.size / count
@@ -78,11 +89,11 @@ def stratified_sample(
 
 
 def _interpolate_conservatively(
-    crossing_rates: Float[np.ndarray, " task"],
-    sampled_rates: Float[np.ndarray, " chosen"],
-    values: Float[np.ndarray, " chosen"],
-) -> Float[np.ndarray, " task"]:
-    """The smaller of the values at the known paces next to each; beyond them, that at the end."""
+    crossing_rates: Float[np.ndarray, " path"],
+    sampled_rates: Float[np.ndarray, " sample"],
+    values: Float[np.ndarray, " sample"],
+) -> Float[np.ndarray, " path"]:
+    """Smaller of the values at the two next sampled rates; the end value outside their range."""
     unique, which = np.unique(sampled_rates, return_inverse=True)
     least = np.full(unique.size, np.inf)
     np.minimum.at(least, which, values)
@@ -92,7 +103,7 @@ def _interpolate_conservatively(
 
 
 def _relative_changes(coarse, fine):
-    """The largest relative change of peaks in each task; NaN where no run works."""
+    """Largest relative change of peaks in each batch; NaN where all runs fail."""
     works = np.isfinite(fine)
     size = np.abs(np.where(works, fine, 0.0))
     size = np.maximum(size, NEGLIGIBLE_PEAK * size.max(axis=-1, keepdims=True))
@@ -105,19 +116,18 @@ def _relative_changes(coarse, fine):
 
 def choose_step_sizes(
     peaks: PeaksFunction,
-    crossing_rates: Float[np.ndarray, " task"],
-    initial_steps: Float[np.ndarray, " task"],
-    max_steps: Float[np.ndarray, " task"],
+    crossing_rates: Float[np.ndarray, " path"],
+    initial_steps: Float[np.ndarray, " path"],
+    max_steps: Float[np.ndarray, " path"],
     count: int,
     tolerance: float,
     map_function: Callable = map,
-) -> tuple[Float[np.ndarray, " task"], float]:
-    """Longest steps (s) of all tasks for a tolerance, and the error seen on a random few.
+) -> tuple[Float[np.ndarray, " path"], float]:
+    """Longest steps (s) of all batches for a tolerance, and the largest error of the sample.
 
-    `peaks` takes tasks, a multiple of `count`, their steps and how many more between events, and
-    returns their peaks; `map_function` calls it several times, as `map` does. `crossing_rates` (1/s) order the
-    tasks, `initial_steps` start the search, `max_steps` (s) cap it. Raises RuntimeError if no step meets the
-    tolerance.
+    `peaks` is called, through `map_function`, with indices of batches, a multiple of `count`. The
+    search over `crossing_rates` (1/s) starts from `initial_steps` (s) and is limited by `max_steps`
+    (s). Raises RuntimeError if no step meets the tolerance.
     """
     target_error = tolerance / SAFETY_FACTOR
     chosen = log_spaced_sample(crossing_rates, count)
@@ -132,7 +142,7 @@ def choose_step_sizes(
     start = np.minimum(initial_steps, max_steps)
     step_ratio = _interpolate_conservatively(
         crossing_rates, crossing_rates[chosen], good_steps / start[chosen]
-    )  # than guessed
+    )  # to the initial step
     steps = np.minimum(start * step_ratio, max_steps)
     sample = stratified_sample(
         crossing_rates, count * max(1, round(np.sqrt(crossing_rates.size / count) / SAMPLE_DIVISOR))
@@ -155,21 +165,21 @@ def _search_step_sizes(
     tolerance: float,
     map_function: Callable,
 ):
-    """Long good steps (s) of some tasks, 0 if none was; which of these have a run that works.
+    """Longest steps (s) of batches that meet a tolerance, 0 without one; whether any run succeeds.
 
-    Tasks go from slow to quick.
+    Batches are in the order of their crossing rates.
     """
     steps = np.minimum(initial_steps, max_steps)
-    # Slow tasks take longest, and what limits their steps is not the error.
+    # Slow crossings take longest, and stability limits their steps, not the error.
     settled = initial_steps >= LIMIT_RATIO * max_steps
     good, bad = np.where(settled, max_steps, 0.0), np.full(batches.size, np.inf)
     error = np.zeros(batches.size)
     change = np.ones(batches.size)
     for _ in range(0 if settled.all() else MAX_ROUNDS):
-        # As many as ever are measured: in place of the settled the quickest, which costs least.
-        places = np.where(settled, batches.size - 1, np.arange(batches.size))
-        found = step_errors(peaks, batches[places], steps[places], map_function)
-        error = np.where(settled, error, found)
+        # The compiled program has a fixed size: the fastest batch, the cheapest, is its padding.
+        rows = np.where(settled, batches.size - 1, np.arange(batches.size))
+        measured = step_errors(peaks, batches[rows], steps[rows], map_function)
+        error = np.where(settled, error, measured)
         met = ~(error > tolerance)
         good = np.where(met, np.maximum(good, steps), good)
         bad = np.where(met, bad, np.minimum(bad, steps))
@@ -177,20 +187,20 @@ def _search_step_sizes(
             change = np.clip(
                 (TARGET_ERROR * tolerance / error) ** (1 / CONVERGENCE_ORDER), 0.5, 1.5
             )
-        # A step is long enough if the error says so, or a longer one was bad or makes no sense.
+        # A step is settled if its error is useful, a longer one fails, or it is the longest.
         limit_known = ~(error < tolerance * MIN_USEFUL_ERROR) | (bad < np.inf) | (good >= max_steps)
         settled = (good > 0) & limit_known
         if settled.all():
             break
         steps = np.where(settled, good, np.minimum(steps * change, max_steps))
-    # What errors still allow is trusted: others are measured with the steps that come of it.
+    # The last extrapolation is not measured here; the sample checks it.
     extrapolation = np.where((good == steps) & (bad == np.inf), np.fmax(change, 1.0), 1.0)
     return good * extrapolation, ~np.isnan(error)
 
 
 def _no_step_error(tolerance: float) -> RuntimeError:
     return RuntimeError(
-        f"no time step makes the peaks agree to {tolerance:g}; the responses grow without "
-        "bound, or the frequencies are too far apart: check stiffnesses, masses and damping, "
+        f"no time step makes the peaks agree to {tolerance:g}; the responses are unstable, "
+        "or the frequencies are too far apart: check stiffnesses, masses and damping, "
         "or keep fewer modes (beam.modes)"
     )

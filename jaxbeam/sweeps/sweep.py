@@ -1,4 +1,4 @@
-"""Many cases at once: any addresses, over grids or paired lists of values."""
+"""Sweep of a case over the values at any addresses, in a grid or paired, as an xarray dataset."""
 
 import json
 import os
@@ -37,33 +37,33 @@ def sweep(
     precision: str = "double",
     client: Any = None,
 ) -> "xarray.Dataset":
-    """Simulate a case for many values of the numbers at some addresses.
+    """Simulate a case for many values of the numbers at given addresses.
 
-    `over` gives each address a list of values (SI units): all combinations, with a dimension for
-    each address, or with `paired` the first of each, the second of each, and so on along `run`.
-    The dataset holds `peak_deflection` (..., sensor) in m with its time, the lowest contact force
-    and the first time at which a load would have to pull (..., load), and `failed`: a run whose
-    result is not finite is marked there, holds NaN, and touches no other. With a controller,
-    `controller_failures` counts the steps at which it found no solution. With `histories`, also
-    `deflection` (..., time, sensor) at the run's sample rate.
+    `over` maps each address to a list of values (SI units): all combinations, with a dimension per
+    address, or with `paired` the first of each, the second, and so on along `run`. The dataset has
+    `peak_deflection` (..., sensor) in m and its time in s, the smallest contact force in N and the
+    time of its first negative value in s (..., load), and `failed`, which marks runs that are not
+    finite; their results are NaN. With a controller, `controller_failures` counts its steps without
+    a solution. With `histories`, `deflection` (..., time, sensor) in m is at the run's sample rate.
 
-    Runs are computed in blocks on all cores, compiled once, with time steps as long as errors of
-    peaks below `tolerance` (relative) allow. Errors are measured on some of the runs, drawn at
-    random, where a sixth of that is the most; `error_estimate` is the largest seen. Others may err
-    ten times as much, and more, near critical speeds of heavy masses. In `precision` "single"
-    rigs and propagators are still made in double, but runs are integrated in half the bits, which
-    is faster where arithmetic is what costs, most of all on a GPU. Results are float32 then; what
-    rounding does to peaks, a few parts in a million, is measured and part of `error_estimate`.
+    Runs are computed in blocks on all cores, compiled once, with the longest time steps whose
+    relative errors of peaks are below `tolerance`. Errors are measured on a stratified random
+    sample of the runs, where they are at most a sixth of the tolerance; `error_estimate` is the
+    largest of these. Other runs may have errors ten times as large, and more near critical speeds
+    of heavy masses. In `precision` "single" models and propagators are made in float64 and runs are
+    integrated in float32, which is faster where arithmetic dominates, as on a GPU. Results are then
+    float32, and the rounding error of peaks, a few parts in a million, is measured and included in
+    `error_estimate`.
 
-    With a `store` every block is kept in a zarr store as soon as it is done; with `resume` a killed
-    sweep continues from there, to bit-identical results. With a `client` of Dask
-    (`distributed.Client`) the blocks are computed by its workers, each of which writes its own to
-    the store; the folder of the store must be one that all of them see.
+    With a `store` each block is written to a zarr store when it is done; with `resume` an
+    interrupted sweep continues from there, with bit-identical results. With a `client` of Dask
+    (`distributed.Client`) its workers compute the blocks and write them to the store, in a folder
+    that they share.
 
-    Raises ValueError for an unknown address, faulty values, a case without sensors, or a controller
-    in single precision;
-    FileExistsError if the store exists and neither `resume` nor `overwrite` is set; OSError if it
-    cannot be written; RuntimeError if no time step meets the tolerance or workers keep dying.
+    Raises ValueError for an unknown address, invalid values, a case without sensors, a controller
+    in single precision, or a client without a store; FileExistsError if the store exists, without
+    `resume` or `overwrite`; OSError if it cannot be written; RuntimeError if no time step meets the
+    tolerance or workers keep dying.
     """
     if client is not None and store is None:
         raise ValueError("workers write their blocks to a store; name one")
@@ -91,7 +91,7 @@ def sweep(
                 path, fingerprint, content, runner.block_count, step_sizes_and_error, overwrite
             )
     missing = block_store.missing()
-    # The first block is always computed here: the arrays of the store are made for it.
+    # The first block is always computed here, and creates the arrays of the store.
     computed_locally = missing if client is None else missing[:1]
     with _progress(runner, missing, progress) as progress_bar:
         for block in _compute(runner, computed_locally, steps, block_store):
@@ -106,18 +106,20 @@ def sweep(
 
 
 def _progress(runner: Runner, missing: list[int], visible: bool) -> tqdm:
-    """A bar that counts runs, those that are done already among them."""
+    """Progress bar of the runs; those of stored blocks count as done."""
     count = int(np.sum(runner.batches.run_index >= 0))
-    left = sum(runner.run_count(block) for block in missing)
-    return tqdm(total=count, initial=count - left, unit="run", disable=not visible, file=sys.stderr)
+    remaining = sum(runner.run_count(block) for block in missing)
+    return tqdm(
+        total=count, initial=count - remaining, unit="run", disable=not visible, file=sys.stderr
+    )
 
 
 def _compute(
     runner: Runner, blocks: list[int], steps, block_store: sweep_store.BlockStore
 ) -> Iterator[int]:
-    """Compute blocks on all cores and keep them, giving the number of each that is done."""
+    """Numbers of blocks as they are computed, on all cores, and stored."""
     results = runner.pool.map(lambda block: (block, runner.compute_block(block, steps)), blocks)
-    # Closed early, by an error or the keyboard, blocks not yet begun are called off.
+    # An error or an interrupt closes the iterator, which cancels blocks not yet started.
     with closing(results):  # type: ignore[type-var]
         for block, result in results:
             block_store.write(block, result)
@@ -137,7 +139,7 @@ _VARIABLES = {
 def _to_dataset(
     specification: SweepSpecification, batches: Batches, results: dict[str, np.ndarray]
 ) -> "xarray.Dataset":
-    """Results of all tasks as a dataset labelled by address."""
+    """Results of all batches as a dataset with a dimension per address, or `run`."""
     import xarray
 
     case, dims, shape = specification.case, specification.dims, specification.shape

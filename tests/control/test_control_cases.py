@@ -1,4 +1,4 @@
-"""Controllers in case files and on the command line; how faulty ones are refused."""
+"""Controllers in case files and on the command line, and the errors of their settings."""
 
 import dataclasses
 import json
@@ -17,9 +17,9 @@ from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.control.test_controllers import HELD
 from tests.loop_as_oracle import expected
 
-ACTUATOR, LISTENER = HELD.actuators[0], HELD.sensors[0]
+ACTUATOR, SENSOR = HELD.actuators[0], HELD.sensors[0]
 SAMPLED = "needs a controller that samples: give controller.period"
-FAULTS = [
+ERRORS = [
     ({"actuators": ()}, "controller has nothing to command: add an actuator, or leave it out"),
     ({"controller": jb.Feedback([1.0, 2.0])}, "controller.gains must list one gain for each of 1"),
     ({"sensors": ()}, "controller.gains has 1 entries, but there are only 0 sensors"),
@@ -113,14 +113,14 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "message"), FAULTS)
-def test_faulty_loops_are_refused(changes, message):
+@pytest.mark.parametrize(("changes", "message"), ERRORS)
+def test_errors_of_controllers(changes, message):
     if isinstance(changes.get("controller"), jb.Prescribed):
         changes = {"sensors": (), **changes}
     case = dataclasses.replace(HELD, **changes)
-    for look in (check_case, jb.simulate):
+    for function in (check_case, jb.simulate):
         with pytest.raises(ValueError, match=re.escape(message)) as caught:
-            look(case)
+            function(case)
         assert "\n" not in str(caught.value)
 
 
@@ -141,7 +141,7 @@ TABLES = [
 ]
 
 
-def test_sampling_too_slow_to_bridge_is_refused():
+def test_too_long_period_is_refused():
     law = jb.Feedback([1.0], period=1e4)
     run = jb.Run(2e4, sample_rate=1e-4)
     case = dataclasses.replace(HELD, sensors=(jb.Sensor(0.3),), controller=law, run=run)
@@ -150,7 +150,7 @@ def test_sampling_too_slow_to_bridge_is_refused():
 
 
 @pytest.mark.parametrize(("table", "message"), TABLES)
-def test_faulty_tables_are_refused(table, message):
+def test_errors_of_tables(table, message):
     content = case_to_dict(HELD) | {"controller": table}
     with pytest.raises(ValueError, match=re.escape(message)):
         case_from_dict(content)
@@ -173,14 +173,14 @@ CONTROLLERS = [
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS, ids=lambda c: type(c).__name__)
-def test_a_case_file_keeps_the_controller(controller, tmp_path):
+def test_case_file_keeps_the_controller(controller, tmp_path):
     sensor = jb.Sensor(0.25)
     case = dataclasses.replace(HELD, controller=controller, sensors=(sensor,))
     jb.save_case(case, tmp_path / "case.toml")
     assert eqx.tree_equal(jb.load_case(tmp_path / "case.toml"), case)
 
 
-def test_entries_of_matrices_have_addresses():
+def test_addresses_of_matrix_entries():
     law = jb.StateFeedback([[1.0, 2.0, 3.0, 4.0, 5.0]], period=1e-3)
     case = dataclasses.replace(HELD, controller=law)
     changed = jb.replace(case, {"controller.gain.0.3": 9.0})
@@ -195,7 +195,7 @@ def command_line(words: list[str]) -> int:
     return ended.value.code
 
 
-def test_the_command_line_runs_a_loop(tmp_path, capsys):
+def test_loop_on_the_command_line(tmp_path, capsys):
     path, output = tmp_path / "case.toml", tmp_path / "out.nc"
     jb.save_case(HELD, path)
     assert command_line(["simulate", str(path), "-o", str(output), "--json"]) == 0

@@ -1,4 +1,4 @@
-"""Controllers in records, batches and derivatives."""
+"""Closed loops: records, divergence, batches and derivatives."""
 
 import dataclasses
 import json
@@ -30,7 +30,7 @@ HELD = jb.Case(
 )
 
 
-def planned(case: jb.Case, times=TIMES, substeps: int = 1) -> IntegrationPlan:
+def plan_for(case: jb.Case, times=TIMES, substeps: int = 1) -> IntegrationPlan:
     return IntegrationPlan(
         static_shapes(case), substeps, 0, False, 0.0, loop_schedule(case, np.asarray(times))
     )
@@ -38,7 +38,7 @@ def planned(case: jb.Case, times=TIMES, substeps: int = 1) -> IntegrationPlan:
 
 @pytest.fixture(scope="module")
 def plan():
-    return planned(HELD)
+    return plan_for(HELD)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def record(plan):
     return jb.simulate(HELD, TIMES, plan)
 
 
-def test_the_record_tells_command_saturation_and_effort(record):
+def test_record_of_command_saturation_and_effort(record):
     truth = expected(HELD, TIMES).command
     assert_allclose(record.command, truth, rtol=0, atol=1e-10)
     assert_array_equal(record.saturated, truth == 0.35)
@@ -56,7 +56,7 @@ def test_the_record_tells_command_saturation_and_effort(record):
     assert record.verdict.startswith("every load presses on the beam throughout")
 
 
-def test_a_record_with_a_controller_survives_its_file(record, tmp_path):
+def test_record_with_a_controller_in_a_file(record, tmp_path):
     record.to_netcdf(tmp_path / "loop.nc")
     back = jb.read_record(tmp_path / "loop.nc")
     assert jax.tree.structure(back) == jax.tree.structure(record)
@@ -72,16 +72,14 @@ UNBOUNDED = dataclasses.replace(HELD, actuators=(jb.PointForce(0.3),), sensors=(
 GAINS, MASSES = np.array([100.0, 1e5, 700.0]), np.array([0.1, 0.4])
 
 
-def test_a_loop_with_too_high_a_gain_ends_with_a_verdict():
-    """Warnings are errors here: it warns of nothing, and it does not fail."""
+def test_verdict_of_a_diverging_loop():
+    """No exception and no warning."""
     record = jb.simulate(jb.replace(UNBOUNDED, {"controller.gains.0": 1e5}))
-    gone = float(record.diverged_time)
-    assert 0 < gone < 0.3
-    assert (
-        f"the control loop diverges: the deflection has grown beyond all bounds by t = {gone:.4g}"
-        in record.verdict
-    )
-    before = np.asarray(record.times) < gone
+    diverged = float(record.diverged_time)
+    assert 0 < diverged < 0.3
+    grown = f"the deflection has grown beyond all bounds by t = {diverged:.4g}"
+    assert f"the control loop diverges: {grown}" in record.verdict
+    before = np.asarray(record.times) < diverged
     assert np.all(np.isfinite(record.deflection[before]))
     assert np.all(np.abs(record.deflection[before]) < 0.6)
     assert np.all(np.isnan(record.deflection[~before]))
@@ -90,7 +88,7 @@ def test_a_loop_with_too_high_a_gain_ends_with_a_verdict():
 
 @pytest.fixture(scope="module")
 def swept():
-    """A sweep over gains, one of which diverges, and masses; and what was compiled for it."""
+    """Sweep over gains, one of which diverges, and masses; and the programs compiled for it."""
     found = []
 
     class Names(logging.Handler):
@@ -99,7 +97,7 @@ def swept():
 
     logger, handler = logging.getLogger("jax"), Names()
     logger.addHandler(handler)
-    jax.config.update("jax_log_compiles", True)  # in all threads, as its context is not
+    jax.config.update("jax_log_compiles", True)  # in all threads; its context is for one
     try:
         over = {"controller.gains.0": GAINS, "loads.0.mass": MASSES}
         dataset = jb.sweep(UNBOUNDED, over, progress=False)
@@ -110,12 +108,12 @@ def swept():
 
 
 @pytest.mark.slow
-def test_only_the_diverging_members_of_a_sweep_fail(swept):
+def test_only_diverging_runs_of_a_sweep_fail(swept):
     dataset, compiled = swept
     assert_array_equal(dataset.failed, [[False, False], [True, True], [False, False]])
     assert np.isnan(dataset.peak_deflection[1]).all()
     assert len(compiled) == 1
-    plan = planned(UNBOUNDED)
+    plan = plan_for(UNBOUNDED)
     for i in (0, 2):
         for j in range(2):
             values = {"controller.gains.0": GAINS[i], "loads.0.mass": MASSES[j]}
@@ -124,8 +122,8 @@ def test_only_the_diverging_members_of_a_sweep_fail(swept):
 
 
 @pytest.mark.slow
-def test_a_batch_of_gains_is_what_each_gives_alone():
-    plan = planned(UNBOUNDED)
+def test_batch_of_gains_equals_single_runs():
+    plan = plan_for(UNBOUNDED)
 
     def deflection(gain):
         case = jb.replace(UNBOUNDED, {"controller.gains.0": gain})
@@ -183,10 +181,10 @@ LAW = dataclasses.replace(
 
 
 @pytest.mark.slow
-def test_gradients_of_a_law_at_every_instant():
+def test_gradients_of_a_law_in_continuous_time():
     names = ("controller.gains.0", "sensors.0.filter.cutoff", "actuators.0.damping", "loads.0.mass")
     sizes = np.array([float(jb.addresses(LAW)[name]) for name in names])
-    plan = planned(LAW, substeps=2)
+    plan = plan_for(LAW, substeps=2)
 
     @jax.jit
     def outputs(point):
@@ -197,6 +195,3 @@ def test_gradients_of_a_law_at_every_instant():
     at = jnp.ones(len(names))
     differences = central(outputs, at, step=2e-3, order=6)
     assert_allclose(jax.jacrev(outputs)(at), differences, rtol=1e-6)
-
-
-# Bad input

@@ -1,4 +1,4 @@
-"""Laws that answer readings: odd polynomials, and compensators against python-control and scipy."""
+"""Feedback of readings: odd polynomials, and compensators against python-control and scipy."""
 
 import dataclasses
 import re
@@ -37,35 +37,35 @@ CASE = jb.Case(
 # Polynomials
 
 
-def test_an_odd_polynomial_of_each_reading_and_its_slope():
+def test_odd_polynomial_and_its_derivative():
     law = jb.Feedback([2.0, -1.0], higher_gains=[[3.0, 0.5], [4.0, -2.0]])
     batch = jnp.array([[0.3, -0.7], [0.0, 0.0], [-1.2, 0.4], [0.9, 2.0]])
 
-    def answer(readings):
-        return law.step(None, seen(readings), jnp.zeros(()))[0]
+    def command(readings):
+        return law.command((), measure(readings), jnp.zeros(()))
 
     for loop, row in enumerate(np.array([[2.0, 3.0, 4.0], [-1.0, 0.5, -2.0]])):
         polynomial = np.polynomial.Polynomial([0, -row[0], 0, -row[1], 0, -row[2]])
         assert_allclose(
-            jax.vmap(answer)(batch)[:, loop], polynomial(batch[:, loop]), rtol=1e-14, atol=0
+            jax.vmap(command)(batch)[:, loop], polynomial(batch[:, loop]), rtol=1e-14, atol=0
         )
-        slopes = jax.vmap(jax.jacrev(answer))(batch)[:, loop]
+        slopes = jax.vmap(jax.jacrev(command))(batch)[:, loop]
         assert_allclose(slopes[:, loop], polynomial.deriv()(batch[:, loop]), rtol=1e-14)
         assert not slopes[:, 1 - loop].any()
 
 
-def test_even_powers_are_odd_in_sign():
+def test_even_powers_keep_the_sign():
     law = jb.Feedback([2.0], power=2, higher_gains=[[3.0]])
-    found, _ = law.step(None, seen(jnp.array([-0.5])), jnp.zeros(()))
+    found = law.command((), measure(jnp.array([-0.5])), jnp.zeros(()))
     assert_allclose(found, 2.0 * 0.5**2 + 3.0 * 0.5**4, rtol=1e-14)
 
 
-def seen(readings) -> Measurement:
+def measure(readings) -> Measurement:
     return Measurement(readings, jnp.zeros(0), jnp.zeros(readings.shape))
 
 
-# Compensators: the law, and for each of its two loops numerator and denominator in s, and the
-# frequency (rad/s) at which sampling does not bend it.
+# Compensators: the controller, and for each of its two loops numerator and denominator in s, and
+# the frequency (rad/s) at which the bilinear transform is exact.
 W = 2 * np.pi * np.array([12.0, 45.0])
 COMPENSATORS = {
     "pd": (
@@ -92,21 +92,22 @@ COMPENSATORS = {
 
 
 def sampled(name: str, period: float = PERIOD) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Coefficients of each loop's sampled filter, by python-control."""
+    """Coefficients of the sampled filter of each loop, by python-control."""
     _, loops, matched = COMPENSATORS[name]
     found = []
-    for (above, below), at in zip(loops, matched, strict=True):
-        bent = control.c2d(control.tf(above, below), period, "tustin", prewarp_frequency=at)
-        found.append((bent.num[0][0], bent.den[0][0]))
+    for (numerator, denominator), at in zip(loops, matched, strict=True):
+        continuous = control.tf(numerator, denominator)
+        discrete = control.c2d(continuous, period, "tustin", prewarp_frequency=at)
+        found.append((discrete.num[0][0], discrete.den[0][0]))
     return found
 
 
 @pytest.mark.parametrize("name", COMPENSATORS)
-def test_compensators_are_those_of_python_control_and_scipy(name):
-    law = COMPENSATORS[name][0]
-    memory, commands = law.init(None), []
+def test_sampled_compensators_against_python_control_and_scipy(name):
+    law = COMPENSATORS[name][0].law(None)
+    state, commands = law.initial_state(), []
     for readings in READINGS:
-        command, memory = law.step(memory, seen(jnp.asarray(readings)), jnp.zeros(()))
+        command, state, _ = law.step(state, measure(jnp.asarray(readings)), jnp.zeros(()))
         commands.append(command)
     for loop, coefficients in enumerate(sampled(name)):
         truth = scipy.signal.lfilter(*coefficients, READINGS[:, loop])
@@ -114,15 +115,15 @@ def test_compensators_are_those_of_python_control_and_scipy(name):
         assert_allclose(found, truth, rtol=0, atol=1e-12 * np.max(np.abs(truth)))
 
 
-def test_a_quick_compensator_is_its_continuous_transfer_function():
-    """At 5 Hz and a hundredth of the period: the order of the bilinear transform is two."""
+def test_sampled_compensator_tends_to_its_transfer_function():
+    """At 5 Hz, with a tenth of the period: the bilinear transform is of second order."""
     s = 2j * np.pi * 5.0
     for law, loops, _ in COMPENSATORS.values():
         errors = []
         for period in (PERIOD, PERIOD / 10):
-            quick = dataclasses.replace(law, period=jnp.asarray(period))
+            fast = dataclasses.replace(law, period=jnp.asarray(period))
             z = np.exp(s * period)
-            b0, b1, b2, _, a1, a2 = np.asarray(quick.init(None)[0])[0]
+            b0, b1, b2, _, a1, a2 = np.asarray(fast.law(None).sections)[0]
             found = (b0 + b1 / z + b2 / z**2) / (1 + a1 / z + a2 / z**2)
             truth = np.array([np.polyval(top, s) / np.polyval(low, s) for top, low in loops])
             errors.append(np.abs(found / truth - 1).max())
@@ -130,19 +131,19 @@ def test_a_quick_compensator_is_its_continuous_transfer_function():
 
 
 @pytest.mark.slow
-def test_a_loop_with_compensators_is_that_of_the_oracle():
+def test_loop_with_compensators_against_the_oracle():
     times = np.linspace(0.0, 0.2, 41)
     case = dataclasses.replace(CASE, controller=COMPENSATORS["ppf"][0])
     plan = IntegrationPlan(static_shapes(case), 2, 0, False, 0.0, loop_schedule(case, times))
     record = jb.simulate(case, jnp.asarray(times), plan)
     filters = sampled("ppf")
-    memories = [np.zeros(len(low) - 1) for _, low in filters]
+    filter_states = [np.zeros(len(low) - 1) for _, low in filters]
 
     def law(readings, state, t):
         command = np.zeros(2)
         for i, coefficients in enumerate(filters):
-            (command[i],), memories[i] = scipy.signal.lfilter(
-                *coefficients, readings[i : i + 1], zi=memories[i]
+            (command[i],), filter_states[i] = scipy.signal.lfilter(
+                *coefficients, readings[i : i + 1], zi=filter_states[i]
             )
         return command
 
@@ -151,8 +152,8 @@ def test_a_loop_with_compensators_is_that_of_the_oracle():
         assert np.all(np.abs(found - true) <= 1e-9 * np.max(np.abs(true), axis=0))
 
 
-def test_positive_position_feedback_damps_the_mode_it_is_tuned_to():
-    """Poles of the loop, sampled fast, are those of python-control's continuous one."""
+def test_positive_position_feedback_damps_the_mode_to_which_it_is_tuned():
+    """Poles of the loop, sampled fast, against those of python-control in continuous time."""
     span = span_of(CASE)
     first = span.frequencies[0]
     gain, ratio = 100.0, 0.3
@@ -162,10 +163,12 @@ def test_positive_position_feedback_damps_the_mode_it_is_tuned_to():
     case = dataclasses.replace(
         CASE, actuators=[jb.PointForce(0.4)], sensors=[jb.Sensor(0.4)], loads=[], controller=law
     )
-    n, push = span.modes, span.shapes(0.4)
+    n, shape = span.modes, span.shapes(0.4)
     stiffness, damping = np.diag(span.frequencies**2), 0.02 * np.diag(span.frequencies)
     a = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -damping]])
-    plant = control.ss(a, np.append(np.zeros(n), push)[:, None], np.append(push, np.zeros(n)), 0.0)
+    plant = control.ss(
+        a, np.append(np.zeros(n), shape)[:, None], np.append(shape, np.zeros(n)), 0.0
+    )
     oscillator = control.tf([gain * first**2], [1.0, 2 * ratio * first, first**2])
     truth = control.feedback(plant, oscillator, sign=1).poles()
     found = linearised_loop(case, 0.0).poles()[: truth.size]
@@ -174,18 +177,18 @@ def test_positive_position_feedback_damps_the_mode_it_is_tuned_to():
     assert truth.real.max() < -2 * 0.01 * first  # twice the damping of the beam's own
 
 
-def at_every_instant(name, **changes) -> jb.Case:
+def without_period(name, **changes) -> jb.Case:
     law = dataclasses.replace(COMPENSATORS[name][0], period=None)
     return dataclasses.replace(CASE, controller=law, **changes)
 
 
 @pytest.mark.parametrize("name", COMPENSATORS)
-def test_poles_without_sampling_are_those_of_python_control(name):
-    """Point forces where the sensors are; states of the filters are among those of the loop."""
-    forces, places = [jb.PointForce(0.19), jb.PointForce(0.4)], (0.19, 0.4)
-    case = at_every_instant(name, actuators=forces, loads=[])
+def test_poles_in_continuous_time_against_python_control(name):
+    """Point forces at the sensors; the states of the filters are among those of the loop."""
+    forces, positions = [jb.PointForce(0.19), jb.PointForce(0.4)], (0.19, 0.4)
+    case = without_period(name, actuators=forces, loads=[])
     span = span_of(case)
-    n, rows = span.modes, np.array([span.shapes(x) for x in places])
+    n, rows = span.modes, np.array([span.shapes(x) for x in positions])
     stiffness, damping = np.diag(span.frequencies**2), 0.02 * np.diag(span.frequencies)
     none = np.zeros((n, n))
     a = np.block([[none, np.eye(n)], [-stiffness, -damping]])
@@ -202,14 +205,14 @@ def test_poles_without_sampling_are_those_of_python_control(name):
 
 
 @pytest.mark.slow
-def test_a_run_without_sampling_is_that_of_scipy():
+def test_run_in_continuous_time_against_scipy():
     """A crossing force, point forces, an analogue filter before the second compensator."""
     times, cutoff = np.linspace(0.0, 0.2, 21), 2 * np.pi * 40.0
-    smooth = jb.Filter(40.0, 1, realisation="analogue")
-    case = at_every_instant(
+    low_pass = jb.Filter(40.0, 1, realisation="analogue")
+    case = without_period(
         "ppf",
         actuators=[jb.PointForce(0.19), jb.PointForce(0.4)],
-        sensors=[jb.Sensor(0.19), jb.Sensor(0.4, filter=smooth)],
+        sensors=[jb.Sensor(0.19), jb.Sensor(0.4, filter=low_pass)],
         loads=[jb.MovingForce(force=4.0, speed=2.0)],
     )
     record = jb.simulate(case, times=jnp.asarray(times), tolerance=1e-8)
@@ -219,52 +222,55 @@ def test_a_run_without_sampling_is_that_of_scipy():
     orders = [part[0].shape[0] for part in filters]
 
     def commands(y):
-        seen, found, place = [rows[0] @ y[:n], y[2 * n]], [], 2 * n + 1
-        for (_, _, c, d), order, reading in zip(filters, orders, seen, strict=True):
-            found.append((c @ y[place : place + order] + d[0] * reading).item())
-            place += order
-        return seen, np.array(found)
+        readings, found, start = [rows[0] @ y[:n], y[2 * n]], [], 2 * n + 1
+        for (_, _, c, d), order, reading in zip(filters, orders, readings, strict=True):
+            found.append((c @ y[start : start + order] + d[0] * reading).item())
+            start += order
+        return readings, np.array(found)
 
     def rate(t, y):
-        seen, given = commands(y)
-        push = given @ rows - (4.0 * span.shapes(2.0 * t) if t < 0.3 else 0.0)
-        moved = push - span.frequencies**2 * y[:n] - 0.02 * span.frequencies * y[n : 2 * n]
-        parts, place = [y[n : 2 * n], moved, [cutoff * (rows[1] @ y[:n] - y[2 * n])]], 2 * n + 1
-        for (a, b, _, _), order, reading in zip(filters, orders, seen, strict=True):
-            parts.append(a @ y[place : place + order] + b[:, 0] * reading)
-            place += order
+        readings, command = commands(y)
+        forces = command @ rows - (4.0 * span.shapes(2.0 * t) if t < 0.3 else 0.0)
+        accelerations = (
+            forces - span.frequencies**2 * y[:n] - 0.02 * span.frequencies * y[n : 2 * n]
+        )
+        filter_rate = cutoff * (rows[1] @ y[:n] - y[2 * n])
+        parts, start = [y[n : 2 * n], accelerations, [filter_rate]], 2 * n + 1
+        for (a, b, _, _), order, reading in zip(filters, orders, readings, strict=True):
+            parts.append(a @ y[start : start + order] + b[:, 0] * reading)
+            start += order
         return np.concatenate(parts)
 
     start = np.zeros(2 * n + 1 + sum(orders))
     truth = scipy.integrate.solve_ivp(
         rate, (0.0, 0.2), start, "DOP853", times, rtol=1e-11, atol=1e-14
     ).y.T
-    given = np.array([commands(y)[1] for y in truth])
-    for found, true in ((record.deflection, truth[:, :n] @ rows.T), (record.command, given)):
+    voltages = np.array([commands(y)[1] for y in truth])
+    for found, true in ((record.deflection, truth[:, :n] @ rows.T), (record.command, voltages)):
         assert_allclose(found, true, rtol=0, atol=1e-6 * np.max(np.abs(true)))
 
 
-FAULTS = [
+ERRORS = [
     ({"gains": jnp.ones(1)}, "controller.gains must list one gain for each of 2 actuators, not 1"),
     ({"lag": jnp.ones(3)}, "controller.lag must be one number for all 2 loops or one for each"),
     ({"lag": jnp.asarray(0.0)}, "controller.lag must be positive"),
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), FAULTS)
-def test_faulty_compensators_are_refused(change, message):
+@pytest.mark.parametrize(("change", "message"), ERRORS)
+def test_errors_of_compensators(change, message):
     law = dataclasses.replace(COMPENSATORS["pd"][0], **change)
     with pytest.raises(ValueError, match=re.escape(message)):
         check_case(dataclasses.replace(CASE, controller=law))
 
 
-def test_an_offset_needs_samples():
+def test_offset_in_continuous_time_is_refused():
     sensors = [jb.Sensor(0.19, offset=1e-3), jb.Sensor(0.4)]
     with pytest.raises(ValueError, match=r"controller.period must be given, as sensors.0 has"):
-        check_case(at_every_instant("pd", sensors=sensors))
+        check_case(without_period("pd", sensors=sensors))
 
 
-def test_an_oscillator_too_quick_for_the_sampling_is_refused():
+def test_oscillator_above_the_nyquist_frequency_is_refused():
     law = dataclasses.replace(COMPENSATORS["ppf"][0], period=jnp.asarray(0.012))
     with pytest.raises(
         ValueError, match=r"below half the sampling frequency, 41.6667 Hz; it is 45"
@@ -273,7 +279,7 @@ def test_an_oscillator_too_quick_for_the_sampling_is_refused():
 
 
 @pytest.mark.parametrize("name", COMPENSATORS)
-def test_a_case_file_keeps_the_compensator(name, tmp_path):
+def test_case_file_keeps_the_compensator(name, tmp_path):
     case = dataclasses.replace(CASE, controller=COMPENSATORS[name][0])
     jb.save_case(case, tmp_path / "case.toml")
     assert f'kind = "{name}"' in (tmp_path / "case.toml").read_text()

@@ -1,4 +1,4 @@
-"""Commands that go with the load: against the same history prescribed, and against themselves."""
+"""Position-scheduled feedforward: commands against numpy and against prescribed ones."""
 
 import dataclasses
 
@@ -33,18 +33,18 @@ def rig(controller=LAW, loads=ONE):
 
 
 def commands(case, times):
-    model = jb.state_space(case)
-    seen = Measurement(jnp.zeros(1), jnp.zeros(2), jnp.zeros(1))
+    plant = jb.state_space(case)
+    measurement = Measurement(jnp.zeros(1), jnp.zeros(2), jnp.zeros(1))
 
     @eqx.filter_jit
-    def asked(law, model):
-        memory = law.init(model)
-        return jax.vmap(lambda t: law.step(memory, seen, t)[0])(times)[:, 0]
+    def commands_at_times(controller, plant):
+        law = controller.law(plant)
+        return jax.vmap(lambda t: law.step((), measurement, t).command)(times)[:, 0]
 
-    return asked(case.controller, model)
+    return commands_at_times(case.controller, plant)
 
 
-def test_the_table_is_read_ahead_of_the_load_once_both_gates_are_passed():
+def test_table_is_read_ahead_of_the_load_after_the_second_gate():
     times = np.linspace(0.0, 1.2, 301)
     share = (times + 0.02 - 0.3) * 1.0 / 0.6
     expected = np.interp(share, SHARES, VALUES[0], left=0.0, right=0.0)
@@ -53,16 +53,16 @@ def test_the_table_is_read_ahead_of_the_load_once_both_gates_are_passed():
     assert_allclose(commands(rig(late), times), np.where(times < 0.5, 0.0, expected), atol=1e-12)
 
 
-def test_in_a_run_it_does_what_the_same_commands_prescribed_do():
+def test_run_equals_that_with_prescribed_commands():
     record = jb.simulate(rig())
     table = np.asarray(commands(rig(), record.times))
-    same = jb.Prescribed(offsets=[0.0], times=record.times, values=table[None], period=0.01)
+    prescribed = jb.Prescribed(offsets=[0.0], times=record.times, values=table[None], period=0.01)
     assert_allclose(record.command[:, 0], table, atol=1e-9)
-    assert_allclose(record.deflection, jb.simulate(rig(same)).deflection, atol=1e-12)
+    assert_allclose(record.deflection, jb.simulate(rig(prescribed)).deflection, atol=1e-12)
 
 
-def test_a_load_from_the_right_is_followed_as_well_and_loads_add_up():
-    times = np.linspace(0.003, 1.203, 61)  # not on the edge of the table
+def test_load_from_the_right_and_several_loads():
+    times = np.linspace(0.003, 1.203, 61)  # not at the jumps of the table
     right = (jb.MovingMass(mass=0.4, speed=-1.0, entry_time=0.3),)
     mirrored = dataclasses.replace(LAW, gates=np.array([0.8, 0.7]))
     first = commands(rig(), times)
@@ -72,7 +72,7 @@ def test_a_load_from_the_right_is_followed_as_well_and_loads_add_up():
     assert_allclose(commands(rig(loads=both), times), first + later, atol=1e-12)
 
 
-def test_round_trip_and_what_is_refused():
+def test_case_file_and_errors_of_settings():
     case = rig()
     assert jax.tree.all(
         jax.tree.map(np.array_equal, case_from_dict(case_to_dict(case)).controller, LAW)
@@ -81,8 +81,8 @@ def test_round_trip_and_what_is_refused():
     for changes, loads, message in (
         ({"period": None}, case.loads, "period must be given"),
         ({"values": np.ones((1, 3))}, case.loads, "values must have for each of 1 actuators"),
-        ({"gates": np.array([0.2, 0.1])}, case.loads, "gates must be two places"),
-        ({"gates": np.array([0.1, 0.4])}, slow, "gates must be two places"),
+        ({"gates": np.array([0.2, 0.1])}, case.loads, "gates must be two positions"),
+        ({"gates": np.array([0.1, 0.4])}, slow, "gates must be two positions"),
         ({}, (), "kind needs loads"),
     ):
         with pytest.raises(ValueError, match=message):

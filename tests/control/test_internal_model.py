@@ -1,4 +1,4 @@
-"""Commands that answer the deflection under the load: against scipy's filters and closed forms."""
+"""Internal-model control: against scipy's filters and closed forms."""
 
 import dataclasses
 
@@ -32,32 +32,39 @@ def rig(controller=LAW, **sensor):
 
 
 def lift():
-    """Static deflection at 0.3 m per volt: a sum over sine modes, of moments at the patch ends."""
+    """Static deflection at 0.3 m (m/V): sum over sine modes of the moments at the patch ends."""
     k = np.arange(1, MODES + 1) * np.pi / LENGTH
     moments = k * (np.cos(k * START) - np.cos(k * END))
     return np.sum(MOMENT * moments * np.sin(k * 0.3) * 2 / (LENGTH * RIGIDITY * k**4))
 
 
-def test_commands_are_those_of_the_table_for_readings_without_the_own_lift():
-    """Replayed from what a run recorded, with a filter of scipy's for the lift."""
+def test_commands_by_the_table_for_readings_without_the_lift():
+    """Computed from the record of a run, with scipy's filter of the lift."""
     record = jb.simulate(rig(noise=np.asarray(4e-6)))
-    sent = np.asarray(record.command)[:, 0]
+    commands = np.asarray(record.command)[:, 0]
     sections = scipy.signal.butter(4, 10.0, fs=100.0, output="sos")
-    before = np.append(0.0, sent[:-1])  # in force until the tick
-    caused = scipy.signal.sosfilt(sections, lift() * before)
-    wanted = np.interp(record.measured[:, 0] - 0.9 * caused, READINGS, VALUES[0])
-    assert sent.max() > 6.0
-    # The command of a tick begins two ticks later; limits are not reached.
-    assert_allclose(sent[2:], wanted[:-2], atol=1e-6)
+    previous = np.append(0.0, commands[:-1])  # until the sample
+    filtered_lift = scipy.signal.sosfilt(sections, lift() * previous)
+    load_deflection = record.measured[:, 0] - 0.9 * filtered_lift
+    expected = np.interp(load_deflection, READINGS, VALUES[0])
+    assert commands.max() > 6.0
+    # The command of a sample begins two samples later; limits are not reached.
+    assert_allclose(commands[2:], expected[:-2], atol=1e-6)
 
 
-def test_notches_are_the_analogue_ones_warped_to_their_frequencies():
-    law = dataclasses.replace(LAW, notches=[16.0, 27.0], notch_damping=0.4)
-    made = law.init(jb.state_space(rig(law))).notch_sections
-    # At rest 1, at its frequency 0, and in between what the analogue one gives a warped frequency.
+def test_frequency_responses_of_notches():
+    controller = dataclasses.replace(LAW, notches=[16.0, 27.0], notch_damping=0.4)
+    made = controller.law(jb.state_space(rig(controller))).notch_sections
+    # 1 at rest, 0 at its frequency; between, that of the analogue notch at the warped frequency.
     for hertz, section in zip([16.0, 27.0], np.asarray(made), strict=True):
-        turn, at = 2 * 100.0 * np.tan(np.pi * hertz / 100.0), np.array([0.0, 9.0, hertz])
-        analogue = [1.0, 0.0, turn**2], [1.0, 0.8 * turn, turn**2]
+        angular_frequency, at = (
+            2 * 100.0 * np.tan(np.pi * hertz / 100.0),
+            np.array([0.0, 9.0, hertz]),
+        )
+        analogue = (
+            [1.0, 0.0, angular_frequency**2],
+            [1.0, 0.8 * angular_frequency, angular_frequency**2],
+        )
         warped = 2 * 100.0 * np.tan(np.pi * at / 100.0)
         _, expected = scipy.signal.freqs(*analogue, worN=warped)
         _, found = scipy.signal.freqz(section[:3], section[3:], worN=at, fs=100.0)
@@ -68,37 +75,39 @@ def test_notches_are_the_analogue_ones_warped_to_their_frequencies():
         jb.simulate(rig(dataclasses.replace(LAW, notches=[16.0, 60.0])))
 
 
-def test_it_may_be_steep_where_plain_feedback_of_the_same_slope_is_not_stable():
+def test_stable_where_plain_feedback_of_the_same_slope_is_unstable():
     steep, times = 3e4, np.zeros(1)  # V/m; the load is not on the beam yet
     readings, values = [-2e-4, 2e-4], [[6.0, -6.0]]
-    relief = jb.InternalModel(readings, values, period=0.01, delay=0.02)
+    internal_model = jb.InternalModel(readings, values, period=0.01, delay=0.02)
     plain = jb.Feedback([steep], period=0.01, delay=0.02)
-    smooth = jb.Filter(10.0, order=10)
+    low_pass = jb.Filter(10.0, order=10)
     rates = [
         frozen_poles(
-            dataclasses.replace(rig(law), sensors=(jb.Sensor(0.3, filter=smooth),)), times
+            dataclasses.replace(rig(law), sensors=(jb.Sensor(0.3, filter=low_pass),)), times
         ).largest_real_part[0]
-        for law in (relief, plain)
+        for law in (internal_model, plain)
     ]
     assert rates[0] < -1.0 and rates[1] > 1.0
 
 
-def test_in_a_file():
+def test_case_file_keeps_the_controller():
     case = rig()
-    assert case_to_dict(case)["controller"]["kind"] == "relief"
+    assert case_to_dict(case)["controller"]["kind"] == "internal-model"
     again = case_from_dict(case_to_dict(case))
     assert_allclose(again.controller.readings, READINGS)
     assert_allclose(again.controller.values, VALUES)
 
 
-BAD = [
-    ({"period": None, "delay": None}, {}, "period must be given: kind 'relief' acts at its ticks"),
+ERRORS = [
+    ({"period": None, "delay": None}, {}, "period must be given: kind 'internal-model' acts"),
     ({"values": np.ones((1, 3))}, {}, "as many entries as readings has, 4"),
     ({}, {"quantity": "velocity"}, "needs a sensor of deflection for each of 1 actuators"),
 ]
 
 
-@pytest.mark.parametrize(("changes", "sensor", "message"), BAD, ids=["period", "values", "sensor"])
-def test_what_does_not_fit_is_refused(changes, sensor, message):
+@pytest.mark.parametrize(
+    ("changes", "sensor", "message"), ERRORS, ids=["period", "values", "sensor"]
+)
+def test_errors_of_settings(changes, sensor, message):
     with pytest.raises(ValueError, match=message):
         jb.simulate(rig(dataclasses.replace(LAW, **changes), **sensor))

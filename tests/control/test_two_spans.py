@@ -1,4 +1,4 @@
-"""Displacement feedback of two spans: an oracle with the reference's numbers, and ours with it."""
+"""Displacement feedback of two spans: the oracle against a reference, and runs against both."""
 
 import dataclasses
 import json
@@ -21,7 +21,7 @@ STARTS = (0.2575, 0.8575)
 
 
 def rig(controller=None, cutoff=None, modes=7, speed=0.4, rigidity=12.11, density=0.5411, **run):
-    """Two spans with a patch and a sensor in the middle of each, and the heaviest mass."""
+    """Two spans, each with a patch and a sensor in the middle, and the heaviest mass."""
     filter = None if cutoff is None else jb.Filter(cutoff, 10, realisation="analogue")
     moment = REFERENCE["moment_per_volt"]
     return jb.Case(
@@ -39,7 +39,7 @@ CUBIC = jb.Feedback([2e9, 2e9], 3)
 
 
 def by_sines(case, times):
-    """What the oracle makes of a case in the basis of the reference, at every instant."""
+    """Motion of a case by the oracle in the basis of the reference, in continuous time."""
     sines = ProjectedSines(1.2, 12.11, 0.5411, 8, 0.03)
     _, loads, actuators, sensors = parts_of(case)
 
@@ -49,12 +49,12 @@ def by_sines(case, times):
     return closed_loop.respond(sines, loads, actuators, sensors, law, times)
 
 
-def test_the_oracles_modes():
+def test_modes_of_the_oracle():
     sines = ProjectedSines(1.2, 12.11, 0.5411, 8)
     assert_allclose(sines.frequencies / (2 * np.pi), REFERENCE["frequencies_hz"], rtol=1e-10)
-    pushes = [sines.shapes(x, 1) - sines.shapes(x + 0.085, 1) for x in STARTS]
-    seen = [sines.shapes(x) / sines.frequencies**2 for x in (0.3, 0.9)]
-    lift = REFERENCE["moment_per_volt"] * np.array(seen) @ np.array(pushes).T
+    force_shapes = [sines.shapes(x, 1) - sines.shapes(x + 0.085, 1) for x in STARTS]
+    compliance = [sines.shapes(x) / sines.frequencies**2 for x in (0.3, 0.9)]
+    lift = REFERENCE["moment_per_volt"] * np.array(compliance) @ np.array(force_shapes).T
     assert_allclose(lift, REFERENCE["static_m_per_V"], rtol=1e-10)
     exact = TwoSpans(1.2, 12.11, 0.5411, 7)
     points, weights = np.polynomial.legendre.leggauss(80)
@@ -62,9 +62,10 @@ def test_the_oracles_modes():
     for order, size in ((0, 0.5411), (2, 12.11)):  # orthonormal in mass, and stiffness is omega^2
         shapes = np.array([[exact.shapes(x, order) for x in half] for half in halves])
         found = size * 0.3 * np.einsum("hxm,x,hxn->mn", shapes, weights, shapes)
-        wanted = np.eye(7) if order == 0 else np.diag(exact.frequencies**2)
-        assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.max(wanted))
-    # Curvature and slope go on at the support.
+        expected_product = np.eye(7) if order == 0 else np.diag(exact.frequencies**2)
+        tolerance = 1e-9 * np.max(expected_product)
+        assert_allclose(found, expected_product, rtol=1e-9, atol=tolerance)
+    # Slope and curvature are continuous at the support.
     for order in (0, 1, 2):
         left, right = (exact.shapes(0.6 + d, order) for d in (-1e-12, 1e-12))
         assert_allclose(left, right, atol=1e-6 * np.max(np.abs(exact.shapes(0.3, order))))
@@ -72,7 +73,7 @@ def test_the_oracles_modes():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["open loop", "filtered cubic law"])
-def test_the_oracle_has_the_numbers_of_the_reference(name):
+def test_oracle_against_the_reference(name):
     known = REFERENCE[name]
     case = rig() if name == "open loop" else rig(CUBIC, 20.0)
     found = by_sines(case, np.append(0.0, known["t"]))
@@ -86,8 +87,8 @@ def filtered():
 
 
 @pytest.mark.slow
-def test_reference_numbers(filtered):
-    """Our modes are exact; its seven are of projected sines, by up to 5e-3 stiffer: so near."""
+def test_runs_against_the_reference(filtered):
+    """To 4e-3: modes are exact, those of the reference projected sines, up to 5e-3 stiffer."""
     known, free = REFERENCE["filtered cubic law"], REFERENCE["open loop"]
     largest = max(known["peak_down_mm"])
     at = np.round(np.array(known["t"]) * 100).astype(int)
@@ -96,21 +97,21 @@ def test_reference_numbers(filtered):
     assert_allclose(200 * np.max(filtered.command, axis=0), known["V_max"], rtol=0.015)
     uncontrolled = 1e3 * np.asarray(jb.simulate(rig(), tolerance=1e-6).peak_deflection)
     assert_allclose(uncontrolled, free["peak_down_mm"], rtol=4e-3)
-    # What control takes off is as near: of both the same share is missing.
-    less, known_less = (
+    # The reductions are closer, as both peaks have the same error.
+    reduction, known_reduction = (
         1 - np.divide(*pair)
         for pair in (
             (1e3 * np.asarray(filtered.peak_deflection), uncontrolled),
             (known["peak_down_mm"], free["peak_down_mm"]),
         )
     )
-    assert_allclose(less, known_less, atol=2e-3)
+    assert_allclose(reduction, known_reduction, atol=2e-3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sampled", [False, True])
-def test_loops_of_two_spans_are_those_of_the_oracle(sampled):
-    """Each sensor to its patch; filters, and where it samples, a delay and limits that are felt."""
+def test_loops_of_two_spans_against_the_oracle(sampled):
+    """Each sensor to its patch, with filters; if sampled, with delay and active limits."""
     law = CUBIC
     if sampled:
         law = jb.Feedback([4e3, 3e3], higher_gains=[[4e9, 2e9]], period=0.01, delay=0.003)

@@ -1,7 +1,6 @@
-"""Estimators at every instant, in closed loops: plant and estimator written out, by scipy's DOP853.
+"""Estimators in continuous time, in closed loops: explicit equations by scipy's DOP853.
 
-The beam has a mode more than the design knows of, which believes in another mass, that enters at
-another time.
+The beam has a mode more than the design, which has another mass and entry time of the load.
 """
 
 import dataclasses
@@ -29,12 +28,12 @@ from tests.differences import central
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant
 
-WEIGHTS, EFFORT = [3e4, 3e4, 1.0, 1.0, 0.0], 0.01
+WEIGHTS, COMMAND_WEIGHT = [3e4, 3e4, 1.0, 1.0, 0.0], 0.01
 FORCE, INTENSITY, DEVIATION = 0.02, 1e-13, 2.0
 MASS, SPEED, ENTRY, END = 0.4, 3.0, 0.02, 0.27
-BELIEVED = {"mass": 0.3, "entry_time": 0.03}
+DESIGN = {"mass": 0.3, "entry_time": 0.03}
 TIMES = np.linspace(0.0, END, 55)
-KINDS = {
+ESTIMATORS = {
     "time-invariant": Kalman(FORCE, measurement_intensity=INTENSITY),
     "known": Kalman(FORCE, measurement_intensity=INTENSITY, loads="known", points=80),
     "estimated": Kalman(
@@ -54,16 +53,16 @@ def loop(estimator, modes=3):
         sensors=[jb.Sensor(0.17, offset=1e-5), jb.Sensor(0.25)],
         loads=[jb.MovingMass(mass=MASS, speed=SPEED, entry_time=ENTRY)],
         controller=jb.LQR(
-            WEIGHTS, [EFFORT], design=DesignModel(modes=2, **BELIEVED), estimator=estimator
+            WEIGHTS, [COMMAND_WEIGHT], design=DesignModel(modes=2, **DESIGN), estimator=estimator
         ),
         run=jb.Run(END),
     )
 
 
 def steady_gain(A, C):
-    """The gain of the time-invariant filter, in rates over frequencies, and readings over noise.
+    """Gain of the time-invariant filter by scipy, in scaled states and readings.
 
-    In those units scipy is right to 1e-14; in the others, to 1e-6.
+    In those units scipy is accurate to 1e-14, in SI units to 1e-6.
     """
     scale = np.concatenate([1 / np.sqrt(-np.diag(A[2:, :2])), np.ones(3)])
     scaled, rows = A * scale / scale[:, None], C * scale / np.sqrt(INTENSITY)
@@ -72,53 +71,55 @@ def steady_gain(A, C):
     return scale[:, None] * P @ rows.T / np.sqrt(INTENSITY)
 
 
-class WrittenOut:
+class ExplicitLoop:
     """x' = A x + B u, X' = F X + G u + L (C x - H X), u = -K X, L = P H' / R and P' by Riccati."""
 
     def __init__(self, name):
-        self.name, case = name, loop(KINDS[name])
+        self.name, case = name, loop(ESTIMATORS[name])
         span, loads, *parts = parts_of(case)
         self.truth, self.span = SampledPlant(span, loads, *parts), span
         inner = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, 2, 0.01)
-        still, moving = SampledPlant(inner, [], *parts), name in ("known", "estimated")
-        guessed = dataclasses.replace(loads[0], mass=BELIEVED["mass"], entry_time=ENTRY + 0.01)
-        self.model = SampledPlant(inner, [guessed], *parts) if moving else still
-        A, B, C, _ = still.matrices(0.0)
-        self.gain = control.lqr(A, B, np.diag(WEIGHTS), EFFORT * np.eye(1))[0]
+        unloaded, moving = SampledPlant(inner, [], *parts), name in ("known", "estimated")
+        design_load = dataclasses.replace(loads[0], mass=DESIGN["mass"], entry_time=ENTRY + 0.01)
+        self.model = SampledPlant(inner, [design_load], *parts) if moving else unloaded
+        A, B, C, _ = unloaded.matrices(0.0)
+        self.gain = control.lqr(A, B, np.diag(WEIGHTS), COMMAND_WEIGHT * np.eye(1))[0]
         size, self.moving = self.model.size, moving
         self.intensity = np.diag([0.0, 0.0, FORCE, FORCE, *[0.0] * (size - 4)])
-        spread = DEVIATION**2 if name == "estimated" else 0.0
-        self.first = np.diag([0.0] * 5 + [spread] * moving)
-        self.guess = np.array([0.0] * 5 + [9.81 * BELIEVED["mass"]] * moving)
-        self.listen = np.zeros((size, 2))
+        variance = DEVIATION**2 if name == "estimated" else 0.0
+        self.initial_covariance = np.diag([0.0] * 5 + [variance] * moving)
+        self.initial_estimate = np.array([0.0] * 5 + [9.81 * DESIGN["mass"]] * moving)
+        self.filter_gain = np.zeros((size, 2))
         if name == "time-invariant":
-            self.listen = steady_gain(A, C)
+            self.filter_gain = steady_gain(A, C)
 
     def rate(self, t, y):
         n, m = self.truth.size, self.model.size
         (A, B, C, _), (F, G, H, _) = self.truth.matrices(t), self.model.matrices(t)
-        x, X, listen, change = y[:n], y[n : n + m], self.listen, np.zeros(0)
+        x, X, L, change = y[:n], y[n : n + m], self.filter_gain, np.zeros(0)
         if self.moving:
             P = y[n + m :].reshape(m, m)
-            listen = P @ H.T / INTENSITY
-            change = (F @ P + P @ F.T - listen @ H @ P + self.intensity).ravel()
+            L = P @ H.T / INTENSITY
+            change = (F @ P + P @ F.T - L @ H @ P + self.intensity).ravel()
         u = -self.gain @ X[:5]
-        return np.concatenate([A @ x + B @ u, F @ X + G @ u + listen @ (C @ x - H @ X), change])
+        return np.concatenate([A @ x + B @ u, F @ X + G @ u + L @ (C @ x - H @ X), change])
 
-    def solved(self):
-        """Deflections at the sensors and commands at `TIMES`."""
+    def solve(self):
+        """Deflections (time, sensor) and commands (time, actuator) at `TIMES`."""
         start = np.zeros(self.truth.size)
         start[-1] = 9.81 * MASS
-        y = np.concatenate([start, self.guess, self.first.ravel() if self.moving else []])
+        y = np.concatenate(
+            [start, self.initial_estimate, self.initial_covariance.ravel() if self.moving else []]
+        )
         events = [0.0, ENTRY, ENTRY + 0.01, ENTRY + 0.2, ENTRY + 0.21, END]
         found = {}
         for early, late in zip(events[:-1], events[1:], strict=True):
-            asked = TIMES[(early - 1e-12 <= TIMES) & (late - 1e-12 > TIMES)]
-            ticks = np.append(np.maximum(asked, early), late - 1e-12)
+            inside = TIMES[(early - 1e-12 <= TIMES) & (late - 1e-12 > TIMES)]
+            times = np.append(np.maximum(inside, early), late - 1e-12)
             part = solve_ivp(
-                self.rate, (early, late - 1e-12), y, "DOP853", ticks, rtol=1e-9, atol=1e-14
+                self.rate, (early, late - 1e-12), y, "DOP853", times, rtol=1e-9, atol=1e-14
             )
-            found |= dict(zip(asked, part.y.T, strict=False))
+            found |= dict(zip(inside, part.y.T, strict=False))
             y = part.y[:, -1]
         found[TIMES[-1]] = y
         states = np.array([found[t] for t in TIMES])
@@ -130,25 +131,25 @@ class WrittenOut:
 @pytest.mark.parametrize(
     "name", ["time-invariant", "estimated", pytest.param("known", marks=pytest.mark.slow)]
 )
-def test_loops_with_an_estimator_at_every_instant(name):
-    deflection, command = WrittenOut(name).solved()
-    record = jb.simulate(loop(KINDS[name]), jnp.asarray(TIMES))
+def test_loops_with_a_filter_in_continuous_time(name):
+    deflection, command = ExplicitLoop(name).solve()
+    record = jb.simulate(loop(ESTIMATORS[name]), jnp.asarray(TIMES))
     for found, true in ((record.deflection, deflection), (record.command, command)):
         assert_allclose(found, true, rtol=0, atol=1e-6 * np.max(np.abs(true)))
 
 
-def at_rest(case):
-    """A, B and C of what the design knows of a case without its load, and the regulator."""
+def unloaded_design(case):
+    """A, B and C of the design plant without its load, and the gain of the regulator."""
     span, _, *parts = parts_of(case)
     inner = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, 2, 0.01)
     A, B, C, _ = SampledPlant(inner, [], *parts).matrices(0.0)
-    return A, B, C, control.lqr(A, B, np.diag(WEIGHTS), EFFORT * np.eye(1))[0]
+    return A, B, C, control.lqr(A, B, np.diag(WEIGHTS), COMMAND_WEIGHT * np.eye(1))[0]
 
 
 def test_poles_of_a_loop_with_a_kalman_filter():
-    """Those of [[A, -B K], [L C, F - G K - L H]], the beam richer than the filter knows."""
-    case = loop(KINDS["time-invariant"])
-    F, G, H, K = at_rest(case)
+    """Those of [[A, -B K], [L C, F - G K - L H]], on a beam with more modes than the design."""
+    case = loop(ESTIMATORS["time-invariant"])
+    F, G, H, K = unloaded_design(case)
     span, _, *parts = parts_of(case)
     A, B, C, _ = SampledPlant(span, [], *parts).matrices(0.0)
     L = steady_gain(F, H)
@@ -158,19 +159,22 @@ def test_poles_of_a_loop_with_a_kalman_filter():
     assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-6)
 
 
-def test_poles_of_an_observer_are_where_they_were_wanted():
+def test_poles_of_a_loop_with_an_observer():
     """Those of the regulator, and one and a half times those of the beam (Luenberger)."""
     case = loop(Observer(speed=1.5), modes=2)
-    A, B, _, K = at_rest(case)
-    own = 1.5 * np.linalg.eigvals(A[:4, :4]), [-400.0]  # and of the shaker, uncorrected
-    expected = np.concatenate([np.linalg.eigvals(A - B @ K), *own])
+    A, B, _, K = unloaded_design(case)
+    observer_poles = (
+        1.5 * np.linalg.eigvals(A[:4, :4]),
+        [-400.0],
+    )  # the last of the shaker, uncorrected
+    expected = np.concatenate([np.linalg.eigvals(A - B @ K), *observer_poles])
     found = np.asarray(linearised_loop(case, -1.0).poles())
     assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-6)
 
 
 @pytest.mark.slow
 def test_gradients():
-    case = loop(KINDS["estimated"], modes=2)
+    case = loop(ESTIMATORS["estimated"], modes=2)
     names = ("process_noise", "measurement_intensity", "weight_deviation")
     sizes = jnp.array([FORCE, INTENSITY, DEVIATION])
     times = jnp.asarray(TIMES)
@@ -188,8 +192,8 @@ def test_gradients():
     assert_allclose(jax.jit(jax.jacfwd(cost))(at), expected, rtol=1e-6)
 
 
-def test_case_files_hold_them():
-    case = loop(KINDS["estimated"])
+def test_case_file_keeps_the_estimator():
+    case = loop(ESTIMATORS["estimated"])
     assert case_from_dict(case_to_dict(case)).controller.estimator.points == 80
 
 
@@ -197,14 +201,14 @@ def test_case_files_hold_them():
     ("estimator", "period", "message"),
     [
         (Kalman(FORCE), None, "measurement_intensity must be given without a controller.period"),
-        (KINDS["known"], 1e-3, "measurement_intensity must be given without"),
+        (ESTIMATORS["known"], 1e-3, "measurement_intensity must be given without"),
         (Kalman(FORCE, 1e-5, measurement_intensity=1e-13), None, "measurement_noise is that of"),
         (Kalman(FORCE, measurement_intensity=[1e-13] * 3), None, "one number or 2, not 3"),
-        (dataclasses.replace(KINDS["known"], points=3), None, "points must be at least"),
-        (Inversion(), None, "period must be given: this estimator steps"),
+        (dataclasses.replace(ESTIMATORS["known"], points=3), None, "points must be at least"),
+        (Inversion(), None, "period must be given: this estimator acts at samples only"),
     ],
 )
-def test_faults_are_named(estimator, period, message):
+def test_errors_of_settings(estimator, period, message):
     case = loop(estimator)
     period = None if period is None else jnp.asarray(period)
     law = dataclasses.replace(case.controller, period=period)

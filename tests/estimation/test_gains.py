@@ -1,4 +1,4 @@
-"""Gains against python-control, scipy and each other; transitions against scipy's integrals."""
+"""Gains against python-control and scipy; sampled transitions against scipy."""
 
 import control
 import jax
@@ -31,19 +31,18 @@ CONTINUOUS, SAMPLED, PLACED = map(jax.jit, (kalman_gain, sampled_kalman_gain, pl
 
 
 @jax.jit
-def _transition(ticks):
-    return ticks.transition(lambda t: (A, jnp.eye(6, 1)), Q, balance(A))
+def _transition(timing):
+    return timing.transition(lambda t: (A, jnp.eye(6, 1)), Q, balance(A))
 
 
-def transition(period, late=None):
-    """Over a period (s) whose command begins late by some s."""
-    return _transition(
-        SampleTiming(jnp.asarray(period), None if late is None else jnp.asarray(late))
-    )
+def transition(period, delay=None):
+    """Transition over a period (s) in which the command begins after a delay (s)."""
+    delay = None if delay is None else jnp.asarray(delay)
+    return _transition(SampleTiming(jnp.asarray(period), delay))
 
 
 def test_kalman_gain_in_continuous_time():
-    """In units in which python-control loses no digits: coordinates times frequencies."""
+    """In coordinates times frequencies, in which python-control is accurate."""
     units = np.concatenate([FREQUENCIES, np.ones(3)])[:, None]
     gain, covariance, _ = control.lqe(A * units / units.T, np.eye(6), C / units.T, Q, R)
     found = CONTINUOUS(A, C, Q, R)
@@ -55,83 +54,82 @@ def test_kalman_gain_in_continuous_time():
 
 def test_sampled_kalman_gain():
     step = transition(2e-3)
-    drift, noise = step.transition, step.noise
-    gain, covariance, _ = control.dlqe(drift, np.eye(6), C, noise, R)
-    found = SAMPLED(drift, C, noise, R)
+    matrix, noise = step.matrix, step.noise_covariance
+    gain, covariance, _ = control.dlqe(matrix, np.eye(6), C, noise, R)
+    found = SAMPLED(matrix, C, noise, R)
     scale = np.sqrt(np.diag(covariance))
     outer = scale * scale[:, None]
     assert_allclose(found[1] / outer, covariance / outer, rtol=0, atol=1e-9)
-    # Its gain is for the prediction of the next state.
-    assert_allclose(drift @ found[0] / scale[:, None], gain / scale[:, None], rtol=0, atol=1e-9)
-    direct = scipy.linalg.solve_discrete_are(drift.T, C.T, noise, R)
+    # The gain of python-control is that of the prediction of the next state.
+    assert_allclose(matrix @ found[0] / scale[:, None], gain / scale[:, None], rtol=0, atol=1e-9)
+    direct = scipy.linalg.solve_discrete_are(matrix.T, C.T, noise, R)
     assert_allclose(direct / outer, covariance / outer, rtol=0, atol=1e-9)
 
 
-def test_sampled_gains_become_the_continuous_one():
-    """A reading each period with noise of covariance R / period is noise of intensity R."""
-    whole, covariance = CONTINUOUS(A, C, Q, R)
+def test_sampled_gain_tends_to_the_continuous_one():
+    """Samples with noise of covariance R / period tend to noise of intensity R."""
+    continuous, covariance = CONTINUOUS(A, C, Q, R)
     scale = np.sqrt(np.diag(covariance))[:, None]
-    short = []
+    errors = []
     for period in (2e-5, 1e-5):
         step = transition(period)
-        gain, _ = SAMPLED(step.transition, C, step.noise, R / period)
-        short.append(
-            np.max(np.abs((gain / period - whole) / scale)) / np.max(np.abs(whole / scale))
-        )
-    assert short[1] < 0.01
-    assert short[1] / short[0] == pytest.approx(0.5, abs=0.02)
+        gain, _ = SAMPLED(step.matrix, C, step.noise_covariance, R / period)
+        error = np.max(np.abs((gain / period - continuous) / scale))
+        errors.append(error / np.max(np.abs(continuous / scale)))
+    assert errors[1] < 0.01
+    assert errors[1] / errors[0] == pytest.approx(0.5, abs=0.02)
 
 
-@pytest.mark.parametrize("late", [None, 7e-4])
-def test_transitions_of_a_plant_that_stays_as_it_is(late):
-    """Noise by Van Loan's block exponential, pushes by differences of held inputs."""
-    period, step = 2e-3, transition(2e-3, late)
-    drift = scipy.linalg.expm(A * period)
+@pytest.mark.parametrize("delay", [None, 7e-4])
+def test_transition_of_a_time_invariant_plant(delay):
+    """Noise by Van Loan's block exponential, inputs by A^-1 (exp(A s) - 1) B."""
+    period, step = 2e-3, transition(2e-3, delay)
+    matrix = scipy.linalg.expm(A * period)
     block = scipy.linalg.expm(np.block([[-A, Q], [np.zeros((6, 6)), A.T]]) * period)
     noise = block[6:, 6:].T @ block[:6, 6:]
-    push = {
+    inputs = {
         s: np.linalg.solve(A, (scipy.linalg.expm(A * s) - np.eye(6)) @ np.eye(6, 1))
-        for s in (period, 0.0 if late is None else period - late)
+        for s in (period, 0.0 if delay is None else period - delay)
     }
-    after = push[period] if late is None else push[period - late]
+    current = inputs[period] if delay is None else inputs[period - delay]
     scale = np.sqrt(np.diag(noise))
     outer = scale * scale[:, None]
-    assert_allclose(
-        step.transition * scale / scale[:, None], drift * scale / scale[:, None], atol=1e-11
-    )
-    assert_allclose(step.noise / outer, noise / outer, rtol=0, atol=1e-10)
-    assert_allclose(step.after / scale[:, None], after / scale[:, None], rtol=1e-9, atol=1e-9)
-    whole = (step.before + step.after) / scale[:, None]
-    assert_allclose(whole, push[period] / scale[:, None], rtol=1e-9, atol=1e-9)
+    column = scale[:, None]
+    assert_allclose(step.matrix * scale / column, matrix * scale / column, atol=1e-11)
+    assert_allclose(step.noise_covariance / outer, noise / outer, rtol=0, atol=1e-10)
+    assert_allclose(step.input_matrix / column, current / column, rtol=1e-9, atol=1e-9)
+    both = (step.previous_input_matrix + step.input_matrix) / column
+    assert_allclose(both, inputs[period] / column, rtol=1e-9, atol=1e-9)
 
 
-def test_one_output_leaves_one_choice_of_gain():
+def test_placed_gain():
+    """With one output the gain is unique; with two the poles are placed."""
     poles = np.array([-100 + 80j, -150 + 500j, -200 + 1100j])
     poles = np.concatenate([poles, poles.conj()])
-    wanted = jnp.block(
+    desired = jnp.block(
         [
             [np.zeros((3, 3)), np.eye(3)],
             [-np.diag(np.abs(poles[:3]) ** 2), np.diag(2 * poles[:3].real)],
         ]
     )
-    gain = PLACED(A, C[:1], wanted)
+    gain = PLACED(A, C[:1], desired)
     scale = np.concatenate([np.ones(3), FREQUENCIES])[:, None]
     expected = scipy.signal.place_poles(A.T, C[:1].T, poles).gain_matrix.T
     assert_allclose(gain / scale, expected / scale, rtol=1e-7)
-    both = PLACED(A, C, wanted)
+    both = PLACED(A, C, desired)
     assert_allclose(np.sort_complex(np.linalg.eigvals(A - both @ C)), np.sort_complex(poles))
 
 
 def test_gradients_of_gains():
     step = transition(2e-3)
-    drift, noise = step.transition, step.noise
+    matrix, noise = step.matrix, step.noise_covariance
 
     @jax.jit
     def gains(point):
         rows = C * jnp.array([[1.0], [point[0]]])
         found = (
-            PLACED(drift, rows, point[1] * drift),
-            SAMPLED(drift, rows, point[2] * noise, R)[0],
+            PLACED(matrix, rows, point[1] * matrix),
+            SAMPLED(matrix, rows, point[2] * noise, R)[0],
             CONTINUOUS(A, rows, point[2] * Q, R)[0],
         )
         return jnp.stack([gain[:3] for gain in found]).reshape(3, -1)

@@ -1,4 +1,4 @@
-"""Kalman filters against Gaussian conditioning by brute force, and their own statistics."""
+"""Kalman filters against brute-force Gaussian conditioning; statistics of innovations."""
 
 import dataclasses
 
@@ -12,6 +12,7 @@ from scipy.stats import chi2
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.estimation.kalman import Kalman
+from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.modes import mesh_layout
 from tests.differences import central
 from tests.loop_as_oracle import parts_of
@@ -43,43 +44,48 @@ def with_delay(case, delay):
 
 
 @jax.jit
-def filtered(kalman, case, commands, readings):
-    """The memory after the last tick; and from every tick the estimate and the squared surprise."""
+def filter_readings(kalman, case, commands, readings):
+    """State of the filter after the last sample; estimates and squared innovations (sample, ...).
 
-    def tick(memory, at):
-        t, command, reading = at
-        surprise = jnp.zeros(())
+    Innovations are squared over their covariance.
+    """
+    plant = jb.state_space(case, layout=LAYOUT)
+    filter = kalman.sampled_filter(plant, sample_timing(case.controller))
+
+    def update(state, sample):
+        t, command, reading = sample
+        square = jnp.zeros(())
         if kalman.loads != "ignored":
-            expected = memory.predicted(command, t)
-            short = reading - expected.readings
-            surprise = short @ jnp.linalg.solve(expected.spread, short)
+            prediction = filter.predict(state, command, t)
+            innovation = reading - prediction.readings
+            square = innovation @ jnp.linalg.solve(prediction.innovation_covariance, innovation)
         measurement = Measurement(reading, jnp.zeros(5), command)
-        estimate, memory = kalman.step(memory, measurement, t)
-        return memory, (estimate, surprise)
+        estimate, state = filter.update(state, measurement, t)
+        return state, (estimate, square)
 
-    start = kalman.init(jb.state_space(case, layout=LAYOUT))
-    return jax.lax.scan(tick, start, (PERIOD * jnp.arange(len(readings)), commands, readings))
+    samples = PERIOD * jnp.arange(len(readings)), commands, readings
+    return jax.lax.scan(update, filter.initial_state(), samples)
 
 
-def oracle(case, ticks, delay=0.0, loaded=True):
-    """Transitions, rows of the readings and intensity of the noise, by the oracle."""
+def oracle(case, samples, delay=0.0, loaded=True):
+    """Transitions and rows (C, D) of the readings at the samples, by the oracle."""
     span, loads, actuators, sensors = parts_of(case)
     plant = SampledPlant(span, loads if loaded else [], actuators, sensors)
     intensity = np.diag([0.0, 0.0, *FORCES, 0.0, *([0.0] * loaded)])
-    times = PERIOD * np.arange(ticks if loaded else 1)
+    times = PERIOD * np.arange(samples if loaded else 1)
     steps = [plant.step(t, PERIOD, delay, intensity) for t in times]
     rows = [plant.matrices(t)[2:] for t in times]
-    return (steps, rows) if loaded else (steps * ticks, rows * ticks)
+    return (steps, rows) if loaded else (steps * samples, rows * samples)
 
 
-def signals(ticks):
-    """Some commands and readings; no filter cares whether they fit."""
+def signals(samples):
+    """Random commands and readings."""
     random = np.random.default_rng(1)
-    return random.normal(size=(ticks, 1)), NOISE * random.normal(size=(ticks, 4)) * 10
+    return random.normal(size=(samples, 1)), NOISE * random.normal(size=(samples, 4)) * 10
 
 
 @pytest.mark.parametrize(
-    ("kalman", "delay", "ticks"),
+    ("kalman", "delay", "samples"),
     [
         (Kalman(FORCES), 0.0022, 240),
         (Kalman(FORCES, loads="known"), None, 8),
@@ -87,13 +93,15 @@ def signals(ticks):
     ],
     ids=lambda x: getattr(x, "loads", None),
 )
-def test_estimates_are_those_of_gaussian_conditioning(kalman, delay, ticks):
-    """The time-invariant filter has forgotten its start by the last tick."""
+def test_estimates_by_gaussian_conditioning(kalman, delay, samples):
+    """The time-invariant filter has forgotten its initial state by the last sample."""
     loaded = kalman.loads != "ignored"
-    commands, readings = signals(ticks)
-    memory, (estimate, _) = filtered(kalman, with_delay(CASE, delay), commands, readings)
-    within = 0.0 if delay is None else delay % PERIOD
-    steps, rows = oracle(CASE, ticks, within, loaded)
+    commands, readings = signals(samples)
+    filter_state, (estimate, _) = filter_readings(
+        kalman, with_delay(CASE, delay), commands, readings
+    )
+    remainder = 0.0 if delay is None else delay % PERIOD
+    steps, rows = oracle(CASE, samples, remainder, loaded)
     size = steps[0].transition.shape[0]
     mean, covariance = np.zeros(size), np.zeros((size, size))
     if loaded:
@@ -103,45 +111,46 @@ def test_estimates_are_those_of_gaussian_conditioning(kalman, delay, ticks):
         (mean, covariance), steps, rows, np.diag(NOISE**2), commands, readings - OFFSET
     )
     scale = np.sqrt(np.diag(covariance)) + 1e-6 * np.abs(state)
-    assert_allclose(memory.state / scale, state / scale, rtol=0, atol=1e-4)
+    assert_allclose(filter_state[0] / scale, state / scale, rtol=0, atol=1e-4)
     if loaded:
         outer = scale * scale[:, None]
-        assert_allclose(memory.covariance / outer, covariance / outer, rtol=0, atol=1e-4)
+        assert_allclose(filter_state.covariance / outer, covariance / outer, rtol=0, atol=1e-4)
     if kalman.loads == "estimated":
         assert_allclose(estimate.weights[-1, 0], state[-1], rtol=1e-4)
     else:
         assert estimate.weights is None
 
 
-def test_surprises_and_errors_are_as_large_as_stated():
-    """Squares of surprises and errors over their covariances follow chi-square laws."""
-    runs, ticks = 200, 8
+def test_innovations_and_errors_have_the_stated_covariance():
+    """Squares over their covariances follow chi-square distributions."""
+    runs, samples = 200, 8
     random = np.random.default_rng(2)
-    steps, rows = oracle(CASE, ticks)
+    steps, rows = oracle(CASE, samples)
     state = np.zeros((runs, 6))
     state[:, -1] = 0.4 * 9.81 + DEVIATION * random.normal(size=runs)
-    commands, readings = random.normal(size=(runs, ticks, 1)), np.zeros((runs, ticks, 4))
-    before = np.zeros((runs, 1))
+    commands, readings = random.normal(size=(runs, samples, 1)), np.zeros((runs, samples, 4))
+    previous = np.zeros((runs, 1))
     for k, (step, (C, D)) in enumerate(zip(steps, rows, strict=True)):
         values, vectors = np.linalg.eigh(step.noise)
         root = vectors * np.sqrt(np.maximum(values, 0))
-        now = commands[:, k]
-        state = state @ step.transition.T + before @ step.before.T + now @ step.after.T
-        state, before = state + random.normal(size=(runs, 6)) @ root.T, now
-        readings[:, k] = state @ C.T + now @ D.T + OFFSET + NOISE * random.normal(size=(runs, 4))
-    each = jax.vmap(filtered, in_axes=(None, None, 0, 0))
-    memory, (estimate, surprise) = each(ESTIMATED, CASE, commands, readings)
-    low, high = chi2.interval(0.999, 4 * runs * ticks)
-    assert low < np.sum(surprise) < high
-    # The state of the shaker is known for certain.
+        command = commands[:, k]
+        state = state @ step.transition.T + previous @ step.before.T + command @ step.after.T
+        state, previous = state + random.normal(size=(runs, 6)) @ root.T, command
+        noise = NOISE * random.normal(size=(runs, 4))
+        readings[:, k] = state @ C.T + command @ D.T + OFFSET + noise
+    for_runs = jax.vmap(filter_readings, in_axes=(None, None, 0, 0))
+    filter_state, (estimate, squares) = for_runs(ESTIMATED, CASE, commands, readings)
+    low, high = chi2.interval(0.999, 4 * runs * samples)
+    assert low < np.sum(squares) < high
+    # The state of the shaker has no noise.
     kept = np.array([0, 1, 2, 3, 5])
-    error = (np.asarray(memory.state) - state)[:, kept]
-    covariance = np.asarray(memory.covariance)[:, kept[:, None], kept]
+    error = (np.asarray(filter_state.x) - state)[:, kept]
+    covariance = np.asarray(filter_state.covariance)[:, kept[:, None], kept]
     squares = np.einsum("ri,ri->r", error, np.linalg.solve(covariance, error[..., None])[..., 0])
     low, high = chi2.interval(0.999, 5 * runs)
     assert low < np.sum(squares) < high
-    assert np.all(np.sqrt(covariance[:, 4, 4]) < 0.6 * DEVIATION)  # it has learnt something
-    assert_allclose(estimate.weights[:, -1, 0], memory.state[:, -1])
+    assert np.all(np.sqrt(covariance[:, 4, 4]) < 0.6 * DEVIATION)  # the readings reduce it
+    assert_allclose(estimate.weights[:, -1, 0], filter_state.x[:, -1])
 
 
 def test_gradients():
@@ -154,7 +163,7 @@ def test_gradients():
         kalman = dataclasses.replace(
             ESTIMATED, process_noise=point[2] * FORCES, weight_deviation=point[3]
         )
-        estimate = filtered(kalman, case, commands, readings)[1][0]
+        estimate = filter_readings(kalman, case, commands, readings)[1][0]
         return jnp.sum((estimate.state[:, 2:4] * 100) ** 2)
 
     at = jnp.array([0.4, 1.0, 1.0, 2.0])

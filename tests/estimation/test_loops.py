@@ -1,4 +1,4 @@
-"""Estimators in closed loops, on beams with more modes than they know of, against numpy's."""
+"""Kalman filters in closed loops on beams with more modes than the design, against numpy."""
 
 import control
 import jax
@@ -42,28 +42,28 @@ def loop(estimator, command_weight=0.01, delay: float | None = DELAY, loads=True
     )
 
 
-def known_plant(case, loaded=False):
-    """What the estimator knows of the plant, by the oracle."""
+def design_plant(case, loaded=False):
+    """Design plant of the estimator, by the oracle."""
     span, loads, *parts = parts_of(case)
     span = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, MODES, 0.01)
     return SampledPlant(span, loads if loaded else [], *parts)
 
 
 def regulator(case):
-    A, B, _, _ = known_plant(case).matrices(0.0)
+    A, B, _, _ = design_plant(case).matrices(0.0)
     return control.lqr(A, B, np.diag(WEIGHTS), case.controller.command_weight[0] * np.eye(1))[0]
 
 
 class NumpyKalman:
-    """The law as numpy would have it; its covariance starts from certain rest, or is steady."""
+    """Law and filter in numpy; the covariance starts from rest without error, or is steady."""
 
     def __init__(self, case, loaded):
         self.gain, self.loaded = regulator(case), loaded
-        self.plant = known_plant(case, loaded)
+        self.plant = design_plant(case, loaded)
         size = self.plant.size
         self.intensity = np.diag([0, 0, FORCE, FORCE, 0.0] + [0.0] * loaded)
         self.state, self.covariance = np.zeros(size), np.zeros((size, size))
-        self.acting, self.next = np.zeros(1), np.zeros(1)
+        self.previous, self.command = np.zeros(1), np.zeros(1)
         if loaded:
             self.state[-1], self.covariance[-1, -1] = 0.4 * 9.81, 4.0
             return
@@ -74,19 +74,19 @@ class NumpyKalman:
         )
 
     def __call__(self, readings, state, t):
-        now = self.next
+        now = self.command
         step = self.step if not self.loaded else self.plant.step(t, PERIOD, DELAY, self.intensity)
         C = self.plant.matrices(t)[2]
-        prior = step.transition @ self.state + step.before @ self.acting + step.after @ now
-        spread = self.covariance
+        prior = step.transition @ self.state + step.before @ self.previous + step.after @ now
+        P = self.covariance
         if self.loaded:
-            spread = step.transition @ spread @ step.transition.T + step.noise
-        gain = spread @ C.T @ np.linalg.inv(C @ spread @ C.T + NOISE**2 * np.eye(2))
+            P = step.transition @ P @ step.transition.T + step.noise
+        gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + NOISE**2 * np.eye(2))
         if self.loaded:
-            self.covariance = spread - gain @ C @ spread
-        self.state, self.acting = prior + gain @ (readings - C @ prior), now
-        self.next = -self.gain @ self.state[:5]
-        return self.next
+            self.covariance = P - gain @ C @ P
+        self.state, self.previous = prior + gain @ (readings - C @ prior), now
+        self.command = -self.gain @ self.state[:5]
+        return self.command
 
 
 def run(case):
@@ -102,8 +102,8 @@ def run(case):
         (Kalman(FORCE, NOISE, loads="estimated", weight_deviation=2.0), 1e-4),
     ],
 )
-def test_estimates_fed_back(kalman, tolerance):
-    """A crossing of a beam with two modes more than the design has."""
+def test_feedback_of_estimates(kalman, tolerance):
+    """Crossing of a beam with two modes more than the design."""
     case = loop(kalman)
     record = run(case)
     truth = expected(case, TIMES, NumpyKalman(case, kalman.loads == "estimated"))
@@ -112,40 +112,40 @@ def test_estimates_fed_back(kalman, tolerance):
 
 
 def sampled_loop(case, modes):
-    """The closed loop on a beam with some modes, from tick to tick: plant and estimate."""
+    """Transition of the closed loop over a period on a beam with some modes: plant and estimate."""
     span, _, *parts = parts_of(case)
     span = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, modes, 0.01)
-    plant, inner = SampledPlant(span, [], *parts), known_plant(case)
+    plant, inner = SampledPlant(span, [], *parts), design_plant(case)
     zero = np.zeros((plant.size, plant.size))
     step, C = plant.step(0.0, PERIOD, 0.0, zero), plant.matrices(0.0)[2]
-    believed = inner.step(0.0, PERIOD, 0.0, np.diag([0, 0, FORCE, FORCE, 0.0]))
-    seen = inner.matrices(0.0)[2]
+    design = inner.step(0.0, PERIOD, 0.0, np.diag([0, 0, FORCE, FORCE, 0.0]))
+    rows = inner.matrices(0.0)[2]
     covariance = scipy.linalg.solve_discrete_are(
-        believed.transition.T, seen.T, believed.noise, NOISE**2 * np.eye(2)
+        design.transition.T, rows.T, design.noise, NOISE**2 * np.eye(2)
     )
-    gain = covariance @ seen.T @ np.linalg.inv(seen @ covariance @ seen.T + NOISE**2 * np.eye(2))
-    law = regulator(case)
-    left = (np.eye(inner.size) - gain @ seen) @ (believed.transition - believed.after @ law)
+    gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + NOISE**2 * np.eye(2))
+    K = regulator(case)
+    estimate_matrix = (np.eye(inner.size) - gain @ rows) @ (design.transition - design.after @ K)
     return np.block(
         [
-            [step.transition, -step.after @ law],
-            [gain @ C @ step.transition, left - gain @ C @ step.after @ law],
+            [step.transition, -step.after @ K],
+            [gain @ C @ step.transition, estimate_matrix - gain @ C @ step.after @ K],
         ]
     )
 
 
 @pytest.mark.slow
-def test_modes_that_are_not_modelled_spill_over():
-    """A hasty loop, stable on the beam of the design, is unstable on the richer one."""
-    radius = {}  # of the loops on both beams, for two weights of the command
+def test_spillover():
+    """A loop of high gain is stable on the beam of the design, unstable on that of more modes."""
+    radius = {}  # spectral radius on both beams, for two weights of the command
     for weight in (0.3, 1e-4):
         case = loop(Kalman(FORCE, NOISE), weight, None, loads=False)
         found = np.linalg.eigvals(linearised_loop(case, 0.0).closed_matrix)
         expected = np.linalg.eigvals(sampled_loop(case, 4))
         largest = -np.sort(-np.abs(expected))[:6]
         assert_allclose(-np.sort(-np.abs(found))[:6], largest, rtol=1e-6)
-        alone = np.max(np.abs(np.linalg.eigvals(sampled_loop(case, MODES))))
-        radius[weight] = alone, largest[0]
+        design = np.max(np.abs(np.linalg.eigvals(sampled_loop(case, MODES))))
+        radius[weight] = design, largest[0]
     assert max(radius[0.3]) < 1
     assert radius[1e-4][0] < 1 < radius[1e-4][1]
 

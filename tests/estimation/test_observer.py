@@ -1,4 +1,4 @@
-"""The observer's poles are where they were asked for, also in the closed loop."""
+"""Poles of the Luenberger observer, alone and in closed loops."""
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.estimation.observer import Observer
+from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.modes import mesh_layout
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant
@@ -34,7 +35,7 @@ def sorted_poles(values):
 
 
 def matrices(case):
-    """Of the plant by the oracle: sampled state and command matrix, rows of the sensors."""
+    """A, sampled A and B, C and D of the plant by the oracle."""
     plant = SampledPlant(*parts_of(case))
     step = plant.step(0.0, PERIOD, 0.0, np.zeros((5, 5)))
     A, _, C, D = plant.matrices(0.0)
@@ -43,58 +44,63 @@ def matrices(case):
 
 @pytest.mark.parametrize("observer", [Observer(speed=2.5), Observer(poles=POLES)])
 def test_poles(observer):
-    """exp(p period) for every pole p asked for, and the shaker's own, which stays."""
+    """exp(p period) for every desired pole p, and that of the shaker, which is not corrected."""
     case = loop(observer)
     layout = mesh_layout(case)
-    memory = jax.jit(lambda c: observer.init(jb.state_space(c, layout=layout)))(case)
-    A, drift, _, C, _ = matrices(case)
+    timing = sample_timing(case.controller)
+
+    @jax.jit
+    def design(case):
+        return observer.sampled_filter(jb.state_space(case, layout=layout), timing)
+
+    A, transition, _, C, _ = matrices(case)
     if observer.poles is None:
-        wanted = 2.5 * np.linalg.eigvals(A[:4, :4])
+        desired = 2.5 * np.linalg.eigvals(A[:4, :4])
     else:
-        wanted = np.array([[a + 1j * b, a - 1j * b] for a, b in POLES]).ravel()
-    error = (np.eye(5) - np.asarray(memory.gain) @ C) @ drift
-    expected = np.exp(PERIOD * np.append(wanted, -400.0))
+        desired = np.array([[a + 1j * b, a - 1j * b] for a, b in POLES]).ravel()
+    error = (np.eye(5) - np.asarray(design(case).gain) @ C) @ transition
+    expected = np.exp(PERIOD * np.append(desired, -400.0))
     assert_allclose(sorted_poles(np.linalg.eigvals(error)), sorted_poles(expected), atol=1e-8)
 
 
-def test_an_observer_does_not_shift_the_poles_of_the_regulator():
-    """The loop has the poles of state feedback and those of the observer: separation."""
+def test_separation():
+    """The loop has the poles of state feedback and those of the observer."""
     case = loop(Observer(poles=POLES))
-    _, drift, push, _, _ = matrices(case)
-    law = np.linalg.eigvals(drift - push @ np.array(GAIN))
-    wanted = np.array([[a + 1j * b, a - 1j * b] for a, b in POLES]).ravel()
-    expected = np.concatenate([law, np.exp(PERIOD * np.append(wanted, -400.0))])
+    _, transition, input_matrix, _, _ = matrices(case)
+    law = np.linalg.eigvals(transition - input_matrix @ np.array(GAIN))
+    desired = np.array([[a + 1j * b, a - 1j * b] for a, b in POLES]).ravel()
+    expected = np.concatenate([law, np.exp(PERIOD * np.append(desired, -400.0))])
     found = np.linalg.eigvals(linearised_loop(case, 0.0).closed_matrix)
-    found = found[np.abs(found) > 1e-6]  # what the loop remembers beside them is forgotten at once
+    found = found[np.abs(found) > 1e-6]  # the last command among the states has poles at zero
     assert_allclose(sorted_poles(found), sorted_poles(expected), atol=1e-7)
 
 
-def test_the_error_dies_away_as_the_poles_say():
+def test_decay_of_the_error():
     case = loop(Observer(poles=POLES), delay=4e-4)
-    observer, layout = case.controller.estimator, mesh_layout(case)
+    controller, layout = case.controller, mesh_layout(case)
     plant = SampledPlant(*parts_of(case))
     step = plant.step(0.0, PERIOD, 4e-4, np.zeros((5, 5)))
     _, _, C, D = plant.matrices(0.0)
     commands = np.random.default_rng(0).normal(size=(60, 1))
-    state, before, readings, states = np.array([1e-3, -1e-3, 0.1, 0.2, 0.0]), np.zeros(1), [], []
-    for now in commands:
-        state = step.transition @ state + step.before @ before + step.after @ now
-        readings.append(C @ state + D @ now)
+    state, previous, readings, states = np.array([1e-3, -1e-3, 0.1, 0.2, 0.0]), np.zeros(1), [], []
+    for command in commands:
+        state = step.transition @ state + step.before @ previous + step.after @ command
+        readings.append(C @ state + D @ command)
         states.append(state)
-        before = now
+        previous = command
 
     @jax.jit
     def estimates(case):
-        model = jb.state_space(case, layout=layout)
+        plant = jb.state_space(case, layout=layout)
+        filter = controller.estimator.sampled_filter(plant, sample_timing(controller))
 
-        def tick(memory, at):
-            estimate, memory = observer.step(
-                memory, Measurement(at[0], jnp.zeros(5), at[1]), jnp.zeros(())
-            )
-            return memory, estimate.state
+        def update(state, sample):
+            measurement = Measurement(sample[0], jnp.zeros(5), sample[1])
+            estimate, state = filter.update(state, measurement, jnp.zeros(()))
+            return state, estimate.state
 
-        signals = jnp.asarray(readings), jnp.asarray(commands)
-        return jax.lax.scan(tick, observer.init(model), signals)[1]
+        samples = jnp.asarray(readings), jnp.asarray(commands)
+        return jax.lax.scan(update, filter.initial_state(), samples)[1]
 
     error = np.abs(estimates(case) - np.array(states)) / np.max(np.abs(states), 0)
     decay = np.exp(-100 * PERIOD * np.arange(60))[:, None]
@@ -112,12 +118,12 @@ def test_the_error_dies_away_as_the_poles_say():
         (Observer(speed=0.5), "speed must be above 1"),
     ],
 )
-def test_faults_are_named(observer, message):
+def test_errors_of_settings(observer, message):
     with pytest.raises(ValueError, match=f"controller.estimator.{message}"):
         check_case(loop(observer))
 
 
-def test_beams_without_damping_need_poles():
+def test_speed_is_refused_without_damping():
     case = jb.replace(
         loop(Observer(speed=2.0)), {"beam.damping_ratio": 0.0, "actuators.0.damping": 0.0}
     )

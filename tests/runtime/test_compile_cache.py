@@ -1,11 +1,14 @@
-"""Programs kept for later processes: found where nothing has changed, and only there."""
+"""The compile cache: a program is found again if nothing that decides it has changed."""
 
 import dataclasses
+import hashlib
 import importlib.metadata
 import os
+import pickle
 import re
 import subprocess
 import sys
+import threading
 
 import equinox as eqx
 import jax
@@ -15,8 +18,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.runtime import compile_cache, compiling
-from jaxbeam.runtime.compiling import compiled, compiled_with
+from jaxbeam.runtime import compile_cache, compiling, program_key
+from jaxbeam.runtime.compiling import compiled
 from tests.modules import ROOT
 
 POINTS = np.array([[2.0, 0.5], [0.5, 3.0]])
@@ -24,7 +27,7 @@ TRACED = []
 
 
 class Pair(eqx.Module):
-    """Something with numbers, constants, and nothing where something could be."""
+    """A module with arrays, static fields, and a field that is None."""
 
     first: jax.Array
     words: str = eqx.field(static=True)
@@ -34,12 +37,12 @@ class Pair(eqx.Module):
 
 @compiled
 def pairs(x, words: str, power: float = 1.0):
-    """A function with a factorisation, to see that LAPACK is there for it."""
+    """Outputs of all kinds; the factorisation needs LAPACK, which must be loaded for it."""
     TRACED.append(x.shape)
     return Pair(jnp.linalg.cholesky(x) ** power, words), {"sum": jnp.sum(x)}
 
 
-@compiled_with(xla_backend_optimization_level=1)
+@compiled(xla_backend_optimization_level=1)
 def roughly(x):
     TRACED.append(x.shape)
     return 2 * x
@@ -59,58 +62,58 @@ def first_of(pair: Pair):
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """A cache folder of its own; functions of this file are trusted not to change."""
-    monkeypatch.setattr(compile_cache, "OURS", ("jaxbeam", "tuning", "tests"))
-    monkeypatch.setattr(compile_cache, "SAFE", {*compile_cache.VERSIONED_PACKAGES, "tests"})
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    again()
-    yield tmp_path
-    jax.config.update("jax_compilation_cache_dir", before)
-    again()
+    """An empty cache folder; functions of this file can be cached."""
+    monkeypatch.setattr(program_key, "OWN_PACKAGES", ("jaxbeam", "tuning", "tests"))
+    packages = {*program_key.VERSIONED_PACKAGES, "tests"}
+    monkeypatch.setattr(program_key, "VERSIONED_PACKAGES", packages)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("JAXBEAM_CACHE_SIZE", "64")
+    forget()
+    yield tmp_path / "jaxbeam"
+    forget()
 
 
-def again():
-    """Forget all, as the next process would not know it."""
+def forget():
+    """Make this process like a new one."""
     compiling.clear_caches()
-    compile_cache._environment_hash.cache_clear()
+    program_key.environment_hash.cache_clear()
     TRACED.clear()
 
 
-def called(function, *args, **kwargs):
-    """What a function returns when it is compiled ahead, and how often that has traced it."""
-    function.ahead(*args, **kwargs)()
-    found = function(*args, **kwargs)
-    return found, len(TRACED)
+def call(function, *args, **kwargs):
+    """Result of a function that is precompiled, and the number of times that it was traced."""
+    function.precompile(*args, **kwargs)()
+    result = function(*args, **kwargs)
+    return result, len(TRACED)
 
 
-def kept(folder):
-    return sorted(folder.glob("jaxbeam-*"))
+def programs(folder):
+    return sorted(folder.glob("program-*"))
 
 
-def test_what_an_earlier_process_has_compiled_is_not_traced_again(folder):
-    (first, total), count = called(pairs, POINTS, "as given")
-    assert count == 1 and len(kept(folder)) == 1
-    again()
-    blank, _ = pairs.template(POINTS, "as given")
-    (second, other), count = called(pairs, POINTS, "as given")
-    assert count == 0 and len(kept(folder)) == 1
-    assert jax.tree.structure(first) == jax.tree.structure(second) == jax.tree.structure(blank)
+def test_a_cached_program_is_not_traced_again(folder):
+    (first, total), count = call(pairs, POINTS, "as given")
+    assert count == 1 and len(programs(folder)) == 1
+    forget()
+    template, _ = pairs.template(POINTS, "as given")
+    (second, other), count = call(pairs, POINTS, "as given")
+    assert count == 0 and len(programs(folder)) == 1
+    assert jax.tree.structure(first) == jax.tree.structure(second) == jax.tree.structure(template)
     assert second.size is abs and second.second is None
     assert_allclose(first.first, np.linalg.cholesky(POINTS), rtol=1e-14)
     assert np.array_equal(first.first, second.first) and total == other
 
 
-def test_calls_find_it_as_well(folder):
+def test_calls_find_a_cached_program_without_precompilation(folder):
     for count in (1, 0):
         for _ in range(2):
             assert_allclose(roughly(POINTS), 2 * POINTS, rtol=0)
-        assert len(TRACED) == count and len(kept(folder)) == 1
-        again()
+        assert len(TRACED) == count and len(programs(folder)) == 1
+        forget()
 
 
-def test_functions_within_others_are_not_kept(folder):
-    """What they use of their surroundings is no part of the key."""
+def test_nested_functions_are_not_cached(folder):
+    """Variables of the function around them are no part of the key."""
 
     def times(factor):
         @compiled
@@ -121,33 +124,33 @@ def test_functions_within_others_are_not_kept(folder):
 
     for factor in (2.0, 3.0):
         assert_allclose(times(factor)(POINTS), factor * POINTS, rtol=0)
-        again()
-    assert not kept(folder)
+        forget()
+    assert not programs(folder)
 
 
-def test_derivatives_are_those_of_the_function(folder):
+def test_derivatives_of_a_cached_function(folder):
     for _ in range(2):
-        called(roughly, POINTS)
+        call(roughly, POINTS)
         slope = jax.grad(lambda x: jnp.sum(roughly(x) ** 2))(POINTS)
         assert_allclose(slope, 8 * POINTS, rtol=1e-14)
-        again()
+        forget()
 
 
 @pytest.mark.parametrize(
     "other",
     [
-        lambda: called(pairs, POINTS, "others"),
-        lambda: called(pairs, POINTS, "as given", 2.0),
-        lambda: called(pairs, POINTS[:1, :1], "as given"),
-        lambda: called(pairs, POINTS.astype(np.float32), "as given"),
-        lambda: called(roughly, POINTS),
+        lambda: call(pairs, POINTS, "others"),
+        lambda: call(pairs, POINTS, "as given", 2.0),
+        lambda: call(pairs, POINTS[:1, :1], "as given"),
+        lambda: call(pairs, POINTS.astype(np.float32), "as given"),
+        lambda: call(roughly, POINTS),
     ],
-    ids=["words", "number", "shape", "precision", "function"],
+    ids=["static string", "static number", "shape", "dtype", "function"],
 )
-def test_another_program_has_another_place(folder, other):
-    called(pairs, POINTS, "as given")
-    again()
-    assert other()[1] == 1 and len(kept(folder)) == 2
+def test_another_signature_or_function_is_another_program(folder, other):
+    call(pairs, POINTS, "as given")
+    forget()
+    assert other()[1] == 1 and len(programs(folder)) == 2
 
 
 def changed_setting(patch):
@@ -155,12 +158,12 @@ def changed_setting(patch):
 
 
 def changed_source(patch):
-    before = compile_cache._environment_hash()
-    patch.setattr(compile_cache, "_surroundings", lambda: before + b"changed")
+    before = program_key.environment_hash()
+    patch.setattr(program_key, "environment_hash", lambda: before + b"changed")
 
 
 def changed_machine(patch):
-    patch.setattr(compile_cache, "machine", lambda: "another")
+    patch.setattr(program_key, "machine_description", lambda: "another")
 
 
 def changed_flags(patch):
@@ -170,35 +173,34 @@ def changed_flags(patch):
 @pytest.mark.parametrize(
     "change", [changed_setting, changed_source, changed_machine, changed_flags]
 )
-def test_what_else_decides_a_program_is_part_of_its_place(folder, change, monkeypatch):
-    called(roughly, POINTS)
-    again()
+def test_options_source_machine_and_settings_decide_a_program(folder, change, monkeypatch):
+    call(roughly, POINTS)
+    forget()
     with monkeypatch.context() as patch:
         change(patch)
-        assert called(roughly, POINTS)[1] == 1 and len(kept(folder)) == 2
-    again()
-    assert called(roughly, POINTS)[1] == 0
-    again()
+        assert call(roughly, POINTS)[1] == 1 and len(programs(folder)) == 2
+    forget()
+    assert call(roughly, POINTS)[1] == 0
+    forget()
     with jax.default_matmul_precision("highest"):
-        assert called(roughly, POINTS)[1] == 1 and len(kept(folder)) == 3
+        assert call(roughly, POINTS)[1] == 1 and len(programs(folder)) == 3
 
 
-def test_a_changed_source_is_noticed(folder, tmp_path, monkeypatch):
-    before = compile_cache._environment_hash()
-    home = tmp_path / "jaxbeam"
-    home.mkdir()
-    monkeypatch.setattr(compile_cache, "__file__", str(home / "runtime" / "compile_cache.py"))
-    marks = [before]
+def test_a_changed_source_file_changes_the_environment_hash(tmp_path, monkeypatch):
+    hashes = [program_key.environment_hash()]
+    package = tmp_path / "jaxbeam"
+    package.mkdir(exist_ok=True)
+    monkeypatch.setattr(program_key, "__file__", str(package / "runtime" / "program_key.py"))
     for text in ("a = 1\n", "a = 2\n"):
-        (home / "modes.py").write_text(text)
-        compile_cache._environment_hash.cache_clear()
-        marks.append(compile_cache._environment_hash())
-    assert len(set(marks)) == 3
+        (package / "modes.py").write_text(text)
+        program_key.environment_hash.cache_clear()
+        hashes.append(program_key.environment_hash())
+    assert len(set(hashes)) == 3
 
 
 @dataclasses.dataclass(frozen=True)
 class Outsider:
-    """A constant of a class whose code is not known to stay the same."""
+    """Stands for a class of a package whose version is not part of the key."""
 
     number: int = 1
 
@@ -206,38 +208,39 @@ class Outsider:
 CONSTANT = Outsider(2)
 
 
-def test_versions_of_all_that_compiles_are_part_of_the_place(monkeypatch):
+def test_versions_of_packages_that_compile_change_the_environment_hash(monkeypatch):
     declared = {
         re.split(r"[^\w.-]", one)[0] for one in importlib.metadata.requires("jaxbeam") or []
     }
     for name in declared & {one.name.lower() for one in importlib.metadata.distributions()}:
         needs = importlib.metadata.requires(name) or []
         if any(re.match(r"jax(lib)?\b(?!.*extra ==)", one) for one in needs):
-            assert name in compile_cache.DEPENDENCIES
-    before, version = compile_cache._environment_hash(), importlib.metadata.version
+            assert name in program_key.DEPENDENCIES
+    before, version = program_key.environment_hash(), importlib.metadata.version
     for changed in ("diffrax", "jaxlib"):
-        compile_cache._environment_hash.cache_clear()
+        program_key.environment_hash.cache_clear()
 
         def newer(name, changed=changed):
             return "99" if name == changed else version(name)
 
         with monkeypatch.context() as patch:
             patch.setattr(importlib.metadata, "version", newer)
-            assert compile_cache._environment_hash() != before
+            assert program_key.environment_hash() != before
 
 
-def test_what_depends_on_code_of_others_is_not_kept(folder, monkeypatch):
-    monkeypatch.setattr(compile_cache, "SAFE", {"jaxbeam", "jax", "jaxlib", "numpy"})
+def test_functions_that_depend_on_external_code_are_not_cached(folder, monkeypatch):
+    packages = {"jaxbeam", "jax", "jaxlib", "numpy"}
+    monkeypatch.setattr(program_key, "VERSIONED_PACKAGES", packages)
     for constant in (Outsider(), CONSTANT, changed_flags):
         for _ in range(2):
-            assert called(doubled, POINTS, constant)[1] == 1
-            again()
+            assert call(doubled, POINTS, constant)[1] == 1
+            forget()
     for _ in range(2):
-        assert called(first_of, Pair(POINTS, "a class of others"))[1] == 1
-        again()
-    monkeypatch.setattr(compile_cache, "OURS", ("jaxbeam", "tuning"))
-    assert called(roughly, POINTS)[1] == 1
-    assert not kept(folder)
+        assert call(first_of, Pair(POINTS, "a class of others"))[1] == 1
+        forget()
+    monkeypatch.setattr(program_key, "OWN_PACKAGES", ("jaxbeam", "tuning"))
+    assert call(roughly, POINTS)[1] == 1
+    assert not programs(folder)
 
 
 @pytest.mark.parametrize(
@@ -246,63 +249,203 @@ def test_what_depends_on_code_of_others_is_not_kept(folder, monkeypatch):
         lambda path: path.write_bytes(path.read_bytes()[:-100]),
         lambda path: path.write_bytes(b""),
         lambda path: path.write_bytes(path.read_bytes()[:50] + b"x" + path.read_bytes()[51:]),
+        lambda path: path.chmod(0o666),
     ],
-    ids=["cut off", "empty", "changed"],
+    ids=["cut off", "empty", "changed", "writable by others"],
 )
-def test_what_is_damaged_is_compiled_again_and_mended(folder, spoil):
-    called(roughly, POINTS)
-    (path,) = kept(folder)
+def test_a_refused_program_is_compiled_and_stored_again(folder, spoil):
+    call(roughly, POINTS)
+    (path,) = programs(folder)
     spoil(path)
-    for count in (1, 0):
-        again()
-        found, traced = called(roughly, POINTS)
-        assert_allclose(found, 2 * POINTS, rtol=0)
-        assert traced == count
+    forget()
+    with pytest.warns(UserWarning, match="compile cache not used: .*program-roughly"):
+        result, count = call(roughly, POINTS)
+    assert_allclose(result, 2 * POINTS, rtol=0)
+    assert count == 1
+    forget()
+    assert call(roughly, POINTS)[1] == 0
 
 
-def test_what_cannot_be_loaded_is_compiled_again(folder, monkeypatch):
-    called(roughly, POINTS)
-    again()
+def test_a_forged_program_is_never_unpickled(folder):
+    """A plain digest, which anybody can compute, does not vouch for it."""
+    call(roughly, POINTS)
+    (path,) = programs(folder)
+    content = pickle.dumps((b"code", Trap()))
+    path.write_bytes(hashlib.sha256(content).digest() + content)
+    forget()
+    with pytest.warns(UserWarning, match="was not written with the key of this user"):
+        assert call(roughly, POINTS)[1] == 1
+    assert not SPRUNG
+    pickle.loads(content)
+    assert SPRUNG
+
+
+SPRUNG = []
+
+
+def spring():
+    SPRUNG.append(True)
+
+
+class Trap:
+    """Runs code when it is unpickled."""
+
+    def __reduce__(self):
+        return spring, ()
+
+
+def test_a_program_that_cannot_be_loaded_is_compiled_again(folder, monkeypatch):
+    call(roughly, POINTS)
+    forget()
 
     def fail(*_):
         raise jax.errors.JaxRuntimeError("made for another machine after all")
 
-    monkeypatch.setattr(compile_cache, "load", fail)
-    found, traced = called(roughly, POINTS)
-    assert_allclose(found, 2 * POINTS, rtol=0)
-    assert traced == 1
+    monkeypatch.setattr(compile_cache, "load_program", fail)
+    result, count = call(roughly, POINTS)
+    assert_allclose(result, 2 * POINTS, rtol=0)
+    assert count == 1
 
 
-def test_without_a_folder_to_write_to_all_goes_on(folder):
-    (folder / "file").write_text("")
-    for place in (str(folder / "file"), "", None, "gs://somewhere/else"):
-        if place != "gs://somewhere/else":  # which JAX itself would not accept here
-            jax.config.update("jax_compilation_cache_dir", place)
-            assert called(roughly, POINTS)[1] == 1
-        again()
-    assert not kept(folder)
+def test_an_unusable_folder_is_one_warning(folder, monkeypatch):
+    folder.write_text("")
+    with pytest.warns(UserWarning, match="compile cache not used: .*jaxbeam cannot be used") as all:
+        assert call(roughly, POINTS)[1] == 1
+    assert len(all) == 1
+    forget()
+    folder.unlink()
+    folder.mkdir(mode=0o777)
+    folder.chmod(0o777)
+    with pytest.warns(UserWarning, match="other users may write to .*jaxbeam; delete it") as all:
+        assert call(roughly, POINTS)[1] == 1
+    assert len(all) == 1 and not programs(folder)
+
+
+def test_the_least_recently_used_programs_are_evicted(folder, monkeypatch):
+    monkeypatch.setattr(compile_cache, "max_bytes", lambda: 10**8)
+    for power in (1, 2):
+        call(pairs, POINTS, "as given", power)
+    old, new = sorted(programs(folder), key=os.path.getmtime)
+    os.utime(old, (1, 1))
+    size = new.stat().st_size
+    monkeypatch.setattr(compile_cache, "max_bytes", lambda: 5 * size // 2)
+    call(pairs, POINTS, "as given", 3)
+    assert len(programs(folder)) == 2 and new.exists() and not old.exists()
+
+
+@pytest.mark.parametrize("size", ["0", "-1"])
+def test_size_zero_switches_the_cache_off(folder, monkeypatch, size):
+    monkeypatch.setenv("JAXBEAM_CACHE_SIZE", size)
+    assert call(roughly, POINTS)[1] == 1
+    assert roughly(POINTS)[0, 0] == 4 and not folder.exists()
+
+
+def test_a_size_that_is_no_number_is_a_warning(folder, monkeypatch):
+    monkeypatch.setenv("JAXBEAM_CACHE_SIZE", "1 GB")
+    with pytest.warns(UserWarning, match="JAXBEAM_CACHE_SIZE is to be a whole number of MiB, not"):
+        assert call(roughly, POINTS)[1] == 1
+    assert not folder.exists()
+
+
+def test_scripts_cache_programs_where_jax_does_unless_told_otherwise(monkeypatch, jax_cache):
+    monkeypatch.delenv("JAXBEAM_CACHE_SIZE")
+    assert compile_cache.max_bytes() == 512 * 2**20
+    jax.config.update("jax_enable_compilation_cache", False)
+    assert compile_cache.max_bytes() == 0
+    jax.config.update("jax_enable_compilation_cache", True)
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert compile_cache.max_bytes() == 0
+    monkeypatch.setenv("JAXBEAM_CACHE_SIZE", "3")
+    assert compile_cache.max_bytes() == 3 * 2**20
+
+
+@pytest.fixture
+def jax_cache(tmp_path):
+    """A folder for JAX's own cache."""
+    from jax.experimental.compilation_cache import compilation_cache
+
+    before = jax.config.jax_compilation_cache_dir
+    compilation_cache.reset_cache()
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "jax"))
+    yield tmp_path / "jax"
+    jax.config.update("jax_compilation_cache_dir", before)
+    compilation_cache.reset_cache()
+
+
+def test_jax_does_not_store_a_cached_program_again(folder, jax_cache):
+    for count in (1, 0):
+        assert call(roughly, POINTS)[1] == count
+        forget()
+    jax.jit(jnp.sin)(0.5)
+    names = [path.name for path in jax_cache.iterdir()]
+    assert len(programs(folder)) == 1
+    assert any("sin" in name for name in names) and not any("roughly" in name for name in names)
+
+
+def test_jax_stores_what_has_no_key(folder, jax_cache, monkeypatch):
+    monkeypatch.setattr(program_key, "OWN_PACKAGES", ("jaxbeam", "tuning"))
+    call(roughly, POINTS)
+    assert not programs(folder)
+    assert any("roughly" in path.name for path in jax_cache.iterdir())
+
+
+def test_threads_that_compile_leave_the_settings_of_jax_as_they_were():
+    name = compile_cache.MIN_COMPILE_TIME
+    before = getattr(jax.config, name)
+    inside, leave = threading.Event(), threading.Event()
+
+    def compile_slowly():
+        with compile_cache.jax_cache_off():
+            inside.set()
+            leave.wait()
+
+    thread = threading.Thread(target=compile_slowly)
+    thread.start()
+    inside.wait()
+    with compile_cache.jax_cache_off():
+        leave.set()
+        thread.join()
+        assert getattr(jax.config, name) == float("inf")
+    assert getattr(jax.config, name) == before
+
+
+def test_commands_switch_the_cache_on_in_their_own_folder(folder, monkeypatch, jax_cache):
+    for name in ("JAXBEAM_CACHE_SIZE", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    compile_cache.switch_on()
+    assert os.environ["JAXBEAM_CACHE_SIZE"] == "512" and compile_cache.enabled()
+    assert jax.config.jax_compilation_cache_dir == str(folder / "jax")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
+    jax.config.update("jax_compilation_cache_dir", "elsewhere")
+    compile_cache.switch_on()
+    assert jax.config.jax_compilation_cache_dir == "elsewhere"
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    (folder / "jax").chmod(0o777)
+    with pytest.warns(UserWarning, match="other users may write to .*jax; delete it"):
+        compile_cache.switch_on()
 
 
 SWEPT = """
 import sys
 import numpy as np
 import jaxbeam as jb
-from jaxbeam import compiling, native, native_library
+from jaxbeam.integrator import native_peaks
+from jaxbeam.runtime import compiling, native_library
 from tests.runtime.test_compile_cache import CASES, OVER
 
 compiled = []
 compile = compiling.Compiled._compile
 
-def counted(self, state, lowered):
+def counted(self, entry, lowered):
     compiled.append(self.__name__)
-    compile(self, state, lowered)
+    compile(self, entry, lowered)
 
 compiling.Compiled._compile = counted
-if native_library.compiler():
-    native.build()
-found = [jb.sweep(case, OVER, progress=False, **how) for case, how in CASES]
+if native_library.find_compiler():
+    native_peaks.LIBRARY.build()
+results = [jb.sweep(case, OVER, progress=False, **how) for case, how in CASES]
 names = ("peak_deflection", "lowest_contact_force", "deflection")
-values = [run[name].values.ravel() for run in found for name in names if name in run]
+values = [run[name].values.ravel() for run in results for name in names if name in run]
 np.save(sys.argv[1], np.concatenate(values).astype(float))
 print(*compiled)
 """
@@ -328,15 +471,16 @@ CASES = [
 
 @pytest.mark.slow
 def test_sweeps_of_the_next_process_compile_nothing_and_are_the_same(tmp_path):
-    changed = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
-    told = []
+    changed = {"JAXBEAM_CACHE_SIZE": "512", "XDG_CACHE_HOME": str(tmp_path)}
+    compiled_names = []
     for name in ("first.npy", "second.npy"):
         command = [sys.executable, "-c", SWEPT, str(tmp_path / name)]
-        done = subprocess.run(
+        process = subprocess.run(
             command, env=os.environ | changed, cwd=ROOT, check=True, capture_output=True, text=True
         )
-        told.append(done.stdout.split())
-        assert not done.stderr
-    assert {"block", "riggings", "rigs", "windows"} <= set(told[0]) and not told[1]
+        compiled_names.append(process.stdout.split())
+        assert not process.stderr
+    expected = {"integrate_block", "discrete_models", "modal_models", "entry_exit_times"}
+    assert expected <= set(compiled_names[0]) and not compiled_names[1]
     first, second = (np.load(tmp_path / name) for name in ("first.npy", "second.npy"))
     assert np.array_equal(first, second) and np.all(np.isfinite(first))

@@ -66,7 +66,7 @@ def test_packages_that_are_not_installed_are_none():
         pytest.param((1, "sampled", "histories"), marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.filterwarnings("ignore::jaxbeam.control.SamplingWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.control.optimal.sampling_loss.SamplingWarning")
 def test_sweeps_of_the_table_are_right_and_fully_measured(kind):
     found = cases.measure(*kind, modes=2, side=2)
     assert found["error"] < 1e-6 and found["scipy_error"] < 1e-6
