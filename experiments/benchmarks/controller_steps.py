@@ -42,7 +42,10 @@ CONTROLLERS = {
     "feedback, linear": jb.Feedback(gains=[2e3], period=PERIOD),
     "feedback, cubic": jb.Feedback(gains=[2e9], power=3, period=PERIOD),
     "feedback-scheduled, load identified": jb.ScheduledFeedback(
-        masses=[0.2, 0.6], gains=[[2e3, 4e3]], load_identification=GATE_IDENTIFICATION, period=PERIOD
+        masses=[0.2, 0.6],
+        gains=[[2e3, 4e3]],
+        load_identification=GATE_IDENTIFICATION,
+        period=PERIOD,
     ),
     "pd": jb.PD(gains=[2e3], rate_gains=20.0, lag=0.02, period=PERIOD),
     "lead": jb.Lead(gains=[2e3], zero=2.0, pole=8.0, period=PERIOD),

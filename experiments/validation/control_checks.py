@@ -17,6 +17,7 @@ import scipy.sparse
 import jaxbeam as jb
 from experiments.validation.check import Check, max_entrywise_error, max_relative_error
 from jaxbeam import rigs
+from jaxbeam.analysis.bound.bound import Bound
 from jaxbeam.analysis.bound.input_influence import input_influence
 from jaxbeam.case.filters import filter_history, second_order_sections, steady_filter_state
 from jaxbeam.estimation.gains import kalman_gain, sampled_kalman_gain
@@ -106,7 +107,7 @@ def bounds() -> Iterator[Check]:
     )
 
 
-def least_peak_by_clarabel(case: jb.Case, best: jb.Bound) -> float:
+def least_peak_by_clarabel(case: jb.Case, best: Bound) -> float:
     """The least peak (m): minimise p subject to |w(t)| <= p at all times, and command limits."""
     influence = input_influence(case, best.positions, best.period, best.spacing)
     row = influence.deflection_rows[0]

@@ -1,7 +1,7 @@
-"""A closed loop cut open at its commands: how plant, sensors and law go on, as pure functions.
+"""Dynamics of the loop opened at the commands, as functions of its state, with loads frozen or not.
 
-Limits and the steps of sensors and commands are left out. What waits, filters and laws remember is
-part of the state, so that the loop can be made linear, or carried along a crossing.
+The state holds plant with sensor filters, states of law and digital filters, and the queues of
+delayed readings and commands. Limits, ranges and resolution are left out.
 """
 
 import math
@@ -24,11 +24,11 @@ from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state,
 from jaxbeam.model.state_space import Plant, build_plant
 from jaxbeam.runtime.compiling import compiled
 
-PERIOD_TOLERANCE = 1e-9  # of a period: shorter differences are none
+PERIOD_TOLERANCE = 1e-9  # of a period; smaller differences of times count as zero
 
 
 class LoopTiming(NamedTuple):
-    """When things happen within a sampling period, in s and in whole periods."""
+    """Sampling period, delay of the commands and delays of the sensors (s) of a loop."""
 
     period: float
     delay: float
@@ -36,7 +36,7 @@ class LoopTiming(NamedTuple):
 
 
 class FrozenTrajectory(AbstractTrajectory):
-    """A load stopped in mid-motion: it keeps position, speed and acceleration."""
+    """Trajectory of a frozen load, with constant position, speed and acceleration."""
 
     position: Float[Array, ""]
     speed: Float[Array, ""]
@@ -57,10 +57,10 @@ class FrozenTrajectory(AbstractTrajectory):
 
 
 class LoopDynamics(eqx.Module):
-    """The plant with the filters of its sensors, and the law, as functions of their states.
+    """Plant with sensor filters, and control law, as functions of their states.
 
-    `augmented_plant` is the plant with those filters as further states, `output_rows` are rows on
-    its states of the inputs of the sensors.
+    `augmented_plant` has the analogue filters of the sensors as further states; `output_rows` map
+    its states to the inputs of the sensors.
     """
 
     plant: Plant
@@ -69,19 +69,19 @@ class LoopDynamics(eqx.Module):
     law: AbstractSampledLaw | AbstractContinuousLaw
 
     def freeze_loads(self, t) -> "LoopDynamics":
-        """The same with the loads stopped in mid-motion."""
+        """The same dynamics with loads frozen at t (s)."""
         loads, length = self.augmented_plant.loads, self.plant.case.beam.length
         on = loads.on_beam(t)
-        motions = tuple(
+        trajectories = tuple(
             FrozenTrajectory(*path.kinematics(t), on[i], length)
             for i, path in enumerate(loads.trajectories)
         )
-        return eqx.tree_at(lambda loop: loop.augmented_plant.loads.trajectories, self, motions)
+        return eqx.tree_at(lambda loop: loop.augmented_plant.loads.trajectories, self, trajectories)
 
     def continuous_dynamics(self, t):
-        """A, B, the rates that the weights cause, and commands as a function of the state.
+        """A, B, rates due to the weights, and the commands as a function of the state, at t (s).
 
-        States of its own that a law has are the last, about those at the start of a run.
+        The last states are those of the law, about their values at the start of a run.
         """
         system, command_count = self.augmented_plant.at(t), len(self.plant.case.actuators)
         size, zero_command = system.A.shape[0], jnp.zeros(command_count)

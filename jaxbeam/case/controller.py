@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
+from jaxbeam.case.former_arguments import AcceptsFormerArguments
 
 Command = Float[Array, " actuator"]
 Time = Float[Array, ""]
@@ -31,7 +32,7 @@ class Measurement(eqx.Module):
 
 
 class ControllerFilter(eqx.Module):
-    """Filter of the readings y of one sensor in continuous time: x' = A x + B y, output C x + D y."""
+    """Continuous filter of the readings y of one sensor: x' = A x + B y, output C x + D y."""
 
     sensor: int = eqx.field(static=True)
     A: Float[Array, "state state"]
@@ -101,7 +102,7 @@ class AbstractStaticLaw(AbstractSampledLaw, AbstractContinuousLaw):
         return ControlStep(self.command(state, measurement, t), state)
 
 
-class AbstractController(eqx.Module):
+class AbstractController(eqx.Module, metaclass=AcceptsFormerArguments):
     """Settings of a controller.
 
     With a sampling `period` (s) its law acts at 0, period, 2 period, ...; a command begins `delay`

@@ -12,6 +12,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import Command, Measurement, Time
+from jaxbeam.case.former_arguments import AcceptsFormerArguments
 
 
 class Estimate(eqx.Module):
@@ -26,7 +27,7 @@ class Estimate(eqx.Module):
 
 
 class AbstractSampledFilter(eqx.Module):
-    """Filter at samples: (estimate, x_k+1) = update(x_k, y_k, t_k), with a state x of any structure.
+    """Filter at samples: (estimate, x_k+1) = update(x_k, y_k, t_k), x of any structure.
 
     Fields of the class are the design; they do not change during a run.
     """
@@ -59,7 +60,7 @@ class AbstractContinuousFilter(eqx.Module):
         """Rates of the states x (1/s) under a command."""
 
 
-class AbstractEstimator(eqx.Module):
+class AbstractEstimator(eqx.Module, metaclass=AcceptsFormerArguments):
     """Settings of an estimator; it acts at the samples of its controller.
 
     To add one, write a file in `jaxbeam.estimation` with a subclass that names its `kind`.

@@ -60,7 +60,7 @@ class DesignModel(eqx.Module):
         return None
 
     def design_plant(self, plant: Plant, coordinates: str) -> Plant:
-        """Plant with the design parameters, on the modes of the given plant or the lowest of them."""
+        """Plant with the design parameters, on the modes of the given plant or the lowest."""
         case, modes = plant.case, plant.modal_model.modes
         if self.modes is not None:
             case = eqx.tree_at(lambda c: c.beam, case, _with_modes(case.beam, self.modes))
@@ -99,6 +99,6 @@ def _with_value(part, name, value):
 
 
 def _has_effect(part, name) -> bool:
-    """Whether a part has a number in use; the entry time of a load with a table is that of the table."""
+    """Whether a part has a number in use; a table gives the entry time of its load."""
     tabulated = name == "entry_time" and part.times is not None
     return getattr(part, name, None) is not None and not tabulated

@@ -61,7 +61,7 @@ class GivenLoad(AbstractLoadSource):
 
 
 def given_load(load: Any) -> GivenLoad:
-    """Load of a case as given; speed and entry time are NaN where a table of positions replaces them."""
+    """Load of a case as given; speed and entry time are NaN for a table of positions."""
     numbers = load.mass, load.speed, load.entry_time
     return GivenLoad(*(jnp.asarray(jnp.nan if x is None else x) for x in numbers))
 
@@ -71,9 +71,9 @@ class AbstractLoadIdentifier(AbstractLoadSource):
 
     `influence_lines` (m/N) are deflections at the sensors `sensor_indices` under a unit force at
     positions spaced evenly along the beam, by the modes of the design model (exact ones:
-    `jaxbeam.model.statics.influence_line`); `static_lift` is the static deflection there per unit of
-    each command, `offset` the offset of the readings (m). `until` is the share of the crossing up
-    to which samples are used.
+    `jaxbeam.model.statics.influence_line`); `static_lift` is the static deflection there per unit
+    of each command, `offset` the offset of the readings (m). `until` is the share of the crossing
+    up to which samples are used.
     """
 
     length: Float[Array, ""]

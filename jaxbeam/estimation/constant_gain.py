@@ -1,4 +1,4 @@
-"""Filter with a constant gain: prediction from sample to sample, then correction by the readings."""
+"""Filter with a constant gain: prediction to the next sample, correction by the readings."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -142,7 +142,7 @@ class Kalman(AbstractEstimator):
         return jnp.broadcast_to(self.weight_deviation**2, (loads,))
 
     def noise_intensity(self, plant: Plant) -> Square:
-        """Intensity of the white noise in the rates of the states, in the unit of each squared times s."""
+        """Intensity of the white noise in the rates of the states, (unit of each)^2 s."""
         modes = plant.coordinate_scale.shape[0]
         force = self.process_noise * plant.coordinate_scale**2
         actuator_intensity = jnp.zeros(plant.modal_model.state_count - 2 * modes)

@@ -67,6 +67,6 @@ def observability_error(system: StateSpace) -> str | None:
     if hertz is None:
         return None
     return (
-        f"kind needs sensors that observe every mode: none of {len(system.outputs)} observes the one"
-        f" at {hertz:.4g} Hz; move one off its nodes, add one, or design for fewer modes"
+        f"kind needs sensors that observe every mode: none of {len(system.outputs)} observes"
+        f" the one at {hertz:.4g} Hz; move one off its nodes, add one, or design for fewer modes"
     )

@@ -27,7 +27,7 @@ StateAndInputMatrices = Callable[[Number], tuple[Float[Array, "..."], Float[Arra
 
 
 class Transition(eqx.Module):
-    """Transition over a period: x+ = matrix x + previous_input_matrix u_previous + input_matrix u + w.
+    """Transition over a period: x+ = matrix x + previous_input_matrix u- + input_matrix u + w.
 
     `noise_covariance` is that of w.
     """
@@ -60,7 +60,7 @@ class Transition(eqx.Module):
 
 
 class SampleTiming(eqx.Module):
-    """Sampling period (s), and the delay (s) within it after which a command begins; None for none."""
+    """Sampling period (s), and delay (s) within it after which a command begins, or None."""
 
     period: Number
     input_delay: Number | None

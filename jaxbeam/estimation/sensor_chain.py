@@ -29,7 +29,7 @@ SystemAtTime = Callable[[Float[Array, ""]], StateSpace]
 
 
 class FilteredPlant(eqx.Module):
-    """Plant with the analogue filters of its sensors; `output_rows` are those of the filtered outputs."""
+    """Plant with the analogue filters of its sensors; `output_rows` of the filtered outputs."""
 
     plant: Plant
     output_rows: Float[Array, "sensor state"]
@@ -88,7 +88,7 @@ class SensorChain(eqx.Module):
         return self._jacobians(C, D, 0)
 
     def transition(self, system_at: SystemAtTime, intensity, scale, t=0.0) -> Transition:
-        """Transition of the states to just before the sample at t (s) from just before the previous.
+        """Transition from just before the previous sample to just before that at t (s).
 
         White noise of this intensity acts on the rates of the plant; see `SampleTiming.transition`.
         """
@@ -135,7 +135,7 @@ class SensorChain(eqx.Module):
         )
 
     def _sampling_update(self, sensor, row, feedthrough, is_sampled, before_command) -> Transition:
-        """Transition at which a sensor takes a sample, if `is_sampled`: the newest of its samples h."""
+        """Transition at a sample of a sensor, if `is_sampled`: the newest of its samples h."""
         index = self._state_layout()[0][sensor]
         identity = jnp.eye(self.state_count)
         seen = jnp.pad(row, (0, self.state_count - self.plant_states))
@@ -148,7 +148,7 @@ class SensorChain(eqx.Module):
         return Transition(matrix, before, after, jnp.zeros_like(identity))
 
     def _jacobians(self, C, D, which: int):
-        """Jacobians on states and commands of the readings (0), or of the states after a sample (1)."""
+        """Jacobians by states and commands of the readings (0) or the states after a sample (1)."""
 
         def sample(state, command):
             return self._sample(state, C @ state[: self.plant_states] + D @ command)[which]
@@ -185,7 +185,7 @@ class SensorChain(eqx.Module):
         return whole.astype(int), self.timing.period - rest
 
     def _state_layout(self) -> tuple[list, list, list, int]:
-        """First samples h, filter states m and noise v of each sensor, None for none; and the end."""
+        """First index of samples h, filter states m, noise v of each sensor, or None; the end."""
         end = self.plant_states
         starts = [], [], []
         for sections, delay in zip(self.filter_sections, self.delays, strict=True):

@@ -90,8 +90,8 @@ def integrate_peaks(
     """What is found of tasks that C integrates one after the other, if it is `available`.
 
     All have tasks as the first axis; a single rig is that of all. Grids are those of `even_grid`,
-    `positions` the places (m) at which peaks are looked for, on both sides of the beam; `max_loads` is
-    how many loads may be on the beam at once. No driver, double precision. Tasks that are not
+    `positions` the places (m) at which peaks are looked for, on both sides of the beam; `max_loads`
+    is how many loads may be on the beam at once. No driver, double precision. Tasks that are not
     wanted come out as at rest.
     """
     shapes = models.modes.series

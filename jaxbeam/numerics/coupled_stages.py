@@ -4,10 +4,10 @@
 
 A, B and E, the directions in which forces act, are constant; f are a few numbers, as the contact
 forces. Within a stretch F f and u are polynomials through their values at the Gauss nodes, to which
-the constant part answers exactly, with its cost (`stage_responses`); demanding the law of f at the nodes
-leaves one small linear system a stretch. So what bounds the length of a stretch is not how fast
-the constant part is, but how fast f and the wanted u change; in a plant with lags much faster than
-that, u is no polynomial, and `flows` are right with longer stretches.
+the constant part answers exactly, with its cost (`stage_responses`); demanding the law of f at the
+nodes leaves one small linear system a stretch. So what bounds the length of a stretch is not how
+fast the constant part is, but how fast f and the wanted u change; in a plant with lags much faster
+than that, u is no polynomial, and `flows` are right with longer stretches.
 """
 
 import functools
@@ -47,9 +47,9 @@ class Coupling(eqx.Module):
 class StageResponse(eqx.Module):
     """What the constant part does over a stretch under inputs given at its Gauss nodes.
 
-    `state_at_nodes` and `state_at_end` take (x, commands, directed forces) to the state at the nodes and at the end,
-    `cost` is what they cost. Commands and forces are ordered by node. What the state at
-    a node is made of lies together, as contact laws sum it.
+    `state_at_nodes` and `state_at_end` take (x, commands, directed forces) to the state at the
+    nodes and at the end, `cost` is what they cost. Commands and forces are ordered by node. What
+    the state at a node is made of lies together, as contact laws sum it.
     """
 
     state_at_nodes: Float[Array, "*length stage whole state"]

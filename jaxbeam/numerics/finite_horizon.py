@@ -87,7 +87,8 @@ def finite_horizon(
 ) -> tuple[GainTable, Float[Array, "edge state state"]]:
     """Gains that minimise x'Fx at the last event plus the integral of x'Qx + u'Ru, and P at edges.
 
-    There are at least so many stretches, and a fine layer, between events (s); F is `terminal_cost`.
+    There are at least so many stretches, and a fine layer, between events (s); F is
+    `terminal_cost`.
     """
     inputs = R.shape[0]
     zero_plant = ConstantPlant(
@@ -142,7 +143,7 @@ def finite_horizon_coupled(
 def _gains_and_costs(
     stage_responses, group_stages, plant, events, min_intervals, Q, R, terminal_cost
 ):
-    """Gains and P, from what `group_stages` tells of a group: flows, and what changes at their nodes.
+    """Gains and P from the stages of each group of intervals, found by `group_stages`.
 
     It is given what `stage_responses` finds for all groups.
     """

@@ -44,7 +44,7 @@ def collocated_stages(
     R: InputWeight,
     lengths: Float[Array, " stretch"],
 ) -> Stage:
-    """Flows over stretches of given lengths (s) along a plant known at their Gauss nodes, `GAUSS_NODES`.
+    """Stages of given lengths (s) of a plant known at their Gauss nodes, `GAUSS_NODES`.
 
     By collocation of x' = A x + B u, the cost by Gauss's rule: together the same as collocation of
     the equations of the optimal state and costate, of order 12 (Hager, Numer. Math. 87, 2000). Fast

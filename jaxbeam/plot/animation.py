@@ -103,7 +103,11 @@ def _beam_axes(axes, record):
     lowest_deflection = np.minimum.accumulate(beam)
     acting_at = [actuator_positions(actuator) for actuator in case.actuators]
     point_actuators = np.array([positions[0] for positions in acting_at if len(positions) == 1])
-    patches = [np.linspace(*positions, 20) for positions in acting_at if len(positions) == 2]
+    patches = [
+        np.linspace(positions[0], positions[1], 20)
+        for positions in acting_at
+        if len(positions) == 2
+    ]
 
     draw_supports(axes, case)
     axes.axhline(0, color=GREY, linewidth=0.7, linestyle=":")

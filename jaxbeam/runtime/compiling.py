@@ -177,7 +177,7 @@ def compiled(function: Callable[P, R], **settings: bool | int) -> Compiled[P, R]
 def compiled(**settings: bool | int) -> Callable[[Callable[P, R]], Compiled[P, R]]: ...
 
 
-def compiled(function=None, **settings):
+def compiled(function: Any = None, **settings: bool | int) -> Any:
     """Compile a function of arrays and static arguments with `xla_options(**settings)`.
 
     A decorator, with or without settings. As with `equinox.filter_jit`, arguments that are not

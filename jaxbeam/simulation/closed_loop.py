@@ -81,8 +81,17 @@ def closed_loop(
     noise = None
     if noisy and any(sensor.noise is not None for sensor in case.sensors):
         noise = noise_samples(case.run.seed, len(case.sensors), schedule.max_readings)
-    bound = _state_bound(case, model)
-    return SampledLoop(plant, law, model, output_rows, bound, loads, schedule, sections, noise)
+    return SampledLoop(
+        plant=plant,
+        law=law,
+        model=model,
+        output_rows=output_rows,
+        state_bound=_state_bound(case, model),
+        loads=loads,
+        schedule=schedule,
+        filter_sections=sections,
+        noise=noise,
+    )
 
 
 def _state_bound(case: Case, model: ModalModel) -> Float[Array, " state"]:

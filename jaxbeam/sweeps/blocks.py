@@ -74,7 +74,7 @@ class Runner:
         self._set_step_limits(entries, exits, limits)
 
     def _set_block_size(self):
-        """Numbers of batches per block and per trial; each device takes an equal part of a block."""
+        """Numbers of batches per block and per trial, multiples of the number of devices."""
         count, batch_size = self.batches.run_index.shape
         self.devices = len(jax.local_devices())
         max_batches, trial_batches = (
@@ -100,7 +100,7 @@ class Runner:
         return list(np.resize(np.arange(count), (self.block_count, self.batches_per_block)))
 
     def _compile_programs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compile what step sizes need, in parallel; entry and exit times (path, load) meanwhile."""
+        """Compile in parallel what step sizes need; entry and exit times (path, load) in s."""
         program = self.program()
         first_values = self.batches.shared_values[self._model_groups()[0]]
         compilations = [
@@ -113,7 +113,7 @@ class Runner:
         return entries, exits
 
     def _make_models(self) -> Float[np.ndarray, " path"]:
-        """Make the models of all batches; longest stable steps (s), infinite where there is none."""
+        """Make the models of all batches; longest stable steps (s), infinite without one."""
         program, count = self.program(), self.batches.run_index.shape[0]
         groups = [
             programs.modal_models(program, self.batches.shared_values[group])
@@ -240,7 +240,7 @@ class Runner:
         return self.batches.shared_values[batch_indices], self.batches.batched_values[batch_indices]
 
     def program(self, substeps: int | None = None) -> programs.Program:
-        """Static data of the compiled programs; with `substeps` per sample interval, histories too."""
+        """Static data of the programs; with `substeps` per sample interval, also for histories."""
         scheduled = substeps is not None or self.case.controller is not None
         sampling = (self.schedule if scheduled else None), substeps
         return programs.Program(self.case, self.shapes, *self.addresses, *sampling)

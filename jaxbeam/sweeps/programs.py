@@ -62,7 +62,7 @@ class Program(NamedTuple):
         return LoadSet(load_set(varied).trajectories, inertia, weight)
 
     def grid(self, model, shared_values, step_size):
-        """Time grid of a batch, for a longest step (s) and a number of extra steps between events."""
+        """Time grid of a batch for a longest step (s) and a number of extra steps per event."""
         varied, (max_step, extra_steps) = self.case_with(shared_values), step_size
         if self.schedule is None:
             return grid_by_step_length(varied, model, max_step, extra_steps)

@@ -1,9 +1,8 @@
-"""Where the results of a long sweep are kept, block by block, so that an interruption costs little.
+"""Zarr store of a sweep, written block by block, so that an interrupted sweep can be resumed.
 
-While a sweep runs, each block is one chunk of flat arrays in the group `blocks` of a zarr store,
-written before the flag that says it is done. When all are done, the labelled dataset takes
-their place; the store is complete from the moment at which the group is gone. A fingerprint of
-everything that shapes the numbers guards against mixing sweeps.
+During a sweep each block is one chunk of flat arrays in the group `blocks`, written before its flag
+in the array `done`. The labelled dataset then replaces the group; the store is complete when the
+group is gone. A fingerprint of all that determines the results protects against mixing sweeps.
 """
 
 from __future__ import annotations
@@ -14,62 +13,29 @@ import shutil
 import tempfile
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxbeam.sweeps.block_store import BlockStore
+
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
-    import zarr  # takes long to import; only sweeps that are kept need it
+    import zarr  # takes long to import; only stored sweeps need it
 
 FINGERPRINT_ATTRIBUTE = "jaxbeam_sweep"
 BLOCKS_GROUP = "blocks"
-DAMAGE_ERRORS = (OSError, ValueError, KeyError, TypeError, RuntimeError)  # what zarr raises for it
-
-
-@runtime_checkable
-class BlockStore(Protocol):
-    """Keeps finished blocks: in memory or on disk."""
-
-    def missing(self) -> list[int]:
-        """Numbers of the blocks that are not done."""
-        ...
-
-    def write(self, block: int, results: dict[str, np.ndarray]) -> None:
-        """Keep the results of a block, arrays of the same shape for every block."""
-        ...
-
-    def collect(self) -> dict[str, np.ndarray]:
-        """Results of all blocks, one after the other along the first axis."""
-        ...
-
-    def finish(self, dataset: xarray.Dataset) -> None:
-        """Put the labelled dataset in the place of the blocks."""
-        ...
-
-
-class MemoryStore(BlockStore):
-    """Keeps blocks in memory."""
-
-    def __init__(self, blocks: int):
-        self._blocks: list[dict[str, np.ndarray]] = [{} for _ in range(blocks)]
-
-    def missing(self) -> list[int]:
-        return [i for i, block in enumerate(self._blocks) if not block]
-
-    def write(self, block: int, results: dict[str, np.ndarray]) -> None:
-        self._blocks[block] = results
-
-    def collect(self) -> dict[str, np.ndarray]:
-        names = self._blocks[0]
-        return {name: np.concatenate([block[name] for block in self._blocks]) for name in names}
-
-    def finish(self, dataset: xarray.Dataset) -> None:
-        pass
+DAMAGE_ERRORS = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    RuntimeError,
+)  # of zarr, for damaged files
 
 
 class ZarrStore(BlockStore):
-    """Keeps blocks in a zarr store; `steps` is what `create_store` was given with them.
+    """Store of blocks in zarr format; `steps` are those given to `create_store`.
 
     Raises ValueError if it cannot be read.
     """
@@ -83,10 +49,10 @@ class ZarrStore(BlockStore):
             self.steps = np.asarray(self._blocks["steps"][:])
             self._flags = self._blocks["done"]
             self._count = self._flags.shape[0]
-        self._arrays: dict[str, Any] = {}  # opened once: to open one takes as long as to write
+        self._arrays: dict[str, Any] = {}  # opened once, as opening takes as long as writing
 
     def specification(self) -> dict[str, Any]:
-        """What was ordered, as it was given to `create_store`."""
+        """Specification of the sweep, as given to `create_store`."""
         with _explaining_damage(self._path):
             return json.loads(np.asarray(self._blocks["order"][:]).tobytes())
 
@@ -101,7 +67,7 @@ class ZarrStore(BlockStore):
         return sorted(set(range(self._count)) - set(flagged) | set(damaged))
 
     def is_done(self, block: int) -> bool:
-        """Whether a block has been written."""
+        """Whether a block has been written and can be read."""
         return self._is_flagged(block) and self._is_intact(block)
 
     def write(self, block: int, results: dict[str, np.ndarray]) -> None:
@@ -117,11 +83,11 @@ class ZarrStore(BlockStore):
 
     def finish(self, dataset: xarray.Dataset) -> None:
         with _explaining_write_errors(self._path):
-            # What an interrupted attempt has left may be incomplete.
+            # Arrays of an interrupted attempt may be incomplete.
             for folder in self._path.iterdir():
                 if folder.is_dir() and folder.name != BLOCKS_GROUP:
                     shutil.rmtree(folder)
-            # Words of fixed length have no settled place in the format, words of any length do.
+            # Strings of fixed length are no settled part of the format, those of any length are.
             labels = dataset["sensor"].values.astype(object)
             dataset.assign_coords(sensor=labels).to_zarr(
                 self._path,
@@ -130,7 +96,7 @@ class ZarrStore(BlockStore):
                 write_empty_chunks=True,
                 encoding={name: {"compressors": _checksummed()} for name in dataset.variables},
             )
-            # From here on the store is complete: a group is one by its description.
+            # Without its metadata the group is gone and the store complete.
             (self._path / BLOCKS_GROUP / "zarr.json").unlink()
             shutil.rmtree(self._path / BLOCKS_GROUP)
 
@@ -138,7 +104,7 @@ class ZarrStore(BlockStore):
         return sorted(set(self._blocks.array_keys()) - {"done", "steps", "order"})
 
     def _result_array(self, name: str, values: np.ndarray) -> Any:
-        """The array for all results of a name, created from those of the first block."""
+        """Array of all results of a name, created with the shapes of the first block."""
         if name not in self._arrays:
             if name not in self._blocks:
                 self._blocks.create_array(
@@ -160,7 +126,7 @@ class ZarrStore(BlockStore):
             return False
 
     def _all_readable(self) -> bool:
-        """Whether all that is there can be read, found out quickly."""
+        """Whether all blocks can be read: a fast check before `_is_intact`."""
         try:
             whole = all(_is_complete(self._blocks[name]) for name in self._names())
             return whole and bool(self.collect())
@@ -168,7 +134,7 @@ class ZarrStore(BlockStore):
             return False
 
     def _is_intact(self, block: int) -> bool:
-        """Whether all results of a block are there and can be read."""
+        """Whether all results of a block exist and can be read."""
         try:
             for name in self._names():
                 array = self._blocks[name]
@@ -183,11 +149,11 @@ class ZarrStore(BlockStore):
 
 
 def read_dataset(path: Path) -> xarray.Dataset:
-    """The dataset of a complete store. Raises ValueError if part of it is missing or damaged."""
+    """Dataset of a complete store. Raises ValueError if part of it is missing or damaged."""
     import xarray
     import zarr
 
-    shutil.rmtree(path / BLOCKS_GROUP, ignore_errors=True)  # a kill may have left its chunks behind
+    shutil.rmtree(path / BLOCKS_GROUP, ignore_errors=True)  # chunks may remain after a kill
     with _explaining_damage(path):
         group = zarr.open_group(path, mode="r")
         arrays: dict[str, Any] = {
@@ -206,18 +172,18 @@ def _checksummed():
 
 
 def _array_options() -> dict[str, Any]:
-    """How arrays are written so that what is damaged or missing can be told."""
+    """Options of arrays with which damaged and missing chunks are detected."""
     return {"compressors": _checksummed(), "config": {"write_empty_chunks": True}}
 
 
 def _is_complete(array: zarr.Array) -> bool:
-    """Whether every chunk of an array is there: zarr reads those that are not as zeros."""
+    """Whether all chunks of an array exist; zarr reads missing ones as zeros."""
     return array.nchunks_initialized == array.nchunks
 
 
 @contextlib.contextmanager
 def _explaining_damage(path: Path):
-    """Turn what damaged files make zarr raise into one sentence."""
+    """Replace errors of zarr about damaged files by a ValueError of one sentence."""
     try:
         yield
     except DAMAGE_ERRORS as error:
@@ -229,20 +195,20 @@ def _explaining_damage(path: Path):
 
 @contextlib.contextmanager
 def _explaining_write_errors(path: Path):
-    """Say in one sentence what kept a sweep from being written, and that nothing is lost."""
+    """Replace errors in writing by one sentence, which says that finished blocks are kept."""
     try:
         yield
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise type(error)(
-            f"cannot write to {path}: {reason}; what is done is kept: mend this, then resume"
+            f"cannot write to {path}: {reason}; finished blocks are kept: mend this, then resume"
         ) from None
 
 
 def status(path: Path) -> tuple[str, str] | None:
-    """Status ("unfinished", "complete") and fingerprint of the sweep at a path, None without one.
+    """Status ("unfinished", "complete") and fingerprint of the sweep at a path; None without one.
 
-    Raises FileExistsError if something else is there.
+    Raises FileExistsError if the path is no sweep.
     """
     import zarr
 
@@ -259,10 +225,10 @@ def status(path: Path) -> tuple[str, str] | None:
 
 
 def resolve_action(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> str:
-    """Decide what to do about a path: "new", "resume" or "complete"; nothing is changed there.
+    """Action for a sweep at a path: "new", "resume", or "complete" for one that is finished.
 
-    Raises FileExistsError if a sweep is there and neither `resume` nor `overwrite` is set, and
-    ValueError if both are, or if it was made from other numbers than are to be resumed.
+    Raises FileExistsError if a sweep exists, without `resume` or `overwrite`, ValueError for both,
+    or if the sweep to be resumed has another fingerprint, and as `check_writable`.
     """
     if resume and overwrite:
         raise ValueError("resume continues a sweep, overwrite discards it; choose one of them")
@@ -278,14 +244,14 @@ def resolve_action(path: Path, fingerprint: str, resume: bool, overwrite: bool) 
     if existing[1] != fingerprint:
         raise ValueError(
             f"{path} holds a sweep of another case, other values or settings, or by another"
-            " version (steps that `jaxbeam native` has compiled are one): it cannot be resumed with"
+            " version (the C library of `jaxbeam native` is one): it cannot be resumed with"
             " these; choose another name, or overwrite it"
         )
     return "complete" if existing[0] == "complete" else "resume"
 
 
 def check_writable(path: Path) -> None:
-    """Raises OSError, before any work, if nothing can be written beside a path."""
+    """Raise OSError if nothing can be written to the folder of a path."""
     try:
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
@@ -303,14 +269,14 @@ def create_store(
     steps: np.ndarray,
     overwrite: bool = False,
 ) -> ZarrStore:
-    """Start a store for a number of blocks; `steps` (s) are the time steps of the tasks.
+    """New store for a number of blocks, with the specification of the sweep.
 
-    What was ordered, in plain words and numbers, is kept with them. With `overwrite` what is at
-    the path gives way.
+    `steps` are the step sizes (s) of the batches and the error estimate. With `overwrite` a sweep
+    at the path is deleted. Raises OSError if the store cannot be written.
     """
     import zarr
 
-    # Built aside and moved into place: a store either exists whole or not at all.
+    # Written beside the path and renamed, so that a store is complete or does not exist.
     temporary_path = path.with_name(f".{path.name}.new")
     shutil.rmtree(temporary_path, ignore_errors=True)
     with _explaining_write_errors(path):

@@ -16,6 +16,7 @@ from jaxbeam.simulation.integration_plan import TOLERANCE, sample_times
 from jaxbeam.simulation.record import sensor_labels
 from jaxbeam.sweeps import cluster, store as sweep_store
 from jaxbeam.sweeps.batches import Batches
+from jaxbeam.sweeps.block_store import BlockStore, MemoryStore
 from jaxbeam.sweeps.blocks import Runner
 from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
 
@@ -83,7 +84,7 @@ def sweep(
     else:
         steps, error = runner.choose_step_sizes()
         if path is None:
-            block_store = sweep_store.MemoryStore(runner.block_count)
+            block_store = MemoryStore(runner.block_count)
         else:
             step_sizes_and_error = np.append(steps, error)
             content = specification.to_dict()
@@ -114,9 +115,7 @@ def _progress(runner: Runner, missing: list[int], visible: bool) -> tqdm:
     )
 
 
-def _compute(
-    runner: Runner, blocks: list[int], steps, block_store: sweep_store.BlockStore
-) -> Iterator[int]:
+def _compute(runner: Runner, blocks: list[int], steps, block_store: BlockStore) -> Iterator[int]:
     """Numbers of blocks as they are computed, on all cores, and stored."""
     results = runner.pool.map(lambda block: (block, runner.compute_block(block, steps)), blocks)
     # An error or an interrupt closes the iterator, which cancels blocks not yet started.

@@ -122,3 +122,17 @@ def test_unknown_name_of_the_package():
 def test_importing_the_package_does_not_import_jax():
     code = "import sys, jaxbeam; assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_old_keyword_arguments():
+    identification = jb.LoadIdentification(gates=[-0.2, -0.1])
+    settings = {"masses": [0.2], "gains": [[2e3]], "period": 0.01}
+    with pytest.warns(DeprecationWarning, match="recognition=.* is called load_identification"):
+        controller = jb.ScheduledFeedback(**settings, recognition=identification)
+    assert controller.load_identification is identification
+    with pytest.warns(DeprecationWarning, match="reach=.* is called max_delay_periods now"):
+        assert jb.Kalman(0.02, 1e-5, reach=3).max_delay_periods == 3
+    with pytest.raises(TypeError, match="places is called positions now; leave one out"):
+        jb.LQR([1.0], [1.0], places=[0.3], positions=[0.3])
+    with pytest.raises(TypeError, match="place_weights"):
+        jb.LQR([1.0], [1.0], place_weights=[1.0])

@@ -2,6 +2,7 @@
 
 import ctypes
 import dataclasses
+import hashlib
 import json
 import pathlib
 import platform
@@ -29,6 +30,7 @@ from jaxbeam.model.contact import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.numerics import peak_search
 from jaxbeam.runtime import native_library
+from jaxbeam.runtime.cache_folder import read_file, write_file
 from jaxbeam.simulation.integration_plan import static_shapes
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.sweeps.store import FINGERPRINT_ATTRIBUTE
@@ -235,13 +237,69 @@ def test_a_resumed_sweep_keeps_to_what_began_it():
     assert len(set(marks(False, "double", controlled))) == 1
 
 
-def test_what_cannot_be_loaded_is_left_alone(folder, monkeypatch, tmp_path):
+def planted(path, library):
+    """Another library, under the right name: dlopen alone would run it."""
+    path.write_bytes(library)
+
+
+def with_a_plain_digest(path, library):
+    path.write_bytes(hashlib.sha256(library).digest() + library)
+
+
+def empty_but_authentic(path, library):
+    write_file(path.name, b"")
+
+
+def truncated(path, library):
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+def linked(path, library):
+    path.replace(path.parent / "elsewhere")
+    path.symlink_to("elsewhere")
+
+
+def writable_by_others(path, library):
+    path.chmod(0o666)
+
+
+def in_an_open_folder(path, library):
+    path.parent.chmod(0o777)
+
+
+@pytest.mark.parametrize(
+    ("attack", "message"),
+    [
+        (planted, "was not written with the key of this user"),
+        (with_a_plain_digest, "was not written with the key of this user"),
+        (empty_but_authentic, "file too short"),
+        (truncated, "is damaged"),
+        (linked, "is a link"),
+        (writable_by_others, "other users may write to"),
+        (in_an_open_folder, "other users may write to"),
+    ],
+)
+def test_a_library_that_others_can_have_written_is_refused(
+    folder, monkeypatch, tmp_path, attack, message
+):
+    """In a folder of its own, as if in another process, which has not loaded the library."""
+    name = native_peaks.LIBRARY.file_name
+    library = read_file(name)
+    assert library is not None and native_peaks.available()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native_peaks.LIBRARY.library_path().parent.mkdir()
-    native_peaks.LIBRARY.library_path().write_bytes(
-        (folder / native_peaks.LIBRARY.library_path().name).read_bytes()[:1000]
-    )
-    assert not native_peaks.available()
+    path = write_file(name, library)
+    attack(path, library)
+    native_library._load.cache_clear()
+    try:
+        with pytest.warns(
+            UserWarning, match=f"C code not used: .*{message}.*`jaxbeam native` comp"
+        ):
+            assert not native_peaks.available()
+        assert not native_peaks.available()  # with no second warning
+    finally:
+        shutil.rmtree(path.parent)
+        monkeypatch.undo()
+        native_library._load.cache_clear()
 
 
 def test_whatever_is_included_decides_the_name_of_a_library():

@@ -67,7 +67,7 @@ def test_what_was_compiled_ahead_is_not_traced_again():
 def test_settings_that_are_not_known_are_left_out(monkeypatch):
     known = {"xla_backend_optimization_level": 1}
     monkeypatch.setenv("XLA_FLAGS", "")
-    monkeypatch.setattr(compiling, "OPTIONS", {"xla_no_such_setting": True, **known})
+    monkeypatch.setattr(compiling, "XLA_OPTIONS", {"xla_no_such_setting": True, **known})
     compiling._supported_options.cache_clear()
     try:
         assert compiling.xla_options() == known

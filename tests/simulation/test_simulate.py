@@ -32,7 +32,8 @@ from tests.oracles.modal_equations import Span
 from tests.runs import assert_close, load_of, plan_of
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::jaxbeam.simulation.simulate.ContactLossWarning"  # the model is bilateral, the oracles too
+    # the model is bilateral, the oracles too
+    "ignore::jaxbeam.simulation.simulate.ContactLossWarning"
 )
 
 SPAN = Span(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, modes=4, damping_ratio=0.02)

@@ -24,9 +24,9 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
     """Optimal gains k(m) or k(m, v) over the crossing, section 5.3 of the thesis.
 
     A `FiniteLQR` is designed for each of the `masses` and `speeds` (magnitudes; that of the load in
-    the design if left out), at constant speed. Between them commands are "interpolated" linearly, or
-    those of the "nearest" design are used; outside, the mass or speed is clamped to the grid. The
-    tables are stretched to the speed of the load, also outside the grid. With loads "known" the
+    the design if left out), at constant speed. Between them commands are "interpolated" linearly,
+    or those of the "nearest" design are used; outside, the mass or speed is clamped to the grid.
+    The tables are stretched to the speed of the load, also outside the grid. With loads "known" the
     weight of that mass is fed forward, as in `AugmentedLQR`.
 
     Mass, speed and entry time are those of the load in the design, or found by
@@ -144,7 +144,7 @@ def _any_not_positive(values) -> bool:
 
 
 def _with_crossing_load(plant: Plant, mass, speed) -> Plant:
-    """Plant with another mass (kg) at another constant speed (m/s), in the direction of its load."""
+    """Plant with another mass (kg) at another constant speed (m/s), in the same direction."""
     load = plant.case.loads[0]
     changed = eqx.tree_at(
         lambda x: (x.mass, x.speed, x.deceleration),

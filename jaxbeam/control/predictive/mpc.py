@@ -172,7 +172,7 @@ class MPC(AbstractStateController):
         return eqx.tree_at(lambda m: m.loads.inertia, design_plant, replace_fn=jnp.zeros_like)
 
     def _terminal_cost(self, sampled, C, weights):
-        """P of the cost after the horizon, of the incremental model under its regulator, or None."""
+        """P of the terminal cost, of the incremental model under its regulator, or None."""
         if self.terminal == "none":
             return None
         A, B, output_rows = incremental_model(sampled.A, sampled.B, C)

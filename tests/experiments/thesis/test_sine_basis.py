@@ -5,10 +5,10 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.linalg import eigh
 
+from experiments.thesis.chapter2.sine_basis import sine_basis_modes
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, replace
 from jaxbeam.model.modes import modes
-from experiments.thesis.chapter2.sine_basis import sine_basis_modes
 
 # Table 2.2 of the thesis (section 2.1.1), frequencies in Hz of eight modes of two spans of 0.6 m.
 ANALYTICAL = [20.387, 31.849, 81.550, 103.212, 183.488, 215.343, 326.2, 368.249]

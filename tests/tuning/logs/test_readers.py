@@ -5,6 +5,7 @@ import pytest
 import scipy.io
 
 from tuning import read_log, read_logs
+from tuning.logs.readers import FORMATS
 
 TIMES = np.arange(40) / 500
 D1, D2 = np.sin(20 * TIMES), np.cos(30 * TIMES) - 1  # mm
@@ -201,3 +202,11 @@ def test_channels_of_a_group_with_different_clocks(tmp_path):
     tdms(tmp_path / "run.tdms", extra={"wf_increment": 0.001})
     with pytest.raises(ValueError, match="group 'log': the channels have different times"):
         read_log(tmp_path / "run.tdms")
+
+
+def test_formats_are_found_in_the_modules_of_the_readers():
+    suffixes = [suffix for log_format in FORMATS for suffix in log_format.suffixes]
+    assert len(set(suffixes)) == len(suffixes)
+    binary = {suffix for f in FORMATS if not f.is_text for suffix in f.suffixes}
+    assert binary == {".tdms", ".mat", ".h5", ".hdf5", ".nc", ".parquet"}
+    assert set(suffixes) - binary == {".csv", ".tsv", ".txt", ".dat", ".lvm"}
