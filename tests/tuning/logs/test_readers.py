@@ -5,7 +5,7 @@ import pytest
 import scipy.io
 
 from tuning import read_log, read_logs
-from tuning.logs.readers import FORMATS
+from tuning.logs import readers
 
 TIMES = np.arange(40) / 500
 D1, D2 = np.sin(20 * TIMES), np.cos(30 * TIMES) - 1  # mm
@@ -205,8 +205,8 @@ def test_channels_of_a_group_with_different_clocks(tmp_path):
 
 
 def test_formats_are_found_in_the_modules_of_the_readers():
-    suffixes = [suffix for log_format in FORMATS for suffix in log_format.suffixes]
+    suffixes = [suffix for log_format in readers.FORMATS for suffix in log_format.suffixes]
     assert len(set(suffixes)) == len(suffixes)
-    binary = {suffix for f in FORMATS if not f.is_text for suffix in f.suffixes}
+    binary = {suffix for f in readers.FORMATS if not f.is_text for suffix in f.suffixes}
     assert binary == {".tdms", ".mat", ".h5", ".hdf5", ".nc", ".parquet"}
     assert set(suffixes) - binary == {".csv", ".tsv", ".txt", ".dat", ".lvm"}
