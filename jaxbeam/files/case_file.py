@@ -165,7 +165,7 @@ def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
     values = dict(table)
     if inspect.isabstract(part_class):
         part_class = _class_of_kind(address, values.pop("kind", None), part_class)
-    fields = {field.name: field for field in dataclasses.fields(part_class)}
+    fields = {field.name: field for field in dataclasses.fields(part_class) if field.metadata}
     values = current_keys(address, values, fields)
     for key, value in values.items():
         if key not in fields:
@@ -232,6 +232,8 @@ def _write_part(address: str, part: Any, part_class: type) -> dict[str, Any]:
         value = getattr(part, field.name)
         if value is None:
             continue
+        if not field.metadata:
+            raise ValueError(f"{address}.{field.name} is no key of a case file; leave it out")
         if "unit" in field.metadata:
             value = concrete(value).tolist()
         elif "part" in field.metadata:
