@@ -26,14 +26,15 @@ OLD_NAMES = {
 def accepts_old_arguments(**new_names: str) -> Callable[[Target], Target]:
     """Decorator for a function, or a class, that takes old keyword arguments as well.
 
-    `new_names` gives the keyword argument that replaced each old one.
+    `new_names` gives the keyword argument that replaced each old one. A call with both an old and
+    its new argument is refused: it raises TypeError.
     """
 
-    def decorate(target: Target) -> Target:
+    def _decorated(target: Target) -> Target:
         function = target.__init__ if isinstance(target, type) else target
 
         @functools.wraps(function)
-        def with_old_arguments(*given, **options):
+        def _with_old_arguments(*given, **options):
             for old in new_names.keys() & options.keys():
                 new = new_names[old]
                 if new in options:
@@ -43,11 +44,11 @@ def accepts_old_arguments(**new_names: str) -> Callable[[Target], Target]:
             return function(*given, **options)
 
         if not isinstance(target, type):
-            return cast(Target, with_old_arguments)
-        target.__init__ = with_old_arguments
+            return cast(Target, _with_old_arguments)
+        target.__init__ = _with_old_arguments
         return cast(Target, target)
 
-    return decorate
+    return _decorated
 
 
 def has_old_attributes(**new_names: str) -> Callable[[Class], Class]:
