@@ -29,7 +29,8 @@ def test_modules_functions_and_classes_are_documented(name):
     tree = parse(FILES[name])
     assert not tree.body or ast.get_docstring(tree), f"{name} has no docstring"
     for node in public(tree.body, ast.FunctionDef, ast.ClassDef):
-        assert ast.get_docstring(node), f"{name}.{node.name} has no docstring"
+        overloaded = any(ast.unparse(one) == "overload" for one in node.decorator_list)
+        assert overloaded or ast.get_docstring(node), f"{name}.{node.name} has no docstring"
 
 
 @pytest.mark.parametrize("name", FILES)

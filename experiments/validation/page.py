@@ -3,7 +3,7 @@
 import platform
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -22,8 +22,8 @@ which fails if an error exceeds its tolerance. The references are in `tests/orac
 compare many more cases with them."""
 
 
-def run_checks() -> list[tuple[str, list[Check]]]:
-    """All checks by group, with the title of each group.
+def check_groups() -> tuple[Callable[[], Iterator[Check]], ...]:
+    """Functions that yield the checks of a group, whose title is their docstring.
 
     Raises RuntimeError outside a clone of the repository, whose tests have the references.
     """
@@ -34,7 +34,7 @@ def run_checks() -> list[tuple[str, list[Check]]]:
             f"the references are in the repository, not in the package ({error});"
             " run this from the root of a clone"
         ) from None
-    groups = (
+    return (
         crossing_checks.frequencies,
         crossing_checks.statics,
         crossing_checks.crossings,
@@ -43,11 +43,15 @@ def run_checks() -> list[tuple[str, list[Check]]]:
         control_checks.loops,
         control_checks.bounds,
     )
+
+
+def run_checks() -> list[tuple[str, list[Check]]]:
+    """Titles and checks of all groups; prints the wall time of each group."""
     results = []
     with warnings.catch_warnings():
         # Moving masses that would lift off solve the same equations.
         warnings.simplefilter("ignore", ContactLossWarning)
-        for group in groups:
+        for group in check_groups():
             start = time.perf_counter()
             results.append((str(group.__doc__).rstrip("."), list(group())))
             print(f"{group.__name__}: {time.perf_counter() - start:.0f} s", flush=True)

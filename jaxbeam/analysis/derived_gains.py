@@ -1,7 +1,7 @@
-"""Gains of displacement feedback over the mass of the load, derived: Fig. 6.7 of the thesis.
+"""Gains of displacement feedback as functions of the mass of the load: Fig. 6.7 of the thesis.
 
-By statics, a linear gain that answers a mass as a power law does; by optimisation, the gain that
-leaves the lowest peak of a whole crossing, filters, delays and limits included.
+From statics, linear gains equivalent to a power law; by optimisation, gains of the lowest peak of
+a crossing, with filters, delays and limits.
 """
 
 import dataclasses
@@ -23,15 +23,15 @@ from jaxbeam.model.statics import influence_line, static_deflection_per_command
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
-LOAD_POSITIONS = 201  # of the load, at which the static deflection is looked for
-TRIAL_GAINS = 8  # gains from the largest one down, by equal factors
-MIN_GAIN_RATIO = 1 / 64  # the smallest of them, of the largest
-GAIN_TOLERANCE = 1e-3  # how exactly the best gain is found, relative
-RUN_TOLERANCE = 1e-5  # of the runs
+LOAD_POSITIONS = 201  # positions of the load at which the static deflection is evaluated
+TRIAL_GAINS = 8  # in a geometric sequence down from the largest
+MIN_GAIN_RATIO = 1 / 64  # smallest / largest trial gain
+GAIN_TOLERANCE = 1e-3  # relative, of the best gain
+RUN_TOLERANCE = 1e-5  # of the simulations
 
 
 class BestGain(NamedTuple):
-    """What `best_gains` finds for a mass (kg): gain, peak (m), and the peak without control."""
+    """Best gain for a mass (kg), its peak deflection (m), and the peak without control (m)."""
 
     mass: float
     gain: float
@@ -42,56 +42,54 @@ class BestGain(NamedTuple):
 def equivalent_gains(
     case: Case, masses: ArrayLike, gain: float, power: int = 3
 ) -> Float[np.ndarray, "actuator mass"]:
-    """Linear gains with which each mass sinks each sensor as far as under a power law.
+    """Linear gains with the same largest static deflections as a power law, for masses in kg.
 
-    Statically, with the load where it sinks the sensor most, each loop alone: the deflection w that
-    a mass m leaves under u = -gain w |w|^(power - 1) obeys s m = w + h gain w^power, with s the
-    deflection per kilogram and h the lift per unit of command, and k = gain w^(power - 1). Speed,
-    filters, limits and the other loops play no part. Masses are in kg, gains in a command per m.
+    Each loop alone, with the load at the position of the largest deflection: the deflection w under
+    u = -gain w |w|^(power - 1) satisfies s m = w + h gain w^power, with s the deflection per
+    kilogram and h that per unit of command, and the gain is k = gain w^(power - 1), in commands per
+    m. Speed, filters, limits and other loops are left out.
 
-    Raises ValueError for a faulty case and one with fewer sensors than actuators.
+    Raises ValueError for an invalid case or one with fewer sensors than actuators.
     """
     actuators, masses = len(case.actuators), np.asarray(masses, float)
     if len(case.sensors) < actuators:
         raise ValueError(
-            f"there are only {len(case.sensors)} sensors for {actuators} actuators; add some"
+            f"only {len(case.sensors)} sensors for {actuators} actuators: add one for each actuator"
         )
     sensor_positions = np.asarray(case.sensor_positions)[:actuators]
     load_positions = np.linspace(0, float(case.beam.length), LOAD_POSITIONS)
     static_deflections = float(case.run.gravity) * -np.asarray(
         influence_line(case, sensor_positions, load_positions)
     ).min(axis=0)
-    static_lifts = np.diagonal(np.asarray(static_deflection_per_command(case, sensor_positions)))
+    per_command = np.diagonal(np.asarray(static_deflection_per_command(case, sensor_positions)))
 
-    def equivalent_gain(free, lift):
+    def equivalent_gain(uncontrolled, unit_response):
         def residual(w):
-            return w + lift * gain * w**power - free
+            return w + unit_response * gain * w**power - uncontrolled
 
-        return gain * scipy.optimize.brentq(residual, 0.0, free, xtol=1e-15) ** (power - 1)
+        return gain * scipy.optimize.brentq(residual, 0.0, uncontrolled, xtol=1e-15) ** (power - 1)
 
-    rows = zip(static_deflections, static_lifts, strict=True)
+    rows = zip(static_deflections, per_command, strict=True)
     return np.array(
-        [[equivalent_gain(each * mass, lift) for mass in masses] for each, lift in rows]
+        [[equivalent_gain(each * mass, unit) for mass in masses] for each, unit in rows]
     )
 
 
 def best_gains(
     case: Case, masses: ArrayLike, max_gain: float, margin: float | None = None
 ) -> list[BestGain]:
-    """For each mass (kg) the gain, up to `max_gain`, that leaves the lowest peak of the run.
+    """Gain up to `max_gain` with the lowest peak of the run, for each mass (kg) of the first load.
 
-    The case has a controller of kind "feedback"; all its loops are given the same gain, in its own
-    units, and its power. Gains from `max_gain` down to a 64th are tried, then the best is sought
-    between its neighbours. With a `margin` only gains count with which the loop bears that much
-    more with the loads parked anywhere on the way (see `stability_margin`); without, also those of
-    loops that would be unstable if the load stayed, but not within the crossing.
+    The case has a controller of kind "feedback", whose loops all have the same gain, in its units
+    and with its power. TRIAL_GAINS gains are tried, then the best is refined between its
+    neighbours. With a `margin`, only gains with at least this gain margin under stationary loads
+    count (see `stability_margin`).
 
-    Raises ValueError for another controller, a faulty case, and if no gain that is tried has the
-    margin.
+    Raises ValueError for another controller, an invalid case, or if no gain has the margin.
     """
     controller = case.controller
     if type(controller) is not Feedback or controller.higher_gains is not None:
-        raise ValueError("gains are derived for a controller of kind 'feedback' with one power")
+        raise ValueError("best gains need a controller of kind 'feedback' with one power")
     masses = [float(mass) for mass in np.atleast_1d(np.asarray(masses, float))]
     uncontrolled_case = dataclasses.replace(case, controller=None)
     plan = integration_plan(_case_with(case, max_gain, max(masses)), None, RUN_TOLERANCE)
@@ -121,7 +119,7 @@ def scheduled_controller(
     between: str = "interpolated",
     load_identification: LoadIdentification | None = None,
 ) -> ScheduledFeedback:
-    """The controller with the gains that `best_gains` found for a case, all else as in its own.
+    """Scheduled controller with the gains of `best_gains`; other settings as those of the case.
 
     Raises ValueError if masses do not increase.
     """
@@ -142,7 +140,7 @@ def scheduled_controller(
 
 
 def _case_with(case: Case, gain: float | None, mass: float) -> Case:
-    """The case with this gain in every loop, if there are loops, and this mass."""
+    """Case with a mass (kg) of the first load, and a gain in all loops unless it is None."""
     change = {"loads.0.mass": mass}
     if gain is not None:
         change["controller.gains"] = np.full(len(case.actuators), gain)
@@ -150,15 +148,15 @@ def _case_with(case: Case, gain: float | None, mass: float) -> Case:
 
 
 def _peak(case: Case, plan) -> float:
-    """The largest deflection (m) at the sensors; infinite where the loop diverges."""
+    """Largest deflection (m) at the sensors; infinite if the loop diverges."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ContactLossWarning)  # a gain to be left aside may cause it
+        warnings.simplefilter("ignore", ContactLossWarning)  # of gains that are not chosen
         peak = float(np.max(concrete(simulate(case, plan=plan).peak_deflection)))
     return peak if np.isfinite(peak) else np.inf
 
 
 def _minimise_peak(peak, max_gain: float) -> tuple[float, float]:
-    """Where a function of the gain is lowest up to a top, and its value there."""
+    """Gain up to `max_gain` with the lowest peak, and the peak."""
     gains = max_gain * np.geomspace(MIN_GAIN_RATIO, 1, TRIAL_GAINS)
     tried = [peak(gain) for gain in gains]
     best = int(np.argmin(tried))
@@ -175,7 +173,7 @@ def _minimise_peak(peak, max_gain: float) -> tuple[float, float]:
 
 
 def _largest_gain_with_margin(case: Case, mass: float, max_gain: float, margin: float) -> float:
-    """The largest gain up to `max_gain` with a margin, to EXACT."""
+    """Largest gain up to `max_gain` with a gain margin, to GAIN_TOLERANCE."""
 
     def lacks_margin(gain):
         return not stability_margin(_case_with(case, gain, mass)).gain >= margin
@@ -185,8 +183,8 @@ def _largest_gain_with_margin(case: Case, mass: float, max_gain: float, margin: 
     low, high = MIN_GAIN_RATIO * max_gain, max_gain
     if lacks_margin(low):
         raise ValueError(
-            f"a mass of {mass:g} kg leaves a gain margin below {margin:g} even with a gain of"
-            f" {low:g}; ask for less, or lower the largest gain"
+            f"with a mass of {mass:g} kg the gain margin is below {margin:g} even for a gain of"
+            f" {low:g}; lower the margin or the largest gain"
         )
     while high / low > 1 + GAIN_TOLERANCE:
         middle = np.sqrt(low * high)

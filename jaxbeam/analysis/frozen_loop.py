@@ -136,10 +136,10 @@ class LoopDynamics(eqx.Module):
         )
 
     def sampling_step(self, timing: LoopTiming, state, t, command_given=None, substeps: int = 1):
-        """The loop from just before a tick at t (s) to just before the next, and the commands.
+        """State just before the next sample, from that just before a sample at t (s); commands.
 
-        The commands given are used in place of those of the law. Moving loads are followed in
-        `substeps` between any two changes of the command.
+        `command_given` replaces the commands of the law. Moving loads take `substeps` between
+        changes of the command.
         """
         plant_state, filters, signal_history, law_state, command_queue = state
         case, signal_history, states, readings = self.plant.case, list(signal_history), [], []
@@ -165,7 +165,7 @@ class LoopDynamics(eqx.Module):
         command_queue = jnp.concatenate(
             [(controller_command if command_given is None else command_given)[None], command_queue]
         )
-        # Within the period the command changes once, and sensors with a lag look at the beam.
+        # Within the period the command changes once, and delayed sensors take their samples.
         change = share * timing.period
         events = sorted({0.0, change, *delayed_samples, timing.period})
         for start, end in zip(events[:-1], events[1:], strict=True):
@@ -189,15 +189,15 @@ class LoopDynamics(eqx.Module):
         ), controller_command
 
     def _advance_plant(self, state, command, t, duration, substeps):
-        """The plant after a span (s) under held commands.
+        """State of the plant after a duration (s) under held commands.
 
         Each substep is two exponentials of matrices at Gauss nodes (order 4; Blanes and Moan,
-        Applied Numerical Mathematics 56, 2006), exact if the loads are frozen.
+        Applied Numerical Mathematics 56, 2006), exact for frozen loads.
         """
         inputs = jnp.concatenate([command, self.augmented_plant.weights])
 
         def augmented_matrix(time):
-            # Inputs are further states that stay: so the matrix is the same for all of them.
+            # Held inputs as further states.
             system = self.augmented_plant.at(time)
             top = jnp.concatenate([system.A, system.B], axis=1)
             return jnp.pad(top, ((0, inputs.shape[0]), (0, 0)))
@@ -206,7 +206,7 @@ class LoopDynamics(eqx.Module):
         return propagate(augmented_matrix, t, duration, substeps, start)[: state.shape[0]]
 
     def _sensor_inputs(self, state, command, t):
-        """What the sensors see of the plant with their analogue filters."""
+        """Inputs of the sensors (sensor,) after their analogue filters."""
         signals = self.output_rows @ self.augmented_plant.to_modal(state)
         has_feedthrough = np.array([s.has_feedthrough for s in self.plant.case.sensors], bool)
         if not has_feedthrough.any():
@@ -223,7 +223,7 @@ class LoopDynamics(eqx.Module):
 
 
 def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
-    """The opened loop of a case with a controller. May be traced and batched."""
+    """Loop dynamics of a case that has a controller; may be traced and batched."""
     return _loop_dynamics(case, compiled_modal_model(case, layout))
 
 
@@ -238,7 +238,7 @@ def _loop_dynamics(case, model):
 
 
 def propagate(matrix, t, duration, substeps: int, start):
-    """x(t + span) of x' = matrix(time) x with x(t) = start, a vector or a matrix; order 4."""
+    """x(t + duration) of x' = matrix(time) x, x(t) = start, a vector or matrix; order 4."""
     step = duration / substeps
     first_node, second_node = 0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6
     larger_weight, smaller_weight = (
@@ -259,7 +259,7 @@ def propagate(matrix, t, duration, substeps: int, start):
 
 
 def _ideal_sensor(sensor):
-    """The sensor without what is not linear in it: its range and its resolution."""
+    """Sensor without range, resolution and offset."""
     fields = ("range", "resolution", "offset")
     return eqx.tree_at(
         lambda s: [getattr(s, name) for name in fields],
@@ -270,7 +270,7 @@ def _ideal_sensor(sensor):
 
 
 def _split_delay(periods: float) -> tuple[int, float, int]:
-    """Whole periods in a lag, the share of one that is left, and how many periods it reaches."""
+    """Whole periods of a delay, the remaining fraction, and the number of periods it spans."""
     whole = math.floor(periods + PERIOD_TOLERANCE)
     remainder = max(periods - whole, 0.0)
     remainder = remainder if remainder > PERIOD_TOLERANCE else 0.0

@@ -85,12 +85,14 @@ class AbstractContinuousLaw(eqx.Module):
         return 0
 
     @abc.abstractmethod
-    def command(self, state: Float[Array, " own"], measurement: Measurement, t: Time) -> Command:
+    def command(
+        self, state: Float[Array, " law_state"], measurement: Measurement, t: Time
+    ) -> Command:
         """Command at t (s), before limits, in the units of the actuators."""
 
     def rates(
-        self, state: Float[Array, " own"], measurement: Measurement, command: Command, t: Time
-    ) -> Float[Array, " own"]:
+        self, state: Float[Array, " law_state"], measurement: Measurement, command: Command, t: Time
+    ) -> Float[Array, " law_state"]:
         """Rates of the states (1/s) under the command that the actuators receive."""
         return jnp.zeros_like(state)
 

@@ -50,13 +50,19 @@ class AbstractContinuousFilter(eqx.Module):
         return 0
 
     @abc.abstractmethod
-    def estimate(self, state: Float[Array, " own"], measurement: Measurement, t: Time) -> Estimate:
+    def estimate(
+        self, state: Float[Array, " filter_state"], measurement: Measurement, t: Time
+    ) -> Estimate:
         """Estimate at t (s)."""
 
     @abc.abstractmethod
     def rates(
-        self, state: Float[Array, " own"], measurement: Measurement, command: Command, t: Time
-    ) -> Float[Array, " own"]:
+        self,
+        state: Float[Array, " filter_state"],
+        measurement: Measurement,
+        command: Command,
+        t: Time,
+    ) -> Float[Array, " filter_state"]:
         """Rates of the states x (1/s) under a command."""
 
 

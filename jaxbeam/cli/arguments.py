@@ -174,14 +174,14 @@ def figure_path(output: Path | None, source: Path) -> Path:
 
 
 def check_exists(kind: str, *paths: Path) -> None:
-    """Raise FileNotFoundError if one of the files, of a kind such as "log file", is missing."""
+    """Raises FileNotFoundError if one of the files, of a kind such as "log file", is missing."""
     for path in paths:
         if not path.exists():
             raise FileNotFoundError(f"{path}: there is no such {kind}")
 
 
 def check_suffix(path: Path | None, suffix: str, content: str) -> None:
-    """Raise ValueError if a file has not the suffix of its content."""
+    """Raises ValueError if a file has not the suffix of its content."""
     if path and path.suffix != suffix:
         raise ValueError(
             f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}"
@@ -189,6 +189,6 @@ def check_suffix(path: Path | None, suffix: str, content: str) -> None:
 
 
 def refuse_option(is_given: bool, reason: str) -> None:
-    """Raise ValueError with the reason if an option is given that does not apply."""
+    """Raises ValueError with the reason if an option is given that does not apply."""
     if is_given:
         raise ValueError(reason)

@@ -20,7 +20,7 @@ NEWTON_ITERATIONS = 4  # of Newton's method; one suffices for a linear law
 
 
 class ContinuousLoop(AbstractInputPolicy):
-    """Input policy of a law in continuous time; its memory are the last commands.
+    """Input policy of a law in continuous time; its memory holds the commands at the last node.
 
     The model includes the analogue filters of sensors and law; its last states are the
     `controller_states` of the law, and their rates the last of its commands. `implicit` is False
@@ -75,17 +75,16 @@ class ContinuousLoop(AbstractInputPolicy):
         if outputs.shape[0]:
             outputs = jnp.stack([*readings, *outputs[sensors:]])  # filters of the law follow
 
-        def law(own_state, readings, plant_state):
+        def law(law_state, readings, plant_state):
             no_command = jnp.zeros(len(case.actuators))
             measurement = Measurement(readings, plant_state, no_command)
-            wanted = self.law.command(own_state, measurement, time)
-            command = limit_commands(case, wanted)
-            rates = self.law.rates(own_state, measurement, command, time)
+            command = limit_commands(case, self.law.command(law_state, measurement, time))
+            rates = self.law.rates(law_state, measurement, command, time)
             return jnp.concatenate([command, rates])
 
-        own_state = state[state.shape[0] - self.controller_states :]
+        law_state = state[state.shape[0] - self.controller_states :]
         plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
-        return jax.vmap(law, in_axes=-1, out_axes=-1)(own_state, outputs, plant_state)
+        return jax.vmap(law, in_axes=-1, out_axes=-1)(law_state, outputs, plant_state)
 
 
 def newton_fixed_point(

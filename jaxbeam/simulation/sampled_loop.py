@@ -101,11 +101,11 @@ class SampledLoop(AbstractInputPolicy):
         def step(inputs):
             law_state, queue, failures = inputs
             available = self._available_readings(readings, event)
-            wanted, law_state, solved = self._step_law(
+            command, law_state, solved = self._step_law(
                 law_state, available, state, memory.command, info.start
             )
-            limited = limit_commands(self.plant.case, wanted, queue[0])
-            queue = jnp.roll(queue, 1, axis=0).at[0].set(limited)
+            command = limit_commands(self.plant.case, command, queue[0])
+            queue = jnp.roll(queue, 1, axis=0).at[0].set(command)
             return law_state, queue, failures + ~solved
 
         law_state, queue, failures = jax.lax.cond(

@@ -251,7 +251,7 @@ def resolve_action(path: Path, fingerprint: str, resume: bool, overwrite: bool) 
 
 
 def check_writable(path: Path) -> None:
-    """Raise OSError if nothing can be written to the folder of a path."""
+    """Raises OSError if nothing can be written to the folder of a path."""
     try:
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:

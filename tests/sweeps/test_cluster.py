@@ -1,4 +1,4 @@
-"""Sweeps on a cluster: as on one machine, whoever dies on the way."""
+"""Sweeps on a cluster: the same store as on one machine, also when a worker is killed."""
 
 import os
 import signal
@@ -35,7 +35,7 @@ def files(store: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def workers():
-    """Two workers in processes of their own, and a client of theirs."""
+    """Client of two workers in processes of their own."""
     with (
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, dashboard_address=":0"
@@ -47,7 +47,7 @@ def workers():
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
-    """The store of the sweep as one machine makes it."""
+    """Store of the sweep, made on one machine."""
     path = tmp_path_factory.mktemp("alone") / "runs.zarr"
     jb.sweep(CASE, OVER, store=path, progress=False)
     return path
@@ -63,7 +63,7 @@ def kill_one(client, store: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of Dask, about the worker that is killed
-def test_two_workers_one_of_them_killed_make_the_same_store(workers, alone, tmp_path):
+def test_killed_worker_does_not_change_the_store(workers, alone, tmp_path):
     store = tmp_path / "runs.zarr"
     killer = threading.Thread(target=kill_one, args=(workers, store))
     killer.start()
@@ -72,7 +72,7 @@ def test_two_workers_one_of_them_killed_make_the_same_store(workers, alone, tmp_
     assert not found.failed.any()
     assert files(store) == files(alone)
 
-    # Begun on one machine, killed, and ended by the workers, it is the same once more.
+    # Started and killed on one machine, finished by the workers.
     second = tmp_path / "second.zarr"
 
     def stop(self, block, results):
@@ -97,26 +97,26 @@ def test_two_workers_one_of_them_killed_make_the_same_store(workers, alone, tmp_
     assert case.read_text() == tomli_w.dumps(tomllib.loads(case.read_text()))
 
 
-def test_an_order_travels_in_plain_words_and_numbers():
-    order = sweep_specification(CASE, OVER, False, False, 1e-7, "double")
-    again = specification_from_dict(order.to_dict())
-    assert again.fingerprint() == order.fingerprint()
-    np.testing.assert_array_equal(again.runs(), order.runs())
+def test_specification_survives_its_dictionary():
+    specification = sweep_specification(CASE, OVER, False, False, 1e-7, "double")
+    again = specification_from_dict(specification.to_dict())
+    assert again.fingerprint() == specification.fingerprint()
+    np.testing.assert_array_equal(again.runs(), specification.runs())
 
 
-def test_workers_refuse_what_they_would_spoil(tmp_path, monkeypatch):
+def test_workers_refuse_missing_stores_and_other_versions(tmp_path, monkeypatch):
     path = tmp_path / "runs.zarr"
     with pytest.raises(ValueError, match="where all machines see it"):
-        cluster.compute_and_store([0], "mark", path)
-    order = sweep_specification(CASE, {"loads.0.mass": [0.1]}, False, False, 1e-7, "double")
-    create_store(path, "mark", order.to_dict(), 1, np.ones(2))
-    monkeypatch.setattr(cluster, "_work", lambda mark, keeper: (None, "other"))
+        cluster.compute_and_store([0], "fingerprint", path)
+    content = sweep_specification(CASE, {"loads.0.mass": [0.1]}, False, False, 1e-7, "double")
+    create_store(path, "fingerprint", content.to_dict(), 1, np.ones(2))
+    monkeypatch.setattr(cluster, "_runner", lambda fingerprint, store: (None, "other"))
     with pytest.raises(ValueError, match="another version of jaxbeam"):
-        cluster.compute_and_store([0], "mark", path)
+        cluster.compute_and_store([0], "fingerprint", path)
     with pytest.raises(ValueError, match="write their blocks to a store; name one"):
         jb.sweep(CASE, {"loads.0.mass": [0.1]}, client=object())
 
 
-def test_a_scheduler_that_does_not_answer_is_named():
+def test_missing_scheduler_is_named():
     with pytest.raises(ConnectionError, match="no Dask scheduler answers at nowhere"):
         cluster.connect("nowhere://1")

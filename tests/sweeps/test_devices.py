@@ -1,4 +1,4 @@
-"""Sweeps in single precision, and shared by several devices: the same results, to rounding."""
+"""Sweeps in single precision and on several devices: the same results, to rounding."""
 
 import dataclasses
 import os
@@ -26,7 +26,7 @@ OVER = {
 }
 
 
-def test_single_precision_is_right_to_what_is_stated():
+def test_single_precision_meets_its_error_estimate():
     double, single = (
         jb.sweep(CASE, OVER, progress=False, precision=word) for word in ("double", "single")
     )
@@ -34,19 +34,19 @@ def test_single_precision_is_right_to_what_is_stated():
     assert double.peak_deflection.dtype == np.float64
     error = np.max(np.abs(single.peak_deflection / double.peak_deflection - 1))
     assert 1e-8 < error < 2e-5  # some tens of roundings, 6e-8 each
-    assert float(error) < 5 * single.error_estimate  # which was seen on some of the runs only
+    assert float(error) < 5 * single.error_estimate  # measured on a sample of the runs
     assert not single.failed.any()
     whole = jb.sweep(CASE, OVER, progress=False, precision="single", histories=True)
     assert whole.deflection.dtype == np.float32
     assert_allclose(np.abs(whole.deflection).max("time") <= double.peak_deflection * 1.00002, True)
 
 
-def test_precisions_that_there_are_not_are_refused():
+def test_unknown_precisions_are_refused():
     with pytest.raises(ValueError, match="precision must be double or single, not 'half'"):
         jb.sweep(CASE, OVER, precision="half")
-    looped = dataclasses.replace(CASE, controller=jb.Feedback(gains=[100.0], period=0.01))
+    controlled = dataclasses.replace(CASE, controller=jb.Feedback(gains=[100.0], period=0.01))
     with pytest.raises(ValueError, match="controllers need double precision"):
-        jb.sweep(looped, OVER, precision="single")
+        jb.sweep(controlled, OVER, precision="single")
 
 
 SHARED = """
@@ -64,7 +64,7 @@ np.savez(sys.argv[1], peaks=peaks, lines=lines)
 
 @pytest.mark.slow
 def test_several_devices_share_a_block(tmp_path):
-    """Three, among which eight tasks do not divide evenly."""
+    """Three devices and eight batches, which three does not divide."""
     flags = os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=3"
     command = [sys.executable, "-c", SHARED, str(tmp_path / "shared.npz")]
     subprocess.run(

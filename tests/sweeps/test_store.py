@@ -1,4 +1,4 @@
-"""Stores that are damaged, full or forbidden: found, told in one sentence, and nothing is lost."""
+"""Stores that are damaged, full or not writable: one sentence, and finished blocks are kept."""
 
 import ast
 import resource
@@ -11,6 +11,7 @@ import xarray
 
 import jaxbeam as jb
 from jaxbeam.simulation.record import read_record
+from jaxbeam.sweeps.specification import SweepSpecification
 from jaxbeam.sweeps.store import ZarrStore
 from tests.modules import module_files, parse
 from tests.sweeps.test_sweep import CASE
@@ -24,7 +25,7 @@ def sweep(store: Path, **options) -> xarray.Dataset:
 
 
 def stop_after(blocks: int, store: Path) -> None:
-    """Begin a sweep and interrupt it after some blocks."""
+    """Start a sweep and interrupt it after a number of blocks."""
     write = ZarrStore.write
 
     def stop(self, block, results):
@@ -39,50 +40,50 @@ def stop_after(blocks: int, store: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def complete(tmp_path_factory):
     """A complete store and its dataset."""
-    path = tmp_path_factory.mktemp("whole") / "runs.zarr"
+    path = tmp_path_factory.mktemp("complete") / "runs.zarr"
     return path, sweep(path)
 
 
 @pytest.fixture
-def copy(whole, tmp_path):
+def copy(complete, tmp_path):
     path = tmp_path / "runs.zarr"
-    shutil.copytree(whole[0], path)
+    shutil.copytree(complete[0], path)
     return path
 
 
 @pytest.fixture(scope="module")
-def begun(tmp_path_factory):
-    """A store in which two blocks of three are done."""
-    path = tmp_path_factory.mktemp("begun") / "runs.zarr"
+def unfinished(tmp_path_factory):
+    """Store with two of three blocks."""
+    path = tmp_path_factory.mktemp("unfinished") / "runs.zarr"
     stop_after(2, path)
     return path
 
 
-def cut(path: Path) -> None:
+def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-7])
 
 
-def garble(path: Path) -> None:
+def flip_bits(path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 0x55
     path.write_bytes(content)
 
 
 DAMAGES = {
-    "cut off": cut,
-    "garbled": garble,
+    "truncated": truncate,
+    "flipped bits": flip_bits,
     "empty": lambda p: p.write_bytes(b""),
-    "gone": Path.unlink,
+    "missing": Path.unlink,
 }
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("part", ["peak_deflection/c/0/0/0", "failed/c/0/0", "peak_time/zarr.json"])
-def test_a_damaged_result_is_refused(copy, part, damage):
+def test_damaged_results_are_refused(copy, part, damage):
     DAMAGES[damage](copy / part)
-    if (part, damage) == ("peak_time/zarr.json", "garbled"):
+    if (part, damage) == ("peak_time/zarr.json", "flipped bits"):
         (copy / part).write_text("{" + (copy / part).read_text())
     with pytest.raises(ValueError, match=r"runs\.zarr is damaged \(.*\): make the sweep anew"):
         sweep(copy, resume=True)
@@ -91,9 +92,9 @@ def test_a_damaged_result_is_refused(copy, part, damage):
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("part", ["peak_deflection/c/1/0/0", "done/c/1"])
-def test_damaged_blocks_are_computed_again(begun, whole, tmp_path, part, damage):
+def test_damaged_blocks_are_computed_again(unfinished, complete, tmp_path, part, damage):
     path = tmp_path / "runs.zarr"
-    shutil.copytree(begun, path)
+    shutil.copytree(unfinished, path)
     DAMAGES[damage](path / "blocks" / part)
     if part == "done/c/1":
         found = sweep(path, resume=True)
@@ -102,43 +103,45 @@ def test_damaged_blocks_are_computed_again(begun, whole, tmp_path, part, damage)
             UserWarning, match="1 finished blocks are damaged and are computed again"
         ):
             found = sweep(path, resume=True)
-    xarray.testing.assert_identical(found, whole[1])
+    xarray.testing.assert_identical(found, complete[1])
 
 
-def test_damaged_beginnings_are_refused(begun, tmp_path):
+def test_damaged_unfinished_stores_are_refused(unfinished, tmp_path):
     path = tmp_path / "runs.zarr"
-    shutil.copytree(begun, path)
-    garble(path / "blocks" / "steps" / "c" / "0")
+    shutil.copytree(unfinished, path)
+    flip_bits(path / "blocks" / "steps" / "c" / "0")
     with pytest.raises(ValueError, match=r"is damaged"):
         sweep(path, resume=True)
-    shutil.copytree(begun, path, dirs_exist_ok=True)
+    shutil.copytree(unfinished, path, dirs_exist_ok=True)
     text = (path / "zarr.json").read_text()
     (path / "zarr.json").write_text(text.replace('"jaxbeam_sweep": "', '"jaxbeam_sweep": "0'))
     with pytest.raises(ValueError, match="another case, other values or settings"):
         sweep(path, resume=True)
-    cut(path / "zarr.json")
+    truncate(path / "zarr.json")
     with pytest.raises(FileExistsError, match="is not a sweep of jaxbeam"):
         sweep(path, overwrite=True)
     assert (path / "blocks" / "done").is_dir()
 
 
-def test_a_full_disk_costs_no_finished_block(begun, whole, tmp_path):
+def test_full_disk_keeps_finished_blocks(unfinished, complete, tmp_path):
     path = tmp_path / "runs.zarr"
-    shutil.copytree(begun, path)
+    shutil.copytree(unfinished, path)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # bytes in a file
     try:
-        with pytest.raises(OSError, match=r"cannot write to .*: file too large; what is done is"):
+        with pytest.raises(
+            OSError, match=r"cannot write to .*: file too large; finished blocks are"
+        ):
             sweep(path, resume=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert ZarrStore(path).missing() == [2]
-    xarray.testing.assert_identical(sweep(path, resume=True), whole[1])
+    xarray.testing.assert_identical(sweep(path, resume=True), complete[1])
     assert not list(path.rglob("*.partial"))
 
 
-def test_a_folder_that_cannot_be_written_to_is_told_before_any_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(jb.order.Order, "work", lambda self: pytest.fail("began to work"))
+def test_folder_that_is_not_writable_is_named_before_any_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(SweepSpecification, "runner", lambda _: pytest.fail("it runs"))
     with pytest.raises(OSError, match=r"cannot write runs\.zarr to the folder .*none: no such"):
         sweep(tmp_path / "none" / "runs.zarr")
     monkeypatch.setattr("tempfile.TemporaryFile", forbidden)
@@ -151,11 +154,11 @@ def forbidden(**_):
     raise PermissionError(13, "Permission denied")
 
 
-# No code from files
+# No code from files is run
 
 
-class Bomb:
-    """Something that, unpickled, leaves a trace."""
+class TracedObject:
+    """Object whose unpickling creates a file."""
 
     def __init__(self, trace: Path):
         self.trace = trace
@@ -166,7 +169,7 @@ class Bomb:
 
 def test_nothing_is_unpickled(copy, tmp_path):
     trace = tmp_path / "trace"
-    objects = np.array([Bomb(trace)] * 3, dtype=object)
+    objects = np.array([TracedObject(trace)] * 3, dtype=object)
     for name in ("run.csv", "run.mat", "run.npz", "run.nc", "run.h5", "run.tdms", "run.parquet"):
         with open(tmp_path / name, "wb") as file:
             np.savez(file, time=objects)
@@ -187,7 +190,7 @@ UNPICKLE = {"pickle", "cloudpickle", "marshal", "shelve", "dill", "joblib"}
 PICKLING = {"jaxbeam.runtime.compile_cache", "jaxbeam.runtime.program_key"}
 
 
-def test_no_module_runs_what_it_reads():
+def test_no_module_runs_code_from_files():
     for name, path in module_files().items():
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):

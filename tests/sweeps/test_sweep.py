@@ -1,4 +1,4 @@
-"""Sweeps: they agree with single runs, mark what fails, and survive being killed."""
+"""Sweeps: agreement with single runs, failed runs, stores, and resuming after a kill."""
 
 import dataclasses
 import os
@@ -29,7 +29,7 @@ MASSES, SPEEDS = [0.1, 0.4, 0.9], [1.5, 4.0]
 
 
 def single(values) -> np.ndarray:
-    """Peaks by one simulation."""
+    """Peaks of one simulation."""
     return np.asarray(jb.simulate(jb.replace(CASE, values)).peak_deflection)
 
 
@@ -42,7 +42,7 @@ def product():
     return sweep({"loads.0.mass": MASSES, "loads.0.speed": SPEEDS})
 
 
-def test_a_product_is_labelled_by_address_and_agrees_with_single_runs(product):
+def test_grid_is_labelled_by_address_and_agrees_with_single_runs(product):
     assert product.peak_deflection.dims == ("loads.0.mass", "loads.0.speed", "sensor")
     assert product.peak_deflection.units == "m"
     assert not product.failed.any()
@@ -61,7 +61,7 @@ def test_a_product_is_labelled_by_address_and_agrees_with_single_runs(product):
     [(1, [], np.geomspace(0.3, 30, 48)), (3, [jb.Support(0.35)], np.linspace(0.3, 10, 48))],
 )
 def test_errors_stay_below_the_tolerance_at_critical_speeds(modes, supports, speeds, tolerance):
-    """There a heavy mass leaves errors ten times those of runs a little slower or quicker."""
+    """Errors of a heavy mass are there ten times those at slightly other speeds."""
     beam = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=modes)
     case = dataclasses.replace(CASE, beam=beam, supports=supports, run=jb.Run(2.3))
     over = {"loads.0.mass": np.linspace(0.1, 1.0, 64), "loads.0.speed": speeds}
@@ -71,7 +71,7 @@ def test_errors_stay_below_the_tolerance_at_critical_speeds(modes, supports, spe
     assert error.max() < tolerance
 
 
-def test_paired_values_run_side_by_side():
+def test_paired_values():
     over = {
         "beam.flexural_rigidity": [10.0, 12.0],
         "supports.0.position": [0.35, 0.45],
@@ -97,8 +97,8 @@ def test_histories_on_request():
     assert_allclose(found.deflection[1, 0], record.deflection, atol=1e-10)
 
 
-def test_a_failed_run_is_marked_and_touches_no_other():
-    """A weight beyond all numbers spoils its run, and that one only."""
+def test_failed_run_is_marked_and_changes_no_other():
+    """An infinite weight makes one run fail."""
     masses, gravity = [*MASSES, 100.0], [9.81, 9.81, 9.81, 1e308]
     whole = sweep({"loads.0.mass": masses, "run.gravity": gravity}, paired=True)
     assert whole.failed.values.tolist() == [False, False, False, True]
@@ -107,7 +107,7 @@ def test_a_failed_run_is_marked_and_touches_no_other():
     assert_allclose(whole.peak_deflection[:-1], sound.peak_deflection, rtol=1e-12)
 
 
-def test_a_store_holds_what_was_returned(product, tmp_path):
+def test_store_holds_the_returned_dataset(product, tmp_path):
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
     path = tmp_path / "runs.zarr"
     xarray.testing.assert_identical(sweep(over, store=path), product)
@@ -135,7 +135,7 @@ jb.sweep(t.CASE, over, store=sys.argv[1], resume=True, progress=False)
 
 
 @pytest.mark.slow
-def test_a_killed_sweep_resumes_to_the_same_bits(tmp_path):
+def test_killed_sweep_resumes_bit_identically(tmp_path):
     def start(path):
         return subprocess.Popen([sys.executable, "-c", KILLED, str(path)])
 
@@ -147,7 +147,7 @@ def test_a_killed_sweep_resumes_to_the_same_bits(tmp_path):
         time.sleep(0.001)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    assert (cut / "blocks").exists(), "it was killed too late to prove anything"
+    assert (cut / "blocks").exists(), "killed after the sweep was complete"
     assert start(cut).wait() == 0
     first, second = (xarray.open_zarr(path, consolidated=False).load() for path in (whole, cut))
     xarray.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
@@ -165,12 +165,12 @@ def test_a_killed_sweep_resumes_to_the_same_bits(tmp_path):
         ({"beam.damping_ratio": [0.1]}, "is a list"),
     ],
 )
-def test_faulty_values_are_refused(over, message):
+def test_invalid_values_are_refused(over, message):
     with pytest.raises(ValueError, match=message):
         sweep(over)
 
 
-def test_other_faults_are_refused():
+def test_other_errors_are_named():
     with pytest.raises(ValueError, match="equally many"):
         sweep({"loads.0.mass": [0.1], "loads.0.speed": [1.0, 2.0]}, paired=True)
     with pytest.raises(ValueError, match="no sensors"):
@@ -178,13 +178,13 @@ def test_other_faults_are_refused():
     two = jb.Case(CASE.beam, [*CASE.supports, jb.Support(0.2)], sensors=CASE.sensors)
     with pytest.raises(ValueError, match="change their order"):
         jb.sweep(two, {"supports.1.position": [0.2, 0.5]}, progress=False)
-    driven = dataclasses.replace(
+    controlled = dataclasses.replace(
         CASE,
         actuators=(jb.PointForce(0.2),),
         controller=jb.Feedback(gains=[1.0], period=0.01),
     )
-    with pytest.raises(ValueError, match="controller.period sets the clock of the run"):
-        jb.sweep(driven, {"controller.period": [0.01, 0.02]}, progress=False)
+    with pytest.raises(ValueError, match="controller.period determines the schedule"):
+        jb.sweep(controlled, {"controller.period": [0.01, 0.02]}, progress=False)
 
 
 def test_each_run_has_the_controller_designed_for_its_loads():
@@ -201,19 +201,19 @@ def test_each_run_has_the_controller_designed_for_its_loads():
 
 
 @given(st.integers(1, 400), st.integers(1, 5), st.integers(0, 10))
-def test_every_run_is_in_one_lane(count, paths, seed):
+def test_every_run_is_in_one_batch(count, paths, seed):
     random = np.random.default_rng(seed)
     speeds = random.integers(0, paths, count).astype(float)
     masses = random.random(count)
-    tasks = make_batches(["loads.0.speed", "loads.0.mass"], np.stack([speeds, masses], axis=1))
-    real = tasks.run_index >= 0
-    assert sorted(tasks.run_index[real]) == list(range(count))
-    rows = np.broadcast_to(tasks.shared_values[:, None, 0], tasks.run_index.shape)
-    assert_array_equal(rows[real], speeds[tasks.run_index[real]])
-    assert_array_equal(tasks.batched_values[..., 0][real], masses[tasks.run_index[real]])
+    batches = make_batches(["loads.0.speed", "loads.0.mass"], np.stack([speeds, masses], axis=1))
+    mask = batches.run_index >= 0
+    assert sorted(batches.run_index[mask]) == list(range(count))
+    rows = np.broadcast_to(batches.shared_values[:, None, 0], batches.run_index.shape)
+    assert_array_equal(rows[mask], speeds[batches.run_index[mask]])
+    assert_array_equal(batches.batched_values[..., 0][mask], masses[batches.run_index[mask]])
 
 
-def test_the_bar_stays_out_of_standard_output(capfd):
+def test_progress_bar_is_on_standard_error(capfd):
     jb.sweep(CASE, {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS})
     captured = capfd.readouterr()
     assert captured.out == "" and "run" in captured.err
@@ -221,8 +221,8 @@ def test_the_bar_stays_out_of_standard_output(capfd):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("modes", "damping"), [(3, 0.03), (6, 0.0), (12, 0.005)])
-def test_longest_steps_do_not_blow_up(modes, damping):
-    """They still follow the highest mode; longer ones feed its motion under a heavy load."""
+def test_longest_steps_are_stable(modes, damping):
+    """They resolve the highest mode, which longer steps excite under a heavy load."""
     masses, speeds = np.array([0.1, 1.0, 8.0]), np.linspace(0.1, 0.35, 7)
     beam = jb.Beam(
         length=0.6,
@@ -238,15 +238,15 @@ def test_longest_steps_do_not_blow_up(modes, damping):
         run=jb.Run(duration=6.5),
     )
     runs = np.array([(mass, speed) for speed in speeds for mass in masses])
-    work = Runner(case, make_batches(["loads.0.mass", "loads.0.speed"], runs), False, 1e-3)
-    peaks = work.compute_block(0, work.max_steps)["peak_deflection"]  # speed, mass, sensor
+    runner = Runner(case, make_batches(["loads.0.mass", "loads.0.speed"], runs), False, 1e-3)
+    peaks = runner.compute_block(0, runner.max_steps)["peak_deflection"]  # speed, mass, sensor
     ratio = peaks / (masses[:, None] * np.asarray(static_peak(case, np.array([0.15, 0.3]))))
     assert ratio.min() > 0.99 and ratio.max() < 1.15
 
 
-def test_errors_are_seen_where_few_steps_lie_between_samples():
-    """Of one or two steps a hold: finer ones must not come out as the same number."""
-    looped = dataclasses.replace(
+def test_errors_are_measured_with_few_steps_per_sample():
+    """One or two steps per hold, which the finer runs must exceed."""
+    controlled = dataclasses.replace(
         CASE,
         actuators=[jb.PointForce(0.3)],
         sensors=[jb.Sensor(0.3)],
@@ -255,7 +255,8 @@ def test_errors_are_seen_where_few_steps_lie_between_samples():
     )
     over = {"loads.0.speed": np.linspace(2.0, 6.0, 6)}
     rough, fine = (
-        jb.sweep(looped, over, progress=False, tolerance=tolerance) for tolerance in (1e-2, 1e-9)
+        jb.sweep(controlled, over, progress=False, tolerance=tolerance)
+        for tolerance in (1e-2, 1e-9)
     )
     error = np.max(np.abs(rough.peak_deflection / fine.peak_deflection - 1))
     assert 1e-9 < error < 2 * rough.error_estimate

@@ -13,7 +13,7 @@ HUBER_THRESHOLD = 1.345  # 95 % of the efficiency of squares for normal noise
 
 
 def check_loss(loss: str) -> None:
-    """Raise ValueError for an unknown loss."""
+    """Raises ValueError for an unknown loss."""
     if loss not in LOSSES:
         raise ValueError(f"a loss is one of {', '.join(LOSSES)}, not {loss!r}")
 

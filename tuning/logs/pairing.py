@@ -152,7 +152,7 @@ def check_times(log: Log) -> None:
 
 
 def check_loads(log: Log, case: Case) -> None:
-    """Raise ValueError unless a load is known and has crossed before the log ends."""
+    """Raises ValueError unless a load is known and has crossed before the log ends."""
     if case.controller is not None and not case.loads:
         return
     if not case.loads:

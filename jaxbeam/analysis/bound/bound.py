@@ -119,6 +119,7 @@ def bound(
     default at the run's sample rate, and at changes of the commands. `places` is the former name of
     `positions`.
 
+    Raises TypeError for both `places` (the former name) and `positions`.
     Raises ValueError for an invalid case, one without loads, without positions or without actuators
     that take commands, for a period or spacing that is not positive, for limits that the rates
     cannot reach from zero, and under `jit` or differentiation (there are no derivatives);
