@@ -1,20 +1,29 @@
 """Keyword arguments of former versions, accepted with a warning by controllers and estimators."""
 
 import dataclasses
+from typing import TYPE_CHECKING, dataclass_transform
 
 import equinox as eqx
 
 from jaxbeam.case.aliases import KEYS, warn_renamed
 
 
-class AcceptsFormerArguments(type(eqx.Module)):
+if TYPE_CHECKING:
+    from equinox._module._module import _ModuleMeta as ModuleMeta
+else:
+    ModuleMeta = type(eqx.Module)
+
+
+class AcceptsFormerArguments(ModuleMeta):
     """Metaclass that replaces former words among the keyword arguments by the present ones."""
 
-    def __call__(cls, *args, **arguments):
-        """Raises TypeError if the old and the new word are both given."""
-        if KEYS.keys() & arguments.keys():
-            arguments = _present(cls, arguments)
-        return super().__call__(*args, **arguments)
+    if not TYPE_CHECKING:  # a type checker takes the fields of a module for its arguments
+
+        def __call__(cls, *args, **arguments):
+            """Raises TypeError if the old and the new word are both given."""
+            if KEYS.keys() & arguments.keys():
+                arguments = _present(cls, arguments)
+            return super().__call__(*args, **arguments)
 
 
 def _present(part_class: type, arguments: dict) -> dict:

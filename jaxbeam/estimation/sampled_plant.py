@@ -11,13 +11,11 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.controller import AbstractController
+from jaxbeam.numerics.discretisation import exponential_and_gramian
 
-DOUBLINGS = 14  # of the short interval of the series, up to the whole
-SERIES_TERMS = 10  # exact to rounding while the norm of the matrix over the interval is below 0.05
 PERIOD_ROUNDING = 1e-9  # of a period; a delay counts as whole periods if it exceeds them by less
 
 Square = Float[Array, "state state"]
@@ -149,29 +147,3 @@ def _augmented_matrix(matrices_at: StateAndInputMatrices, time, scale):
     A, B = matrices_at(time)
     top = jnp.concatenate([A * scale / scale[:, None], B / scale[:, None]], axis=1)
     return jnp.pad(top, ((0, B.shape[1]), (0, 0)))
-
-
-def exponential_and_gramian(matrix: Square, intensity: Square) -> tuple[Square, Square]:
-    """exp(M) and the integral of exp(M s) N exp(M's) over s from 0 to 1.
-
-    By the series of a small fraction of M and doubling: unlike the blocks of one larger exponential
-    (Van Loan's), this is accurate however fast the plant decays.
-    """
-    scaled_matrix = matrix / 2**DOUBLINGS
-    scaled_intensity = intensity / 2**DOUBLINGS
-    identity = jnp.eye(matrix.shape[0])
-
-    def horner(sums, k):
-        flow, gathered = sums
-        grown = scaled_matrix @ gathered
-        return (
-            identity + scaled_matrix @ flow / k,
-            scaled_intensity + (grown + grown.T) / (k + 1),
-        ), None
-
-    def double(sums, _):
-        flow, gathered = sums
-        return (flow @ flow, gathered + flow @ gathered @ flow.T), None
-
-    sums, _ = jax.lax.scan(horner, (identity, scaled_intensity), np.arange(SERIES_TERMS, 0.0, -1.0))
-    return jax.lax.scan(double, sums, length=DOUBLINGS)[0]

@@ -7,6 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+DOUBLINGS = 14  # from the short interval of the series to the whole
+SERIES_TERMS = 10  # exact to rounding while the norm of the matrix over that interval is below 0.05
+
 
 def c2d(
     A: Float[Array, "state state"],
@@ -34,6 +37,33 @@ def c2d(
     factorials = np.array([math.factorial(k) for k in range(powers)], float)
     transition = exponential[:states, :states] * scale[:, None] / scale
     return transition, jnp.moveaxis(input_matrix, 1, 0) * factorials[:, None, None] * scale[:, None]
+
+
+def exponential_and_gramian(
+    matrix: Float[Array, "state state"], intensity: Float[Array, "state state"]
+) -> tuple[Float[Array, "state state"], Float[Array, "state state"]]:
+    """exp(M) and the integral of exp(M s) N exp(M's) over s from 0 to 1.
+
+    By the series of a small fraction of M and doubling: unlike the blocks of one larger exponential
+    (Van Loan's), this is accurate however fast the plant decays.
+    """
+    scaled_matrix, scaled_intensity = matrix / 2**DOUBLINGS, intensity / 2**DOUBLINGS
+    identity = jnp.eye(matrix.shape[0])
+
+    def horner(sums, k):
+        exponential, integral = sums
+        product = scaled_matrix @ integral
+        return (
+            identity + scaled_matrix @ exponential / k,
+            scaled_intensity + (product + product.T) / (k + 1),
+        ), None
+
+    def double(sums, _):
+        exponential, integral = sums
+        return (exponential @ exponential, integral + exponential @ integral @ exponential.T), None
+
+    sums, _ = jax.lax.scan(horner, (identity, scaled_intensity), np.arange(SERIES_TERMS, 0.0, -1.0))
+    return jax.lax.scan(double, sums, length=DOUBLINGS)[0]
 
 
 def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:

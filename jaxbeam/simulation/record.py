@@ -16,6 +16,7 @@ from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.output_rows import quantity_history
+from jaxbeam.simulation.result_variables import MODE_FIELDS, MODE_VARIABLES, VARIABLES
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -172,16 +173,16 @@ class Record(eqx.Module):
 
         variables = {
             name: (dims, np.asarray(getattr(self, name)), {"units": unit, "long_name": words})
-            for name, (dims, unit, words) in _VARIABLES.items()
+            for name, (dims, unit, words) in VARIABLES.items()
         }
         # Modes of repeated frequencies are not unique, so they are stored.
         variables |= {
             f"mode_{name}": (
                 dims,
-                np.asarray(getattr(self.modes, _MODE_FIELDS.get(name, name))),
+                np.asarray(getattr(self.modes, MODE_FIELDS.get(name, name))),
                 {"units": unit, "long_name": words},
             )
-            for name, (dims, unit, words) in _MODE_VARIABLES.items()
+            for name, (dims, unit, words) in MODE_VARIABLES.items()
         }
         coordinates = {
             "time": ("time", np.asarray(self.times), {"units": "s"}),
@@ -210,36 +211,7 @@ class Record(eqx.Module):
         dataset.drop_vars(empty).to_netcdf(path, engine="scipy")
 
 
-_VARIABLES = {
-    "deflection": (("time", "sensor"), "m", "deflection at the sensor"),
-    "velocity": (("time", "sensor"), "m/s", "velocity at the sensor"),
-    "acceleration": (("time", "sensor"), "m/s^2", "acceleration at the sensor"),
-    "measured": (("time", "sensor"), "SI unit of its quantity", "reading of the sensor"),
-    "coordinates": (("time", "mode"), "m kg^0.5", "modal coordinate"),
-    "rates": (("time", "mode"), "m kg^0.5/s", "rate of the modal coordinate"),
-    "accelerations": (("time", "mode"), "m kg^0.5/s^2", "acceleration of the modal coordinate"),
-    "load_position": (("time", "load"), "m", "position of the load"),
-    "contact_force": (("time", "load"), "N", "contact force, positive under compression"),
-    "command": (("time", "actuator"), "unit of a command", "command to the actuator"),
-    "failures": (("time",), "1", "steps of the controller without a solution so far"),
-    "peak_deflection": (("sensor",), "m", "largest absolute deflection"),
-    "peak_time": (("sensor",), "s", "time of the largest absolute deflection"),
-    "lowest_contact_force": (("load",), "N", "smallest contact force"),
-    "contact_lost_time": (("load",), "s", "time of the first negative contact force"),
-    "contact_lost_position": (("load",), "m", "position of the first negative contact force"),
-}
-_MODE_VARIABLES = {
-    "stiffness": (("mode",), "1/s^2", "stiffness of the mode"),
-    "damping": (("mode",), "1/s", "damping of the mode"),
-    "coupling": (("mode", "other_mode"), "1/s^2", "stiffness between repeated modes"),
-    "damping_coupling": (("mode", "other_mode"), "1/s", "damping between repeated modes"),
-    "nodes": (("node",), "m", "ends of the segments of the mode shapes"),
-    "series": (("segment", "degree", "mode"), "kg^-0.5", "Chebyshev series of the mode shapes"),
-    "unit": ((), "1/s^2", "flexural rigidity / (mass per length x length^4)"),
-}
-# Fields of `Modes` by their names in files, where they differ.
-_MODE_FIELDS = {"unit": "stiffness_unit"}
-_STORED_VARIABLES = [name for name in _VARIABLES if name in Record.__annotations__]
+_STORED_VARIABLES = [name for name in VARIABLES if name in Record.__annotations__]
 
 
 def record_from_xarray(dataset: "xarray.Dataset") -> Record:
@@ -258,14 +230,14 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         **dataset.sizes,
     }
     may_be_empty = *_STORED_VARIABLES, "measured"
-    shapes = {name: [sizes.get(d, 0) for d in _VARIABLES[name][0]] for name in may_be_empty}
+    shapes = {name: [sizes.get(d, 0) for d in VARIABLES[name][0]] for name in may_be_empty}
     empty = {
-        name: (_VARIABLES[name][0], np.zeros(shape))
+        name: (VARIABLES[name][0], np.zeros(shape))
         for name, shape in shapes.items()
         if 0 in shape and name not in dataset.variables
     }
     dataset = dataset.assign(empty)
-    mode_variables = {name: f"mode_{name}" for name in _MODE_VARIABLES}
+    mode_variables = {name: f"mode_{name}" for name in MODE_VARIABLES}
     required = (*_STORED_VARIABLES, *mode_variables.values(), "time")
     missing = [name for name in required if name not in dataset.variables]
     if missing:
@@ -275,7 +247,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         case=case,
         modes=Modes(
             **{
-                _MODE_FIELDS.get(name, name): jnp.asarray(dataset[label].values)
+                MODE_FIELDS.get(name, name): jnp.asarray(dataset[label].values)
                 for name, label in mode_variables.items()
             }
         ),

@@ -76,7 +76,9 @@ def _check_times(times) -> None:
         return
     times = concrete(times)
     if times.ndim != 1 or times.size < 2:
-        raise ValueError(f"times must be a list of at least two numbers; its shape is {times.shape}")
+        raise ValueError(
+            f"times must be at least two numbers in a list; its shape is {times.shape}"
+        )
     if not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
         raise ValueError("times (s from the start of the run) must be finite and ascend")
 

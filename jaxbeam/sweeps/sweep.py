@@ -14,6 +14,7 @@ from tqdm import tqdm
 from jaxbeam.case.case import Case
 from jaxbeam.simulation.integration_plan import TOLERANCE, sample_times
 from jaxbeam.simulation.record import sensor_labels
+from jaxbeam.simulation.result_variables import SWEEP_VARIABLES
 from jaxbeam.sweeps import cluster, store as sweep_store
 from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.block_store import BlockStore, MemoryStore
@@ -125,16 +126,6 @@ def _compute(runner: Runner, blocks: list[int], steps, block_store: BlockStore) 
             yield block
 
 
-_VARIABLES = {
-    "peak_deflection": ("m", "largest absolute deflection", ("sensor",)),
-    "peak_time": ("s", "time of the largest absolute deflection", ("sensor",)),
-    "lowest_contact_force": ("N", "smallest contact force", ("load",)),
-    "contact_lost_time": ("s", "first time at which the load would have to pull", ("load",)),
-    "controller_failures": ("1", "steps at which the controller found no solution", ()),
-    "deflection": ("m", "deflection", ("time", "sensor")),
-}
-
-
 def _to_dataset(
     specification: SweepSpecification, batches: Batches, results: dict[str, np.ndarray]
 ) -> "xarray.Dataset":
@@ -154,11 +145,11 @@ def _to_dataset(
         "failed": (dims, failed.reshape(shape), {"long_name": "whether the run failed"})
     }
     for name, values in flat.items():
-        unit, words, dims_of_variable = _VARIABLES[name]
+        own_dims, unit, words = SWEEP_VARIABLES[name]
         values = np.where(failed.reshape(-1, *(1,) * (values.ndim - 1)), np.nan, values)
         attributes = {"units": unit, "long_name": words}
         variables[name] = (
-            (*dims, *dims_of_variable),
+            (*dims, *own_dims),
             values.reshape(*shape, *values.shape[1:]),
             attributes,
         )

@@ -1,4 +1,4 @@
-"""Margins of loops with commands that wait for periods, against matrices written out."""
+"""Margins of loops with delays of several periods, against independent matrices."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tests.loop_as_oracle import span_of
 PERIOD, GAIN = 0.002, 200.0
 
 
-def rig(delay) -> jb.Case:
+def delayed_case(delay) -> jb.Case:
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=2),
         actuators=[jb.Patch(0.2575, 0.3425, 8.292e-4, correction=0.32, amplifier_gain=200.0)],
@@ -24,31 +24,31 @@ def rig(delay) -> jb.Case:
     )
 
 
-def critical(case: jb.Case, waiting: int) -> float:
-    """The gain with which the loop turns unstable, commands waiting for whole periods."""
+def critical_gain(case: jb.Case, waiting: int) -> float:
+    """Gain at which the loop with a delay of whole periods turns unstable."""
     span = span_of(case)
-    n, pull = span.modes, span.shapes(0.2575, 1) - span.shapes(0.3425, 1)
+    n, slopes = span.modes, span.shapes(0.2575, 1) - span.shapes(0.3425, 1)
     lower = -np.hstack([np.diag(span.frequencies**2), span.damping])
     a = np.vstack([np.eye(n, 2 * n, k=n), lower])
-    b = np.append(np.zeros(n), 8.292e-4 * 0.32 * 200.0 * pull)[:, None]
+    b = np.append(np.zeros(n), 8.292e-4 * 0.32 * 200.0 * slopes)[:, None]
     c = np.append(span.shapes(0.3), np.zeros(n))
     system = scipy.signal.cont2discrete((a, b, c[None], np.zeros((1, 1))), PERIOD)
-    drift, push = np.asarray(system[0]), np.asarray(system[1])[:, 0]
-    size = 2 * n + waiting  # the commands that wait come last, the newest first
+    transition, force_response = np.asarray(system[0]), np.asarray(system[1])[:, 0]
+    size = 2 * n + waiting  # delayed commands last, newest first
     whole = np.zeros((size, size))
-    whole[: 2 * n, : 2 * n], whole[: 2 * n, -1] = drift, push
+    whole[: 2 * n, : 2 * n], whole[: 2 * n, -1] = transition, force_response
     whole[2 * n + 1 :, 2 * n : -1] = np.eye(waiting - 1)
 
-    def beyond(gain):
+    def excess(gain):
         whole[2 * n, : 2 * n] = -gain * c
         return np.abs(np.linalg.eigvals(whole)).max() - 1
 
-    return scipy.optimize.brentq(beyond, 0.0, 1e4)
+    return scipy.optimize.brentq(excess, 0.0, 1e4)
 
 
 @pytest.mark.parametrize("waiting", [1, 2, 5])
-def test_commands_that_wait_for_several_periods(waiting):
-    """Their chain of states has a single eigenvector."""
-    case = rig(waiting * PERIOD)
+def test_gain_margin_with_delays_of_several_periods(waiting):
+    """The states of the delay have a single eigenvector."""
+    case = delayed_case(waiting * PERIOD)
     found = margins(linearised_loop(case, 0.0))
-    assert_allclose(found.gain, critical(case, waiting) / GAIN, rtol=1e-8)
+    assert_allclose(found.gain, critical_gain(case, waiting) / GAIN, rtol=1e-8)

@@ -1,4 +1,4 @@
-"""Derivatives of what a run gives, by every number of its case, against differences."""
+"""Derivatives of peaks and readings by every number of a case, against differences."""
 
 import jax
 import jax.numpy as jnp
@@ -9,13 +9,13 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.simulation.integration_plan import integration_plan
 
-# A load that enters over the free end loses contact; the model is bilateral, and smooth in it.
+# A load loses contact on entry at the free end; the bilateral model is smooth there.
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning"),
 ]
 
-TIMES = jnp.linspace(0.0, 0.4, 101)  # loads enter and leave within it
+TIMES = jnp.linspace(0.0, 0.4, 101)  # s; loads enter and leave in between
 
 ONE_SPAN = jb.Case(
     jb.Beam(
@@ -55,7 +55,7 @@ TWO_SPANS = jb.Case(
 
 
 class Problem:
-    """Peaks and a misfit as functions of all numbers of a case, in units of their own size."""
+    """Peaks and a misfit as functions of all numbers of a case, relative to their values."""
 
     def __init__(self, case):
         found = jb.addresses(case)
@@ -71,7 +71,7 @@ class Problem:
         self.value = jax.jit(self.outputs)
 
     def outputs(self, point):
-        """Peaks (over their own size), and the sum of squares of what the sensors read off data."""
+        """Relative peaks, and the mean square of normalised residuals of the readings."""
         case = jb.replace(self.case, dict(zip(self.addresses, point * self.sizes, strict=True)))
         record = jb.simulate(case, TIMES, self.plan)
         misfit = jnp.mean(((record.measured - self.data) / self.scale) ** 2)
@@ -90,17 +90,16 @@ class Problem:
         return np.array(columns).T
 
 
-# Reverse mode transposes what forward mode does: where it is right, both are.
 @pytest.mark.parametrize(
     ("case", "modes"),
     [(ONE_SPAN, [jax.jacfwd, jax.jacrev]), (TWO_SPANS, [jax.jacfwd, jax.jacrev])],
     ids=["one span", "two spans"],
 )
-def test_gradients_are_those_of_differences(case, modes):
+def test_gradients_agree_with_differences(case, modes):
     problem = Problem(case)
     differences = problem.differences()
     for mode in modes:
         found = jax.jit(mode(problem.outputs))(problem.point)
         for i, address in enumerate(problem.addresses):
-            # What hardly depends on a number is only known to the rounding of the outputs.
+            # The absolute tolerance is the rounding of the outputs.
             assert_allclose(found[:, i], differences[:, i], rtol=1e-6, atol=1e-9, err_msg=address)

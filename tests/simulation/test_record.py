@@ -1,4 +1,4 @@
-"""Records: labelled results, their way to a file and back, and what they refuse."""
+"""Records: shapes, quantities, verdicts, datasets and netCDF files."""
 
 import equinox as eqx
 import jax
@@ -36,7 +36,7 @@ def record():
     return jb.simulate(CASE)
 
 
-def test_arrays_have_the_promised_shapes(record):
+def test_shapes_of_arrays(record):
     assert record.times.shape == (101,)
     assert_allclose(record.times, np.arange(101) / 250.0)
     assert record.coordinates.shape == record.rates.shape == (101, 3)
@@ -48,7 +48,7 @@ def test_arrays_have_the_promised_shapes(record):
     assert record.peak_deflection.shape == record.peak_time.shape == (5,)
 
 
-def test_at_gives_every_quantity_anywhere(record):
+def test_quantities_at_any_position(record):
     """Slope, strain and rates against differences of the deflection."""
     x, h = np.array([[0.2, 0.4], [0.7, 1.0]]), 1e-4
     low, middle, high = (record.at(x + d) for d in (-h, 0.0, h))
@@ -67,7 +67,7 @@ def test_at_gives_every_quantity_anywhere(record):
     assert np.median(error) < 0.2 * np.max(np.abs(record.at(0.3, "acceleration")))
 
 
-def test_sensors_read_their_quantity_with_their_offset(record):
+def test_readings_are_quantities_plus_offsets(record):
     columns = [
         record.at(0.25) + 1e-4,
         record.at(0.8, "acceleration") + 0.5,
@@ -81,7 +81,7 @@ def test_sensors_read_their_quantity_with_their_offset(record):
     assert np.isnan(record.strain[:, 0]).all()
 
 
-def test_an_unknown_quantity_is_refused(record):
+def test_unknown_quantity_is_refused(record):
     with pytest.raises(ValueError, match="no quantity 'force'; there are deflection"):
         record.at(0.3, "force")
     with pytest.raises(ValueError, match="fibre_distance"):
@@ -89,25 +89,25 @@ def test_an_unknown_quantity_is_refused(record):
 
 
 def assert_same(found, expected):
-    """Every number of two records is the same, to the last bit."""
-    for name, ours in vars(expected).items():
-        theirs = getattr(found, name)
-        assert jax.tree.structure(ours) == jax.tree.structure(theirs), name
-        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+    """Equality of two records, bit by bit."""
+    for name, value in vars(expected).items():
+        other = getattr(found, name)
+        assert jax.tree.structure(value) == jax.tree.structure(other), name
+        for a, b in zip(jax.tree.leaves(value), jax.tree.leaves(other), strict=True):
             assert_array_equal(a, b, err_msg=name)
 
 
-def test_a_dataset_restores_the_record_exactly(record):
+def test_dataset_restores_the_record_exactly(record):
     assert_same(record_from_xarray(record.to_xarray()), record)
 
 
-def test_a_netcdf_file_restores_the_record_exactly(record, tmp_path):
+def test_netcdf_file_restores_the_record_exactly(record, tmp_path):
     path = tmp_path / "run.nc"
     record.to_netcdf(path)
     assert_same(jb.read_record(path), record)
 
 
-def test_the_dataset_is_labelled_with_units(record):
+def test_dataset_has_labels_and_units(record):
     dataset = record.to_xarray()
     assert dataset.attrs["title"] == "a run for its record"
     assert dataset.deflection.dims == ("time", "sensor")
@@ -122,7 +122,7 @@ def test_the_dataset_is_labelled_with_units(record):
     assert_array_equal(later.measured, record.measured[25])
 
 
-def test_an_existing_file_is_not_overwritten_unasked(record, tmp_path):
+def test_existing_file_is_kept_without_overwrite(record, tmp_path):
     path = tmp_path / "run.nc"
     path.write_text("precious")
     with pytest.raises(FileExistsError, match="exists already"):
@@ -139,7 +139,7 @@ def test_other_files_are_refused(tmp_path):
         jb.read_record(tmp_path / "absent.nc")
 
 
-def test_the_verdict_tells_of_contact_and_error(record):
+def test_verdict_names_contact_loss_and_error(record):
     assert record.verdict.startswith("every load presses on the beam throughout; estimated error")
     nan = jnp.nan
     lost = eqx.tree_at(
@@ -152,10 +152,15 @@ def test_the_verdict_tells_of_contact_and_error(record):
     assert "load 0" not in lost.verdict
 
 
-def test_a_run_without_loads_or_sensors_has_a_record(tmp_path):
+def test_record_without_loads_and_sensors(tmp_path):
     case = jb.Case(jb.Beam(1.0, 10.0, 1.0, modes=2), run=jb.Run(0.1))
     record = jb.simulate(case)
     assert record.deflection.shape == (101, 0) and record.contact_force.shape == (101, 0)
     assert not np.any(record.coordinates)
     record.to_netcdf(tmp_path / "nothing.nc")
     assert_same(jb.read_record(tmp_path / "nothing.nc"), record)
+
+
+def test_former_name_of_the_readings_warns(record):
+    with pytest.warns(DeprecationWarning, match="Record.shown is called controller_readings now"):
+        assert record.shown is record.controller_readings is None

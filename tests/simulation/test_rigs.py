@@ -1,4 +1,4 @@
-"""Whole rigs: against finite elements, their own mirror image, and the reference implementation."""
+"""Cases of many parts against finite elements, mirror images and the reference implementation."""
 
 import dataclasses
 import json
@@ -27,7 +27,7 @@ REFERENCE = json.loads((DATA / "reference_cases.json").read_text("utf-8"))
 
 
 @pytest.mark.parametrize("reference", REFERENCE, ids=lambda reference: reference["title"])
-def test_reference_cases_are_matched(reference):
+def test_reference_cases(reference):
     record = jb.simulate(case_from_dict(tomllib.loads(reference["case_toml"])))
     assert_allclose(record.modes.frequencies, reference["natural_frequencies_hz"], rtol=1e-9)
     deflection = record.deflection[np.array(reference["sample_index"])]
@@ -55,7 +55,7 @@ GENERAL = finite_elements.Beam(
 
 
 def case_on(beam: finite_elements.Beam, loads: list[Load], modes: int, sensors) -> jb.Case:
-    """The case of a finite-element beam."""
+    """Case of a finite-element beam."""
     return jb.Case(
         jb.Beam(
             beam.length,
@@ -86,11 +86,11 @@ def case_on(beam: finite_elements.Beam, loads: list[Load], modes: int, sensors) 
 
 
 def mirrored(beam: finite_elements.Beam) -> finite_elements.Beam:
-    """The beam seen from behind."""
+    """Mirror image of the beam."""
 
     def flip(parts, *names):
-        places = [{n: beam.length - getattr(part, n) for n in names} for part in parts]
-        return [dataclasses.replace(p, **x) for p, x in zip(parts, places, strict=True)]
+        positions = [{n: beam.length - getattr(part, n) for n in names} for part in parts]
+        return [dataclasses.replace(p, **x) for p, x in zip(parts, positions, strict=True)]
 
     return dataclasses.replace(
         beam,
@@ -104,8 +104,8 @@ def mirrored(beam: finite_elements.Beam) -> finite_elements.Beam:
     )
 
 
-def test_a_general_rig_agrees_with_finite_elements_and_with_its_mirror_image():
-    """Unequal spans, elastic and damped supports, a patch, a suspension; masses both ways."""
+def test_general_case_agrees_with_finite_elements_and_mirror_image():
+    """Unequal spans, elastic and damped supports, patch, suspension; masses in both directions."""
     loads = [Load(0.3, 2.5, 0.02, deceleration=4.0), Load(0.2, -3.0, 0.1, deceleration=-1.0)]
     times, sensors = np.linspace(0.0, 0.8, 81), np.array([0.2, 0.6, 1.3])
     case = case_on(GENERAL, loads, 4, sensors)
@@ -115,8 +115,8 @@ def test_a_general_rig_agrees_with_finite_elements_and_with_its_mirror_image():
     assert_close(record.velocity, expected.velocity, 1e-4)
     assert_close(record.contact_force, expected.contact_force, 1e-4)
 
-    turned = [dataclasses.replace(load, speed=-load.speed) for load in loads]
-    other = case_on(mirrored(GENERAL), turned, 4, GENERAL.length - sensors)
+    reversed_loads = [dataclasses.replace(load, speed=-load.speed) for load in loads]
+    other = case_on(mirrored(GENERAL), reversed_loads, 4, GENERAL.length - sensors)
     image = jb.simulate(other, jnp.asarray(times), plan_of(other))
     assert_close(image.deflection, record.deflection, 1e-9)
     assert_close(image.contact_force, record.contact_force, 1e-8)
@@ -129,15 +129,15 @@ SPRINGS = [finite_elements.Support(x, 3000.0, 5.0) for x in (0.2, 0.9)]
 @pytest.mark.parametrize(
     ("ends", "supports", "speed"),
     [
-        ("clamped-free", [], 4.0),  # leaves over the tip
-        ("clamped-free", [], -4.0),  # enters over the tip
+        ("clamped-free", [], 4.0),  # exit at the free end
+        ("clamped-free", [], -4.0),  # entry at the free end
         ("free-free", SPRINGS, 3.0),
         ("clamped-guided", [], 5.0),
         ("free-pinned", [SPRINGS[0]], -3.0),
     ],
 )
-def test_all_kinds_of_ends_agree_with_finite_elements(ends, supports, speed):
-    """Also that the peak is that of the finely sampled deflection, wherever it is."""
+def test_all_end_conditions_agree_with_finite_elements(ends, supports, speed):
+    """Deflection and contact force."""
     beam = finite_elements.Beam(
         1.2, 12.0, 0.7, ends, supports=supports, damping_ratio=0.02, elements=100
     )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxbeam.case.case import Case
+from jaxbeam.files.report import text_table
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.tune import ParameterBounds, tune
@@ -31,14 +32,14 @@ class IntegerSearchResult:
 
     def __str__(self) -> str:
         names = list(self.choices[0])
-        heads = [*names, *(f"{found.name}" for found in self.tuned[0].run_sets)]
-        lines = ["objective by choice", "".join(f"{head:>24}" for head in heads)]
+        header = [*names, *(run_set.name for run_set in self.tuned[0].run_sets), ""]
+        rows = []
         for choice, found in zip(self.choices, self.tuned, strict=True):
-            cells = [f"{choice[name]:d}" for name in names]
-            cells += [f"{outcome.objective[1]:.5g}" for outcome in found.run_sets]
-            mark = "  (best)" if found is self.best else ""
-            lines.append("".join(f"{cell:>24}" for cell in cells) + mark)
-        return "\n".join([*lines, "", str(self.best)])
+            objectives = [f"{run_set.objective[1]:.5g}" for run_set in found.run_sets]
+            mark = "(best)" if found is self.best else ""
+            rows.append([*(f"{choice[name]:d}" for name in names), *objectives, mark])
+        lines = text_table(header, rows, ">" * (len(header) - 1) + "<")
+        return "\n".join(["objective by choice", *lines, "", str(self.best)])
 
 
 def tune_integers(

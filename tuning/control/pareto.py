@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from jaxbeam.case.case import Case
+from jaxbeam.files.report import text_table
 from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import METRICS, Objective
@@ -29,12 +30,14 @@ class ParetoFront:
         return np.array([[one.metrics[self.metric], one.objective[1]] for one in run_sets])
 
     def __str__(self) -> str:
-        heads = ("limit", self.metric, "objective", f"{self.metric} held out", "objective held out")
-        lines = ["".join(f"{head:>24}" for head in heads)]
-        rows = zip(self.limits, self.points(), self.points(held_out=True), strict=True)
-        for limit, training, held_out in rows:
-            lines.append("".join(f"{x:>24.5g}" for x in (limit, *training, *held_out)))
-        return "\n".join(lines)
+        columns = ("limit", self.metric, "objective")
+        header = (*columns, f"{self.metric} held out", "objective held out")
+        points = zip(self.limits, self.points(), self.points(held_out=True), strict=True)
+        rows = [
+            [f"{x:.5g}" for x in (limit, *training, *held_out)]
+            for limit, training, held_out in points
+        ]
+        return "\n".join(text_table(header, rows, ">" * len(header)))
 
     def plot(self):
         """Figure of the front, on training and on held-out runs."""

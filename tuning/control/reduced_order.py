@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.control.optimal.lqr import AbstractRegulator
+from jaxbeam.files.report import text_table
 from tuning.aliases import has_old_attributes
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
@@ -35,9 +36,11 @@ class ReducedFeedback:
     tuned: TuningResult
 
     def __str__(self) -> str:
-        lines = [f"{'state':<8}{'share':>8}  fed back"]
-        for state, share in enumerate(self.shares):
-            lines.append(f"{state:<8}{share:>8.3f}  {'yes' if state in self.fed_back else 'no'}")
+        rows = [
+            (str(state), f"{share:.3f}", "yes" if state in self.fed_back else "no")
+            for state, share in enumerate(self.shares)
+        ]
+        lines = text_table(("state", "share", "fed back"), rows, "<><")
         rounded, tuned = self.tuned.run_sets[0].objective
         relaxed = self.relaxed.run_sets[0].objective[1]
         lines += [

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.files.report import text_table
 from tuning.aliases import has_old_attributes
 from tuning.control.load_cases import AddressValues, value_columns
 from tuning.control.objective import Objective
@@ -133,13 +134,12 @@ class TuningResult:
         return sentence
 
     def __str__(self) -> str:
-        lines = [f"{'parameter':<34}{'before':>14}{'after':>14}  unit"]
-        for parameter, value in zip(self.parameters, self.values, strict=True):
-            mark = "  (at a bound)" if parameter.at_bound(value) else ""
-            lines.append(
-                f"{parameter.address:<34}{parameter.start:>14.6g}{value:>14.6g}"
-                f"  {parameter.unit}{mark}"
-            )
+        pairs = zip(self.parameters, self.values, strict=True)
+        rows = [
+            (p.address, f"{p.start:.6g}", f"{value:.6g}", p.unit, _bound_mark(p, value))
+            for p, value in pairs
+        ]
+        lines = text_table(("parameter", "before", "after", "unit", ""), rows, "<>><<")
         for outcome in self.run_sets:
             lines += ["", *_run_table(outcome)]
         if len(self.start_results) > 1:
@@ -224,28 +224,28 @@ def _start_lines(minima: tuple[StartResult, ...]) -> list[str]:
     return lines
 
 
-def _run_table(outcome: RunSetResult) -> list[str]:
+def _bound_mark(parameter: FreeParameter, value: float) -> str:
+    return "(at a bound)" if parameter.at_bound(value) else ""
+
+
+def _run_table(run_set: RunSetResult) -> list[str]:
     """Lines of a table of the runs of a run set: what varies, peaks (mm), attained shares."""
-    varied = value_columns(outcome.runs)
-    names = [*varied, "no control", "before", "after", "least", "share before", "share after"]
-    before, after = (
-        outcome.attained_shares(outcome.peaks_before),
-        outcome.attained_shares(outcome.peaks_after),
+    varied = value_columns(run_set.runs)
+    header = [*varied, "no control", "before", "after", "least", "share before", "share after"]
+    peaks = (
+        run_set.uncontrolled_peaks,
+        run_set.peaks_before,
+        run_set.peaks_after,
+        run_set.least_peaks,
     )
-    widths = [max(len(name) + 2, 12) for name in names]
-    lines = [
-        f"{outcome.name} runs: peaks in mm, shares of the attainable reduction",
-        "".join(f"{name:>{w}}" for name, w in zip(names, widths, strict=True)),
+    shares = [run_set.attained_shares(own) for own in (run_set.peaks_before, run_set.peaks_after)]
+    rows = [
+        [
+            *(f"{column[i]:.4g}" for column in varied.values()),
+            *(f"{1e3 * own[i]:.4f}" for own in peaks),
+            *(f"{own[i]:.1%}" for own in shares),
+        ]
+        for i in range(len(run_set.runs))
     ]
-    for i in range(len(outcome.runs)):
-        peaks = (
-            outcome.uncontrolled_peaks,
-            outcome.peaks_before,
-            outcome.peaks_after,
-            outcome.least_peaks,
-        )
-        cells = [f"{column[i]:.4g}" for column in varied.values()]
-        cells += [f"{1e3 * peak[i]:.4f}" for peak in peaks]
-        cells += [f"{before[i]:.1%}", f"{after[i]:.1%}"]
-        lines.append("".join(f"{cell:>{w}}" for cell, w in zip(cells, widths, strict=True)))
-    return lines
+    title = f"{run_set.name} runs: peaks in mm, shares of the attainable reduction"
+    return [title, *text_table(header, rows, ">" * len(header))]

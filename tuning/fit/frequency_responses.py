@@ -20,6 +20,7 @@ from jaxbeam.model.frequency_response import StationaryMasses, frequency_respons
 from jaxbeam.model.modes import mesh_layout
 from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares
+from tuning.fit.summary import parameter_table
 from tuning.fit.uncertainty.covariance import confidence_intervals
 from tuning.logs.log import Log
 from tuning.parameters.free import FreeParameter, free_parameters
@@ -185,15 +186,9 @@ class ResponseFit:
         }
 
     def __str__(self) -> str:
-        width = max(map(len, self.addresses))
-        lines = [
-            f"{address:{width}}  {value:11.5g}  {low:11.5g} to {high:<10.5g}"
-            for address, value, (low, high) in zip(
-                self.addresses, self.values, self.intervals, strict=True
-            )
-        ]
-        off = ", ".join(f"{100 * share:.2g} %" for share in self.relative_misfit)
-        return "\n".join([*lines, f"responses are off by {off}", self.verdict])
+        lines = parameter_table(self.parameters, self.values, self.intervals)
+        errors = ", ".join(f"{100 * share:.2g} %" for share in self.relative_misfit)
+        return "\n".join([*lines, f"responses are off by {errors}", self.verdict])
 
 
 def identify_responses(

@@ -42,7 +42,7 @@ def report_sections(
     held_out: Sequence[HeldOutPrediction] = (),
     models: Sequence[ModelCriteria] = (),
 ) -> list[ReportSection]:
-    """Sections of the report on a fit; those on what is left out are left out."""
+    """Sections of the report on a fit; arguments left out have no section."""
     from tuning.fit.uncertainty.plots import plot_posterior, plot_profiles
 
     tables = [_parameter_table(fit), *_minima_table(fit)]
@@ -60,7 +60,7 @@ def report_sections(
         sections.append(ReportSection("Profiles", [*verdicts, figure]))
     if posterior:
         figure = ReportFigure("posterior", plot_posterior(posterior))
-        parts = [posterior.verdict + ".", _posterior_table(posterior), figure]
+        parts = [posterior.verdict + ".", posterior.table, figure]
         sections.append(ReportSection("Posterior", parts))
     if held_out:
         verdicts = [found.verdict + "." for found in held_out]
@@ -123,24 +123,6 @@ def _correlation_table(fit: Fit) -> ReportTable:
         cells = ("" if np.isnan(entry) else f"{entry:.2f}" for entry in row)
         rows.append((address, *cells))
     return ReportTable(("", *fit.addresses), rows)
-
-
-def _posterior_table(posterior: Posterior) -> ReportTable:
-    columns = zip(
-        posterior.addresses,
-        posterior.means,
-        posterior.deviations,
-        posterior.intervals,
-        posterior.r_hat,
-        posterior.effective_draws,
-        strict=True,
-    )
-    rows = [
-        (address, f"{mean:.6g}", f"{sd:.2g}", f"{low:.5g} to {high:.5g}", f"{r:.3f}", f"{n:.0f}")
-        for address, mean, sd, (low, high), r, n in columns
-    ]
-    header = ("parameter", "mean", "deviation", "95 % interval", "R-hat", "effective draws")
-    return ReportTable(header, rows)
 
 
 def _model_table(models: Sequence[ModelCriteria]) -> ReportTable:

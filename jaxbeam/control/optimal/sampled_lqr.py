@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 from jaxbeam.case.fields import NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.control.optimal.lqr import AbstractRegulator
 from jaxbeam.control.state_law import GainLaw
-from jaxbeam.estimation.sampled_plant import exponential_and_gramian, sample_timing
+from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.state_space import Plant
-from jaxbeam.numerics.discretisation import balance
+from jaxbeam.numerics.discretisation import balance, exponential_and_gramian
 from jaxbeam.numerics.intervals import InputMatrix, InputWeight, Square, symmetric_part
 from jaxbeam.numerics.riccati import dlqr
 
@@ -106,8 +106,8 @@ def discrete_lq_problem(
     def propagator_and_cost(span):
         """Propagator of x and a held command over a span (s), and its cost matrix."""
         matrix = augmented_matrix * scale / scale[:, None] * span
-        flow, cost = exponential_and_gramian(matrix.T, span * cost_rate * cost_scale)
-        return flow.T * scale[:, None] / scale, cost / cost_scale
+        transition, cost = exponential_and_gramian(matrix.T, span * cost_rate * cost_scale)
+        return transition.T * scale[:, None] / scale, cost / cost_scale
 
     one, none = np.eye(commands), np.zeros((commands, commands))
     command_rows = np.concatenate([np.zeros((commands, states)), none, one], axis=1)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbeam.files.report import ReportTable, text_table
 from tuning.aliases import current_word, has_old_attributes
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.result import Fit
@@ -89,16 +90,27 @@ class Posterior:
         }
         return {"numbers": numbers, "verdict": self.verdict}
 
+    @property
+    def table(self) -> ReportTable:
+        """Table of means, deviations, intervals and diagnostics of the parameters."""
+        columns = zip(
+            self.addresses,
+            self.means,
+            self.deviations,
+            self.intervals,
+            self.r_hat,
+            self.effective_draws,
+            strict=True,
+        )
+        rows = [
+            (name, f"{mean:.6g}", f"{sd:.2g}", f"{low:.5g} to {high:.5g}", f"{r:.3f}", f"{n:.0f}")
+            for name, mean, sd, (low, high), r, n in columns
+        ]
+        header = ("parameter", "mean", "deviation", "95 % interval", "R-hat", "effective draws")
+        return ReportTable(header, rows)
+
     def __str__(self) -> str:
-        width = max(map(len, self.addresses))
-        head = f"{'parameter':{width}}  {'mean':>11}  {'deviation':>10}  {'95 % interval':^25}"
-        lines = [f"{head}  {'R-hat':>6}  {'draws':>6}"]
-        rows = zip(self.addresses, self.means, self.deviations, self.intervals, strict=True)
-        for i, (address, mean, deviation, (low, high)) in enumerate(rows):
-            lines.append(
-                f"{address:{width}}  {mean:11.5g}  {deviation:10.3g}  {low:11.5g} to {high:<10.5g}"
-                f"  {self.r_hat[i]:6.3f}  {self.effective_draws[i]:6.0f}"
-            )
+        lines = text_table(self.table.header, self.table.rows, "<>><>>")
         return "\n".join([*lines, self.verdict])
 
 

@@ -1,0 +1,37 @@
+"""Variables of records and sweeps in datasets: dimensions, unit and meaning, by name."""
+
+VARIABLES = {
+    "deflection": (("time", "sensor"), "m", "deflection at the sensor"),
+    "velocity": (("time", "sensor"), "m/s", "velocity at the sensor"),
+    "acceleration": (("time", "sensor"), "m/s^2", "acceleration at the sensor"),
+    "measured": (("time", "sensor"), "SI unit of its quantity", "reading of the sensor"),
+    "coordinates": (("time", "mode"), "m kg^0.5", "modal coordinate"),
+    "rates": (("time", "mode"), "m kg^0.5/s", "rate of the modal coordinate"),
+    "accelerations": (("time", "mode"), "m kg^0.5/s^2", "acceleration of the modal coordinate"),
+    "load_position": (("time", "load"), "m", "position of the load"),
+    "contact_force": (("time", "load"), "N", "contact force, positive under compression"),
+    "command": (("time", "actuator"), "unit of a command", "command to the actuator"),
+    "failures": (("time",), "1", "steps of the controller without a solution so far"),
+    "peak_deflection": (("sensor",), "m", "largest absolute deflection"),
+    "peak_time": (("sensor",), "s", "time of the largest absolute deflection"),
+    "lowest_contact_force": (("load",), "N", "smallest contact force"),
+    "contact_lost_time": (("load",), "s", "time of the first negative contact force"),
+    "contact_lost_position": (("load",), "m", "position of the first negative contact force"),
+}
+# Those of a run in a sweep, after the dimensions of the sweep.
+SWEEP_VARIABLES = VARIABLES | {
+    "controller_failures": ((), "1", "steps at which the controller found no solution")
+}
+
+# Variables of the modes in records, with names that begin with mode_.
+MODE_VARIABLES = {
+    "stiffness": (("mode",), "1/s^2", "stiffness of the mode"),
+    "damping": (("mode",), "1/s", "damping of the mode"),
+    "coupling": (("mode", "other_mode"), "1/s^2", "stiffness between repeated modes"),
+    "damping_coupling": (("mode", "other_mode"), "1/s", "damping between repeated modes"),
+    "nodes": (("node",), "m", "ends of the segments of the mode shapes"),
+    "series": (("segment", "degree", "mode"), "kg^-0.5", "Chebyshev series of the mode shapes"),
+    "unit": ((), "1/s^2", "flexural rigidity / (mass per length x length^4)"),
+}
+# Fields of `Modes` by their names in files, where they differ.
+MODE_FIELDS = {"unit": "stiffness_unit"}
