@@ -1,12 +1,11 @@
 """Keyword arguments of former versions, accepted with a warning by controllers and estimators."""
 
 import dataclasses
-from typing import TYPE_CHECKING, dataclass_transform
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 
 from jaxbeam.case.aliases import KEYS, warn_renamed
-
 
 if TYPE_CHECKING:
     from equinox._module._module import _ModuleMeta as ModuleMeta
