@@ -7,16 +7,12 @@ import equinox as eqx
 
 from jaxbeam.case.aliases import KEYS, warn_renamed
 
-if TYPE_CHECKING:
-    from equinox._module._module import _ModuleMeta as ModuleMeta
+if TYPE_CHECKING:  # a type checker takes the fields of a module for its arguments
+    AcceptsFormerArguments = type
 else:
-    ModuleMeta = type(eqx.Module)
 
-
-class AcceptsFormerArguments(ModuleMeta):
-    """Metaclass that replaces former words among the keyword arguments by the present ones."""
-
-    if not TYPE_CHECKING:  # a type checker takes the fields of a module for its arguments
+    class AcceptsFormerArguments(type(eqx.Module)):
+        """Metaclass that replaces former words among the keyword arguments by the present ones."""
 
         def __call__(cls, *args, **arguments):
             """Raises TypeError if the old and the new word are both given."""
