@@ -10,11 +10,11 @@ import jaxbeam as jb
 from jaxbeam.analysis.amplification import amplification, envelope
 
 LENGTH, RIGIDITY, DENSITY, FORCE = 0.6, 11.68, 0.535, 5.0
-PLACES = np.array([0.15, 0.3, 0.4])
+POSITIONS = np.array([0.15, 0.3, 0.4])
 
 
 def crossing(speed: float, modes: int = 4) -> jb.Case:
-    """A force over an undamped pinned beam, and some free vibration."""
+    """Moving force on an undamped pinned beam, with 0.1 s of free vibration."""
     return jb.Case(
         jb.Beam(length=LENGTH, flexural_rigidity=RIGIDITY, mass_per_length=DENSITY, modes=modes),
         loads=[jb.MovingForce(force=FORCE, speed=speed)],
@@ -22,51 +22,51 @@ def crossing(speed: float, modes: int = 4) -> jb.Case:
     )
 
 
-def exact(speed: float, times, modes: int = 4):
-    """Deflection (time, place) on the beam: the classical series for a moving force."""
+def forced_deflection(speed: float, times, modes: int = 4):
+    """Deflection (time, position) during the crossing: series of a moving force."""
     j = np.arange(1, modes + 1)
     omega = (j * np.pi / LENGTH) ** 2 * np.sqrt(RIGIDITY / DENSITY)
     drive = j * np.pi * speed / LENGTH
     t = times[:, None]
     q = np.sin(drive * t) - drive / omega * np.sin(omega * t)
     q = -2 * FORCE / (DENSITY * LENGTH) * q / (omega**2 - drive**2)
-    return q @ np.sin(j[:, None] * np.pi * PLACES / LENGTH)
+    return q @ np.sin(j[:, None] * np.pi * POSITIONS / LENGTH)
 
 
-def free(speed: float, times, modes: int = 4):
-    """Deflection (time, place) after the exit: each mode swings on from what it has then."""
+def free_deflection(speed: float, times, modes: int = 4):
+    """Deflection (time, position) after the exit: free vibration of each mode."""
     j = np.arange(1, modes + 1)
     omega = (j * np.pi / LENGTH) ** 2 * np.sqrt(RIGIDITY / DENSITY)
     drive, end = j * np.pi * speed / LENGTH, LENGTH / speed
     scale = -2 * FORCE / (DENSITY * LENGTH) / (omega**2 - drive**2)
-    place = -scale * drive / omega * np.sin(omega * end)
+    coordinate = -scale * drive / omega * np.sin(omega * end)
     rate = scale * drive * (np.cos(drive * end) - np.cos(omega * end))
     phase = omega * (times[:, None] - end)
-    q = place * np.cos(phase) + rate / omega * np.sin(phase)
-    return q @ np.sin(j[:, None] * np.pi * PLACES / LENGTH)
+    q = coordinate * np.cos(phase) + rate / omega * np.sin(phase)
+    return q @ np.sin(j[:, None] * np.pi * POSITIONS / LENGTH)
 
 
 @pytest.mark.parametrize("speed", [1.0, 4.0])
-def test_the_envelope_is_that_of_the_series(speed):
+def test_envelope_agrees_with_the_series(speed):
     end = LENGTH / speed
     on, after = np.linspace(0, end, 200_001), np.linspace(end, end + 0.1, 200_001)
-    series = np.concatenate([exact(speed, on), free(speed, after)])
-    assert_allclose(exact(speed, on[-1:]), free(speed, after[:1]), rtol=1e-9)
-    found = envelope(crossing(speed), PLACES)
+    series = np.concatenate([forced_deflection(speed, on), free_deflection(speed, after)])
+    assert_allclose(forced_deflection(speed, on[-1:]), free_deflection(speed, after[:1]), rtol=1e-9)
+    found = envelope(crossing(speed), POSITIONS)
     scale = 1e-7 * np.abs(series).max()
     assert_allclose(found.lowest, series.min(axis=0), atol=scale)
     assert_allclose(found.highest, series.max(axis=0), atol=scale)
     assert np.all(np.asarray(found.highest) > 100 * scale)
 
 
-def test_the_envelope_of_a_controlled_beam_is_that_of_its_record():
+def test_envelope_of_a_controlled_run_agrees_with_its_record():
     case = dataclasses.replace(
         crossing(2.0),
         actuators=[jb.PointForce(0.3)],
-        sensors=[jb.Sensor(x) for x in PLACES],
+        sensors=[jb.Sensor(x) for x in POSITIONS],
         controller=jb.Feedback(gains=[2000.0], period=0.002),
     )
-    found, record = envelope(case, PLACES), jb.simulate(case)
+    found, record = envelope(case, POSITIONS), jb.simulate(case)
     largest = np.maximum(-np.asarray(found.lowest), found.highest)
     assert_allclose(largest, record.peak_deflection, rtol=1e-7)
     samples = np.asarray(record.deflection)
@@ -75,12 +75,12 @@ def test_the_envelope_of_a_controlled_beam_is_that_of_its_record():
     assert np.all(np.abs(samples.max(axis=0) - found.highest) < 0.05 * largest)
 
 
-def test_an_envelope_off_the_beam_is_refused():
+def test_positions_off_the_beam_are_refused():
     with pytest.raises(ValueError, match="x must lie on the beam.* it is 0.7 m"):
         envelope(crossing(1.0), np.array([0.7]))
 
 
-def test_a_slow_force_is_not_amplified_and_a_fast_one_is():
+def test_amplification_of_slow_and_fast_forces():
     middle = np.array([LENGTH / 2])
     static = FORCE * LENGTH**3 / (48 * RIGIDITY)
     fast = amplification(crossing(15.0), middle)

@@ -70,7 +70,7 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("compare")
     (path / "weak.toml").write_text(CASE + LOW_GAIN)
     (path / "wild.toml").write_text(UNSTABLE)
-    (path / "told.toml").write_text(OPEN_LOOP)
+    (path / "constant.toml").write_text(OPEN_LOOP)
     return path
 
 
@@ -130,7 +130,7 @@ def test_margin_is_the_smallest_over_stationary_positions(found):
 
 def test_loops_without_a_margin_name_the_obstacle(found, folder):
     slow = dataclasses.replace(found.case.sensors[0], sampling_period=jnp.asarray(0.02))
-    open_loop = load_controller(folder / "told.toml")
+    open_loop = load_controller(folder / "constant.toml")
     for changes, obstacle in (
         ({"controller": open_loop}, "do not depend on readings"),
         ({"controller": jb.MPC(4, 2, 1e-9, period=0.01)}, "not linear at its limits"),
@@ -147,7 +147,7 @@ def test_loops_without_a_margin_name_the_obstacle(found, folder):
 def test_picture_names_every_run(found):
     figure = plot_comparison(found)
     written = words(figure)
-    for part in ("no control", "weak", "wild", "best possible", "limit 7.50", "command (V)"):
+    for part in ("no control", "weak", "wild", "optimal commands", "limit 7.50", "command (V)"):
         assert part in written
     assert f"({found.metrics['weak'].share:.0%})" in written
     top = figure.axes[0]
@@ -195,15 +195,15 @@ def run(line: str, folder, monkeypatch, capsys) -> tuple[int, str, str]:
 
 @pytest.mark.slow
 def test_command_prints_and_draws(found, folder, monkeypatch, capsys):
-    line = "compare weak.toml --controllers wild.toml told.toml"
+    line = "compare weak.toml --controllers wild.toml constant.toml"
     code, printed, wrong = run(f"{line} -o out.png", folder, monkeypatch, capsys)
     assert code == 0, wrong
     assert f"below {found.bound.peak:.6g} m" in printed
     assert f"{found.metrics['weak'].share:.1%}" in printed
-    assert "told: every load presses on the beam throughout" in printed
+    assert "constant: every load presses on the beam throughout" in printed
     assert f"wild: {found.loop_summary('wild')}; every load presses on the beam" in printed
     assert f"{found.metrics['weak'].stability_margin.gain:.3g}" in printed
-    assert "no margin of told: commands that do not depend on readings close no loop" in printed
+    assert "no margin of constant: commands that do not depend on readings close no loop" in printed
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
     code, printed, wrong = run(f"{line} --json --period 0.02", folder, monkeypatch, capsys)
     assert code == 0, wrong

@@ -1,4 +1,4 @@
-"""Modes and what they miss make the exact static response, section forces included."""
+"""Modes plus residuals against the exact static response; section forces."""
 
 import dataclasses
 
@@ -42,24 +42,25 @@ STEADY = np.array([1e-3 * 0.5 * 200.0, 2.0, 2e-3, 4.2 / 0.8, 1.0, 0.0])
 X = np.array([0.0, 0.05, 0.25, 0.33, 0.42, 0.6, 1.0, 1.3])
 
 
-def oracle_lifts(case: jb.Case, x, derivative: int = 0) -> np.ndarray:
-    """Finite elements: deflections per unit command, (actuator, place)."""
-    beam, lifts = as_oracle(case, elements=1), []
+def oracle_deflections(case: jb.Case, x, derivative: int = 0) -> np.ndarray:
+    """Deflections per unit command (actuator, position) by finite elements."""
+    beam, deflections = as_oracle(case, elements=1), []
     for actuator, steady in zip(case.actuators, STEADY, strict=True):
         if isinstance(actuator, jb.Patch):
-            edges = float(actuator.start), float(actuator.end), steady
-            lifts.append(finite_elements.static_deflection(beam, x, patch_moments=[edges]))
+            moments = [(float(actuator.start), float(actuator.end), steady)]
+            found = finite_elements.static_deflection(beam, x, patch_moments=moments)
         else:
             force = float(actuator.position), steady
-            lifts.append(finite_elements.static_deflection(beam, x, [force]))
-    return np.array(lifts)
+            found = finite_elements.static_deflection(beam, x, [force])
+        deflections.append(found)
+    return np.array(deflections)
 
 
-# The exact lift
+# Exact static deflection per command
 
 
-def test_a_patch_lifts_a_pinned_beam_as_the_closed_form_says():
-    """w'' = -M / E I over the patch, nothing elsewhere, so w = (M / E I) (two Macaulay terms)."""
+def test_patch_on_a_pinned_beam_against_closed_form():
+    """w'' = -M / E I over the patch, zero elsewhere: w = (M / E I) (two Macaulay terms)."""
     a, b, length = 0.2, 0.35, 0.6
     x = np.linspace(0.0, length, 13)
     ramp = ((length - a) ** 2 - (length - b) ** 2) / 2
@@ -72,7 +73,7 @@ def test_a_patch_lifts_a_pinned_beam_as_the_closed_form_says():
 
 def test_slope_curvature_and_third_derivative_of_a_pinned_beam():
     x = np.array([0.1, 0.2, 0.3, 0.35, 0.5])
-    over = np.array([0, 1, 1, 0, 0])  # at the edges, what lies to the right
+    over = np.array([0, 1, 1, 0, 0])  # at the ends of the patch, the section to the right
     assert_allclose(
         static_deflection_per_command(PLAIN, x, 2)[0], -1e-3 / 13.211 * over, rtol=1e-12, atol=1e-18
     )
@@ -81,8 +82,8 @@ def test_slope_curvature_and_third_derivative_of_a_pinned_beam():
     assert_allclose(static_deflection_per_command(PLAIN, 0.3, 1)[0], slopes[0], rtol=1e-9)
 
 
-def test_lifts_of_all_kinds_as_finite_elements_have_them():
-    expected = oracle_lifts(GENERAL, X)
+def test_all_actuators_agree_with_finite_elements():
+    expected = oracle_deflections(GENERAL, X)
     found = static_deflection_per_command(GENERAL, X)
     assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
     assert_allclose(found[-1], 0.0, atol=0)
@@ -90,7 +91,7 @@ def test_lifts_of_all_kinds_as_finite_elements_have_them():
 
 @pytest.mark.parametrize("ends", ["clamped-clamped", "guided-pinned", "free-clamped"])
 @pytest.mark.parametrize("supports", [[], [jb.Support(0.4)], [jb.Support(0.5, 2e4, 0.0, 30.0)]])
-def test_lift_of_a_patch_for_other_ends_and_spans(ends, supports):
+def test_patch_with_other_ends_and_supports(ends, supports):
     patch = jb.Patch(0.25, 0.55, 1.0, added_mass=0.2, added_rigidity=4.0)
     case = jb.Case(jb.Beam(1.0, 12.0, 0.8, ends=ends), supports, [patch])
     x, beam = np.linspace(0, 1, 9), as_oracle(case, elements=1)
@@ -99,7 +100,7 @@ def test_lift_of_a_patch_for_other_ends_and_spans(ends, supports):
     assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
-def test_many_modes_approach_the_exact_lift():
+def test_residual_decreases_with_the_number_of_modes():
     errors = []
     for count in (4, 12, 36):
         case = jb.Case(dataclasses.replace(PLAIN.beam, modes=count), actuators=PLAIN.actuators)
@@ -110,7 +111,7 @@ def test_many_modes_approach_the_exact_lift():
     assert errors[2] < errors[1] / 5
 
 
-# Truncated and corrected is exact
+# Modes plus residual
 
 
 @pytest.fixture(scope="module")
@@ -118,9 +119,9 @@ def model():
     return eqx.filter_jit(modal_model)(GENERAL, mesh_layout(GENERAL))
 
 
-@pytest.mark.parametrize("derivative", [0, 3])  # the moments below are of the second
-def test_modes_and_residual_make_the_exact_response(model, derivative):
-    """The modal part is the equilibrium of the rig's own equations, found from its state space."""
+@pytest.mark.parametrize("derivative", [0, 3])  # section forces, below, use the second
+def test_modes_plus_residual_are_exact(model, derivative):
+    """The modal part is the equilibrium of the state equations of the model."""
     y = np.array([0.07, 0.5])
     matrix, modes = np.asarray(model.state_matrix[0]), GENERAL.beam.modes
     shapes = np.asarray(model.shapes(X, (derivative,))[0])
@@ -129,33 +130,33 @@ def test_modes_and_residual_make_the_exact_response(model, derivative):
     exact = np.asarray(static_deflection_per_command(GENERAL, X, derivative))
     found = modal + residual_actuator_gain(GENERAL, X, derivative)
     assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
-    pressed = np.zeros((len(matrix), y.size))
-    pressed[1 : 2 * modes : 2] = -np.asarray(model.shapes(y, (0,))[0]).T
-    modal = (shapes @ -np.linalg.solve(matrix, pressed)[: 2 * modes : 2]).T
+    load_input = np.zeros((len(matrix), y.size))
+    load_input[1 : 2 * modes : 2] = -np.asarray(model.shapes(y, (0,))[0]).T
+    modal = (shapes @ -np.linalg.solve(matrix, load_input)[: 2 * modes : 2]).T
     exact = influence_line(GENERAL, X, y, derivative)
     found = modal + residual_flexibility(GENERAL, X, y, derivative)
     assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
 
 
-def test_residuals_differentiate():
+def test_derivatives_of_residuals():
     layout, scale = mesh_layout(PLAIN), np.array([1.0, 100.0])
 
-    def missed(values):
+    def residual(values):
         names = ("actuators.0.start", "beam.flexural_rigidity")
         changed = replace(PLAIN, dict(zip(names, values * scale, strict=True)))
         return residual_actuator_gain(changed, X[3:5], 2, layout)[0]
 
     point = np.array([0.2, 0.13])
-    found = jax.jacobian(missed)(jnp.asarray(point))
-    expected = central(missed, point, 1e-3)
+    found = jax.jacobian(residual)(jnp.asarray(point))
+    expected = central(residual, point, 1e-3)
     assert_allclose(found, expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
 
 
 # Section forces
 
 
-def test_a_patch_leaves_no_moment_in_a_determinate_beam():
-    """Its own moment and the bending of the stiffer section under it are in balance."""
+def test_patch_causes_no_moment_in_a_determinate_beam():
+    """The active moment balances the bending of the stiffened section."""
     patch = dataclasses.replace(PLAIN.actuators[0], added_rigidity=5.0, added_mass=0.1)
     for ends in ("pinned-pinned", "clamped-free"):
         beam = dataclasses.replace(PLAIN.beam, ends=ends)
@@ -168,14 +169,14 @@ def test_a_patch_leaves_no_moment_in_a_determinate_beam():
         assert_allclose(shear_force(case, x, third), 0.0, atol=1e-12)
 
 
-def test_moment_of_a_patch_on_a_beam_clamped_at_both_ends():
-    """Linear along the beam, M = p + q x, so bent that both ends keep deflection and slope."""
+def test_moment_of_a_patch_on_a_clamped_beam():
+    """M = p + q x, with zero deflection and slope at both ends."""
     patch, x = PLAIN.actuators[0], np.linspace(0.0, 0.6, 13)
     case = jb.Case(dataclasses.replace(PLAIN.beam, ends="clamped-clamped"), actuators=[patch])
-    length, a, b, own = 0.6, 0.2, 0.35, 1e-3
-    # The integrals over the beam of the curvature, E I w'' = M - own, and of x w'' are zero.
+    length, a, b, active = 0.6, 0.2, 0.35, 1e-3
+    # The integrals over the beam of the curvature, E I w'' = M - active moment, and of x w'' are zero.
     system = np.array([[length, length**2 / 2], [length**2 / 2, length**3 / 3]])
-    p, q = np.linalg.solve(system, own * np.array([b - a, (b**2 - a**2) / 2]))
+    p, q = np.linalg.solve(system, active * np.array([b - a, (b**2 - a**2) / 2]))
     found = bending_moment(case, x, static_deflection_per_command(case, x, 2)[0], [1.0])
     assert_allclose(found, p + q * x, rtol=1e-11)
     assert_allclose(
@@ -197,8 +198,8 @@ def test_moments_and_shear_of_a_clamped_beam(x):
 
 
 @pytest.mark.slow
-def test_moment_under_a_slow_load_while_a_patch_pushes():
-    """Three modes and the correction: P a b / L within the slight motion of a slow crossing."""
+def test_moment_under_a_slow_load_and_a_patch():
+    """Three modes and the correction: P a b / L, within the dynamics of a slow crossing."""
     case = jb.Case(
         jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.1),
         actuators=[jb.Patch(0.25, 0.35, 1e-3)],
@@ -213,11 +214,11 @@ def test_moment_under_a_slow_load_while_a_patch_pushes():
     assert_allclose(found[1:-1], expected, atol=2e-3)
     modal = bending_moment(case, x, record.at(x, "strain", fibre_distance=-1.0))
     assert np.abs(modal[1:-1] - expected).max() > 0.05
-    # Commands bend the section too: those of a record are seen to without being named.
-    driven = dataclasses.replace(case, controller=jb.Prescribed(offsets=[1.0]))
+    # The correction includes the commands of a record.
+    controlled = dataclasses.replace(case, controller=jb.Prescribed(offsets=[1.0]))
     steady = dataclasses.replace(
-        record, case=driven, command=jnp.full((record.times.size, 1), 100.0)
+        record, case=controlled, command=jnp.full((record.times.size, 1), 100.0)
     )
-    missed = residual_actuator_gain(case, x, 2)[0] * 100.0
+    residual = residual_actuator_gain(case, x, 2)[0] * 100.0
     difference = corrected_deflection(steady, x, 2) - corrected_deflection(record, x, 2)
-    assert_allclose(difference, np.tile(missed, (121, 1)), atol=1e-15)
+    assert_allclose(difference, np.tile(residual, (121, 1)), atol=1e-15)

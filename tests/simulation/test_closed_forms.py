@@ -88,5 +88,5 @@ def test_slow_mass_has_the_static_deflection(one_mass):
     static = -weight * SPAN.shapes(positions) @ shapes.T
     end = slice(85, None)
     assert_close(extrapolated[end], static[end], 1e-7)
-    exact = [influence_line(0.6, 11.68, "pinned-pinned", x, places[end]) for x in SENSORS]
+    exact = [influence_line(0.6, 11.68, "pinned-pinned", x, positions[end]) for x in SENSORS]
     assert_close(extrapolated[end], weight * np.array(exact).T, 5e-3)  # four modes
