@@ -49,7 +49,7 @@ def _styled_runs(comparison: Comparison):
     return [
         ("no control", comparison.uncontrolled, UNCONTROLLED_STYLE),
         *controlled_runs,
-        ("best possible", comparison.optimal, OPTIMAL_STYLE),
+        ("optimal commands", comparison.optimal, OPTIMAL_STYLE),
     ]
 
 

@@ -149,7 +149,7 @@ def _draw_forces(axes, record):
         axes.plot(lost, 0 * lost, "X", color=ALARM, markersize=7, zorder=3)
         annotate(
             axes,
-            "has to pull",
+            "contact loss",
             (lost.min(), 0),
             (-6, -6),
             ha="right",

@@ -76,7 +76,7 @@ def test_record_of_many_parts(record):
     assert_allclose(data(lost)[0], [0.05])
     said = words(figure)
     assert "load 0" in said and "load 1" in said and "load 2" not in said
-    assert "has to pull" in said
+    assert "contact loss" in said
 
 
 def test_record_without_sensors_or_loads(record):
