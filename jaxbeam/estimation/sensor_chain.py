@@ -99,8 +99,8 @@ class SensorChain(eqx.Module):
             return system.A, system.B
 
         start = t - self.timing.period
-        previous_inputs = system_at(start)
-        matrix, feedthrough = self._jacobians(previous_inputs.C, previous_inputs.D, 1)
+        first = system_at(start)
+        matrix, feedthrough = self._jacobians(first.C, first.D, 1)
         transition = Transition(
             matrix, feedthrough, jnp.zeros_like(feedthrough), jnp.zeros_like(matrix)
         )
@@ -112,12 +112,12 @@ class SensorChain(eqx.Module):
         )
         for k, part in enumerate(parts):
             padded = jax.scipy.linalg.block_diag(part.matrix, np.eye(sensor_states))
-            previous_inputs, after = (
+            inputs = (
                 jnp.pad(x, ((0, sensor_states), (0, 0)))
                 for x in (part.previous_input_matrix, part.input_matrix)
             )
             noise = jnp.pad(part.noise_covariance, ((0, sensor_states), (0, sensor_states)))
-            transition = transition.compose(Transition(padded, previous_inputs, after, noise))
+            transition = transition.compose(Transition(padded, *inputs, noise))
             for i, offset in sampling_offsets.items():
                 system, is_sampled = system_at(start + ends[k]), ends[k] == offset
                 transition = transition.compose(
@@ -138,14 +138,14 @@ class SensorChain(eqx.Module):
         """Transition at a sample of a sensor, if `is_sampled`: the newest of its samples h."""
         index = self._state_layout()[0][sensor]
         identity = jnp.eye(self.state_count)
-        seen = jnp.pad(row, (0, self.state_count - self.plant_states))
-        matrix = identity.at[index].set(jnp.where(is_sampled, seen, identity[index]))
+        output_row = jnp.pad(row, (0, self.state_count - self.plant_states))
+        matrix = identity.at[index].set(jnp.where(is_sampled, output_row, identity[index]))
         no_input = jnp.zeros((self.state_count, feedthrough.shape[0]))
-        before, after = (
+        previous_inputs, inputs = (
             no_input.at[index].set(jnp.where(is_sampled & acts, feedthrough, 0.0))
             for acts in (before_command, ~before_command)
         )
-        return Transition(matrix, before, after, jnp.zeros_like(identity))
+        return Transition(matrix, previous_inputs, inputs, jnp.zeros_like(identity))
 
     def _jacobians(self, C, D, which: int):
         """Jacobians by states and commands of the readings (0) or the states after a sample (1)."""

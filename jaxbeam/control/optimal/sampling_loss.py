@@ -32,7 +32,7 @@ def sampling_limit(case: Case) -> Float[Array, " mode"]:
     suspensions included; an overdamped mode has no limit and no entry. Controllability is lost at
     multiples of the limit too, and poor near it and in between. Not for use inside `jit`.
 
-    Raises ValueError for a faulty case.
+    Raises ValueError for an invalid case.
     """
     check_case(case)
     return jnp.asarray(np.pi / _oscillatory_modes(state_space(case).unloaded)[0].imag)

@@ -178,61 +178,63 @@ def _interior_point(G, h, limits_matter):
     """Mehrotra's predictor-corrector method (SIAM J. Optimization 2, 1992), regularised in l."""
     rows, variables = G.shape
 
-    def optimality_errors(z, weight, slack):
-        stationary, limits = z + G.T @ weight, G @ z + slack - h
+    def optimality_errors(z, multipliers, slack):
+        stationary, limits = z + G.T @ multipliers, G @ z + slack - h
         worst = jnp.maximum(jnp.max(jnp.abs(stationary)), jnp.max(jnp.abs(limits)))
-        return jnp.maximum(worst, jnp.max(jnp.minimum(weight, slack))), stationary, limits
+        return jnp.maximum(worst, jnp.max(jnp.minimum(multipliers, slack))), stationary, limits
 
     def unfinished(state):
         *_, status, steps = state
         return (status == UNFINISHED) & (steps < MAX_STEPS)
 
     def step(state):
-        z, weight, slack, _, steps = state
-        _, stationary, limits = optimality_errors(z, weight, slack)
-        scaling = 1 / (slack / weight + DUAL_REGULARISATION)
+        z, multipliers, slack, _, steps = state
+        _, stationary, limits = optimality_errors(z, multipliers, slack)
+        scaling = 1 / (slack / multipliers + DUAL_REGULARISATION)
         factor = jnp.linalg.cholesky(jnp.eye(variables) + (G.T * scaling) @ G)
 
         def newton(product):
-            rest = scaling * (limits - product / weight)
+            rest = scaling * (limits - product / multipliers)
             z_change = jax.scipy.linalg.cho_solve((factor, True), -stationary - G.T @ rest)
-            weight_change = rest + scaling * (G @ z_change)
-            return z_change, weight_change, -(product + slack * weight_change) / weight
+            multiplier_change = rest + scaling * (G @ z_change)
+            return z_change, multiplier_change, -(product + slack * multiplier_change) / multipliers
 
-        gap = weight @ slack
-        _, weight_change, slack_change = newton(weight * slack)
-        length = _step_length(weight, weight_change, slack, slack_change, 1.0)
-        affine_gap = (weight + length * weight_change) @ (slack + length * slack_change)
+        gap = multipliers @ slack
+        _, multiplier_change, slack_change = newton(multipliers * slack)
+        length = _step_length(multipliers, multiplier_change, slack, slack_change, 1.0)
+        affine_gap = (multipliers + length * multiplier_change) @ (slack + length * slack_change)
         centring_step = (steps > STEPS_BEFORE_CENTRING) & (steps % 2 == 0)
         centring_target = jnp.where(centring_step, 0.3, (affine_gap / gap) ** 3) * gap / rows
         # The second-order correction is scaled by the step length of the predictor: in full, it
         # makes the method cycle where limits nearly exclude each other. A centring step without it
         # ends the rare cycles that are left.
-        second_order = jnp.where(centring_step, 0.0, length) * weight_change * slack_change
-        z_change, weight_change, slack_change = newton(
-            weight * slack + second_order - centring_target
+        second_order = jnp.where(centring_step, 0.0, length) * multiplier_change * slack_change
+        z_change, multiplier_change, slack_change = newton(
+            multipliers * slack + second_order - centring_target
         )
-        length = _step_length(weight, weight_change, slack, slack_change, 0.995)
+        length = _step_length(multipliers, multiplier_change, slack, slack_change, 0.995)
         z, slack = z + length * z_change, slack + length * slack_change
-        next_multipliers = weight + length * weight_change
+        next_multipliers = multipliers + length * multiplier_change
         error, *_ = optimality_errors(z, next_multipliers, slack)
         return (
             z,
             next_multipliers,
             slack,
-            _status(TOLERANCE, error, z, weight, next_multipliers, h, G),
+            _status(TOLERANCE, error, z, multipliers, next_multipliers, h, G),
             steps + 1,
         )
 
     start = jnp.zeros(variables), jnp.ones(rows), jnp.maximum(h, 0.0) + 1.0
     initial_status = jnp.where(limits_matter, UNFINISHED, SOLVED), jnp.zeros((), int)
-    z, weight, _, status, steps = jax.lax.while_loop(unfinished, step, (*start, *initial_status))
-    return z, jnp.where(limits_matter, weight, 0.0), status, steps
+    z, multipliers, _, status, steps = jax.lax.while_loop(
+        unfinished, step, (*start, *initial_status)
+    )
+    return z, jnp.where(limits_matter, multipliers, 0.0), status, steps
 
 
-def _step_length(weight, weight_change, slack, slack_change, boundary_share):
-    """Step length, at most 1, at which no weight or slack loses more than this share."""
-    worst = jnp.maximum(jnp.max(-weight_change / weight), jnp.max(-slack_change / slack))
+def _step_length(multipliers, multiplier_change, slack, slack_change, boundary_share):
+    """Step length, at most 1, at which no multipliers or slack loses more than this share."""
+    worst = jnp.maximum(jnp.max(-multiplier_change / multipliers), jnp.max(-slack_change / slack))
     return jnp.where(worst > boundary_share, boundary_share / worst, 1.0)
 
 
@@ -248,18 +250,18 @@ def _hildreth(G, h, limits_matter):
         return (status == UNFINISHED) & (sweeps < MAX_SWEEPS)
 
     def sweep(state):
-        z, weight, _, sweeps = state
+        z, multipliers, _, sweeps = state
 
         def row(i, now):
-            z, weight = now
-            better = jnp.maximum(0.0, weight[i] + G[i] @ z - h[i])
-            return z - G[i] * (better - weight[i]), weight.at[i].set(better)
+            z, multipliers = now
+            updated = jnp.maximum(0.0, multipliers[i] + G[i] @ z - h[i])
+            return z - G[i] * (updated - multipliers[i]), multipliers.at[i].set(updated)
 
-        _, after = jax.lax.fori_loop(0, rows, row, (z, weight))
+        _, after = jax.lax.fori_loop(0, rows, row, (z, multipliers))
         z = -G.T @ after
         slack = h - G @ z
         error = jnp.maximum(jnp.max(-slack), jnp.max(jnp.minimum(after, slack)))
-        return z, after, _status(HILDRETH_TOLERANCE, error, z, weight, after, h, G), sweeps + 1
+        return z, after, _status(HILDRETH_TOLERANCE, error, z, multipliers, after, h, G), sweeps + 1
 
     initial_status = jnp.where(limits_matter, UNFINISHED, SOLVED), jnp.zeros((), int)
     start = jnp.zeros(variables), jnp.zeros(rows)

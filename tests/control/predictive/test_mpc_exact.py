@@ -82,7 +82,7 @@ def sequences(law) -> np.ndarray:
     return np.array(found).T
 
 
-class Program:
+class ExplicitProgram:
     """Program of a sample: sum of squares of affine functions of the variables, and limits."""
 
     def __init__(self, law, plants, weight, state, unexplained, previous, C):
@@ -212,7 +212,7 @@ def test_commands_against_an_independent_program(name):
         times = midpoints if varying or weight else np.full(midpoints.shape, -1.0)
         (A, B, E), *plants = [plant(span, t, mass) for t in times]
         unexplained = state - (A @ past + B @ previous + E * weight)
-        program = Program(law, plants, weight, state, unexplained, previous, C)
+        program = ExplicitProgram(law, plants, weight, state, unexplained, previous, C)
         assert_allclose(found[k], program.solve(), rtol=0, atol=1e-6)
         past, previous = state, found[k]
     if law.solver != "unconstrained":
