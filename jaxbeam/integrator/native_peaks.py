@@ -1,9 +1,8 @@
-"""Peaks of many runs by hand-written C (`native.c`), where that was compiled for this machine.
+"""Peaks of many runs by the C integrator (`integrate_peaks.c`), if it is compiled for this machine.
 
-XLA makes of a step some forty small loops over the lanes; by hand it is one, and so are all steps
-of all tasks. The C is compiled once, when asked for, by the C compiler of the machine, into the
-user's cache folder. Sweeps then use it where they look for peaks alone (not histories), without a
-controller, in double precision, on CPUs. Nobody needs it.
+XLA splits a step into some forty loops over the runs of a batch; in C it is one, and so are all
+steps of all tasks. It serves sweeps of peaks (not of histories) without a controller, in double
+precision, on CPUs.
 """
 
 import ctypes
@@ -17,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.integrate import integrate_peaks as plain_march
+from jaxbeam.integrator.integrate import integrate_peaks as integrate_peaks_in_jax
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
     GAUSS_NODES,
@@ -41,34 +40,37 @@ from jaxbeam.numerics.peak_search import (
 )
 from jaxbeam.runtime.native_library import Library
 
-PADDING = 8  # numbers that fill whole vector registers of any machine
-C_CONSTANTS = {
-    "FILL": PADDING,
-    "STEPS": CHUNK_STEPS,
+PADDING = 8  # doubles in the widest vector register
+C_MACROS = {
+    "PADDING": PADDING,
+    "CHUNK_STEPS": CHUNK_STEPS,
     "NODES": NODE_COUNT,
-    "TERMS": TAYLOR_TERMS,
+    "TAYLOR_TERMS": TAYLOR_TERMS,
     "DOUBLINGS": DOUBLINGS,
-    "POINTS": len(PEAK_NODES),
-    "NEAR": PEAK_MARGIN,
-    "BESIDE_END": (PEAK_MARGIN - 1)
+    "PEAK_POINTS": len(PEAK_NODES),
+    "PEAK_MARGIN": PEAK_MARGIN,
+    "END_PEAK_MARGIN": (PEAK_MARGIN - 1)
     * float(np.diff(PEAK_NODES)[0] / np.diff(PEAK_NODES).max()) ** 2,
-    "REACH": newton_step_limit(PEAK_NODES),
-    "ROUNDS": ESTIMATE_ITERATIONS,
-    "STARTS": START_POINTS,
-    "CLIMBS": NEWTON_ITERATIONS,
-    "SLACK": TIE_ROUNDING_UNITS * sys.float_info.epsilon,
+    "NEWTON_STEP_LIMIT": newton_step_limit(PEAK_NODES),
+    "ESTIMATE_ITERATIONS": ESTIMATE_ITERATIONS,
+    "START_POINTS": START_POINTS,
+    "NEWTON_ITERATIONS": NEWTON_ITERATIONS,
+    "TIE_TOLERANCE": TIE_ROUNDING_UNITS * sys.float_info.epsilon,
 }
-HEADERS = ("exponentials", "lanes", "matrices", "path", "peaks", "steps", "tables", "work")
+HEADERS = (
+    *("ffi", "load_path", "matrices", "peak_search", "propagators"),
+    *("registers", "step_matrices", "steps", "workspace"),
+)
 LIBRARY = Library(
-    sources=("native.c",),
-    headers=tuple(f"native_{part}.h" for part in HEADERS),
-    constants=tuple(C_CONSTANTS.items()),
-    targets=("march",),
+    sources=("integrate_peaks.c",),
+    headers=tuple(f"{name}.h" for name in HEADERS),
+    macros=tuple(C_MACROS.items()),
+    targets=("integrate_peaks",),
 )
 
 
 def supports(case: Case) -> bool:
-    """Whether steps of this case, if its peaks are swept, are those in C."""
+    """Whether a sweep of peaks of this case uses the C integrator."""
     return case.controller is None and available()
 
 
@@ -84,20 +86,20 @@ def integrate_peaks(
     mask: Bool[Array, " task"],
     models: ModalModel,
     grids: TimeGrid,
-    positions: Float[Array, "task place"],
+    positions: Float[Array, "task position"],
     loads: LoadSet,
 ) -> Peaks:
-    """What is found of tasks that C integrates one after the other, if it is `available`.
+    """Peaks of tasks, each a batch of runs without commands; only where C is `available`.
 
-    All have tasks as the first axis; a single rig is that of all. Grids are those of `even_grid`,
-    `positions` the places (m) at which peaks are looked for, on both sides of the beam; `max_loads`
-    is how many loads may be on the beam at once. No driver, double precision. Tasks that are not
-    wanted come out as at rest.
+    All arguments but `max_loads`, the largest number of loads on the beam at once, have tasks as
+    their first axis, of length one where models are shared. Deflections are those at `positions`
+    (m). Grids are of one step length a panel (`grid_by_step_length`). Tasks not in the mask stay
+    at rest.
     """
     shapes = models.modes.series
     if models.mode_map is not None:
         shapes = shapes @ models.mode_map[:, None]
-    numbers = (
+    constants = (
         np.asarray(GAUSS_NODES),
         lagrange_coefficients(),
         interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T,
@@ -113,35 +115,35 @@ def integrate_peaks(
             grids.on_beam_intervals,
         ),
         *(*jax.vmap(LoadSet.cubics)(loads), loads.inertia, loads.weight, positions),
-        *(part[None] for part in numbers),
+        *(part[None] for part in constants),
     )
     tasks, load_count, batch_size = loads.inertia.shape
     position_count, modes = positions.shape[1], shapes.shape[-1]
     blocks, block_size = models.state_matrix.shape[1:3]
     beam = grids.counts.shape[1], blocks, block_size, modes // blocks, *shapes.shape[1:3]
     sizes = *beam, max_loads, load_count, position_count, batch_size
-    workspace_size = LIBRARY.load().march_room
+    workspace_size = LIBRARY.load().workspace_size
     workspace_size.restype, workspace_size.argtypes = ctypes.c_int64, [ctypes.c_int64] * len(sizes)
     results = [
         (tasks, batch_size, count)
         for count in (position_count, position_count, load_count, load_count)
     ]
     call = jax.ffi.ffi_call(
-        LIBRARY.ffi_name("march"),
+        LIBRARY.ffi_name("integrate_peaks"),
         [jax.ShapeDtypeStruct(shape, float) for shape in (*results, (workspace_size(*sizes),))],
         vmap_method="sequential",
     )
-    return Peaks(*call(*arguments, slots=np.int64(max_loads))[:-1])
+    return Peaks(*call(*arguments, max_loads=np.int64(max_loads))[:-1])
 
 
 @integrate_peaks.defjvp
 def _integrate_peaks_jvp(max_loads, primals, tangents):
-    """C is not differentiated, but what it stands for."""
+    """Derivatives of the same function in JAX."""
 
     def jax_peaks(mask, models, *rest):
         def task(model, grid, positions, loads):
             discrete = discrete_model(model, grid, positions)
-            return plain_march(discrete, loads, max_loads=max_loads)[0].peaks()
+            return integrate_peaks_in_jax(discrete, loads, max_loads=max_loads)[0].peaks()
 
         tasks = mask.shape[0]
         models = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape[1:])), models)

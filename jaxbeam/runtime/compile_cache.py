@@ -5,7 +5,7 @@ its name is a hash known before (`program_key`), in a folder private to the user
 Programs are for one CPU device. Loading unpickles, here and within JAX, so it is done only after
 `cache_folder.read_file` has verified the file's HMAC.
 
-The README, "Compiled programs are cached", says who caches, and how to switch it on or off.
+The README ("Speed") says how scripts switch it on and commands off.
 """
 
 import contextlib

@@ -37,13 +37,13 @@ class Library(NamedTuple):
 
     sources: tuple[str, ...]
     headers: tuple[str, ...]
-    constants: tuple[tuple[str, float], ...]
+    macros: tuple[tuple[str, float], ...]
     targets: tuple[str, ...]
 
     @property
     def compiler_flags(self) -> tuple[str, ...]:
         """Arguments of the compiler, without the sources."""
-        return (*COMPILER_FLAGS, *(f"-D{name}={value}" for name, value in self.constants))
+        return (*COMPILER_FLAGS, *(f"-D{name}={value}" for name, value in self.macros))
 
     @property
     def file_name(self) -> str:

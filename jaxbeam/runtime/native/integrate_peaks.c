@@ -1,0 +1,170 @@
+/* Deflection peaks and contact forces of several tasks, each a batch of runs that differ in their
+ * loads: integrator/integrate.py, `integrate_peaks`, without commands. Steps are advanced in
+ * chunks. First the matrices of its steps are computed, which all runs of a task share; then groups
+ * of runs, as many as fill a vector register, are advanced through all steps of the chunk, so that
+ * their states stay in the first-level cache. native_peaks.py compiles this file and calls it. */
+
+#include "steps.h"
+
+/* Size of the workspace in doubles. XLA allocates it, as an output that is not read: to allocate it
+ * in every call would take long. */
+int64_t workspace_size(int64_t panels, int64_t blocks, int64_t block_size, int64_t modes,
+                       int64_t segments, int64_t terms, int64_t max_loads, int64_t loads,
+                       int64_t positions, int64_t batch_size) {
+    Workspace w = {.panels = (int)panels,
+                   .blocks = (int)blocks,
+                   .block_size = (int)block_size,
+                   .modes = (int)modes,
+                   .segments = (int)segments,
+                   .terms = (int)terms,
+                   .max_loads = (int)max_loads,
+                   .loads = (int)loads,
+                   .positions = (int)positions,
+                   .batch_size = batch_size};
+    derive_sizes(&w);
+    return (int64_t)((partition_workspace(&w, 0) + sizeof(Register)) / 8);
+}
+
+/* Initial state: at rest, without peaks. */
+static void reset(Workspace *w) {
+    const size_t batch_size = (size_t)w->batch_size, sampled = (size_t)w->positions * batch_size;
+    memset(w->state, 0, 8 * (size_t)w->states * batch_size);
+    memset(w->peak_samples, 0, 8 * PEAK_POINTS * sampled);
+    memset(w->peak, 0, 8 * sampled);
+    memset(w->peak_step_start, 0, 8 * sampled);
+    memset(w->peak_step_length, 0, 8 * sampled);
+    for (size_t i = 0; i < (size_t)w->loads * batch_size; i++)
+        w->lowest_force[i] = w->contact_loss_time[i] = INFINITY;
+    for (size_t i = 0; i < batch_size; i++) w->finite[i] = 1;
+}
+
+/* Steps of the next chunk, with their matrices; returns their number. `done` steps of the panel
+ * precede it. */
+static int next_chunk(Workspace *w, int *panel, int64_t *done) {
+    int count = 0;
+    while (count < CHUNK_STEPS && *panel < w->panels) {
+        if (*done >= panel_steps(w, *panel)) {
+            ++*panel, *done = 0;
+            continue;
+        }
+        Step *step = w->steps + count++;
+        step->panel = *panel, step->length = w->inputs[STEP_LENGTHS][*panel];
+        step->start = w->inputs[PANEL_STARTS][*panel] + (double)(*done)++ * step->length;
+        step->transition = w->transition + (size_t)*panel * transition_size(w);
+        step->loads = 0;
+        const uint8_t *active = (const uint8_t *)w->inputs[LOADS_ON_BEAM] + *panel * w->loads;
+        for (int l = 0; l < w->loads && step->loads < w->max_loads; l++)
+            if (active[l]) step->load_numbers[step->loads++] = l;
+        step->rows = step->loads * NODES;
+        step_matrices(w, step);
+    }
+    return count;
+}
+
+/* Time after which no load is on the beam. */
+static double last_exit(const Workspace *w) {
+    double last = 0;
+    for (int l = 0; l < w->loads; l++) last = fmax(last, w->inputs[ON_BEAM_INTERVALS][2 * l + 1]);
+    return last;
+}
+
+static void integrate_task(Workspace *w) {
+    reset(w);
+    shape_series(w);
+    observation_rows(w, (double *)w->product);
+    compute_propagators(w);
+    const double exit_time = last_exit(w);
+    int panel = 0;
+    int64_t done = 0;
+    for (int steps; (steps = next_chunk(w, &panel, &done));) {
+        for (ptrdiff_t first = 0; first < w->batch_size;) {
+            int groups = 0;
+            for (; groups < INTERLEAVED_GROUPS && first < w->batch_size;
+                 groups++, first += REGISTER_WIDTH) {
+                w->groups[groups].first = first;
+                w->groups[groups].count = runs_from(w, first);
+            }
+            advance_chunk(w, steps, w->groups, groups);
+        }
+        const Step *last = w->steps + steps - 1;
+        if (last->start + last->length >= exit_time && peaks_final(w)) break;
+    }
+}
+
+/* Outputs of a task, (run, position) and (run, load). */
+static void write_results(const Workspace *w, int64_t task) {
+    const ptrdiff_t batch_size = w->batch_size, plane = w->positions * batch_size;
+    const ptrdiff_t sampled = task * plane, contact = task * w->loads * batch_size;
+    for (int position = 0; position < w->positions; position++)
+        for (ptrdiff_t first = 0; first < batch_size; first += REGISTER_WIDTH) {
+            const int count = runs_from(w, first);
+            const ptrdiff_t at = position * batch_size + first;
+            Register samples[PEAK_POINTS];
+            for (int p = 0; p < PEAK_POINTS; p++)
+                samples[p] = load(w->peak_samples + p * plane + at, count);
+            const Curve curve = curve_through(samples, w->inputs[INTERPOLATION]);
+            const Register x = find_peak(&curve), peak = magnitude(&curve, x);
+            const Register time = load(w->peak_step_start + at, count) +
+                                  (x + 1) / 2 * load(w->peak_step_length + at, count);
+            for (int l = 0; l < count; l++) {
+                const ptrdiff_t to = sampled + (first + l) * w->positions + position;
+                w->outputs[PEAK][to] = w->finite[first + l] ? peak[l] : NAN;
+                w->outputs[PEAK_TIME][to] = w->finite[first + l] ? time[l] : NAN;
+            }
+        }
+    for (int load = 0; load < w->loads; load++)
+        for (ptrdiff_t l = 0; l < batch_size; l++) {
+            const double loss_time = w->contact_loss_time[load * batch_size + l];
+            w->outputs[LOWEST_FORCE][contact + l * w->loads + load] =
+                w->lowest_force[load * batch_size + l];
+            w->outputs[CONTACT_LOSS_TIME][contact + l * w->loads + load] =
+                loss_time < INFINITY ? loss_time : NAN;
+        }
+}
+
+/* Weights of the samples in the slopes of the interpolating polynomial at its ends. */
+static void end_slopes(Workspace *w) {
+    memset(w->end_slopes, 0, sizeof w->end_slopes);
+    for (int i = 1; i < PEAK_POINTS; i++)
+        for (int p = 0; p < PEAK_POINTS; p++) {
+            const double slope = i * w->inputs[INTERPOLATION][p * PEAK_POINTS + i]; /* at 1 */
+            w->end_slopes[p] += i % 2 ? slope : -slope;
+            w->end_slopes[PEAK_POINTS + p] += slope;
+        }
+}
+
+XLA_FFI_Error *integrate_peaks(XLA_FFI_CallFrame *frame) {
+    if (answer_version_query(frame)) return NULL;
+    if (frame->args.size != ARGUMENT_COUNT || frame->rets.size != RESULT_COUNT)
+        return ffi_error(frame, "the compiled C is of another version than jaxbeam: compile it "
+                                "anew with `jaxbeam native`");
+    const int64_t *dims[ARGUMENT_COUNT];
+    for (int i = 0; i < ARGUMENT_COUNT; i++)
+        dims[i] = ((XLA_FFI_Buffer *)frame->args.args[i])->dims;
+    XLA_FFI_Buffer **results = (XLA_FFI_Buffer **)frame->rets.rets;
+    const int64_t max_loads = *(const int64_t *)((XLA_FFI_Scalar *)frame->attrs.attrs[0])->value;
+    Workspace workspace = {.panels = (int)dims[STEP_COUNTS][1],
+                           .blocks = (int)dims[STATE_MATRIX][1],
+                           .block_size = (int)dims[STATE_MATRIX][2],
+                           .modes = (int)(dims[SHAPE_SERIES][3] / dims[STATE_MATRIX][1]),
+                           .segments = (int)dims[SHAPE_SERIES][1],
+                           .terms = (int)dims[SHAPE_SERIES][2],
+                           .pieces = (int)dims[BREAKPOINTS][2],
+                           .max_loads = (int)max_loads,
+                           .loads = (int)dims[INERTIA][1],
+                           .positions = (int)dims[POSITIONS][1],
+                           .batch_size = dims[INERTIA][2]};
+    Workspace *w = &workspace;
+    derive_sizes(w);
+    for (int i = 0; i < RESULT_COUNT; i++) w->outputs[i] = results[i]->data;
+    partition_workspace(w, (uintptr_t)aligned_memory(frame, WORKSPACE));
+    const int64_t tasks = results[PEAK]->dims[0];
+    for (int64_t task = 0; task < tasks; task++) {
+        set_inputs(w, frame, task);
+        if (task == 0) end_slopes(w);
+        if (*(const uint8_t *)w->inputs[MASK]) integrate_task(w);
+        else reset(w);
+        write_results(w, task);
+    }
+    return NULL;
+}

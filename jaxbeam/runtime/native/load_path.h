@@ -1,0 +1,136 @@
+/* Load path over a step: integrator/step_matrices.py, `load_path`. */
+
+#pragma once
+
+#include "workspace.h"
+
+/* Chebyshev series (segment, term, derivative and mode) of mode shapes and their first two
+ * derivatives by position. */
+static void shape_series(Workspace *w) {
+    const int terms = w->terms, modes = w->all_modes, columns = w->columns;
+    for (int s = 0; s < w->segments; s++) {
+        const double half = (w->inputs[SHAPE_NODES][s + 1] - w->inputs[SHAPE_NODES][s]) / 2;
+        double *series = w->series + (ptrdiff_t)s * terms * columns;
+        for (int k = 0; k < terms; k++)
+            memcpy(series + k * columns, w->inputs[SHAPE_SERIES] + (s * terms + k) * modes,
+                   8 * (size_t)modes);
+        for (int d = modes; d < columns; d += modes) {
+            /* Recurrence of the coefficients of a derivative, from the highest down. */
+            double *here = series + d;
+            memset(here + (terms - 1) * columns, 0, 8 * (size_t)modes);
+            for (int k = terms - 2; k >= 0; k--)
+                for (int m = 0; m < modes; m++) {
+                    double above = k + 2 < terms ? here[(k + 2) * columns + m] : 0;
+                    here[k * columns + m] =
+                        above + 2 * (k + 1) * here[(k + 1) * columns + m - modes];
+                }
+            for (int m = 0; m < modes; m++) here[m] /= 2;
+        }
+        for (int k = 0; k < terms; k++)
+            for (int c = modes; c < columns; c++)
+                series[k * columns + c] /= c < 2 * modes ? half : half * half;
+    }
+}
+
+/* Mode shapes and their first two derivatives at positions x, in `shape_sums`. */
+static void evaluate_shapes(const Workspace *w, Register x) {
+    const double *nodes = w->inputs[SHAPE_NODES];
+    const size_t size = (size_t)w->columns * sizeof(Register);
+    Register *sums = w->shape_sums, *segment_sums = w->shape_sums + w->columns,
+             *chebyshev = w->chebyshev;
+    for (int s = 0; s < w->segments; s++) {
+        Mask here = ~(Mask){0};
+        if (s > 0) here &= x >= nodes[s];
+        if (s < w->segments - 1) here &= x < nodes[s + 1];
+        if (!any(here)) continue;
+        Register local = 2 * (x - nodes[s]) / (nodes[s + 1] - nodes[s]) - 1;
+        chebyshev[0] = broadcast(1);
+        if (w->terms > 1) chebyshev[1] = local;
+        for (int k = 2; k < w->terms; k++) /* doubling the index preserves accuracy */
+            chebyshev[k] = 2 * chebyshev[k / 2] * chebyshev[k - k / 2] - chebyshev[k % 2];
+        memset(segment_sums, 0, size);
+        add_product(segment_sums, w->series + (ptrdiff_t)s * w->terms * w->columns, w->columns,
+                    chebyshev, w->terms);
+        for (int c = 0; c < w->columns; c++) sums[c] = choose(here, segment_sums[c], sums[c]);
+    }
+}
+
+/* Mode shapes at the monitored positions, and the static deflection of each under a unit force
+ * there, which bounds the deflection at a given energy; infinite without stiffness. */
+static void observation_rows(const Workspace *w, double *stiffness) {
+    const int block_size = w->block_size, modes = w->modes;
+    for (int position = 0; position < w->positions; position++) {
+        double *mode_row = w->mode_rows + position * w->all_modes;
+        evaluate_shapes(w, broadcast(w->inputs[POSITIONS][position]));
+        for (int m = 0; m < w->all_modes; m++) mode_row[m] = w->shape_sums[m][0];
+        w->flexibility[position] = 0;
+        for (int b = 0; b < w->blocks; b++) {
+            const double *matrix = w->inputs[STATE_MATRIX] + (ptrdiff_t)b * block_size * block_size;
+            double *row = stiffness;
+            for (int i = 0; i < modes; i++, row += modes + 1) {
+                for (int j = 0; j < modes; j++) row[j] = -matrix[(2 * i + 1) * block_size + 2 * j];
+                row[modes] = mode_row[b * modes + i];
+                for (int k = 0; k < i; k++) {
+                    const double *above = stiffness + k * (modes + 1), factor = row[k] / above[k];
+                    for (int j = k; j <= modes; j++) row[j] -= factor * above[j];
+                }
+                const double deflection = row[modes] * row[modes] / row[i];
+                w->flexibility[position] += row[i] > 0 ? deflection : INFINITY;
+            }
+        }
+    }
+}
+
+/* Position (m), speed (m/s) and acceleration (m/s^2) of a load. */
+static void evaluate_trajectory(const Workspace *w, int64_t load, double time, double *position,
+                                double *speed, double *acceleration) {
+    const double *breakpoints = w->inputs[BREAKPOINTS] + load * w->pieces;
+    int piece = 0;
+    for (int end = w->pieces; end - piece > 1;) {
+        int middle = (piece + end) / 2;
+        if (breakpoints[middle] <= time) piece = middle;
+        else end = middle;
+    }
+    const double *c = w->inputs[CUBICS] + (load * w->pieces + piece) * 4,
+                 t = time - breakpoints[piece];
+    *position = c[0] + t * (c[1] + t * (c[2] + t * c[3]));
+    *speed = c[1] + t * (2 * c[2] + t * 3 * c[3]);
+    *acceleration = 2 * c[2] + t * 6 * c[3];
+}
+
+/* Mode shapes (mode, node) and contact rows (state, node) under the loads of a step:
+ * model/contact.py, `contact_rows`. */
+static void load_path(const Workspace *w, const Step *step) {
+    const int block_size = w->block_size, modes = w->modes, all_modes = w->all_modes;
+    for (int s = 0; s < step->loads; s++) {
+        double position[PADDED_NODES], speed[PADDED_NODES], acceleration[PADDED_NODES];
+        for (int k = 0; k < PADDED_NODES; k++) {
+            double time =
+                step->start + step->length * w->inputs[GAUSS_NODES][k < NODES ? k : NODES - 1];
+            evaluate_trajectory(w, step->load_numbers[s], time, position + k, speed + k,
+                                acceleration + k);
+        }
+        for (int first = 0; first < NODES; first += REGISTER_WIDTH) {
+            const Register v = load_full(speed + first), a = load_full(acceleration + first);
+            double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES + first;
+            double *contact_rows =
+                w->contact_rows + (ptrdiff_t)s * w->states * PADDED_NODES + first;
+            evaluate_shapes(w, load_full(position + first));
+            const Register *value = w->shape_sums, *slope = value + all_modes,
+                           *curvature = slope + all_modes;
+            for (int m = 0; m < all_modes; m++)
+                store(shape + m * PADDED_NODES, value[m], REGISTER_WIDTH);
+            for (int i = 0; i < w->states; i++) {
+                const int b = i / block_size, j = i % block_size, m = b * modes + j / 2;
+                const double *rates =
+                    w->inputs[STATE_MATRIX] + ((ptrdiff_t)b * block_size + 1) * block_size + j;
+                Register row = {0};
+                for (int n = 0; n < modes; n++)
+                    row += value[b * modes + n] * rates[2 * n * block_size];
+                if (j < 2 * modes)
+                    row += j % 2 ? 2 * v * slope[m] : v * v * curvature[m] + a * slope[m];
+                store(contact_rows + i * PADDED_NODES, row, REGISTER_WIDTH);
+            }
+        }
+    }
+}

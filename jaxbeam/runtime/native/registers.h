@@ -1,0 +1,103 @@
+/* Vector registers that hold one number of each of several runs, and their arithmetic. */
+
+#pragma once
+
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+/* Compilers split wider vectors into scalars, or worse. */
+#if defined __AVX512F__
+#include <immintrin.h>
+#define INTRINSIC(name) _mm512_##name##_pd
+enum { REGISTER_WIDTH = 8 };
+#elif defined __AVX2__
+#include <immintrin.h>
+#define INTRINSIC(name) _mm256_##name##_pd
+enum { REGISTER_WIDTH = 4 };
+#else
+enum { REGISTER_WIDTH = 2 };
+#endif
+
+#define ALWAYS_INLINE __attribute__((always_inline))
+
+typedef double Register __attribute__((vector_size(8 * REGISTER_WIDTH)));
+typedef int64_t Mask __attribute__((vector_size(8 * REGISTER_WIDTH)));
+
+static inline Register broadcast(double value) {
+    return value - (Register){0}; /* with + instead, the compiler keeps the addition */
+}
+static inline Register choose(Mask which, Register yes, Register no) {
+    return (Register)(((Mask)yes & which) | ((Mask)no & ~which));
+}
+#ifdef INTRINSIC /* one instruction; NaN is handled as in the other branch */
+static inline Register maximum(Register a, Register b) { return INTRINSIC(max)(a, b); }
+static inline Register minimum(Register a, Register b) { return INTRINSIC(min)(a, b); }
+#else
+static inline Register maximum(Register a, Register b) { return choose(a > b, a, b); }
+static inline Register minimum(Register a, Register b) { return choose(a < b, a, b); }
+#endif
+static inline Register absolute(Register a) { return (Register)((Mask)a & INT64_MAX); }
+static inline int any(Mask mask) {
+    int64_t sum = 0;
+    for (int l = 0; l < REGISTER_WIDTH; l++) sum |= mask[l];
+    return sum != 0;
+}
+
+/* Load and store the first `count` numbers of a register; memory need not be aligned. */
+typedef double Unaligned __attribute__((vector_size(8 * REGISTER_WIDTH), aligned(8), may_alias));
+static inline Register load(const double *from, int count) {
+    if (count == REGISTER_WIDTH) return *(const Unaligned *)from;
+    Register values = {0};
+    memcpy(&values, from, 8 * (size_t)count);
+    return values;
+}
+static inline Register load_full(const double *from) { return load(from, REGISTER_WIDTH); }
+static inline void store(double *to, Register values, int count) {
+    if (count == REGISTER_WIDTH) *(Unaligned *)to = values;
+    else memcpy(to, &values, 8 * (size_t)count);
+}
+
+/* sums += table values for up to 8 rows of a table whose columns are contiguous, `stride` numbers
+ * apart. Eight independent sums hide the latency of the additions. */
+static inline ALWAYS_INLINE void add_rows(Register *sums, const double *table, int stride,
+                                          const Register *values, int size, int rows) {
+    Register sum[8];
+    for (int r = 0; r < rows; r++) sum[r] = sums[r];
+    for (int k = 0; k < size; k++, table += stride)
+        for (int r = 0; r < rows; r++) sum[r] += table[r] * values[k];
+    for (int r = 0; r < rows; r++) sums[r] = sum[r];
+}
+
+static inline ALWAYS_INLINE void add_product(Register *sums, const double *table, int rows,
+                                             const Register *values, int size) {
+    int r = 0;
+    for (; r + 8 <= rows; r += 8) add_rows(sums + r, table + r, rows, values, size, 8);
+    if (r + 6 <= rows) add_rows(sums + r, table + r, rows, values, size, 6), r += 6;
+    if (r + 4 <= rows) add_rows(sums + r, table + r, rows, values, size, 4), r += 4;
+    if (r + 2 <= rows) add_rows(sums + r, table + r, rows, values, size, 2), r += 2;
+    if (r < rows) add_rows(sums + r, table + r, rows, values, size, 1);
+}
+
+/* Solve (1 + m_i G_ij) r_j = -d_i in place by elimination without pivoting: model/contact.py,
+ * `solve_contact_forces`. */
+static inline ALWAYS_INLINE void solve_contact_system(Register *matrix, Register *right, int size) {
+#pragma GCC unroll 8
+    for (int i = 0; i < size; i++) {
+        Register *row = matrix + i * size;
+#pragma GCC unroll 8
+        for (int k = 0; k < i; k++) {
+            Register factor = row[k] * matrix[k * size + k]; /* the diagonal has been inverted */
+#pragma GCC unroll 8
+            for (int j = k + 1; j < size; j++) row[j] -= factor * matrix[k * size + j];
+            right[i] -= factor * right[k];
+        }
+        row[i] = 1 / row[i];
+    }
+#pragma GCC unroll 8
+    for (int j = size - 1; j >= 0; j--) {
+        right[j] *= matrix[j * size + j];
+#pragma GCC unroll 8
+        for (int i = 0; i < j; i++) right[i] -= matrix[i * size + j] * right[j];
+    }
+}

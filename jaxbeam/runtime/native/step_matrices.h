@@ -1,0 +1,90 @@
+/* Step matrices of a task, shared by all its runs: integrator/step_matrices.py, `step_matrices`. */
+
+#pragma once
+
+#include "load_path.h"
+
+/* Rows of one load for its Gauss nodes from `first` on, as many as a register holds: contact
+ * response, force response and contact compliance. */
+static void step_matrices_at_nodes(const Workspace *w, const Step *step, int s, int first) {
+    const int block_size = w->block_size, modes = w->modes, all_modes = w->all_modes;
+    const int rows = step->rows, states = w->states, last = NODES - first;
+    const int count = last < REGISTER_WIDTH ? last : REGISTER_WIDTH;
+    const double *node_transition =
+        w->node_transition + (size_t)step->panel * node_transition_size(w) + first;
+    const double *node_force_response =
+        w->node_force_response + (size_t)step->panel * node_force_response_size(w) + first;
+    const double *end_response =
+        w->force_response + (size_t)step->panel * force_response_size(w) + first;
+    const double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES + first;
+    const double *contact_rows = w->contact_rows + (ptrdiff_t)s * states * PADDED_NODES + first;
+    double *contact_response = step->contact_response + s * NODES + first;
+    double *force_response = step->force_response + (ptrdiff_t)(s * NODES + first) * states;
+    for (int i = 0; i < states; i++) {
+        const double *rows_of = contact_rows + i / block_size * block_size * PADDED_NODES;
+        const double *transitions = node_transition +
+                                    i / block_size * block_size * block_size * PADDED_NODES +
+                                    i % block_size * PADDED_NODES;
+        Register response = {0}, response_of_force = {0};
+        for (int j = 0; j < block_size; j++)
+            response += load_full(rows_of + j * PADDED_NODES) *
+                        load_full(transitions + j * block_size * PADDED_NODES);
+        for (int m = 0; m < modes; m++)
+            response_of_force += load_full(shape + (i / block_size * modes + m) * PADDED_NODES) *
+                                 load_full(end_response + (i * modes + m) * PADDED_NODES);
+        store(contact_response + i * rows, response, count);
+        for (int k = 0; k < count; k++) force_response[k * states + i] = response_of_force[k];
+    }
+    Register *acceleration = w->acceleration;
+    for (int c = 0; c < NODES; c++) {
+        const double *there = shape - first + c, *contact_rows_there = contact_rows - first + c;
+        Register here = {0}; /* direct term: the force accelerates the beam under the load */
+        if (c >= first && c < first + REGISTER_WIDTH) here[c - first] = 1;
+        for (int m = 0; m < all_modes; m++) {
+            const int from = m / modes * block_size;
+            const double *response_of_force =
+                node_force_response + (c * states * modes + m % modes) * PADDED_NODES;
+            Register sum = here * there[m * PADDED_NODES];
+            for (int i = from; i < from + block_size; i++)
+                sum += contact_rows_there[i * PADDED_NODES] *
+                       load_full(response_of_force + i * modes * PADDED_NODES);
+            acceleration[m] = sum;
+        }
+        for (int q = 0; q < step->loads; q++) {
+            const double *under = shape + (ptrdiff_t)(q - s) * all_modes * PADDED_NODES;
+            Register contact_compliance = {0};
+            for (int m = 0; m < all_modes; m++)
+                contact_compliance += acceleration[m] * load_full(under + m * PADDED_NODES);
+            store(step->contact_compliance + (s * NODES + c) * rows + q * NODES + first,
+                  contact_compliance, count);
+        }
+    }
+}
+
+/* Matrices of a step with its loads. */
+static void step_matrices(const Workspace *w, const Step *step) {
+    const int all_modes = w->all_modes, states = w->states;
+    const int sample_count = w->sample_count, padded = padded_size(sample_count);
+    memcpy(step->sample_rows, w->sample_rows + (size_t)step->panel * sample_rows_size(w),
+           8 * sample_rows_size(w));
+    if (!step->loads) return;
+    load_path(w, step);
+    const double *sample_response =
+        w->sample_response + (size_t)step->panel * sample_response_size(w);
+    for (int s = 0; s < step->loads; s++) {
+        const double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES;
+        for (int first = 0; first < NODES; first += REGISTER_WIDTH)
+            step_matrices_at_nodes(w, step, s, first);
+        for (int f = 0; f < NODES; f++)
+            for (int l = 0; l < sample_count; l += REGISTER_WIDTH) {
+                const double *input_row = sample_response + f * all_modes * padded + l;
+                Register sampled = {0};
+                for (int m = 0; m < all_modes; m++)
+                    sampled += shape[m * PADDED_NODES + f] * load_full(input_row + m * padded);
+                double *stored =
+                    step->sample_rows + (ptrdiff_t)(states + s * NODES + f) * sample_count + l;
+                store(stored, sampled,
+                      sample_count - l < REGISTER_WIDTH ? sample_count - l : REGISTER_WIDTH);
+            }
+    }
+}

@@ -1,0 +1,192 @@
+/* A chunk of steps for a group of runs: integrator/step.py, `advance`, and
+ * integrator/running_peaks.py, `update_peaks`, without commands. */
+
+#pragma once
+
+#include "propagators.h"
+#include "peak_search.h"
+#include "step_matrices.h"
+
+/* Smallest contact forces so far, and the first times at which they are tensile. */
+static void update_contact_minimum(const Workspace *w, const Step *step, const Group *g) {
+    for (int s = 0; s < step->loads; s++) {
+        const Register *forces = g->state + w->states + s * NODES;
+        const ptrdiff_t at = step->load_numbers[s] * w->batch_size + g->first;
+        Register pull = forces[0];
+        for (int k = 1; k < NODES; k++) pull = maximum(forces[k], pull);
+        store(w->lowest_force + at, minimum(-pull, load(w->lowest_force + at, g->count)), g->count);
+        if (!any(pull > 0)) continue;
+        Register loss_time = load(w->contact_loss_time + at, g->count);
+        for (int k = 0; k < NODES; k++) {
+            Register time = broadcast(step->start + step->length * w->inputs[GAUSS_NODES][k]);
+            loss_time = choose(forces[k] > 0, minimum(time, loss_time), loss_time);
+        }
+        store(w->contact_loss_time + at, loss_time, g->count);
+    }
+}
+
+/* Contact forces at the Gauss nodes of a step, for a number of loads that may be known when
+ * compiling. */
+static inline ALWAYS_INLINE void contact_forces(const Workspace *w, const Step *step,
+                                                const Group *g, int loads, Register *matrix,
+                                                Register *forces) {
+    const int rows = loads * NODES;
+    memset(forces, 0, (size_t)rows * sizeof *forces);
+    add_product(forces, step->contact_response, rows, g->state, w->states);
+    for (int s = 0; s < loads; s++) {
+        const ptrdiff_t at = step->load_numbers[s] * w->batch_size + g->first;
+        Register mass = load(w->inputs[INERTIA] + at, g->count),
+                 weight = load(w->inputs[WEIGHT] + at, g->count);
+        for (int i = s * NODES; i < (s + 1) * NODES; i++) {
+            forces[i] = -(weight + mass * forces[i]);
+            for (int j = 0; j < rows; j++)
+                matrix[i * rows + j] = mass * step->contact_compliance[i * rows + j];
+            matrix[i * rows + i] += 1;
+        }
+    }
+    solve_contact_system(matrix, forces, rows);
+}
+
+static void solve_contact(const Workspace *w, const Step *step, const Group *g) {
+    if (step->loads == 1) { /* the matrix fits into registers */
+        Register matrix[NODES * NODES], forces[NODES];
+        contact_forces(w, step, g, 1, matrix, forces);
+        memcpy(g->state + w->states, forces, sizeof forces);
+    } else {
+        contact_forces(w, step, g, step->loads, g->matrix, g->state + w->states);
+    }
+}
+
+/* Deflections at the peak nodes of a step, the largest of them, and a bound of those between. */
+static void sample_positions(const Workspace *w, int t, const Step *step, const Group *g) {
+    Register *sampled = g->samples + t * w->sample_count;
+    memset(sampled, 0, (size_t)w->sample_count * sizeof *sampled);
+    add_product(sampled, step->sample_rows, w->sample_count, g->state, w->states + step->rows);
+    for (int position = 0; position < w->positions; position++) {
+        Register largest = {0};
+        for (int i = position; i < w->sample_count; i += w->positions)
+            largest = maximum(absolute(sampled[i]), largest);
+        g->sample_peak[t * w->positions + position] = largest;
+        g->peak_bound[t * w->positions + position] = peak_bound_within(
+            sampled[position], sampled[w->sample_count - w->positions + position], largest);
+    }
+}
+
+/* State at the end of a step; a block of two states is an uncoupled mode. */
+static void propagate(const Workspace *w, const Step *step, Group *g) {
+    const double *transition = step->transition;
+    Register *state = g->state, *next_state = g->next_state;
+    if (w->block_size == 2) {
+        for (int i = 0; i < w->states; i += 2, transition += 4) {
+            next_state[i] = transition[0] * state[i] + transition[2] * state[i + 1];
+            next_state[i + 1] = transition[1] * state[i] + transition[3] * state[i + 1];
+        }
+    } else {
+        memset(next_state, 0, (size_t)w->states * sizeof *next_state);
+        for (int i = 0; i < w->states;
+             i += w->block_size, transition += w->block_size * w->block_size)
+            add_product(next_state + i, transition, w->block_size, state + i, w->block_size);
+    }
+    if (step->loads)
+        add_product(next_state, step->force_response, w->states, state + w->states, step->rows);
+    g->state = next_state, g->next_state = state;
+}
+
+/* Peaks so far, from the samples of all steps of the chunk. */
+static void update_peaks(const Workspace *w, int steps, const Group *g, int position) {
+    const int count = g->count;
+    const ptrdiff_t at = position * w->batch_size + g->first, plane = w->positions * w->batch_size;
+    const Register *sampled = g->samples + position;
+    Register former = load(w->peak + at, count), reached = former, peak = former, top = {0};
+    for (int t = 0; t < steps; t++)
+        reached = maximum(g->sample_peak[t * w->positions + position], reached);
+    for (int t = 0; t < steps; t++) {
+        /* Only a step whose bound exceeds all samples can have the peak. */
+        Register found = g->sample_peak[t * w->positions + position];
+        Mask candidate = g->peak_bound[t * w->positions + position] > reached;
+        if (!any(candidate)) continue;
+        Register samples[PEAK_POINTS];
+        for (int p = 0; p < PEAK_POINTS; p++)
+            samples[p] = sampled[(t * PEAK_POINTS + p) * w->positions];
+        if (any(candidate & peak_inside(samples, w->end_slopes, found)))
+            found = estimate_peak(samples, w->inputs[INTERPOLATION], w->inputs[PEAK_FRACTIONS]);
+        top = choose(found > peak, broadcast(t), top);
+        peak = maximum(found, peak);
+    }
+    Mask better = peak > former;
+    if (!any(better)) return;
+    store(w->peak + at, peak, count);
+    for (int t = 0; t < steps; t++) {
+        Mask here = better & (top == broadcast(t));
+        if (!any(here)) continue;
+        for (int p = 0; p < PEAK_POINTS; p++) {
+            double *stored = w->peak_samples + p * plane + at;
+            store(stored,
+                  choose(here, sampled[(t * PEAK_POINTS + p) * w->positions], load(stored, count)),
+                  count);
+        }
+        const Step *step = w->steps + t;
+        store(w->peak_step_start + at,
+              choose(here, broadcast(step->start), load(w->peak_step_start + at, count)), count);
+        store(w->peak_step_length + at,
+              choose(here, broadcast(step->length), load(w->peak_step_length + at, count)), count);
+    }
+}
+
+/* All steps of the chunk for a few groups, interleaved: while the divisions of one wait, another
+ * computes. */
+static void advance_chunk(const Workspace *w, int steps, Group *groups, int group_count) {
+    Group *end = groups + group_count;
+    for (const Group *g = groups; g < end; g++)
+        for (int i = 0; i < w->states; i++)
+            g->state[i] = load(w->state + i * w->batch_size + g->first, g->count);
+    for (int t = 0; t < steps; t++) {
+        const Step *step = w->steps + t;
+        if (step->loads) {
+            for (const Group *g = groups; g < end; g++) solve_contact(w, step, g);
+            for (const Group *g = groups; g < end; g++) update_contact_minimum(w, step, g);
+        }
+        for (const Group *g = groups; g < end; g++) sample_positions(w, t, step, g);
+        for (Group *g = groups; g < end; g++) propagate(w, step, g);
+    }
+    for (const Group *g = groups; g < end; g++) {
+        for (int position = 0; position < w->positions; position++)
+            update_peaks(w, steps, g, position);
+        Register zero = {0}; /* NaN if a state is infinite or NaN, which it then stays */
+        for (int i = 0; i < w->states; i++) {
+            store(w->state + i * w->batch_size + g->first, g->state[i], g->count);
+            zero += 0 * g->state[i];
+        }
+        double *finite = w->finite + g->first;
+        store(finite, choose(zero == 0, load(finite, g->count), broadcast(0)), g->count);
+    }
+}
+
+/* Whether the energy left cannot raise any peak, by the bound of `observation_rows`. Diverged runs
+ * cannot. */
+static int peaks_final(const Workspace *w) {
+    const int block_size = w->block_size, modes = w->modes;
+    for (ptrdiff_t first = 0; first < w->batch_size; first += REGISTER_WIDTH) {
+        const int count = runs_from(w, first);
+        Register energy = {0};
+        for (int b = 0; b < w->blocks; b++) {
+            const double *state = w->state + b * block_size * w->batch_size + first;
+            const double *matrix = w->inputs[STATE_MATRIX] + b * block_size * block_size;
+            for (int i = 0; i < 2 * modes; i += 2) {
+                Register rate = load(state + (i + 1) * w->batch_size, count), pull = {0};
+                for (int j = 0; j < 2 * modes; j += 2)
+                    pull -=
+                        matrix[(i + 1) * block_size + j] * load(state + j * w->batch_size, count);
+                energy += rate * rate + load(state + i * w->batch_size, count) * pull;
+            }
+        }
+        const Mask finite = 0 * energy == 0;
+        for (int position = 0; position < w->positions; position++) {
+            Register peak = load(w->peak + position * w->batch_size + first, count);
+            Mask above = finite & ~(w->flexibility[position] * energy < peak * peak);
+            for (int l = 0; l < count; l++)
+                if (above[l]) return 0;
+        }
+    }
+    return 1;
+}

@@ -1,0 +1,198 @@
+/* Arguments, outputs and workspace of a call. Macros: CHUNK_STEPS (steps of a chunk), NODES (Gauss
+ * nodes of a step), PEAK_POINTS (samples of a step). A last axis of nodes or samples is padded to a
+ * multiple of PADDING. */
+
+#pragma once
+
+#include <math.h>
+
+#include "ffi.h"
+
+enum { PADDED_NODES = (NODES + PADDING - 1) / PADDING * PADDING };
+enum { STEP_FRACTIONS = NODES + 1 }; /* Gauss nodes and end of a step */
+enum { INTERLEAVED_GROUPS = 2 };     /* groups of runs that are advanced together */
+
+/* Arguments of the call, with tasks as the first axis, of length one if shared: modal model, panels
+ * of the time grid, trajectories, loads, positions, constants. */
+enum {
+    MASK,
+    STATE_MATRIX,
+    SHAPE_NODES,
+    SHAPE_SERIES,
+    PANEL_STARTS,
+    STEP_COUNTS,
+    STEP_LENGTHS,
+    LOADS_ON_BEAM,
+    ON_BEAM_INTERVALS,
+    BREAKPOINTS,
+    CUBICS,
+    INERTIA,
+    WEIGHT,
+    POSITIONS,
+    GAUSS_NODES,
+    LAGRANGE_COEFFICIENTS,
+    INTERPOLATION,
+    PEAK_FRACTIONS,
+    ARGUMENT_COUNT
+};
+enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, WORKSPACE, RESULT_COUNT };
+
+/* A step and its matrices, stored by columns: contact response (state, row), contact compliance
+ * (row, row), force response (row, state), sample rows (state and row, sample). Rows are the Gauss
+ * nodes of all loads on the beam. */
+typedef struct {
+    int panel, loads, rows;
+    double start, length;
+    const double *transition;
+    int64_t *load_numbers;
+    double *contact_response, *contact_compliance, *force_response, *sample_rows;
+} Step;
+
+/* Runs that fill a register; contact forces follow the state in memory. */
+typedef struct {
+    ptrdiff_t first;
+    int count;
+    Register *state, *next_state, *matrix;
+    Register *samples; /* (step, sample, position) */
+    /* (step, position): largest of the samples, and bound of the curve between them */
+    Register *sample_peak, *peak_bound;
+} Group;
+
+typedef struct {
+    /* Numbers of each; modes are those of a block. */
+    int panels, blocks, block_size, modes, segments, terms, pieces, max_loads, loads, positions;
+    int states, all_modes, sample_count, columns;
+    ptrdiff_t batch_size;
+    const double *inputs[ARGUMENT_COUNT];
+    double *outputs[RESULT_COUNT];
+    /* Of the task: series of mode shapes and their derivatives; mode shapes and static flexibility
+     * at the positions. */
+    double *series, *mode_rows, *flexibility;
+    /* Of each panel: propagators, with nodes, forces or samples as the last axis. */
+    double *node_transition, *node_force_response, *transition, *force_response, *sample_rows,
+        *sample_response;
+    /* Exponential of a block, for several fractions of steps at once. */
+    double *scale;
+    Register *block_matrix, *series_sums, *product, *exponential, *doubled_exponential, *phi,
+        *doubled_phi, *weights;
+    /* Of a step: mode shapes and contact rows at the Gauss nodes. */
+    double *shape, *contact_rows;
+    Register *acceleration, *shape_sums, *chebyshev;
+    /* Of each run: state, running peaks, smallest contact forces; whether it is finite. */
+    double *state, *peak, *peak_samples, *peak_step_start, *peak_step_length, *lowest_force,
+        *contact_loss_time, *finite;
+    Group groups[INTERLEAVED_GROUPS];
+    Step steps[CHUNK_STEPS];
+    double end_slopes[2 * PEAK_POINTS]; /* weights of the samples in the slopes at both ends */
+} Workspace;
+
+static int padded_size(int count) { return (count + PADDING - 1) / PADDING * PADDING; }
+
+/* Sizes of the matrices of a panel, in doubles. */
+static size_t node_transition_size(const Workspace *w) {
+    return (size_t)w->states * w->block_size * PADDED_NODES;
+}
+static size_t force_response_size(const Workspace *w) {
+    return (size_t)w->states * w->modes * PADDED_NODES;
+}
+static size_t node_force_response_size(const Workspace *w) {
+    return NODES * force_response_size(w);
+}
+static size_t transition_size(const Workspace *w) { return (size_t)w->states * w->block_size; }
+static size_t sample_rows_size(const Workspace *w) { return (size_t)w->states * w->sample_count; }
+static size_t sample_response_size(const Workspace *w) {
+    return (size_t)NODES * w->all_modes * padded_size(w->sample_count);
+}
+
+/* Next part of the workspace, aligned to registers. */
+static void *allocate(uintptr_t start, size_t *used, size_t numbers) {
+    void *part = (void *)(start + *used);
+    *used += (8 * numbers + sizeof(Register) - 1) & -sizeof(Register);
+    return part;
+}
+
+/* Set the pointers into the workspace; its size in bytes. */
+static size_t partition_workspace(Workspace *w, uintptr_t start) {
+    size_t used = 0, batch_size = (size_t)w->batch_size, panels = (size_t)w->panels,
+           block_size = (size_t)w->block_size;
+    size_t rows = (size_t)w->max_loads * NODES, states = (size_t)w->states,
+           sample_count = (size_t)w->sample_count;
+    size_t positions = (size_t)w->positions, all_modes = (size_t)w->all_modes,
+           modes = (size_t)w->modes;
+    w->series = allocate(start, &used, (size_t)w->segments * w->terms * w->columns);
+    w->mode_rows = allocate(start, &used, positions * all_modes);
+    w->flexibility = allocate(start, &used, positions);
+    w->node_transition = allocate(start, &used, panels * node_transition_size(w));
+    w->node_force_response = allocate(start, &used, panels * node_force_response_size(w));
+    w->transition = allocate(start, &used, panels * transition_size(w));
+    w->force_response = allocate(start, &used, panels * force_response_size(w));
+    w->sample_rows = allocate(start, &used, panels * sample_rows_size(w));
+    w->sample_response = allocate(start, &used, panels * sample_response_size(w));
+    w->scale = allocate(start, &used, block_size);
+    w->block_matrix = allocate(start, &used, block_size * block_size * REGISTER_WIDTH);
+    w->series_sums = allocate(start, &used, block_size * (block_size + modes) * REGISTER_WIDTH);
+    w->product = allocate(start, &used, block_size * (block_size + NODES * modes) * REGISTER_WIDTH);
+    w->exponential = allocate(start, &used, block_size * block_size * REGISTER_WIDTH);
+    w->doubled_exponential = allocate(start, &used, block_size * block_size * REGISTER_WIDTH);
+    w->phi = allocate(start, &used, block_size * NODES * modes * REGISTER_WIDTH);
+    w->doubled_phi = allocate(start, &used, block_size * NODES * modes * REGISTER_WIDTH);
+    w->weights = allocate(start, &used, NODES * NODES * REGISTER_WIDTH);
+    w->shape = allocate(start, &used, (size_t)w->max_loads * all_modes * PADDED_NODES);
+    w->contact_rows = allocate(start, &used, (size_t)w->max_loads * states * PADDED_NODES);
+    w->acceleration = allocate(start, &used, all_modes * REGISTER_WIDTH);
+    w->shape_sums = allocate(start, &used, (size_t)2 * w->columns * REGISTER_WIDTH);
+    w->chebyshev = allocate(start, &used, (size_t)w->terms * REGISTER_WIDTH);
+    w->state = allocate(start, &used, states * batch_size);
+    w->peak = allocate(start, &used, positions * batch_size);
+    w->peak_samples = allocate(start, &used, PEAK_POINTS * positions * batch_size);
+    w->peak_step_start = allocate(start, &used, positions * batch_size);
+    w->peak_step_length = allocate(start, &used, positions * batch_size);
+    w->lowest_force = allocate(start, &used, (size_t)w->loads * batch_size);
+    w->contact_loss_time = allocate(start, &used, (size_t)w->loads * batch_size);
+    w->finite = allocate(start, &used, batch_size);
+    for (int k = 0; k < INTERLEAVED_GROUPS; k++) {
+        Group *g = w->groups + k;
+        g->state = allocate(start, &used, (states + rows) * REGISTER_WIDTH);
+        g->next_state = allocate(start, &used, (states + rows) * REGISTER_WIDTH);
+        g->matrix = allocate(start, &used, rows * rows * REGISTER_WIDTH);
+        g->samples = allocate(start, &used, CHUNK_STEPS * sample_count * REGISTER_WIDTH);
+        g->sample_peak = allocate(start, &used, CHUNK_STEPS * positions * REGISTER_WIDTH);
+        g->peak_bound = allocate(start, &used, CHUNK_STEPS * positions * REGISTER_WIDTH);
+    }
+    for (int t = 0; t < CHUNK_STEPS; t++) {
+        Step *step = w->steps + t;
+        step->load_numbers = allocate(start, &used, (size_t)w->max_loads);
+        step->contact_response = allocate(start, &used, rows * states);
+        step->contact_compliance = allocate(start, &used, rows * rows);
+        step->force_response = allocate(start, &used, rows * states);
+        step->sample_rows = allocate(start, &used, (states + rows) * sample_count);
+    }
+    return used;
+}
+
+/* Sizes that follow from others. */
+static void derive_sizes(Workspace *w) {
+    w->states = w->blocks * w->block_size, w->all_modes = w->blocks * w->modes;
+    w->sample_count = PEAK_POINTS * w->positions, w->columns = 3 * w->all_modes;
+}
+
+/* Arguments of a task. */
+static void set_inputs(Workspace *w, const XLA_FFI_CallFrame *frame, int64_t task) {
+    for (int i = 0; i < ARGUMENT_COUNT; i++) {
+        const XLA_FFI_Buffer *buffer = frame->args.args[i];
+        int64_t bytes = i == MASK || i == LOADS_ON_BEAM ? 1 : 8;
+        for (int64_t d = 1; d < buffer->rank; d++) bytes *= buffer->dims[d];
+        int64_t away = buffer->dims[0] > 1 ? task * bytes : 0;
+        w->inputs[i] = (const double *)((const char *)buffer->data + away);
+    }
+}
+
+static int64_t panel_steps(const Workspace *w, int panel) {
+    return ((const int64_t *)w->inputs[STEP_COUNTS])[panel];
+}
+
+/* Number of runs of the group that begins with the run `first`. */
+static int runs_from(const Workspace *w, ptrdiff_t first) {
+    const ptrdiff_t left = w->batch_size - first;
+    return left < REGISTER_WIDTH ? (int)left : REGISTER_WIDTH;
+}
