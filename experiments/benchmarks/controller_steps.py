@@ -113,13 +113,14 @@ def measure(controller: AbstractController) -> ComputingTimes:
 
 
 def main() -> None:
-    """Print the table. Raises SystemExit if a kind of controller is missing from it."""
+    """Print the table, and the kinds of controllers that it lacks."""
     options = parser(__doc__)
     options.add_argument("--only", default="", help="time the controllers whose names contain this")
     only = options.parse_args().only
-    left_out = set(kinds(AbstractController).values()) - {type(law) for law in CONTROLLERS.values()}
-    if left_out:
-        raise SystemExit(f"no controller of kind {', '.join(k.__name__ for k in left_out)}")
+    classes = {type(controller) for controller in CONTROLLERS.values()}
+    lacking = [kind for kind, each in kinds(AbstractController).items() if each not in classes]
+    if lacking:
+        print(f"not timed, as no example is listed here: {', '.join(lacking)}")
     print_table(("microseconds per step", "median", "worst", "256 at once", "worst"))
     for name, controller in CONTROLLERS.items():
         if only in name:

@@ -19,7 +19,7 @@ from jaxbeam.control.optimal.crossing_lqr import AugmentedLQR
 from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.simulation.closed_loop import loop_schedule
-from tests.control.optimal.test_regulators import (
+from tests.control.optimal.test_crossing_lqr import (
     ENTRIES,
     EVENTS,
     GRAVITY,
