@@ -1,1 +1,1 @@
-"""One case to one record."""
+"""Simulation of one case: integration plan, closed loop, record."""

@@ -137,8 +137,13 @@ def integration_plan(
     )
     lead_samples = max(0, int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE)))
     _check_step_count(samples.size * (intervals.max() / step), step)
-    substeps = max(1, int(np.ceil(intervals.max() / step)))
+    substeps = steps_per_interval(intervals.max(), step)
     return IntegrationPlan(shapes, substeps, lead_samples, equally_spaced, error)
+
+
+def steps_per_interval(interval: float, max_step: float) -> int:
+    """Smallest number of equal steps of at most `max_step` (s) in an interval (s)."""
+    return max(1, int(np.ceil(interval / max_step)))
 
 
 def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> IntegrationPlan:
@@ -232,7 +237,7 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
             " give a shorter controller.period or a higher run.sample_rate"
         )
     _check_step_count(schedule.times.size * interval / step, step)
-    min_substeps = max(1, int(np.ceil(interval / step)))
+    min_substeps = steps_per_interval(interval, step)
 
     @functools.cache
     def response(halvings):

@@ -15,7 +15,12 @@ from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import StaticShapes, max_concurrent_loads, sample_times
+from jaxbeam.simulation.integration_plan import (
+    StaticShapes,
+    max_concurrent_loads,
+    sample_times,
+    steps_per_interval,
+)
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.common_layout import common_layout
@@ -174,7 +179,7 @@ class Runner:
         batch_indices = np.arange(first, first + self.batches_per_block) % count
         substeps = None
         if self.histories:
-            substeps = max(1, int(np.ceil(float(self.schedule.lengths.max()) / steps.min())))
+            substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
         return self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
 
     def _programs_to_compile(self, program, shared_values):

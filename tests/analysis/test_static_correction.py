@@ -174,7 +174,7 @@ def test_moment_of_a_patch_on_a_clamped_beam():
     patch, x = PLAIN.actuators[0], np.linspace(0.0, 0.6, 13)
     case = jb.Case(dataclasses.replace(PLAIN.beam, ends="clamped-clamped"), actuators=[patch])
     length, a, b, active = 0.6, 0.2, 0.35, 1e-3
-    # The integrals over the beam of the curvature, E I w'' = M - active moment, and of x w'' are zero.
+    # The integrals over the beam of w'', with E I w'' = M - active moment, and of x w'' are zero.
     system = np.array([[length, length**2 / 2], [length**2 / 2, length**3 / 3]])
     p, q = np.linalg.solve(system, active * np.array([b - a, (b**2 - a**2) / 2]))
     found = bending_moment(case, x, static_deflection_per_command(case, x, 2)[0], [1.0])

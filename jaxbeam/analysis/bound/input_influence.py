@@ -25,7 +25,12 @@ from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.simulation.integration_plan import StaticShapes, choose_step_size, static_shapes
+from jaxbeam.simulation.integration_plan import (
+    StaticShapes,
+    choose_step_size,
+    static_shapes,
+    steps_per_interval,
+)
 
 TOLERANCE = 1e-9  # relative to the largest deflection
 MAX_BATCH_SIZE = 256  # unit commands at once; more exceed the cache of the processor
@@ -106,7 +111,7 @@ def input_influence(
     shapes = static_shapes(uncontrolled_case)
     step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
     schedule = controller_schedule(times, hold_times, 0.0, [], [], np.zeros(0))
-    substeps = max(1, int(np.ceil(float(np.diff(times).max()) / step)))
+    substeps = steps_per_interval(np.diff(times).max(), step)
     # Runs with hold -1 (the unforced one) or a hold after the end (padding) have no command.
     hold_index = np.append(-1, np.repeat(np.arange(count), actuators))
     actuator_index = np.append(0, np.tile(np.arange(actuators), count))
