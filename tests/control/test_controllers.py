@@ -104,7 +104,7 @@ def swept():
     finally:
         jax.config.update("jax_log_compiles", False)
         logger.removeHandler(handler)
-    return dataset, [message for message in found if "Compiling jit(block" in message]
+    return dataset, [message for message in found if "Compiling jit(integrate_block" in message]
 
 
 @pytest.mark.slow
