@@ -10,7 +10,7 @@ from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.gains import filter_gain
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
-from jaxbeam.numerics.intervals import symmetric_part
+from jaxbeam.numerics.matrices import symmetric_part
 
 Square = Float[Array, "state state"]
 

@@ -112,12 +112,14 @@ class SensorChain(eqx.Module):
         )
         for k, part in enumerate(parts):
             padded = jax.scipy.linalg.block_diag(part.matrix, np.eye(sensor_states))
-            inputs = (
+            previous_input, present_input = (
                 jnp.pad(x, ((0, sensor_states), (0, 0)))
                 for x in (part.previous_input_matrix, part.input_matrix)
             )
             noise = jnp.pad(part.noise_covariance, ((0, sensor_states), (0, sensor_states)))
-            transition = transition.compose(Transition(padded, *inputs, noise))
+            transition = transition.compose(
+                Transition(padded, previous_input, present_input, noise)
+            )
             for i, offset in sampling_offsets.items():
                 system, is_sampled = system_at(start + ends[k]), ends[k] == offset
                 transition = transition.compose(

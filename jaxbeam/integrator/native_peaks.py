@@ -23,13 +23,13 @@ from jaxbeam.integrator.propagators import (
     NODE_COUNT,
     PEAK_NODES,
     TAYLOR_TERMS,
-    lagrange_coefficients,
 )
 from jaxbeam.integrator.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import LoadSet
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
     ESTIMATE_ITERATIONS,
     NEWTON_ITERATIONS,
@@ -101,7 +101,7 @@ def integrate_peaks(
         shapes = shapes @ models.mode_map[:, None]
     constants = (
         np.asarray(GAUSS_NODES),
-        lagrange_coefficients(),
+        lagrange_coefficients(NODE_COUNT),
         interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T,
         np.asarray(PEAK_NODES),
     )

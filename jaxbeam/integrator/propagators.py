@@ -21,13 +21,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.numerics.gauss import gauss_nodes, lagrange_coefficients
 
 NODE_COUNT = 6  # Gauss nodes in a step; the integrator has order 12
 DOUBLINGS = 7
 TAYLOR_TERMS = 14
 MAX_STEP_NORM = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is exact to rounding
 
-GAUSS_NODES = (np.polynomial.legendre.leggauss(NODE_COUNT)[0] + 1) / 2
+GAUSS_NODES = gauss_nodes(NODE_COUNT)
 # Positions in a step at which the deflection is sampled for its peak: the ends and the Gauss nodes,
 # for which propagators exist. Interpolants through these oscillate less than through equal points.
 PEAK_NODES = (0.0, *(float(node) for node in GAUSS_NODES), 1.0)
@@ -46,19 +47,9 @@ class Propagators(eqx.Module):
     input_end: Float[Array, "*length force block side input"]
 
 
-@functools.cache
-def lagrange_coefficients() -> np.ndarray:
-    """Monomial coefficients (node, power) of the Lagrange polynomials through the Gauss nodes."""
-    polynomials = []
-    for k, node in enumerate(GAUSS_NODES):
-        others = np.delete(GAUSS_NODES, k)
-        polynomials.append(np.polynomial.polynomial.polyfromroots(others) / np.prod(node - others))
-    return np.array(polynomials)
-
-
 def end_weights() -> np.ndarray:
     """Weights (node, end) that extrapolate values at the Gauss nodes to the ends of a step."""
-    coefficients = lagrange_coefficients()
+    coefficients = lagrange_coefficients(NODE_COUNT)
     return np.stack([coefficients[:, 0], coefficients.sum(axis=1)], axis=1)
 
 
@@ -114,7 +105,7 @@ def propagators(
         part.reshape(*part.shape[:-1], *durations.shape) for part in (transition, phi_functions)
     )
     powers = np.arange(NODE_COUNT)
-    weights = lagrange_coefficients() * np.array(
+    weights = lagrange_coefficients(NODE_COUNT) * np.array(
         [math.factorial(p) for p in powers]
     )  # force, power
     weights = weights * fractions[:, None, None] ** powers  # fraction, force, power

@@ -1,6 +1,7 @@
-"""Small linear systems, many at a time, spelt out.
+"""Linear algebra of many small matrices at once, batch axis last.
 
-A library's factorisation would seek pivots in each of them; that takes longer, to compile as well.
+Products and eliminations are unrolled, without pivoting: at these sizes a call of a library takes
+longer than the arithmetic, and longer to compile.
 """
 
 from collections.abc import Callable
@@ -12,23 +13,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-MAX_UNROLLED_TERMS = (
-    12  # terms; XLA calls a library for products, which takes as long as adding these
-)
+MAX_UNROLLED_TERMS = 12  # of a sum that takes as long as the call of a library for the product
 
 
 def solve_small(
-    matrix: Float[Array, "row row lane"], right: Float[Array, "row column lane"]
-) -> Float[Array, "row column lane"]:
-    """Solve systems by halves: few operations, each on all lanes at once.
+    matrix: Float[Array, "row row batch"], right: Float[Array, "row column batch"]
+) -> Float[Array, "row column batch"]:
+    """Solve systems by block elimination in halves: few operations, each on the whole batch.
 
-    No pivots are sought: for matrices that are positive, or the identity plus masses times a
-    positive matrix. Linear in the right side, so that it can be transposed.
+    For matrices that need no pivoting: positive definite ones, or the identity plus masses times a
+    positive definite one. Linear in the right side, so that it can be transposed.
     """
     return right if matrix.shape[0] == 0 else _block_eliminate(matrix, right)[0]
 
 
 def _block_eliminate(matrix, *rights):
+    """Solutions for several right sides."""
     size = matrix.shape[0]
     if size <= 3:
         inverse = _cofactor_inverse(matrix)
@@ -51,12 +51,12 @@ def _block_eliminate(matrix, *rights):
 
 
 def _unrolled_matmul(a, b):
-    """Product of small matrices (row, row, lane), spelt out."""
+    """Product (row, column, batch) of small matrices as an unrolled sum."""
     return sum(a[:, k, None] * b[k] for k in range(1, b.shape[0])) + a[:, 0, None] * b[0]
 
 
 def _cofactor_inverse(matrix):
-    """Inverse of up to three rows, by cofactors."""
+    """Inverse of matrices of up to three rows, by cofactors."""
     size = matrix.shape[0]
     if size == 1:
         return 1 / matrix
@@ -76,9 +76,9 @@ def _cofactor_inverse(matrix):
 
 
 def matvec(
-    matrix: Float[Array, "row column"], vectors: Float[Array, "column lane"]
-) -> Float[Array, "row lane"]:
-    """Product of a matrix with many columns, spelt out where few terms are added."""
+    matrix: Float[Array, "row column"], vectors: Float[Array, "column batch"]
+) -> Float[Array, "row batch"]:
+    """Product of one matrix with a batch of vectors, unrolled where the sums are short."""
     if not 0 < vectors.shape[0] <= MAX_UNROLLED_TERMS:
         return matrix @ vectors
     return _unrolled_matmul(matrix[..., None], vectors[:, None])[:, 0]
@@ -87,11 +87,11 @@ def matvec(
 def solve_unpivoted(
     matrix: Float[Array, "row row"], right: Float[Array, "row column"]
 ) -> Float[Array, "row column"]:
-    """Solve a system of any size; under `vmap` many at a time, with the systems as the last axis.
+    """Solve a system of any size without pivoting; under `vmap` the batch axis is the last.
 
-    As `solve_small` without pivots, but by a loop, which compiles quickly for larger matrices too.
-    Where a library's factorisations of batches run side by side, their threads may wait for each
-    other for ever (jaxlib's hand parts of a batch to the threads that they are waiting on).
+    By a loop, which compiles quickly for larger matrices too, unlike `solve_small`. LAPACK's
+    factorisations of batches may deadlock where several run at the same time: jaxlib hands parts of
+    a batch to the threads that wait for it.
     """
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x,
@@ -103,7 +103,7 @@ def solve_unpivoted(
 
 @jax.custom_batching.custom_vmap
 def _gauss_jordan(matrix, right):
-    """Gauss and Jordan's elimination of systems (row, column, *lane)."""
+    """Solve systems (row, column, *batch) by Gauss-Jordan elimination."""
     size = matrix.shape[0]
     rows = np.arange(size).reshape(-1, *[1] * (matrix.ndim - 1))
 
@@ -119,19 +119,19 @@ def _gauss_jordan(matrix, right):
 
 @_gauss_jordan.def_vmap
 def _(count, batched, *systems):
-    lanes = [
+    systems = [
         jnp.moveaxis(part, 0, -1)
         if has
         else jnp.broadcast_to(part[..., None], (*part.shape, count))
         for part, has in zip(systems, batched, strict=True)
     ]
-    return jnp.moveaxis(_gauss_jordan(*lanes), -1, 0), True
+    return jnp.moveaxis(_gauss_jordan(*systems), -1, 0), True
 
 
 def matmul(
     a: Float[Array, "row term _"], b: Float[Array, "term column _"]
-) -> Float[Array, "row column lane"]:
-    """Products, spelt out where few terms are added, else by a library."""
+) -> Float[Array, "row column batch"]:
+    """Products of matrices, unrolled where the sums are short, else by a library."""
     if a.shape[2] == 1:
         return jnp.tensordot(a[..., 0], b, 1)
     if b.shape[2] == 1:
@@ -143,13 +143,13 @@ def matmul(
     )
 
 
-def transpose(matrix: Float[Array, "row column lane"]) -> Float[Array, "column row lane"]:
-    """The transposes."""
+def transpose(matrix: Float[Array, "row column batch"]) -> Float[Array, "column row batch"]:
+    """Transposes of matrices."""
     return jnp.swapaxes(matrix, 0, 1)
 
 
-def hstack(*parts: Float[Array, "row _ _"]) -> Float[Array, "row column lane"]:
-    """Matrices side by side."""
+def hstack(*parts: Float[Array, "row _ _"]) -> Float[Array, "row column batch"]:
+    """Matrices with equal rows, concatenated along the columns."""
     batch_size = batch_size_of(parts)
     return jnp.concatenate(
         [jnp.broadcast_to(part, (*part.shape[:2], batch_size)) for part in parts], axis=1
@@ -158,8 +158,8 @@ def hstack(*parts: Float[Array, "row _ _"]) -> Float[Array, "row column lane"]:
 
 def solve_batch(
     matrix: Float[Array, "row row _"], right: Float[Array, "row column _"]
-) -> Float[Array, "row column lane"]:
-    """As `solve_unpivoted`, with the systems as the last axis."""
+) -> Float[Array, "row column batch"]:
+    """`solve_unpivoted` of a batch, batch axis last."""
     batch_size = batch_size_of(matrix, right)
     matrix, right = (jnp.broadcast_to(x, (*x.shape[:2], batch_size)) for x in (matrix, right))
     return jax.lax.custom_linear_solve(
@@ -171,14 +171,14 @@ def solve_batch(
 
 
 def batch_size_of(*args: Any) -> int:
-    """How many lanes there are."""
+    """Length of the batch axis, the last of all arrays; shared ones have length one."""
     return max(part.shape[-1] for part in jax.tree.leaves(eqx.filter(args, eqx.is_array)))
 
 
 def vmap_last_axis(function: Callable, *args: Any) -> Any:
-    """What a function of arrays without lanes returns for each lane of these.
+    """Map a function over the last axis of all arrays in its arguments; results get it last too.
 
-    What lanes share has a last axis of length one, here and in `batch_axis_last`.
+    Arrays whose last axis has length one are shared.
     """
     arrays, rest = eqx.partition(args, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
@@ -196,32 +196,32 @@ def vmap_last_axis(function: Callable, *args: Any) -> Any:
 
 
 def batch_axis_last(function: Callable, *args: Any) -> Any:
-    """Call a function of trees of arrays (..., lane) with arrays that have no lanes.
+    """Call a function of arrays (..., batch) with unbatched arrays.
 
-    Under `vmap` what is mapped is the lanes: matrices are small, so what is done for an element of
-    all of them at once are the long loops. Derivatives are those of a single lane, mapped.
+    Under `vmap` the mapped axis becomes the batch axis, so that the inner loops run over the batch,
+    which is longer than the matrices. Derivatives are those of a batch of one, mapped.
     """
     arrays, rest = eqx.partition(args, eqx.is_array)
 
-    def call(lanes):
-        return function(*eqx.combine(lanes, rest))
+    def call(batched):
+        return function(*eqx.combine(batched, rest))
 
     def unbatched_function(given):
-        found = call(jax.tree.map(lambda part: part[..., None], given))
-        return jax.tree.map(lambda part: part[..., 0], found)
+        result = call(jax.tree.map(lambda part: part[..., None], given))
+        return jax.tree.map(lambda part: part[..., 0], result)
 
     mapped_function = jax.custom_batching.custom_vmap(unbatched_function)
 
     @mapped_function.def_vmap
     def _(count, mapped, given):
-        def last(part, has):
-            return jnp.moveaxis(part, 0, -1) if has else part[..., None]
+        def to_last(part, is_mapped):
+            return jnp.moveaxis(part, 0, -1) if is_mapped else part[..., None]
 
-        def first(part):
+        def to_first(part):
             return jnp.moveaxis(jnp.broadcast_to(part, (*part.shape[:-1], count)), -1, 0)
 
-        found = jax.tree.map(first, call(jax.tree.map(last, given, *mapped)))
-        return found, jax.tree.map(lambda _: True, found)
+        result = jax.tree.map(to_first, call(jax.tree.map(to_last, given, *mapped)))
+        return result, jax.tree.map(lambda _: True, result)
 
     differentiable_function = jax.custom_jvp(lambda given: mapped_function(given))
     differentiable_function.defjvp(lambda given, rates: jax.jvp(unbatched_function, given, rates))

@@ -1,13 +1,13 @@
-"""Flows of a plant that changes in time only by a few forces: a beam under travelling masses.
+"""Stages of a plant that varies in time only by a few forces: a beam under travelling masses.
 
     x' = A x + B u + E F(t) f,      f = V(t) x + S(t) u - D(t) f
 
-A, B and E, the directions in which forces act, are constant; f are a few numbers, as the contact
-forces. Within a stretch F f and u are polynomials through their values at the Gauss nodes, to which
-the constant part answers exactly, with its cost (`stage_responses`); demanding the law of f at the
-nodes leaves one small linear system a stretch. So what bounds the length of a stretch is not how
-fast the constant part is, but how fast f and the wanted u change; in a plant with lags much faster
-than that, u is no polynomial, and `flows` are right with longer stretches.
+A, B and E, the directions of the forces, are constant; f are a few numbers, such as contact forces.
+Over an interval F f and u are the polynomials through their values at the Gauss nodes. The exact
+response and cost of the constant part to them (`stage_responses`) depend on the length of the
+interval only; the law of f at the nodes then is one small linear system an interval. So the length
+of an interval is limited by how fast f and the optimal u vary, not by the constant part. Where a
+plant has much faster lags, u is no such polynomial, and `stages` is accurate with longer intervals.
 """
 
 import functools
@@ -21,14 +21,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.numerics.batched_linalg import solve_unpivoted
-from jaxbeam.numerics.intervals import InputMatrix, InputWeight, Square, matrix_transpose
+from jaxbeam.numerics.gauss import gauss_weights, lagrange_coefficients
+from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square
 from jaxbeam.numerics.stages import GAUSS_NODES, NODE_COUNT, Stage, command_cost_matrix
 
-TAYLOR_TERMS = 12  # of the series for the shortest stretches
+TAYLOR_TERMS = 12  # of the series for the shortest intervals
 
 
 class ConstantPlant(eqx.Module):
-    """The constant part of a plant; see the module."""
+    """Constant part A, B, E of a plant; see the module."""
 
     A: Square
     B: InputMatrix
@@ -36,7 +37,7 @@ class ConstantPlant(eqx.Module):
 
 
 class Coupling(eqx.Module):
-    """What changes in time; see the module: F, V, S and D."""
+    """Time-varying part F, V, S, D of a plant; see the module."""
 
     force_distribution: Float[Array, "*time direction force"]
     force_state_rows: Float[Array, "*time force state"]
@@ -45,32 +46,32 @@ class Coupling(eqx.Module):
 
 
 class StageResponse(eqx.Module):
-    """What the constant part does over a stretch under inputs given at its Gauss nodes.
+    """Response and cost of the constant part over an interval.
 
-    `state_at_nodes` and `state_at_end` take (x, commands, directed forces) to the state at the
-    nodes and at the end, `cost` is what they cost. Commands and forces are ordered by node. What
-    the state at a node is made of lies together, as contact laws sum it.
+    `state_at_nodes` and `state_at_end` give the state at the Gauss nodes and at the end from
+    (x0, commands, E F f), and `cost` is the integral of x'Qx as a quadratic form of these.
+    Commands and forces are values at the nodes, ordered by node.
     """
 
-    state_at_nodes: Float[Array, "*length stage whole state"]
-    state_at_end: Float[Array, "*length state whole"]
-    cost: Float[Array, "*length whole whole"]
+    state_at_nodes: Float[Array, "*length node source state"]
+    state_at_end: Float[Array, "*length state source"]
+    cost: Float[Array, "*length source source"]
 
 
 def stage_responses(
     plant: ConstantPlant, Q: Square, length: Float[Array, ""], halvings: int
 ) -> StageResponse:
-    """Answers for stretches of a length (s), of half of it, and so on, the longest first.
+    """Responses for intervals of a length (s), of half of it, and so on, the longest first.
 
-    Inputs are first taken as polynomials sum_p c_p s^p / p! of the share s of the stretch that is
-    over. For the shortest stretch a Taylor series gives the answers; then they are doubled.
+    By Taylor series for the shortest interval, and doubling. Inputs are first the polynomials
+    sum_p c_p s^p / p! of the fraction s of the interval, then those through values at the nodes.
     """
     inputs = jnp.concatenate([plant.B, plant.E], axis=1)
     states, count = inputs.shape
     fractions = np.append(GAUSS_NODES, 1.0)
     shortest_length = length / 2**halvings
     transition, input_responses = _phi_functions(plant.A * shortest_length, inputs, fractions)
-    # To the nodes of the shortest stretch, from its start.
+    # States at the nodes of the shortest interval.
     powers = fractions[:, None] ** np.arange(1, NODE_COUNT + 1)
     state_at_nodes = (
         shortest_length * powers[:NODE_COUNT, :, None, None] * input_responses[:NODE_COUNT]
@@ -78,26 +79,24 @@ def stage_responses(
     state_at_nodes = jnp.concatenate(
         [transition[:NODE_COUNT], _flatten_node_columns(state_at_nodes)], axis=2
     )
-    quadrature = (np.polynomial.legendre.leggauss(NODE_COUNT)[1] / 2)[:, None, None]
-    cost = jnp.tensordot(
-        matrix_transpose(state_at_nodes), quadrature * (Q @ state_at_nodes), ((0, 2), (0, 1))
-    )
+    quadrature = gauss_weights(NODE_COUNT)[:, None, None]
+    cost = jnp.tensordot(state_at_nodes.mT, quadrature * (Q @ state_at_nodes), ((0, 2), (0, 1)))
 
     def double(carry, _):
-        drift, pushes, cost, span = carry
-        after = _double_phi(drift, pushes), _double_cost(drift[-1], span * pushes[-1], cost, count)
-        return (*after[0], after[1], 2 * span), carry
+        transition, input_responses, cost, length = carry
+        doubled = _double_phi(transition, input_responses)
+        doubled_cost = _double_cost(transition[-1], length * input_responses[-1], cost, count)
+        return (*doubled, doubled_cost, 2 * length), carry
 
     start = (transition, input_responses, shortest_length * cost, shortest_length)
     longest, shorter = jax.lax.scan(double, start, length=halvings)
     transition, input_responses, cost, lengths = jax.tree.map(
-        lambda few, one: jnp.concatenate([few, one[None]])[::-1], shorter, longest
+        lambda some, last: jnp.concatenate([some, last[None]])[::-1], shorter, longest
     )
     # From coefficients to values at the nodes, commands first.
-    lagrange = _lagrange_coefficients() * np.array(
-        [math.factorial(p) for p in range(NODE_COUNT)]
-    )  # node, power
-    local = lagrange * powers[:, None]  # fraction, node, power: over each fraction by itself
+    factorials = np.array([math.factorial(p) for p in range(NODE_COUNT)])
+    lagrange = lagrange_coefficients(NODE_COUNT) * factorials  # node, power
+    local = lagrange * powers[:, None]  # fraction, node, power: over each fraction of the interval
     node_input_response = (
         jnp.einsum("cqp,lcpik->lciqk", local, input_responses) * lengths[:, None, None, None, None]
     )
@@ -111,9 +110,9 @@ def stage_responses(
     input_cost = _commands_before_forces(jnp.einsum("qx,lpkxj->lpkqj", lagrange, input_cost), plant)
     input_cost = _commands_before_forces(jnp.moveaxis(input_cost, (1, 2), (-2, -1)), plant)
     top = jnp.concatenate([cost[:, :states, :states], cross_cost], axis=2)
-    below = jnp.concatenate([matrix_transpose(cross_cost), input_cost], axis=2)
+    below = jnp.concatenate([cross_cost.mT, input_cost], axis=2)
     return StageResponse(
-        matrix_transpose(state_response[:, :NODE_COUNT]),
+        state_response[:, :NODE_COUNT].mT,
         state_response[:, -1],
         jnp.concatenate([top, below], axis=1),
     )
@@ -126,17 +125,16 @@ def coupled_stages(
     R: InputWeight,
     length: Float[Array, ""],
 ) -> Stage:
-    """Flows over stretches of one length (s), from the coupling (stretch, stage) at their nodes."""
+    """Stages of intervals of one length (s), from the coupling (interval, node) at their nodes."""
     states, inputs = plant.B.shape
     free_columns = states + NODE_COUNT * inputs  # the states at the start and the commands
     interval_count, forces = coupling.force_state_rows.shape[0], coupling.force_state_rows.shape[2]
     size = NODE_COUNT * forces
-    # What the law of f sees, of what is known and of f itself. Stretches come last, for small sums.
+    # Rows of V x + S u at the nodes, and of f itself. Intervals are the last axis: sums are short.
     distribution = jnp.moveaxis(coupling.force_distribution, 0, -1)
     contact_rows = jnp.einsum("cwi,scri->cwrs", response.state_at_nodes, coupling.force_state_rows)
-    direct = jnp.moveaxis(coupling.command_feedthrough, 0, -1).swapaxes(
-        1, 2
-    )  # stage, input, force, stretch
+    # (node, input, force, interval)
+    direct = jnp.moveaxis(coupling.command_feedthrough, 0, -1).swapaxes(1, 2)
     direct_part = np.eye(NODE_COUNT)[:, :, None, None, None] * direct[:, None]
     right = (
         contact_rows[:, :free_columns]
@@ -155,7 +153,7 @@ def coupled_stages(
         np.eye(NODE_COUNT)[:, None, :, None, None] * force_feedthrough[:, :, None] - force_on_force
     )
     force = jax.vmap(solve_unpivoted, -1)(force_system.reshape(size, size, interval_count), right)
-    # What the forces do to the end, what they cost with what is known, and by themselves.
+    # Response of the end to the forces; their cost with x0 and u, and by themselves.
     force_response = jnp.concatenate([response.state_at_end, response.cost])[:, free_columns:]
     force_response = force_response.reshape(-1, NODE_COUNT, distribution.shape[1])
     force_response = jnp.einsum("wqd,qdts->wqts", force_response, distribution).reshape(
@@ -175,13 +173,8 @@ def coupled_stages(
     )
     end = response.state_at_end[:, :free_columns] + force_to_end @ force
     command_cost = jnp.pad(command_cost_matrix(R, length), (states, 0))
-    force_part = matrix_transpose(force) @ (matrix_transpose(cross_cost) + force_cost @ force / 2)
-    cost = (
-        response.cost[:free_columns, :free_columns]
-        + command_cost
-        + force_part
-        + matrix_transpose(force_part)
-    )
+    force_part = force.mT @ (cross_cost.mT + force_cost @ force / 2)
+    cost = response.cost[:free_columns, :free_columns] + command_cost + force_part + force_part.mT
     return Stage(end[..., :states], end[..., states:], cost)
 
 
@@ -193,33 +186,33 @@ def stages_of_length(
     R: InputWeight,
     length: Float[Array, ""],
 ) -> Stage:
-    """Those over stretches of one of the lengths that there are answers for."""
+    """`coupled_stages` for intervals of one of the lengths of `responses`."""
     response = jax.tree.map(
         lambda part: jax.lax.dynamic_index_in_dim(part, length_index, 0, False), responses
     )
     return coupled_stages(plant, response, coupling, R, length)
 
 
-def explicit_force_law(coupling: Coupling) -> Float[Array, "stretch stage force both"]:
-    """Rows that take state and command to f, its law being solved."""
+def explicit_force_law(coupling: Coupling) -> Float[Array, "interval node force state_and_input"]:
+    """Rows of the explicit law f = (1 + D)^-1 (V x + S u)."""
     law = jnp.eye(coupling.force_feedthrough.shape[-1]) + coupling.force_feedthrough
     right_side = jnp.concatenate([coupling.force_state_rows, coupling.command_feedthrough], axis=3)
     return jax.vmap(jax.vmap(solve_unpivoted))(law, right_side)
 
 
 def _unrolled_sum(terms, axis):
-    """A short sum, spelt out: it is not worth a loop."""
+    """Sum over a short axis, unrolled: shorter to run than a loop."""
     return functools.reduce(operator.add, jnp.unstack(terms, axis=axis))
 
 
 def _flatten_node_columns(input_responses):
-    """Pushes (fraction, power, state, input) as columns (fraction, state, power and input)."""
+    """Responses (fraction, power, state, input) as columns (fraction, state, power and input)."""
     ordered = jnp.moveaxis(input_responses, 1, 2)
     return ordered.reshape(*ordered.shape[:2], -1)
 
 
 def _commands_before_forces(columns, plant: ConstantPlant):
-    """Columns (..., node, input) in one row, the commands of all nodes before the forces."""
+    """Columns (..., node, input) as (..., column), commands of all nodes before the forces."""
     inputs = plant.B.shape[1]
     commands, forces = columns[..., :inputs], columns[..., inputs:]
     shape = (*columns.shape[:-2], -1)
@@ -227,7 +220,7 @@ def _commands_before_forces(columns, plant: ConstantPlant):
 
 
 def _phi_functions(x, inputs, fractions):
-    """exp(c x), and phi_1 ... phi of c x times the inputs, for fractions c of a small x."""
+    """exp(c x), and phi_1, ... of c x times the inputs, for fractions c of a small matrix x."""
     states = x.shape[0]
     columns = jnp.concatenate([jnp.eye(states), inputs], axis=1)
     rows = [columns]
@@ -242,26 +235,25 @@ def _phi_functions(x, inputs, fractions):
 
 
 def _double_phi(transition, input_responses):
-    """The exponentials, and the phi functions (fraction, phi, state, input), of twice as much."""
+    """Exponentials and phi functions (fraction, phi, state, input) of the doubled argument."""
     halves = 0.5 ** np.arange(1, NODE_COUNT + 1)
-    after = transition[:, None] @ input_responses + jnp.einsum(
+    doubled = transition[:, None] @ input_responses + jnp.einsum(
         "pq,cqik->cpik", _second_half_matrix().T, input_responses
     )
-    return transition @ transition, after * halves[:, None, None]
+    return transition @ transition, doubled * halves[:, None, None]
 
 
 def _double_cost(transition, input_responses, cost, count):
-    """What two stretches cost, for inputs given as coefficients over both."""
+    """Cost of two equal intervals together, for inputs with coefficients over both."""
     states = transition.shape[0]
     first = 0.5 ** np.arange(NODE_COUNT)
     first_half_inputs = _flatten_columns(input_responses * first[:, None, None])
     scale = np.append(np.ones(states), np.repeat(first, count))
-    second_half_weights = jnp.asarray(
-        _second_half_matrix() * first
-    )  # coefficient within the second, over both
+    # (coefficient over the second, coefficient over both)
+    second_half_weights = jnp.asarray(_second_half_matrix() * first)
 
     def to_second_half(columns):
-        """Columns by coefficients within the second stretch, as those over both."""
+        """Columns for coefficients over the second interval, as columns for those over both."""
         split = columns.reshape(-1, NODE_COUNT, count)
         return jnp.einsum("ipk,pq->iqk", split, second_half_weights).reshape(columns.shape)
 
@@ -283,7 +275,7 @@ def _double_cost(transition, input_responses, cost, count):
 
 
 def _flatten_columns(input_responses):
-    """Pushes (power, state, input) as columns (state, power and input)."""
+    """Responses (power, state, input) as columns (state, power and input)."""
     return jnp.moveaxis(input_responses, 0, 1).reshape(input_responses.shape[1], -1)
 
 
@@ -292,9 +284,3 @@ def _second_half_matrix() -> np.ndarray:
     """Weights 1 / (q - p)!: coefficient q of (1 + s)^q / q! in s^p / p!."""
     rows = range(NODE_COUNT)
     return np.array([[1 / math.factorial(q - p) if q >= p else 0.0 for q in rows] for p in rows])
-
-
-@functools.cache
-def _lagrange_coefficients() -> np.ndarray:
-    """Monomial coefficients (node, power) of the Lagrange polynomials through the Gauss nodes."""
-    return np.linalg.inv(GAUSS_NODES[:, None] ** np.arange(NODE_COUNT)).T

@@ -1,4 +1,4 @@
-"""Exact propagation of x' = A x + B u from sample to sample, for inputs polynomial in between."""
+"""Discrete-time equivalents of x' = A x + B u, exact for inputs polynomial between samples."""
 
 import math
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-DOUBLINGS = 14  # from the short interval of the series to the whole
+DOUBLINGS = 14  # of the short interval of the series
 SERIES_TERMS = 10  # exact to rounding while the norm of the matrix over that interval is below 0.05
 
 
@@ -17,7 +17,7 @@ def c2d(
     period: Float[Array, ""] | float,
     degree: int = 0,
 ) -> tuple[Float[Array, "state state"], Float[Array, "power state input"]]:
-    """Propagators over a period (s): x(h) = drift x(0) + sum_k push_k c_k.
+    """Transition Phi and input matrices Gamma over a period h: x(h) = Phi x(0) + sum_k Gamma_k c_k.
 
     The input is u(s) = sum_k c_k (s / h)^k with k up to `degree`: 0 is a zero-order hold, 1 a
     first-order hold with c_0 = u(0) and c_1 = u(h) - u(0). Exact, by one matrix exponential
@@ -27,7 +27,7 @@ def c2d(
     A, B = A * scale / scale[:, None], B / scale[:, None]
     states, inputs = B.shape
     powers = degree + 1
-    # The derivatives of the input by s / h are further states, each the rate of the one before.
+    # The derivatives of the input by s / h are further states, each the rate of the previous one.
     block = jnp.zeros((states + inputs * powers,) * 2)
     block = block.at[:states, :states].set(A * period)
     block = block.at[:states, states : states + inputs].set(B * period)
@@ -42,10 +42,10 @@ def c2d(
 def exponential_and_gramian(
     matrix: Float[Array, "state state"], intensity: Float[Array, "state state"]
 ) -> tuple[Float[Array, "state state"], Float[Array, "state state"]]:
-    """exp(M) and the integral of exp(M s) N exp(M's) over s from 0 to 1.
+    """exp(M) and the integral of exp(M s) N exp(M's) over s from 0 to 1; N is the intensity.
 
     By the series of a small fraction of M and doubling: unlike the blocks of one larger exponential
-    (Van Loan's), this is accurate however fast the plant decays.
+    (Van Loan 1978), this is accurate however fast the plant decays.
     """
     scaled_matrix, scaled_intensity = matrix / 2**DOUBLINGS, intensity / 2**DOUBLINGS
     identity = jnp.eye(matrix.shape[0])
@@ -67,9 +67,10 @@ def exponential_and_gramian(
 
 
 def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
-    """Scale of the states with which rows and columns of the matrix are of like size.
+    """Scale of the states with which rows and columns of the matrix have like norms.
 
     Without it, squaring an exponential of deflections in m and their rates in m/s loses digits.
+    The balanced matrix is A * scale / scale[:, None].
     """
     size = jnp.abs(matrix) * (1 - np.eye(matrix.shape[0]))
 
@@ -78,7 +79,7 @@ def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
         rows, columns = jnp.sum(scaled, axis=1), jnp.sum(scaled, axis=0)
         both = (rows > 0) & (columns > 0)
         ratio = jnp.where(both, rows, 1.0) / jnp.where(both, columns, 1.0)
-        return scale * ratio**0.25  # half the step for one state alone, as all move at once
+        return scale * ratio**0.25  # half the step for one state, as all change at once
 
     start = jnp.ones(matrix.shape[0])
     return jax.lax.stop_gradient(jax.lax.fori_loop(0, 20, equalise, start))
@@ -89,9 +90,9 @@ def hermite_cubics(
     values: Float[Array, " time"],
     rates: Float[Array, " time"] | None = None,
 ) -> Float[Array, "interval power"]:
-    """Coefficients c_k of the cubics in s / h through samples and their rates, for each interval.
+    """Coefficients c_k of the cubics in s / h through samples and their rates (per s).
 
-    Straight lines if no rates (unit of the values per s) are given.
+    Straight lines without rates.
     """
     difference = jnp.diff(values)
     start, end = (difference, difference)
@@ -106,9 +107,9 @@ def hermite_cubics(
 def evaluate_cubics(
     times: Float[Array, " time"],
     coefficients: Float[Array, "interval power"],
-    query_times: Float[Array, " *place"],
-) -> Float[Array, " *place"]:
-    """Values of the cubics at any times (s); before the first and after the last they are held."""
+    query_times: Float[Array, " *query"],
+) -> Float[Array, " *query"]:
+    """Values of piecewise cubics at any times (s); held before the first and after the last."""
     interval = jnp.clip(
         jnp.searchsorted(times, query_times, side="right") - 1, 0, coefficients.shape[0] - 1
     )

@@ -1,31 +1,29 @@
-"""The eigenvalue problem of the modes, with derivatives that hold at repeated eigenvalues too."""
+"""Generalised symmetric eigenvalue problem, with derivatives valid at repeated eigenvalues too."""
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 
-REPEATED_EIGENVALUE_TOLERANCE = 1e-6  # relative: closer modes are treated as a repeated one
-RIGID_BODY_EIGENVALUE = (
-    1e-10  # in beam units: lower eigenvalues are those of rigid-body modes, zero
-)
+REPEATED_EIGENVALUE_TOLERANCE = 1e-6  # relative: closer eigenvalues are treated as repeated
+RIGID_BODY_EIGENVALUE = 1e-10  # in beam units: eigenvalues below are zero, of rigid-body modes
 
 
 @jax.custom_jvp
 def eigen(stiffness, mass):
-    """Solve K x = lambda M x: ascending values, mass-normalised vectors, zero coupling.
+    """Ascending eigenvalues and mass-normalised eigenvectors X of K x = lambda M x, and coupling.
 
-    Vectors of (nearly) repeated values have no derivative of their own. Their tangents leave the
-    vectors unrotated and appear in the third result instead, the off-diagonal part of X' K X,
-    which is zero but has a derivative; whoever uses it gets exact derivatives of the response.
+    Vectors of (nearly) repeated values have no derivative of their own: their tangents do not
+    rotate them. The coupling, the off-diagonal part of X' K X, is zero and carries the derivative
+    instead; a model that includes it has exact derivatives of its response.
     """
-    factor = jnp.linalg.cholesky(stiffness + mass)  # the shift lifts rigid-body modes off zero
+    factor = jnp.linalg.cholesky(stiffness + mass)  # shifted: rigid-body modes are not singular
     mass_half_solved = solve_triangular(factor, mass, lower=True)
     flexibility = solve_triangular(factor, mass_half_solved.T, lower=True)
     inverse, vectors = jnp.linalg.eigh((flexibility + flexibility.T) / 2)
     vectors = solve_triangular(factor.T, vectors[:, ::-1], lower=False)
     inverse = jnp.maximum(inverse[::-1], jnp.finfo(inverse.dtype).tiny)
     vectors = vectors / jnp.sqrt(jnp.sum(vectors * (mass @ vectors), axis=0))
-    # The quotient is right to the square of the error of the vector.
+    # The error of Rayleigh's quotient is that of the vector squared.
     values = jnp.sum(vectors * (stiffness @ vectors), axis=0)
     values = jnp.where(values > RIGID_BODY_EIGENVALUE, values, 0.0)
     return values, vectors, jnp.zeros_like(mass)
@@ -42,7 +40,7 @@ def _eigen_jvp(primals, tangents):
     rotation = (stiffness - values[None, :] * mass) / jnp.where(repeated, 1.0, gap)
     rotation = jnp.where(repeated, -mass / 2, rotation)
     coupling_tangent = stiffness - (values[None, :] + values[:, None]) / 2 * mass
-    # Zero, but a second derivative sees how the coupling changes.
+    # Zero, but with a derivative, which second derivatives need.
     rotated_coupling = rotation.T @ coupling + coupling @ rotation
     rotation = rotation + jnp.where(repeated, 0.0, rotated_coupling / jnp.where(repeated, 1.0, gap))
     coupling_tangent = coupling_tangent + rotated_coupling

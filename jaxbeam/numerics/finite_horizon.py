@@ -1,10 +1,10 @@
-"""Optimal gains over a finite time, found backward from its end, stretch by stretch.
+"""Finite-horizon linear-quadratic control of time-varying plants: gains and cost-to-go matrices.
 
 Eqs (3.3) to (3.9) of the thesis, (3.8) with its sign corrected:
 
     dP/dt = -P A - A'P - Q + P B R^-1 B'P,     P(end) = F,     K = R^-1 B'P
 
-Stretches come in groups of equal length, a group at a time is worked out.
+The recursion runs backward over groups of equal intervals; stages are computed a group at a time.
 """
 
 from collections.abc import Callable
@@ -30,8 +30,8 @@ from jaxbeam.numerics.coupled_stages import (
     stages_of_length,
 )
 from jaxbeam.numerics.gain_polynomials import interpolate_gains
-from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.numerics.intervals import InputWeight, Square
+from jaxbeam.numerics.gain_table import GainTable, PlantMatrices
+from jaxbeam.numerics.matrices import InputWeight, Square
 from jaxbeam.numerics.stages import (
     GAUSS_NODES,
     collocated_stages,
@@ -39,42 +39,35 @@ from jaxbeam.numerics.stages import (
     riccati_recursion,
 )
 
-INTERVALS_PER_GROUP = 8  # stretches
-# Backward in time P hastens, right before an event, to what the plant from then on demands, and
-# rings for a while at twice the frequencies of the modes. So stretches of the last tenth of the
-# time since the event before are quartered, those of the tenth before halved, and what the last
-# group would last is cut into ever shorter stretches, so often halved.
+INTERVALS_PER_GROUP = 8
+# Boundary layer: backward in time from an event, P approaches that of the next plant and oscillates
+# at twice the modal frequencies. So intervals of the last tenth of the time between two events are
+# quartered, those of the tenth before halved, and the last group is halved further, so often:
 MAX_HALVINGS = 13
 BOUNDARY_LAYER_HALVINGS = [2, 2, 2, *range(3, MAX_HALVINGS + 1), MAX_HALVINGS]
 
-# What changes in a plant, at times (s) of any shape.
+# Time-varying part of a plant at times (s) of any shape.
 CouplingFunction = Callable[[Float[Array, "..."]], Coupling]
-# State matrix and command matrix at a time (s).
-PlantMatrices = Callable[[Float[Array, ""]], tuple[Float[Array, "..."], Float[Array, "..."]]]
 
 
 def interval_halvings(min_intervals: int) -> Int[np.ndarray, " group"]:
-    """How often the stretches of each group are halved, for at least so many stretches."""
+    """How often the intervals of each group are halved, for at least so many intervals."""
     group_count = max(1, -(-min_intervals // INTERVALS_PER_GROUP))
     tenth = group_count // 10
     before = np.repeat([0, 1, 2], [group_count - 1 - 2 * tenth, 2 * tenth, 4 * tenth])
     return np.concatenate([before, BOUNDARY_LAYER_HALVINGS])
 
 
-def breakpoint_fractions(min_intervals: int) -> Float[np.ndarray, " edge"]:
-    """Edges of the stretches between two events, as shares, 0 to 1, of the time between them."""
+def breakpoint_fractions(min_intervals: int) -> Float[np.ndarray, " breakpoint"]:
+    """Breakpoints of the intervals between two events, as fractions of the time between them."""
     lengths = np.repeat(0.5 ** interval_halvings(min_intervals), INTERVALS_PER_GROUP)
     return np.append(0.0, np.cumsum(lengths) / np.sum(lengths))
 
 
-def boundary_layer(min_intervals: int) -> Float[np.ndarray, " edge"]:
-    """Edges of the fine layer before an event, as shares of the time since the one before."""
-    return (
-        1
-        - breakpoint_fractions(min_intervals)[
-            -1 - INTERVALS_PER_GROUP * len(BOUNDARY_LAYER_HALVINGS) : -1
-        ]
-    )
+def boundary_layer(min_intervals: int) -> Float[np.ndarray, " breakpoint"]:
+    """Breakpoints of the boundary layer: time to the event, as fractions of that between events."""
+    count = INTERVALS_PER_GROUP * len(BOUNDARY_LAYER_HALVINGS)
+    return 1 - breakpoint_fractions(min_intervals)[-1 - count : -1]
 
 
 def finite_horizon(
@@ -84,11 +77,11 @@ def finite_horizon(
     Q: Square,
     R: InputWeight,
     terminal_cost: Square,
-) -> tuple[GainTable, Float[Array, "edge state state"]]:
-    """Gains that minimise x'Fx at the last event plus the integral of x'Qx + u'Ru, and P at edges.
+) -> tuple[GainTable, Float[Array, "breakpoint state state"]]:
+    """Gains that minimise x'Fx at the last event plus the integral of x'Qx + u'Ru, and P.
 
-    There are at least so many stretches, and a fine layer, between events (s); F is
-    `terminal_cost`.
+    P is that at the breakpoints of the table: between each two events (s) at least `min_intervals`,
+    and a boundary layer. F is `terminal_cost`.
     """
     inputs = R.shape[0]
     zero_plant = ConstantPlant(
@@ -118,8 +111,8 @@ def finite_horizon_coupled(
     Q: Square,
     R: InputWeight,
     terminal_cost: Square,
-) -> tuple[GainTable, Float[Array, "edge state state"]]:
-    """The same for a plant that changes by a few forces; much faster, see `coupled`."""
+) -> tuple[GainTable, Float[Array, "breakpoint state state"]]:
+    """`finite_horizon` for a plant that varies by a few forces (`coupled_stages`): much faster."""
 
     def responses_of_all_lengths():
         longest = jnp.diff(events) * (
@@ -143,9 +136,10 @@ def finite_horizon_coupled(
 def _gains_and_costs(
     stage_responses, group_stages, plant, events, min_intervals, Q, R, terminal_cost
 ):
-    """Gains and P from the stages of each group of intervals, found by `group_stages`.
+    """Gain table, and P at its breakpoints.
 
-    It is given what `stage_responses` finds for all groups.
+    `group_stages` gives stages, force distribution and force law of a group of intervals, from the
+    result of `stage_responses`, which is computed once.
     """
     fractions, durations = breakpoint_fractions(min_intervals), jnp.diff(events)
     steps = np.diff(fractions).reshape(-1, INTERVALS_PER_GROUP)
@@ -158,40 +152,39 @@ def _gains_and_costs(
     length_indices = np.arange(durations.size)[:, None] * (MAX_HALVINGS + 1) + interval_halvings(
         min_intervals
     )
-    given = times, lengths, jnp.asarray(length_indices)
-    groups = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), given)
+    groups = times, lengths, jnp.asarray(length_indices)
+    groups = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), groups)
     R_inverse = solve_unpivoted(R, jnp.eye(R.shape[0]))
     stage_responses = eqx.filter_closure_convert(stage_responses)
     first = jax.tree.map(lambda part: part[0], groups)
     group_stages = eqx.filter_closure_convert(
         group_stages, eqx.filter_eval_shape(stage_responses), R, *first
     )
-    costs, found = batch_axis_last(
+    costs, coefficients = batch_axis_last(
         _riccati_sweep, stage_responses, group_stages, plant, groups, Q, R, R_inverse, terminal_cost
     )
     costs = jnp.concatenate([costs.reshape(-1, *Q.shape), terminal_cost[None]])
     inner = events[:-1, None] + durations[:, None] * fractions[:-1]
     breakpoints = jnp.append(inner.reshape(-1), events[-1])
     breakpoints = (breakpoints - breakpoints[0]) / (breakpoints[-1] - breakpoints[0])
-    return GainTable(breakpoints, found.reshape(-1, *found.shape[2:])), costs
+    coefficients = coefficients.reshape(-1, *coefficients.shape[2:])
+    return GainTable(breakpoints, coefficients), costs
 
 
 def _riccati_sweep(stage_responses, group_stages, plant, groups, Q, R, R_inverse, terminal_cost):
-    """P at the starts of stretches and polynomials of the gain, of all groups, in lanes."""
-    responses = vmap_last_axis(lambda prepare: prepare(), stage_responses)
-    zero_R = jnp.zeros((*R.shape[:2], 1))  # commands, so that lanes with other R share the flows
+    """P at the starts of intervals, and gain polynomials, of all groups; batch axis last."""
+    responses = vmap_last_axis(lambda function: function(), stage_responses)
+    zero_R = jnp.zeros((*R.shape[:2], 1))  # so that a batch that differs in R shares its stages
 
     def backward_step(cost, group):
         length = group[1]
         stages, shape, force_law = vmap_last_axis(
-            lambda make, *rest: make(*rest), group_stages, responses, zero_R, *group
+            lambda function, *rest: function(*rest), group_stages, responses, zero_R, *group
         )
         costs = riccati_recursion(stages, vmap_last_axis(command_cost_matrix, R, length), cost)
-        found = interpolate_gains(plant, shape, force_law, costs, length, Q, R_inverse)
-        return (costs[0] + transpose(costs[0])) / 2, (costs[:-1], found)
+        coefficients = interpolate_gains(plant, shape, force_law, costs, length, Q, R_inverse)
+        return (costs[0] + transpose(costs[0])) / 2, (costs[:-1], coefficients)
 
-    given = stage_responses, group_stages, plant, groups, Q, R, terminal_cost
-    batched_terminal_cost = jnp.broadcast_to(
-        terminal_cost, (*terminal_cost.shape[:2], batch_size_of(given))
-    )
+    batch_size = batch_size_of(stage_responses, group_stages, plant, groups, Q, R, terminal_cost)
+    batched_terminal_cost = jnp.broadcast_to(terminal_cost, (*terminal_cost.shape[:2], batch_size))
     return jax.lax.scan(backward_step, batched_terminal_cost, groups, reverse=True)[1]

@@ -1,4 +1,4 @@
-"""Tables of gains along a time: polynomials between the edges of short stretches of it."""
+"""Gain tables: gains as piecewise polynomials over a fraction of time, between breakpoints."""
 
 from collections.abc import Callable
 
@@ -8,24 +8,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.numerics.intervals import InputWeight, Square
+from jaxbeam.numerics.matrices import InputWeight, Square
 from jaxbeam.numerics.riccati import lqr
 from jaxbeam.numerics.stages import GAUSS_NODES
 
-END_OFFSET = 1e-9  # of a stretch: how far within it its ends are looked at, step by step
+END_OFFSET = 1e-9  # of an interval: ends are evaluated so far inside, as the plant may jump there
 
-# State matrix and command matrix at a time (s).
+# State matrix A and input matrix B at a time (s).
 PlantMatrices = Callable[[Float[Array, ""]], tuple[Float[Array, "..."], Float[Array, "..."]]]
 
 
 class GainTable(eqx.Module):
-    """A gain as a function of the share of its time that is over, 0 to 1."""
+    """Gain as a function of the fraction, 0 to 1, of its time span."""
 
-    breakpoints: Float[Array, " edge"]
-    coefficients: Float[Array, "stretch power input state"]
+    breakpoints: Float[Array, " breakpoint"]
+    coefficients: Float[Array, "interval power input state"]
 
     def __call__(self, fraction: Float[Array, ""]) -> Float[Array, "input state"]:
-        """The gain at a share of the time; before 0 and after 1 that at the end is held."""
+        """Gain at a fraction of the time span; held before 0 and after 1."""
         i = jnp.searchsorted(self.breakpoints, fraction, side="right") - 1
         i = jnp.clip(i, 0, self.coefficients.shape[0] - 1)
         length = self.breakpoints[i + 1] - self.breakpoints[i]
@@ -35,23 +35,25 @@ class GainTable(eqx.Module):
 
 
 def breakpoints_between(
-    events: Float[Array, " event"], fractions: Float[np.ndarray, " share"]
-) -> Float[Array, " edge"]:
-    """Edges (s) of stretches: at these shares, from 0 on, of the time from event to event."""
+    events: Float[Array, " event"], fractions: Float[np.ndarray, " fraction"]
+) -> Float[Array, " breakpoint"]:
+    """Breakpoints (s) at fractions, from 0, of the time from each event to the next."""
     inner = events[:-1, None] + jnp.diff(events)[:, None] * fractions
     return jnp.append(inner.reshape(-1), events[-1])
 
 
-def uniform_fractions(intervals: int) -> Float[np.ndarray, " share"]:
-    """Shares for so many equal stretches."""
+def uniform_fractions(intervals: int) -> Float[np.ndarray, " fraction"]:
+    """Fractions at the starts of equal intervals."""
     return np.arange(intervals) / intervals
 
 
 def frozen_time_gains(
-    plant: PlantMatrices, breakpoints: Float[Array, " edge"], Q: Square, R: InputWeight
+    plant: PlantMatrices, breakpoints: Float[Array, " breakpoint"], Q: Square, R: InputWeight
 ) -> GainTable:
-    """Gains for the plant frozen at each time, eqs (3.10) and (3.11) of the thesis."""
+    """Infinite-horizon gains of the plant frozen at each time, eqs (3.10) and (3.11) of the thesis.
 
+    Cubics between the breakpoints (s), from the gains and their rates there. Raises as `lqr`.
+    """
     lengths = jnp.diff(breakpoints)
     offset = END_OFFSET * lengths
 
@@ -69,9 +71,9 @@ def frozen_time_gains(
 
 
 def hermite_polynomials(
-    starts: Float[Array, "rate stretch *gain"], ends: Float[Array, "rate stretch *gain"]
-) -> Float[Array, "stretch power *gain"]:
-    """Polynomials through values and their rates at both ends of stretches."""
+    starts: Float[Array, "order interval *gain"], ends: Float[Array, "order interval *gain"]
+) -> Float[Array, "interval power *gain"]:
+    """Polynomials through values and their derivatives at both ends of intervals."""
     start_matrix, end_matrix = hermite_matrices(starts.shape[0])
     return jnp.moveaxis(
         jnp.tensordot(start_matrix, starts, 1) + jnp.tensordot(end_matrix, ends, 1), 0, 1
@@ -79,11 +81,11 @@ def hermite_polynomials(
 
 
 def derivatives_at_breakpoints(
-    values: Float[Array, "stretch stage *value"],
-) -> Float[Array, "edge rate *value"]:
-    """What takes values at nodes, with its first two rates, at the starts of stretches and the end.
+    values: Float[Array, "interval node *value"],
+) -> Float[Array, "breakpoint order *value"]:
+    """Values and first two derivatives at the start of each interval and at the last end.
 
-    That of the last stretch, if others follow.
+    They are those of the polynomials through values at the Gauss nodes.
     """
     starts = jnp.einsum("rj,sj...->sr...", NODES_TO_ENDS[0], values)
     return jnp.concatenate(
@@ -94,7 +96,7 @@ def derivatives_at_breakpoints(
 def _power_derivatives(
     position: float, orders: int, powers: int
 ) -> Float[np.ndarray, "order power"]:
-    """The powers of a number, and their rates up to an order."""
+    """Powers of a number, and their derivatives below an order."""
     exponents = np.arange(powers)
     factors = [np.prod([exponents - k for k in range(r)], axis=0) for r in range(orders)]
     remaining_exponents = [np.maximum(exponents - r, 0) for r in range(orders)]
@@ -104,13 +106,13 @@ def _power_derivatives(
 
 
 def hermite_matrices(orders: int) -> tuple[Float[np.ndarray, "power order"], ...]:
-    """What takes a value and its rates at 0, and those at 1, to the polynomial through them."""
+    """Matrices from derivatives at 0, and from those at 1, to the Hermite polynomial."""
     rows = [_power_derivatives(at, orders, 2 * orders) for at in (0.0, 1.0)]
     inverse = np.linalg.inv(np.concatenate(rows))
     return inverse[:, :orders], inverse[:, orders:]
 
 
-# What takes values at the nodes to that at each end, and to its first two rates there.
+# (end, order, node): from values at the Gauss nodes to derivatives at both ends.
 NODES_TO_ENDS = np.stack(
     [_power_derivatives(at, 3, GAUSS_NODES.size) for at in (0.0, 1.0)]
 ) @ np.linalg.inv(GAUSS_NODES[:, None] ** np.arange(GAUSS_NODES.size))

@@ -1,4 +1,4 @@
-"""Largest value of a smooth curve known at a few points, absolute unless asked otherwise."""
+"""Peak of the polynomial through a few samples: its largest absolute value, or other magnitude."""
 
 import functools
 from collections.abc import Callable
@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-ESTIMATE_ITERATIONS = 2  # of Newton's method for a close estimate
+ESTIMATE_ITERATIONS = 2  # of Newton's method in an estimate
 TIE_ROUNDING_UNITS = 8  # by which equal numbers may differ
-START_POINTS = 17  # places from which a peak is sought: closer than the extrema of the curve can be
-NEWTON_ITERATIONS = 3  # rounds of Newton's method from each, and once more from the best
+START_POINTS = 17  # of the search, closer to each other than extrema of the curve can be
+NEWTON_ITERATIONS = 3  # from each start point, and once more from the best
 
 
 class Curve(NamedTuple):
-    """A polynomial in 2 c - 1 and its first two derivatives: coefficients, lowest power first."""
+    """Polynomial in 2 c - 1 and its first two derivatives: coefficients, lowest power first."""
 
     value: list
     slope: list
@@ -25,14 +25,14 @@ class Curve(NamedTuple):
 
 @functools.cache
 def interpolation_matrix(points: tuple[float, ...]) -> np.ndarray:
-    """Matrix from samples at points in [0, 1] to coefficients of their curve, slope and bend."""
+    """Matrix from samples at points in [0, 1] to the coefficients of a `Curve`, concatenated."""
     value = np.linalg.inv(_to_unit_interval(points)[:, None] ** np.arange(len(points)))
     slope = np.polynomial.polynomial.polyder(value)
     return np.concatenate([value, slope, np.polynomial.polynomial.polyder(slope)])
 
 
 def newton_step_limit(points: tuple[float, ...]) -> float:
-    """How far a step towards the peak may go in `estimate_peak`: a few cross half of any gap."""
+    """Step limit of Newton's method in `estimate_peak`: a few steps cross half of any gap."""
     return float(np.diff(_to_unit_interval(points)).max()) / 3
 
 
@@ -47,7 +47,7 @@ def _interpolate(samples: Float[Array, "point *rest"], points: tuple[float, ...]
 
 
 def _horner(coefficients: list, position):
-    """The polynomial at a place, by Horner's rule."""
+    """Value of a polynomial by Horner's rule."""
     value = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         value = coefficient + position * value
@@ -55,7 +55,7 @@ def _horner(coefficients: list, position):
 
 
 def _newton_stationary_point(curve: Curve, start, step_limit: float, iterations: int):
-    """Where the curve is flat near the start, by rounds of Newton's method within reach."""
+    """Stationary point near the start, by Newton's method with limited steps."""
 
     def newton_step(_, position):
         second_derivative = _horner(curve.curvature, position)
@@ -71,12 +71,12 @@ def _newton_stationary_point(curve: Curve, start, step_limit: float, iterations:
 
 
 def max_with_ties(
-    values: Float[Array, "some *rest"],
-) -> tuple[Float[Array, " *rest"], Bool[Array, "some *rest"]]:
-    """The highest of some values, and which of them are: quicker than `argmax`.
+    values: Float[Array, "candidate *rest"],
+) -> tuple[Float[Array, " *rest"], Bool[Array, "candidate *rest"]]:
+    """Largest of the candidates, and which of them equal it: quicker than `argmax`.
 
-    Those that differ by rounding count, as XLA may compute what is compared here once for the
-    maximum and once more, rounded otherwise, for the comparison.
+    They may differ by rounding, as XLA may compute a candidate once for the maximum and once more,
+    rounded otherwise, for the comparison.
     """
     maximum = jnp.max(values, axis=0)
     tolerance = TIE_ROUNDING_UNITS * jnp.finfo(values.dtype).eps
@@ -86,9 +86,9 @@ def max_with_ties(
 def estimate_peak(
     samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = jnp.abs
 ) -> Float[Array, " *rest"]:
-    """Largest size of a value, closely estimated: sought from the largest sample alone.
+    """Estimate of the peak, searched from the largest sample only.
 
-    Cheap, to tell which of many steps holds the peak; `refine_peak` then finds it.
+    It tells which of many steps has the peak, which `refine_peak` then finds.
     """
     magnitudes = magnitude(samples)
     largest = jnp.max(magnitudes, axis=0)
@@ -104,9 +104,9 @@ def estimate_peak(
 def locate_peak(
     samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = jnp.abs
 ) -> Float[Array, " *rest"]:
-    """Where in [-1, 1] the polynomial through the samples has the largest size of a value."""
+    """Position in [-1, 1] of the largest magnitude of the polynomial through the samples."""
     curve = _interpolate(samples, points)
-    # From everywhere, as peaks may tie; at an end Newton's method may run away to a lower place.
+    # The start points are candidates too: Newton's method may leave an end for a lower extremum.
     starts = np.linspace(-1.0, 1.0, START_POINTS).reshape(-1, *(1,) * (samples.ndim - 1))
     starts = jnp.broadcast_to(starts.astype(samples.dtype), (START_POINTS, *samples.shape[1:]))
     positions = jnp.concatenate(
@@ -114,8 +114,8 @@ def locate_peak(
     )
     _, ties = max_with_ties(magnitude(_horner(curve.value, positions)))
     position = jnp.max(jnp.where(ties, positions, -1.0), axis=0)
-    # The height is right by now to nearly rounding, the place to the root of that: further rounds
-    # mend this, unless the peak is at an end and there is nothing flat nearby.
+    # The magnitude is accurate to nearly rounding by now, the position to the square root of that:
+    # further iterations improve it, unless the peak is at an end without stationary point nearby.
     stationary_point = _newton_stationary_point(
         curve, position, 2 / START_POINTS, NEWTON_ITERATIONS
     )
@@ -128,11 +128,10 @@ def locate_peak(
 def refine_peak(
     samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = jnp.abs
 ) -> tuple[Float[Array, " *rest"], ...]:
-    """Largest size of a value of the polynomial through the samples, and where in [0, 1] it is.
+    """Largest magnitude of the polynomial through the samples, and its position in [0, 1].
 
-    `points` are where in [0, 1] the samples are, in order and with both ends. The derivative is
-    that at the fixed place of the peak, which is exact where the peak is a maximum inside the curve
-    and where it is at an end that stays.
+    `points` are the positions in [0, 1] of the samples, ascending and with both ends. The
+    derivative is that at a fixed position, exact for a peak inside the curve or at a fixed end.
     """
     position = locate_peak(jax.lax.stop_gradient(samples), points, magnitude)
     position = jax.lax.optimization_barrier(jax.lax.stop_gradient(position))

@@ -1,4 +1,4 @@
-"""Functions made of one Chebyshev series for each segment between nodes, and their derivatives."""
+"""Piecewise Chebyshev series, one for each segment between nodes, and their derivatives."""
 
 import functools
 
@@ -11,11 +11,13 @@ from numpy.polynomial import chebyshev, legendre
 from jaxbeam.runtime.compiling import compiled
 
 
-@compiled  # many small operations, which one by one would take seconds to compile
-def piecewise_chebyshev(nodes, series, x, derivatives) -> Float[Array, "order *place column"]:
-    """Functions given by one Chebyshev series for each segment between nodes, at positions x.
+# Eagerly the first call takes 5 s, as small programs compile, and the next 4 ms; compiled 0.5 s
+# and 0.1 ms. `Modes` and tests call it eagerly.
+@compiled
+def piecewise_chebyshev(nodes, series, x, derivatives) -> Float[Array, "order *position column"]:
+    """Derivatives of given orders at positions x, of series (segment, degree, column).
 
-    `series` is (segment, degree, column); the derivatives are by x, in the unit of the nodes.
+    The derivatives are by x, in the unit of the nodes.
     """
     x = jnp.asarray(x, float)
     half_length = jnp.diff(nodes) / 2
@@ -35,21 +37,21 @@ def piecewise_chebyshev(nodes, series, x, derivatives) -> Float[Array, "order *p
 
 @jax.custom_jvp
 def _evaluate_series(series, local, segment):
-    """The series of the segment of each place, summed at that place, -1 to 1, in its segment."""
+    """Values of the series at local positions, -1 to 1, in their segments."""
     return _sum_series(_segment_polynomials(series, local, segment), series)
 
 
 @_evaluate_series.defjvp
-def _evaluate_series_jvp(given, changes):
-    """What moves along a series meets its derivative: nothing else need be differentiated."""
-    series, local, segment = given
-    change, local_tangent, _ = changes
+def _evaluate_series_jvp(primals, tangents):
+    """A tangent of the position is multiplied by the derivative of the series, not of the table."""
+    series, local, segment = primals
+    series_tangent, local_tangent, _ = tangents
     table = _segment_polynomials(series, local, segment)
     derivative_series = jnp.asarray(_derivative_matrix(series.shape[1], 1), series.dtype) @ series
     values, slopes = jnp.split(
         _sum_series(table, jnp.concatenate([series, derivative_series], axis=2)), 2, -1
     )
-    return values, _sum_series(table, change) + slopes * local_tangent[..., None]
+    return values, _sum_series(table, series_tangent) + slopes * local_tangent[..., None]
 
 
 def _sum_series(table, series):
@@ -58,7 +60,7 @@ def _sum_series(table, series):
 
 
 def _segment_polynomials(series, local, segment):
-    """The polynomials of all segments, zero but for those of the segment of each place."""
+    """Polynomials of all segments, zero except those of the segment of each position."""
     segments, terms, _ = series.shape
     table = _chebyshev_polynomials(local, terms)
     masks = (segment[..., None] == s for s in range(segments))
@@ -86,14 +88,13 @@ def legendre_to_chebyshev(terms: int) -> np.ndarray:
 def _chebyshev_polynomials(t, terms: int):
     """Chebyshev polynomials of degree 0 to terms - 1 at t, along a new last axis.
 
-    Built by doubling, T_(k+j) = 2 T_k T_j - T_(k-j), which takes few steps and does not lose
-    accuracy.
+    By doubling, T_(k+j) = 2 T_k T_j - T_(k-j): few steps, and accurate.
     """
     axis = t.ndim
     table = jnp.stack([jnp.ones_like(t), t], axis=axis)
     while table.shape[axis] < terms:
         table = jax.lax.optimization_barrier(table)
-        # Plain slices: indexing would give the compiler several times as much to read.
+        # Slices by lax: indexing makes the program several times as long to compile.
         last = 2 * jax.lax.slice_in_dim(table, -1, None, axis=axis)
         lower = jax.lax.rev(jax.lax.slice_in_dim(table, 0, -1, axis=axis), (axis,))
         higher = last * jax.lax.slice_in_dim(table, 1, None, axis=axis) - lower

@@ -1,10 +1,11 @@
-"""Algebraic Riccati, Lyapunov and Stein equations, in continuous and in discrete time.
+"""Algebraic Riccati equations in continuous and discrete time, and the LQR gains from them.
 
-A Riccati equation is solved by joining a stretch of time to itself until it is infinitely long,
-the structured doubling algorithm (Chu, Fan, Lin and Wang, Int. J. Control 77, 2004), and refined
-by Newton's method (Kleinman, IEEE Trans. Automatic Control 13, 1968). It needs no eigenvalues, so
-it runs on every device, in batches; derivatives are implicit, forward and in reverse.
+Solved by the structured doubling algorithm (Chu, Fan, Lin and Wang, Int. J. Control 77, 2004) and
+refined by Newton's method (Kleinman, IEEE Trans. Automatic Control 13, 1968). Neither needs
+eigenvalues, so they run on every device, in batches; derivatives are implicit, forward and reverse.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,29 +14,49 @@ from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.intervals import (
-    InputMatrix,
-    InputWeight,
-    Interval,
-    Square,
-    costate_unit,
-    symmetric_part,
+from jaxbeam.numerics.lyapunov import (
+    MAX_DOUBLINGS,
+    TRANSITION_TOLERANCE,
+    cayley_shift,
+    lyapunov,
+    stein,
 )
+from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
 
 GainAndCost = tuple[Float[Array, "input state"], Square]
 
-MAX_DOUBLINGS = 60  # at most, before an equation is taken for unsolvable
-TRANSITION_TOLERANCE = 1e-9  # norm of a drift whose square does not count
+
+class Interval(NamedTuple):
+    """Transition matrix Phi, G and H of an interval of optimal control.
+
+    The optimal state x and costate l = P x obey x1 = Phi x0 - G l1 and l0 = H x0 + Phi' l1, with
+    symmetric, positive semidefinite G and H.
+    """
+
+    transition: Square
+    G: Square
+    H: Square
+
+    def compose(self, later: "Interval") -> "Interval":
+        """This interval followed by a later one; associative, and stable for stiff plants."""
+        coupling = jnp.eye(self.transition.shape[0]) + self.G @ later.H
+        solved = jnp.linalg.solve(coupling, jnp.concatenate([self.transition, self.G], axis=1))
+        transition, G = jnp.split(solved, 2, axis=1)
+        return Interval(
+            transition=later.transition @ transition,
+            G=later.G + symmetric_part(later.transition @ G @ later.transition.T),
+            H=self.H + symmetric_part(self.transition.T @ later.H @ transition),
+        )
 
 
 def care(
     A: Square, B: InputMatrix, Q: Square, R: InputWeight, N: InputMatrix | None = None
 ) -> Square:
-    """The stabilising P of A'P + P A - (P B + N) R^-1 (B'P + N') + Q = 0, eq. (3.10) of the thesis.
+    """Stabilising P of A'P + P A - (P B + N) R^-1 (B'P + N') + Q = 0, eq. (3.10) of the thesis.
 
-    Differentiable. Raises ValueError for matrices of wrong size, an R that is
-    not positive, a Q that is indefinite, and if there is no stabilising solution; under `jit` and
-    `vmap` the answer is nan instead.
+    Differentiable. Raises ValueError for matrices of wrong size, an R that is not positive
+    definite, a Q with a negative eigenvalue, or if there is no stabilising solution; under `jit`
+    and `vmap` the result is nan instead.
     """
     _check_weights(A, B, Q, R, N)
     state_matrix, G, H = _without_cross_weight(A, B, Q, R, N)
@@ -45,9 +66,10 @@ def care(
 def lqr(
     A: Square, B: InputMatrix, Q: Square, R: InputWeight, N: InputMatrix | None = None
 ) -> GainAndCost:
-    """Gain K (input, state) of u = -K x with the least integral of x'Qx + u'Ru + 2x'Nu, and P.
+    """Gain K (input, state) of u = -K x that minimises the integral of x'Qx + u'Ru + 2x'Nu, and P.
 
-    K = R^-1 (B'P + N'), eqs (3.7) and (3.11) of the thesis. Raises as `care`.
+    K = R^-1 (B'P + N'), eqs (3.7) and (3.11) of the thesis. python-control's `lqr` also returns the
+    poles. Raises as `care`.
     """
     cost = care(A, B, Q, R, N)
     cross = B.T @ cost if N is None else B.T @ cost + N.T
@@ -57,7 +79,7 @@ def lqr(
 def dare(
     A: Square, B: InputMatrix, Q: Square, R: InputWeight, N: InputMatrix | None = None
 ) -> Square:
-    """The stabilising P of A'PA - (A'PB + N) (R + B'PB)^-1 (B'PA + N') + Q = P.
+    """Stabilising P of A'PA - (A'PB + N) (R + B'PB)^-1 (B'PA + N') + Q = P.
 
     Differentiable. Raises as `care`.
     """
@@ -69,61 +91,22 @@ def dare(
 def dlqr(
     A: Square, B: InputMatrix, Q: Square, R: InputWeight, N: InputMatrix | None = None
 ) -> GainAndCost:
-    """Gain K (input, state) of u = -K x with the least sum of x'Qx + u'Ru + 2x'Nu, and P.
+    """Gain K (input, state) of u = -K x that minimises the sum of x'Qx + u'Ru + 2x'Nu, and P.
 
-    Raises as `care`.
+    K = (R + B'PB)^-1 (B'PA + N'). Raises as `care`.
     """
     cost = dare(A, B, Q, R, N)
     cross = B.T @ cost @ A if N is None else B.T @ cost @ A + N.T
     return jnp.linalg.solve(R + B.T @ cost @ B, cross), cost
 
 
-def lyapunov(A: Square, S: Square) -> Square:
-    """X of A'X + X A + S = 0 for a stable A; differentiable."""
-    scale = balance(A)
-    scaled = A * scale / scale[:, None]
-    outer = scale * scale[:, None]
-
-    def solve(matrix, right):
-        shift = _cayley_shift(matrix)
-        inverse = jnp.linalg.inv(shift * jnp.eye(matrix.shape[0]) - matrix)
-        discrete_matrix = inverse @ (shift * jnp.eye(matrix.shape[0]) + matrix)
-        return _stein_series(discrete_matrix, 2 * shift * inverse.T @ right @ inverse)
-
-    scaled_solution = jax.lax.custom_linear_solve(
-        lambda x: -(scaled.T @ x + x @ scaled),
-        S * outer,
-        lambda _, right: solve(scaled, right),
-        lambda _, right: solve(scaled.T, right),
-    )
-    return scaled_solution / outer
-
-
-def stein(A: Square, S: Square) -> Square:
-    """X of A'X A - X + S = 0 for an A with eigenvalues within the unit circle; differentiable."""
-    scale = balance(A)
-    scaled = A * scale / scale[:, None]
-    outer = scale * scale[:, None]
-    scaled_solution = jax.lax.custom_linear_solve(
-        lambda x: x - scaled.T @ x @ scaled,
-        S * outer,
-        lambda _, right: _stein_series(scaled, right),
-        lambda _, right: _stein_series(scaled.T, right),
-    )
-    return scaled_solution / outer
-
-
 @jax.custom_jvp
 def _care(A, G, H):
-    """P of drift'P + P drift - P reach P + toll = 0."""
-    scale = balance(A)
-    outer = scale * scale[:, None]
-    A, G, H = A * scale / scale[:, None], G / outer, H * outer
-    unit = costate_unit(G, H)
-    G, H = G / unit, H * unit
-    # Cayley's transform makes of it an equation in discrete time with the same solution.
+    """P of A'P + P A - P G P + H = 0."""
+    A, G, H, unscale = _balanced(A, G, H)
+    # Cayley's transform gives an equation in discrete time with the same solution.
     size = A.shape[0]
-    shift = _cayley_shift(A)
+    shift = cayley_shift(A)
     shifted = jnp.linalg.inv(A - shift * jnp.eye(size))
     mixed = jnp.linalg.inv(A.T - shift * jnp.eye(size) + H @ shifted @ G)
     start = Interval(
@@ -131,11 +114,11 @@ def _care(A, G, H):
         G=symmetric_part(2 * shift * shifted @ G @ mixed),
         H=symmetric_part(2 * shift * mixed @ H @ shifted),
     )
-    cost = _doubled_to_infinity(start)
+    cost = _infinite_horizon_cost(start)
     for _ in range(2):
         closed_loop = A - G @ cost
         cost = symmetric_part(lyapunov(closed_loop, H + cost @ G @ cost))
-    return cost / outer / unit
+    return unscale(cost)
 
 
 @_care.defjvp
@@ -150,18 +133,14 @@ def _care_jvp(primals, tangents):
 
 @jax.custom_jvp
 def _dare(A, G, H):
-    """P of P = drift'P (1 + reach P)^-1 drift + toll."""
-    scale = balance(A)
-    outer = scale * scale[:, None]
-    A, G, H = A * scale / scale[:, None], G / outer, H * outer
-    unit = costate_unit(G, H)
-    G, H = G / unit, H * unit
-    cost = _doubled_to_infinity(Interval(A, G, H))
+    """P of P = A'P (1 + G P)^-1 A + H."""
+    A, G, H, unscale = _balanced(A, G, H)
+    cost = _infinite_horizon_cost(Interval(A, G, H))
     for _ in range(2):
         closed_loop = _closed_loop_matrix(A, G, cost)
         cost_closed_loop = cost @ closed_loop
         cost = symmetric_part(stein(closed_loop, H + cost_closed_loop.T @ G @ cost_closed_loop))
-    return cost / outer / unit
+    return unscale(cost)
 
 
 @_dare.defjvp
@@ -178,13 +157,33 @@ def _dare_jvp(primals, tangents):
     return cost, stein(closed_loop, source)
 
 
+def _balanced(A, G, H):
+    """Matrices for balanced states and costates, and the function that scales their P back."""
+    scale = balance(A)
+    outer = scale * scale[:, None]
+    A, G, H = A * scale / scale[:, None], G / outer, H * outer
+    unit = _costate_unit(G, H)
+    return A, G / unit, H * unit, lambda cost: cost / outer / unit
+
+
+def _costate_unit(G, H):
+    """Unit of the costate in which G and H have equal norms; one if either is zero."""
+    G_size, H_size = jnp.sum(G**2), jnp.sum(H**2)
+    both = (G_size > 0) & (H_size > 0)
+    ratio = jnp.where(both, G_size, 1.0) / jnp.where(both, H_size, 1.0)
+    return jax.lax.stop_gradient(ratio**0.25)
+
+
 def _closed_loop_matrix(A, G, cost):
-    """State matrix of the closed loop in discrete time."""
+    """State matrix (1 + G P)^-1 A of the closed loop in discrete time."""
     return jnp.linalg.solve(jnp.eye(A.shape[0]) + G @ cost, A)
 
 
-def _doubled_to_infinity(interval: Interval) -> Square:
-    """The toll of a stretch joined to itself for ever; nan if its drift does not die away."""
+def _infinite_horizon_cost(interval: Interval) -> Square:
+    """H of an interval composed with itself until its transition vanishes.
+
+    nan if that takes more than MAX_DOUBLINGS.
+    """
 
     def unconverged(state):
         part, count = state
@@ -196,28 +195,8 @@ def _doubled_to_infinity(interval: Interval) -> Square:
     return jnp.where(jnp.max(jnp.abs(part.transition)) <= TRANSITION_TOLERANCE, part.H, jnp.nan)
 
 
-def _stein_series(A, first_term):
-    """The sum of drift'^k first drift^k over all k, twice as many terms at a time."""
-
-    def unconverged(state):
-        _, power, count = state
-        return (jnp.max(jnp.abs(power)) > TRANSITION_TOLERANCE) & (count < MAX_DOUBLINGS)
-
-    def double(state):
-        total, power, count = state
-        return total + power.T @ total @ power, power @ power, count + 1
-
-    total, power, _ = jax.lax.while_loop(unconverged, double, (first_term, A, 0))
-    return jnp.where(jnp.max(jnp.abs(power)) <= TRANSITION_TOLERANCE, total, jnp.nan)
-
-
-def _cayley_shift(matrix):
-    """A rate larger than that of any eigenvalue, at which Cayley's transform is centred."""
-    return 1.1 * jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + jnp.finfo(float).tiny
-
-
 def _without_cross_weight(A, B, Q, R, N):
-    """State matrix, B R^-1 B' and state weight of the same problem without a cross weight."""
+    """State matrix, G = B R^-1 B' and state weight of the equal problem without cross weight."""
     inverse = jnp.linalg.inv(R)
     G = symmetric_part(B @ inverse @ B.T)
     if N is None:
@@ -226,7 +205,7 @@ def _without_cross_weight(A, B, Q, R, N):
 
 
 def _check_weights(A, B, Q, R, N):
-    """Raise ValueError for matrices that pose no problem of optimal control."""
+    """Raise ValueError for weights that define no optimal control."""
     states, inputs = B.shape
     expected_shapes = {
         "A": (states, states),
@@ -253,14 +232,14 @@ def _check_weights(A, B, Q, R, N):
             )
         if name == "Q" and smallest_eigenvalue < -1e-12 * size:
             raise ValueError(
-                f"Q must not be negative; its least eigenvalue is {smallest_eigenvalue:g}"
+                f"Q must be positive semidefinite; its least eigenvalue is {smallest_eigenvalue:g}"
             )
 
 
 def _require_finite(cost):
     if is_concrete(cost) and not np.all(np.isfinite(concrete(cost))):
         raise ValueError(
-            "there is no stabilising solution: some undamped or growing mode is out of the reach"
-            " of the commands, or undamped and not weighted by Q"
+            "there is no stabilising solution: an undamped or unstable mode is not controllable"
+            " by the commands, or an undamped one is not weighted by Q"
         )
     return cost

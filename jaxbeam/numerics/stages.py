@@ -1,12 +1,11 @@
-"""What a plant does over stretches of time, and what it costs, under commands that are polynomials.
+"""Discrete plant and quadratic cost over an interval, under commands polynomial in time.
 
-Over a stretch the commands are the polynomials through their values U at its Gauss nodes, and
+The commands are the polynomials through their values U at the Gauss nodes of the interval:
 
-    x(end) = drift x(start) + push U,
-    integral of x'Qx + u'Ru = (x(start), U)' toll (x(start), U)
+    x1 = Phi x0 + Gamma U,     integral of x'Qx + u'Ru = (x0, U)' W (x0, U)
 
-Optimal control then picks U, one stretch after the other, backward from the end: for a cost P at
-the end, that at the start is the least of toll + (drift, push)' P (drift, push) over all U.
+Optimal control minimises over U, one interval after the other, backward in time: for a cost P at
+the end, that at the start is the minimum of W + (Phi, Gamma)' P (Phi, Gamma) over U.
 """
 
 import equinox as eqx
@@ -15,40 +14,35 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbeam.numerics.batched_linalg import (
-    batch_axis_last,
-    batch_size_of,
-    matmul,
-    solve_batch,
-    transpose,
-)
+from jaxbeam.numerics.batched_linalg import batch_size_of, matmul, solve_batch, transpose
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.intervals import InputWeight, Square, matrix_transpose, symmetric_part
+from jaxbeam.numerics.gauss import gauss_nodes, gauss_weights, integration_matrix
+from jaxbeam.numerics.matrices import InputWeight, Square, symmetric_part
 
-NODE_COUNT = 6  # Gauss nodes of a stretch; order 12
-GAUSS_NODES = (np.polynomial.legendre.leggauss(NODE_COUNT)[0] + 1) / 2
+NODE_COUNT = 6  # Gauss nodes of an interval; order 12
+GAUSS_NODES = gauss_nodes(NODE_COUNT)
 
 
 class Stage(eqx.Module):
-    """What a plant does over a stretch, and what it costs; see the module."""
+    """Transition Phi, input matrix Gamma and cost matrix W of an interval; see the module."""
 
     transition: Float[Array, "*batch state state"]
-    input_matrix: Float[Array, "*batch state value"]
-    cost: Float[Array, "*batch both both"]
+    input_matrix: Float[Array, "*batch state node_input"]
+    cost: Float[Array, "*batch state_and_input state_and_input"]
 
 
 def collocated_stages(
-    A: Float[Array, "stretch stage state state"],
-    B: Float[Array, "stretch stage state input"],
+    A: Float[Array, "interval node state state"],
+    B: Float[Array, "interval node state input"],
     Q: Square,
     R: InputWeight,
-    lengths: Float[Array, " stretch"],
+    lengths: Float[Array, " interval"],
 ) -> Stage:
-    """Stages of given lengths (s) of a plant known at their Gauss nodes, `GAUSS_NODES`.
+    """Stages of intervals of given lengths (s), for a plant given at their `GAUSS_NODES`.
 
-    By collocation of x' = A x + B u, the cost by Gauss's rule: together the same as collocation of
-    the equations of the optimal state and costate, of order 12 (Hager, Numer. Math. 87, 2000). Fast
-    modes should turn by no more than about 2 rad in a stretch.
+    Collocation of x' = A x + B u, with the cost by Gauss's rule, equals collocation of the
+    equations of optimal state and costate, of order 12 (Hager, Numer. Math. 87, 2000). The phase of
+    the fastest mode should advance by at most about 2 rad in an interval.
     """
     scale = balance(A[0, 0])
     scaled_A, scaled_B = A * scale / scale[:, None], B / scale[:, None]
@@ -66,25 +60,21 @@ def collocated_stages(
     )
 
 
-def costs_to_go(stages: Stage, terminal_cost: Square) -> Float[Array, "edge state state"]:
-    """P at the start of each of successive stretches and, last, at the end, where it is given."""
-    return batch_axis_last(riccati_recursion, stages, jnp.zeros((1, 1)), terminal_cost)
-
-
 def riccati_recursion(
     stages: Stage,
-    command_cost: Float[Array, "#value #value #lane"],
-    terminal_cost: Float[Array, "state state #lane"],
-) -> Float[Array, "edge state state lane"]:
-    """P at the start of each of successive stretches and at the end, with lanes as the last axis.
+    command_cost: Float[Array, "#node_input #node_input #batch"],
+    terminal_cost: Float[Array, "state state #batch"],
+) -> Float[Array, "breakpoint state state batch"]:
+    """P at the start of each of successive intervals and at the end, batch axis last.
 
-    Commands also cost `command_cost`, which lanes that share the flows need not share.
+    `command_cost` is added to the cost of the commands; so a batch that differs in R alone shares
+    its stages.
     """
     states = terminal_cost.shape[0]
 
     def backward_step(cost, part):
-        across, stage_cost = part
-        quadratic_cost = stage_cost + matmul(across, transpose(matmul(across, cost)))
+        dynamics, stage_cost = part  # (Phi, Gamma)'
+        quadratic_cost = stage_cost + matmul(dynamics, transpose(matmul(dynamics, cost)))
         cross_cost = quadratic_cost[states:, :states]
         gain = solve_batch(quadratic_cost[states:, states:] + command_cost, cross_cost)
         cost = quadratic_cost[:states, :states] - matmul(transpose(cross_cost), gain)
@@ -103,46 +93,34 @@ def riccati_recursion(
 
 
 def _collocated_stage(A, B, length, Q, R) -> Stage:
-    """The flow of a plant with (stage, state, ...) matrices; unknown are the rates h x'.
+    """Stage of a plant with matrices (node, state, ...).
 
-    x_i = x(start) + sum_j a_ij h x'_j.
+    Unknown are the rates h x'_i at the nodes, with x_i = x0 + sum_j a_ij h x'_j.
     """
     _, size, inputs = B.shape
     A, B, values = length * A, length * B, NODE_COUNT * inputs
+    integration_weights = integration_matrix(NODE_COUNT)
+    quadrature_weights = gauss_weights(NODE_COUNT)
     rows = NODE_COUNT * size
-    state_coupling = _INTEGRATION_MATRIX[:, None, :, None] * A[:, :, None, :]
-    # Each node has a command of its own.
+    state_coupling = integration_weights[:, None, :, None] * A[:, :, None, :]
     input_coupling = np.eye(NODE_COUNT)[:, None, :, None] * B[:, :, None, :]
     right = jnp.concatenate([A, input_coupling.reshape(NODE_COUNT, size, values)], axis=2)
     rates = jnp.linalg.solve(
         jnp.eye(rows) - state_coupling.reshape(rows, rows), right.reshape(rows, size + values)
     ).reshape(NODE_COUNT, size, size + values)
     start = np.eye(size, size + values)
-    states = start + jnp.tensordot(_INTEGRATION_MATRIX, rates, axes=1)
-    end = start + jnp.tensordot(_QUADRATURE_WEIGHTS, rates, axes=1)
-    weighted = _QUADRATURE_WEIGHTS[:, None, None] * (Q @ states)
-    integrated_cost = symmetric_part(
-        jnp.tensordot(matrix_transpose(states), weighted, ((0, 2), (0, 1)))
-    )
+    states = start + jnp.tensordot(integration_weights, rates, axes=1)
+    end = start + jnp.tensordot(quadrature_weights, rates, axes=1)
+    weighted = quadrature_weights[:, None, None] * (Q @ states)
+    integrated_cost = symmetric_part(jnp.tensordot(states.mT, weighted, ((0, 2), (0, 1))))
     cost = length * integrated_cost + jnp.pad(command_cost_matrix(R, length), (size, 0))
     return Stage(end[:, :size], end[:, size:], cost)
 
 
-def command_cost_matrix(R: InputWeight, length: Float[Array, ""]) -> Float[Array, "value value"]:
-    """What the commands cost over a stretch (s); Gauss's rule is exact for their squares."""
-    # Where a stretch has no length they do nothing, and must not seem to be free.
+def command_cost_matrix(
+    R: InputWeight, length: Float[Array, ""]
+) -> Float[Array, "node_input node_input"]:
+    """Cost matrix of the commands over an interval (s); Gauss's rule is exact for their squares."""
+    # Over an interval of length zero the commands have no effect; a cost keeps W invertible.
     safe_length = jnp.where(length > 0, length, 1.0)
-    return safe_length * jnp.kron(np.diag(_QUADRATURE_WEIGHTS), R)
-
-
-def _gauss_tableau():
-    """Weights a_ij (up to each node) and b_j (over all) of the Gauss collocation method."""
-    powers = np.arange(1, NODE_COUNT + 1)
-    vandermonde = GAUSS_NODES[:, None] ** (powers - 1)
-    integration_matrix = np.linalg.solve(
-        vandermonde.T, (GAUSS_NODES[:, None] ** powers / powers).T
-    ).T
-    return integration_matrix, np.linalg.solve(vandermonde.T, 1 / powers)
-
-
-_INTEGRATION_MATRIX, _QUADRATURE_WEIGHTS = _gauss_tableau()
+    return safe_length * jnp.kron(np.diag(gauss_weights(NODE_COUNT)), R)

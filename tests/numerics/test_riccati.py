@@ -9,11 +9,18 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
-from jaxbeam.numerics.riccati import care, dare, dlqr, lqr, lyapunov, stein
-from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, costs_to_go
+from jaxbeam.numerics.batched_linalg import batch_axis_last
+from jaxbeam.numerics.lyapunov import lyapunov, stein
+from jaxbeam.numerics.riccati import care, dare, dlqr, lqr
+from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, riccati_recursion
 from tests.differences import central
 
 R = jnp.array([[0.1, 0.02], [0.02, 0.3]])
+
+
+def cost_to_go(stages, terminal_cost):
+    """P at the start of each interval and at the end."""
+    return batch_axis_last(riccati_recursion, stages, jnp.zeros((1, 1)), terminal_cost)
 
 
 def plant(seed=0, states=6):
@@ -86,7 +93,7 @@ def test_what_has_no_answer_is_refused():
     A, B, Q, _ = plant()
     with pytest.raises(ValueError, match="R must be positive definite"):
         care(A, B, Q, -R)
-    with pytest.raises(ValueError, match="Q must not be negative"):
+    with pytest.raises(ValueError, match="Q must be positive semidefinite"):
         care(A, B, Q.at[0, 0].set(-9.0), R)
     with pytest.raises(ValueError, match="Q must be symmetric"):
         dare(A, B, Q.at[0, 1].set(9.0), R)
@@ -120,7 +127,7 @@ def test_backward_equation_as_a_stiff_integrator_solves_it():
     def solve():
         A, B = jax.vmap(jax.vmap(varying))(edges[:-1, None] + lengths[:, None] * GAUSS_NODES)
         parts = collocated_stages(A, B, jnp.asarray(Q), jnp.asarray(weight), lengths)
-        return costs_to_go(parts, jnp.asarray(Q))
+        return cost_to_go(parts, jnp.asarray(Q))
 
     def back(s, cost):
         t = span - s

@@ -8,8 +8,9 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BarycentricInterpolator
 
+from jaxbeam.numerics.batched_linalg import batch_axis_last
 from jaxbeam.numerics.coupled_stages import ConstantPlant, Coupling, coupled_stages, stage_responses
-from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, costs_to_go
+from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, riccati_recursion
 
 STATES, INPUTS, DIRECTIONS, FORCES, HALVINGS = 4, 2, 3, 2, 3
 START, LENGTH = 0.4, 0.1
@@ -22,6 +23,11 @@ PHASES = [
     RANDOM.uniform(0, 6, size)
     for size in [(DIRECTIONS, FORCES), (FORCES, STATES), (FORCES, INPUTS), (FORCES, FORCES)]
 ]
+
+
+def cost_to_go(stages, terminal_cost):
+    """P at the start of each interval and at the end."""
+    return batch_axis_last(riccati_recursion, stages, jnp.zeros((1, 1)), terminal_cost)
 
 
 def coupling(t):
@@ -84,8 +90,8 @@ def test_a_flow_is_what_the_plant_does_and_costs(made):
 def test_both_lead_to_the_same_costs():
     """Also where stretches have no length."""
     collocated, by_force = (
-        jax.jit(lambda made=made: costs_to_go(made(4), Q))() for made in (by_collocation, by_forces)
+        jax.jit(lambda made=made: cost_to_go(made(4), Q))() for made in (by_collocation, by_forces)
     )
     assert_allclose(by_force, collocated, rtol=1e-10)
     still = collocated_stages(*jax.vmap(jax.vmap(matrices))(nodes(1)), Q, R, jnp.zeros(1))
-    assert_allclose(costs_to_go(still, 3 * Q)[0], 3 * Q, rtol=1e-14)
+    assert_allclose(cost_to_go(still, 3 * Q)[0], 3 * Q, rtol=1e-14)

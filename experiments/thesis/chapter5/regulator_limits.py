@@ -16,7 +16,8 @@ from experiments.thesis.chapter5 import published
 from experiments.thesis.verdicts import Finding, make_finding
 from jaxbeam.analysis.stability import frozen_poles, growth
 from jaxbeam.analysis.stability_limits import stability_limit
-from jaxbeam.numerics.riccati import dlqr, stein
+from jaxbeam.numerics.lyapunov import stein
+from jaxbeam.numerics.riccati import dlqr
 from jaxbeam.plot.poles import plot_poles
 
 COMMAND_WEIGHT = 9e-8  # R of the example in 5.1

@@ -13,7 +13,7 @@ from jaxbeam.control.state_law import GainLaw
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance, exponential_and_gramian
-from jaxbeam.numerics.intervals import InputMatrix, InputWeight, Square, symmetric_part
+from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
 from jaxbeam.numerics.riccati import dlqr
 
 # With the previous command among the states.

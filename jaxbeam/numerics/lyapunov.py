@@ -1,0 +1,64 @@
+"""Lyapunov and Stein equations, by doubling: on every device, in batches, differentiable."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbeam.numerics.discretisation import balance
+from jaxbeam.numerics.matrices import Square
+
+MAX_DOUBLINGS = 60  # after which an equation is taken for unsolvable
+TRANSITION_TOLERANCE = 1e-9  # norm of a transition matrix whose square is below rounding
+
+
+def lyapunov(A: Square, S: Square) -> Square:
+    """X of A'X + X A + S = 0 for a stable A; nan for another."""
+
+    def solve(matrix, right):
+        shift = cayley_shift(matrix)
+        inverse = jnp.linalg.inv(shift * jnp.eye(matrix.shape[0]) - matrix)
+        discrete_matrix = inverse @ (shift * jnp.eye(matrix.shape[0]) + matrix)
+        return _stein_series(discrete_matrix, 2 * shift * inverse.T @ right @ inverse)
+
+    return _solve_balanced(A, S, lambda A, X: -(A.T @ X + X @ A), solve)
+
+
+def stein(A: Square, S: Square) -> Square:
+    """X of A'X A - X + S = 0 for an A with eigenvalues in the unit circle; nan for another."""
+    return _solve_balanced(A, S, lambda A, X: X - A.T @ X @ A, _stein_series)
+
+
+def cayley_shift(matrix: Square) -> Float[Array, ""]:
+    """A rate above that of any eigenvalue, as the centre of Cayley's transform."""
+    return 1.1 * jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + jnp.finfo(float).tiny
+
+
+def _solve_balanced(A: Square, S: Square, operator: Callable, solve: Callable) -> Square:
+    """X of operator(A, X) = S, linear in X, by `solve` for the balanced A."""
+    scale = balance(A)
+    scaled = A * scale / scale[:, None]
+    outer = scale * scale[:, None]
+    scaled_solution = jax.lax.custom_linear_solve(
+        lambda X: operator(scaled, X),
+        S * outer,
+        lambda _, right: solve(scaled, right),
+        lambda _, right: solve(scaled.T, right),
+    )
+    return scaled_solution / outer
+
+
+def _stein_series(A, first_term):
+    """Sum over k of A'^k first_term A^k, with the number of terms doubled each time."""
+
+    def unconverged(state):
+        _, power, count = state
+        return (jnp.max(jnp.abs(power)) > TRANSITION_TOLERANCE) & (count < MAX_DOUBLINGS)
+
+    def double(state):
+        total, power, count = state
+        return total + power.T @ total @ power, power @ power, count + 1
+
+    total, power, _ = jax.lax.while_loop(unconverged, double, (first_term, A, 0))
+    return jnp.where(jnp.max(jnp.abs(power)) <= TRANSITION_TOLERANCE, total, jnp.nan)
