@@ -45,7 +45,7 @@ def test_gains_are_right_to_1e_8(rig):
     """dP/dt = -P A - A'P - Q + P B R^-1 B'P backward in time, by scipy's Radau at 1e-10."""
     case, regulator = rig()
     model, end = jb.state_space(case, regulator.coordinates), 0.6
-    table = eqx.filter_jit(lambda m: regulator.gains(m))(model)
+    table = eqx.filter_jit(lambda m: regulator.gain_table(m))(model)
     found = np.asarray(jax.jit(jax.vmap(table))(jnp.asarray(SHARES)))
     Q, R = map(np.asarray, regulator.weights(model))
     terminal = Q if regulator.terminal_weight is None else np.diag(regulator.terminal_weight)
@@ -139,19 +139,23 @@ def test_gains_are_right_between_edges_too(seven_modes, turn, error):
         loads=[jb.MovingMass(mass=MASS, speed=SPEED)],
         controller=FiniteLQR(WEIGHTS, [EFFORT], points=points),
     )
-    found = jax.jit(lambda: jax.vmap(case.controller.gains(jb.state_space(case)))(CROSSED))()
+    found = jax.jit(lambda: jax.vmap(case.controller.gain_table(jb.state_space(case)))(CROSSED))()
     sizes = np.max(np.abs(seven_modes), axis=1)
     near = [np.max(sizes[np.abs(CROSSED - share) < 0.01]) for share in CROSSED]
     assert np.max(np.max(np.abs(found[:, 0] - seven_modes), axis=1) / near) < error
 
 
-def test_many_designs_at_once_ask_no_library_for_factors():
+def test_batched_designs_call_no_lapack():
     """On two threads those of its batches wait for each other for ever."""
     case, regulator = two_spans()
     model = jb.state_space(case)
 
     def gains(effort):
-        return eqx.tree_at(lambda r: r.command_weight, regulator, effort).gains(model).pieces
+        return (
+            eqx.tree_at(lambda r: r.command_weight, regulator, effort)
+            .gain_table(model)
+            .coefficients
+        )
 
     told = jax.jit(jax.vmap(gains)).lower(jnp.ones((4, 2))).as_text()
     assert "custom_call" not in told

@@ -48,7 +48,7 @@ def matrices(t):
 
 
 def nodes(count):
-    """Gauss nodes of so many stretches over the time that is looked at."""
+    """Gauss nodes of so many intervals over the time of the test."""
     return START + LENGTH * (np.arange(count)[:, None] + GAUSS_NODES) / count
 
 
@@ -57,17 +57,17 @@ def by_collocation(count):
     return collocated_stages(*at, Q, R, jnp.full(count, LENGTH / count))
 
 
-def by_forces(count):
-    """With the answers for a stretch of this length, as it is halved from a longer one."""
+def by_coupling(count):
+    """With the responses for an interval of this length, halved from a longer one."""
     length, kind = jnp.asarray(LENGTH / count), HALVINGS - 1
     answer = stage_responses(PLANT, Q, length * 2**kind, HALVINGS)
     parts = jax.vmap(jax.vmap(coupling))(nodes(count))
     return coupled_stages(PLANT, jax.tree.map(lambda x: x[kind], answer), parts, R, length)
 
 
-@pytest.mark.parametrize("made", [by_collocation, by_forces])
-def test_a_flow_is_what_the_plant_does_and_costs(made):
-    flow = jax.jit(made, static_argnums=0)(1)
+@pytest.mark.parametrize("made", [by_collocation, by_coupling])
+def test_stage_against_scipy(made):
+    stage = jax.jit(made, static_argnums=0)(1)
     # Of a degree that Gauss's rule for the cost, too, is exact for.
     start, powers = RANDOM.normal(size=STATES), GAUSS_NODES[:, None] ** np.arange(4)
     values = powers @ RANDOM.normal(size=(4, INPUTS))
@@ -83,14 +83,19 @@ def test_a_flow_is_what_the_plant_does_and_costs(made):
     span, tight = (START, START + LENGTH), {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
     expected = solve_ivp(rate, span, np.append(start, 0.0), **tight).y[:, -1]
     both = np.append(start, values)
-    assert_allclose(flow.drift[0] @ start + flow.push[0] @ both[STATES:], expected[:-1], rtol=1e-9)
-    assert_allclose(both @ flow.toll[0] @ both, expected[-1], rtol=1e-9)
+    assert_allclose(
+        stage.transition[0] @ start + stage.input_matrix[0] @ both[STATES:],
+        expected[:-1],
+        rtol=1e-9,
+    )
+    assert_allclose(both @ stage.cost[0] @ both, expected[-1], rtol=1e-9)
 
 
-def test_both_lead_to_the_same_costs():
-    """Also where stretches have no length."""
+def test_costs_of_both_kinds_of_stages_are_equal():
+    """Also over intervals of length zero."""
     collocated, by_force = (
-        jax.jit(lambda made=made: cost_to_go(made(4), Q))() for made in (by_collocation, by_forces)
+        jax.jit(lambda made=made: cost_to_go(made(4), Q))()
+        for made in (by_collocation, by_coupling)
     )
     assert_allclose(by_force, collocated, rtol=1e-10)
     still = collocated_stages(*jax.vmap(jax.vmap(matrices))(nodes(1)), Q, R, jnp.zeros(1))
