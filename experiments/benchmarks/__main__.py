@@ -50,8 +50,8 @@ def main() -> None:
     )
     options.add_argument("--quick", action="store_true", help="short runs, to check that all work")
     options.add_argument("--list", action="store_true", help="only list the benchmarks")
-    given = options.parse_args()
-    names = [_current_name(name) for name in given.names]
+    arguments = options.parse_args()
+    names = [_current_name(name) for name in arguments.names]
     unknown = set(names) - set(BENCHMARKS)
     if unknown:
         message = f"{', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}"
@@ -59,12 +59,12 @@ def main() -> None:
     failed = []
     for name in names or BENCHMARKS:
         about, quick = BENCHMARKS[name]
-        if given.list:
+        if arguments.list:
             print(f"{name:18} {about}")
             continue
         print(f"\n## {name}: {about}\n", flush=True)
         command = [sys.executable, "-m", f"experiments.benchmarks.{name}"]
-        if subprocess.run(command + (quick.split() if given.quick else [])).returncode:
+        if subprocess.run(command + (quick.split() if arguments.quick else [])).returncode:
             failed.append(name)
     if failed:
         raise SystemExit(f"failed: {', '.join(failed)}")

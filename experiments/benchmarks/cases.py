@@ -2,11 +2,12 @@
 
     python -m experiments.benchmarks.cases [--spans 1 2] [--loops open sampled] [--modes 3 6 12]
 
-Masses by speeds cross a pinned beam of one span, or of two. In a sampled loop a patch on each span
-answers the deflection at its own sensor every 10 ms, in an instant loop continuously. Each kind of
-sweep is measured in its own process: wall time (median of three) with compiling apart, and peak
-memory. Then the largest error, of peaks relative to each, of histories relative to the largest
-deflection of each run, against DOP853 with a strict tolerance at some masses and speeds.
+Masses by speeds cross a pinned beam of one span, or of two. A patch on each span is commanded by
+-gain times the deflection at its own sensor: in a sampled loop every 10 ms, in an instant loop
+continuously. Each kind of sweep is measured in its own process: wall time (median of three) with
+compiling apart, and peak memory. Then the largest error, of peaks relative to each, of histories
+relative to the largest deflection of each run, against DOP853 with a strict tolerance at some
+masses and speeds.
 
 scipy is DOP853 in a loop with the tolerance at which its peaks are right to one part in a million,
 timed on some runs and scaled; for peaks it stops half a second after the exit. diffrax has all
@@ -37,7 +38,7 @@ from experiments.benchmarks.sweep import TOLERANCE
 
 LOOPS = {"open": None, "sampled": 0.01, "instant": None}  # s between two commands
 GAIN = 1e3  # V/m
-SENSORS = {1: (0.3, 0.15, 0.45), 2: (0.3, 0.9, 0.15)}  # m; patch i answers sensor i
+SENSORS = {1: (0.3, 0.15, 0.45), 2: (0.3, 0.9, 0.15)}  # m; sensor i is fed back to patch i
 SAMPLE_RATE = 100.0  # Hz, of histories and of the record of a loop
 SCIPY_RUNS = 6  # timed runs, from which the time of scipy is scaled
 
@@ -98,10 +99,10 @@ def measure(spans: int, loop: str, saved: str, modes: int, side: int) -> dict[st
         return jb.sweep(case, over, **options)
 
     timing = time_call(by_jaxbeam, repeat=3)
-    memory, found = peak_memory(), by_jaxbeam()
+    memory, results = peak_memory(), by_jaxbeam()
     checked = np.ix_(*[np.unique(np.linspace(0, side - 1, 4).astype(int))] * 2)
     chosen = masses[checked[0].ravel()], speeds[checked[1].ravel()]
-    times = found.time.values if histories else None
+    times = results.time.values if histories else None
 
     def by_scipy(beam, masses, speeds, **tolerance):
         if histories:
@@ -114,10 +115,10 @@ def measure(spans: int, loop: str, saved: str, modes: int, side: int) -> dict[st
     if histories:
         reference = by_scipy(beam, *chosen, tolerance=baselines.REFERENCE_TOLERANCE)
         size = np.max(np.abs(reference), axis=(2, 3), keepdims=True)
-        error = largest_error(found.deflection.values[checked])
+        error = largest_error(results.deflection.values[checked])
     else:
         size = reference = baselines.reference_peaks(beam, *chosen)
-        error = largest_error(found.peak_deflection.values[checked])
+        error = largest_error(results.peak_deflection.values[checked])
     scaled = baselines.scipy_time(by_scipy, beam, masses, speeds, SCIPY_RUNS, 1, by_jaxbeam)
     row = {
         "run": timing.run,
@@ -147,19 +148,23 @@ def main() -> None:
     options.add_argument("--side", type=int, default=64, help="number of masses, and of speeds")
     options.add_argument("--quick", action="store_true", help="3 modes, 8 by 8")
     options.add_argument("--measure", nargs=5, help=argparse.SUPPRESS)
-    given = options.parse_args()
-    if given.measure:
-        spans, loop, saved, modes, side = given.measure
+    arguments = options.parse_args()
+    if arguments.measure:
+        spans, loop, saved, modes, side = arguments.measure
         print(json.dumps(measure(int(spans), loop, saved, int(modes), int(side))))
         return
-    if given.quick:
-        given.modes, given.side = [3], 8
+    if arguments.quick:
+        arguments.modes, arguments.side = [3], 8
     began = time.perf_counter()
-    print(f"{given.side**2} crossings; scipy and diffrax in times jaxbeam's, errors in brackets\n")
+    print(
+        f"{arguments.side**2} crossings; scipy and diffrax in times jaxbeam's, errors in brackets\n"
+    )
     columns = "jaxbeam", "error", "compiling", "peak MiB", "scipy", "diffrax"
     print_table(("spans", "loop", "saved", "modes", *columns), right_from=3)
-    for kind in itertools.product(given.spans, given.loops, given.keep, given.modes):
-        row = measure_in_subprocess("experiments.benchmarks.cases", *kind, given.side)
+    for kind in itertools.product(
+        arguments.spans, arguments.loops, arguments.keep, arguments.modes
+    ):
+        row = measure_in_subprocess("experiments.benchmarks.cases", *kind, arguments.side)
         others = [
             f"{row[name]:.3g} ({row[name + '_error']:.0e})" if name in row else ""
             for name in ("scipy", "diffrax")

@@ -40,11 +40,11 @@ def time_sweep(runs: int, client, store: Path) -> tuple[int, float]:
     Raises RuntimeError if a run fails.
     """
     start = time.perf_counter()
-    found = jb.sweep(one_span_case(3), grid(runs), store=store, progress=False, client=client)
-    took = time.perf_counter() - start
-    if found.failed.any():
-        raise RuntimeError(f"{int(found.failed.sum())} runs failed")
-    return found.failed.size, took
+    results = jb.sweep(one_span_case(3), grid(runs), store=store, progress=False, client=client)
+    wall_time = time.perf_counter() - start
+    if results.failed.any():
+        raise RuntimeError(f"{int(results.failed.sum())} runs failed")
+    return results.failed.size, wall_time
 
 
 def main() -> None:
@@ -54,22 +54,22 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("--runs", type=int, default=1_000_000)
     options.add_argument("--workers", type=int, default=2)
-    given = options.parse_args()
+    arguments = options.parse_args()
     header = "runs", "seconds", "runs a second", "peak memory here", "a billion runs"
     print_table(header, right_from=0)
     with (
         tempfile.TemporaryDirectory() as folder,
         LocalCluster(
-            n_workers=given.workers, threads_per_worker=1, dashboard_address=":0"
-        ) as machines,
-        Client(machines, set_as_default=False) as client,
+            n_workers=arguments.workers, threads_per_worker=1, dashboard_address=":0"
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
     ):
-        for runs in (given.runs // 10, given.runs):
-            count, took = time_sweep(runs, client, Path(folder) / f"{runs}.zarr")
-            rate = count / took
-            hours = 1e9 / rate * given.workers / 3600
+        for runs in (arguments.runs // 10, arguments.runs):
+            count, wall_time = time_sweep(runs, client, Path(folder) / f"{runs}.zarr")
+            rate = count / wall_time
+            hours = 1e9 / rate * arguments.workers / 3600
             memory = f"{peak_memory():.0f} MiB"
-            cells = str(count), f"{took:.1f}", f"{rate:.0f}", memory, f"{hours:.0f} core hours"
+            cells = str(count), f"{wall_time:.1f}", f"{rate:.0f}", memory, f"{hours:.0f} core hours"
             print_row(cells)
 
 

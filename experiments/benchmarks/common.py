@@ -100,12 +100,12 @@ def parser(module_doc: str | None, modes: Sequence[int] = ()) -> argparse.Argume
 
     With `modes` there is an option --modes, whose default they are.
     """
-    made = argparse.ArgumentParser(description=(module_doc or "").splitlines()[0])
+    options = argparse.ArgumentParser(description=(module_doc or "").splitlines()[0])
     if modes:
-        made.add_argument(
+        options.add_argument(
             "--modes", type=int, nargs="+", default=list(modes), help="numbers of modes"
         )
-    return made
+    return options
 
 
 def measure_in_subprocess(
@@ -113,14 +113,14 @@ def measure_in_subprocess(
 ) -> dict[str, float]:
     """The JSON that `python -m MODULE --measure ARGUMENTS` prints last, in its own process."""
     command = [sys.executable, "-m", module, "--measure", *map(str, arguments)]
-    done = subprocess.run(
+    process = subprocess.run(
         command,
         env=os.environ | dict(environment or {}),
         check=True,
         stdout=subprocess.PIPE,
         text=True,
     )
-    return json.loads(done.stdout.splitlines()[-1])
+    return json.loads(process.stdout.splitlines()[-1])
 
 
 def print_table(header: Sequence[str], right_from: int = 1) -> None:

@@ -67,7 +67,7 @@ def time_steps(
     `measurements` are the readings, states and commands (sample, ...) at `times` (s).
     """
     timed_steps = set(np.linspace(0, times.shape[0] - 1, TIMED_STEPS).astype(int).tolist())
-    state, found, zero = law.initial_state(), [], jnp.zeros(())
+    state, step_times, zero = law.initial_state(), [], jnp.zeros(())
     for k in range(times.shape[0]):
         measurement = tuple(part[k] for part in measurements)
 
@@ -76,7 +76,7 @@ def time_steps(
 
         next_state = repeat(1).state
         if k in timed_steps:
-            found.append(_time_per_step(repeat))
+            step_times.append(_time_per_step(repeat))
         state = next_state
     batch_indices = np.resize(np.arange(times.shape[0]), BATCH_SIZE)
     batch = tuple(part[batch_indices] for part in measurements)
@@ -87,7 +87,10 @@ def time_steps(
     all_at_once()  # compiles
     batched = [_seconds(all_at_once) / BATCH_SIZE for _ in range(2 * ATTEMPTS + 1)]
     return ComputingTimes(
-        *(float(x) for x in (np.median(found), max(found), np.median(batched), max(batched)))
+        *(
+            float(x)
+            for x in (np.median(step_times), max(step_times), np.median(batched), max(batched))
+        )
     )
 
 

@@ -35,7 +35,7 @@ def measure(runs: int) -> dict[str, float]:
     Raises RuntimeError if a run fails.
     """
     case, times, over = one_span_case(3), [], grid(runs)
-    xarray.Dataset({"loaded": ("run", [0.0])})  # loads its own parts at first use
+    xarray.Dataset({"loaded": ("run", [0.0])})  # xarray imports modules at first use
     # Shapes of blocks depend on the number of masses: all of them and some speeds compile all.
     speeds = over["loads.0.speed"]
     some = over | {"loads.0.speed": speeds[:: -(-len(speeds) // 16)]}
@@ -67,22 +67,22 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("--runs", type=int, nargs="+", default=[4096, 40_000, 400_000, 4_000_000])
     options.add_argument("--measure", type=int, help=argparse.SUPPRESS)
-    given = options.parse_args()
-    if given.measure is not None:
-        print(json.dumps(measure(given.measure)))
+    arguments = options.parse_args()
+    if arguments.measure is not None:
+        print(json.dumps(measure(arguments.measure)))
         return
     with tempfile.TemporaryDirectory() as cache:
         print_table(("compiling a sweep", "seconds"))
         for name in ("cold", "from the compile cache"):
-            found = measure_with_cache(COMPILED_RUNS, cache)
-            print_row((name, f"{found['first'] - found['again']:.2f}"))
+            measured = measure_with_cache(COMPILED_RUNS, cache)
+            print_row((name, f"{measured['first'] - measured['again']:.2f}"))
         print()
         header = "runs", "seconds", "us a run", "peak MiB", "bytes a run above those before"
         print_table(header, right_from=0)
-        for runs in given.runs:
-            found, count = measure_with_cache(runs, cache), round(runs**0.5) ** 2
-            seconds, peak = found["run"], found["peak"]
-            growth = (peak - found["before"]) * 2**20 / count
+        for runs in arguments.runs:
+            measured, count = measure_with_cache(runs, cache), round(runs**0.5) ** 2
+            seconds, peak = measured["run"], measured["peak"]
+            growth = (peak - measured["before"]) * 2**20 / count
             times = f"{seconds:.2f}", f"{1e6 * seconds / count:.1f}"
             print_row((str(count), *times, f"{peak:.0f}", f"{growth:.0f}"))
 

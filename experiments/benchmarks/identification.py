@@ -108,7 +108,7 @@ def fit_by_scipy(logs: list[Log]) -> tuple[np.ndarray, int, float]:
         return np.concatenate([part.ravel() for part in parts])
 
     begin = time.perf_counter()
-    found = least_squares(
+    solution = least_squares(
         residuals,
         INITIAL_VALUES,
         x_scale=INITIAL_VALUES,
@@ -117,7 +117,7 @@ def fit_by_scipy(logs: list[Log]) -> tuple[np.ndarray, int, float]:
         ftol=1e-12,
         gtol=1e-12,
     )
-    return found.x, calls, time.perf_counter() - begin
+    return solution.x, calls, time.perf_counter() - begin
 
 
 def time_fits() -> dict[str, float]:
@@ -130,16 +130,20 @@ def time_fits() -> dict[str, float]:
     dataset = make_dataset(initial_case(), logs)
     numbers = free_parameters(dataset.cases, dict.fromkeys(TRUTH), 1.0)
     search = LeastSquares(dataset, numbers)
-    found = search.solve(dataset.measured)
+    solution = search.solve(dataset.measured)
     first = time.perf_counter() - begin
     begin = time.perf_counter()
-    found = search.solve(dataset.measured)
+    solution = search.solve(dataset.measured)
     again = time.perf_counter() - begin
     values, calls, seconds = fit_by_scipy(logs)
     # A fit estimates the noise; here it is given, for the same weights as scipy.
-    noise = np.full(found.noise.shape, NOISE)
-    given = search.step_scale(found.unbounded, noise)[None], search.weights(noise), dataset.measured
-    points, _ = search.minimise(found.unbounded[None], *given, np.ones(len(numbers), bool))
+    noise = np.full(solution.noise.shape, NOISE)
+    weighting = (
+        search.step_scale(solution.unbounded, noise)[None],
+        search.weights(noise),
+        dataset.measured,
+    )
+    points, _ = search.minimise(solution.unbounded[None], *weighting, np.ones(len(numbers), bool))
     by_jaxbeam = search.values_at(points[0])
     return {
         "first_fit_s": first,
@@ -149,20 +153,20 @@ def time_fits() -> dict[str, float]:
         "ratio": seconds / again,
         "ratio_first": seconds / first,
         "difference": float(np.max(np.abs(by_jaxbeam / values - 1))),
-        "largest_error": float(np.max(found.uncertainty.errors / np.abs(found.values))),
+        "largest_error": float(np.max(solution.uncertainty.errors / np.abs(solution.values))),
     }
 
 
 def main() -> None:
     """Print the comparison."""
-    found = time_fits()
-    print(f"jaxbeam, compiled:              {found['fit_s']:8.2f} s")
-    print(f"jaxbeam, compiling included:    {found['first_fit_s']:8.2f} s")
-    print(f"scipy, differences and DOP853:  {found['scipy_s']:8.2f} s, "
-          f"{found['scipy_evaluations']:.0f} evaluations of ten logs")  # fmt: skip
-    print(f"ratios: {found['ratio']:.0f}, with compiling {found['ratio_first']:.1f}")
-    print(f"largest relative difference of the optima {found['difference']:.1e}, "
-          f"of standard errors up to {found['largest_error']:.1e}")  # fmt: skip
+    results = time_fits()
+    print(f"jaxbeam, compiled:              {results['fit_s']:8.2f} s")
+    print(f"jaxbeam, compiling included:    {results['first_fit_s']:8.2f} s")
+    print(f"scipy, differences and DOP853:  {results['scipy_s']:8.2f} s, "
+          f"{results['scipy_evaluations']:.0f} evaluations of ten logs")  # fmt: skip
+    print(f"ratios: {results['ratio']:.0f}, with compiling {results['ratio_first']:.1f}")
+    print(f"largest relative difference of the optima {results['difference']:.1e}, "
+          f"of standard errors up to {results['largest_error']:.1e}")  # fmt: skip
 
 
 if __name__ == "__main__":

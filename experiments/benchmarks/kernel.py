@@ -62,10 +62,10 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     mask = np.ones(SPEEDS.size, bool)
     models = jax.tree.map(lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), runner.models)
     step_size = steps, np.zeros(steps.size, int)
-    found = programs.discrete_models(
+    batched_models = programs.discrete_models(
         runner.program(), mask, models, runner.batches.shared_values, step_size
     )
-    discrete_models = jax.tree.map(np.asarray, found)
+    discrete_models = jax.tree.map(np.asarray, batched_models)
     pinned_beam = PinnedBeam(modes)
     rates = discrete_models.model.state_matrix[0, :, 1, :]
     peak_search_points = (
@@ -131,14 +131,14 @@ def kernel_peaks(library: Library, beam: np.ndarray, crossings: list) -> np.ndar
 
 def main() -> None:
     """Compile the kernel, time it beside jaxbeam, and print the table."""
-    given = parser(__doc__, modes=[3, 6, 12]).parse_args()
+    options = parser(__doc__, modes=[3, 6, 12]).parse_args()
     if compiler() is None:
         print("no C compiler here (cc, gcc, clang): nothing to compare with")
         return
     columns = "jaxbeam, all cores", "C kernel, one core", "ratio", "difference"
     print_table(("4096 crossings", *columns))
     with tempfile.TemporaryDirectory() as folder:
-        for modes in given.modes:
+        for modes in options.modes:
             library, (beam, crossings) = build(modes, Path(folder)), kernel_arguments(modes)
             by_jaxbeam, by_kernel = sweep_peaks(modes), kernel_peaks(library, beam, crossings)
             difference = np.max(np.abs(by_kernel / by_jaxbeam - 1))

@@ -47,7 +47,7 @@ def operation_stages(dump: Path, module: str) -> dict[str, str]:
 
     XLA may make one kernel of a whole loop, a call; it counts for all stages of what it calls.
     """
-    found, calls = {}, {}
+    stages, calls = {}, {}
     within = collections.defaultdict(set)  # stages and computations named by each computation
     for path in dump.glob(f"*{module}*after_optimizations.txt"):
         computation = ""
@@ -56,8 +56,8 @@ def operation_stages(dump: Path, module: str) -> dict[str, str]:
                 computation = begins[1]
             within[computation] |= set(re.findall(r"(?:to_apply|body|calls)=%([^\s,]+)", line))
             if named := re.match(r'\s+(?:ROOT )?%(\S+) = .*op_name="([^"]*)"', line):
-                found[named[1]] = stage_of(named[2])
-                within[computation].add(found[named[1]])
+                stages[named[1]] = stage_of(named[2])
+                within[computation].add(stages[named[1]])
                 if called := re.search(r" call\(.*to_apply=%([^\s,]+)", line):
                     calls[named[1]] = called[1]
     for name, computation in calls.items():
@@ -66,8 +66,8 @@ def operation_stages(dump: Path, module: str) -> dict[str, str]:
             new = within[todo.pop()] - inner
             inner |= new
             todo += [part for part in new if part in within]
-        found[name] = " and ".join(sorted(inner & set(STAGES))) or found[name]
-    return found
+        stages[name] = " and ".join(sorted(inner & set(STAGES))) or stages[name]
+    return stages
 
 
 def stage_shares(trace: Path, stages: dict[str, str], module: str) -> dict[str, float]:
@@ -78,18 +78,18 @@ def stage_shares(trace: Path, stages: dict[str, str], module: str) -> dict[str, 
     times: collections.Counter[str] = collections.Counter()
     open_until: dict[tuple, list] = collections.defaultdict(list)  # ends and stages of events
     for event in sorted(events, key=lambda event: (event.get("ts", 0), -event.get("dur", 0))):
-        about = event.get("args", {})
-        name = about.get("hlo_op", "")
-        if about.get("hlo_module") != module or CONTROL_FLOW.match(name):
+        arguments = event.get("args", {})
+        name = arguments.get("hlo_op", "")
+        if arguments.get("hlo_module") != module or CONTROL_FLOW.match(name):
             continue
-        stage, took = stages.get(name, "the rest"), event.get("dur", 0.0)
-        around = open_until[event["pid"], event["tid"]]
-        while around and around[-1][0] <= event["ts"]:
-            around.pop()
-        if around:  # an event within another counts for its own stage alone
-            times[around[-1][1]] -= took
-        around.append((event["ts"] + took, stage))
-        times[stage] += took
+        stage, duration = stages.get(name, "the rest"), event.get("dur", 0.0)
+        enclosing = open_until[event["pid"], event["tid"]]
+        while enclosing and enclosing[-1][0] <= event["ts"]:
+            enclosing.pop()
+        if enclosing:  # an event within another counts for its own stage alone
+            times[enclosing[-1][1]] -= duration
+        enclosing.append((event["ts"] + duration, stage))
+        times[stage] += duration
     return {stage: time / times.total() for stage, time in times.most_common()}
 
 
@@ -98,19 +98,19 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("--modes", type=int, default=3)
     options.add_argument("--keep", type=Path, help="folder for the trace")
-    given = options.parse_args()
-    folder = given.keep or Path(tempfile.mkdtemp())
+    arguments = options.parse_args()
+    folder = arguments.keep or Path(tempfile.mkdtemp())
     flags = f"--xla_dump_to={folder / 'hlo'} --xla_dump_hlo_as_text"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
     jax.config.update("jax_enable_compilation_cache", False)  # cached programs are not dumped
-    sweep_peaks(given.modes)
+    sweep_peaks(arguments.modes)
     settings = jax.profiler.ProfileOptions()
     settings.python_tracer_level = 0
     with jax.profiler.trace(str(folder / "trace"), profiler_options=settings):
-        sweep_peaks(given.modes)
+        sweep_peaks(arguments.modes)
     module = f"jit_{integrate_block.__name__}"
     stages = operation_stages(folder / "hlo", module)
-    print_table((f"{given.modes} modes, 4096 crossings", "share of the time"))
+    print_table((f"{arguments.modes} modes, 4096 crossings", "share of the time"))
     for stage, share in stage_shares(folder / "trace", stages, module).items():
         print_row((stage, f"{share:.0%}"))
 

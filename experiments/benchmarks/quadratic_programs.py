@@ -61,17 +61,23 @@ def crossing_programs(variables: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
         record = jb.simulate(case, tolerance=1e-4)
     law = case.controller.law(state_space(case)).law
     states = jnp.concatenate([record.coordinates, record.rates], axis=1)
-    before = jnp.concatenate([jnp.zeros((1, 1)), record.command[:-1]])
+    previous_commands = jnp.concatenate([jnp.zeros((1, 1)), record.command[:-1]])
 
     @compiled
-    def program(law, state, last, before):
-        predicted_state = law.sampled_plant.A @ last + law.sampled_plant.B @ before
-        known = jnp.concatenate([state, state - predicted_state, before, jnp.ones(1)])
-        return law.quadratic_program(law.prediction, known, before)
+    def program(law, state, previous_states, previous_commands):
+        predicted_state = (
+            law.sampled_plant.A @ previous_states + law.sampled_plant.B @ previous_commands
+        )
+        prediction_data = jnp.concatenate(
+            [state, state - predicted_state, previous_commands, jnp.ones(1)]
+        )
+        return law.quadratic_program(law.prediction, prediction_data, previous_commands)
 
-    last = jnp.concatenate([jnp.zeros((1, states.shape[1])), states[:-1]])
-    found = [program(law, *each) for each in zip(states, last, before, strict=True)]
-    H, f, M, gamma = (np.array(part) for part in zip(*found, strict=True))
+    previous_states = jnp.concatenate([jnp.zeros((1, states.shape[1])), states[:-1]])
+    programs = [
+        program(law, *each) for each in zip(states, previous_states, previous_commands, strict=True)
+    ]
+    H, f, M, gamma = (np.array(part) for part in zip(*programs, strict=True))
     return H[0], f, M[0], gamma
 
 
@@ -90,13 +96,16 @@ def solve_by_jaxbeam(H, f, M, gamma) -> tuple[np.ndarray, np.ndarray, float, flo
     def at_once(H, f, M, gamma):
         return jax.vmap(lambda f, gamma: solve_qp(H, f, M, gamma))(f, gamma)
 
-    found = in_turn(H, f, M, gamma)
-    if not found.solved.all():
-        raise RuntimeError(f"jaxbeam left {int((~found.solved).sum())} programs unsolved")
-    many = np.resize(np.arange(len(f)), BATCH_SIZE)
-    batch = time_call(at_once, H, f[many], M, gamma[many], repeat=ROUNDS).run / BATCH_SIZE
+    solutions = in_turn(H, f, M, gamma)
+    if not solutions.solved.all():
+        raise RuntimeError(f"jaxbeam left {int((~solutions.solved).sum())} programs unsolved")
+    batch_indices = np.resize(np.arange(len(f)), BATCH_SIZE)
+    batch = (
+        time_call(at_once, H, f[batch_indices], M, gamma[batch_indices], repeat=ROUNDS).run
+        / BATCH_SIZE
+    )
     single = time_call(in_turn, H, f, M, gamma, repeat=ROUNDS).run / len(f)
-    return np.asarray(found.x), np.asarray(found.steps) > 0, single, batch
+    return np.asarray(solutions.x), np.asarray(solutions.steps) > 0, single, batch
 
 
 def solve_by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, float, float]:
@@ -109,14 +118,16 @@ def solve_by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, floa
     solver.setup(matrices[0], f[0], matrices[1], free, gamma[0], **settings)
     times = []
     for _ in range(ROUNDS):
-        x, own, start = [], 0.0, time.perf_counter()
+        x, reported_time, start = [], 0.0, time.perf_counter()
         with _suppress_output():
             for one, top in zip(f, gamma, strict=True):
                 solver.update(q=one, u=top)
-                found = solver.solve(raise_error=True)
-                x.append(found.x)
-                own += found.info.update_time + found.info.solve_time + found.info.polish_time
-        times.append((own / len(f), (time.perf_counter() - start) / len(f)))
+                solution = solver.solve(raise_error=True)
+                x.append(solution.x)
+                reported_time += (
+                    solution.info.update_time + solution.info.solve_time + solution.info.polish_time
+                )
+        times.append((reported_time / len(f), (time.perf_counter() - start) / len(f)))
     return np.array(x), *np.median(times, axis=0)
 
 
@@ -124,14 +135,14 @@ def solve_by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, floa
 def _suppress_output():
     """Discard what is printed, by C too: OSQP reports its polishing whatever its settings."""
     sys.stdout.flush()
-    kept = os.dup(1)
-    with open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), 1)
+    stdout = os.dup(1)
+    with open(os.devnull, "w") as null_device:
+        os.dup2(null_device.fileno(), 1)
         try:
             yield
         finally:
-            os.dup2(kept, 1)
-            os.close(kept)
+            os.dup2(stdout, 1)
+            os.close(stdout)
 
 
 def main() -> None:
@@ -141,20 +152,26 @@ def main() -> None:
     if package is None:
         print("OSQP is not installed (uv sync --extra benchmarks): nothing to compare with")
         return
-    ours = "limits active", "jaxbeam, one by one", "256 at once"
+    jaxbeam_columns = "limits active", "jaxbeam, one by one", "256 at once"
     print_table(
-        ("variables", *ours, "OSQP, its report", "OSQP, from Python", "largest difference"),
+        (
+            "variables",
+            *jaxbeam_columns,
+            "OSQP, its report",
+            "OSQP, from Python",
+            "largest difference",
+        ),
         right_from=0,
     )
     for variables in HORIZONS:
         H, f, M, gamma = crossing_programs(variables)
         H, f = H / np.max(np.abs(H)), f / np.max(np.abs(H))
         x, constrained, single, batch = solve_by_jaxbeam(H, f, M, gamma)
-        by_osqp, own, called = solve_by_osqp(package, H, f, M, gamma)
+        by_osqp, reported, called = solve_by_osqp(package, H, f, M, gamma)
         difference = np.max(np.abs(by_osqp - x)) / np.max(np.abs(x))
         if difference > SOLUTION_TOLERANCE:
             raise RuntimeError(f"{variables} variables: solutions differ by {difference:.0e}")
-        times = [f"{1e6 * t:.1f} us" for t in (single, batch, own, called)]
+        times = [f"{1e6 * t:.1f} us" for t in (single, batch, reported, called)]
         active = f"{np.mean(constrained):.0%} of {len(f)}"
         print_row((str(variables), active, *times, f"{difference:.0e}"))
 

@@ -48,10 +48,13 @@ def time_designs(function, batches, share: float = 1.0, threads: int = THREADS) 
 
     A `share` of all batches is timed, the same number in each thread, and the time is scaled.
     """
-    each = max(1, round(len(batches) * share / threads))
+    batches_per_thread = max(1, round(len(batches) * share / threads))
     program = jax.jit(lambda some: jax.lax.map(function, some), compiler_options=xla_options())
     start = time.perf_counter()
-    parts = [jnp.asarray(batches[i * each : (i + 1) * each]) for i in range(threads)]
+    parts = [
+        jnp.asarray(batches[i * batches_per_thread : (i + 1) * batches_per_thread])
+        for i in range(threads)
+    ]
     program = program.lower(parts[0]).compile()
     compiled, runs = time.perf_counter() - start, []
     with ThreadPoolExecutor(threads) as pool:
@@ -59,7 +62,7 @@ def time_designs(function, batches, share: float = 1.0, threads: int = THREADS) 
             start = time.perf_counter()
             list(pool.map(lambda part: jax.block_until_ready(program(part)), parts))
             runs.append(time.perf_counter() - start)
-    return DesignTimes(compiled, min(runs) * len(batches) / (each * threads))
+    return DesignTimes(compiled, min(runs) * len(batches) / (batches_per_thread * threads))
 
 
 def regulator_case(modes: int, points: int) -> jb.Case:
@@ -130,9 +133,9 @@ def time_invariant(modes: int) -> DesignTimes:
     return time_designs(jax.vmap(design), np.geomspace(*COMMAND_WEIGHTS, DESIGNS)[None], threads=1)
 
 
-def print_times(name: str, found: DesignTimes) -> None:
+def print_times(name: str, times: DesignTimes) -> None:
     """Print a row of the table."""
-    print_row((name, f"{found.compiling:.2f}", f"{found.run:.2f}"))
+    print_row((name, f"{times.compiling:.2f}", f"{times.run:.2f}"))
 
 
 def main() -> None:

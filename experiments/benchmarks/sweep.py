@@ -61,8 +61,8 @@ FREE = (
 def sweep_peaks(modes: int) -> np.ndarray:
     """Peaks (mass, speed, sensor) in m by `jaxbeam.sweep`, choice of time steps included."""
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
-    found = jb.sweep(one_span_case(modes), over, progress=False, tolerance=TOLERANCE)
-    return found.peak_deflection.values
+    results = jb.sweep(one_span_case(modes), over, progress=False, tolerance=TOLERANCE)
+    return results.peak_deflection.values
 
 
 def compare(modes: int) -> list[tuple[str, Timing, float]]:
@@ -113,8 +113,8 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
             lambda: numba_peaks.numba_peaks(peak_function, beam, MASSES, SPEEDS),
         )
     scaled = baselines.scipy_time(baselines.scipy_peaks, beam, MASSES, SPEEDS, reference=by_jaxbeam)
-    some = baselines.scipy_peaks(beam, MASSES[::21], SPEEDS[CHECKED_SPEEDS])
-    error = float(np.max(np.abs(some / reference[::21] - 1)))
+    checked_peaks = baselines.scipy_peaks(beam, MASSES[::21], SPEEDS[CHECKED_SPEEDS])
+    error = float(np.max(np.abs(checked_peaks / reference[::21] - 1)))
     return [*rows, ("scipy DOP853, scaled", scaled, error)]
 
 
@@ -153,13 +153,13 @@ def derivatives() -> list[tuple[str, float]]:
 
 def main() -> None:
     """Run the benchmark and print its tables."""
-    given = parser(__doc__, modes=[3, 12]).parse_args()
+    arguments = parser(__doc__, modes=[3, 12]).parse_args()
     # An empty folder, so that a library compiled earlier is not used.
     with tempfile.TemporaryDirectory() as folder, with_cache_folder(folder):
-        # Both load their own parts at first use, which is no part of compiling.
+        # xarray and JAX import modules at first use, which is not compiling.
         xarray.Dataset({"a": ("x", [0.0])})
         jnp.zeros(1).block_until_ready()
-        _print_tables(given.modes)
+        _print_tables(arguments.modes)
 
 
 def _print_tables(mode_counts: list[int]) -> None:

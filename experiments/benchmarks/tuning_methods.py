@@ -79,7 +79,7 @@ def run_evolution(
     population = 4 * len(free)
     objective(np.array(list(free.values())).mean(axis=1)[:, None] * np.ones(population))
     began = time.perf_counter()
-    found = differential_evolution(
+    solution = differential_evolution(
         objective,
         list(free.values()),
         maxiter=max(evaluations // population - 1, 1),
@@ -92,7 +92,9 @@ def run_evolution(
         x0=[float(value_at(case, address)) for address in free],
         callback=lambda intermediate_result: time.perf_counter() - began > seconds,
     )
-    return SearchResult(float(found.fun), time.perf_counter() - began, int(found.nfev) * population)
+    return SearchResult(
+        float(solution.fun), time.perf_counter() - began, int(solution.nfev) * population
+    )
 
 
 def run_gradients(case: jb.Case, free: dict, method: str) -> tuple[float, SearchResult]:
@@ -101,19 +103,19 @@ def run_gradients(case: jb.Case, free: dict, method: str) -> tuple[float, Search
     options = {"steps": STEPS, "method": method, "least_peaks": False, "progress": False}
     tuning.tune(case, free, loads, **options)
     began = time.perf_counter()
-    found = tuning.tune(case, free, loads, **options)
-    start, end = found.run_sets[0].objective
+    tuned = tuning.tune(case, free, loads, **options)
+    start, end = tuned.run_sets[0].objective
     return start, SearchResult(end, time.perf_counter() - began, GRADIENT_COST * STEPS)
 
 
 def main() -> None:
     """Run all searches and print their worst peaks."""
     case, free = tuning_problem()
-    found = {method: run_gradients(case, free, method) for method in METHODS}
-    print(f"worst peak, relative to no control: {found['adam'][0]:.4f} at the start")
-    for method, (_, result) in found.items():
+    searches = {method: run_gradients(case, free, method) for method in METHODS}
+    print(f"worst peak, relative to no control: {searches['adam'][0]:.4f} at the start")
+    for method, (_, result) in searches.items():
         print(f"{method}, {STEPS} gradients: {result}")
-    seconds = found["adam"][1].seconds
+    seconds = searches["adam"][1].seconds
     result = run_evolution(case, free, 10**6, seconds)
     print(f"differential evolution, as long as adam: {result}")
     for factor in (1, EVALUATION_FACTOR):

@@ -98,11 +98,11 @@ def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
         change = {RIGIDITY: factor * float(case.beam.flexural_rigidity)}
         run_sets[name] = make_run_set(bench, [load | change for load in loads])
     records = {name: run_set.records({}) for name, run_set in run_sets.items()}
-    best = run_sets[SENSORS_ONLY].uncontrolled
+    bounds = run_sets[SENSORS_ONLY].uncontrolled
     return HeldOutStudy(
         title=case.title,
         loads=loads,
-        achievable=1 - best["least"] / best["peak"],
+        achievable=1 - bounds["least"] / bounds["peak"],
         reductions={
             name: 1 - peaks(found) / run_sets[name].uncontrolled["peak"]
             for name, found in records.items()

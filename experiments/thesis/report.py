@@ -41,17 +41,17 @@ def as_text(run: ExperimentRun) -> str:
 
 def sections(runs: Sequence[ExperimentRun]) -> list[ReportSection]:
     """The report of all experiments: method and summary, then each finding with its numbers."""
-    found = [ReportSection("", [METHOD, _summary_table(runs)])]
+    report = [ReportSection("", [METHOD, _summary_table(runs)])]
     for run in runs:
         title = f"{run.experiment.name}: {run.experiment.covers}"
-        found.append(ReportSection(title, [run.experiment.claim]))
+        report.append(ReportSection(title, [run.experiment.claim]))
         for finding, assigned in zip(run.outcome.findings, run.verdicts, strict=True):
             table = ReportTable(COLUMNS, _finding_rows(finding, assigned), _verdict_class)
             notes = _finding_notes(finding, assigned.verdicts)
-            found.append(ReportSection(_finding_title(finding), [table, *notes], level=3))
+            report.append(ReportSection(_finding_title(finding), [table, *notes], level=3))
         figures = [ReportFigure(figure_name(run, name)) for name in run.outcome.figures]
-        found.append(ReportSection("", [*run.outcome.remarks, *figures]))
-    return found
+        report.append(ReportSection("", [*run.outcome.remarks, *figures]))
+    return report
 
 
 def figure_name(run: ExperimentRun, name: str) -> str:
@@ -88,7 +88,9 @@ def _finding_rows(finding: Finding, assigned: FindingVerdicts) -> list[tuple[str
 def _finding_notes(finding: Finding, verdicts: Sequence[str]) -> list[str]:
     """Sentences on the values by each interpretation, and why numbers cannot be reproduced."""
     published = finding.published
-    sentences = [f"Reading: {published.interpretation}."] if published.interpretation else []
+    sentences = []
+    if published.interpretation:
+        sentences.append(f"Interpretation: {published.interpretation}.")
     if len(finding.interpretations) > 1:
         for name, values in finding.interpretations.items():
             numbers = " ".join(f"{value:.5g}" for value in np.asarray(values))

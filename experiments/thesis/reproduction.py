@@ -42,8 +42,8 @@ OUTPUT_FOLDER = "out/reproduce"
 
 def experiments() -> dict[str, Experiment]:
     """All experiments by name, in the order of the thesis."""
-    found = [importlib.import_module(f"experiments.{name}").EXPERIMENT for name in MODULES]
-    return {experiment.name: experiment for experiment in found}
+    modules = [importlib.import_module(f"experiments.{name}") for name in MODULES]
+    return {module.EXPERIMENT.name: module.EXPERIMENT for module in modules}
 
 
 def select_experiments(names: Sequence[str]) -> list[Experiment]:

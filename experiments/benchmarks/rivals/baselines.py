@@ -1,4 +1,4 @@
-"""The crossing of `pinned_beam` solved with scipy and with diffrax as well as each allows.
+"""The crossing of `pinned_beam` solved by scipy and by diffrax, each as fast as it allows.
 
 The results are the largest absolute deflections at the sensors, over the crossing and the free
 vibration after it, to one part in a million; or deflections at given times. The rules are the same
@@ -75,20 +75,22 @@ def scipy_time(solve, beam, masses, speeds, runs=12, repeat=3, reference=None):
     fitted to runs at speeds spread over all, each with another mass, each timed `repeat` times. A
     function `reference` is called between them for the ratio.
     """
-    chosen = np.linspace(0, len(speeds) - 1, runs).round().astype(int)
+    sampled_speeds = np.linspace(0, len(speeds) - 1, runs).round().astype(int)
     mixed = np.resize(np.asarray(masses)[:: max(len(masses) // runs, 1)], runs)
-    pairs = zip(mixed, np.asarray(speeds)[chosen], strict=True)
-    found = [time_call(solve, beam, [m], [v], repeat=repeat, reference=reference) for m, v in pairs]
+    pairs = zip(mixed, np.asarray(speeds)[sampled_speeds], strict=True)
+    timings = [
+        time_call(solve, beam, [m], [v], repeat=repeat, reference=reference) for m, v in pairs
+    ]
 
     def total_cost(costs):
-        growing, constant = np.polyfit(1 / np.asarray(speeds)[chosen], costs, 1)
+        growing, constant = np.polyfit(1 / np.asarray(speeds)[sampled_speeds], costs, 1)
         return float(len(masses) * np.sum(constant + growing / np.asarray(speeds)))
 
     return Timing(
-        total_cost([t.run for t in found]),
-        ratio=total_cost([t.ratio for t in found]),
-        shortest=total_cost([t.shortest for t in found]),
-        reference_shortest=min(t.reference_shortest for t in found),
+        total_cost([t.run for t in timings]),
+        ratio=total_cost([t.ratio for t in timings]),
+        shortest=total_cost([t.shortest for t in timings]),
+        reference_shortest=min(t.reference_shortest for t in timings),
     )
 
 
@@ -159,7 +161,7 @@ def _states(dense, shape, times):
 def _scipy_runs(beam, masses, speed, times, tolerance, samples):
     """Peaks of all `masses` at one speed, integrated as one system, (run, sensor) in m.
 
-    `matmul` (s) are those of `free_times`.
+    `times` (s) are those of `free_times`.
     """
     fractions = np.linspace(0, 1, samples + 1)
     peaks = np.zeros((len(beam.sensors), len(masses)))
@@ -179,7 +181,7 @@ def _scipy_runs(beam, masses, speed, times, tolerance, samples):
 
 def _scipy_samples(beam, masses, speed, times, tolerance):
     """Deflections of one mass at increasing times, (time, sensor) in m."""
-    found = np.zeros((len(times), len(beam.sensors)))
+    deflections = np.zeros((len(times), len(beam.sensors)))
     exit_time = beam.length / speed
     end = min(exit_time, times[-1]) if beam.gain is None else times[-1]
     state = np.zeros(1)
@@ -187,12 +189,12 @@ def _scipy_samples(beam, masses, speed, times, tolerance):
         inside = (times > start) & (times <= start + length)
         sample_times = np.append(times[inside], start + length)
         states = dense(sample_times)
-        found[inside] = (beam.sensor_shapes @ states[0, :, 0, :-1]).T
+        deflections[inside] = (beam.sensor_shapes @ states[0, :, 0, :-1]).T
         state = states[..., -1]
     later = times > exit_time
     if beam.gain is None and later.any():
-        found[later] = free_vibration(beam, times[later] - exit_time, *state)[0][:, :, 0]
-    return found
+        deflections[later] = free_vibration(beam, times[later] - exit_time, *state)[0][:, :, 0]
+    return deflections
 
 
 def _diffrax_runs(beam, masses, speed, times):

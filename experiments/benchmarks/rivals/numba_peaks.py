@@ -53,7 +53,7 @@ def compile_peaks(package: ModuleType | None):
 
     @jit
     def cubic(interval, value, slope, after, after_slope):
-        """The largest absolute value of the cubic of one interval, as `hermite_peaks`."""
+        """Largest absolute value of the cubic on one interval, as `hermite_peaks`."""
         left, right, rise = interval * slope, interval * after_slope, after - value
         square, cube = 3 * rise - 2 * left - right, left + right - 2 * rise
         root = math.sqrt(max(square * square - 3 * cube * left, 0.0))
@@ -86,10 +86,10 @@ def compile_peaks(package: ModuleType | None):
         return peak
 
     @jit
-    def cross(mass, speed, beam, pair, tolerance, peaks):
+    def cross(mass, speed, beam, coefficients, tolerance, peaks):
         """The state [q, q'] at the exit, NaN if it fails; fills in the peaks of the crossing."""
         length, numbers, squares, damping, amplitude, rows, sizes = beam
-        weights, end_weights, error_weights, nodes = pair
+        weights, end_weights, error_weights, nodes = coefficients
         modes, stages = squares.size, nodes.size
         rates = np.zeros((stages, 2 * modes))
         state, trial, after = np.zeros(2 * modes), np.zeros(2 * modes), np.zeros(2 * modes)
@@ -154,11 +154,11 @@ def compile_peaks(package: ModuleType | None):
                 before[s], before_rate[s] = value, rate
 
     @every
-    def fill(masses, speeds, beam, pair, tolerance, times, decays, exponents, found):
+    def fill(masses, speeds, beam, coefficients, tolerance, times, decays, exponents, peaks):
         for run in share(masses.size * speeds.size):
             i, j = run // speeds.size, run % speeds.size
-            state = cross(masses[i], speeds[j], beam, pair, tolerance, found[i, j])
-            vibrate_freely(state, times, decays, exponents, beam[5], found[i, j])
+            state = cross(masses[i], speeds[j], beam, coefficients, tolerance, peaks[i, j])
+            vibrate_freely(state, times, decays, exponents, beam[5], peaks[i, j])
 
     return fill
 
@@ -173,10 +173,10 @@ def numba_peaks(peak_function, beam, masses, speeds, free=FREE_VIBRATION):
     weights = np.zeros((nodes.size, nodes.size))
     for i, row in enumerate(tableau.a_lower, 1):
         weights[i, :i] = row
-    pair = weights, np.asarray(tableau.b_sol), np.asarray(tableau.b_error), nodes
+    coefficients = weights, np.asarray(tableau.b_sol), np.asarray(tableau.b_error), nodes
     damping = 2 * beam.damping_ratio * beam.frequencies
     sizes = np.ravel(beam.state_scales)
-    plain = (
+    modal_numbers = (
         beam.length,
         beam.wavenumbers,
         beam.frequencies**2,
@@ -185,8 +185,10 @@ def numba_peaks(peak_function, beam, masses, speeds, free=FREE_VIBRATION):
     )
     times = free_times(beam, free)
     decays = np.exp(np.outer(times, beam.poles))
-    found = np.zeros((len(masses), len(speeds), len(beam.sensors)))
-    given = np.asarray(masses, float), np.asarray(speeds, float)
-    whole = *plain, np.ascontiguousarray(beam.sensor_shapes), sizes
-    peak_function(*given, whole, pair, TOLERANCE, times, decays, beam.poles, found)
-    return found
+    peaks = np.zeros((len(masses), len(speeds), len(beam.sensors)))
+    swept_values = np.asarray(masses, float), np.asarray(speeds, float)
+    beam_numbers = *modal_numbers, np.ascontiguousarray(beam.sensor_shapes), sizes
+    peak_function(
+        *swept_values, beam_numbers, coefficients, TOLERANCE, times, decays, beam.poles, peaks
+    )
+    return peaks

@@ -27,8 +27,8 @@ MOMENT = 8.292e-4 * 0.35 * 200.0  # N m of a patch per volt of command
 class PinnedBeam:
     """The pinned beam of the benchmark, in SI units, with equal spans.
 
-    With a `gain` (V/m) the patch on each span answers the sensor of its number, u = -gain y: every
-    `period` (s), held in between, or continuously without a period.
+    With a `gain` (V/m) the command of patch i on span i is u = -gain y of sensor i: every `period`
+    (s), held in between, or continuously without a period.
     """
 
     modes: int

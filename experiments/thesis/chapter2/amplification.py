@@ -98,7 +98,7 @@ def run(load_rig) -> ExperimentResult:
     two = with_sensors(two_spans(load_rig), 0.3, 0.9, duration=DURATION)
     undamped = jb.replace(two, {"beam.damping_ratio": 0.0})
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ContactLossWarning)  # the maps show it
+        warnings.simplefilter("ignore", ContactLossWarning)  # the maps show lost contact
         mass_one = sweep_amplification(one, MASSES, ONE_SPAN_RATIOS)
         mass_two = sweep_amplification(two, MASSES, TWO_SPAN_RATIOS)
         force_one = sweep_amplification(as_moving_force(one), [1.0], ONE_SPAN_RATIOS)
@@ -158,8 +158,8 @@ def _on_spring(bare: jb.Case) -> np.ndarray:
     )
     force = sweep_amplification(as_moving_force(case), [1.0], [0.7])
     mass = sweep_amplification(case, [0.26, 0.5], [0.5, 0.75])
-    found = force.amplification[0, 0], mass.amplification[0, 0], mass.amplification[1, 1]
-    return np.array([value[0] for value in found])
+    amplification = force.amplification[0, 0], mass.amplification[0, 0], mass.amplification[1, 1]
+    return np.array([value[0] for value in amplification])
 
 
 def _inconsistency_fig_2_25(interpretations) -> str:
@@ -170,7 +170,7 @@ def _inconsistency_fig_2_25(interpretations) -> str:
         return ""
     return (
         "it is not stated whether the shaker was on the beam, nor until when peaks count: each"
-        " number follows from one of these readings, but all from none"
+        " number follows from one of these interpretations, but all from none"
     )
 
 

@@ -93,9 +93,9 @@ def _features(response: FrequencyResponse) -> dict:
     "low": its value at the lowest frequency (N/V), "drops": dips below that (Hz), "peak": the
     largest peak (Hz, N/V).
     """
-    found = resonances_and_antiresonances(response, 3)
-    low = found[0][2]
-    drops = [at for kind, at, magnitude in found if kind == "dip" and magnitude < low]
+    extrema = resonances_and_antiresonances(response, 3)
+    low = extrema[0][2]
+    drops = [at for kind, at, magnitude in extrema if kind == "dip" and magnitude < low]
     return {
         "low": low,
         "drops": drops,

@@ -134,7 +134,7 @@ def _scatter(both_speeds, ratios) -> str:
         return ""
     return (
         f"measured at {SPEEDS[0]:g} and {SPEEDS[1]:g} m/s it differs by up to {difference:.1f}"
-        f" points; by every reading of the rig the speed changes it by no more than"
+        f" points; by every interpretation of the rig the speed changes it by no more than"
         f" {computed:.1f}, so this is scatter"
     )
 
@@ -172,7 +172,7 @@ def _gain_scheduling_finding(runs: RegulatorRuns, rigs: dict[str, jb.Case]) -> F
     numbers, own = published.GAIN_SCHEDULING, published.VARYING_SLOW.numbers
     largest = own[0] - own[-1] + max(differences)
     inconsistency = (
-        f"one gain reduces the peaks of either mass by the same share, by every reading to"
+        f"one gain reduces the peaks of either mass by the same share, by every interpretation to"
         f" {max(differences):.1f} points, so that Table 5.1, each mass with its own, allows no"
         f" more than {largest:.1f}"
     )
@@ -224,7 +224,7 @@ def _draw_interpretations(tables, ratios) -> Figure:
     # By one interpretation the response grows without bound; the table has its peak.
     panels[0].set(ylabel="peak in percent of no control", ylim=(0, 110))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    set_title(figure, "Optimal control in several readings (Tables 5.1 to 5.4)")
+    set_title(figure, "Optimal control by several interpretations (Tables 5.1 to 5.4)")
     return figure
 
 

@@ -1,6 +1,6 @@
 """Sampled gains and stability of the regulators of section 5.
 
-Frozen poles are no stability criterion for a time-varying loop, but they are what was published.
+Frozen poles are no stability criterion for a time-varying loop; the thesis publishes them as one.
 """
 
 from collections.abc import Mapping
@@ -45,12 +45,12 @@ def with_other_shaker(rig: jb.Case) -> jb.Case:
 def sampling_findings(rig: jb.Case, weights) -> list[Finding]:
     """Sampling limits and gains of the sampled regulator, for the rig with its shaker."""
     rig = with_active_shaker(rig)
-    moved = jb.replace(rig, {"actuators.0.position": 0.25})
-    moved = with_modes(moved, 2)
+    moved_shaker = jb.replace(rig, {"actuators.0.position": 0.25})
+    moved_shaker = with_modes(moved_shaker, 2)
     two_mode_weights = [weights[i] for i in (0, 1, 3, 4, 6)]
     gains = (
         (published.SAMPLED_GAIN, rig, 5e-3, weights),
-        (published.MOVED_SHAKER_GAIN, moved, 1e-2, two_mode_weights),
+        (published.MOVED_SHAKER_GAIN, moved_shaker, 1e-2, two_mode_weights),
         (published.FAST_GAIN, rig, 2e-4, weights),
     )
     limits = make_finding(published.SAMPLING_LIMITS, jb.sampling_limit(rig))
@@ -136,8 +136,8 @@ def frozen_pole_findings(interpretations: Mapping[str, TimeVaryingLoops]) -> lis
             published.FROZEN_POLE_LIMITS,
             limits[literal],
             {name: limits[name] for name in others},
-            inconsistency=f"by every reading frozen poles are unstable from {highest[0]:.2g} m/s"
-            f" and from {highest[1]:.2g} kg at the latest"
+            inconsistency="by every interpretation frozen poles are unstable from"
+            f" {highest[0]:.2g} m/s and from {highest[1]:.2g} kg at the latest"
             if below
             else "",
         ),
@@ -192,5 +192,5 @@ def _stability_limit(case, address, bounds, rate) -> float:
     """
     if rate(jb.replace(case, {address: bounds[0]})) > 0:
         return bounds[0]
-    found = stability_limit(case, address, bounds[0], bounds[1], rate, points=5)
-    return np.inf if found is None else found
+    limit = stability_limit(case, address, bounds[0], bounds[1], rate, points=5)
+    return np.inf if limit is None else limit

@@ -165,9 +165,9 @@ def _one_span(case: jb.Case):
     higher_gain_peaks = []
     for gain in HIGHER_GAINS:
         higher = [change | {"controller.gains.0": gain * 1e3} for change in changes]
-        found = simulate_changes(with_feedback(case, 1, ONE_SPAN_CUTOFF), higher)
+        records_by_gain = simulate_changes(with_feedback(case, 1, ONE_SPAN_CUTOFF), higher)
         higher_gain_peaks.append(
-            np.reshape([float(one.peak_deflection[0]) for one in found], shape)
+            np.reshape([float(one.peak_deflection[0]) for one in records_by_gain], shape)
         )
     switches, last = switching_masses(
         MASSES, np.reshape(peaks, (3, *shape)), np.array(higher_gain_peaks)
@@ -215,9 +215,9 @@ def _draw(records: dict[str, jb.Record], title: str) -> Figure:
         axes.set(title=f"at {float(sensor.position):g} m", ylabel="deflection (mm)")
     gains = [float(actuator.amplifier_gain) for actuator in case.actuators]
     plot_commands(panels[-1], records, range(count), gains)
-    title_of_commands = "at the patches, second patch dashed" if count > 1 else "at the patch"
+    command_title = "at the patches, second patch dashed" if count > 1 else "at the patch"
     last = float(records["cubic"].times[-1])
-    panels[-1].set(title=title_of_commands, xlabel="time (s)", ylabel="voltage (V)", xlim=(0, last))
+    panels[-1].set(title=command_title, xlabel="time (s)", ylabel="voltage (V)", xlim=(0, last))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     set_title(figure, title)
     return figure

@@ -36,6 +36,6 @@ def simulate_changes(case: jb.Case, changes: Sequence[Mapping[str, Any]]) -> lis
     cases = [jb.replace(case, change) for change in changes]
     plan = integration_plan(cases[-1], None, TOLERANCE)
     with warnings.catch_warnings():
-        # Where gains are too high, loads would have to pull; the peaks show it.
+        # With too high gains the contact force becomes negative; the peaks show it.
         warnings.simplefilter("ignore", ContactLossWarning)
         return [jb.simulate(one, plan=plan) for one in cases]

@@ -159,13 +159,13 @@ def _peak_times(record: jb.Record) -> np.ndarray:
 
 def _irreproducible_reductions(case: jb.Case) -> str:
     """Printed reductions that no printed beam yields, with the computed ranges; or empty."""
-    found = []
+    reductions = []
     for (rigidity, density), ratio in itertools.product(PRINTED_SECTIONS, DAMPING_RATIOS):
         beam = {"beam.flexural_rigidity": rigidity, "beam.mass_per_length": density}
         one = jb.replace(case, beam | {"beam.damping_ratio": ratio})
         free, controlled = jb.simulate(one, tolerance=TOLERANCE), simulate_mpc(one, 4, 3)
-        found.append(_reductions_by_half(free, controlled)[PRINTED_REDUCTIONS])
-    low, high = np.min(found, axis=0), np.max(found, axis=0)
+        reductions.append(_reductions_by_half(free, controlled)[PRINTED_REDUCTIONS])
+    low, high = np.min(reductions, axis=0), np.max(reductions, axis=0)
     printed = published.TWO_SPAN_REDUCTION
     outside = (printed.numbers < low - printed.allowed_error) | (
         printed.numbers > high + printed.allowed_error

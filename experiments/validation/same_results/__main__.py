@@ -20,11 +20,13 @@ def main() -> None:
     comparer.add_argument("first", type=Path)
     comparer.add_argument("second", type=Path)
     comparer.add_argument("--tolerance", type=float, default=comparison.TOLERANCE)
-    given = parser.parse_args()
-    if given.command == "compare":
-        sys.exit(0 if comparison.compare(given.first, given.second, given.tolerance) else 1)
-    names = given.only or list(writing.cases())
-    writing.write(given.output, names, given.jobs, given.checkout)
+    arguments = parser.parse_args()
+    if arguments.command == "compare":
+        sys.exit(
+            0 if comparison.compare(arguments.first, arguments.second, arguments.tolerance) else 1
+        )
+    names = arguments.only or list(writing.cases())
+    writing.write(arguments.output, names, arguments.jobs, arguments.checkout)
 
 
 if __name__ == "__main__":

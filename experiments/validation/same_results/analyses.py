@@ -69,7 +69,7 @@ position = 0.3
 quantity = "acceleration"
 """
     beam = read(BEAM, SHAKER, MIDSPAN, kinds, MASS, RUN)
-    found: Arrays = {}
+    arrays: Arrays = {}
     for coordinates in ("modal", "sine"):
         model = jb.state_space(beam, coordinates)
         systems = {
@@ -80,10 +80,10 @@ quantity = "acceleration"
         }
         for name, system in systems.items():
             parts = {matrix: np.asarray(getattr(system, matrix)) for matrix in "ABCD"}
-            found |= named(**{f"{coordinates}.{name}": parts})
-        found[f"{coordinates}.B_f"] = np.asarray(model.B_f(0.3))
-    found["sampling_limit"] = np.asarray(jb.sampling_limit(beam))
-    return found
+            arrays |= named(**{f"{coordinates}.{name}": parts})
+        arrays[f"{coordinates}.B_f"] = np.asarray(model.B_f(0.3))
+    arrays["sampling_limit"] = np.asarray(jb.sampling_limit(beam))
+    return arrays
 
 
 def natural_modes() -> Arrays:
@@ -95,17 +95,17 @@ def natural_modes() -> Arrays:
     cases = {end: read(wide.format(end), RUN) for end in ends}
     cases["bonded"] = read(PATCH_BEAM, spring, bonded, RUN)
     cases["two spans"] = read(TWO_SPANS, RUN)
-    found: Arrays = {}
+    arrays: Arrays = {}
     for name, one in cases.items():
-        modes, places = jb.modes(one), np.linspace(0.0, float(one.beam.length), 41)
-        found |= named(
+        modes, positions = jb.modes(one), np.linspace(0.0, float(one.beam.length), 41)
+        arrays |= named(
             **{
                 name: {
                     "frequencies": np.asarray(modes.frequencies),
                     "damping_ratios": np.asarray(modes.damping_ratios),
-                    "shapes": np.asarray(modes.shapes(places)),
-                    "curvatures": np.asarray(modes.shapes(places, 2)),
+                    "shapes": np.asarray(modes.shapes(positions)),
+                    "curvatures": np.asarray(modes.shapes(positions, 2)),
                 }
             }
         )
-    return found
+    return arrays

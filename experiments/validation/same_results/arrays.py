@@ -72,13 +72,13 @@ def of_command(*words: str, file: str = "", cache: Path | None = None) -> Arrays
         path.write_text(file, encoding="utf-8")
         command = [sys.executable, "-m", "jaxbeam", words[0], str(path), *words[1:], "--json"]
         environment = os.environ | ({} if cache is None else {"XDG_CACHE_HOME": str(cache)})
-        done = subprocess.run(
+        process = subprocess.run(
             command, capture_output=True, text=True, cwd=REPOSITORY, env=environment
         )
-    if done.returncode:
-        message = (done.stderr.strip() or "no message").splitlines()[-1]
+    if process.returncode:
+        message = (process.stderr.strip() or "no message").splitlines()[-1]
         raise RuntimeError(f"jaxbeam {' '.join(words)}: {message}")
-    return of_json(json.loads(done.stdout))
+    return of_json(json.loads(process.stdout))
 
 
 def named(**parts: Arrays) -> Arrays:

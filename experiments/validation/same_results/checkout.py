@@ -1,4 +1,4 @@
-"""Import of jaxbeam and tuning from another checkout; imports neither at the top itself."""
+"""Import of jaxbeam and tuning from another checkout; this module itself imports neither."""
 
 import importlib
 import os

@@ -37,8 +37,8 @@ def fit_to_logs() -> Arrays:
     }
     rig = (folder / "rig.toml").read_text(encoding="utf-8").replace("modes = 12", "modes = 4")
     fit = tuning.identify(read(rig), logs, free)
-    found = of_json(fit.to_dict())
-    return found | {"fitted": np.asarray(fit.fitted), "residuals": np.asarray(fit.residuals)}
+    arrays = of_json(fit.to_dict())
+    return arrays | {"fitted": np.asarray(fit.fitted), "residuals": np.asarray(fit.residuals)}
 
 
 def fit_to_frequency_responses() -> Arrays:
@@ -54,7 +54,7 @@ def fit_to_frequency_responses() -> Arrays:
     fit = tuning.identify_responses(
         start, measured, ["beam.flexural_rigidity", "beam.damping_ratio"]
     )
-    # The fit is exact: misfit and intervals are rounding, without digits to compare.
+    # The fit is exact: misfit and intervals are rounding errors, not compared.
     numbers = of_json(fit.to_dict()["numbers"])
     values = {name: array for name, array in numbers.items() if name.endswith("value")}
     fitted = np.asarray(fit.fitted)
@@ -126,12 +126,12 @@ def modes_of_a_decay() -> Arrays:
     since = np.maximum(times - 2.0, 0.0)
     values = np.zeros((times.size, 2))
     for frequency, damping, shape in ((5.0, 0.01, (1.0, 0.8)), (12.0, 0.008, (0.5, -0.6))):
-        turn = 2 * np.pi * frequency
-        root = turn * (-damping + 1j * np.sqrt(1 - damping**2))
+        omega = 2 * np.pi * frequency
+        root = omega * (-damping + 1j * np.sqrt(1 - damping**2))
         values += np.outer(np.exp(root * since).real, shape)
     values[times < 2.0] = 1.5 * random.normal(size=(int(np.sum(times < 2.0)), 2))
     values += 0.1 * np.sin(0.3 * times)[:, None] + 0.05 * random.normal(size=values.shape)
     log = tuning.Log(times, values, ("a0", "a1"), ("acceleration",) * 2, ("m/s^2",) * 2)
     fit = tuning.identify_modes(log, band=(1.0, 20.0))
-    found = of_json(fit.to_dict()) | {"measured": fit.measured}
-    return found if fit.fitted is None else found | {"fitted": fit.fitted}
+    arrays = of_json(fit.to_dict()) | {"measured": fit.measured}
+    return arrays if fit.fitted is None else arrays | {"fitted": fit.fitted}

@@ -24,12 +24,12 @@ LONG = ("tuned_gain", "fit_to_logs", "comparison_of_controllers", "load_identifi
 
 def cases() -> dict[str, Callable[[], dict[str, np.ndarray]]]:
     """Functions that compute the arrays of a case, by name: all public ones of MODULES."""
-    found = {}
+    functions_by_name = {}
     for name in MODULES:
         module = importlib.import_module(f"experiments.validation.same_results.{name}")
         functions = inspect.getmembers(module, inspect.isfunction)
-        found |= {k: f for k, f in functions if f.__module__ == module.__name__}
-    return found
+        functions_by_name |= {k: f for k, f in functions if f.__module__ == module.__name__}
+    return functions_by_name
 
 
 def run_case(name: str) -> tuple[dict[str, np.ndarray], float]:
