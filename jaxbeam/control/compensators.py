@@ -85,7 +85,7 @@ class AbstractCompensator(AbstractController):
         return SampledCompensator(section[None])
 
     def _per_loop(self, *coefficients) -> Polynomials:
-        """Coefficients as rows with an entry for each loop; one number serves all loops."""
+        """Coefficients as rows with an entry for each loop; a single number holds for all loops."""
         return jnp.stack([jnp.broadcast_to(row, self.gains.shape) for row in coefficients])
 
 
@@ -192,9 +192,9 @@ class PositivePositionFeedback(AbstractCompensator):
 def _reading_filter(
     sensor: int, numerator: Float[Array, " power"], denominator: Float[Array, " power"]
 ) -> ControllerFilter:
-    """Realisation of a transfer function of degree 1 or 2: x1 follows the reading, x2 = x1' / w.
+    """Filter of order 1 or 2 with a given transfer function; its states are x1, and x2 = x1' / w.
 
-    At rest x1 is the reading.
+    In steady state x1 equals the reading.
     """
     feedthrough = numerator[-1] / denominator[-1]
     output_row = (numerator - feedthrough * denominator)[:-1] / denominator[0]

@@ -18,9 +18,9 @@ LOAD_FIELDS = ("mass", "speed", "entry_time")
 class DesignModel(eqx.Module):
     """Parameters of actuators and loads in the design of a controller, and its number of modes.
 
-    Each is one number for all parts that have it, or a list with one for each actuator (or load);
-    what is left out is as in the case. `stiffness = 0` leaves the suspension of shakers out of the
-    design; `modes` keeps only the lowest modes of the beam in it.
+    Each is one number for all parts that have it, or a list with one for each actuator (or load); a
+    parameter left out has its value in the case. `stiffness = 0` leaves the suspension of shakers
+    out of the design; `modes` keeps only the lowest modes of the beam in it.
     """
 
     force_per_volt: Float[Array, " *actuator"] | None = number(
@@ -99,6 +99,6 @@ def _with_value(part, name, value):
 
 
 def _has_effect(part, name) -> bool:
-    """Whether a part has a number in use; a table gives the entry time of its load."""
+    """Whether a part uses a parameter; a load with a table of positions has no entry time."""
     tabulated = name == "entry_time" and part.times is not None
     return getattr(part, name, None) is not None and not tabulated

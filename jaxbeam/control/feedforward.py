@@ -1,7 +1,7 @@
 """Position-scheduled feedforward: commands tabulated over the position of the load.
 
-Where voltage limits the control, what a light load allows at each position suits a heavy one too:
-the position of the load suffices, its mass is not needed.
+Where the voltage limits the control, commands that a light load allows at each position suit a
+heavy load too: the schedule needs the position of the load, not its mass.
 """
 
 from typing import ClassVar

@@ -96,18 +96,18 @@ class InternalModel(AbstractController):
     def _notch_sections(self) -> Float[Array, "notch 6"]:
         """Sampled notches: bilinear transforms, warped to be exact at their frequencies."""
         warped = jnp.tan(jnp.pi * self.notches * self.period)
-        wide, one = 2 * self.notch_damping * warped, jnp.ones_like(warped)
-        whole = 1 + wide + warped**2
-        middle, side = 2 * (warped**2 - 1) / whole, (1 + warped**2) / whole
-        last = (1 - wide + warped**2) / whole
-        return jnp.stack([side, middle, side, one, middle, last], axis=1)
+        damping_term, ones = 2 * self.notch_damping * warped, jnp.ones_like(warped)
+        leading = 1 + damping_term + warped**2
+        middle, outer = 2 * (warped**2 - 1) / leading, (1 + warped**2) / leading
+        last = (1 - damping_term + warped**2) / leading
+        return jnp.stack([outer, middle, outer, ones, middle, last], axis=1)
 
 
 class InternalModelLaw(AbstractSampledLaw):
     """Table f, static lift H (m per unit of a command), and filters as second-order sections.
 
     `sensor_filters` are those of each sensor, for H u; `notch_sections` act on all of y - c H u.
-    The state holds the states of the former, and of the latter.
+    The state holds those of the sensor filters and those of the notches.
     """
 
     readings: Float[Array, " breakpoint"]

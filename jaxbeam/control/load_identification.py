@@ -1,6 +1,6 @@
 """Load identification: settings of a case file, and its replay on the record of a run.
 
-In a simulation the gate times are those of the trajectory of the load; the law receives both.
+In a simulation the gate times are computed from the trajectory of the load.
 """
 
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import Plant, state_space
 from jaxbeam.runtime.compiling import compiled
 
-INFLUENCE_POSITIONS = 201  # along the beam, of the influence lines
+INFLUENCE_POSITIONS = 201  # load positions along the beam at which influence lines are tabulated
 
 
 class LoadIdentification(eqx.Module):
@@ -53,7 +53,7 @@ class LoadIdentification(eqx.Module):
         """Error of these settings in a case, as "key must ...", or None."""
         deflection_sensors = sum(sensor.quantity == "deflection" for sensor in case.sensors)
         if not deflection_sensors:
-            return "until has no use without a sensor of deflection; add one"
+            return "until needs a sensor of deflection; add one"
         if (self.gates is None) == (self.threshold is None):
             return "gates or threshold must be given, and not both"
         if self.gates is None:
@@ -147,7 +147,7 @@ def _replay(settings: LoadIdentification, case: Case, layout, record):
         readings, command, t = sample
         return identifier.update(sums, Measurement(readings, no_state, command), t)[1], None
 
-    # A sample of a record holds the command that begins there; the law measured the one before.
+    # A sample of a record holds the command that begins there; the law received the previous one.
     previous_commands = jnp.concatenate([jnp.zeros_like(record.command[:1]), record.command[:-1]])
     samples = record.measured, previous_commands, record.times
     sums, _ = jax.lax.scan(update, identifier.initial_state(), samples)

@@ -18,9 +18,9 @@ from jaxbeam.case.controller import Measurement, Time
 
 # A line through identified positions is accepted when these scatter by this share of the distance
 # over which they are identified, and their weights add up to this many of the largest weight: at
-# first the beam lags, and its load seems to stand or to jump.
+# first the beam lags, and identified positions stand still or jump.
 MIN_TRAVEL_SPREAD, MIN_EFFECTIVE_SAMPLES = 0.1, 8
-INFLUENCE_ROUNDING = 1e-20  # of the largest squared influence; rounding is below
+INFLUENCE_ROUNDING = 1e-20  # of the largest squared influence; smaller ones are rounding errors
 
 
 class LoadEstimate(NamedTuple):
@@ -143,13 +143,13 @@ class GateIdentifier(AbstractLoadIdentifier):
 
     def increments(self, sums, deflections, t):
         share = self.crossing_share(t)
-        *_, passed, done = self.estimate(sums, t)
+        *_, speed_identified, mass_identified = self.estimate(sums, t)
         relative_position = jnp.where(self.speed < 0, 1 - share, share)
         positions = np.linspace(0, 1, self.influence_lines.shape[1])
         influence = jax.vmap(lambda line: jnp.interp(relative_position, positions, line))(
             self.influence_lines
         )
-        active = passed & ~done & (share > 0)
+        active = speed_identified & ~mass_identified & (share > 0)
         return jnp.where(active, jnp.stack([influence @ deflections, influence @ influence]), 0.0)
 
 
@@ -197,20 +197,18 @@ class DeflectionIdentifier(AbstractLoadIdentifier):
         observable = squares > INFLUENCE_ROUNDING * jnp.max(squares)
         explained = jnp.where(observable, products**2 / jnp.where(observable, squares, 1.0), 0.0)
         best = jnp.clip(jnp.argmax(explained), 1, squares.shape[0] - 2)
-        before, here, after = (explained[best + k] for k in (-1, 0, 1))
-        curvature = before - 2 * here + after
+        left, centre, right = (explained[best + k] for k in (-1, 0, 1))
+        curvature = left - 2 * centre + right
         concave = curvature < 0
-        vertex = jnp.where(
-            concave, (before - after) / (2 * jnp.where(concave, curvature, -1.0)), 0.0
-        )
-        interval = best + jnp.clip(vertex, -0.5, 0.5)
-        position = interval * self.length / (squares.shape[0] - 1)
+        vertex = jnp.where(concave, (left - right) / (2 * jnp.where(concave, curvature, -1.0)), 0.0)
+        index = best + jnp.clip(vertex, -0.5, 0.5)
+        position = index * self.length / (squares.shape[0] - 1)
         return position, products[best], squares[best]
 
     def _fitted_line(self, sums):
         """Speed (m/s) and entry time (s) of the fitted line, and whether they are determined.
 
-        Until they are, one length per second and zero.
+        Until they are determined: one beam length per second, and zero.
         """
         total, t, square, x, product = sums[:5]
         time_variance = total * square - t**2

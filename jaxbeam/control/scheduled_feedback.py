@@ -30,7 +30,7 @@ class ScheduledFeedback(AbstractController):
     row of `gains`, one for each of the `masses` m of the load. Between these they are
     "interpolated" linearly, or "stepped": constant from each mass to the next, as in Fig. 6.7 of
     the thesis; beyond the first and last mass they are constant. The mass is that of the single
-    load of the case, or the one that `load_identification` finds; until it has, the lightest mass
+    load of the case, or the one identified by `load_identification`; until it is, the lightest mass
     is assumed.
     """
 

@@ -29,9 +29,9 @@ from jaxbeam.runtime.compiling import compiled
 
 
 class AbstractStateController(AbstractController):
-    """Settings of a law that is fed by the state of the plant that it is designed for.
+    """Settings of a law that feeds back the state of its design plant.
 
-    That design plant is the case itself, with the numbers of the `design` model where these
+    The design plant is that of the case, with the parameters of the `design` model where these
     differ; its states are those of `state_space` in the chosen coordinates. Without an `estimator`
     the law receives the true state, of which a design with fewer modes receives the first ones.
     """
@@ -59,7 +59,7 @@ class AbstractStateController(AbstractController):
         return self.design.design_plant(plant, self.coordinates)
 
     def design_loads(self, case: Case) -> tuple:
-        """Loads of a case with the numbers of the design model."""
+        """Loads of a case with the parameters of the design model."""
         return case.loads if self.design is None else self.design.design_loads(case)
 
     def design_law(self, plant):
@@ -76,7 +76,7 @@ class AbstractStateController(AbstractController):
         return SampledStateLaw(law, filter)
 
     def breakpoints(self, case):
-        """Entry and exit times of the design loads, where the gain of a continuous filter bends."""
+        """Entry and exit times of the design loads, kinks in the gain of a continuous filter."""
         if self.period is not None or self.estimator is None:
             return None
         design_case = eqx.tree_at(lambda c: c.loads, case, self.design_loads(case))
@@ -136,9 +136,11 @@ def _unloaded_design_plant(controller: AbstractStateController, case, layout) ->
 def _design_state_map(plant: Plant, design_plant: Plant) -> Float[Array, "design_state state"]:
     """Map of the states of a plant to those of its design plant, the first modes of the same."""
     modal_states = 2 * plant.coordinate_scale.shape[0]
-    kept = 2 * design_plant.coordinate_scale.shape[0]
+    design_modal_states = 2 * design_plant.coordinate_scale.shape[0]
     states = plant.to_modal(jnp.eye(plant.modal_model.state_count))
-    return design_plant.from_modal(jnp.concatenate([states[:kept], states[modal_states:]]))
+    return design_plant.from_modal(
+        jnp.concatenate([states[:design_modal_states], states[modal_states:]])
+    )
 
 
 def deflection_rows(

@@ -24,7 +24,7 @@ from jaxbeam.case.estimator import (
 class AbstractStateLaw(eqx.Module):
     """Control law fed by an estimate of the state of its plant; static laws have an empty state.
 
-    Fields of the class are the design; they do not change during a run.
+    Fields of the class hold the design; they are constant during a run.
     """
 
     def initial_state(self) -> Any:
@@ -70,7 +70,7 @@ class TrueState(AbstractSampledFilter, AbstractContinuousFilter):
 
 
 class SampledStateLaw(AbstractSampledLaw):
-    """State law behind a filter at samples; the state holds that of the law and of the filter."""
+    """State law behind a filter at samples; the state holds those of the law and of the filter."""
 
     law: AbstractStateLaw
     filter: AbstractSampledFilter
@@ -86,7 +86,7 @@ class SampledStateLaw(AbstractSampledLaw):
 
 
 class ContinuousStateLaw(AbstractContinuousLaw):
-    """Static state law behind a filter in continuous time, whose states are those of the whole."""
+    """Static state law behind a filter in continuous time; the states are those of the filter."""
 
     law: AbstractStateLaw
     filter: AbstractContinuousFilter

@@ -24,7 +24,7 @@ class FilterState(NamedTuple):
 
 
 class OneStepPrediction(NamedTuple):
-    """Prediction of states and readings at a sample, each with its covariance, and their C."""
+    """Prediction of states and readings at a sample with covariances, and output matrix C."""
 
     x: Float[Array, " state"]
     covariance: Square

@@ -30,7 +30,7 @@ class Inversion(AbstractEstimator):
     By least squares where there are more sensors of deflection than modes; the least-norm solution
     where there are fewer. Other sensors are not used. Rates are differences between samples,
     smoothed by a first-order lag of `time_constant`. States of actuators follow from the commands.
-    The loads do not enter.
+    Loads are not modelled.
     """
 
     kind: ClassVar[str] = "inversion"
@@ -51,9 +51,11 @@ class Inversion(AbstractEstimator):
             inputs = jnp.concatenate(
                 [system.A[modal_states:, :modal_states], system.B[modal_states:]], axis=1
             )
-            inner = system.A[modal_states:, modal_states:]
-            no_noise, scale = jnp.zeros_like(inner), balance(inner)
-            actuator_transition = timing.transition(lambda t: (inner, inputs), no_noise, scale)
+            actuator_matrix = system.A[modal_states:, modal_states:]
+            no_noise, scale = jnp.zeros_like(actuator_matrix), balance(actuator_matrix)
+            actuator_transition = timing.transition(
+                lambda t: (actuator_matrix, inputs), no_noise, scale
+            )
         smoothing = (
             0.0 if self.time_constant is None else jnp.exp(-timing.period / self.time_constant)
         )

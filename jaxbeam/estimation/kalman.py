@@ -20,7 +20,7 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.finite_horizon import finite_horizon
 
-MAX_PHASE_PER_INTERVAL = 3.0  # rad, of the fastest mode in an interval of the gain table
+MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of the table
 
 Square = Float[Array, "state state"]
 
@@ -39,10 +39,10 @@ class Kalman(AbstractEstimator):
     is coloured. The beam is at rest one period before the first sample. Not modelled are sampling
     periods of the sensors' own, nor the direct effect of the white forces on accelerometers.
 
-    Without a period the filter acts in continuous time (Kalman-Bucy): the noise of readings then
-    has the `measurement_intensity`, which samples a period apart have with variance intensity /
-    period; the beam is at rest at first. Along the crossing its gain is tabulated, in `points`
-    intervals between each two of the entries and exits, to 1e-8.
+    Without a period the filter acts in continuous time (Kalman-Bucy): the noise of readings is
+    white with the `measurement_intensity`, that of samples with variance intensity / period; the
+    beam is at rest at t = 0. Along the crossing the gain is tabulated, in `points` intervals
+    between consecutive entries and exits, with errors of 1e-8.
     """
 
     kind: ClassVar[str] = "kalman"
@@ -110,9 +110,9 @@ class Kalman(AbstractEstimator):
             return TimeInvariantFilter(offset, zero_state, plant_states, system, gain)
         end = plant.case.run.duration
 
-        def dual_system(back):
+        def dual_system(time_to_end):
             """Transposed plant at a time (s) before the end: its regulator has the same gain."""
-            plant = filtered.with_filtered_outputs(filtered_model.augmented(end - back))
+            plant = filtered.with_filtered_outputs(filtered_model.augmented(end - time_to_end))
             return plant.A.T, plant.C.T
 
         crossing_times = jnp.array(
@@ -197,7 +197,7 @@ class Kalman(AbstractEstimator):
         return observability_error(system) or self._interval_error(case, system)
 
     def _interval_error(self, case, system) -> str | None:
-        """Error if the fastest mode turns too far within an interval of the gain table, or None."""
+        """Error if an interval of the gain table is too long for the fastest mode, or None."""
         if case.controller.period is not None or self.loads == "ignored":
             return None
         modes = mode_count(system)

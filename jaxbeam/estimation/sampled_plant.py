@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.numerics.discretisation import exponential_and_gramian
 
-PERIOD_ROUNDING = 1e-9  # of a period; a delay counts as whole periods if it exceeds them by less
+PERIOD_ROUNDING = 1e-9  # of a period; delays that exceed whole periods by less count as whole
 
 Square = Float[Array, "state state"]
 Number = Float[Array, ""]
@@ -87,10 +87,11 @@ class SampleTiming(eqx.Module):
         t: Number | float = 0.0,
         breaks: Sequence[Number] = (),
     ) -> tuple[list[Transition], Float[Array, " part"], Bool[Array, " part"]]:
-        """The same in parts, split where the command changes and at `breaks` (s into the period).
+        """Transitions of the parts of a period, split at the command change and at `breaks` (s).
 
-        Returns the parts, the time in the period at which each ends (s), and whether the previous
-        command acts in it.
+        Breaks are counted from the start of the period. Returns the transitions, whose composition
+        is that of `transition`, the end of each part (s from the start of the period), and whether
+        the previous command acts in it.
         """
         input_delay = jnp.zeros(()) if self.input_delay is None else self.input_delay
         cuts = [*breaks, *([] if self.input_delay is None else [input_delay])]

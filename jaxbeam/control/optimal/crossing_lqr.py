@@ -26,7 +26,7 @@ from jaxbeam.numerics.gain_table import (
     uniform_fractions,
 )
 
-MAX_PHASE_PER_INTERVAL = 3.0  # rad, of the fastest mode in an interval of a table
+MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of a table
 
 
 class AbstractCrossingRegulator(AbstractRegulator):
@@ -37,7 +37,7 @@ class AbstractCrossingRegulator(AbstractRegulator):
     the design model has another speed, the table is stretched. After the crossing the command is
     "none", or the last gain is on "hold", or it decays ("fade", with the time constant
     `fade_time`), or the "time-invariant" regulator takes over. A table has `points` intervals, or
-    some more, between each two of the entries and exits.
+    some more, between consecutive entries and exits.
 
     With `entries` "measured" the table starts with the first entry and ends with the last exit of
     the loads of the case; with "predicted" it runs between those of the `design` model, whatever
@@ -116,11 +116,11 @@ class AbstractCrossingRegulator(AbstractRegulator):
 class AbstractFiniteHorizonRegulator(AbstractCrossingRegulator):
     """Regulator over the crossing, from the Riccati equation integrated backward in time.
 
-    `terminal_weight` is the diagonal of F, eq. (3.3) of the thesis; Q if left out. With 7 modes
-    gains were right everywhere to 3e-4 of the largest nearby where the fastest mode turned by 3 rad
-    in an interval of the table, to 3e-5 with 2 rad, 2e-6 with 1, and 1e-7 with 0.5; while P
-    oscillates, before an event, the table has finer intervals. Where an actuator lags, they were
-    right to 1e-6 if an interval lasted nine of its time constants, to 1e-8 with four.
+    `terminal_weight` is the diagonal of F, eq. (3.3) of the thesis; Q if left out. With 7 modes the
+    largest error of the gains, relative to the largest gain nearby, was 3e-4 where the phase of the
+    fastest mode advanced by 3 rad in an interval of the table, 3e-5 with 2 rad, 2e-6 with 1, and
+    1e-7 with 0.5; while P oscillates, before an event, the table has finer intervals. With a lag of
+    an actuator it was 1e-6 if an interval lasted nine of its time constants, 1e-8 with four.
     """
 
     terminal_weight: Float[Array, " state"] | None = number(
@@ -208,7 +208,7 @@ def finite_horizon_gains(
 def interval_error(
     regulator: AbstractCrossingRegulator, case: Any, slowest_speed=None
 ) -> str | None:
-    """Error if the fastest mode turns too far within an interval, by the formula for pinned ends.
+    """Error if an interval is too long for the fastest mode, by the frequency for pinned ends.
 
     Loads cross at the speeds of the design, or at the `slowest_speed` (m/s) if that is given.
     """
@@ -227,6 +227,6 @@ def interval_error(
         return None
     return (
         f"points must be at least {min_points} for {modes} modes and a crossing of"
-        f" {crossing_time:.3g} s: in each interval the fastest mode may turn by"
-        f" {MAX_PHASE_PER_INTERVAL:g} rad only"
+        f" {crossing_time:.3g} s: in an interval the phase of the fastest mode may advance by at"
+        f" most {MAX_PHASE_PER_INTERVAL:g} rad"
     )

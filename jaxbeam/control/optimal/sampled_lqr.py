@@ -25,10 +25,10 @@ class DiscreteLQR(AbstractRegulator):
     """Time-invariant regulator for the plant without loads, designed for held commands.
 
     It minimises the same integral as `LQR`, over commands that are held for a `period` and begin a
-    `delay` after the sample: the weights mean the same at every period, the motion between samples
-    counts, and the gain tends to that of `LQR` as the period shrinks. `input_rate_weight` adds the
-    changes of the command, as rates over a period. With it or a delay, the last command, as
-    limited by the actuators, is fed back too.
+    `delay` after the sample: weights have the same meaning at every period, the cost includes the
+    motion between samples, and the gain tends to that of `LQR` as the period shrinks.
+    `input_rate_weight` adds the changes of the command, as rates over a period. With it or a delay,
+    the last command, as limited by the actuators, is fed back too.
     """
 
     kind: ClassVar[str] = "dlqr"
@@ -109,8 +109,8 @@ def discrete_lq_problem(
         transition, cost = exponential_and_gramian(matrix.T, span * cost_rate * cost_scale)
         return transition.T * scale[:, None] / scale, cost / cost_scale
 
-    one, none = np.eye(commands), np.zeros((commands, commands))
-    command_rows = np.concatenate([np.zeros((commands, states)), none, one], axis=1)
+    identity, zeros = np.eye(commands), np.zeros((commands, commands))
+    command_rows = np.concatenate([np.zeros((commands, states)), zeros, identity], axis=1)
     state_at_change = jnp.eye(states + commands, states + 2 * commands)  # x and v, of (x, v, u)
     cost = jnp.zeros((states + 2 * commands,) * 2)
     if input_delay is not None:

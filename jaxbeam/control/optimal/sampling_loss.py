@@ -71,8 +71,8 @@ def sampled_reachability(
     max_input = np.linalg.norm(rows, axis=1) * np.linalg.norm(concrete(system.B))
     controllable = np.linalg.norm(modal_inputs, axis=1) > UNCONTROLLABLE * max_input
     shares = [
-        _mode_reachability(*at, period, memory_time)
-        for at in zip(poles[controllable], modal_inputs[controllable], strict=True)
+        _mode_reachability(*mode, period, memory_time)
+        for mode in zip(poles[controllable], modal_inputs[controllable], strict=True)
     ]
     if not shares:
         return 1.0, 0.0
@@ -98,8 +98,8 @@ def _mode_reachability(
 
 def _oscillatory_modes(system: StateSpace) -> tuple[np.ndarray, np.ndarray]:
     """Oscillating poles (1/s, those with positive imaginary part) and their left eigenvectors."""
-    found = scipy.linalg.eig(concrete(system.A), left=True, right=False)
-    poles, left_vectors = found[0], found[1]
+    eigenpairs = scipy.linalg.eig(concrete(system.A), left=True, right=False)
+    poles, left_vectors = eigenpairs[0], eigenpairs[1]
     oscillatory = np.flatnonzero(poles.imag > 1e-6 * np.abs(poles))
     oscillatory = oscillatory[np.argsort(poles[oscillatory].imag)]
     return poles[oscillatory], left_vectors[:, oscillatory].conj().T

@@ -29,7 +29,7 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
     The tables are stretched to the speed of the load, also outside the grid. With loads "known" the
     weight of that mass is fed forward, as in `AugmentedLQR`.
 
-    Mass, speed and entry time are those of the load in the design, or found by
+    Mass, speed and entry time are those of the load in the design, or identified by
     `load_identification`: then the command is zero until the speed is identified, and the lightest
     mass is assumed until the mass is.
     """
@@ -135,8 +135,8 @@ class ScheduledGainLaw(AbstractStateLaw):
         """Weight of each design of a grid at a value."""
         if self.nearest:
             return jax.nn.one_hot(jnp.argmin(jnp.abs(grid - value)), grid.shape[0], dtype=float)
-        ones = jnp.eye(grid.shape[0])
-        return jax.vmap(lambda one: jnp.interp(value, grid, one))(ones)
+        unit_vectors = jnp.eye(grid.shape[0])
+        return jax.vmap(lambda weights: jnp.interp(value, grid, weights))(unit_vectors)
 
 
 def _any_not_positive(values) -> bool:

@@ -109,7 +109,9 @@ class MPC(AbstractStateController):
             return "period must be given: predictive control acts at samples"
         excess_delay = None if self.delay is None else self.delay - self.period
         if excess_delay is not None and is_concrete(excess_delay) and concrete(excess_delay) >= 0:
-            return "delay must be less than the period: no longer one is predicted"
+            return (
+                "delay must be less than the period: the prediction allows for one pending command"
+            )
         if self.moves > self.horizon:
             return f"moves must be at most the horizon, {self.horizon}, not {self.moves}"
         if outputs == 0:
@@ -117,8 +119,10 @@ class MPC(AbstractStateController):
         for name, allowed in sizes.items():
             value = getattr(self, name)
             if value is not None and value.shape not in allowed:
-                what = " or ".join("one number" if not s else f"{s[0]} entries" for s in allowed)
-                return f"{name} must have {what}, not {value.size}"
+                allowed_sizes = " or ".join(
+                    "one number" if not s else f"{s[0]} entries" for s in allowed
+                )
+                return f"{name} must have {allowed_sizes}, not {value.size}"
         pole = self.laguerre_pole
         if pole is not None and is_concrete(pole) and concrete(pole) >= 1:
             return f"laguerre_pole must be below 1, not {concrete(pole):g}"

@@ -72,8 +72,8 @@ class MPCLaw(AbstractStateLaw):
         predicted_state = (
             past_plant.A @ previous_state + past_plant.B @ previous_command + past_plant.E @ weights
         )
-        known = jnp.concatenate([state, state - predicted_state, previous_command, jnp.ones(1)])
-        move, solved = self._first_move(prediction, known, previous_command)
+        initial = jnp.concatenate([state, state - predicted_state, previous_command, jnp.ones(1)])
+        move, solved = self._first_move(prediction, initial, previous_command)
         return ControlStep(previous_command + jnp.where(solved, move, 0.0), state, solved)
 
     def _predict(self, t, estimate):
@@ -97,13 +97,13 @@ class MPCLaw(AbstractStateLaw):
         past, future = (jax.tree.map(lambda p, s=s: p[s], plants) for s in (0, slice(1, None)))
         return past, predict(future, self.C, self.move_maps, weights), weights
 
-    def quadratic_program(self, prediction: Prediction, known, previous_command):
+    def quadratic_program(self, prediction: Prediction, initial, previous_command):
         """Quadratic program of a sample, in the moves, and in the excesses over soft limits.
 
-        `known` is the state, its unexplained change, the previous command u(k-1), and 1, as in
-        `Prediction`.
+        `initial` are the initial conditions of `Prediction`: the state, its unexplained change, the
+        previous command u(k-1), and 1.
         """
-        free_response = prediction.F @ known
+        free_response = prediction.F @ initial
         weight, Phi, maps = self.output_weights, prediction.Phi, self.move_maps
         if self.terminal_cost is not None:
             weight = weight.at[-1].set(0.0)  # included in P
@@ -113,7 +113,7 @@ class MPCLaw(AbstractStateLaw):
         if self.terminal_cost is not None:
             terminal_gradient = prediction.terminal_phi.T @ self.terminal_cost
             H = H + terminal_gradient @ prediction.terminal_phi
-            f = f + terminal_gradient @ (prediction.terminal @ known)
+            f = f + terminal_gradient @ (prediction.terminal @ initial)
         H, f, M = 2 * H, 2 * f, self.limits.rows
         gamma = self.limits.limits - self.limits.command_rows @ previous_command
         if self.solver == "unconstrained":
@@ -122,9 +122,9 @@ class MPCLaw(AbstractStateLaw):
             return self._with_soft_limits(H, f, M, gamma, Phi, free_response)
         return QuadraticProgram(H, f, M, gamma)
 
-    def _first_move(self, prediction, known, previous_command):
+    def _first_move(self, prediction, initial, previous_command):
         """First move of the solution, and whether there is one."""
-        program = self.quadratic_program(prediction, known, previous_command)
+        program = self.quadratic_program(prediction, initial, previous_command)
         maps = self.move_maps
         if program.M.shape[0] == 0:
             return maps[0] @ -jnp.linalg.solve(program.H, program.f), jnp.ones((), bool)
@@ -147,9 +147,9 @@ def output_weights(
     horizon: int, outputs: int, horizon_weight, output_weight
 ) -> Float[Array, "horizon output"]:
     """Weights of squared deflections in each period; weights that are None are 1."""
-    by_period = jnp.ones(horizon) if horizon_weight is None else horizon_weight
-    by_output = jnp.ones(outputs) if output_weight is None else output_weight
-    return by_period[:, None] * jnp.broadcast_to(by_output, (outputs,))
+    period_weights = jnp.ones(horizon) if horizon_weight is None else horizon_weight
+    factors = jnp.ones(outputs) if output_weight is None else output_weight
+    return period_weights[:, None] * jnp.broadcast_to(factors, (outputs,))
 
 
 def command_limits(actuators, maps: Float[Array, "period actuator variable"], period):

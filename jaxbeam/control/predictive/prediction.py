@@ -26,15 +26,16 @@ class SampledPlant(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Future outputs Y = F known + Phi variables, eq. (7.4), and the state after the horizon.
+    """Future outputs Y = F initial + Phi variables, eq. (7.4), and the state after the horizon.
 
-    `known` is (x(k), w, u(k-1), 1), with a column of F for each; that of 1 is the response to the
-    loads. `terminal` and `terminal_phi` give x(k+N) - x(k+N-1), then y(k+N), N the horizon.
+    `initial` are the initial conditions (x(k), w, u(k-1), 1), with a column of F for each; that of
+    1 is the response to the loads. `terminal` and `terminal_phi` give x(k+N) - x(k+N-1), then
+    y(k+N), N the horizon.
     """
 
-    F: Float[Array, "horizon output known"]
+    F: Float[Array, "horizon output initial"]
     Phi: Float[Array, "horizon output variable"]
-    terminal: Float[Array, "augmented known"]
+    terminal: Float[Array, "augmented initial"]
     terminal_phi: Float[Array, "augmented variable"]
 
 
@@ -55,12 +56,12 @@ def sampled_plant(
     if delay is None:
         return SampledPlant(transition, input_matrix, load_matrix)
     late_input_matrix = c2d(A, B, period - delay)[1][0]
-    none = jnp.zeros((actuators, transition.shape[0]))
+    no_state = jnp.zeros((actuators, transition.shape[0]))
     return SampledPlant(
         A=jnp.block(
             [
                 [transition, input_matrix - late_input_matrix],
-                [none, jnp.zeros((actuators, actuators))],
+                [no_state, jnp.zeros((actuators, actuators))],
             ]
         ),
         B=jnp.concatenate([late_input_matrix, jnp.eye(actuators)]),
@@ -104,7 +105,7 @@ def move_basis(
     step = jnp.array(
         [[column[i - j] if i >= j else 0.0 for j in range(terms)] for i in range(terms)]
     )
-    _, sequences = jax.lax.scan(lambda now, _: (step @ now, now), first, length=horizon)
+    _, sequences = jax.lax.scan(lambda values, _: (step @ values, values), first, length=horizon)
     return sequences
 
 
@@ -122,21 +123,21 @@ def predict(
     """F and Phi of a plant given over each period of the horizon, eqs (7.5) and (7.10).
 
     `move_maps` map the variables to moves; `load_weights` are in N. For a time-invariant plant F
-    known equals F (x(k) - x(k-1), y(k)) of the thesis.
+    initial equals F (x(k) - x(k-1), y(k)) of the thesis.
     """
     states, actuators = plants.B.shape[-2:]
-    known_count = 2 * states + actuators + 1
-    columns = known_count + move_maps.shape[2]
+    initial_count = 2 * states + actuators + 1
+    columns = initial_count + move_maps.shape[2]
     previous_command = jnp.eye(actuators, columns, k=2 * states)
     commands = previous_command + jnp.pad(
-        jnp.cumsum(move_maps, axis=0), ((0, 0), (0, 0), (known_count, 0))
+        jnp.cumsum(move_maps, axis=0), ((0, 0), (0, 0), (initial_count, 0))
     )
     unexplained = jnp.eye(states, columns, k=states)
 
     def advance(state, period):
         plant, command = period
         next_state = plant.A @ state + plant.B @ command + unexplained
-        next_state = next_state.at[:, known_count - 1].add(plant.E @ load_weights)
+        next_state = next_state.at[:, initial_count - 1].add(plant.E @ load_weights)
         return next_state, next_state
 
     initial_state = jnp.eye(states, columns)
@@ -145,10 +146,10 @@ def predict(
     trajectory = jnp.concatenate([initial_state[None], trajectory])
     terminal = jnp.concatenate([trajectory[-1] - trajectory[-2], outputs[-1]])
     return Prediction(
-        outputs[..., :known_count],
-        outputs[..., known_count:],
-        terminal[:, :known_count],
-        terminal[:, known_count:],
+        outputs[..., :initial_count],
+        outputs[..., initial_count:],
+        terminal[:, :initial_count],
+        terminal[:, initial_count:],
     )
 
 

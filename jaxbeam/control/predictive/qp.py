@@ -69,7 +69,7 @@ def solve_qp(
 
     By the "interior"-point method, or by Hildreth's dual procedure ("hildreth"), eqs (7.22) and
     (7.23) of the thesis, swept until converged. Differentiable (see the module), also under `vmap`.
-    Numerical failures do not raise; they show in the status, which is `UNFINISHED` for numbers that
+    Numerical failures do not raise; the status reports them: it is `UNFINISHED` for numbers that
     are not finite and for an H that is not positive definite.
 
     Raises ValueError for an unknown method.
@@ -233,7 +233,7 @@ def _interior_point(G, h, limits_matter):
 
 
 def _step_length(multipliers, multiplier_change, slack, slack_change, boundary_share):
-    """Step length, at most 1, at which no multipliers or slack loses more than this share."""
+    """Step length, at most 1, at which no multiplier or slack decreases by more than this share."""
     worst = jnp.maximum(jnp.max(-multiplier_change / multipliers), jnp.max(-slack_change / slack))
     return jnp.where(worst > boundary_share, boundary_share / worst, 1.0)
 
@@ -252,8 +252,8 @@ def _hildreth(G, h, limits_matter):
     def sweep(state):
         z, multipliers, _, sweeps = state
 
-        def row(i, now):
-            z, multipliers = now
+        def row(i, iterate):
+            z, multipliers = iterate
             updated = jnp.maximum(0.0, multipliers[i] + G[i] @ z - h[i])
             return z - G[i] * (updated - multipliers[i]), multipliers.at[i].set(updated)
 
