@@ -32,7 +32,7 @@ def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> EventSched
     if controller.period is None:
         return controller_schedule(samples, np.zeros(0), 0.0, [], [], breakpoints)
 
-    def clock(period):
+    def sampling_times(period):
         return np.arange(int(np.floor(end / period * (1 + 1e-12))) + 1) * period
 
     period = float(concrete(controller.period))
@@ -43,9 +43,9 @@ def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> EventSched
     delay = 0.0 if controller.delay is None else float(concrete(controller.delay))
     return controller_schedule(
         samples,
-        clock(period),
+        sampling_times(period),
         delay,
-        [clock(float(p)) for p in sampling_periods],
+        [sampling_times(float(p)) for p in sampling_periods],
         delays,
         breakpoints,
     )

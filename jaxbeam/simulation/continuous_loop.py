@@ -16,7 +16,7 @@ from jaxbeam.model.sensor_signals import filtered_reading
 from jaxbeam.model.state_space import Plant
 from jaxbeam.simulation.command_limits import limit_commands
 
-NEWTON_ITERATIONS = 4  # of Newton's method; one suffices for a linear law
+NEWTON_ITERATIONS = 4  # for the commands of a step; one suffices for a linear law
 
 
 class ContinuousLoop(AbstractInputPolicy):

@@ -1,7 +1,7 @@
 """Integration plan of a case: array shapes and step size, chosen before compilation.
 
-It is made from concrete numbers and is static in the compiled code, which then holds for all
-numbers that suit the plan.
+A plan is computed from concrete numbers and is static in the compiled code, which then holds for
+all numbers for which the plan is valid.
 """
 
 import dataclasses
@@ -245,7 +245,7 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
             _closed_loop_trial_run(case, shapes, schedule, jnp.asarray(min_substeps * 2**halvings))
         )
 
-    # A loop that diverges does so with any step, and its error has no meaning. A stiff law in
+    # A loop that diverges does so with any step, so its error is not defined. A stiff law in
     # continuous time may also overflow because the steps are too long.
     confirming_halvings = 6 if case.controller.period is None else 1
     if np.isnan(response(1)).any() and np.isnan(response(confirming_halvings)).any():
@@ -277,7 +277,8 @@ def _halve_until_converged(
 ) -> tuple[int, float]:
     """Number of halvings of a step until one more changes the response within the tolerance.
 
-    And that change, relative to the largest response. Raises RuntimeError if there is none.
+    Returns it with that change, relative to the largest response. Raises RuntimeError if no number
+    up to `max_halvings` suffices.
     """
     coarse = response(0)
     for halvings in range(max_halvings):

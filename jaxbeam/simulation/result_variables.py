@@ -18,7 +18,7 @@ VARIABLES = {
     "contact_lost_time": (("load",), "s", "time of the first negative contact force"),
     "contact_lost_position": (("load",), "m", "position of the first negative contact force"),
 }
-# Those of a run in a sweep, after the dimensions of the sweep.
+# Variables of a run in a sweep; the dimensions of the sweep come first.
 SWEEP_VARIABLES = VARIABLES | {
     "controller_failures": ((), "1", "steps at which the controller found no solution")
 }

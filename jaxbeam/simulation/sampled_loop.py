@@ -26,9 +26,9 @@ from jaxbeam.simulation.command_limits import limit_commands
 class LoopMemory(NamedTuple):
     """Memory of a sampled loop, batch axis last.
 
-    State of the law, command in force, states of the digital filters, readings (newest first) that
-    are not available yet or the latest, commands (newest first) that have not begun yet, and the
-    number of samples at which the law found no solution.
+    State of the law, present command, states of the digital filters, latest readings and those not
+    available yet (newest first), commands that have not begun yet (newest first), and the number of
+    samples at which the law found no solution.
     """
 
     law_state: Any

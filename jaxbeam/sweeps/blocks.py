@@ -105,7 +105,7 @@ class Runner:
         return list(np.resize(np.arange(count), (self.block_count, self.batches_per_block)))
 
     def _compile_programs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compile in parallel what step sizes need; entry and exit times (path, load) in s."""
+        """Compile the programs for step sizes; entry and exit times (path, load) in s."""
         program = self.program()
         first_values = self.batches.shared_values[self._model_groups()[0]]
         compilations = [

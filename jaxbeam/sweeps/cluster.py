@@ -2,7 +2,7 @@
 
 Only the path of the store and block numbers are sent. A worker makes the runner from the
 specification and step sizes in the store, and writes each block as a chunk of its own. Dask gives
-unfinished blocks of workers that die to others, which skip the blocks written already.
+unfinished blocks of workers that die to other workers, which skip the blocks written already.
 """
 
 import threading
@@ -60,7 +60,7 @@ def compute_blocks(
             yield from future.result()
     except KilledWorker:
         raise RuntimeError(
-            "workers keep dying (too little memory for each?); what they finished is kept:"
+            "workers keep dying (too little memory for each?); finished blocks are kept:"
             " mend this, then resume"
         ) from None
     finally:

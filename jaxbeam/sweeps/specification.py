@@ -22,7 +22,7 @@ from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
 
-# Positions and entries of lists are valid or not together.
+# Positions and list entries, whose values are valid only in combination.
 JOINTLY_CHECKED = re.compile(
     r"beam\.length|(supports|actuators|sensors)\.\d+\.(position|start|end)|.*\.\d+"
 )
@@ -30,7 +30,7 @@ JOINTLY_CHECKED = re.compile(
 PRECISIONS = ("double", "single")
 
 # Numbers that determine the schedule of a closed loop.
-CLOCK_ADDRESS = re.compile(
+SCHEDULE_ADDRESS = re.compile(
     r"run\.(duration|sample_rate)|controller\.(period|delay|times\.\d+)"
     r"|sensors\.\d+\.(sampling_period|delay)"
 )
@@ -193,7 +193,7 @@ def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.nda
         ) from None
     if values.ndim != 1 or values.size == 0:
         raise ValueError(f"{address} takes a list of values, not one of shape {values.shape}")
-    if case.controller is not None and CLOCK_ADDRESS.fullmatch(address):
+    if case.controller is not None and SCHEDULE_ADDRESS.fullmatch(address):
         raise ValueError(
             f"{address} determines the schedule, which all runs with a controller share:"
             " make a sweep for each of its values"

@@ -94,24 +94,24 @@ def _interpolate_conservatively(
     values: Float[np.ndarray, " sample"],
 ) -> Float[np.ndarray, " path"]:
     """Smaller of the values at the two next sampled rates; the end value outside their range."""
-    unique, which = np.unique(sampled_rates, return_inverse=True)
-    least = np.full(unique.size, np.inf)
-    np.minimum.at(least, which, values)
+    unique, group = np.unique(sampled_rates, return_inverse=True)
+    smallest = np.full(unique.size, np.inf)
+    np.minimum.at(smallest, group, values)
     above = np.searchsorted(unique, crossing_rates, side="left")
     below = np.searchsorted(unique, crossing_rates, side="right") - 1
-    return np.minimum(*(least[np.clip(side, 0, unique.size - 1)] for side in (below, above)))
+    return np.minimum(*(smallest[np.clip(side, 0, unique.size - 1)] for side in (below, above)))
 
 
 def _relative_changes(coarse, fine):
     """Largest relative change of peaks in each batch; NaN where all runs fail."""
-    works = np.isfinite(fine)
-    size = np.abs(np.where(works, fine, 0.0))
+    finite = np.isfinite(fine)
+    size = np.abs(np.where(finite, fine, 0.0))
     size = np.maximum(size, NEGLIGIBLE_PEAK * size.max(axis=-1, keepdims=True))
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         change = np.abs(coarse - fine) / size
     change = np.where(np.isfinite(coarse), change, np.inf)
-    change = np.where(works & (size > 0), change, 0.0).max(axis=(1, 2), initial=0.0)
-    return np.where(works.any(axis=(1, 2)), change, np.nan)
+    change = np.where(finite & (size > 0), change, 0.0).max(axis=(1, 2), initial=0.0)
+    return np.where(finite.any(axis=(1, 2)), change, np.nan)
 
 
 def choose_step_sizes(
@@ -131,17 +131,17 @@ def choose_step_sizes(
     """
     target_error = tolerance / SAFETY_FACTOR
     chosen = log_spaced_sample(crossing_rates, count)
-    good_steps, works = _search_step_sizes(
+    valid_steps, succeeds = _search_step_sizes(
         peaks, chosen, initial_steps[chosen], max_steps[chosen], target_error, map_function
     )
-    if not np.all(good_steps > 0):
+    if not np.all(valid_steps > 0):
         raise _no_step_error(tolerance)
-    if not works.any():
+    if not succeeds.any():
         return np.minimum(initial_steps, max_steps), 0.0
-    chosen, good_steps = chosen[works], good_steps[works]
+    chosen, valid_steps = chosen[succeeds], valid_steps[succeeds]
     start = np.minimum(initial_steps, max_steps)
     step_ratio = _interpolate_conservatively(
-        crossing_rates, crossing_rates[chosen], good_steps / start[chosen]
+        crossing_rates, crossing_rates[chosen], valid_steps / start[chosen]
     )  # to the initial step
     steps = np.minimum(start * step_ratio, max_steps)
     sample = stratified_sample(
@@ -172,30 +172,41 @@ def _search_step_sizes(
     steps = np.minimum(initial_steps, max_steps)
     # Slow crossings take longest, and stability limits their steps, not the error.
     settled = initial_steps >= LIMIT_RATIO * max_steps
-    good, bad = np.where(settled, max_steps, 0.0), np.full(batches.size, np.inf)
+    longest_valid, shortest_invalid = (
+        np.where(settled, max_steps, 0.0),
+        np.full(batches.size, np.inf),
+    )
     error = np.zeros(batches.size)
-    change = np.ones(batches.size)
+    step_factor = np.ones(batches.size)
     for _ in range(0 if settled.all() else MAX_ROUNDS):
         # The compiled program has a fixed size: the fastest batch, the cheapest, is its padding.
         rows = np.where(settled, batches.size - 1, np.arange(batches.size))
         measured = step_errors(peaks, batches[rows], steps[rows], map_function)
         error = np.where(settled, error, measured)
-        met = ~(error > tolerance)
-        good = np.where(met, np.maximum(good, steps), good)
-        bad = np.where(met, bad, np.minimum(bad, steps))
+        meets_tolerance = ~(error > tolerance)
+        longest_valid = np.where(meets_tolerance, np.maximum(longest_valid, steps), longest_valid)
+        shortest_invalid = np.where(
+            meets_tolerance, shortest_invalid, np.minimum(shortest_invalid, steps)
+        )
         with np.errstate(divide="ignore"):
-            change = np.clip(
+            step_factor = np.clip(
                 (TARGET_ERROR * tolerance / error) ** (1 / CONVERGENCE_ORDER), 0.5, 1.5
             )
         # A step is settled if its error is useful, a longer one fails, or it is the longest.
-        limit_known = ~(error < tolerance * MIN_USEFUL_ERROR) | (bad < np.inf) | (good >= max_steps)
-        settled = (good > 0) & limit_known
+        limit_known = (
+            ~(error < tolerance * MIN_USEFUL_ERROR)
+            | (shortest_invalid < np.inf)
+            | (longest_valid >= max_steps)
+        )
+        settled = (longest_valid > 0) & limit_known
         if settled.all():
             break
-        steps = np.where(settled, good, np.minimum(steps * change, max_steps))
+        steps = np.where(settled, longest_valid, np.minimum(steps * step_factor, max_steps))
     # The last extrapolation is not measured here; the sample checks it.
-    extrapolation = np.where((good == steps) & (bad == np.inf), np.fmax(change, 1.0), 1.0)
-    return good * extrapolation, ~np.isnan(error)
+    extrapolation = np.where(
+        (longest_valid == steps) & (shortest_invalid == np.inf), np.fmax(step_factor, 1.0), 1.0
+    )
+    return longest_valid * extrapolation, ~np.isnan(error)
 
 
 def _no_step_error(tolerance: float) -> RuntimeError:

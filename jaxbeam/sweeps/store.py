@@ -87,7 +87,7 @@ class ZarrStore(BlockStore):
             for folder in self._path.iterdir():
                 if folder.is_dir() and folder.name != BLOCKS_GROUP:
                     shutil.rmtree(folder)
-            # Strings of fixed length are no settled part of the format, those of any length are.
+            # Zarr specifies strings of variable length, not of fixed length.
             labels = dataset["sensor"].values.astype(object)
             dataset.assign_coords(sensor=labels).to_zarr(
                 self._path,
@@ -128,8 +128,8 @@ class ZarrStore(BlockStore):
     def _all_readable(self) -> bool:
         """Whether all blocks can be read: a fast check before `_is_intact`."""
         try:
-            whole = all(_is_complete(self._blocks[name]) for name in self._names())
-            return whole and bool(self.collect())
+            complete = all(_is_complete(self._blocks[name]) for name in self._names())
+            return complete and bool(self.collect())
         except ValueError:
             return False
 
