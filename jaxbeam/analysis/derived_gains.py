@@ -96,13 +96,13 @@ def best_gains(
     uncontrolled_plan = integration_plan(
         _case_with(uncontrolled_case, None, max(masses)), None, RUN_TOLERANCE
     )
-    found = []
+    best = []
     for mass in masses:
         largest = (
             max_gain if margin is None else _largest_gain_with_margin(case, mass, max_gain, margin)
         )
         gain, peak = _minimise_peak(lambda g, m=mass: _peak(_case_with(case, g, m), plan), largest)
-        found.append(
+        best.append(
             BestGain(
                 mass,
                 gain,
@@ -110,7 +110,7 @@ def best_gains(
                 _peak(_case_with(uncontrolled_case, None, mass), uncontrolled_plan),
             )
         )
-    return found
+    return best
 
 
 def scheduled_controller(

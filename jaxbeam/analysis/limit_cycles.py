@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.simulation.record import Record
 
-MIN_SWING = 0.2  # of the range of a history: smaller reversals are no turning points
-MIN_EXTRA_TURNS = 4  # turning points more than without control: two cycles
+MIN_REVERSAL = 0.2  # of the range of a history; smaller reversals are no turning points
+MIN_EXTRA_TURNS = 4  # turning points beyond those without control: two cycles
 
 
 class CommandOscillation(NamedTuple):
@@ -66,20 +66,20 @@ def count_oscillations(
 
 
 def turning_points(history: Float[np.ndarray, " time"]) -> list[int]:
-    """Indices of extremes of a history, followed by a reversal of more than MIN_SWING of its range.
+    """Indices of extremes of a history before reversals of more than MIN_REVERSAL of its range.
 
     Empty for a history that is constant or not finite.
     """
     if not np.all(np.isfinite(history)) or np.ptp(history) == 0:
         return []
-    min_swing, turns, extreme, direction = MIN_SWING * np.ptp(history), [], 0, 0.0
+    min_reversal, turns, extreme, direction = MIN_REVERSAL * np.ptp(history), [], 0, 0.0
     for k, value in enumerate(history):
         change = value - history[extreme]
-        if direction == 0:  # no change beyond MIN_SWING so far
-            if abs(change) > min_swing:
+        if direction == 0:  # no change beyond MIN_REVERSAL so far
+            if abs(change) > min_reversal:
                 direction, extreme = np.sign(change), k
         elif direction * change >= 0:
             extreme = k
-        elif abs(change) > min_swing:
+        elif abs(change) > min_reversal:
             turns, extreme, direction = [*turns, extreme], k, -direction
     return turns

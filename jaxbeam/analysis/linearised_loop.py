@@ -130,8 +130,8 @@ def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoo
     start, rebuild = loop.rest_state(timing)
 
     def sampling_step(state, given):
-        after, wanted = loop.sampling_step(timing, rebuild(state), t, given)
-        return ravel_pytree(after)[0], wanted
+        after, command = loop.sampling_step(timing, rebuild(state), t, given)
+        return ravel_pytree(after)[0], command
 
     equilibrium = _equilibrium(lambda state: sampling_step(state, None)[0] - state, start)
     command_at_equilibrium = sampling_step(equilibrium, None)[1]
@@ -146,6 +146,6 @@ def _equilibrium(change, start):
         step = jnp.linalg.lstsq(jax.jacfwd(change)(state), -change(state))[0]
         return state + step, None
 
-    found = jax.lax.scan(newton_step, start, length=NEWTON_ITERATIONS)[0]
+    state = jax.lax.scan(newton_step, start, length=NEWTON_ITERATIONS)[0]
     # Derivatives of the poles by the equilibrium, non-zero for a nonlinear law, are left out.
-    return jax.lax.stop_gradient(jnp.where(jnp.all(jnp.isfinite(found)), found, start))
+    return jax.lax.stop_gradient(jnp.where(jnp.all(jnp.isfinite(state)), state, start))

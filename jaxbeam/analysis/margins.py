@@ -92,16 +92,16 @@ def _transfer_function(A, column, row):
         residues = (row @ vectors) * np.linalg.solve(vectors, column.astype(complex))
         return values, lambda s: (residues / (s[:, None] - values)).sum(axis=1)
     # Delays of several periods make A defective: Schur form and back substitution.
-    found = scipy.linalg.schur(A, output="complex")
-    triangle, basis = np.asarray(found[0]), np.asarray(found[1])
+    schur_form = scipy.linalg.schur(A, output="complex")
+    triangle, basis = np.asarray(schur_form[0]), np.asarray(schur_form[1])
     row, column = row @ basis, basis.conj().T @ column
 
     def transfer(s):
-        found = np.zeros((column.size, s.size), complex)
+        solution = np.zeros((column.size, s.size), complex)
         for i in reversed(range(column.size)):
-            rest = column[i] + triangle[i, i + 1 :] @ found[i + 1 :]
-            found[i] = rest / (s - triangle[i, i])
-        return row @ found
+            rest = column[i] + triangle[i, i + 1 :] @ solution[i + 1 :]
+            solution[i] = rest / (s - triangle[i, i])
+        return row @ solution
 
     return np.diag(triangle), transfer
 

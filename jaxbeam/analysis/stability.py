@@ -194,9 +194,9 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
             A, input_matrix, _, command = loop.continuous_dynamics(t)
             return A + input_matrix @ jax.jacfwd(command)(jnp.zeros(A.shape[0]))
 
-        def advance(whole, t):
-            whole = propagate(closed_matrix, t[0], t[1] - t[0], substeps, whole)
-            return whole, whole
+        def advance(transition, t):
+            transition = propagate(closed_matrix, t[0], t[1] - t[0], substeps, transition)
+            return transition, transition
 
         start = jnp.eye(closed_matrix(times[0]).shape[0])
         spans = jnp.stack([times[:-1], times[1:]], axis=1)
@@ -210,14 +210,14 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
             0 * loop.augmented_plant.loads.weight,
         )
 
-        def advance_sample(whole, t):
+        def advance_sample(transition, t):
             def after(state):
                 return ravel_pytree(
                     unweighted.sampling_step(timing, rebuild(state), t, None, substeps)[0]
                 )[0]
 
-            whole = jax.jacfwd(after)(rest_state) @ whole
-            return whole, whole
+            transition = jax.jacfwd(after)(rest_state) @ transition
+            return transition, transition
 
         start = jnp.eye(rest_state.shape[0])
         transitions = jax.lax.scan(advance_sample, start, times[:-1])[1]

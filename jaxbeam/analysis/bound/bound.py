@@ -135,7 +135,7 @@ def bound(
 
 
 def least_achievable_peak(case: Case, positions: ArrayLike | None, period: float) -> float:
-    """Peak (m) of `bound` alone, in less time. Raises as `bound`."""
+    """Peak (m) of `bound`, without the run for the uncontrolled peak. Raises as `bound`."""
     return _bound_without_baseline(case, positions, period, None).peak
 
 

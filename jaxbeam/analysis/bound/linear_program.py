@@ -66,9 +66,8 @@ class _LinearProgram:
         self.low, self.high, self.max_change = (
             part / self.command_scale for part in (low, high, max_change)
         )
-        self.active_rows = np.zeros(
-            (3, 0), int
-        )  # time index, position index, sign of the deflection
+        # Rows so far: time index, position index, sign of the deflection.
+        self.generated_rows = np.zeros((3, 0), int)
 
     def add_violated_rows(self, commands, peak) -> bool:
         """Add rows at local maxima along the beam where the deflection exceeds a peak.
@@ -78,16 +77,16 @@ class _LinearProgram:
         deflection = self.influence.deflection(commands) / self.deflection_scale
         size = np.abs(deflection)
         padded = np.pad(size, ((0, 0), (1, 1)), constant_values=-1.0)
-        highest = (size >= padded[:, :-2]) & (size > padded[:, 2:])
-        time_index, position_index = np.nonzero(highest & (size > peak + VIOLATION_TOLERANCE))
-        new = np.stack(
+        local_maxima = (size >= padded[:, :-2]) & (size > padded[:, 2:])
+        time_index, position_index = np.nonzero(local_maxima & (size > peak + VIOLATION_TOLERANCE))
+        new_rows = np.stack(
             [
                 time_index,
                 position_index,
                 np.sign(deflection[time_index, position_index]).astype(int),
             ]
         )
-        self.active_rows = np.concatenate([self.active_rows, new], axis=1)
+        self.generated_rows = np.concatenate([self.generated_rows, new_rows], axis=1)
         return time_index.size > 0
 
     def solve(self, activity_penalty: float):
@@ -99,29 +98,33 @@ class _LinearProgram:
         count = holds * actuators
         penalties = [0.0, activity_penalty, activity_penalty / holds, 1.0]
         cost = np.repeat(penalties, [count, count + actuators, count, 1])
-        matrix, right = self._constraints()
+        matrix, right_side = self._constraints()
         options = {
             "primal_feasibility_tolerance": LP_TOLERANCE,
             "dual_feasibility_tolerance": LP_TOLERANCE,
         }
         bounds = self._bounds()
         for method in HIGHS_METHODS:
-            best = scipy.optimize.linprog(
-                cost, matrix, right, bounds=bounds, method=method, options=options
+            solution = scipy.optimize.linprog(
+                cost, matrix, right_side, bounds=bounds, method=method, options=options
             )
-            if best.status in (SOLVED, INFEASIBLE):
+            if solution.status in (SOLVED, INFEASIBLE):
                 break
-        if best.status == INFEASIBLE:
+        if solution.status == INFEASIBLE:
             raise ValueError(
                 "no commands, starting from zero, meet limits and rates of the actuators"
             )
-        if best.status != SOLVED:
-            raise RuntimeError(f"the linear program of the bound failed: {best.message}")
+        if solution.status != SOLVED:
+            raise RuntimeError(f"the linear program of the bound failed: {solution.message}")
         multipliers = np.zeros((self.influence.times.size, self.influence.deflection_rows.shape[0]))
-        when, where, sign = self.active_rows
-        row_multipliers = best.ineqlin.marginals[right.size - sign.size :]
+        when, where, sign = self.generated_rows
+        row_multipliers = solution.ineqlin.marginals[right_side.size - sign.size :]
         np.add.at(multipliers, (when, where), -sign * row_multipliers)
-        return best.x[-1], best.x[:count].reshape(self.shape) * self.command_scale, multipliers
+        return (
+            solution.x[-1],
+            solution.x[:count].reshape(self.shape) * self.command_scale,
+            multipliers,
+        )
 
     def _constraints(self):
         """Rows for changes and absolute values of commands, then for deflections; right side."""
@@ -131,7 +134,7 @@ class _LinearProgram:
         difference = sp.eye(holds + 1, holds) - sp.eye(holds + 1, holds, k=-1)
         difference, identity = sp.kron(difference, sp.eye(actuators)), sp.eye(holds * actuators)
         change = sp.eye(difference.shape[0])
-        when, where, sign = self.active_rows
+        when, where, sign = self.generated_rows
         rows = self.influence.deflection_rows[where] * sign[:, None] / self.deflection_scale
         response = (
             np.einsum("im,imka->ika", rows, self.influence.response[when]) * self.command_scale
