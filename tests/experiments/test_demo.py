@@ -26,8 +26,8 @@ def test_identification_sweep_and_tuning(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tuning, "identify", identify_optimised)
     demo.run(tmp_path / "out", json=True)
     assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN
-    found = json.loads(capsys.readouterr().out)
-    numbers, truth = found["numbers"], found["truth"]
+    summary = json.loads(capsys.readouterr().out)
+    numbers, truth = summary["numbers"], summary["truth"]
     assert numbers.keys() == truth.keys()
     intervals = {name: number["interval_95"] for name, number in numbers.items()}
     hits = [low <= truth[name] <= high for name, (low, high) in intervals.items()]
@@ -36,7 +36,7 @@ def test_identification_sweep_and_tuning(tmp_path, capsys, monkeypatch):
         assert not results.failed.any()
         sizes = {**dict.fromkeys(demo.SWEPT_VALUES, 45), "sensor": 3}
         assert results.peak_deflection.sizes == sizes
-    runs = found["tuned"]["runs"]["held out"]
+    runs = summary["tuned"]["runs"]["held out"]
     peaks = ("least_peak", "peak_after", "peak_before", "uncontrolled_peak")
     least, after, before, free = (np.array(runs[name]) for name in peaks)
     assert np.all(least < after) and np.all(before < free)

@@ -1,4 +1,4 @@
-"""The two integrators of one model against each other."""
+"""The integrator with fixed steps against the adaptive reference."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,7 +49,7 @@ SHAKER_SUSPENSION = jb.replace(
 
 @pytest.fixture(scope="module")
 def plans():
-    """A plan for each of the two structures, so that each is compiled once."""
+    """Integration plans by number of loads, so that each structure is compiled once."""
     return {len(case.loads): integration_plan(case, TIMES, 1e-10) for case in _STRUCTURES}
 
 
@@ -61,9 +61,9 @@ _STRUCTURES = [TWO_SPANS_AND_A_STREAM, SHAKER_SUSPENSION]
     "case", [TWO_SPANS_AND_A_STREAM, TWO_SPANS_AND_BRAKING, DAMPED_SUPPORT, SHAKER_SUSPENSION]
 )
 def test_both_integrators_agree(case, plans):
-    fast = jb.simulate(case, TIMES, plans[len(case.loads)])
-    slow = simulate_adaptive(case, TIMES)
+    record = jb.simulate(case, TIMES, plans[len(case.loads)])
+    reference = simulate_adaptive(case, TIMES)
     for name, tolerance in {"deflection": 1e-9, "rates": 1e-8, "contact_force": 1e-8}.items():
-        expected = np.asarray(getattr(slow, name))
-        error = np.max(np.abs(getattr(fast, name) - expected)) / np.max(np.abs(expected))
+        expected = np.asarray(getattr(reference, name))
+        error = np.max(np.abs(getattr(record, name) - expected)) / np.max(np.abs(expected))
         assert error < tolerance, name

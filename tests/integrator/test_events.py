@@ -14,55 +14,65 @@ MILLI = 1e-3
 @given(
     period=st.integers(1, 40),
     delay=st.integers(0, 90),
-    clock=st.integers(1, 40),
-    late=st.integers(0, 90),
+    sensor_period=st.integers(1, 40),
+    sensor_delay=st.integers(0, 90),
     spacing=st.integers(1, 50),
 )
-def test_commands_and_readings_come_when_they_are_due(period, delay, clock, late, spacing):
-    """Followed event by event with plain lists, in whole milliseconds."""
+def test_commands_and_readings_come_when_they_are_due(
+    period, delay, sensor_period, sensor_delay, spacing
+):
+    """Against a replay event by event with plain lists, in whole milliseconds."""
     end = 200 // spacing * spacing
     samples = MILLI * np.arange(0, end + 1, spacing)
-    ticks, clocks = MILLI * np.arange(0, end + 1, period), MILLI * np.arange(0, end + 1, clock)
+    control_instants, sensor_instants = (
+        MILLI * np.arange(0, end + 1, period),
+        MILLI * np.arange(0, end + 1, sensor_period),
+    )
     breakpoints = np.array([0.0777])
     found = controller_schedule(
-        samples, ticks, MILLI * delay, [clocks], [MILLI * late], breakpoints
+        samples,
+        control_instants,
+        MILLI * delay,
+        [sensor_instants],
+        [MILLI * sensor_delay],
+        breakpoints,
     )
     times = np.asarray(found.times)
     assert np.all(np.diff(times) > 0) and times[0] == 0 and times[-1] == samples[-1]
     assert_allclose(times[np.asarray(found.sample_events)], samples, rtol=0, atol=0)
     assert (samples[-1] >= 0.0777) == np.any(np.abs(times - 0.0777) < 1e-12)
-    gaps = np.asarray(found.lengths)[np.asarray(found.length_index)]
-    assert_allclose(gaps, np.diff(times), rtol=0, atol=1e-10)
+    lengths = np.asarray(found.lengths)[np.asarray(found.length_index)]
+    assert_allclose(lengths, np.diff(times), rtol=0, atol=1e-10)
 
-    made, seen = [], [("rest", -1)] * (found.max_age + 1)
+    commands, readings = [], [("rest", -1)] * (found.max_age + 1)
     for event, time in enumerate(times):
         now = time / MILLI
         number = int(found.reading[event, 0])
         if number >= 0:
-            assert_allclose(number * clock - late, now, atol=1e-6)
-            seen.insert(0, ("read", number))
+            assert_allclose(number * sensor_period - sensor_delay, now, atol=1e-6)
+            readings.insert(0, ("read", number))
         if found.control_sample[event] >= 0:
             assert_allclose(int(found.control_sample[event]) * period, now, atol=1e-6)
-            made.insert(0, int(found.control_sample[event]))
-        arrived = int(np.floor(now / clock + 1e-6))
-        expected = ("read", arrived) if arrived * clock - late >= 0 else ("rest", -1)
+            commands.insert(0, int(found.control_sample[event]))
+        newest = int(np.floor(now / sensor_period + 1e-6))
+        expected = ("read", newest) if newest * sensor_period - sensor_delay >= 0 else ("rest", -1)
         assert found.reading_age[event, 0] <= found.max_age
-        assert seen[int(found.reading_age[event, 0])] == expected
-        begins = int(found.command_age[event])
-        if begins >= 0:
-            assert begins <= found.max_waiting
-            assert_allclose(made[begins] * period + delay, now, atol=1e-6)
-    assert np.sum(np.asarray(found.control_sample) >= 0) == ticks.size
+        assert readings[int(found.reading_age[event, 0])] == expected
+        command_age = int(found.command_age[event])
+        if command_age >= 0:
+            assert command_age <= found.max_waiting
+            assert_allclose(commands[command_age] * period + delay, now, atol=1e-6)
+    assert np.sum(np.asarray(found.control_sample) >= 0) == control_instants.size
     assert np.sum(np.asarray(found.command_age) >= 0) == np.sum(
-        ticks + MILLI * delay <= end * MILLI + 1e-9
+        control_instants + MILLI * delay <= end * MILLI + 1e-9
     )
 
 
 def test_schedules_of_one_shape_are_stacked():
-    two = [
+    schedules = [
         sample_schedule(jnp.linspace(0, end, 5), even) for end, even in ((1.0, True), (2.0, False))
     ]
-    whole = stack_schedules(two)
-    assert whole.times.shape == (2, 5) and whole.lengths.shape == (2, 4)
+    stacked = stack_schedules(schedules)
+    assert stacked.times.shape == (2, 5) and stacked.lengths.shape == (2, 4)
     with pytest.raises(ValueError, match="differ in the number of events or samples"):
-        stack_schedules([two[0], sample_schedule(jnp.linspace(0, 1, 4), True)])
+        stack_schedules([schedules[0], sample_schedule(jnp.linspace(0, 1, 4), True)])

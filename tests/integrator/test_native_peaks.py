@@ -61,7 +61,7 @@ STREAM = jb.Case(
     run=jb.Run(1.5),
 )
 # A heavy mass at high speed: contact is lost, and some runs diverge.
-WILD = jb.Case(
+LOST_CONTACT = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, modes=6, damping_ratio=0.0),
     sensors=SENSORS,
     loads=[jb.MovingMass(mass=5.0, speed=20.0)],
@@ -94,7 +94,7 @@ def folder(tmp_path_factory):
         yield native_peaks.LIBRARY.library_path().parent
 
 
-def sweep_with_and_without(case, over):
+def sweep_by_c_and_xla(case, over):
     """Results of a sweep with the C integrator, and without."""
     native = jb.sweep(case, over, progress=False)
     with pytest.MonkeyPatch.context() as patch:
@@ -109,11 +109,11 @@ def sweep_with_and_without(case, over):
         pytest.param(COUPLED, GRID | {"beam.flexural_rigidity": [9.0, 12.0]}, id="coupled"),
         pytest.param(STREAM, FEW, id="stream"),
         pytest.param(LONG, {"loads.0.mass": [0.5, 2.0], "sensors.1.position": [1.8]}, id="long"),
-        pytest.param(WILD, {"loads.0.mass": [0.5, 5.0, 60.0]}, id="wild"),
+        pytest.param(LOST_CONTACT, {"loads.0.mass": [0.5, 5.0, 60.0]}, id="lost contact"),
     ],
 )
 def test_results_equal_those_of_xla(case, over):
-    native, plain = sweep_with_and_without(case, over)
+    native, plain = sweep_by_c_and_xla(case, over)
     assert_allclose(native.peak_deflection, plain.peak_deflection, rtol=1e-11)
     assert_allclose(native.lowest_contact_force, plain.lowest_contact_force, rtol=1e-9, atol=1e-9)
     assert_allclose(native.contact_lost_time, plain.contact_lost_time, rtol=1e-9)
@@ -131,7 +131,7 @@ def test_a_beam_without_loads_stays_at_rest():
     assert np.all(results.peak_deflection == 0) and not results.failed.any()
 
 
-NARROW = """
+NARROW_SCRIPT = """
 import sys
 import jaxbeam as jb
 from jaxbeam.integrator import native_peaks
@@ -149,7 +149,7 @@ def test_narrower_registers_give_equal_results(without, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CC", f"{native_library.find_compiler()} -mno-{without}")
     path = tmp_path / "found.nc"
-    subprocess.run([sys.executable, "-c", NARROW, str(path)], check=True, cwd=ROOT)
+    subprocess.run([sys.executable, "-c", NARROW_SCRIPT, str(path)], check=True, cwd=ROOT)
     monkeypatch.setattr(native_peaks, "available", lambda: False)
     plain = jb.sweep(COUPLED, GRID, progress=False).peak_deflection
     with xarray.open_dataset(path, engine="h5netcdf") as found:
@@ -158,8 +158,10 @@ def test_narrower_registers_give_equal_results(without, tmp_path, monkeypatch):
 
 
 def test_one_of_these_cases_loses_contact():
-    lost = jb.sweep(WILD, {"loads.0.mass": [0.5, 5.0]}, progress=False).contact_lost_time
-    assert np.isfinite(lost).any()
+    contact_lost_time = jb.sweep(
+        LOST_CONTACT, {"loads.0.mass": [0.5, 5.0]}, progress=False
+    ).contact_lost_time
+    assert np.isfinite(contact_lost_time).any()
 
 
 def peaks_of_mass(case, native, max_step=1e-3):
@@ -234,8 +236,8 @@ def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pytest.raises(SystemExit, match="0"):
         main(["native", "--json"])
-    answer = json.loads(capsys.readouterr().out)
-    assert answer == {"path": str(native_peaks.LIBRARY.library_path()), "compiled": True}
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {"path": str(native_peaks.LIBRARY.library_path()), "compiled": True}
     assert native_peaks.LIBRARY.library_path().exists() and native_peaks.available()
     with pytest.raises(SystemExit, match="0"):
         main(["native", "--remove"])

@@ -1,4 +1,4 @@
-"""Steps without commands: their own derivative rule against that of every operation."""
+"""Steps without commands: their custom derivative rule against that of each operation."""
 
 import jax
 import jax.numpy as jnp
@@ -38,51 +38,51 @@ def random_steps(blocks: int, side: int, rows: int):
     )
     on = active[:, None, None]
     loads = tuple(on * rng.uniform(0.1, 1.0, (STEPS, rows, BATCH_SIZE)) for _ in range(2))
-    given = matrices, *loads, rng.normal(size=(states, BATCH_SIZE))
+    arguments = matrices, *loads, rng.normal(size=(states, BATCH_SIZE))
 
-    def changed(leaf):
+    def tangent(leaf):
         if leaf.dtype == bool:
             return np.zeros(leaf.shape, jax.dtypes.float0)
-        # A step without a load stays without.
-        here = on if leaf.shape == loads[0].shape else 1.0
-        return jnp.asarray(here * rng.normal(size=leaf.shape))
+        # Tangents do not add a load to a step without one.
+        factor = on if leaf.shape == loads[0].shape else 1.0
+        return jnp.asarray(factor * rng.normal(size=leaf.shape))
 
-    given = jax.tree.map(jnp.asarray, given)
-    return given, jax.tree.map(changed, given)
+    arguments = jax.tree.map(jnp.asarray, arguments)
+    return arguments, jax.tree.map(tangent, arguments)
 
 
-def one_by_one(matrices, inertia, weight, state):
+def advance_by_operations(matrices, inertia, weight, state):
     """The same steps, differentiated operation by operation."""
     after, (states, forces) = jax.lax.scan(advance, state, (matrices, inertia, weight, None))
     return after, states, forces
 
 
-# One block a mode, more terms than are spelt out, and a model whose modes are coupled.
+# One block for each mode, more terms than are unrolled, and coupled modes.
 SHAPES = [(3, 2, 6), (8, 2, 12), (1, 7, 6)]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_tangents_of_steps_are_those_of_every_operation(shape):
-    given, changes = random_steps(*shape)
-    found = jax.jvp(advance_unforced, given, changes)
-    wanted = jax.jvp(one_by_one, given, changes)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+    arguments, tangents = random_steps(*shape)
+    found = jax.jvp(advance_unforced, arguments, tangents)
+    expected = jax.jvp(advance_by_operations, arguments, tangents)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(b).max())
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_tangents_of_steps_are_differences(shape):
-    given, changes = random_steps(*shape)
+    arguments, tangents = random_steps(*shape)
     size = 1e-6
 
-    def moved(by):
+    def result_after(by):
         def shifted(a, b):
             return a if a.dtype == bool else a + by * b
 
-        return advance_unforced(*jax.tree.map(shifted, given, changes))
+        return advance_unforced(*jax.tree.map(shifted, arguments, tangents))
 
-    found = jax.jvp(advance_unforced, given, changes)[1]
-    for a, up, down in zip(found, moved(size), moved(-size), strict=True):
+    found = jax.jvp(advance_unforced, arguments, tangents)[1]
+    for a, up, down in zip(found, result_after(size), result_after(-size), strict=True):
         change = (up - down) / (2 * size)
         np.testing.assert_allclose(a, change, rtol=1e-6, atol=1e-7 * np.abs(change).max())
 
@@ -92,26 +92,30 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(shape):
     """First and second derivatives along a direction are the same in both modes."""
     (matrices, *rest), (matrix_tangents, *rest_tangents) = random_steps(*shape)
     found = advance_unforced(matrices, *rest)
-    wanted = [np.random.default_rng(7).normal(size=part.shape) for part in found]
+    targets = [np.random.default_rng(7).normal(size=part.shape) for part in found]
 
     names = "contact_response", "contact_compliance", "transition", "force_response"
 
     def misfit(*parts):
         parts, rest = parts[: len(names)], parts[len(names) :]
-        moved = StepMatrices(*parts, None, None, None, matrices.loaded)
-        found = advance_unforced(moved, *rest)
-        return sum(jnp.sum((a - b) ** 2) for a, b in zip(found, wanted, strict=True))
+        varied = StepMatrices(*parts, None, None, None, matrices.loaded)
+        found = advance_unforced(varied, *rest)
+        return sum(jnp.sum((a - b) ** 2) for a, b in zip(found, targets, strict=True))
 
-    given = (*(getattr(matrices, name) for name in names), *rest)
-    changes = (*(getattr(matrix_tangents, name) for name in names), *rest_tangents)
-    slope = jax.grad(misfit, argnums=tuple(range(len(given))))
+    arguments = (*(getattr(matrices, name) for name in names), *rest)
+    tangents = (*(getattr(matrix_tangents, name) for name in names), *rest_tangents)
+    gradient = jax.grad(misfit, argnums=tuple(range(len(arguments))))
 
-    def along(*given):
-        return sum(jnp.sum(a * b) for a, b in zip(slope(*given), changes, strict=True))
+    def directional_derivative(*arguments):
+        return sum(jnp.sum(a * b) for a, b in zip(gradient(*arguments), tangents, strict=True))
 
-    forward, bend = jax.jvp(lambda *g: jax.jvp(misfit, g, changes)[1], given, changes)
-    np.testing.assert_allclose(along(*given), forward, rtol=1e-10)
-    np.testing.assert_allclose(jax.jvp(along, given, changes)[1], bend, rtol=1e-9)
+    forward, second_derivative = jax.jvp(
+        lambda *g: jax.jvp(misfit, g, tangents)[1], arguments, tangents
+    )
+    np.testing.assert_allclose(directional_derivative(*arguments), forward, rtol=1e-10)
+    np.testing.assert_allclose(
+        jax.jvp(directional_derivative, arguments, tangents)[1], second_derivative, rtol=1e-9
+    )
 
 
 def test_reverse_mode_stores_states_and_forces_of_each_step_only():

@@ -1,4 +1,4 @@
-"""Small linear systems, many at a time, against numpy's."""
+"""Solutions and products of batches of small matrices, against numpy."""
 
 import jax
 import jax.numpy as jnp
@@ -12,15 +12,15 @@ from tests.differences import central
 RANDOM = np.random.default_rng(0)
 
 
-def systems(size, *lanes):
-    """Positive matrices, made uneven, and right sides."""
-    half = RANDOM.normal(size=(*lanes, size, size))
+def systems(size, *batch_shape):
+    """Nonsymmetric positive definite matrices, and right sides (batch..., size, 2)."""
+    half = RANDOM.normal(size=(*batch_shape, size, size))
     matrix = half @ np.swapaxes(half, -1, -2) + np.eye(size) + 0.3 * half
-    return jnp.asarray(matrix), jnp.asarray(RANDOM.normal(size=(*lanes, size, 2)))
+    return jnp.asarray(matrix), jnp.asarray(RANDOM.normal(size=(*batch_shape, size, 2)))
 
 
 @pytest.mark.parametrize("size", [1, 2, 7])
-def test_systems_of_any_size_and_in_any_number(size):
+def test_solutions_for_any_size_and_batch_shape(size):
     matrix, right = systems(size, 3, 4)
     expected = np.linalg.solve(matrix, right)
     assert_allclose(jax.vmap(jax.vmap(solve_unpivoted))(matrix, right), expected, rtol=1e-9)
@@ -29,20 +29,20 @@ def test_systems_of_any_size_and_in_any_number(size):
 
 
 @pytest.mark.parametrize("columns", [0, 1, MAX_UNROLLED_TERMS, MAX_UNROLLED_TERMS + 1])
-def test_products_spelt_out_or_not(columns):
-    matrix, lanes = RANDOM.normal(size=(5, columns)), RANDOM.normal(size=(columns, 4))
-    found = matvec(jnp.asarray(matrix), jnp.asarray(lanes))
-    assert_allclose(found, matrix @ lanes, rtol=1e-13, atol=1e-14)
+def test_unrolled_and_other_products(columns):
+    matrix, vectors = RANDOM.normal(size=(5, columns)), RANDOM.normal(size=(columns, 4))
+    found = matvec(jnp.asarray(matrix), jnp.asarray(vectors))
+    assert_allclose(found, matrix @ vectors, rtol=1e-13, atol=1e-14)
 
 
-def test_slopes_forward_and_in_reverse():
+def test_derivatives_in_forward_and_reverse_mode():
     matrix, right = systems(3, 2)
 
-    def one(x):
+    def solution(x):
         return jax.vmap(solve_unpivoted)(matrix * x[:, None, None], right + x[:, None, None] ** 2)
 
-    at, weights = np.array([1.1, 0.7]), RANDOM.normal(size=(2, 3, 2))
-    expected = central(one, at, 1e-4)
-    assert_allclose(jax.jacfwd(one)(at), expected, rtol=1e-7, atol=1e-8)
-    found = jax.grad(lambda x: (weights * one(x)).sum())(at)
+    point, weights = np.array([1.1, 0.7]), RANDOM.normal(size=(2, 3, 2))
+    expected = central(solution, point, 1e-4)
+    assert_allclose(jax.jacfwd(solution)(point), expected, rtol=1e-7, atol=1e-8)
+    found = jax.grad(lambda x: (weights * solution(x)).sum())(point)
     assert_allclose(found, np.einsum("ijk,ijkx->x", weights, expected), rtol=1e-7)

@@ -14,7 +14,7 @@ SHARES = np.array([0.0, 0.123, 0.25, 0.377, 0.5, 0.61, 0.75, 0.9, 0.97, 0.9999])
 
 
 def one_span():
-    """The rig with a shaker, whose lag of 0.1 ms makes the equation stiff."""
+    """One span with a shaker, whose lag of 0.1 ms makes the equation stiff."""
     shaker = jb.Shaker(0.5, 12000.0, 80.0, force_per_volt=4.6, bandwidth=1e4)
     case = jb.Case(
         jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
@@ -25,7 +25,7 @@ def one_span():
 
 
 def two_spans():
-    """The rig with a patch on each span."""
+    """Two spans with a patch on each."""
     patches = [
         jb.Patch(x, x + 0.085, 8.292e-4, correction=0.39, amplifier_gain=200.0)
         for x in (0.2575, 0.8575)
@@ -41,7 +41,7 @@ def two_spans():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", [one_span, two_spans])
-def test_gains_are_right_to_1e_8(rig):
+def test_gains_are_accurate_to_1e_8(rig):
     """dP/dt = -P A - A'P - Q + P B R^-1 B'P backward in time, by scipy's Radau at 1e-10."""
     case, regulator = rig()
     model, end = jb.state_space(case, regulator.coordinates), 0.6
@@ -50,22 +50,22 @@ def test_gains_are_right_to_1e_8(rig):
     Q, R = map(np.asarray, regulator.weights(model))
     terminal = Q if regulator.terminal_weight is None else np.diag(regulator.terminal_weight)
     upper = np.triu_indices(Q.shape[0])
-    frozen = jax.jit(lambda t: (model.A(t), model.B(t)))
+    system_matrices = jax.jit(lambda t: (model.A(t), model.B(t)))
 
-    def parts(since, packed):
-        """Plant, P and what the gain sees, so long (s) before the end."""
-        A, B = map(np.asarray, frozen(np.clip(end - since, 0.0, end * (1 - 1e-15))))
+    def matrices(time_to_go, packed):
+        """A, B, P and the gain at a time `time_to_go` (s) before the end."""
+        A, B = map(np.asarray, system_matrices(np.clip(end - time_to_go, 0.0, end * (1 - 1e-15))))
         P = np.zeros_like(Q)
         P[upper] = packed
         P = P + np.triu(P, 1).T
         return A, B, P, np.linalg.solve(R, B.T @ P)
 
-    def rate(since, packed):
-        A, B, P, gain = parts(since, packed)
+    def rate(time_to_go, packed):
+        A, B, P, gain = matrices(time_to_go, packed)
         return (P @ A + A.T @ P + Q - P @ B @ gain)[upper]
 
-    def slopes(since, packed):
-        A, B, P, gain = parts(since, packed)
+    def jacobian(time_to_go, packed):
+        A, B, P, gain = matrices(time_to_go, packed)
         closed, columns = A - B @ gain, []
         for i, j in zip(*upper, strict=True):
             change = np.zeros_like(P)
@@ -73,23 +73,32 @@ def test_gains_are_right_to_1e_8(rig):
             columns.append((change @ closed + closed.T @ change)[upper])
         return np.array(columns).T
 
-    asked = end * (1 - SHARES[::-1])
+    times_to_go = end * (1 - SHARES[::-1])
     size = np.max(np.abs(terminal)) + np.max(np.abs(Q)) * end
     solution = solve_ivp(
-        rate, (0.0, end), terminal[upper], "Radau", asked, rtol=1e-10, atol=1e-16 * size, jac=slopes
+        rate,
+        (0.0, end),
+        terminal[upper],
+        "Radau",
+        times_to_go,
+        rtol=1e-10,
+        atol=1e-16 * size,
+        jac=jacobian,
     )
-    expected = [parts(s, y)[3] for s, y in zip(asked, solution.y.T, strict=True)][::-1]
-    far = [np.max(np.abs(a - b)) / np.max(np.abs(b)) for a, b in zip(found, expected, strict=True)]
-    assert np.max(far) < 1e-8
+    expected = [matrices(s, y)[3] for s, y in zip(times_to_go, solution.y.T, strict=True)][::-1]
+    errors = [
+        np.max(np.abs(a - b)) / np.max(np.abs(b)) for a, b in zip(found, expected, strict=True)
+    ]
+    assert np.max(errors) < 1e-8
 
 
-RIGIDITY, DENSITY, SPEED, MASS, EFFORT = 13.211, 0.812, 2.0, 0.4, 1e-3
+RIGIDITY, DENSITY, SPEED, MASS, COMMAND_WEIGHT = 13.211, 0.812, 2.0, 0.4, 1e-3
 WAVES = np.arange(1, 8) * np.pi / 0.6
 FASTEST = WAVES[-1] ** 2 * np.sqrt(RIGIDITY / DENSITY)
 WEIGHTS = [1e6] * 7 + [10.0] * 7
-# Many before the end, where gains ring and, last, hasten.
+# Dense towards the end, where gains oscillate and change fast.
 BEFORE_END = np.geomspace(0.3, 1e-6, 1500)
-CROSSED = np.sort(np.concatenate([np.linspace(0.0, 0.999, 1500), 1 - BEFORE_END]))
+FINE_SHARES = np.sort(np.concatenate([np.linspace(0.0, 0.999, 1500), 1 - BEFORE_END]))
 
 
 @pytest.fixture(scope="module")
@@ -99,63 +108,69 @@ def seven_modes():
     The equations of motion are written out: (1 + m s s') q'' + ... for a row s of mode shapes.
     """
     norm, upper, end = np.sqrt(2 / (DENSITY * 0.6)), np.triu_indices(14), 0.6 / SPEED
-    pushed, squares = norm * np.sin(0.25 * WAVES), WAVES**4 * RIGIDITY / DENSITY
+    modal_forces, squares = norm * np.sin(0.25 * WAVES), WAVES**4 * RIGIDITY / DENSITY
 
     def plant(t):
         s, slope = norm * np.sin(SPEED * t * WAVES), norm * WAVES * np.cos(SPEED * t * WAVES)
-        stiff = np.diag(squares) - MASS * SPEED**2 * np.outer(s, WAVES**2 * s)
-        damped = np.diag(0.06 * np.sqrt(squares)) + 2 * MASS * SPEED * np.outer(s, slope)
+        stiffness = np.diag(squares) - MASS * SPEED**2 * np.outer(s, WAVES**2 * s)
+        damping = np.diag(0.06 * np.sqrt(squares)) + 2 * MASS * SPEED * np.outer(s, slope)
         share = MASS * s / (1 + MASS * s @ s)
-        law = -np.hstack([stiff, damped])
-        A = np.vstack([np.hstack([np.zeros((7, 7)), np.eye(7)]), law - np.outer(share, s @ law)])
-        return A, np.append(np.zeros(7), pushed - share * (s @ pushed))
+        free_rows = -np.hstack([stiffness, damping])
+        A = np.vstack(
+            [np.hstack([np.zeros((7, 7)), np.eye(7)]), free_rows - np.outer(share, s @ free_rows)]
+        )
+        return A, np.append(np.zeros(7), modal_forces - share * (s @ modal_forces))
 
-    def parts(since, packed):
-        A, B = plant(end - since)
+    def matrices(time_to_go, packed):
+        A, B = plant(end - time_to_go)
         P = np.zeros((14, 14))
         P[upper] = packed
         P.T[upper] = packed
         return A, P, P @ B
 
-    def rate(since, packed):
-        A, P, seen = parts(since, packed)
+    def rate(time_to_go, packed):
+        A, P, PB = matrices(time_to_go, packed)
         half = P @ A
-        return (half + half.T + np.diag(WEIGHTS) - np.outer(seen, seen) / EFFORT)[upper]
+        return (half + half.T + np.diag(WEIGHTS) - np.outer(PB, PB) / COMMAND_WEIGHT)[upper]
 
-    asked, first = end * (1 - CROSSED[::-1]), np.diag(WEIGHTS)[upper]
-    tight = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-10}
-    solution = solve_ivp(rate, (0.0, end), first, t_eval=asked, **tight)
-    gains = [parts(s, y)[2] / EFFORT for s, y in zip(asked, solution.y.T, strict=True)]
+    times_to_go, first = end * (1 - FINE_SHARES[::-1]), np.diag(WEIGHTS)[upper]
+    options = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-10}
+    solution = solve_ivp(rate, (0.0, end), first, t_eval=times_to_go, **options)
+    gains = [
+        matrices(s, y)[2] / COMMAND_WEIGHT for s, y in zip(times_to_go, solution.y.T, strict=True)
+    ]
     return np.array(gains)[::-1]
 
 
-@pytest.mark.parametrize(("turn", "error"), [(3.0, 3e-4), (1.0, 2e-6), (0.5, 1e-7)])
-def test_gains_are_right_between_edges_too(seven_modes, turn, error):
+@pytest.mark.parametrize(("phase_step", "error"), [(3.0, 3e-4), (1.0, 2e-6), (0.5, 1e-7)])
+def test_gains_are_accurate_between_breakpoints_too(seven_modes, phase_step, error):
     """Compared with the largest gain within a hundredth of the crossing."""
-    points = int(np.ceil(FASTEST * 0.6 / SPEED / turn))
+    points = int(np.ceil(FASTEST * 0.6 / SPEED / phase_step))
     case = jb.Case(
         jb.Beam(0.6, RIGIDITY, DENSITY, 0.03, modes=7),
         actuators=[jb.PointForce(0.25)],
         loads=[jb.MovingMass(mass=MASS, speed=SPEED)],
-        controller=FiniteLQR(WEIGHTS, [EFFORT], points=points),
+        controller=FiniteLQR(WEIGHTS, [COMMAND_WEIGHT], points=points),
     )
-    found = jax.jit(lambda: jax.vmap(case.controller.gain_table(jb.state_space(case)))(CROSSED))()
+    found = jax.jit(
+        lambda: jax.vmap(case.controller.gain_table(jb.state_space(case)))(FINE_SHARES)
+    )()
     sizes = np.max(np.abs(seven_modes), axis=1)
-    near = [np.max(sizes[np.abs(CROSSED - share) < 0.01]) for share in CROSSED]
-    assert np.max(np.max(np.abs(found[:, 0] - seven_modes), axis=1) / near) < error
+    local_sizes = [np.max(sizes[np.abs(FINE_SHARES - share) < 0.01]) for share in FINE_SHARES]
+    assert np.max(np.max(np.abs(found[:, 0] - seven_modes), axis=1) / local_sizes) < error
 
 
 def test_batched_designs_call_no_lapack():
-    """On two threads those of its batches wait for each other for ever."""
+    """LAPACK calls of batches on two threads deadlock."""
     case, regulator = two_spans()
     model = jb.state_space(case)
 
-    def gains(effort):
+    def gains(command_weight):
         return (
-            eqx.tree_at(lambda r: r.command_weight, regulator, effort)
+            eqx.tree_at(lambda r: r.command_weight, regulator, command_weight)
             .gain_table(model)
             .coefficients
         )
 
-    told = jax.jit(jax.vmap(gains)).lower(jnp.ones((4, 2))).as_text()
-    assert "custom_call" not in told
+    program = jax.jit(jax.vmap(gains)).lower(jnp.ones((4, 2))).as_text()
+    assert "custom_call" not in program

@@ -12,8 +12,8 @@ import jaxbeam.numerics.peak_search
 from jaxbeam.integrator.propagators import PEAK_NODES
 
 EQUAL = tuple(float(share) for share in np.linspace(0.0, 1.0, 7))
-EITHER = pytest.mark.parametrize("points", [EQUAL, PEAK_NODES], ids=["equal", "of a step"])
-refine, vertex = (
+both_point_sets = pytest.mark.parametrize("points", [EQUAL, PEAK_NODES], ids=["equal", "of a step"])
+refine, estimate = (
     jax.jit(function, static_argnames="points")
     for function in (
         jaxbeam.numerics.peak_search.refine_peak,
@@ -26,7 +26,7 @@ def samples(curve, points):
     return jnp.asarray(curve(np.array(points)))[:, None]
 
 
-def highest(curve):
+def largest_magnitude(curve):
     """Largest absolute value on [0, 1], and where: scipy, from the best of a fine grid."""
     fine = np.linspace(0.0, 1.0, 2001)
     best = fine[np.argmax(np.abs(curve(fine)))]
@@ -40,64 +40,64 @@ def highest(curve):
     return max(-found.fun, ends), found.x
 
 
-@EITHER
+@both_point_sets
 @hypothesis.given(coefficients=st.lists(st.floats(-1.0, 1.0), min_size=8, max_size=8))
-# As high to both sides; three peaks that differ by 6e-9.
+# Two peaks of equal height; three peaks that differ by 6e-9.
 @hypothesis.example(coefficients=[0.0, 0.25, 0.0, -0.75, 0.0, 0.0, 0.0, 0.0])
 @hypothesis.example(coefficients=[-1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 5e-05, 0.0])
 def test_peak_of_a_polynomial_is_exact(points, coefficients):
-    # Falling as in a smooth curve; as many as there are points, which then tell all of it.
-    own = np.array(coefficients[: len(points)])
-    polynomial = np.polynomial.Chebyshev(own * 0.2 ** np.arange(own.size), domain=[0, 1])
-    top, _ = highest(polynomial)
-    hypothesis.assume(top > 1e-3)
-    value, place = refine(samples(polynomial, points), points)
-    assert value[0] == pytest.approx(top, rel=1e-10)
-    assert abs(polynomial(float(place[0]))) == pytest.approx(top, rel=1e-10)
+    # Coefficients decay as those of a smooth curve; as many as points, which determine them.
+    leading = np.array(coefficients[: len(points)])
+    polynomial = np.polynomial.Chebyshev(leading * 0.2 ** np.arange(leading.size), domain=[0, 1])
+    peak, _ = largest_magnitude(polynomial)
+    hypothesis.assume(peak > 1e-3)
+    value, position = refine(samples(polynomial, points), points)
+    assert value[0] == pytest.approx(peak, rel=1e-10)
+    assert abs(polynomial(float(position[0]))) == pytest.approx(peak, rel=1e-10)
 
 
-@EITHER
+@both_point_sets
 @hypothesis.given(
     waves=st.floats(0.02, 0.1),
     phase=st.floats(0.0, 2 * np.pi),
     share=st.floats(-0.5, 0.5),
     other=st.floats(0.0, 2 * np.pi),
 )
-def test_estimate_tells_steps_apart(points, waves, phase, share, other):
-    """The estimate picks the step with the peak: it must be right to less than peaks differ."""
+def test_estimate_is_accurate_enough_to_choose_a_step(points, waves, phase, share, other):
+    """The step with the peak is chosen by the estimate: its error is below differences of peaks."""
 
     def curve(c):
         both = waves * 2 * np.pi * c
         return np.cos(both + phase) + share * np.cos(2 * both + other)
 
-    top, _ = highest(curve)
-    hypothesis.assume(top > 0.1)
-    # What the polynomial through the samples cannot follow: its remainder near an end.
+    peak, _ = largest_magnitude(curve)
+    hypothesis.assume(peak > 0.1)
+    # Remainder of the polynomial through the samples, near an end.
     count = len(points)
-    remainder = 1e-6 * (2 * np.pi * waves) ** count * (1 + abs(share) * 2**count) / top
+    remainder = 1e-6 * (2 * np.pi * waves) ** count * (1 + abs(share) * 2**count) / peak
     found = samples(curve, points)
-    assert refine(found, points)[0][0] == pytest.approx(top, rel=remainder + 1e-14)
-    assert vertex(found, points)[0] == pytest.approx(top, rel=10 * remainder + 1e-14)
+    assert refine(found, points)[0][0] == pytest.approx(peak, rel=remainder + 1e-14)
+    assert estimate(found, points)[0] == pytest.approx(peak, rel=10 * remainder + 1e-14)
 
 
-@EITHER
-def test_peak_at_a_kink_belongs_to_the_step_that_rises(points):
-    """A peak just after a step's start is above the end of the step before, however little."""
+@both_point_sets
+def test_peak_just_after_a_kink_is_that_of_the_step_after_it(points):
+    """A peak just after the start of a step exceeds the end of the step before by little."""
 
     def after(c):
         return 1.0 - (c - 0.004) ** 2
 
     before = samples(lambda c: 0.5 + (after(0.0) - 0.5) * c, points)
-    found = vertex(samples(after, points), points)[0]
-    assert found > vertex(before, points)[0]
+    found = estimate(samples(after, points), points)[0]
+    assert found > estimate(before, points)[0]
     assert found == pytest.approx(1.0, rel=1e-14)
 
 
-@EITHER
+@both_point_sets
 def test_straight_and_flat_curves(points):
     flat = jnp.zeros((len(points), 1))
-    assert vertex(flat, points)[0] == refine(flat, points)[0][0] == 0
+    assert estimate(flat, points)[0] == refine(flat, points)[0][0] == 0
     line = samples(lambda c: 4 * c - 3.0, points)
-    assert vertex(line, points)[0] == pytest.approx(3.0)
-    value, place = refine(line, points)
-    assert value[0] == pytest.approx(3.0) and place[0] == 0
+    assert estimate(line, points)[0] == pytest.approx(3.0)
+    value, position = refine(line, points)
+    assert value[0] == pytest.approx(3.0) and position[0] == 0

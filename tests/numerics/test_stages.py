@@ -1,4 +1,4 @@
-"""Flows over stretches, against scipy's integration of the plant and of what it costs."""
+"""Stages of intervals, against scipy's integration of the plant and of its cost."""
 
 import jax
 import jax.numpy as jnp
@@ -31,20 +31,22 @@ def cost_to_go(stages, terminal_cost):
 
 
 def coupling(t):
-    """Two forces, each of which also feels the other."""
+    """Coupling of two contact forces, each of which also acts on the acceleration at the other."""
     sizes = zip((1.0, 2.0, 1.0, 0.2), PHASES, strict=True)
     return Coupling(*(size * jnp.sin(2 * t + phase) for size, phase in sizes))
 
 
 def matrices(t):
-    """The same plant, its forces eliminated."""
+    """A and B of the same plant with its contact forces eliminated."""
     part = coupling(t)
-    law = jnp.linalg.solve(
+    force_rows = jnp.linalg.solve(
         jnp.eye(FORCES) + part.force_feedthrough,
         jnp.concatenate([part.force_state_rows, part.command_feedthrough], axis=1),
     )
-    push = PLANT.E @ part.force_distribution
-    return PLANT.A + push @ law[:, :STATES], PLANT.B + push @ law[:, STATES:]
+    input_directions = PLANT.E @ part.force_distribution
+    return PLANT.A + input_directions @ force_rows[
+        :, :STATES
+    ], PLANT.B + input_directions @ force_rows[:, STATES:]
 
 
 def nodes(count):
@@ -59,16 +61,16 @@ def by_collocation(count):
 
 def by_coupling(count):
     """With the responses for an interval of this length, halved from a longer one."""
-    length, kind = jnp.asarray(LENGTH / count), HALVINGS - 1
-    answer = stage_responses(PLANT, Q, length * 2**kind, HALVINGS)
+    length, halving = jnp.asarray(LENGTH / count), HALVINGS - 1
+    responses = stage_responses(PLANT, Q, length * 2**halving, HALVINGS)
     parts = jax.vmap(jax.vmap(coupling))(nodes(count))
-    return coupled_stages(PLANT, jax.tree.map(lambda x: x[kind], answer), parts, R, length)
+    return coupled_stages(PLANT, jax.tree.map(lambda x: x[halving], responses), parts, R, length)
 
 
-@pytest.mark.parametrize("made", [by_collocation, by_coupling])
-def test_stage_against_scipy(made):
-    stage = jax.jit(made, static_argnums=0)(1)
-    # Of a degree that Gauss's rule for the cost, too, is exact for.
+@pytest.mark.parametrize("stages", [by_collocation, by_coupling])
+def test_stage_against_scipy(stages):
+    stage = jax.jit(stages, static_argnums=0)(1)
+    # A degree for which Gauss's rule is exact for the cost too.
     start, powers = RANDOM.normal(size=STATES), GAUSS_NODES[:, None] ** np.arange(4)
     values = powers @ RANDOM.normal(size=(4, INPUTS))
     command, plant = (
@@ -80,23 +82,23 @@ def test_stage_against_scipy(made):
         (A, B), x, u = plant(t), state[:STATES], command(t)
         return np.append(A @ x + B @ u, x @ Q @ x + u @ R @ u)
 
-    span, tight = (START, START + LENGTH), {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
-    expected = solve_ivp(rate, span, np.append(start, 0.0), **tight).y[:, -1]
-    both = np.append(start, values)
+    span, options = (START, START + LENGTH), {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
+    expected = solve_ivp(rate, span, np.append(start, 0.0), **options).y[:, -1]
+    start_and_inputs = np.append(start, values)
     assert_allclose(
-        stage.transition[0] @ start + stage.input_matrix[0] @ both[STATES:],
+        stage.transition[0] @ start + stage.input_matrix[0] @ start_and_inputs[STATES:],
         expected[:-1],
         rtol=1e-9,
     )
-    assert_allclose(both @ stage.cost[0] @ both, expected[-1], rtol=1e-9)
+    assert_allclose(start_and_inputs @ stage.cost[0] @ start_and_inputs, expected[-1], rtol=1e-9)
 
 
 def test_costs_of_both_kinds_of_stages_are_equal():
     """Also over intervals of length zero."""
     collocated, by_force = (
-        jax.jit(lambda made=made: cost_to_go(made(4), Q))()
-        for made in (by_collocation, by_coupling)
+        jax.jit(lambda stages=stages: cost_to_go(stages(4), Q))()
+        for stages in (by_collocation, by_coupling)
     )
     assert_allclose(by_force, collocated, rtol=1e-10)
-    still = collocated_stages(*jax.vmap(jax.vmap(matrices))(nodes(1)), Q, R, jnp.zeros(1))
-    assert_allclose(cost_to_go(still, 3 * Q)[0], 3 * Q, rtol=1e-14)
+    zero_length = collocated_stages(*jax.vmap(jax.vmap(matrices))(nodes(1)), Q, R, jnp.zeros(1))
+    assert_allclose(cost_to_go(zero_length, 3 * Q)[0], 3 * Q, rtol=1e-14)

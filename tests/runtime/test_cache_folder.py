@@ -1,4 +1,4 @@
-"""The cache folder: what another user could have written is refused; old files are evicted."""
+"""The cache folder: files another user could have written are refused; old files are evicted."""
 
 import hashlib
 import hmac
@@ -32,12 +32,12 @@ def test_a_file_is_read_as_it_was_written(folder):
 
 
 def test_folder_key_and_files_are_private_to_the_user_whatever_the_umask(folder):
-    before = os.umask(0)
+    umask = os.umask(0)
     try:
         path = write_file(NAME, CONTENT)
         cache_folder.private_folder("jax")
     finally:
-        os.umask(before)
+        os.umask(umask)
     for file, mode in ((path, 0o600), (folder / "key", 0o600), (folder, 0o700)):
         assert stat.S_IMODE(file.stat().st_mode) == mode
     assert stat.S_IMODE((folder / "jax").stat().st_mode) == 0o700
@@ -189,7 +189,7 @@ def test_a_relative_cache_home_is_ignored(monkeypatch, tmp_path):
     assert cache_folder.cache_folder() == tmp_path / ".cache" / "jaxbeam"
 
 
-def test_a_folder_that_cannot_be_created_is_a_sentence(tmp_path):
+def test_a_folder_that_cannot_be_created_is_an_error_message(tmp_path):
     (tmp_path / "jaxbeam").write_text("")
     with pytest.raises(CacheError, match=r"jaxbeam cannot be used \(File exists\)"):
         write_file(NAME, CONTENT)
@@ -203,17 +203,17 @@ def test_the_least_recently_used_files_are_evicted(folder):
     (folder / "jax" / "jit_f-cache").write_bytes(bytes(1000))
     os.utime(folder / "jax" / "jit_f-cache", (1, 1))
 
-    def left():
+    def remaining():
         files = (path.name for path in folder.rglob("*") if path.is_file())
         return sorted(set(files) - {"key", "native-0"})
 
     evict(5000)
-    assert left() == ["jit_f-cache", "program-a", "program-b", "program-c"]
+    assert remaining() == ["jit_f-cache", "program-a", "program-b", "program-c"]
     evict(3200)
-    assert left() == ["program-a", "program-b", "program-c"]
+    assert remaining() == ["program-a", "program-b", "program-c"]
     mark_used("program-a")
     evict(2100)
-    assert left() == ["program-a", "program-c"]
+    assert remaining() == ["program-a", "program-c"]
     evict(0)
-    assert left() == []
+    assert remaining() == []
     assert (folder / "key").exists() and read_file("native-0") == bytes(1000)

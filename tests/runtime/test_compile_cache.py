@@ -1,4 +1,4 @@
-"""The compile cache: a program is found again if nothing that decides it has changed."""
+"""The compile cache: a stored program is used if code, options and machine have not changed."""
 
 import dataclasses
 import hashlib
@@ -43,7 +43,7 @@ def pairs(x, words: str, power: float = 1.0):
 
 
 @compiled(xla_backend_optimization_level=1)
-def roughly(x):
+def unoptimised(x):
     TRACED.append(x.shape)
     return 2 * x
 
@@ -55,7 +55,7 @@ def doubled(x, about: object):
 
 
 @compiled
-def first_of(pair: Pair):
+def first_array(pair: Pair):
     TRACED.append(pair.words)
     return pair.first
 
@@ -68,13 +68,13 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(program_key, "VERSIONED_PACKAGES", packages)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("JAXBEAM_CACHE_SIZE", "64")
-    forget()
+    clear_process_caches()
     yield tmp_path / "jaxbeam"
-    forget()
+    clear_process_caches()
 
 
-def forget():
-    """Make this process like a new one."""
+def clear_process_caches():
+    """Clear all caches of this process, as in a new one."""
     compiling.clear_caches()
     program_key.environment_hash.cache_clear()
     TRACED.clear()
@@ -94,7 +94,7 @@ def programs(folder):
 def test_a_cached_program_is_not_traced_again(folder):
     (first, total), count = call(pairs, POINTS, "as given")
     assert count == 1 and len(programs(folder)) == 1
-    forget()
+    clear_process_caches()
     template, _ = pairs.template(POINTS, "as given")
     (second, other), count = call(pairs, POINTS, "as given")
     assert count == 0 and len(programs(folder)) == 1
@@ -107,9 +107,9 @@ def test_a_cached_program_is_not_traced_again(folder):
 def test_calls_find_a_cached_program_without_precompilation(folder):
     for count in (1, 0):
         for _ in range(2):
-            assert_allclose(roughly(POINTS), 2 * POINTS, rtol=0)
+            assert_allclose(unoptimised(POINTS), 2 * POINTS, rtol=0)
         assert len(TRACED) == count and len(programs(folder)) == 1
-        forget()
+        clear_process_caches()
 
 
 def test_nested_functions_are_not_cached(folder):
@@ -124,16 +124,16 @@ def test_nested_functions_are_not_cached(folder):
 
     for factor in (2.0, 3.0):
         assert_allclose(times(factor)(POINTS), factor * POINTS, rtol=0)
-        forget()
+        clear_process_caches()
     assert not programs(folder)
 
 
 def test_derivatives_of_a_cached_function(folder):
     for _ in range(2):
-        call(roughly, POINTS)
-        slope = jax.grad(lambda x: jnp.sum(roughly(x) ** 2))(POINTS)
+        call(unoptimised, POINTS)
+        slope = jax.grad(lambda x: jnp.sum(unoptimised(x) ** 2))(POINTS)
         assert_allclose(slope, 8 * POINTS, rtol=1e-14)
-        forget()
+        clear_process_caches()
 
 
 @pytest.mark.parametrize(
@@ -143,18 +143,18 @@ def test_derivatives_of_a_cached_function(folder):
         lambda: call(pairs, POINTS, "as given", 2.0),
         lambda: call(pairs, POINTS[:1, :1], "as given"),
         lambda: call(pairs, POINTS.astype(np.float32), "as given"),
-        lambda: call(roughly, POINTS),
+        lambda: call(unoptimised, POINTS),
     ],
     ids=["static string", "static number", "shape", "dtype", "function"],
 )
 def test_another_signature_or_function_is_another_program(folder, other):
     call(pairs, POINTS, "as given")
-    forget()
+    clear_process_caches()
     assert other()[1] == 1 and len(programs(folder)) == 2
 
 
 def changed_setting(patch):
-    patch.setattr(roughly, "settings", {"xla_backend_optimization_level": 0})
+    patch.setattr(unoptimised, "settings", {"xla_backend_optimization_level": 0})
 
 
 def changed_source(patch):
@@ -174,16 +174,16 @@ def changed_flags(patch):
     "change", [changed_setting, changed_source, changed_machine, changed_flags]
 )
 def test_options_source_machine_and_settings_decide_a_program(folder, change, monkeypatch):
-    call(roughly, POINTS)
-    forget()
+    call(unoptimised, POINTS)
+    clear_process_caches()
     with monkeypatch.context() as patch:
         change(patch)
-        assert call(roughly, POINTS)[1] == 1 and len(programs(folder)) == 2
-    forget()
-    assert call(roughly, POINTS)[1] == 0
-    forget()
+        assert call(unoptimised, POINTS)[1] == 1 and len(programs(folder)) == 2
+    clear_process_caches()
+    assert call(unoptimised, POINTS)[1] == 0
+    clear_process_caches()
     with jax.default_matmul_precision("highest"):
-        assert call(roughly, POINTS)[1] == 1 and len(programs(folder)) == 3
+        assert call(unoptimised, POINTS)[1] == 1 and len(programs(folder)) == 3
 
 
 def test_a_changed_source_file_changes_the_environment_hash(tmp_path, monkeypatch):
@@ -234,12 +234,12 @@ def test_functions_that_depend_on_external_code_are_not_cached(folder, monkeypat
     for constant in (Outsider(), CONSTANT, changed_flags):
         for _ in range(2):
             assert call(doubled, POINTS, constant)[1] == 1
-            forget()
+            clear_process_caches()
     for _ in range(2):
-        assert call(first_of, Pair(POINTS, "a class of others"))[1] == 1
-        forget()
+        assert call(first_array, Pair(POINTS, "a class of others"))[1] == 1
+        clear_process_caches()
     monkeypatch.setattr(program_key, "OWN_PACKAGES", ("jaxbeam", "tuning"))
-    assert call(roughly, POINTS)[1] == 1
+    assert call(unoptimised, POINTS)[1] == 1
     assert not programs(folder)
 
 
@@ -254,71 +254,73 @@ def test_functions_that_depend_on_external_code_are_not_cached(folder, monkeypat
     ids=["cut off", "empty", "changed", "writable by others"],
 )
 def test_a_refused_program_is_compiled_and_stored_again(folder, spoil):
-    call(roughly, POINTS)
+    call(unoptimised, POINTS)
     (path,) = programs(folder)
     spoil(path)
-    forget()
-    with pytest.warns(UserWarning, match="compile cache not used: .*program-roughly"):
-        result, count = call(roughly, POINTS)
+    clear_process_caches()
+    with pytest.warns(UserWarning, match="compile cache not used: .*program-unoptimised"):
+        result, count = call(unoptimised, POINTS)
     assert_allclose(result, 2 * POINTS, rtol=0)
     assert count == 1
-    forget()
-    assert call(roughly, POINTS)[1] == 0
+    clear_process_caches()
+    assert call(unoptimised, POINTS)[1] == 0
 
 
 def test_a_forged_program_is_never_unpickled(folder):
     """A plain digest, which anybody can compute, does not vouch for it."""
-    call(roughly, POINTS)
+    call(unoptimised, POINTS)
     (path,) = programs(folder)
-    content = pickle.dumps((b"code", Trap()))
+    content = pickle.dumps((b"code", MaliciousPickle()))
     path.write_bytes(hashlib.sha256(content).digest() + content)
-    forget()
+    clear_process_caches()
     with pytest.warns(UserWarning, match="was not written with the key of this user"):
-        assert call(roughly, POINTS)[1] == 1
-    assert not SPRUNG
+        assert call(unoptimised, POINTS)[1] == 1
+    assert not EXECUTED
     pickle.loads(content)
-    assert SPRUNG
+    assert EXECUTED
 
 
-SPRUNG = []
+EXECUTED = []
 
 
-def spring():
-    SPRUNG.append(True)
+def record_execution():
+    EXECUTED.append(True)
 
 
-class Trap:
-    """Runs code when it is unpickled."""
+class MaliciousPickle:
+    """An object that runs code when it is unpickled."""
 
     def __reduce__(self):
-        return spring, ()
+        return record_execution, ()
 
 
 def test_a_program_that_cannot_be_loaded_is_compiled_again(folder, monkeypatch):
-    call(roughly, POINTS)
-    forget()
+    call(unoptimised, POINTS)
+    clear_process_caches()
 
     def fail(*_):
         raise jax.errors.JaxRuntimeError("made for another machine after all")
 
     monkeypatch.setattr(compile_cache, "load_program", fail)
-    result, count = call(roughly, POINTS)
+    result, count = call(unoptimised, POINTS)
     assert_allclose(result, 2 * POINTS, rtol=0)
     assert count == 1
 
 
-def test_an_unusable_folder_is_one_warning(folder, monkeypatch):
+def test_an_unusable_folder_gives_one_warning(folder, monkeypatch):
     folder.write_text("")
-    with pytest.warns(UserWarning, match="compile cache not used: .*jaxbeam cannot be used") as all:
-        assert call(roughly, POINTS)[1] == 1
-    assert len(all) == 1
-    forget()
+    with pytest.warns(
+        UserWarning, match="compile cache not used: .*jaxbeam cannot be used"
+    ) as caught:
+        assert call(unoptimised, POINTS)[1] == 1
+    assert len(caught) == 1
+    clear_process_caches()
     folder.unlink()
     folder.mkdir(mode=0o777)
     folder.chmod(0o777)
-    with pytest.warns(UserWarning, match="other users may write to .*jaxbeam; delete it") as all:
-        assert call(roughly, POINTS)[1] == 1
-    assert len(all) == 1 and not programs(folder)
+    with pytest.warns(UserWarning, match="other users may write to .*jaxbeam; delete it") as caught:
+        assert call(unoptimised, POINTS)[1] == 1
+    assert len(caught) == 1 and not programs(folder)
 
 
 def test_the_least_recently_used_programs_are_evicted(folder, monkeypatch):
@@ -336,18 +338,18 @@ def test_the_least_recently_used_programs_are_evicted(folder, monkeypatch):
 @pytest.mark.parametrize("size", ["0", "-1"])
 def test_size_zero_switches_the_cache_off(folder, monkeypatch, size):
     monkeypatch.setenv("JAXBEAM_CACHE_SIZE", size)
-    assert call(roughly, POINTS)[1] == 1
-    assert roughly(POINTS)[0, 0] == 4 and not folder.exists()
+    assert call(unoptimised, POINTS)[1] == 1
+    assert unoptimised(POINTS)[0, 0] == 4 and not folder.exists()
 
 
-def test_a_size_that_is_no_number_is_a_warning(folder, monkeypatch):
+def test_a_size_that_is_no_number_gives_a_warning(folder, monkeypatch):
     monkeypatch.setenv("JAXBEAM_CACHE_SIZE", "1 GB")
     with pytest.warns(UserWarning, match="JAXBEAM_CACHE_SIZE is to be a whole number of MiB, not"):
-        assert call(roughly, POINTS)[1] == 1
+        assert call(unoptimised, POINTS)[1] == 1
     assert not folder.exists()
 
 
-def test_scripts_cache_programs_where_jax_does_unless_told_otherwise(monkeypatch, jax_cache):
+def test_scripts_cache_programs_where_jax_does_unless_set_otherwise(monkeypatch, jax_cache):
     monkeypatch.delenv("JAXBEAM_CACHE_SIZE")
     assert compile_cache.max_bytes() == 512 * 2**20
     jax.config.update("jax_enable_compilation_cache", False)
@@ -374,19 +376,19 @@ def jax_cache(tmp_path):
 
 def test_jax_does_not_store_a_cached_program_again(folder, jax_cache):
     for count in (1, 0):
-        assert call(roughly, POINTS)[1] == count
-        forget()
+        assert call(unoptimised, POINTS)[1] == count
+        clear_process_caches()
     jax.jit(jnp.sin)(0.5)
     names = [path.name for path in jax_cache.iterdir()]
     assert len(programs(folder)) == 1
-    assert any("sin" in name for name in names) and not any("roughly" in name for name in names)
+    assert any("sin" in name for name in names) and not any("unoptimised" in name for name in names)
 
 
-def test_jax_stores_what_has_no_key(folder, jax_cache, monkeypatch):
+def test_jax_stores_programs_without_a_key(folder, jax_cache, monkeypatch):
     monkeypatch.setattr(program_key, "OWN_PACKAGES", ("jaxbeam", "tuning"))
-    call(roughly, POINTS)
+    call(unoptimised, POINTS)
     assert not programs(folder)
-    assert any("roughly" in path.name for path in jax_cache.iterdir())
+    assert any("unoptimised" in path.name for path in jax_cache.iterdir())
 
 
 def test_threads_that_compile_leave_the_settings_of_jax_as_they_were():
@@ -425,7 +427,7 @@ def test_commands_switch_the_cache_on_in_their_own_folder(folder, monkeypatch, j
         compile_cache.switch_on()
 
 
-SWEPT = """
+SWEEP_SCRIPT = """
 import sys
 import numpy as np
 import jaxbeam as jb
@@ -474,7 +476,7 @@ def test_sweeps_of_the_next_process_compile_nothing_and_are_the_same(tmp_path):
     changed = {"JAXBEAM_CACHE_SIZE": "512", "XDG_CACHE_HOME": str(tmp_path)}
     compiled_names = []
     for name in ("first.npy", "second.npy"):
-        command = [sys.executable, "-c", SWEPT, str(tmp_path / name)]
+        command = [sys.executable, "-c", SWEEP_SCRIPT, str(tmp_path / name)]
         process = subprocess.run(
             command, env=os.environ | changed, cwd=ROOT, check=True, capture_output=True, text=True
         )

@@ -1,4 +1,4 @@
-"""Compiled functions, alone and as parts of others; settings that XLA does not know."""
+"""Compiled functions, alone and within others; options that XLA does not know."""
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +28,8 @@ def wave(x, power: int = 1):
         (jax.jit(lambda x: x * jax.grad(wave)(0.5)), lambda x: x * np.cos(0.5)),
     ],
 )
-def test_it_is_the_function_wherever_it_is_called(transformed, expected):
-    """Settings are refused within another function: they must not be given there."""
+def test_compiled_functions_can_be_transformed(transformed, expected):
+    """JAX refuses compiler options within another function: there they are left out."""
     assert_allclose(transformed(POINTS), expected(POINTS), rtol=1e-14)
 
 
@@ -38,15 +38,19 @@ def halves(x, words: str):
     return {"half": x[: x.shape[0] // 2], "words": words, "count": x.shape[0], "none": None}
 
 
-def test_what_it_will_return_is_known_before_it_is_compiled():
-    blank, real = halves.template(POINTS[:2], "as given"), halves(POINTS[:2], "as given")
-    assert jax.tree.structure(blank) == jax.tree.structure(real)
-    assert_allclose(real["half"], POINTS[:1])
-    assert (blank["words"], blank["count"]) == (real["words"], real["count"]) == ("as given", 2)
-    assert blank["half"].shape == (1,) and blank["half"].dtype == real["half"].dtype
+def test_template_has_the_structure_and_shapes_of_the_result():
+    expected, result = halves.template(POINTS[:2], "as given"), halves(POINTS[:2], "as given")
+    assert jax.tree.structure(expected) == jax.tree.structure(result)
+    assert_allclose(result["half"], POINTS[:1])
+    assert (
+        (expected["words"], expected["count"])
+        == (result["words"], result["count"])
+        == ("as given", 2)
+    )
+    assert expected["half"].shape == (1,) and expected["half"].dtype == result["half"].dtype
 
 
-def test_what_was_compiled_ahead_is_not_traced_again():
+def test_precompiled_functions_are_not_traced_again():
     traced = []
 
     @compiled
@@ -64,7 +68,7 @@ def test_what_was_compiled_ahead_is_not_traced_again():
     assert traced == [(3,), (2,), (3,)]
 
 
-def test_settings_that_are_not_known_are_left_out(monkeypatch):
+def test_unknown_options_are_left_out(monkeypatch):
     known = {"xla_backend_optimization_level": 1}
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(compiling, "XLA_OPTIONS", {"xla_no_such_setting": True, **known})

@@ -40,7 +40,7 @@ def test_a_library_is_available_once_it_is_compiled_until_it_is_removed():
     LIBRARY.remove()
 
 
-def planted(path, library):
+def without_hmac(path, library):
     """A library without HMAC, which the dynamic loader alone would accept."""
     path.write_bytes(library)
 
@@ -77,7 +77,7 @@ def with_a_known_key(path, library):
 @pytest.mark.parametrize(
     ("attack", "message"),
     [
-        (planted, "was not written with the key of this user"),
+        (without_hmac, "was not written with the key of this user"),
         (with_plain_digest, "was not written with the key of this user"),
         (empty_but_authentic, "file too short"),
         (truncated, "is damaged"),

@@ -133,10 +133,10 @@ def test_scipy_time_scales_a_sample_to_the_whole_grid(monkeypatch):
         )
 
     monkeypatch.setattr(baselines, "time_call", known_time)
-    found = scipy_time(scipy_peaks, PinnedBeam(1), masses, speeds, runs=4)
-    np.testing.assert_allclose(found.run, np.sum(0.01 + 0.02 / speeds) * len(masses))
-    np.testing.assert_allclose(found.ratio, np.sum(3 / speeds) * len(masses))
-    np.testing.assert_allclose(found.ratio_of_shortest, found.run / 2 / 0.1)
+    timing = scipy_time(scipy_peaks, PinnedBeam(1), masses, speeds, runs=4)
+    np.testing.assert_allclose(timing.run, np.sum(0.01 + 0.02 / speeds) * len(masses))
+    np.testing.assert_allclose(timing.ratio, np.sum(3 / speeds) * len(masses))
+    np.testing.assert_allclose(timing.ratio_of_shortest, timing.run / 2 / 0.1)
 
 
 @pytest.mark.parametrize("position", [0.1, 0.55, 0.7, 1.15])

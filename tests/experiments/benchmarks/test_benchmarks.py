@@ -68,13 +68,13 @@ def test_packages_that_are_not_installed_are_none():
 )
 @pytest.mark.filterwarnings("ignore::jaxbeam.control.optimal.sampling_loss.SamplingWarning")
 def test_sweeps_of_the_table_are_right_and_fully_measured(kind):
-    found = cases.measure(*kind, modes=2, side=2)
-    assert found["error"] < 1e-6 and found["scipy_error"] < 1e-6
-    assert ("diffrax" in found) == (kind[1:] == ("open", "peaks"))
-    assert found.get("diffrax_error", 0.0) < 1e-6
-    times = [found[name] for name in ("run", "compile", "scipy")]
+    row = cases.measure(*kind, modes=2, side=2)
+    assert row["error"] < 1e-6 and row["scipy_error"] < 1e-6
+    assert ("diffrax" in row) == (kind[1:] == ("open", "peaks"))
+    assert row.get("diffrax_error", 0.0) < 1e-6
+    times = [row[name] for name in ("run", "compile", "scipy")]
     assert all(np.isfinite(time) and time > 0 for time in times)
-    assert found["memory"] > 50  # MiB; JAX alone takes as much
+    assert row["memory"] > 50  # MiB; JAX alone takes as much
 
 
 @pytest.fixture(scope="module")
@@ -98,22 +98,22 @@ def test_osqp_solves_the_same_programs(programs):
     package = pytest.importorskip("osqp")
     H, f, M, gamma = programs
     scale = np.max(np.abs(H))
-    x, own, called = quadratic_programs.solve_by_osqp(package, H / scale, f / scale, M, gamma)
+    x, reported, called = quadratic_programs.solve_by_osqp(package, H / scale, f / scale, M, gamma)
     by_jaxbeam = quadratic_programs.solve_by_jaxbeam(H, f, M, gamma)[0]
     atol = quadratic_programs.SOLUTION_TOLERANCE * np.max(np.abs(by_jaxbeam))
     np.testing.assert_allclose(x, by_jaxbeam, atol=atol)
-    assert 0 < own < called
+    assert 0 < reported < called
 
 
 def test_growth_measures_times_and_memory():
-    found = growth.measure(25)
-    assert 0 < found["again"] < found["first"] and found["run"] > 0
-    assert 50 < found["before"] <= found["peak"]
+    measured = growth.measure(25)
+    assert 0 < measured["again"] < measured["first"] and measured["run"] > 0
+    assert 50 < measured["before"] <= measured["peak"]
 
 
 def test_steps_of_a_controller_are_timed():
-    found = controller_steps.measure(controller_steps.CONTROLLERS["feedback, linear"])
-    assert 0 < found.median <= found.worst < 1e-3
+    times = controller_steps.measure(controller_steps.CONTROLLERS["feedback, linear"])
+    assert 0 < times.median <= times.worst < 1e-3
 
 
 def test_designs_are_timed():
@@ -125,9 +125,9 @@ def test_designs_are_timed():
 @pytest.mark.slow
 def test_scipy_identifies_the_same_optimum(monkeypatch):
     monkeypatch.setattr(identification, "SPEEDS", np.array([2.0, 4.0]))
-    found = identification.time_fits()
-    assert found["difference"] < 1e-5 < found["largest_error"]
-    assert found["ratio"] > 1
+    results = identification.time_fits()
+    assert results["difference"] < 1e-5 < results["largest_error"]
+    assert results["ratio"] > 1
 
 
 @pytest.mark.slow

@@ -18,8 +18,8 @@ from experiments.benchmarks.controller_steps import patch_case
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep
 
 
-class Laborious(AbstractSampledLaw):
-    """Multiplies by a matrix as often as its reading says, and keeps its last command."""
+class RepeatedProductLaw(AbstractSampledLaw):
+    """Law that multiplies by a matrix as often as its reading says; its state is its command."""
 
     matrix: Any
 
@@ -37,11 +37,11 @@ def test_worst_step_differs_from_the_median():
     readings = np.full((41, 1), 20.0)
     readings[20] = 600.0
     measurements = jnp.asarray(readings), jnp.zeros((41, 0)), jnp.zeros((41, 1))
-    found = time_steps(Laborious(jnp.eye(6) + 0.1), measurements, jnp.arange(41) * 0.01)
-    assert 8 * found.median < found.worst < 100 * found.median
-    assert 1e-8 < found.median < 1e-4
+    times = time_steps(RepeatedProductLaw(jnp.eye(6) + 0.1), measurements, jnp.arange(41) * 0.01)
+    assert 8 * times.median < times.worst < 100 * times.median
+    assert 1e-8 < times.median < 1e-4
     # In a batch every step takes as long as the slowest, but 256 share the call.
-    assert found.median < found.batched <= found.batched_worst
+    assert times.median < times.batched <= times.batched_worst
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ def test_intervals_of_rig_b_contain_the_true_values():
     """The log in the repository is the one that `make_rig_logs` makes."""
     stored = np.loadtxt(LOGS / "B.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(stored, make_rig_logs.make("B"), atol=2e-5)
-    assert (LOGS / "B.toml").read_text(encoding="utf-8") == make_rig_logs.beside("B")
+    assert (LOGS / "B.toml").read_text(encoding="utf-8") == make_rig_logs.description("B")
     fit = fit_rig("B", rigs.load)
     low, high = fit.intervals.T
     truth = np.array(list(HAND_FITTED["B"].values()))

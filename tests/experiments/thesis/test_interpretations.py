@@ -41,42 +41,53 @@ def test_critical_speed_of_the_denser_beam():
 def mobility(s, mass):
     """Eqs (2.29) and (2.30) at the shaker, with a stationary mass at midspan."""
     waves, omega = sines(4)
-    here, there = np.sin(0.5 * waves), np.sin(0.3 * waves)
-    plain = np.diag(MODAL * (s**2 + 2 * DAMPING * omega * s + omega**2))
-    return s * here @ np.linalg.solve(plain + mass * s**2 * np.outer(there, there), here)
+    at_shaker, at_midspan = np.sin(0.5 * waves), np.sin(0.3 * waves)
+    dynamic_stiffness = np.diag(MODAL * (s**2 + 2 * DAMPING * omega * s + omega**2))
+    return (
+        s
+        * at_shaker
+        @ np.linalg.solve(
+            dynamic_stiffness + mass * s**2 * np.outer(at_midspan, at_midspan), at_shaker
+        )
+    )
 
 
 def force_per_volt(frequency, in_impedance, in_transmission):
     """Eq. (2.34), with a stationary mass (kg) in eq. (2.26) and another in (2.33)."""
     s = 2j * np.pi * frequency
-    own = s / (0.02 * s**2 + 0.55 * s + 9700)
-    felt, beam = mobility(s, in_impedance), mobility(s, in_transmission)
-    impedance = 0.82 + 5e-5 * s + 4.2**2 * felt / (1 + felt / own)
-    return 4.2 / impedance * own / (own + beam)
+    shaker_mobility = s / (0.02 * s**2 + 0.55 * s + 9700)
+    impedance_mobility, transmission_mobility = (
+        mobility(s, in_impedance),
+        mobility(s, in_transmission),
+    )
+    impedance = (
+        0.82 + 5e-5 * s + 4.2**2 * impedance_mobility / (1 + impedance_mobility / shaker_mobility)
+    )
+    return 4.2 / impedance * shaker_mobility / (shaker_mobility + transmission_mobility)
 
 
 def test_the_mass_in_one_equation_only():
     beam = dataclasses.replace(rigs.load("A").beam, modes=4)
     found = shaker._mass_in_impedance_only(beam)
-    some = slice(None, None, 97)
-    expected = [force_per_volt(f, 0.5, 0.0) for f in np.asarray(found.frequencies)[some]]
-    np.testing.assert_allclose(np.asarray(found.values)[some, 3], expected, rtol=1e-8)
+    every_97th = slice(None, None, 97)
+    expected = [force_per_volt(f, 0.5, 0.0) for f in np.asarray(found.frequencies)[every_97th]]
+    np.testing.assert_allclose(np.asarray(found.values)[every_97th, 3], expected, rtol=1e-8)
     both = shaker._response(beam, shaker.STATIONARY_MASS)
-    expected = [force_per_volt(f, 0.5, 0.5) for f in np.asarray(both.frequencies)[some]]
-    np.testing.assert_allclose(np.asarray(both.values)[some, 3], expected, rtol=1e-8)
+    expected = [force_per_volt(f, 0.5, 0.5) for f in np.asarray(both.frequencies)[every_97th]]
+    np.testing.assert_allclose(np.asarray(both.values)[every_97th, 3], expected, rtol=1e-8)
 
 
 def test_sampled_gain_of_the_other_shaker():
     """3.25 N/V and 1000 1/s: all seven numbers that are printed for 5 ms."""
     waves, omega = sines(3)
-    here = np.sin(0.5 * waves)
+    at_shaker = np.sin(0.5 * waves)
     A, B = np.zeros((7, 7)), np.zeros((7, 1))
     A[:3, 3:6] = np.eye(3)
-    A[3:6, :3] = -np.diag(omega**2) - 3500 / MODAL * np.outer(here, here)
-    A[3:6, 3:6] = -np.diag(2 * DAMPING * omega) - 80 / MODAL * np.outer(here, here)
-    A[3:6, 6], A[6, 6], B[6] = 3.25 * here / MODAL, -1000, 1000
-    held = expm(5e-3 * np.vstack([np.hstack([A, B]), np.zeros((1, 8))]))
-    A, B = held[:7, :7], held[:7, 7:]
+    A[3:6, :3] = -np.diag(omega**2) - 3500 / MODAL * np.outer(at_shaker, at_shaker)
+    A[3:6, 3:6] = -np.diag(2 * DAMPING * omega) - 80 / MODAL * np.outer(at_shaker, at_shaker)
+    A[3:6, 6], A[6, 6], B[6] = 3.25 * at_shaker / MODAL, -1000, 1000
+    exponential = expm(5e-3 * np.vstack([np.hstack([A, B]), np.zeros((1, 8))]))
+    A, B = exponential[:7, :7], exponential[:7, 7:]
     cost = solve_discrete_are(A, B, np.diag(STATE_WEIGHTS), [[COMMAND_WEIGHT]])
     expected = np.linalg.solve(COMMAND_WEIGHT + B.T @ cost @ B, B.T @ cost @ A)[0]
     computed = np.asarray(

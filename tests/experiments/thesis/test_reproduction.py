@@ -128,8 +128,8 @@ def test_report(tmp_path, capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["reproduce", "patches", "-o", str(tmp_path / "out"), "--json"])
     printed = json.loads(capsys.readouterr().out)
-    kept = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert printed["summary"] == kept["summary"]
+    stored = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert printed["summary"] == stored["summary"]
     assert printed["summary"][REPRODUCED] + printed["summary"][EXPLAINED] == 4
     for name in ("report.md", "report.html"):
         text = (tmp_path / "out" / name).read_text()

@@ -1,4 +1,4 @@
-"""The thesis's own approximation gives the thesis's own numbers, the spurious mode included."""
+"""Modes in a sine basis have the frequencies of Table 2.2, the spurious one included."""
 
 import jax
 import numpy as np
@@ -30,15 +30,15 @@ def test_the_approximate_row_of_table_2_2_to_all_printed_digits():
 
 def test_the_analytical_row_of_table_2_2_is_that_of_the_exact_modes():
     found = modes(two_spans(8)).frequencies
-    # 11.68 / 0.535 are themselves rounded: 0.002 Hz is what they can say.
+    # 11.68 and 0.535 are rounded, which changes frequencies by 0.002 Hz.
     assert_allclose(found, ANALYTICAL, rtol=0, atol=2.1e-3)
 
 
-def test_twenty_sines_come_closer():
+def test_twenty_sines_are_more_accurate():
     found = sine_basis_modes(two_spans(20)).frequencies
     assert_allclose(found[:8], TWENTY, rtol=0, atol=5.1e-4)
     exact = modes(two_spans(8)).frequencies
-    assert np.all(found[:8] > exact * (1 - 1e-12))  # from above, as Rayleigh and Ritz have it
+    assert np.all(found[:8] > exact * (1 - 1e-12))  # upper bounds, by Rayleigh and Ritz
 
 
 def test_modes_are_those_of_the_matrix_of_sines():
@@ -60,7 +60,7 @@ def test_modes_are_those_of_the_matrix_of_sines():
     assert_allclose(found.shapes(x), expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
-def test_it_is_differentiable():
+def test_frequencies_are_differentiable():
     case = Case(Beam(1.2, 11.68, 0.535, modes=5), supports=[Support(0.5, 2e3)])
 
     def frequencies(k):
