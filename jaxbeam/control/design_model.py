@@ -45,7 +45,7 @@ class DesignModel(eqx.Module):
     modes: int | None = count("lowest modes of the beam in the design", default=None)
 
     def validate(self, case: Any) -> str | None:
-        """Error of these numbers in a case, as "key must ...", or None."""
+        """Error of these parameters in a case, as "key must ...", or None."""
         if self.modes is not None and self.modes > case.beam.modes:
             return f"modes must be at most {case.beam.modes}, the modes of the beam: raise those"
         for names, parts in ((ACTUATOR_FIELDS, case.actuators), (LOAD_FIELDS, case.loads)):

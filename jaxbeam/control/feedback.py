@@ -10,7 +10,7 @@ from jaxbeam.case.fields import count, number
 
 
 def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
-    """Error of one gain for each actuator, fed by the sensor of the same number; or None."""
+    """Error unless each actuator has one gain and a sensor of the same index, or None."""
     loops, actuators = gains.shape[0], len(case.actuators)
     if loops != actuators:
         return f"gains must list one gain for each of {actuators} actuators, not {loops}"

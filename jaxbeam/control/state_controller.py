@@ -134,7 +134,7 @@ def _unloaded_design_plant(controller: AbstractStateController, case, layout) ->
 
 
 def _design_state_map(plant: Plant, design_plant: Plant) -> Float[Array, "design_state state"]:
-    """Map of the states of a plant to those of its design plant, the first modes of the same."""
+    """Map from the states of a plant to those of its design plant: first modes, then actuators."""
     modal_states = 2 * plant.coordinate_scale.shape[0]
     design_modal_states = 2 * design_plant.coordinate_scale.shape[0]
     states = plant.to_modal(jnp.eye(plant.modal_model.state_count))

@@ -74,7 +74,7 @@ class CrossingFilter(AbstractSampledFilter):
         noise = self.sensor_chain.noise_covariance
         gain = filter_gain(prediction.covariance, prediction.C, noise)
         x = prediction.x + gain @ (measurement.readings - prediction.readings)
-        # Joseph's form: symmetric and not negative, whatever the rounding.
+        # Joseph's form: symmetric and positive semidefinite in spite of rounding.
         error_matrix = jnp.eye(x.shape[0]) - gain @ prediction.C
         covariance = error_matrix @ prediction.covariance @ error_matrix.T + gain @ noise @ gain.T
         state = FilterState(x, symmetric_part(covariance), measurement.command)

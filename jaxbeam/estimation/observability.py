@@ -33,9 +33,9 @@ def deflection_outputs(system: StateSpace) -> np.ndarray:
 def conditioning(system: StateSpace) -> Float[Array, ""]:
     """Condition number (no unit) of the mode shapes at the sensors of deflection.
 
-    Bound on the ratio of the relative errors of modal coordinates to those of the readings when eq.
-    (4.8) of the thesis is solved for the former. Infinite, or beyond 1e12, where the sensors do not
-    distinguish the modes. Differentiable, for choosing positions of sensors.
+    Bound on the ratio of the relative errors of the modal coordinates by eq. (4.8) of the thesis to
+    those of the readings. Infinite, or beyond 1e12, where the sensors do not distinguish the modes.
+    Differentiable, for choosing positions of sensors.
     """
     values = jnp.linalg.svd(deflection_mode_shapes(system), compute_uv=False)
     return values[0] / values[-1]

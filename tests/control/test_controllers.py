@@ -58,9 +58,9 @@ def test_record_of_command_saturation_and_effort(record):
 
 def test_record_with_a_controller_in_a_file(record, tmp_path):
     record.to_netcdf(tmp_path / "loop.nc")
-    back = jb.read_record(tmp_path / "loop.nc")
-    assert jax.tree.structure(back) == jax.tree.structure(record)
-    jax.tree.map(assert_array_equal, back, record)
+    restored = jb.read_record(tmp_path / "loop.nc")
+    assert jax.tree.structure(restored) == jax.tree.structure(record)
+    jax.tree.map(assert_array_equal, restored, record)
     dataset = record.to_xarray()
     assert dataset.command.dims == ("time", "actuator")
     assert json.loads(dataset.attrs["case"])["controller"]["gains"] == [600.0]
@@ -77,8 +77,8 @@ def test_verdict_of_a_diverging_loop():
     record = jb.simulate(jb.replace(UNBOUNDED, {"controller.gains.0": 1e5}))
     diverged = float(record.diverged_time)
     assert 0 < diverged < 0.3
-    grown = f"the deflection has grown beyond all bounds by t = {diverged:.4g}"
-    assert f"the control loop diverges: {grown}" in record.verdict
+    growth = f"the deflection has grown beyond all bounds by t = {diverged:.4g}"
+    assert f"the control loop diverges: {growth}" in record.verdict
     before = np.asarray(record.times) < diverged
     assert np.all(np.isfinite(record.deflection[before]))
     assert np.all(np.abs(record.deflection[before]) < 0.6)
@@ -87,15 +87,15 @@ def test_verdict_of_a_diverging_loop():
 
 
 @pytest.fixture(scope="module")
-def swept():
+def sweep_and_compilations():
     """Sweep over gains, one of which diverges, and masses; and the programs compiled for it."""
-    found = []
+    messages = []
 
-    class Names(logging.Handler):
+    class MessageRecorder(logging.Handler):
         def emit(self, record):
-            found.append(record.getMessage())
+            messages.append(record.getMessage())
 
-    logger, handler = logging.getLogger("jax"), Names()
+    logger, handler = logging.getLogger("jax"), MessageRecorder()
     logger.addHandler(handler)
     jax.config.update("jax_log_compiles", True)  # in all threads; its context is for one
     try:
@@ -104,21 +104,21 @@ def swept():
     finally:
         jax.config.update("jax_log_compiles", False)
         logger.removeHandler(handler)
-    return dataset, [message for message in found if "Compiling jit(integrate_block" in message]
+    return dataset, [message for message in messages if "Compiling jit(integrate_block" in message]
 
 
 @pytest.mark.slow
-def test_only_diverging_runs_of_a_sweep_fail(swept):
-    dataset, compiled = swept
+def test_only_diverging_runs_of_a_sweep_fail(sweep_and_compilations):
+    dataset, compilations = sweep_and_compilations
     assert_array_equal(dataset.failed, [[False, False], [True, True], [False, False]])
     assert np.isnan(dataset.peak_deflection[1]).all()
-    assert len(compiled) == 1
+    assert len(compilations) == 1
     plan = plan_for(UNBOUNDED)
     for i in (0, 2):
         for j in range(2):
             values = {"controller.gains.0": GAINS[i], "loads.0.mass": MASSES[j]}
-            one = jb.simulate(jb.replace(UNBOUNDED, values), TIMES, plan)
-            assert_allclose(dataset.peak_deflection[i, j], one.peak_deflection, rtol=1e-7)
+            single_run = jb.simulate(jb.replace(UNBOUNDED, values), TIMES, plan)
+            assert_allclose(dataset.peak_deflection[i, j], single_run.peak_deflection, rtol=1e-7)
 
 
 @pytest.mark.slow
@@ -129,11 +129,11 @@ def test_batch_of_gains_equals_single_runs():
         case = jb.replace(UNBOUNDED, {"controller.gains.0": gain})
         return jb.simulate(case, TIMES, plan).deflection
 
-    together = jax.jit(jax.vmap(deflection))(jnp.asarray(GAINS))
-    for gain, found in zip(GAINS, together, strict=True):
+    batched = jax.jit(jax.vmap(deflection))(jnp.asarray(GAINS))
+    for gain, found in zip(GAINS, batched, strict=True):
         # Rounding grows where the loop diverges.
         assert_allclose(found, deflection(gain), rtol=1e-12 if gain < 1e4 else 1e-6, atol=1e-15)
-    assert np.isnan(together[1]).any() and np.isfinite(together[np.array([0, 2])]).all()
+    assert np.isnan(batched[1]).any() and np.isfinite(batched[np.array([0, 2])]).all()
 
 
 # Derivatives

@@ -21,7 +21,7 @@ LAW = jb.Feedforward(gates=[-0.2, -0.1], shares=SHARES, values=VALUES, period=0.
 ONE = (jb.MovingMass(mass=0.4, speed=1.0, entry_time=0.3),)
 
 
-def rig(controller=LAW, loads=ONE):
+def beam_case(controller=LAW, loads=ONE):
     return jb.Case(
         jb.Beam(0.6, 13.2, 0.81, 0.03, modes=1),
         actuators=[jb.Patch(0.25, 0.35, 8.3e-4, correction=0.3, amplifier_gain=200.0)],
@@ -48,32 +48,34 @@ def test_table_is_read_ahead_of_the_load_after_the_second_gate():
     times = np.linspace(0.0, 1.2, 301)
     share = (times + 0.02 - 0.3) * 1.0 / 0.6
     expected = np.interp(share, SHARES, VALUES[0], left=0.0, right=0.0)
-    assert_allclose(commands(rig(), times), expected, atol=1e-12)
+    assert_allclose(commands(beam_case(), times), expected, atol=1e-12)
     late = dataclasses.replace(LAW, gates=np.array([0.1, 0.2]))
-    assert_allclose(commands(rig(late), times), np.where(times < 0.5, 0.0, expected), atol=1e-12)
+    assert_allclose(
+        commands(beam_case(late), times), np.where(times < 0.5, 0.0, expected), atol=1e-12
+    )
 
 
 def test_run_equals_that_with_prescribed_commands():
-    record = jb.simulate(rig())
-    table = np.asarray(commands(rig(), record.times))
+    record = jb.simulate(beam_case())
+    table = np.asarray(commands(beam_case(), record.times))
     prescribed = jb.Prescribed(offsets=[0.0], times=record.times, values=table[None], period=0.01)
     assert_allclose(record.command[:, 0], table, atol=1e-9)
-    assert_allclose(record.deflection, jb.simulate(rig(prescribed)).deflection, atol=1e-12)
+    assert_allclose(record.deflection, jb.simulate(beam_case(prescribed)).deflection, atol=1e-12)
 
 
 def test_load_from_the_right_and_several_loads():
     times = np.linspace(0.003, 1.203, 61)  # not at the jumps of the table
     right = (jb.MovingMass(mass=0.4, speed=-1.0, entry_time=0.3),)
     mirrored = dataclasses.replace(LAW, gates=np.array([0.8, 0.7]))
-    first = commands(rig(), times)
-    assert_allclose(commands(rig(mirrored, right), times), first, atol=1e-12)
+    first = commands(beam_case(), times)
+    assert_allclose(commands(beam_case(mirrored, right), times), first, atol=1e-12)
     both = (*ONE, jb.MovingMass(mass=0.2, speed=1.0, entry_time=0.5))
-    later = commands(rig(loads=both[1:]), times)
-    assert_allclose(commands(rig(loads=both), times), first + later, atol=1e-12)
+    later = commands(beam_case(loads=both[1:]), times)
+    assert_allclose(commands(beam_case(loads=both), times), first + later, atol=1e-12)
 
 
 def test_case_file_and_errors_of_settings():
-    case = rig()
+    case = beam_case()
     assert jax.tree.all(
         jax.tree.map(np.array_equal, case_from_dict(case_to_dict(case)).controller, LAW)
     )
@@ -86,4 +88,4 @@ def test_case_file_and_errors_of_settings():
         ({}, (), "kind needs loads"),
     ):
         with pytest.raises(ValueError, match=message):
-            jb.simulate(rig(dataclasses.replace(LAW, **changes), loads))
+            jb.simulate(beam_case(dataclasses.replace(LAW, **changes), loads))

@@ -19,7 +19,7 @@ LAW = jb.InternalModel(READINGS, VALUES, compensation=0.9, period=0.01, delay=0.
 SMOOTH = jb.Filter(10.0, order=4)
 
 
-def rig(controller=LAW, **sensor):
+def beam_case(controller=LAW, **sensor):
     patch = jb.Patch(START, END, 8.3e-4, correction=0.3, amplifier_gain=200.0, limits=[-2.5, 7.5])
     return jb.Case(
         jb.Beam(LENGTH, RIGIDITY, 0.81, 0.03, modes=MODES),
@@ -40,7 +40,7 @@ def lift():
 
 def test_commands_by_the_table_for_readings_without_the_lift():
     """Computed from the record of a run, with scipy's filter of the lift."""
-    record = jb.simulate(rig(noise=np.asarray(4e-6)))
+    record = jb.simulate(beam_case(noise=np.asarray(4e-6)))
     commands = np.asarray(record.command)[:, 0]
     sections = scipy.signal.butter(4, 10.0, fs=100.0, output="sos")
     previous = np.append(0.0, commands[:-1])  # until the sample
@@ -54,7 +54,7 @@ def test_commands_by_the_table_for_readings_without_the_lift():
 
 def test_frequency_responses_of_notches():
     controller = dataclasses.replace(LAW, notches=[16.0, 27.0], notch_damping=0.4)
-    made = controller.law(jb.state_space(rig(controller))).notch_sections
+    made = controller.law(jb.state_space(beam_case(controller))).notch_sections
     # 1 at rest, 0 at its frequency; between, that of the analogue notch at the warped frequency.
     for hertz, section in zip([16.0, 27.0], np.asarray(made), strict=True):
         angular_frequency, at = (
@@ -72,30 +72,30 @@ def test_frequency_responses_of_notches():
     with pytest.raises(
         ValueError, match="notches must be below half the sampling frequency, 50 Hz"
     ):
-        jb.simulate(rig(dataclasses.replace(LAW, notches=[16.0, 60.0])))
+        jb.simulate(beam_case(dataclasses.replace(LAW, notches=[16.0, 60.0])))
 
 
 def test_stable_where_plain_feedback_of_the_same_slope_is_unstable():
     steep, times = 3e4, np.zeros(1)  # V/m; the load is not on the beam yet
     readings, values = [-2e-4, 2e-4], [[6.0, -6.0]]
     internal_model = jb.InternalModel(readings, values, period=0.01, delay=0.02)
-    plain = jb.Feedback([steep], period=0.01, delay=0.02)
+    feedback = jb.Feedback([steep], period=0.01, delay=0.02)
     low_pass = jb.Filter(10.0, order=10)
     rates = [
         frozen_poles(
-            dataclasses.replace(rig(law), sensors=(jb.Sensor(0.3, filter=low_pass),)), times
+            dataclasses.replace(beam_case(law), sensors=(jb.Sensor(0.3, filter=low_pass),)), times
         ).largest_real_part[0]
-        for law in (internal_model, plain)
+        for law in (internal_model, feedback)
     ]
     assert rates[0] < -1.0 and rates[1] > 1.0
 
 
 def test_case_file_keeps_the_controller():
-    case = rig()
+    case = beam_case()
     assert case_to_dict(case)["controller"]["kind"] == "internal-model"
-    again = case_from_dict(case_to_dict(case))
-    assert_allclose(again.controller.readings, READINGS)
-    assert_allclose(again.controller.values, VALUES)
+    restored = case_from_dict(case_to_dict(case))
+    assert_allclose(restored.controller.readings, READINGS)
+    assert_allclose(restored.controller.values, VALUES)
 
 
 ERRORS = [
@@ -110,4 +110,4 @@ ERRORS = [
 )
 def test_errors_of_settings(changes, sensor, message):
     with pytest.raises(ValueError, match=message):
-        jb.simulate(rig(dataclasses.replace(LAW, **changes), **sensor))
+        jb.simulate(beam_case(dataclasses.replace(LAW, **changes), **sensor))

@@ -28,7 +28,7 @@ PATCH = jb.Patch(
 MASSES, GAINS = [0.2, 0.3, 0.6], [[1000.0, 4000.0, 2000.0]]
 
 
-def rig(controller=None, mass=0.45, **run) -> jb.Case:
+def beam_case(controller=None, mass=0.45, **run) -> jb.Case:
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=2),
         actuators=[PATCH],
@@ -60,10 +60,10 @@ def test_gains_by_interpolation_and_in_steps():
         (0.4, [3.0, 4.0], [3.0, 4.0]),
         (0.9, [3.0, 4.0], [3.0, 4.0]),
     ):
-        assert_allclose(gains_at(two, rig(), mass), line, rtol=1e-14)
-        assert_allclose(gains_at(stepped, rig(), mass), steps, rtol=1e-14)
+        assert_allclose(gains_at(two, beam_case(), mass), line, rtol=1e-14)
+        assert_allclose(gains_at(stepped, beam_case(), mass), steps, rtol=1e-14)
     readings = jnp.array([-2.0, 0.5])
-    law = two.law(jb.state_space(rig(mass=0.25)))
+    law = two.law(jb.state_space(beam_case(mass=0.25)))
     measurement = Measurement(readings, jnp.zeros(0), jnp.zeros(2))
     command = law.step(law.initial_state(), measurement, 0.0).command
     assert_allclose(command, [1.5 * 8.0, -7.0 * 0.125], rtol=1e-14)
@@ -73,7 +73,7 @@ def test_gains_by_interpolation_and_in_steps():
 def record():
     """Run with load identification from gates; sensors and gates have no error."""
     identification = jb.LoadIdentification(gates=[-0.1, -0.05], until=0.3)
-    return jb.simulate(rig(law(load_identification=identification), mass=0.4))
+    return jb.simulate(beam_case(law(load_identification=identification), mass=0.4))
 
 
 def test_gain_before_and_after_the_mass_is_identified(record):
@@ -113,7 +113,7 @@ def test_mass_from_a_record_is_that_of_the_loop(record):
 
 
 def test_case_file_keeps_the_controller():
-    case = rig(
+    case = beam_case(
         law(between="stepped", load_identification=jb.LoadIdentification(gates=[-0.1, -0.05]))
     )
     check_case(case)
@@ -144,7 +144,7 @@ def test_case_file_keeps_the_controller():
 )
 def test_errors_of_settings(change, words):
     with pytest.raises(ValueError, match=words):
-        check_case(dataclasses.replace(rig(law()), **change))
+        check_case(dataclasses.replace(beam_case(law()), **change))
 
 
 # Derivation of gains
@@ -156,7 +156,7 @@ def test_printed_gains_follow_from_statics():
     The static deflection of a pinned beam is g L^3 / (48 E I) per kilogram; w = 1 mm, where k w = 2
     w^3 at k = 2, and w = 1.2247 mm at k = 3 give the masses, with the lift of a patch at midspan.
     """
-    case = jb.replace(rig(), {"actuators.0.correction": 0.502})
+    case = jb.replace(beam_case(), {"actuators.0.correction": 0.502})
     deflection_per_mass = 9.81 * 0.6**3 / (48 * 13.211)
     # A moment between 0.2575 m and its mirror image: w(L/2) is the integral of x M / (E I) from
     # the support to the middle.
@@ -169,7 +169,7 @@ def test_printed_gains_follow_from_statics():
 
 @pytest.fixture(scope="module")
 def loop():
-    return rig(jb.Feedback([1000.0], period=0.01))
+    return beam_case(jb.Feedback([1000.0], period=0.01))
 
 
 @pytest.mark.slow
@@ -206,8 +206,10 @@ def test_best_gain_with_a_margin(loop):
 
 def test_other_controllers_are_refused():
     with pytest.raises(ValueError, match="kind 'feedback' with one power"):
-        best_gains(rig(law()), [0.2], 1.0)
+        best_gains(beam_case(law()), [0.2], 1.0)
     with pytest.raises(ValueError, match="only 0 sensors for 1 actuators"):
-        equivalent_gains(dataclasses.replace(rig(), sensors=()), [0.2], 1.0)
+        equivalent_gains(dataclasses.replace(beam_case(), sensors=()), [0.2], 1.0)
     with pytest.raises(ValueError, match="masses must increase"):
-        scheduled_controller(rig(law()), [BestGain(mass, 1.0, 1.0, 1.0) for mass in (0.2, 0.1)])
+        scheduled_controller(
+            beam_case(law()), [BestGain(mass, 1.0, 1.0, 1.0) for mass in (0.2, 0.1)]
+        )

@@ -78,10 +78,10 @@ class ExplicitLoop:
         self.name, case = name, loop(ESTIMATORS[name])
         span, loads, *parts = parts_of(case)
         self.truth, self.span = SampledPlant(span, loads, *parts), span
-        inner = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, 2, 0.01)
-        unloaded, moving = SampledPlant(inner, [], *parts), name in ("known", "estimated")
+        design_span = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, 2, 0.01)
+        unloaded, moving = SampledPlant(design_span, [], *parts), name in ("known", "estimated")
         design_load = dataclasses.replace(loads[0], mass=DESIGN["mass"], entry_time=ENTRY + 0.01)
-        self.model = SampledPlant(inner, [design_load], *parts) if moving else unloaded
+        self.model = SampledPlant(design_span, [design_load], *parts) if moving else unloaded
         A, B, C, _ = unloaded.matrices(0.0)
         self.gain = control.lqr(A, B, np.diag(WEIGHTS), COMMAND_WEIGHT * np.eye(1))[0]
         size, self.moving = self.model.size, moving
@@ -141,8 +141,8 @@ def test_loops_with_a_filter_in_continuous_time(name):
 def unloaded_design(case):
     """A, B and C of the design plant without its load, and the gain of the regulator."""
     span, _, *parts = parts_of(case)
-    inner = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, 2, 0.01)
-    A, B, C, _ = SampledPlant(inner, [], *parts).matrices(0.0)
+    design_span = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, 2, 0.01)
+    A, B, C, _ = SampledPlant(design_span, [], *parts).matrices(0.0)
     return A, B, C, control.lqr(A, B, np.diag(WEIGHTS), COMMAND_WEIGHT * np.eye(1))[0]
 
 
@@ -153,9 +153,9 @@ def test_poles_of_a_loop_with_a_kalman_filter():
     span, _, *parts = parts_of(case)
     A, B, C, _ = SampledPlant(span, [], *parts).matrices(0.0)
     L = steady_gain(F, H)
-    whole = np.block([[A, -B @ K], [L @ C, F - G @ K - L @ H]])
+    closed_matrix = np.block([[A, -B @ K], [L @ C, F - G @ K - L @ H]])
     found = np.asarray(linearised_loop(case, -1.0).poles())
-    expected = np.linalg.eigvals(whole)
+    expected = np.linalg.eigvals(closed_matrix)
     assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-6)
 
 

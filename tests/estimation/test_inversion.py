@@ -151,6 +151,6 @@ def test_sensors_on_nodes_of_modes_outside_the_design():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_case(case)
-    again = case_from_dict(case_to_dict(case))
-    assert case_to_dict(again) == case_to_dict(case)
+    restored = case_from_dict(case_to_dict(case))
+    assert case_to_dict(restored) == case_to_dict(case)
     assert case_to_dict(case)["controller"]["estimator"]["kind"] == "kalman"

@@ -74,17 +74,17 @@ class NumpyKalman:
         )
 
     def __call__(self, readings, state, t):
-        now = self.command
+        command = self.command
         step = self.step if not self.loaded else self.plant.step(t, PERIOD, DELAY, self.intensity)
         C = self.plant.matrices(t)[2]
-        prior = step.transition @ self.state + step.before @ self.previous + step.after @ now
+        prior = step.transition @ self.state + step.before @ self.previous + step.after @ command
         P = self.covariance
         if self.loaded:
             P = step.transition @ P @ step.transition.T + step.noise
         gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + NOISE**2 * np.eye(2))
         if self.loaded:
             self.covariance = P - gain @ C @ P
-        self.state, self.previous = prior + gain @ (readings - C @ prior), now
+        self.state, self.previous = prior + gain @ (readings - C @ prior), command
         self.command = -self.gain @ self.state[:5]
         return self.command
 
@@ -115,17 +115,18 @@ def sampled_loop(case, modes):
     """Transition of the closed loop over a period on a beam with some modes: plant and estimate."""
     span, _, *parts = parts_of(case)
     span = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, modes, 0.01)
-    plant, inner = SampledPlant(span, [], *parts), design_plant(case)
+    plant, design = SampledPlant(span, [], *parts), design_plant(case)
     zero = np.zeros((plant.size, plant.size))
     step, C = plant.step(0.0, PERIOD, 0.0, zero), plant.matrices(0.0)[2]
-    design = inner.step(0.0, PERIOD, 0.0, np.diag([0, 0, FORCE, FORCE, 0.0]))
-    rows = inner.matrices(0.0)[2]
+    design_step = design.step(0.0, PERIOD, 0.0, np.diag([0, 0, FORCE, FORCE, 0.0]))
+    rows = design.matrices(0.0)[2]
     covariance = scipy.linalg.solve_discrete_are(
-        design.transition.T, rows.T, design.noise, NOISE**2 * np.eye(2)
+        design_step.transition.T, rows.T, design_step.noise, NOISE**2 * np.eye(2)
     )
     gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + NOISE**2 * np.eye(2))
     K = regulator(case)
-    estimate_matrix = (np.eye(inner.size) - gain @ rows) @ (design.transition - design.after @ K)
+    correction = np.eye(design.size) - gain @ rows
+    estimate_matrix = correction @ (design_step.transition - design_step.after @ K)
     return np.block(
         [
             [step.transition, -step.after @ K],

@@ -67,9 +67,9 @@ def test_separation():
     """The loop has the poles of state feedback and those of the observer."""
     case = loop(Observer(poles=POLES))
     _, transition, input_matrix, _, _ = matrices(case)
-    law = np.linalg.eigvals(transition - input_matrix @ np.array(GAIN))
+    regulator_poles = np.linalg.eigvals(transition - input_matrix @ np.array(GAIN))
     desired = np.array([[a + 1j * b, a - 1j * b] for a, b in POLES]).ravel()
-    expected = np.concatenate([law, np.exp(PERIOD * np.append(desired, -400.0))])
+    expected = np.concatenate([regulator_poles, np.exp(PERIOD * np.append(desired, -400.0))])
     found = np.linalg.eigvals(linearised_loop(case, 0.0).closed_matrix)
     found = found[np.abs(found) > 1e-6]  # the last command among the states has poles at zero
     assert_allclose(sorted_poles(found), sorted_poles(expected), atol=1e-7)

@@ -45,7 +45,7 @@ LAYOUT, TIMING = mesh_layout(CASE), sample_timing(CASE.controller)
 SAMPLES, RUNS = 14, 100
 
 
-class Truth:
+class SimulatedPlant:
     """Plant with analogue filters and random forces, at the sample times of the sensors."""
 
     def __init__(self):
@@ -54,7 +54,7 @@ class Truth:
         self.size = self.plant.size  # q, q', z, filter, weight
         self.intensity = np.diag([0.0, 0.0, *FORCES, *[0.0] * (self.size - 4)])
         # Times in the period: samples of delayed sensors, a new command, the next sample.
-        self.stops = sorted({*SAMPLE_TIMES.tolist(), DELAY, PERIOD})
+        self.part_ends = sorted({*SAMPLE_TIMES.tolist(), DELAY, PERIOD})
 
     def signals(self, t, state, command):
         _, _, C, D = self.plant.matrices(t)
@@ -73,17 +73,17 @@ class Truth:
         states, previous = [], np.zeros((RUNS, 1))
         for k in range(SAMPLES):
             last = 0.0
-            for stop in self.stops:
-                begin, end = start + k * PERIOD + last, start + k * PERIOD + stop
-                command = previous if stop <= DELAY else commands[k]
+            for part_end in self.part_ends:
+                begin, end = start + k * PERIOD + last, start + k * PERIOD + part_end
+                command = previous if part_end <= DELAY else commands[k]
                 transition, input_matrix, noise = self.plant._integrated(begin, end, self.intensity)
                 values, vectors = np.linalg.eigh(noise)
                 shocks = random.normal(size=state.shape) * np.sqrt(np.maximum(values, 0))
                 state = state @ transition.T + command @ input_matrix.T + shocks @ vectors.T
                 outputs = self.signals(end, state, command)
-                for i in np.flatnonzero(stop == SAMPLE_TIMES):
+                for i in np.flatnonzero(part_end == SAMPLE_TIMES):
                     raw[:, k + WHOLE[i], i] = outputs[:, i]
-                last = stop
+                last = part_end
             states.append(state)
             previous = commands[k]
         raw = raw[:, :SAMPLES]
@@ -117,7 +117,7 @@ def filter_readings(commands, readings):
 @pytest.mark.slow
 def test_innovations_are_white_with_the_stated_covariance():
     """With analogue and digital Butterworth filters, delays, and an unknown weight."""
-    states, readings, commands = Truth().runs(np.random.default_rng(0))
+    states, readings, commands = SimulatedPlant().runs(np.random.default_rng(0))
     filter_state, innovations = jax.vmap(filter_readings)(
         jnp.asarray(commands), jnp.asarray(readings)
     )
@@ -175,15 +175,15 @@ def test_estimate_without_noise_is_the_state(crossing):
 def test_gain_of_the_time_invariant_filter_is_the_limit():
     """Limit of the gain of the crossing filter while no load is on the beam."""
     sensors = (SENSORS[0], SENSORS[1], dataclasses.replace(SENSORS[2], filter=None))
-    far = (jb.MovingMass(mass=0.4, speed=0.5, entry_time=99.0),)
-    case = dataclasses.replace(CASE, sensors=sensors, loads=far)
+    late_loads = (jb.MovingMass(mass=0.4, speed=0.5, entry_time=99.0),)
+    case = dataclasses.replace(CASE, sensors=sensors, loads=late_loads)
 
     @jax.jit
-    def found():
+    def gains():
         plant = jb.state_space(case, layout=LAYOUT)
         steady = Kalman(FORCES, max_delay_periods=2).sampled_filter(plant, TIMING)
-        known = Kalman(FORCES, loads="known", max_delay_periods=2)
-        filter = known.sampled_filter(plant, TIMING)
+        kalman = Kalman(FORCES, loads="known", max_delay_periods=2)
+        filter = kalman.sampled_filter(plant, TIMING)
         at_rest = Measurement(jnp.asarray(OFFSET[:3]), jnp.zeros(5), jnp.zeros(1))
         state, _ = jax.lax.scan(
             lambda state, t: (filter.update(state, at_rest, t)[1], None),
@@ -194,7 +194,7 @@ def test_gain_of_the_time_invariant_filter_is_the_limit():
         gain = last.covariance @ last.C.T @ jnp.linalg.inv(last.innovation_covariance)
         return steady.gain, jnp.delete(gain, filter.sensor_chain.plant_states - 1, axis=0)
 
-    steady, limit = found()
+    steady, limit = gains()
     size = np.max(np.abs(limit), axis=1, keepdims=True) + np.finfo(float).tiny
     assert_allclose(steady / size, limit / size, rtol=0, atol=1e-5)
 

@@ -38,12 +38,14 @@ class StreamPlant(SampledPlant):
         span, n = self.plant.span, self.plant.span.modes
         on = [x.entry_time <= t < x.time_at(span.length) for x in self.loads]
         shapes = [span.shapes(x.motion(t, span.length, False)[0]) for x in self.loads]
-        massive = [x.kind == "mass" and here for x, here in zip(self.loads, on, strict=True)]
+        massive = [
+            x.kind == "mass" and is_on_beam for x, is_on_beam in zip(self.loads, on, strict=True)
+        ]
         masses = [x.mass * has_mass for x, has_mass in zip(self.loads, massive, strict=True)]
         mass = np.eye(n) + sum(m * np.outer(s, s) for m, s in zip(masses, shapes, strict=True))
-        for i, (shape, here) in enumerate(zip(shapes, on, strict=True), self.inner):
+        for i, (shape, is_on_beam) in enumerate(zip(shapes, on, strict=True), self.inner):
             A[:, i], C[:, i] = 0.0, 0.0
-            A[n : 2 * n, i] = -np.linalg.solve(mass, shape) * here
+            A[n : 2 * n, i] = -np.linalg.solve(mass, shape) * is_on_beam
             C[2, i] = self.plant.rows[2] @ A[n : 2 * n, i]  # the accelerometer
         return A, B, C, D
 
@@ -55,8 +57,8 @@ def test_estimates_by_gaussian_conditioning(loads):
     commands, readings = signals(SAMPLES)
     kalman = Kalman(FORCES, loads=loads, weight_deviation=deviation)
     filter_state, (estimate, _) = filter_readings(kalman, STREAM, commands, readings)
-    span, known, actuators, sensors = parts_of(STREAM)
-    plant = StreamPlant(span, known, actuators, sensors)
+    span, oracle_loads, actuators, sensors = parts_of(STREAM)
+    plant = StreamPlant(span, oracle_loads, actuators, sensors)
     intensity = np.diag([0.0, 0.0, *FORCES, *[0.0] * 4])
     times = PERIOD * np.arange(SAMPLES)
     steps = [plant.step(t, PERIOD, 0.0, intensity) for t in times]

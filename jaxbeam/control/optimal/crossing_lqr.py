@@ -40,8 +40,8 @@ class AbstractCrossingRegulator(AbstractRegulator):
     some more, between consecutive entries and exits.
 
     With `entries` "measured" the table starts with the first entry and ends with the last exit of
-    the loads of the case; with "predicted" it runs between those of the `design` model, whatever
-    the loads do.
+    the loads of the case; with "predicted" it runs between entry and exit of the
+    loads of the `design` model.
     """
 
     entries: str = choice("times of entry and exit", "measured", "predicted", default="measured")

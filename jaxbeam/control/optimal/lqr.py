@@ -43,7 +43,7 @@ class AbstractRegulator(AbstractStateController):
     )
 
     def sizes(self, case) -> dict[str, int]:
-        """Number of entries that lists of these names must have."""
+        """Required number of entries of each list, by name."""
         states = self.state_count(case)
         return {"state_weight": states, "command_weight": len(case.actuators), "feedback": states}
 

@@ -41,7 +41,7 @@ SIZES = np.array([0.3, 4.0, 4e5, 1e-3, 11.68])
 STATE = jnp.array([1e-3, -3e-4, 0.02, 0.05, 0.1])
 
 
-def rig(law):
+def beam_case(law):
     return jb.Case(
         jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
         actuators=[jb.Shaker(0.22, 2000.0, 5.0, force_per_volt=4.6, bandwidth=500.0)],
@@ -53,7 +53,7 @@ def rig(law):
 
 def commands_of(name):
     """Function from relative numbers to commands for a state at three shares of the crossing."""
-    case = rig(LAWS[name])
+    case = beam_case(LAWS[name])
     layout = mesh_layout(case)
 
     def commands(point):
@@ -106,7 +106,7 @@ def test_batched_designs_with_shared_parameters(actuator, varied):
     """Only one parameter varies; reverse-mode derivatives too."""
     part, states = ACTUATORS[actuator]
     law = jb.FiniteLQR(WEIGHTS["state_weight"][:states], [1e-3], points=20)
-    case = dataclasses.replace(rig(law), actuators=[part])
+    case = dataclasses.replace(beam_case(law), actuators=[part])
     layout, start = mesh_layout(case), float(jb.addresses(case)[varied])
 
     def coefficients(share):
@@ -140,7 +140,7 @@ ESTIMATORS = {
 def test_gains_of_estimators_over_the_plant(name):
     """Batched over rigidities and positions of the sensor, and their derivatives."""
     estimator, period = ESTIMATORS[name]
-    case = rig(jb.LQR(**WEIGHTS, period=period, estimator=estimator))
+    case = beam_case(jb.LQR(**WEIGHTS, period=period, estimator=estimator))
     layout = mesh_layout(case)
 
     def gain(point):

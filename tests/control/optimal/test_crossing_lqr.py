@@ -35,7 +35,7 @@ WEIGHTS = {
 Q, R = np.diag(WEIGHTS["state_weight"]), np.diag(WEIGHTS["command_weight"])
 
 
-def rig(controller=None):
+def beam_case(controller=None):
     return jb.Case(
         jb.Beam(LENGTH, RIGIDITY, DENSITY, DAMPING, modes=MODES),
         actuators=[jb.PointForce(POSITION)],
@@ -53,8 +53,12 @@ def plant(time, masses=MASSES, speeds=SPEEDS, entries=ENTRIES):
     """A, B and B_f at a time (s) other than the events."""
     n = np.arange(1, MODES + 1) * np.pi / LENGTH
     rate = n**2 * np.sqrt(RIGIDITY / DENSITY)
-    half = DENSITY * LENGTH / 2
-    M, C, K = half * np.eye(MODES), 2 * DAMPING * half * np.diag(rate), half * np.diag(rate**2)
+    modal_mass = DENSITY * LENGTH / 2
+    M, C, K = (
+        modal_mass * np.eye(MODES),
+        2 * DAMPING * modal_mass * np.diag(rate),
+        modal_mass * np.diag(rate**2),
+    )
     force_shapes = []
     for mass, speed, entry in zip(masses, speeds, entries, strict=True):
         on = float(entry < time < entry + LENGTH / speed)
@@ -64,8 +68,8 @@ def plant(time, masses=MASSES, speeds=SPEEDS, entries=ENTRIES):
         K = K - on * mass * speed**2 * np.outer(S, n**2 * S)
         force_shapes.append(-on * S)
     accelerations = np.linalg.solve(M, np.column_stack([np.sin(n * POSITION), *force_shapes]))
-    stiff, damped = np.linalg.solve(M, K), np.linalg.solve(M, C)
-    A = np.block([[np.zeros((MODES, MODES)), np.eye(MODES)], [-stiff, -damped]])
+    stiffness, damping = np.linalg.solve(M, K), np.linalg.solve(M, C)
+    A = np.block([[np.zeros((MODES, MODES)), np.eye(MODES)], [-stiffness, -damping]])
     inputs = np.vstack([np.zeros_like(accelerations), accelerations])
     return A, inputs[:, :1], inputs[:, 1:]
 
@@ -91,8 +95,10 @@ def optimum():
 
     def augmented(time):
         A, B, B_f = plant(time)
-        below = np.zeros((len(MASSES), size))
-        return np.vstack([np.hstack([A, B_f]), below]), np.vstack([B, np.zeros((len(MASSES), 1))])
+        weight_rates = np.zeros((len(MASSES), size))
+        return np.vstack([np.hstack([A, B_f]), weight_rates]), np.vstack(
+            [B, np.zeros((len(MASSES), 1))]
+        )
 
     def rate(time, flat):
         P, (A, B) = flat.reshape(size, size), augmented(time)
@@ -106,7 +112,7 @@ def optimum():
 
 def test_optimal_gains_for_overlapping_masses(optimum):
     law = AugmentedLQR(**WEIGHTS, points=300)
-    model = jb.state_space(rig(), "sine")
+    model = jb.state_space(beam_case(), "sine")
     gains = jax.jit(lambda shares: jax.vmap(law.gain_table(model))(shares))(TIMES / EVENTS[-1])[
         :, 0
     ]
@@ -140,11 +146,13 @@ def test_loop_with_gains_of_the_frozen_plant():
 
     shape = np.sin(np.arange(1, MODES + 1) * np.pi * 0.25 / LENGTH)
     deflection = integrate_between_events(rate, np.zeros(2 * MODES), 1e-8)[:, :MODES] @ shape
-    free = integrate_between_events(uncontrolled, np.zeros(2 * MODES), 1e-8)[:, :MODES] @ shape
-    record = jb.simulate(rig(StepLQR(**WEIGHTS, points=60)), jnp.asarray(TIMES))
+    uncontrolled_deflection = (
+        integrate_between_events(uncontrolled, np.zeros(2 * MODES), 1e-8)[:, :MODES] @ shape
+    )
+    record = jb.simulate(beam_case(StepLQR(**WEIGHTS, points=60)), jnp.asarray(TIMES))
     peak = np.max(np.abs(deflection))
     assert_allclose(record.deflection[:, 0] / peak, deflection / peak, atol=1e-6)
-    assert peak < 0.8 * np.max(np.abs(free))
+    assert peak < 0.8 * np.max(np.abs(uncontrolled_deflection))
 
 
 @pytest.mark.parametrize("kind", [StepLQR, AugmentedLQR])
@@ -155,7 +163,7 @@ def test_derivatives_of_a_loop_through_the_design_of_its_gains(kind):
         "beam.flexural_rigidity": RIGIDITY,
         "loads.1.mass": MASSES[1],
     }
-    case = rig(kind(**WEIGHTS, points=70))
+    case = beam_case(kind(**WEIGHTS, points=70))
     times = jnp.asarray(TIMES)
     schedule = loop_schedule(case, TIMES)
     plan = dataclasses.replace(plan_of(case, substeps=2, even=False), schedule=schedule)

@@ -53,11 +53,11 @@ def test_weighted_deflections():
 
 def test_design_without_suspension(monkeypatch):
     law = jb.LQR(STATES, [9e-5], coordinates="sine", design=DesignModel(stiffness=0.0, damping=0.0))
-    case, real = shaker_case(law), [state_matrices(SPEED * t, SPEED, MASS, 4.6) for t in TIMES]
+    case, plants = shaker_case(law), [state_matrices(SPEED * t, SPEED, MASS, 4.6) for t in TIMES]
     monkeypatch.setattr(oracle, "SPRING", 0.0)
     monkeypatch.setattr(oracle, "DAMPER", 0.0)
     K = gain(*state_matrices(0.0, 0.0, 0.0, 4.6))
-    assert_poles(case, TIMES, [A - B @ K for A, B in real])
+    assert_poles(case, TIMES, [A - B @ K for A, B in plants])
 
 
 def test_design_with_another_mass_and_speed():
@@ -76,8 +76,8 @@ def test_time_invariant_regulator_after_the_crossing():
     law = jb.StepLQR(STATES, [9e-5], coordinates="sine", points=100, after="time-invariant")
     A, B = state_matrices(0.0, 0.0, 0.0, 4.6)
     assert_poles(shaker_case(law), [1.2], [A - B @ gain(A, B)])  # the load leaves at 1.09 s
-    none = jb.StepLQR(STATES, [9e-5], coordinates="sine", points=100)
-    assert_poles(shaker_case(none), [1.2], [A])
+    without_regulator = jb.StepLQR(STATES, [9e-5], coordinates="sine", points=100)
+    assert_poles(shaker_case(without_regulator), [1.2], [A])
 
 
 def test_stability_limit_in_mass():

@@ -36,7 +36,7 @@ DESIGN = DesignModel(force_per_volt=4.6)
 AFTER_EXIT = [4.737544e-07, 7.254085e-11]
 
 
-def rig(controller=None, force_per_volt=4.6, **run):
+def beam_case(controller=None, force_per_volt=4.6, **run):
     shaker = jb.Shaker(0.5, 12000.0, 80.0, force_per_volt=force_per_volt, bandwidth=1e4)
     return jb.Case(
         jb.Beam(0.6, 11.68, 0.535, 0.03, modes=3),
@@ -50,7 +50,7 @@ def rig(controller=None, force_per_volt=4.6, **run):
 
 @pytest.fixture(scope="module")
 def model():
-    return jb.state_space(rig(), "sine")
+    return jb.state_space(beam_case(), "sine")
 
 
 def gains_at(regulator, model, shares=SHARES):
@@ -90,15 +90,15 @@ def test_closed_loops(controller, name):
     The reference does not resolve that layer: it is replaced by `AFTER_EXIT`, or left out.
     """
     expected = REFERENCE[f"continuous_closed_loop_{name}"]
-    record = jb.simulate(rig(controller, 2.5), times=jnp.array([0.0, *expected["time_s"]]))
+    record = jb.simulate(beam_case(controller, 2.5), times=jnp.array([0.0, *expected["time_s"]]))
     last = 5 if name == "augmented" else None
     deflection = np.array(expected["deflection_at_0p25_m"])
     if name == "finite_time":
         deflection[5:] = AFTER_EXIT
-    peak, most = np.max(np.abs(deflection)), np.max(np.abs(expected["voltage"]))
-    found, volts = record.deflection[1:, 0][:last], record.command[1:, 0][:last]
+    peak, largest_voltage = np.max(np.abs(deflection)), np.max(np.abs(expected["voltage"]))
+    found, command = record.deflection[1:, 0][:last], record.command[1:, 0][:last]
     assert_allclose(found, deflection[:last], rtol=0, atol=1e-6 * peak)
-    assert_allclose(volts, expected["voltage"][:last], rtol=0, atol=1e-6 * most)
+    assert_allclose(command, expected["voltage"][:last], rtol=0, atol=1e-6 * largest_voltage)
 
 
 @pytest.mark.slow
@@ -111,16 +111,18 @@ def test_cost_of_the_optimal_gain(model):
     end = 0.6 / 0.55
     times = jnp.linspace(0.0, end, 40001)  # a lag of 0.1 ms, by the Runge-Kutta method
     step = times[1]
-    bump = jnp.asarray(np.random.default_rng(0).normal(size=(2, 7))) * table(jnp.ones(()) / 2)
+    perturbation = jnp.asarray(np.random.default_rng(0).normal(size=(2, 7))) * table(
+        jnp.ones(()) / 2
+    )
 
     @jax.jit
     def cost(change):
         def rate(t, state):
             share = t / end
-            gain = table(share) + change[0] * bump[0] + change[1] * share * bump[1]
+            gain = table(share) + change[0] * perturbation[0] + change[1] * share * perturbation[1]
             command, system = -gain @ state[:7], model.at(jnp.minimum(t, end - 1e-9))
-            spent = state[:7] @ Q @ state[:7] + command @ R @ command
-            return jnp.append(system.A @ state[:7] + system.B[:, :1] @ command, spent)
+            cost_rate = state[:7] @ Q @ state[:7] + command @ R @ command
+            return jnp.append(system.A @ state[:7] + system.B[:, :1] @ command, cost_rate)
 
         def advance(state, t):
             a = rate(t, state)
@@ -134,22 +136,25 @@ def test_cost_of_the_optimal_gain(model):
 
     predicted = start @ costs[0] @ start
     assert_allclose(cost(jnp.zeros(2)), predicted, rtol=1e-6)
-    slope, bend = jax.jit(jax.jacfwd(cost))(jnp.zeros(2)), cost(jnp.ones(2)) - predicted
-    assert bend > 1e-3 * predicted
+    slope, second_difference = (
+        jax.jit(jax.jacfwd(cost))(jnp.zeros(2)),
+        cost(jnp.ones(2)) - predicted,
+    )
+    assert second_difference > 1e-3 * predicted
     assert_allclose(slope, 0.0, atol=1e-6 * predicted)
 
 
 def test_case_file_keeps_the_controller():
     controller = AugmentedLQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN, after="hold")
-    case = rig(controller, 2.5)
+    case = beam_case(controller, 2.5)
     check_case(case)
-    again = case_from_dict(case_to_dict(case))
-    assert eqx.tree_equal(case, again)
+    restored = case_from_dict(case_to_dict(case))
+    assert eqx.tree_equal(case, restored)
 
 
 def test_intervals_needed_follow_from_the_modes_of_the_design():
     few = DesignModel(modes=1)
-    check_case(rig(FiniteLQR([1.0] * 3, [1.0], points=100, design=few)))
+    check_case(beam_case(FiniteLQR([1.0] * 3, [1.0], points=100, design=few)))
 
 
 @pytest.mark.parametrize(
@@ -173,4 +178,4 @@ def test_intervals_needed_follow_from_the_modes_of_the_design():
 )
 def test_errors_of_settings(controller, message):
     with pytest.raises(ValueError, match=message):
-        check_case(rig(controller))
+        check_case(beam_case(controller))

@@ -31,9 +31,9 @@ from tests.control.optimal.test_crossing_lqr import (
     WEIGHTS,
     Q,
     R,
+    beam_case,
     integrate_between_events,
     plant,
-    rig,
 )
 from tests.runs import plan_of
 
@@ -60,8 +60,8 @@ def optimal_gain(masses, speeds, entries):
 
     def augmented(time):
         A, B, B_f = plant(time, masses, speeds, entries)
-        below = np.zeros((count, size))
-        return np.vstack([np.hstack([A, B_f]), below]), np.vstack([B, np.zeros((count, 1))])
+        weight_rates = np.zeros((count, size))
+        return np.vstack([np.hstack([A, B_f]), weight_rates]), np.vstack([B, np.zeros((count, 1))])
 
     def rate(time, flat):
         P, (A, B) = flat.reshape(size, size), augmented(time)
@@ -102,7 +102,7 @@ def simulated(predicted):
     """Run on `FINE_TIMES` under the regulator of a prediction, in single steps between them."""
     numbers = {"mass": "masses", "speed": "speeds", "entry_time": "entries"}
     design = DesignModel(**{name: predicted[key] for name, key in numbers.items()})
-    case = rig(dataclasses.replace(LAW, design=design))
+    case = beam_case(dataclasses.replace(LAW, design=design))
     plan = plan_of(case, substeps=1, even=False)
     plan = dataclasses.replace(plan, schedule=loop_schedule(case, FINE_TIMES))
     return jb.simulate(case, jnp.asarray(FINE_TIMES), plan)
@@ -118,10 +118,10 @@ def test_deflections_under_a_wrong_prediction():
 
 def test_exact_prediction_has_the_least_cost():
     """The cost is x'Fx + integral of x'Qx + u'Ru."""
-    scale = jb.state_space(rig(), "sine").coordinate_scale
+    scale = jb.state_space(beam_case(), "sine").coordinate_scale
 
-    def cost(**wrong):
-        record = simulated(TRUE | wrong)
+    def cost(**errors):
+        record = simulated(TRUE | errors)
         states = np.hstack([record.coordinates * scale, record.rates * scale])
         cost_rate = (
             np.einsum("ti,ij,tj->t", states, Q, states) + R[0, 0] * record.command[:, 0] ** 2
@@ -129,26 +129,26 @@ def test_exact_prediction_has_the_least_cost():
         return np.trapezoid(cost_rate, FINE_TIMES) + states[-1] @ Q @ states[-1]
 
     exact, masses = cost(), np.array(MASSES)
-    late, heavy = cost(entries=np.add(ENTRIES, 0.02)), cost(masses=1.3 * masses)
-    assert exact < late and exact < heavy
+    late_entries, large_masses = cost(entries=np.add(ENTRIES, 0.02)), cost(masses=1.3 * masses)
+    assert exact < late_entries and exact < large_masses
     # At its minimum the cost is flat: half the error costs a quarter.
     half = cost(masses=1.15 * masses)
-    assert (heavy - exact) / (half - exact) == pytest.approx(4.0, rel=0.02)
+    assert (large_masses - exact) / (half - exact) == pytest.approx(4.0, rel=0.02)
 
 
 def test_case_file_keeps_predicted_entries():
-    case = rig(LAW)
+    case = beam_case(LAW)
     check_case(case)
     assert case_from_dict(case_to_dict(case)).controller.entries == "predicted"
 
 
 def test_errors_of_predicted_entries():
     table = jb.MovingMass(mass=0.2, times=[0.0, 0.3], positions=[0.0, 0.6])
-    case = dataclasses.replace(rig(LAW), loads=(table,))
+    case = dataclasses.replace(beam_case(LAW), loads=(table,))
     late = dataclasses.replace(LAW, design=DesignModel(entry_time=0.1))
     with pytest.raises(ValueError, match=r"design\.entry_time has no effect"):
         check_case(dataclasses.replace(case, controller=late))
-    one = dataclasses.replace(rig(), loads=rig().loads[:1])
+    single_load = dataclasses.replace(beam_case(), loads=beam_case().loads[:1])
     law = ScheduledLQR(**WEIGHTS, masses=[0.3], points=300, entries="predicted")
     with pytest.raises(ValueError, match="entries must be 'measured'"):
-        check_case(dataclasses.replace(one, controller=law))
+        check_case(dataclasses.replace(single_load, controller=law))

@@ -27,7 +27,7 @@ WEIGHTS = {
 }
 
 
-def rig(controller=None, modes=3, **shaker):
+def beam_case(controller=None, modes=3, **shaker):
     """Rig of chapter 5 of the thesis, with its shaker at 0.5 m."""
     shaker = {"stiffness": 12000.0, "damping": 80.0, "force_per_volt": 4.6} | shaker
     return jb.Case(
@@ -47,7 +47,7 @@ def plant_of(case):
 
 @pytest.fixture(scope="module")
 def model():
-    return plant_of(rig())
+    return plant_of(beam_case())
 
 
 @eqx.filter_jit
@@ -73,9 +73,9 @@ def integrate(A, B, Q, R, spans):
         cost_rate = scipy.linalg.block_diag(Q, R)
         parts = 64  # short ones, as the blocks contain a growing exponential
         block = np.block([[-rate.T, cost_rate], [np.zeros_like(rate), rate]]) * span / parts
-        whole = scipy.linalg.expm(block)
-        transition = whole[n + m :, n + m :]
-        part_cost = transition.T @ whole[: n + m, n + m :]
+        propagator = scipy.linalg.expm(block)
+        transition = propagator[n + m :, n + m :]
+        part_cost = transition.T @ propagator[: n + m, n + m :]
         for _ in range(parts):
             augmented = np.vstack([state, command])
             cost = cost + augmented.T @ part_cost @ augmented
@@ -164,16 +164,16 @@ def test_sampling_limits():
     Without the suspension: pi / omega, omega_n = (n pi / L)^2 sqrt(EI / m), less the damping.
     """
     omega = (np.arange(1, 4) * np.pi / 0.6) ** 2 * np.sqrt(11.68 / 0.535)
-    free = rig(stiffness=0.0, damping=0.0)
+    unsprung = beam_case(stiffness=0.0, damping=0.0)
     expected = np.pi / (omega * np.sqrt(1 - 0.03**2))
-    assert_allclose(jb.sampling_limit(free), expected, rtol=1e-9)
-    stiffer = jb.sampling_limit(rig(damping=0.0))
+    assert_allclose(jb.sampling_limit(unsprung), expected, rtol=1e-9)
+    stiffer = jb.sampling_limit(beam_case(damping=0.0))
     assert stiffer.shape == (3,) and np.all(stiffer < expected)
 
 
 def test_controllability_is_lost_at_the_sampling_limit():
     """Of one mode: by Gramians, by the rank of (B, A B), and by poles under the optimal gain."""
-    case = rig(modes=1, stiffness=0.0, damping=0.0, bandwidth=1e5)
+    case = beam_case(modes=1, stiffness=0.0, damping=0.0, bandwidth=1e5)
     model = plant_of(case)
     plant, limit = model.unloaded, float(jb.sampling_limit(case)[0])
 
@@ -209,27 +209,29 @@ def test_controllability_is_lost_at_the_sampling_limit():
     assert sizes[1] < 1e-9 * sizes[0]
     # No gain damps the mode there: one of its two poles stays.
     weights = {"state_weight": [1e3, 1.0, 0.0], "command_weight": [1e-6], "coordinates": "sine"}
-    free = np.abs(np.linalg.eigvals(sampled.A)).max()
+    open_loop_radius = np.abs(np.linalg.eigvals(sampled.A)).max()
     moved = []
     for share in (0.5, 1.0):
         sampled = plant.discretize(share * limit)
         gain = designed_gain(DiscreteLQR(**weights, period=share * limit), model)
-        moved.append(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ gain)).max() / free**share)
+        moved.append(
+            np.abs(np.linalg.eigvals(sampled.A - sampled.B @ gain)).max() / open_loop_radius**share
+        )
     assert moved[0] < 0.75
     assert moved[1] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_slow_sampling_warns(tmp_path, capsys):
     """In Python by a warning, on the command line by one sentence, before the run."""
-    slow = rig(DiscreteLQR(**WEIGHTS, period=5e-3))
+    slow = beam_case(DiscreteLQR(**WEIGHTS, period=5e-3))
     with pytest.warns(
         SamplingWarning,
         match="the mode at .* Hz is hardly controllable at a period of .* limit is pi",
     ):
         check_case(slow)
     with pytest.warns(SamplingWarning):
-        check_case(rig(LQR(**WEIGHTS, period=5e-3)))
-    check_case(rig(DiscreteLQR(**WEIGHTS, period=2e-3)))
+        check_case(beam_case(LQR(**WEIGHTS, period=5e-3)))
+    check_case(beam_case(DiscreteLQR(**WEIGHTS, period=2e-3)))
     path = tmp_path / "slow.toml"
     jb.save_case(slow, path)
     with warnings.catch_warnings(), pytest.raises(SystemExit) as ended:
@@ -251,7 +253,7 @@ def test_slow_sampling_warns(tmp_path, capsys):
 )
 def test_errors_of_settings(options, message):
     with pytest.raises(ValueError, match=message):
-        check_case(rig(DiscreteLQR(**WEIGHTS, **options)))
+        check_case(beam_case(DiscreteLQR(**WEIGHTS, **options)))
 
 
 @pytest.mark.slow
@@ -267,5 +269,5 @@ def test_poles_of_the_loop_are_those_of_the_design(model):
     expected = np.abs(
         np.linalg.eigvals(transition - input_matrix @ np.asarray(designed_gain(law, model)))
     )
-    found = np.abs(np.linalg.eigvals(linearised_loop(rig(law), 0.0).closed_matrix))
+    found = np.abs(np.linalg.eigvals(linearised_loop(beam_case(law), 0.0).closed_matrix))
     assert_allclose(np.sort(found)[-7:], np.sort(expected)[-7:], rtol=1e-7)

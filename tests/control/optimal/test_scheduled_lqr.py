@@ -30,7 +30,7 @@ GRID = {"masses": [0.2, 0.4], "speeds": [1.0, 2.0]}
 GATE_IDENTIFICATION = jb.LoadIdentification(gates=[-0.15, -0.05], until=0.3)
 
 
-def rig(controller=None, mass=0.4, speed=1.0, **run):
+def beam_case(controller=None, mass=0.4, speed=1.0, **run):
     return jb.Case(
         jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
         actuators=[jb.Shaker(0.25, 2000.0, 5.0, force_per_volt=4.6, bandwidth=500.0)],
@@ -57,7 +57,7 @@ STATES = jnp.asarray(np.random.default_rng(0).normal(size=(3, 5)) * [1e-3, 1e-4,
 
 def commands(controller, shares, mass=0.4, speed=1.0):
     """Commands (share,) for the states at some shares of the crossing."""
-    case = rig(controller, mass, speed)
+    case = beam_case(controller, mass, speed)
     times = 0.2 + 0.6 / abs(speed) * jnp.asarray(shares)
     return np.asarray(_commands(case, mesh_layout(case), STATES, times)[:, 0])
 
@@ -72,19 +72,23 @@ def test_commands_are_interpolated_between_designs():
     end = {"terminal_weight": [1e3, 1e2, 0.1, 0.01, 1e-3]}
     scheduled = ScheduledLQR(**WEIGHTS, **GRID, **end, after="fade", fade_time=0.05)
     single = FiniteLQR(**WEIGHTS, **end, after="hold")
-    known = {
+    single_designs = {
         (m, v): commands(single, shares, m, v) * [1.0, 1.0, np.exp(-1.0 / v)]
         for m in GRID["masses"]
         for v in GRID["speeds"]
     }
-    for at, expected in known.items():
+    for at, expected in single_designs.items():
         assert_allclose(commands(scheduled, shares, *at), expected, rtol=1e-9)
-    mean = sum(known.values()) / 4
+    mean = sum(single_designs.values()) / 4
     # At another speed the same share is at another time, so the fading is left out.
     assert_allclose(commands(scheduled, shares, 0.3, 1.5)[:2], mean[:2], rtol=1e-9)
-    assert_allclose(commands(scheduled, shares, 0.5, 3.0)[:2], known[0.4, 2.0][:2], rtol=1e-9)
+    assert_allclose(
+        commands(scheduled, shares, 0.5, 3.0)[:2], single_designs[0.4, 2.0][:2], rtol=1e-9
+    )
     nearest = dataclasses.replace(scheduled, between="nearest")
-    assert_allclose(commands(nearest, shares, 0.26, 1.6)[:2], known[0.2, 2.0][:2], rtol=1e-9)
+    assert_allclose(
+        commands(nearest, shares, 0.26, 1.6)[:2], single_designs[0.2, 2.0][:2], rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize(("fade", "left"), [(None, 1.0), (0.5, np.exp(-2.0))])
@@ -108,7 +112,7 @@ def test_load_is_identified_from_gates_in_the_loop(speed):
     law = ScheduledLQR(
         **gentle, masses=[0.2, 0.6], speeds=[0.5, 1.0], load_identification=identification
     )
-    record = jb.simulate(rig(law, 0.5, speed, duration=1.1, sample_rate=500.0))
+    record = jb.simulate(beam_case(law, 0.5, speed, duration=1.1, sample_rate=500.0))
     passed = 0.2 - 0.05 / 0.8
     assert np.all(record.command[np.asarray(record.times) < passed] == 0)
     assert np.max(np.abs(record.command)) > 0.01
@@ -127,7 +131,7 @@ def test_commands_follow_the_identified_load():
     law = dataclasses.replace(
         given, period=jnp.asarray(4e-3), load_identification=GATE_IDENTIFICATION
     )
-    case, state = rig(law, 0.3, 0.8), STATES[0]
+    case, state = beam_case(law, 0.3, 0.8), STATES[0]
     layout = mesh_layout(case)
     times = 0.2 + 0.75 * jnp.array([-0.1, 0.05, 0.1, 0.2, 0.31, 0.6])
 
@@ -152,16 +156,18 @@ def test_commands_follow_the_identified_load():
     assert_allclose(mass[1:], 0.3, rtol=1e-9)
     light = dataclasses.replace(given, masses=jnp.array([0.2]))
     assert commands[0] == 0.0
-    one = _commands(rig(light, 0.3, 0.8), layout, STATES[:1], times[1:2])
-    other = _commands(rig(given, 0.3, 0.8), layout, jnp.tile(STATES[:1], (2, 1)), times[4:])
-    assert_allclose(commands[1], one[0, 0], rtol=1e-9)
-    assert_allclose(commands[4:], other[:, 0], rtol=1e-7)
+    at_lightest_mass = _commands(beam_case(light, 0.3, 0.8), layout, STATES[:1], times[1:2])
+    at_given_mass = _commands(
+        beam_case(given, 0.3, 0.8), layout, jnp.tile(STATES[:1], (2, 1)), times[4:]
+    )
+    assert_allclose(commands[1], at_lightest_mass[0, 0], rtol=1e-9)
+    assert_allclose(commands[4:], at_given_mass[:, 0], rtol=1e-7)
 
 
 def test_speed_and_mass_from_deflections_without_gates():
     """Static readings, with an offset, of a mass that moves to the left at constant speed."""
     settings = jb.LoadIdentification(threshold=1e-6, until=0.4)
-    case = rig(mass=0.3)
+    case = beam_case(mass=0.3)
     offset = dataclasses.replace(case.sensors[2], offset=jnp.asarray(1e-4))
     case = dataclasses.replace(case, sensors=(*case.sensors[:2], offset))
     layout = mesh_layout(case)
@@ -203,7 +209,7 @@ def test_load_is_identified_without_gates_in_the_loop():
     law = ScheduledLQR(
         **gentle, masses=[0.2, 0.6], speeds=[0.5, 1.0], load_identification=identification
     )
-    record = jb.simulate(rig(law, 0.5, 0.8, duration=1.1, sample_rate=500.0))
+    record = jb.simulate(beam_case(law, 0.5, 0.8, duration=1.1, sample_rate=500.0))
     before = np.asarray(record.times) < 0.2 + 0.3 * 0.75
     assert np.all(record.command[before] == 0)
     assert np.max(np.abs(record.command)) > 0.01
@@ -214,7 +220,7 @@ def test_load_is_identified_without_gates_in_the_loop():
 
 def test_position_of_a_load_at_rest():
     """Anywhere: near the pins deflections are rounding, whose ratio may fit any position."""
-    case = rig()
+    case = beam_case()
     model = jb.state_space(case)
     identifier = jb.LoadIdentification(threshold=1e-9, until=0.9).identifier(model, model)
     positions = np.linspace(0.02, 0.58, 5001)
@@ -231,7 +237,7 @@ def test_position_of_a_load_at_rest():
 
 def test_influence_lines_and_lift_are_static():
     """Up to the truncation of modes: 2 L^3 / (EI pi^4) sum of n^-4 on a pinned beam."""
-    case = rig()
+    case = beam_case()
     case = eqx.tree_at(lambda c: c.beam, case, dataclasses.replace(case.beam, modes=12))
     layout = mesh_layout(case)
 
@@ -250,7 +256,7 @@ def test_influence_lines_and_lift_are_static():
 
 
 def test_case_file_keeps_the_controller():
-    case = rig(
+    case = beam_case(
         ScheduledLQR(**WEIGHTS, **GRID, period=4e-3, load_identification=GATE_IDENTIFICATION)
     )
     check_case(case)
@@ -284,11 +290,11 @@ def test_case_file_keeps_the_controller():
 )
 def test_errors_of_settings(options, message):
     with pytest.raises(ValueError, match=message):
-        check_case(rig(ScheduledLQR(**WEIGHTS, **(GRID | options))))
+        check_case(beam_case(ScheduledLQR(**WEIGHTS, **(GRID | options))))
 
 
 def test_several_loads_are_refused():
-    case = rig(ScheduledLQR(**WEIGHTS, **GRID))
+    case = beam_case(ScheduledLQR(**WEIGHTS, **GRID))
     twice = eqx.tree_at(lambda c: c.loads, case, case.loads * 2)
     with pytest.raises(ValueError, match="kind needs a single load"):
         check_case(twice)

@@ -29,7 +29,7 @@ PATCH = jb.Patch(
 THESIS = {"horizon": 6, "moves": 4, "move_weight": 1e-11, "period": PERIOD}
 
 
-def rig(controller=None, modes=3, patch=PATCH, **run) -> jb.Case:
+def beam_case(controller=None, modes=3, patch=PATCH, **run) -> jb.Case:
     """One-span rig with a patch, and the heaviest mass at 1 m/s."""
     return jb.Case(
         jb.Beam(0.6, 13.211, 0.812, 0.03, modes=modes),
@@ -57,7 +57,7 @@ def run(case: jb.Case, substeps: int) -> jb.Record:
 
 @pytest.fixture(scope="module")
 def one_span():
-    return run(rig(mpc(), modes=5), 16)
+    return run(beam_case(mpc(), modes=5), 16)
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ SUBSTEPS = 10
 SAMPLES = 62
 
 
-def tabulate(case):
+def crossing_matrices(case):
     """A, B and input by the loads (sample, substep, ...), C of the sensor, layout of the modes."""
     model = jb.state_space(case)
     midpoints = (jnp.arange(SAMPLES * SUBSTEPS) + 0.5) * PERIOD / SUBSTEPS
@@ -134,7 +134,7 @@ def tabulate(case):
 
 @pytest.fixture(scope="module")
 def crossing():
-    return tabulate(rig())
+    return crossing_matrices(beam_case())
 
 
 def close_loop(case, crossing):
@@ -166,8 +166,8 @@ compiled_loop = eqx.filter_jit(close_loop)
 
 
 @pytest.fixture(scope="module")
-def plain(crossing):
-    return compiled_loop(rig(mpc()), crossing)
+def controlled(crossing):
+    return compiled_loop(beam_case(mpc()), crossing)
 
 
 @pytest.fixture(scope="module")
@@ -180,26 +180,26 @@ def uncontrolled(crossing):
     return np.array(deflection)[::SUBSTEPS]
 
 
-def test_three_modes(plain, uncontrolled):
+def test_three_modes(controlled, uncontrolled):
     """The peak is reduced by 20.8 % with three modes, as computed independently."""
-    deflection, command, failures = plain
+    deflection, command, failures = controlled
     reduction = 100 * (1 - np.max(-deflection) / np.max(-uncontrolled))
     assert_allclose(reduction, 20.8, atol=0.1)
     assert np.max(command) <= 7.5 + 1e-9 and np.min(command) >= -2.5 - 1e-9 and failures == 0
 
 
-def test_hildreth_in_the_loop(plain, crossing):
-    deflection, command, failures = compiled_loop(rig(mpc(solver="hildreth")), crossing)
-    assert_allclose(command, plain[1], rtol=0, atol=1e-8)
-    assert_allclose(deflection, plain[0], rtol=0, atol=1e-11)
+def test_hildreth_in_the_loop(controlled, crossing):
+    deflection, command, failures = compiled_loop(beam_case(mpc(solver="hildreth")), crossing)
+    assert_allclose(command, controlled[1], rtol=0, atol=1e-8)
+    assert_allclose(deflection, controlled[0], rtol=0, atol=1e-11)
     assert failures == 0
 
 
 @pytest.mark.slow
 def test_known_loads_reduce_the_deflection():
     """A light mass, for which the patch is strong enough: less than half of the deflection."""
-    light = jb.replace(rig(mpc()), {"loads.0.mass": 0.1})
-    crossing = tabulate(light)
+    light = jb.replace(beam_case(mpc()), {"loads.0.mass": 0.1})
+    crossing = crossing_matrices(light)
     unknown, command, _ = compiled_loop(light, crossing)
     assert np.max(command) < 7.5
     for prediction in ("time-invariant", "time-varying"):
@@ -211,13 +211,14 @@ def test_known_loads_reduce_the_deflection():
 
 def test_rate_limits_and_soft_limits(crossing):
     slow = dataclasses.replace(PATCH, rate_limit=jnp.array(40.0))
-    _, command, failures = compiled_loop(rig(mpc(), patch=slow), crossing)
+    _, command, failures = compiled_loop(beam_case(mpc(), patch=slow), crossing)
     assert np.max(np.abs(np.diff(command, prepend=0.0))) <= 40.0 * PERIOD + 1e-9
     assert failures == 0
     # Large weights of moves and of deflections beyond 0.5 mm only.
     settings = {"move_weight": 1e-8, "output_weight": 1e-4}
     without, limited = (
-        compiled_loop(rig(mpc(**settings, soft_limit=limit)), crossing)[0] for limit in (1.0, 5e-4)
+        compiled_loop(beam_case(mpc(**settings, soft_limit=limit)), crossing)[0]
+        for limit in (1.0, 5e-4)
     )
     assert np.max(np.abs(limited)) < np.max(np.abs(without))
     assert np.sum(np.abs(limited) > 5.2e-4) < np.sum(np.abs(without) > 5.2e-4)
@@ -228,7 +229,7 @@ def test_no_steady_deflection_under_an_unknown_constant_load(crossing):
     A, B, _, *rest = crossing
     frozen = tuple(jnp.broadcast_to(part[-1, -1], part.shape) for part in (A, B))
     load_input = jnp.broadcast_to(B[-1, -1, :, 0] * -3.0, (*A.shape[:2], 6))
-    deflection, command, _ = compiled_loop(rig(mpc()), (*frozen, load_input, *rest))
+    deflection, command, _ = compiled_loop(beam_case(mpc()), (*frozen, load_input, *rest))
     assert np.max(np.abs(deflection)) > 1e-5
     assert_allclose(deflection[-1], 0.0, atol=1e-9)
     assert_allclose(command[-1], 3.0, rtol=1e-5)
@@ -239,7 +240,7 @@ def test_records_count_steps_without_a_solution():
     infeasible = dataclasses.replace(
         PATCH, limits=jnp.array([1.0, 2.0]), rate_limit=jnp.array(10.0)
     )
-    record = run(rig(mpc(), modes=1, patch=infeasible, duration=0.05), 1)
+    record = run(beam_case(mpc(), modes=1, patch=infeasible, duration=0.05), 1)
     assert_array_equal(record.failures, np.arange(1, 7))
     assert_array_equal(record.command, 1.0)  # 0 V is held, clipped to the limits
     assert "no solution in 6 of its steps" in record.verdict
@@ -252,7 +253,7 @@ def test_sweeps_count_steps_without_a_solution():
     infeasible = dataclasses.replace(
         PATCH, limits=jnp.array([1.0, 2.0]), rate_limit=jnp.array(10.0)
     )
-    case = rig(mpc(), modes=1, patch=infeasible, duration=0.05)
+    case = beam_case(mpc(), modes=1, patch=infeasible, duration=0.05)
     runs = jb.sweep(case, {"actuators.0.rate_limit": [10.0, 1000.0]}, progress=False)
     assert_array_equal(runs.controller_failures, [6.0, 0.0])
     assert not runs.failed.any()
@@ -264,7 +265,7 @@ def test_derivatives_of_a_closed_loop(crossing):
 
     def cost(change):
         weights = {"move_weight": 1e-8 * jnp.exp(change[0]), "horizon_weight": jnp.exp(change[1:])}
-        deflection, command, _ = close_loop(rig(mpc(horizon=3, moves=2, **weights)), crossing)
+        deflection, command, _ = close_loop(beam_case(mpc(horizon=3, moves=2, **weights)), crossing)
         total = jnp.sum(deflection**2) * 1e6 + jnp.sum(command**2) * 1e-3
         return jnp.stack([total, jnp.max(command)])
 

@@ -15,7 +15,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation.kalman import Kalman
-from tests.control.predictive.test_mpc import PATCH, PERIOD, THESIS, mpc, rig
+from tests.control.predictive.test_mpc import PATCH, PERIOD, THESIS, beam_case, mpc
 
 INTENSITY, NOISE = 0.05, 1e-6
 SAMPLES, SUBSTEPS = 40, 4
@@ -23,7 +23,7 @@ SAMPLES, SUBSTEPS = 40, 4
 
 def estimates(readings, commands):
     """States (sample, state) of three modes by a Kalman filter in numpy."""
-    plant = jb.state_space(rig()).unloaded
+    plant = jb.state_space(beam_case()).unloaded
     A, B, C = map(np.asarray, (plant.A, plant.B, plant.C))
     size = A.shape[0]
     # Van Loan's exponentials: plant with its command, and noise of a period.
@@ -46,7 +46,7 @@ def estimates(readings, commands):
 def test_filter_of_three_modes_on_twelve():
     """Commands equal those of the law behind a filter in numpy; the peak is reduced by a sixth."""
     settings = {"design": DesignModel(modes=3), "estimator": Kalman(INTENSITY, NOISE)}
-    case = rig(mpc(**settings), modes=12)
+    case = beam_case(mpc(**settings), modes=12)
     model = jb.state_space(case)
     midpoints = (np.arange(SAMPLES * SUBSTEPS) + 0.5) * PERIOD / SUBSTEPS
 
@@ -92,7 +92,7 @@ def test_filter_of_three_modes_on_twelve():
 
         return jax.lax.scan(step, law.initial_state(), (jnp.asarray(states), previous))[1]
 
-    expected = commands_for(jb.state_space(rig(with_true_state)))
+    expected = commands_for(jb.state_space(beam_case(with_true_state)))
     expected = np.clip(expected, *np.asarray(PATCH.limits))
     assert np.ptp(expected) > 5
     assert_allclose(commands, expected, rtol=0, atol=1e-5)
@@ -103,7 +103,7 @@ def test_filter_of_three_modes_on_twelve():
 def test_known_loads_within_limits():
     """Each command against bounded least squares over the future commands, by scipy."""
     controller = mpc(loads="known")
-    case = jb.replace(rig(controller), {"loads.0.entry_time": -0.1, "loads.0.mass": 0.4})
+    case = jb.replace(beam_case(controller), {"loads.0.entry_time": -0.1, "loads.0.mass": 0.4})
     force = dataclasses.replace(case, loads=(jb.MovingForce(mass=0.4, speed=1.0, entry_time=-0.1),))
     random = np.random.default_rng(1)
     states = random.normal(size=(12, 6)) * [4e-4, 2e-5, 5e-6, 5e-3, 5e-4, 5e-4]

@@ -40,7 +40,7 @@ DRAWS = np.random.default_rng(5).normal(size=(SAMPLES, 4))
 STATES = DRAWS * np.array([2e-4, 3e-5, 1e-2, 5e-3]) - np.array([1.5e-4, 0, 0, 0])
 
 
-def rig(**settings) -> jb.Case:
+def beam_case(**settings) -> jb.Case:
     actuators = [
         jb.Patch(x, x + 0.05, MOMENT, limits=list(LIMITS), rate_limit=RATE) for x in STARTS
     ]
@@ -65,10 +65,10 @@ def plant(span, t, mass):
     state_matrix = np.vstack([np.eye(n, 2 * n, k=n), -compliance @ np.hstack([stiffness, damping])])
     forces = [MOMENT * (span.shapes(x, 1) - span.shapes(x + 0.05, 1)) for x in STARTS] + [-under]
     inputs = np.vstack([np.zeros((n, 3)), compliance @ np.array(forces).T])
-    whole = scipy.linalg.expm(
+    propagator = scipy.linalg.expm(
         PERIOD * np.vstack([np.hstack([state_matrix, inputs]), np.zeros((3, 7))])
     )
-    return whole[:4, :4], whole[:4, 4:6], whole[:4, 6]
+    return propagator[:4, :4], propagator[:4, 4:6], propagator[:4, 6]
 
 
 def sequences(law) -> np.ndarray:
@@ -103,9 +103,9 @@ class ExplicitProgram:
         """Terms whose squares are the cost, in units in which they are some thousands."""
         moves, _, states = self.future(variables)
         law, outputs = self.law, states[1:] @ self.C.T
-        by_period = np.ones(law.horizon) if law.horizon_weight is None else law.horizon_weight
-        by_output = np.ones(2) if law.output_weight is None else law.output_weight
-        weight = np.outer(by_period, by_output)
+        period_weights = np.ones(law.horizon) if law.horizon_weight is None else law.horizon_weight
+        output_weights = np.ones(2) if law.output_weight is None else law.output_weight
+        weight = np.outer(period_weights, output_weights)
         parts = [np.sqrt(np.broadcast_to(law.move_weight, 2)) * moves]
         if law.terminal == "riccati":
             A, B, _ = self.plants[0]
@@ -163,7 +163,9 @@ class ExplicitProgram:
 def affine(function, count):
     """Value at zero, and derivatives by the variables (..., variable)."""
     start = function(np.zeros(count))
-    return start, np.stack([function(one) - start for one in np.eye(count)], axis=-1)
+    return start, np.stack(
+        [function(unit_vector) - start for unit_vector in np.eye(count)], axis=-1
+    )
 
 
 def by_clarabel(H, f, M, gamma):
@@ -200,7 +202,7 @@ def commands_of(case) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_commands_against_an_independent_program(name):
-    case = rig(**SETTINGS[name])
+    case = beam_case(**SETTINGS[name])
     law, span, found = case.controller, span_of(case), commands_of(case)
     varying = law.prediction == "time-varying"
     mass = MASS if varying else 0.0
@@ -220,5 +222,5 @@ def test_commands_against_an_independent_program(name):
         active |= (found > LIMITS[1] - 1e-6) | (found < LIMITS[0] + 1e-6)
         assert 0 < np.mean(active) < 1, "some limits and rate limits must be active, not all"
     if law.soft_limit is not None:
-        without = commands_of(rig(**SETTINGS[name] | {"soft_limit": 1.0}))
+        without = commands_of(beam_case(**SETTINGS[name] | {"soft_limit": 1.0}))
         assert np.max(np.abs(found - without)) > 0.05

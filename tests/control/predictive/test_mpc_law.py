@@ -15,7 +15,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.control.predictive.prediction import incremental_model
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.numerics.riccati import dlqr
-from tests.control.predictive.test_mpc import PATCH, PERIOD, mpc, rig
+from tests.control.predictive.test_mpc import PATCH, PERIOD, beam_case, mpc
 
 
 def test_complete_laguerre_basis_equals_plain_moves():
@@ -32,7 +32,7 @@ def commands(controller, states, patch=PATCH, failing=False):
 
     With `failing` also the number of samples without a solution, up to each sample.
     """
-    case = rig(controller, patch=patch)
+    case = beam_case(controller, patch=patch)
     model = jb.state_space(case)
 
     @eqx.filter_jit
@@ -66,7 +66,7 @@ def test_unconstrained_law():
         output_weight=output_weight, horizon_weight=horizon_weight, solver="unconstrained"
     )
     states = np.random.default_rng(0).normal(size=(2, 6)) * 1e-3
-    A, B, C = map(np.asarray, incremental_model(*incremental_plant(rig(controller))))
+    A, B, C = map(np.asarray, incremental_model(*incremental_plant(beam_case(controller))))
     power = [np.linalg.matrix_power(A, n) for n in range(7)]
     F = np.concatenate([C @ power[n] for n in range(1, 7)])
     Phi = np.array(
@@ -75,7 +75,7 @@ def test_unconstrained_law():
     weight = np.diag(output_weight * horizon_weight)
     gain = np.linalg.solve(Phi.T @ weight @ Phi + 1e-11 * np.eye(4), Phi.T @ weight @ F)[0]
     expected, previous = 0.0, np.zeros(6)
-    C = incremental_plant(rig(controller))[2]
+    C = incremental_plant(beam_case(controller))[2]
     for state, command in zip(states, commands(controller, jnp.asarray(states)), strict=True):
         expected = expected - gain @ np.concatenate([state - previous, C @ state])
         assert_allclose(command, [expected], rtol=1e-9)
@@ -85,7 +85,7 @@ def test_unconstrained_law():
 def test_terminal_cost_gives_the_regulator():
     """Dual mode, eq. (7.31): with terminal cost at any horizon, without it at a long one."""
     states = np.random.default_rng(0).normal(size=(2, 6)) * 1e-3
-    A, B, C = incremental_plant(rig())
+    A, B, C = incremental_plant(beam_case())
     A, B, rows = incremental_model(A, B, C)
     gain = dlqr(A, B, rows.T @ rows, 1e-11 * jnp.eye(1))[0]
     first = -gain @ np.concatenate([states[0], C @ states[0]])
@@ -105,7 +105,7 @@ def test_without_a_solution_the_last_command_is_held():
     found, failures = commands(mpc(), jnp.zeros((2, 6)), infeasible, failing=True)
     assert_array_equal(found, 0.0)
     assert_array_equal(failures, [1.0, 2.0])
-    case = rig(mpc(), patch=infeasible)
+    case = beam_case(mpc(), patch=infeasible)
     state, near_limit = 1e-3 * jnp.ones(6), jnp.array([0.7])  # V
     measurement = Measurement(jnp.zeros(1), state, near_limit)
     law = case.controller.law(jb.state_space(case))
@@ -115,7 +115,7 @@ def test_without_a_solution_the_last_command_is_held():
 
 
 def test_case_file_keeps_the_controller():
-    case = rig(mpc(positions=[0.2, 0.4], soft_limit=1e-3, loads="known", delay=0.002))
+    case = beam_case(mpc(positions=[0.2, 0.4], soft_limit=1e-3, loads="known", delay=0.002))
     check_case(case)
     assert eqx.tree_equal(case, case_from_dict(case_to_dict(case)))
 
@@ -139,4 +139,4 @@ def test_case_file_keeps_the_controller():
 )
 def test_errors_of_settings(settings, words):
     with pytest.raises(ValueError, match=words):
-        check_case(rig(mpc(**settings)))
+        check_case(beam_case(mpc(**settings)))

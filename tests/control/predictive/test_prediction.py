@@ -37,11 +37,11 @@ def test_prediction_against_the_incremental_model():
         for j in range(min(i + 1, 3)):
             Phi[i, :, 2 * j : 2 * j + 2] = rows @ power[i - j] @ B_incremental
     assert_allclose(found.Phi, Phi, atol=1e-14)
-    previous, now, command = np.random.default_rng(1).normal(size=(3, 4))
+    previous, state, command = np.random.default_rng(1).normal(size=(3, 4))
     command = command[:2]
-    unexplained = now - A @ previous - B @ command
-    free = found.F @ np.concatenate([now, unexplained, command, [1.0]])
-    assert_allclose(free, F @ np.concatenate([now - previous, C @ now]), atol=1e-13)
+    unexplained = state - A @ previous - B @ command
+    free_response = found.F @ np.concatenate([state, unexplained, command, [1.0]])
+    assert_allclose(free_response, F @ np.concatenate([state - previous, C @ state]), atol=1e-13)
     assert_allclose(found.terminal[4:], found.F[-1], atol=1e-14)
 
 

@@ -115,7 +115,7 @@ def test_infeasible_problems(size, solve):
 def test_accuracy_does_not_depend_on_units(method):
     """In metres and volts H and f are of the order 1e-9."""
     H, f, M, gamma = (part[3] for part in problems("plain", 6, 12))
-    plain = solve_qp(H, f, M, gamma, method)
+    unscaled = solve_qp(H, f, M, gamma, method)
     row, unit = np.logspace(-4, 4, 12), np.logspace(-2, 2, 6)
     scaled = solve_qp(
         1e-9 * H * unit * unit[:, None],
@@ -125,7 +125,7 @@ def test_accuracy_does_not_depend_on_units(method):
         method,
     )
     assert scaled.solved
-    assert_allclose(scaled.x * unit, plain.x, rtol=0, atol=1e-9)
+    assert_allclose(scaled.x * unit, unscaled.x, rtol=0, atol=1e-9)
 
 
 def test_numbers_that_are_not_finite_in_a_batch(solve):

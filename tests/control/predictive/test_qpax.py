@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.control.predictive.qp import solve_qp
-from tests.control.predictive.test_mpc import mpc, rig
+from tests.control.predictive.test_mpc import beam_case, mpc
 from tests.control.predictive.test_mpc_law import commands
 from tests.control.predictive.test_qp import FEASIBLE, problems
 from tests.oracles import qpax_solver
@@ -57,11 +57,11 @@ def test_commands_of_predictive_control():
     def next_command(plant, state, last_state, previous):
         law = controller.law(plant).law
         predicted = law.sampled_plant.A @ last_state + law.sampled_plant.B @ previous
-        known = jnp.concatenate([state, state - predicted, previous, jnp.ones(1)])
-        x, solved = qpax_solver.solve(*law.quadratic_program(law.prediction, known, previous))
+        initial = jnp.concatenate([state, state - predicted, previous, jnp.ones(1)])
+        x, solved = qpax_solver.solve(*law.quadratic_program(law.prediction, initial, previous))
         return previous + law.move_maps[0] @ x, solved
 
-    plant = jb.state_space(rig(controller))
+    plant = jb.state_space(beam_case(controller))
     last_state, previous = jnp.zeros(6), jnp.zeros(1)
     for state, command in zip(states, found, strict=True):
         expected, solved = next_command(plant, state, last_state, previous)
