@@ -18,7 +18,7 @@ class LoadStabilityLimits(NamedTuple):
     """Mass (kg) and speed (m/s, absolute) of a load above which a loop is unstable.
 
     Infinite if no limit was found, zero if all values tried are unstable, None if the load has no
-    such number.
+    mass (or speed).
     """
 
     mass: float | None

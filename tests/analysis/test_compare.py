@@ -75,29 +75,29 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(folder):
+def comparison(folder):
     case = jb.load_case(folder / "weak.toml")
     return compare(case, {"weak": case.controller, "wild": load_controller(folder / "wild.toml")})
 
 
-def test_metrics_match_the_records(found):
-    assert list(found.records) == list(found.metrics) == ["weak", "wild"]
-    assert found.case.controller is None
-    assert found.uncontrolled.case.controller is None
-    for name, record in found.records.items():
-        metrics, deflection = found.metrics[name], np.asarray(record.deflection)[:, 0]
+def test_metrics_match_the_records(comparison):
+    assert list(comparison.records) == list(comparison.metrics) == ["weak", "wild"]
+    assert comparison.case.controller is None
+    assert comparison.uncontrolled.case.controller is None
+    for name, record in comparison.records.items():
+        metrics, deflection = comparison.metrics[name], np.asarray(record.deflection)[:, 0]
         assert metrics.peak == record.peak_deflection[0]
         assert_allclose(metrics.rms**2, np.mean(deflection**2), rtol=1e-12)
         assert metrics.after_exit == np.max(np.abs(deflection[np.asarray(record.times) > 0.3]))
         assert metrics.saturated.shape == metrics.effort.shape == (1,)
         assert_allclose(metrics.effort[0], np.trapezoid(record.command[:, 0] ** 2, record.times))
-        taken = found.bound.uncontrolled - metrics.peak
-        whole = found.bound.uncontrolled - found.bound.peak
-        assert_allclose(metrics.share, taken / whole, rtol=1e-12)
-    assert 0 < found.metrics["weak"].share < 1
-    assert found.metrics["wild"].share < 0
-    assert found.metrics["wild"].saturated[0] > 0.1 > found.metrics["weak"].saturated[0]
-    assert found.bound.share(found.optimal) > 0.99
+        reduction = comparison.bound.uncontrolled - metrics.peak
+        attainable = comparison.bound.uncontrolled - comparison.bound.peak
+        assert_allclose(metrics.share, reduction / attainable, rtol=1e-12)
+    assert 0 < comparison.metrics["weak"].share < 1
+    assert comparison.metrics["wild"].share < 0
+    assert comparison.metrics["wild"].saturated[0] > 0.1 > comparison.metrics["weak"].saturated[0]
+    assert comparison.bound.share(comparison.optimal) > 0.99
 
 
 def critical_gain(case: jb.Case, position: float) -> float:
@@ -119,67 +119,70 @@ def critical_gain(case: jb.Case, position: float) -> float:
     return scipy.optimize.brentq(excess, 0.0, 2e4)
 
 
-def test_margin_is_the_smallest_over_stationary_positions(found):
+def test_margin_is_the_smallest_over_stationary_positions(comparison):
     gains = [
-        critical_gain(found.records["weak"].case, x) for x in np.linspace(0, 0.6, LOAD_POSITIONS)
+        critical_gain(comparison.records["weak"].case, x)
+        for x in np.linspace(0, 0.6, LOAD_POSITIONS)
     ]
-    assert_allclose(found.metrics["weak"].stability_margin.gain, min(gains) / 2000.0, rtol=1e-9)
-    assert 0 < found.metrics["weak"].stability_margin.delay < 0.01
-    assert found.metrics["weak"].stability_margin.obstacle == ""
+    assert_allclose(
+        comparison.metrics["weak"].stability_margin.gain, min(gains) / 2000.0, rtol=1e-9
+    )
+    assert 0 < comparison.metrics["weak"].stability_margin.delay < 0.01
+    assert comparison.metrics["weak"].stability_margin.obstacle == ""
 
 
-def test_loops_without_a_margin_name_the_obstacle(found, folder):
-    slow = dataclasses.replace(found.case.sensors[0], sampling_period=jnp.asarray(0.02))
+def test_loops_without_a_margin_name_the_obstacle(comparison, folder):
+    slow = dataclasses.replace(comparison.case.sensors[0], sampling_period=jnp.asarray(0.02))
     open_loop = load_controller(folder / "constant.toml")
     for changes, obstacle in (
         ({"controller": open_loop}, "do not depend on readings"),
         ({"controller": jb.MPC(4, 2, 1e-9, period=0.01)}, "not linear at its limits"),
         (
-            {"controller": found.records["weak"].case.controller, "sensors": (slow,)},
+            {"controller": comparison.records["weak"].case.controller, "sensors": (slow,)},
             "sensors.0.sampling_period must be the controller's",
         ),
     ):
-        missing = stability_margin(dataclasses.replace(found.case, **changes))
+        missing = stability_margin(dataclasses.replace(comparison.case, **changes))
         assert np.isnan(missing.gain) and np.isnan(missing.delay)
         assert obstacle in missing.obstacle
 
 
-def test_picture_names_every_run(found):
-    figure = plot_comparison(found)
+def test_picture_names_every_run(comparison):
+    figure = plot_comparison(comparison)
     written = words(figure)
     for part in ("no control", "weak", "wild", "optimal commands", "limit 7.50", "command (V)"):
         assert part in written
-    assert f"({found.metrics['weak'].share:.0%})" in written
+    assert f"({comparison.metrics['weak'].share:.0%})" in written
     top = figure.axes[0]
     lines = {line.get_label(): line.get_ydata() for line in top.get_lines()}
-    assert_allclose(lines["weak"], 1e3 * found.records["weak"].deflection[:, 0])
-    assert any(np.allclose(y, -1e3 * found.bound.peak) for y in lines.values() if len(y) == 2)
+    assert_allclose(lines["weak"], 1e3 * comparison.records["weak"].deflection[:, 0])
+    assert any(np.allclose(y, -1e3 * comparison.bound.peak) for y in lines.values() if len(y) == 2)
 
 
-def test_picture_marks_diverging_controllers(found):
-    diverged = jnp.full(found.uncontrolled.deflection.shape[:1] + (2,), jnp.nan)
+def test_picture_marks_diverging_controllers(comparison):
+    diverged = jnp.full(comparison.uncontrolled.deflection.shape[:1] + (2,), jnp.nan)
     unknown = jnp.full(1, jnp.nan)
     parts = {"coordinates": diverged, "peak_deflection": unknown, "peak_time": unknown}
-    record = dataclasses.replace(found.records["wild"], **parts)
-    comparison = dataclasses.replace(found, records={"wild": record})
-    assert "wild diverges" in words(plot_comparison(comparison))
+    record = dataclasses.replace(comparison.records["wild"], **parts)
+    diverging = dataclasses.replace(comparison, records={"wild": record})
+    assert "wild diverges" in words(plot_comparison(diverging))
 
 
-def test_comparison_needs_a_controller(found):
+def test_comparison_needs_a_controller(comparison):
     with pytest.raises(ValueError, match="give at least one controller"):
-        compare(found.case, {})
+        compare(comparison.case, {})
 
 
-def test_invalid_controller_is_named(found):
+def test_invalid_controller_is_named(comparison):
     with pytest.raises(ValueError, match="two: controller.gains must list one gain for each of 1"):
-        compare(found.case, {"two": jb.Feedback([1.0, 2.0], period=0.01)})
+        compare(comparison.case, {"two": jb.Feedback([1.0, 2.0], period=0.01)})
 
 
-def test_former_names_warn(found):
+def test_former_names_warn(comparison):
     for old, new in (("free", "uncontrolled"), ("best", "optimal"), ("merits", "metrics")):
         with pytest.warns(DeprecationWarning, match=f"Comparison.{old} is called {new} now"):
-            assert getattr(found, old) is getattr(found, new)
-    metrics = found.metrics["weak"]
+            assert getattr(comparison, old) is getattr(comparison, new)
+    metrics = comparison.metrics["weak"]
     for old, new in (("reserve", "stability_margin"), ("swings", "limit_cycles")):
         with pytest.warns(DeprecationWarning, match=f"{old} is called {new} now"):
             assert getattr(metrics, old) is getattr(metrics, new)
@@ -194,38 +197,38 @@ def run(line: str, folder, monkeypatch, capsys) -> tuple[int, str, str]:
 
 
 @pytest.mark.slow
-def test_command_prints_and_draws(found, folder, monkeypatch, capsys):
+def test_command_prints_and_draws(comparison, folder, monkeypatch, capsys):
     line = "compare weak.toml --controllers wild.toml constant.toml"
-    code, printed, wrong = run(f"{line} -o out.png", folder, monkeypatch, capsys)
-    assert code == 0, wrong
-    assert f"below {found.bound.peak:.6g} m" in printed
-    assert f"{found.metrics['weak'].share:.1%}" in printed
+    code, printed, errors = run(f"{line} -o out.png", folder, monkeypatch, capsys)
+    assert code == 0, errors
+    assert f"below {comparison.bound.peak:.6g} m" in printed
+    assert f"{comparison.metrics['weak'].share:.1%}" in printed
     assert "constant: every load presses on the beam throughout" in printed
-    assert f"wild: {found.loop_summary('wild')}; every load presses on the beam" in printed
-    assert f"{found.metrics['weak'].stability_margin.gain:.3g}" in printed
+    assert f"wild: {comparison.loop_summary('wild')}; every load presses on the beam" in printed
+    assert f"{comparison.metrics['weak'].stability_margin.gain:.3g}" in printed
     assert "no margin of constant: commands that do not depend on readings close no loop" in printed
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
-    code, printed, wrong = run(f"{line} --json --period 0.02", folder, monkeypatch, capsys)
-    assert code == 0, wrong
+    code, printed, errors = run(f"{line} --json --period 0.02", folder, monkeypatch, capsys)
+    assert code == 0, errors
     answer = json.loads(printed)
     assert answer["held_for"] == 0.02
-    assert answer["least_peak"] >= found.bound.peak * (1 - 1e-6)
-    assert answer["controllers"]["weak"]["peak"] == found.metrics["weak"].peak
+    assert answer["least_peak"] >= comparison.bound.peak * (1 - 1e-6)
+    assert answer["controllers"]["weak"]["peak"] == comparison.metrics["weak"].peak
     assert answer["controllers"]["wild"]["stability_margin"]["gain"] is None  # infinite
 
 
 @pytest.mark.slow
-def test_metrics_over_several_load_cases(found, folder, monkeypatch, capsys):
+def test_metrics_over_several_load_cases(comparison, folder, monkeypatch, capsys):
     line = "compare weak.toml --over loads.0.mass=0.3,0.509"
-    code, printed, wrong = run(f"{line} --json", folder, monkeypatch, capsys)
-    assert code == 0, wrong
+    code, printed, errors = run(f"{line} --json", folder, monkeypatch, capsys)
+    assert code == 0, errors
     answer = json.loads(printed)
     light, heavy = (case["controllers"]["weak"] for case in answer["cases"])
     assert [case["values"] for case in answer["cases"]] == [
         {"loads.0.mass": 0.3},
         {"loads.0.mass": 0.509},
     ]
-    assert heavy["peak"] == pytest.approx(found.metrics["weak"].peak, rel=1e-6)
+    assert heavy["peak"] == pytest.approx(comparison.metrics["weak"].peak, rel=1e-6)
     summary = answer["over_all"]["weak"]
     assert summary["peak"] == max(light["peak"], heavy["peak"])
     assert summary["worst_share"] == min(light["share"], heavy["share"])
@@ -257,6 +260,6 @@ def test_metrics_over_several_load_cases(found, folder, monkeypatch, capsys):
 def test_errors_are_named(folder, monkeypatch, capsys, line, message):
     (folder / "bare.toml").write_text(CASE)
     (folder / "odd.toml").write_text("controller = 1")
-    code, printed, wrong = run(line, folder, monkeypatch, capsys)
+    code, printed, errors = run(line, folder, monkeypatch, capsys)
     assert (code, printed) == (1, "")
-    assert message in wrong
+    assert message in errors

@@ -26,11 +26,11 @@ def test_turning_points_leave_out_small_reversals():
 
 def test_oscillations_are_counted_beyond_those_of_the_deflection():
     growing, zero = np.exp(TIMES) * np.sin(2 * np.pi * 9.0 * TIMES), np.zeros(TIMES.size)
-    free = count_oscillations(TIMES, growing, zero > 0, zero)
-    assert free.oscillates and not free.limit_cycle
-    assert_allclose(free.frequency, 9.0, rtol=0.02)
-    held = count_oscillations(TIMES, np.clip(growing, -2, 2), np.abs(growing) >= 2, zero)
-    assert held.limit_cycle and held.at_limits > 10
+    unlimited = count_oscillations(TIMES, growing, zero > 0, zero)
+    assert unlimited.oscillates and not unlimited.limit_cycle
+    assert_allclose(unlimited.frequency, 9.0, rtol=0.02)
+    limited = count_oscillations(TIMES, np.clip(growing, -2, 2), np.abs(growing) >= 2, zero)
+    assert limited.limit_cycle and limited.at_limits > 10
     forced = count_oscillations(TIMES, -growing, zero > 0, growing)
     assert forced.extra == 0 and not forced.oscillates
 
@@ -69,15 +69,18 @@ def test_high_gain_has_published_limit_cycle():
     With 0.261 kg the commands oscillate within the limits.
     """
     case = unstable_case(3.0, 0.03, 0.01)
-    free = dataclasses.replace(case, controller=None)
-    plan, plain = integration_plan(case, None, 1e-4), integration_plan(free, None, 1e-4)
-    for mass, cycles in ((0.261, False), (0.322, True), (0.509, True)):
-        heavy = {"loads.0.mass": mass}
-        found = command_oscillations(
-            jb.simulate(jb.replace(case, heavy), plan=plan),
-            jb.simulate(jb.replace(free, heavy), plan=plain),
+    uncontrolled = dataclasses.replace(case, controller=None)
+    plan, uncontrolled_plan = (
+        integration_plan(case, None, 1e-4),
+        integration_plan(uncontrolled, None, 1e-4),
+    )
+    for mass, limit_cycle in ((0.261, False), (0.322, True), (0.509, True)):
+        change = {"loads.0.mass": mass}
+        oscillations = command_oscillations(
+            jb.simulate(jb.replace(case, change), plan=plan),
+            jb.simulate(jb.replace(uncontrolled, change), plan=uncontrolled_plan),
         )
-        assert [one.limit_cycle for one in found] == [cycles, cycles]
+        assert [one.limit_cycle for one in oscillations] == [limit_cycle, limit_cycle]
     unstable = stability_margin(jb.replace(case, {"loads.0.mass": 0.322})).unstable
     assert unstable is not None and unstable.rate > 1
-    assert_allclose(found[0].frequency, unstable.frequency, rtol=0.25)
+    assert_allclose(oscillations[0].frequency, unstable.frequency, rtol=0.25)

@@ -35,13 +35,13 @@ def critical_gain(case: jb.Case, waiting: int) -> float:
     system = scipy.signal.cont2discrete((a, b, c[None], np.zeros((1, 1))), PERIOD)
     transition, force_response = np.asarray(system[0]), np.asarray(system[1])[:, 0]
     size = 2 * n + waiting  # delayed commands last, newest first
-    whole = np.zeros((size, size))
-    whole[: 2 * n, : 2 * n], whole[: 2 * n, -1] = transition, force_response
-    whole[2 * n + 1 :, 2 * n : -1] = np.eye(waiting - 1)
+    closed_matrix = np.zeros((size, size))
+    closed_matrix[: 2 * n, : 2 * n], closed_matrix[: 2 * n, -1] = transition, force_response
+    closed_matrix[2 * n + 1 :, 2 * n : -1] = np.eye(waiting - 1)
 
     def excess(gain):
-        whole[2 * n, : 2 * n] = -gain * c
-        return np.abs(np.linalg.eigvals(whole)).max() - 1
+        closed_matrix[2 * n, : 2 * n] = -gain * c
+        return np.abs(np.linalg.eigvals(closed_matrix)).max() - 1
 
     return scipy.optimize.brentq(excess, 0.0, 1e4)
 

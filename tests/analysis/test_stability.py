@@ -51,15 +51,15 @@ def shaker_case(controller, modes=3, force_per_volt=4.6, loads=None, sensors=1):
 def state_matrices(x, speed, mass, force_per_volt, modes=3):
     """State and input matrices in the sine basis, eqs (2.11) and (2.36) corrected."""
     n = np.arange(1, modes + 1) * np.pi / LENGTH
-    half = DENSITY * LENGTH / 2
+    modal_mass = DENSITY * LENGTH / 2
     omega = n**2 * np.sqrt(RIGIDITY / DENSITY)
-    shaker, here = np.sin(n * SHAKER_POSITION), np.sin(n * x)
-    slope, bend = n * np.cos(n * x), -(n**2) * np.sin(n * x)
-    M = half * np.eye(modes) + mass * np.outer(here, here)
-    C = half * np.diag(2 * RATIO * omega) + DAMPER * np.outer(shaker, shaker)
-    C += 2 * mass * speed * np.outer(here, slope)
-    K = half * np.diag(omega**2) + SPRING * np.outer(shaker, shaker)
-    K += mass * speed**2 * np.outer(here, bend)
+    shaker, load_shape = np.sin(n * SHAKER_POSITION), np.sin(n * x)
+    slope, curvature = n * np.cos(n * x), -(n**2) * np.sin(n * x)
+    M = modal_mass * np.eye(modes) + mass * np.outer(load_shape, load_shape)
+    C = modal_mass * np.diag(2 * RATIO * omega) + DAMPER * np.outer(shaker, shaker)
+    C += 2 * mass * speed * np.outer(load_shape, slope)
+    K = modal_mass * np.diag(omega**2) + SPRING * np.outer(shaker, shaker)
+    K += mass * speed**2 * np.outer(load_shape, curvature)
     A = np.zeros((2 * modes + 1,) * 2)
     A[:modes, modes:-1] = np.eye(modes)
     A[modes:-1, :modes] = -np.linalg.solve(M, K)
@@ -99,7 +99,7 @@ def test_frozen_poles_of_published_regulator():
 
 
 def test_pole_of_published_loop_with_filter():
-    # `frozen_eig` of the reference numbers: 0.509 kg stationary at midspan, filter of 10 Hz.
+    """`frozen_eig` of the reference numbers: 0.509 kg stationary at midspan, filter of 10 Hz."""
     beam = jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.03, modes=5)
     patch = jb.Patch(start=0.2575, end=0.3425, moment_per_volt=0.000265358032154821)
     filter = jb.Filter(cutoff=10.0, order=10, realisation="analogue")
@@ -124,7 +124,7 @@ def test_crossing_branches_are_tracked():
 
 
 def test_sampled_poles_match_simulated_decay():
-    # The loop has a delay of one and a half periods, a delayed sensor and a digital filter.
+    """The loop has a delay of one and a half periods, a delayed sensor and a digital filter."""
     filter = jb.Filter(cutoff=60.0, order=2)
     case = shaker_case(
         jb.Feedback([200.0], period=0.004, delay=0.006),
@@ -151,16 +151,17 @@ def test_sampled_poles_match_simulated_decay():
 GAIN = np.array([[300.0, -800.0, 12.0, 0.5, 0.0]])
 
 
-def closed(x, speed, mass):
+def closed_matrix(x, speed, mass):
+    """State matrix under state feedback, with the load frozen at x (m)."""
     A, B = state_matrices(x, speed, mass, 4.6, modes=2)
     return A - B @ GAIN
 
 
-def over_crossing(speed, end):
+def crossing_transition(speed, end):
     """Transition matrix of the loop over the first part of a crossing."""
 
     def rate(t, y):
-        return (closed(speed * t, speed, MASS) @ y.reshape(5, 5)).ravel()
+        return (closed_matrix(speed * t, speed, MASS) @ y.reshape(5, 5)).ravel()
 
     solved = scipy.integrate.solve_ivp(
         rate, (0, end), np.eye(5).ravel(), method="Radau", rtol=1e-9, atol=1e-12
@@ -176,15 +177,15 @@ def test_growth_against_scipy():
     shaker, half = np.sin(n * SHAKER_POSITION), DENSITY * LENGTH / 2
     stiffness = half * np.diag(n**4 * RIGIDITY / DENSITY) + SPRING * np.outer(shaker, shaker)
     root = np.linalg.cholesky(scipy.linalg.block_diag(stiffness, half * np.eye(2))).T
-    part = root @ over_crossing(SPEED, end)[:4, :4] @ np.linalg.inv(root)
+    part = root @ crossing_transition(SPEED, end)[:4, :4] @ np.linalg.inv(root)
     assert found.factor[1] == pytest.approx(np.linalg.norm(part, ord=2), rel=1e-4)
 
 
 def test_floquet_multipliers_against_scipy():
     case = shaker_case(jb.StateFeedback(gain=GAIN, coordinates="sine"), modes=2)
     found = stream(jb.replace(case, {"loads.0.speed": 20.0}), 0.04)
-    alone = scipy.linalg.expm(0.01 * closed(0.0, 0.0, 0.0))
-    expected = np.linalg.eigvals(alone @ over_crossing(20.0, 0.03))
+    unloaded_transition = scipy.linalg.expm(0.01 * closed_matrix(0.0, 0.0, 0.0))
+    expected = np.linalg.eigvals(unloaded_transition @ crossing_transition(20.0, 0.03))
     order = np.argsort(-np.abs(expected))[:3]
     np.testing.assert_allclose(
         np.sort(np.abs(found.multipliers))[::-1][:3], np.abs(expected)[order], rtol=1e-4
@@ -200,13 +201,13 @@ def test_sampled_multipliers_converge_to_continuous():
         ).largest_multiplier
 
     # A hold delays by half a period: the difference is of first order.
-    exact = largest(None)
-    far, near = (largest(period) - exact for period in (4e-4, 2e-4))
-    assert far / near == pytest.approx(2.0, abs=0.15)
+    continuous = largest(None)
+    coarse, fine = (largest(period) - continuous for period in (4e-4, 2e-4))
+    assert coarse / fine == pytest.approx(2.0, abs=0.15)
 
 
 def test_limit_of_a_gain_is_its_gain_margin():
-    # The mass of the load is negligible.
+    """The mass of the load is negligible."""
     case = shaker_case(
         jb.Feedback([100.0], period=0.004), modes=2, loads=[jb.MovingMass(mass=1e-9, speed=SPEED)]
     )
@@ -239,7 +240,7 @@ def test_margins_against_python_control():
 
 
 def test_pole_is_on_unit_circle_at_gain_margin():
-    # It crosses at -1, half the sampling frequency.
+    """The pole leaves the circle at -1, half the sampling frequency."""
     loop = linearised_loop(shaker_case(regulator(period=0.002)), 0.0)
     A, B, K = (np.asarray(part) for part in (loop.A, loop.B, loop.K))
     gain = margins(loop).gain
@@ -251,8 +252,8 @@ def test_pole_is_on_unit_circle_at_gain_margin():
 def test_delay_beyond_its_margin_destabilises():
     found = margins(linearised_loop(shaker_case(jb.Feedback([1500.0], period=0.002), modes=2), 0.0))
     for share, stable in ((0.98, True), (1.02, False)):
-        later = jb.Feedback([1500.0], period=0.002, delay=share * found.delay)
-        poles = linearised_loop(shaker_case(later, modes=2), 0.0).poles()
+        delayed = jb.Feedback([1500.0], period=0.002, delay=share * found.delay)
+        poles = linearised_loop(shaker_case(delayed, modes=2), 0.0).poles()
         assert (poles.real.max() < 0) == stable
 
 

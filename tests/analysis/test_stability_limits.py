@@ -37,6 +37,7 @@ def regulated(x, speed=SPEED, mass=MASS):
 
 
 def fastest_growth(speed, mass):
+    """Largest real part (1/s) of the poles under regulated state feedback over the crossing."""
     positions = LENGTH * np.linspace(0.0, 1.0, 101)[:-1]
     return max(np.linalg.eigvals(regulated(x, speed, mass)).real.max() for x in positions)
 
@@ -117,6 +118,7 @@ def monodromy_matrix(row, speed, mass, spacing, steps=400):
 
 
 def largest_frozen(row, speed, mass):
+    """Largest real part (1/s) of the frozen poles over the crossing, with a feedback row."""
     positions = LENGTH * np.linspace(0.0, 1.0, 101)[:-1]
     frozen = [state_matrices(x, speed, mass, 4.6, modes=2) for x in positions]
     return max(np.linalg.eigvals(A - B @ row).real.max() for A, B in frozen)

@@ -33,7 +33,7 @@ def loop(actuators, sensors, controller, beam=BEAM, loads=(MASS,), duration=0.4)
     return jb.Case(beam, (), actuators, sensors, loads, controller, jb.Run(duration))
 
 
-def planned(case: jb.Case, times, substeps: int) -> IntegrationPlan:
+def plan_with_substeps(case: jb.Case, times, substeps: int) -> IntegrationPlan:
     """Plan with a number of steps between events, without trial runs."""
     return IntegrationPlan(
         static_shapes(case), substeps, 0, False, 0.0, loop_schedule(case, np.asarray(times))
@@ -41,7 +41,7 @@ def planned(case: jb.Case, times, substeps: int) -> IntegrationPlan:
 
 
 def run(case: jb.Case, times=TIMES, substeps: int = 2) -> jb.Record:
-    return jb.simulate(case, jnp.asarray(times), planned(case, times, substeps))
+    return jb.simulate(case, jnp.asarray(times), plan_with_substeps(case, times, substeps))
 
 
 ALL_STATES = [[300.0, 10.0, 20.0, 2.0, 0.1, -0.1, 0.02]]
@@ -133,7 +133,7 @@ def test_loops_agree_with_the_oracle(name):
     truth = expected(case, TIMES)
     pairs = [(record.deflection, truth.deflection), (record.command, truth.command)]
     if case.controller.period is not None:
-        pairs.append((record.measured, truth.shown))
+        pairs.append((record.measured, truth.arrived_readings))
     for found, true in pairs:
         size = np.max(np.abs(true), axis=0)
         assert np.all(size > 0)
@@ -147,8 +147,8 @@ def test_controller_and_record_have_the_same_noise():
     case = loop([PATCH], [sensor], jb.Feedback([1000.0], period=2e-3), loads=())
     record = run(case, 2e-3 * np.arange(101))
     noise = 1e-4 * np.asarray(noise_samples(case.run.seed, 1, 101))[np.arange(101) // 2]
-    read = record.deflection[::2] + noise[::2]
-    assert_allclose(record.measured, np.repeat(read, 2, axis=0)[:101], rtol=1e-12)
+    readings = record.deflection[::2] + noise[::2]
+    assert_allclose(record.measured, np.repeat(readings, 2, axis=0)[:101], rtol=1e-12)
     # The last command, too, is the one just after the sample.
     assert_allclose(record.command, -1000.0 * record.measured, rtol=1e-12)
 
@@ -159,9 +159,9 @@ def test_readings_for_fits_have_no_noise():
     noiseless = LOOPS["delay beyond two periods, filter at the sensor's own period"]
     noisy = dataclasses.replace(noiseless.sensors[0], noise=jnp.array(1e-3))
     case = dataclasses.replace(noiseless, sensors=(noisy,))
-    plan = planned(case, TIMES, 2)
+    plan = plan_with_substeps(case, TIMES, 2)
     found = jax.jit(lambda: simulate_readings(case, jnp.asarray(TIMES), plan))()
-    truth = expected(noiseless, TIMES).shown
+    truth = expected(noiseless, TIMES).arrived_readings
     assert_allclose(found, truth, rtol=0, atol=1e-9 * np.max(np.abs(truth)))
 
 
@@ -189,14 +189,14 @@ def test_law_that_saturates_within_a_step_meets_the_tolerance(actuator, gain):
 def test_sampled_law_converges_to_continuous_time():
     """At first order: a hold delays by half a period on average."""
     case = loop([PATCH], [SENSOR], jb.Feedback([1000.0]))
-    law = expected(case, TIMES[::2]).modal
+    continuous = expected(case, TIMES[::2]).modal
     errors = []
     for period in (4e-3, 1e-3):
         held = dataclasses.replace(case, controller=jb.Feedback([1000.0], period=period))
-        errors.append(np.max(np.abs(run(held, TIMES[::2], 1).coordinates - law)))
+        errors.append(np.max(np.abs(run(held, TIMES[::2], 1).coordinates - continuous)))
     order = np.log(errors[0] / errors[1]) / np.log(4)
     assert_allclose(order, 1.0, atol=0.02)
-    assert errors[-1] < 2e-3 * np.max(np.abs(law))
+    assert errors[-1] < 2e-3 * np.max(np.abs(continuous))
 
 
 STATIONARY_MASS = jb.MovingMass(mass=0.2, times=[0.0, 9.0], positions=[0.2, 0.2])
@@ -232,11 +232,11 @@ def test_time_invariant_sampled_loop_agrees_with_python_control():
     delay = control.tf([1.0], [1.0, 0.0], period)
     feedback = control.ss(gain * delay * filter, inputs=["w"], outputs=["u_back"])
     negation = control.summing_junction(["-u_back"], "u")
-    closed = control.interconnect(
+    closed_system = control.interconnect(
         [plant, feedback, negation], inputs=["weight"], outputs=["w", "u"]
     )
     weight = np.full((1, times.size), 0.2 * 9.81)
-    response = control.forced_response(closed, times, weight).outputs
+    response = control.forced_response(closed_system, times, weight).outputs
     size = np.max(np.abs(response), axis=1)
     assert_allclose(record.deflection[:, 0], response[0], rtol=0, atol=1e-9 * size[0])
     # The command at a sample is the one that begins there.
@@ -257,8 +257,8 @@ def test_poles_in_continuous_time_agree_with_python_control():
     a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(stiffness), -np.diag(damping)]])
     output = np.append(np.zeros(n), shapes)[None]
     plant = control.ss(a, np.append(np.zeros(n), shapes)[:, None], output, 0.0)
-    closed = control.feedback(plant, 200.0)
-    step = scipy.linalg.expm(closed.A * 1e-3)
+    closed_system = control.feedback(plant, 200.0)
+    step = scipy.linalg.expm(closed_system.A * 1e-3)
     free_motion = np.stack(
         [np.linalg.matrix_power(step, k) @ states[:, 0] for k in range(states.shape[1])], axis=1
     )
@@ -288,22 +288,22 @@ def test_energy_is_conserved():
     def at(positions, quantity):
         return np.asarray(record.at(jnp.asarray(positions), quantity))[1:-1]
 
-    z, drive = 0.0, np.zeros((len(starts), 6))
+    z, shaker_signal = 0.0, np.zeros((len(starts), 6))
     for k, command in enumerate(held[:, 0, 0]):
-        drive[k] = command + (z - command) * np.exp(-400.0 * (inner[k] - starts[k]))
+        shaker_signal[k] = command + (z - command) * np.exp(-400.0 * (inner[k] - starts[k]))
         z = command + (z - command) * np.exp(-400.0 * spans[k])
     q, rates = np.asarray(record.coordinates), np.asarray(record.rates)
     span = span_of(case)
     slopes = span.shapes(0.2575, 1) - span.shapes(0.3425, 1)
     at_shaker = at([0.5], "velocity")[:, 0]
-    power = drive.ravel() * 4.6 * at_shaker
+    power = shaker_signal.ravel() * 4.6 * at_shaker
     power = power + 8.3e-4 * 0.32 * 200.0 * held[:, :, 1].ravel() * (rates[1:-1] @ slopes)
     supplied = power.reshape(-1, 6)
     under = np.array(
         [span.shapes(x) @ u for x, u in zip(2.0 * inner.ravel(), rates[1:-1], strict=True)]
     )
     work = (-np.asarray(record.contact_force)[1:-1, 0] * under).reshape(-1, 6)
-    lost = 8.0 * at_shaker**2 + rates[1:-1] ** 2 @ (2 * 0.03 * span.frequencies)
+    dissipation = 8.0 * at_shaker**2 + rates[1:-1] ** 2 @ (2 * 0.03 * span.frequencies)
 
     def total(rate):
         return float(np.sum(rate.reshape(-1, 6) @ weights * spans / 2))
@@ -312,4 +312,6 @@ def test_energy_is_conserved():
     stored = (end + 3500.0 * (span.shapes(0.5) @ q[-1]) ** 2) / 2
     size = total(np.abs(supplied)) + total(np.abs(work))
     assert total(np.abs(supplied)) > 0.01 * size
-    assert_allclose(total(supplied) + total(work), stored + total(lost), rtol=0, atol=1e-8 * size)
+    assert_allclose(
+        total(supplied) + total(work), stored + total(dissipation), rtol=0, atol=1e-8 * size
+    )

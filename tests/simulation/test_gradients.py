@@ -81,9 +81,10 @@ class Problem:
         """Jacobian (output, number) by central differences, extrapolated from two steps."""
         columns = []
         for i in range(self.point.size):
-            one = np.eye(self.point.size)[i]
+            direction = np.eye(self.point.size)[i]
             single, double = (
-                (self.value(self.point + h * one) - self.value(self.point - h * one)) / (2 * h)
+                (self.value(self.point + h * direction) - self.value(self.point - h * direction))
+                / (2 * h)
                 for h in (step, 2 * step)
             )
             columns.append((4 * single - double) / 3)

@@ -125,9 +125,11 @@ def test_contact_force_is_weight_plus_inertia_along_the_path(one_mass):
     assert_allclose(record.load_position[on, 0], x, rtol=1e-12, atol=1e-15)
     q, u, a = (getattr(record, name)[on] for name in ("coordinates", "rates", "accelerations"))
     shape, slope, curvature = (record.modes.shapes(x, order) for order in range(3))
-    path = np.sum(shape * a + 2 * speed[:, None] * slope * u, axis=1)
-    path += np.sum((speed**2)[:, None] * curvature * q + acceleration[:, None] * slope * q, axis=1)
-    assert_close(record.contact_force[on, 0], 0.4 * (GRAVITY + path), 1e-11)
+    acceleration_along_path = np.sum(shape * a + 2 * speed[:, None] * slope * u, axis=1)
+    acceleration_along_path += np.sum(
+        (speed**2)[:, None] * curvature * q + acceleration[:, None] * slope * q, axis=1
+    )
+    assert_close(record.contact_force[on, 0], 0.4 * (GRAVITY + acceleration_along_path), 1e-11)
     off = np.isnan(record.load_position[:, 0])
     assert off.any() and np.all(record.contact_force[off] == 0)
 

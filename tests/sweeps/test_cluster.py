@@ -46,7 +46,7 @@ def workers():
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory):
+def local_store(tmp_path_factory):
     """Store of the sweep, made on one machine."""
     path = tmp_path_factory.mktemp("alone") / "runs.zarr"
     jb.sweep(CASE, OVER, store=path, progress=False)
@@ -63,14 +63,14 @@ def kill_one(client, store: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of Dask, about the worker that is killed
-def test_killed_worker_does_not_change_the_store(workers, alone, tmp_path):
+def test_killed_worker_does_not_change_the_store(workers, local_store, tmp_path):
     store = tmp_path / "runs.zarr"
     killer = threading.Thread(target=kill_one, args=(workers, store))
     killer.start()
     found = jb.sweep(CASE, OVER, store=store, progress=False, client=workers)
     killer.join()
     assert not found.failed.any()
-    assert files(store) == files(alone)
+    assert files(store) == files(local_store)
 
     # Started and killed on one machine, finished by the workers.
     second = tmp_path / "second.zarr"
@@ -93,15 +93,15 @@ def test_killed_worker_does_not_change_the_store(workers, alone, tmp_path):
     with pytest.raises(SystemExit) as ended:
         main([*line, "--over", lists[0], "--over", lists[1]])
     assert ended.value.code == 0
-    assert files(second) == files(alone)
+    assert files(second) == files(local_store)
     assert case.read_text() == tomli_w.dumps(tomllib.loads(case.read_text()))
 
 
-def test_specification_survives_its_dictionary():
+def test_specification_from_its_dictionary_is_equal():
     specification = sweep_specification(CASE, OVER, False, False, 1e-7, "double")
-    again = specification_from_dict(specification.to_dict())
-    assert again.fingerprint() == specification.fingerprint()
-    np.testing.assert_array_equal(again.runs(), specification.runs())
+    restored = specification_from_dict(specification.to_dict())
+    assert restored.fingerprint() == specification.fingerprint()
+    np.testing.assert_array_equal(restored.runs(), specification.runs())
 
 
 def test_workers_refuse_missing_stores_and_other_versions(tmp_path, monkeypatch):

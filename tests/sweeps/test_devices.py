@@ -36,9 +36,11 @@ def test_single_precision_meets_its_error_estimate():
     assert 1e-8 < error < 2e-5  # some tens of roundings, 6e-8 each
     assert float(error) < 5 * single.error_estimate  # measured on a sample of the runs
     assert not single.failed.any()
-    whole = jb.sweep(CASE, OVER, progress=False, precision="single", histories=True)
-    assert whole.deflection.dtype == np.float32
-    assert_allclose(np.abs(whole.deflection).max("time") <= double.peak_deflection * 1.00002, True)
+    with_histories = jb.sweep(CASE, OVER, progress=False, precision="single", histories=True)
+    assert with_histories.deflection.dtype == np.float32
+    assert_allclose(
+        np.abs(with_histories.deflection).max("time") <= double.peak_deflection * 1.00002, True
+    )
 
 
 def test_unknown_precisions_are_refused():
@@ -70,9 +72,9 @@ def test_several_devices_share_a_block(tmp_path):
     subprocess.run(
         command, env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}, check=True
     )
-    alone = jb.sweep(CASE, OVER, progress=False, histories=True)
+    one_device = jb.sweep(CASE, OVER, progress=False, histories=True)
     with np.load(tmp_path / "shared.npz") as shared:
-        assert_allclose(shared["lines"], alone.deflection, rtol=1e-9, atol=1e-16)
+        assert_allclose(shared["lines"], one_device.deflection, rtol=1e-9, atol=1e-16)
         assert_allclose(
             shared["peaks"], jb.sweep(CASE, OVER, progress=False).peak_deflection, rtol=1e-12
         )

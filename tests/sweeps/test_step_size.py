@@ -54,39 +54,39 @@ def test_steps_stay_below_their_limits():
 @pytest.mark.parametrize("best", [1.0, 1e-3])
 def test_steps_at_their_limit_are_checked_without_search(best):
     """If the step at the limit is too long, the check finds it."""
-    tried, rates, limits = [], np.geomspace(1, 10, 20), np.full(20, 0.01)
-    measure = peaks_with_error(np.full(20, best))
+    measured, rates, limits = [], np.geomspace(1, 10, 20), np.full(20, 0.01)
+    peaks = peaks_with_error(np.full(20, best))
 
-    def recorded(chosen, steps, extra_steps=0):
-        tried.append(steps.max())
-        return measure(chosen, steps)
+    def recorded_peaks(chosen, steps, extra_steps=0):
+        measured.append(steps.max())
+        return peaks(chosen, steps)
 
-    steps, error = choose_step_sizes(recorded, rates, LIMIT_RATIO * limits, limits, 4, 1e-6)
+    steps, error = choose_step_sizes(recorded_peaks, rates, LIMIT_RATIO * limits, limits, 4, 1e-6)
     assert error <= 1e-6
     if best == 1.0:
-        assert np.all(steps == limits) and len(tried) == 2  # coarse and fine, of the check
+        assert np.all(steps == limits) and len(measured) == 2  # coarse and fine, of the check
     else:
-        assert np.all(steps < best) and len(tried) > 2
+        assert np.all(steps < best) and len(measured) > 2
 
 
 def test_failed_runs_are_left_out():
     rates = np.geomspace(1, 10, 20)
-    good = peaks_with_error(np.ones(20) * 0.1)
-    bad = peaks_with_error(np.ones(20) * 0.1, failing=(0, 7))
+    all_succeed = peaks_with_error(np.ones(20) * 0.1)
+    some_fail = peaks_with_error(np.ones(20) * 0.1, failing=(0, 7))
     settings = (rates, np.full(20, 0.02), np.full(20, 1.0), 8, 1e-6)
     np.testing.assert_allclose(
-        choose_step_sizes(bad, *settings)[0], choose_step_sizes(good, *settings)[0]
+        choose_step_sizes(some_fail, *settings)[0], choose_step_sizes(all_succeed, *settings)[0]
     )
-    all_failing = peaks_with_error(np.ones(20), failing=range(20))
-    steps, error = choose_step_sizes(all_failing, *settings)
+    all_fail = peaks_with_error(np.ones(20), failing=range(20))
+    steps, error = choose_step_sizes(all_fail, *settings)
     assert error == 0 and np.all(steps == 0.02)
 
 
 def test_sample_shortens_steps_that_are_too_long():
     """Steps meet the tolerance at the rates of the search, not between them."""
     rates = np.geomspace(1, 10, 64)
-    tried = np.unique(log_spaced_sample(rates, 4))
-    best = np.where(np.isin(np.arange(64), tried), 0.5, 0.25)
+    measured = np.unique(log_spaced_sample(rates, 4))
+    best = np.where(np.isin(np.arange(64), measured), 0.5, 0.25)
     steps, error = choose_step_sizes(
         peaks_with_error(best), rates, np.full(64, 0.1), np.full(64, np.inf), 4, 1e-6
     )
@@ -96,18 +96,18 @@ def test_sample_shortens_steps_that_are_too_long():
 
 def test_settled_batches_are_not_measured_again():
     """Only the fastest starts with a step that is too long, and is measured again."""
-    rates, best = np.geomspace(1, 10, 4), np.full(4, 0.1)
-    tried, measure = [], peaks_with_error(best)
+    rates, unit_steps = np.geomspace(1, 10, 4), np.full(4, 0.1)
+    measured, peaks = [], peaks_with_error(unit_steps)
 
-    def recorded(chosen, steps, extra_steps=0):
-        tried.append(set(np.asarray(chosen).tolist()))
-        return measure(chosen, steps)
+    def recorded_peaks(chosen, steps, extra_steps=0):
+        measured.append(set(np.asarray(chosen).tolist()))
+        return peaks(chosen, steps)
 
-    guesses = np.full(4, 0.9 * 0.1 * (1e-7 / SAFETY_FACTOR) ** (1 / ORDER))
-    guesses[-1] *= 2
-    choose_step_sizes(recorded, rates, guesses, np.ones(4), 4, 1e-7)
+    initial_steps = np.full(4, 0.9 * 0.1 * (1e-7 / SAFETY_FACTOR) ** (1 / ORDER))
+    initial_steps[-1] *= 2
+    choose_step_sizes(recorded_peaks, rates, initial_steps, np.ones(4), 4, 1e-7)
     # Fine and coarse steps each: of all, of the fastest, and of the sample.
-    assert tried == [{0, 1, 2, 3}] * 2 + [{3}] * 2 + [{0, 1, 2, 3}] * 2
+    assert measured == [{0, 1, 2, 3}] * 2 + [{3}] * 2 + [{0, 1, 2, 3}] * 2
 
 
 def test_short_initial_steps_are_lengthened():

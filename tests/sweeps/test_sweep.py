@@ -28,7 +28,7 @@ CASE = jb.Case(
 MASSES, SPEEDS = [0.1, 0.4, 0.9], [1.5, 4.0]
 
 
-def single(values) -> np.ndarray:
+def single_run_peaks(values) -> np.ndarray:
     """Peaks of one simulation."""
     return np.asarray(jb.simulate(jb.replace(CASE, values)).peak_deflection)
 
@@ -38,19 +38,19 @@ def sweep(over, **options) -> xarray.Dataset:
 
 
 @pytest.fixture(scope="module")
-def product():
+def grid_dataset():
     return sweep({"loads.0.mass": MASSES, "loads.0.speed": SPEEDS})
 
 
-def test_grid_is_labelled_by_address_and_agrees_with_single_runs(product):
-    assert product.peak_deflection.dims == ("loads.0.mass", "loads.0.speed", "sensor")
-    assert product.peak_deflection.units == "m"
-    assert not product.failed.any()
-    assert product.error_estimate <= 1e-7
+def test_grid_is_labelled_by_address_and_agrees_with_single_runs(grid_dataset):
+    assert grid_dataset.peak_deflection.dims == ("loads.0.mass", "loads.0.speed", "sensor")
+    assert grid_dataset.peak_deflection.units == "m"
+    assert not grid_dataset.failed.any()
+    assert grid_dataset.error_estimate <= 1e-7
     for mass in MASSES[::2]:
         for speed in SPEEDS:
-            found = product.peak_deflection.sel({"loads.0.mass": mass, "loads.0.speed": speed})
-            expected = single({"loads.0.mass": mass, "loads.0.speed": speed})
+            found = grid_dataset.peak_deflection.sel({"loads.0.mass": mass, "loads.0.speed": speed})
+            expected = single_run_peaks({"loads.0.mass": mass, "loads.0.speed": speed})
             assert_allclose(found, expected, rtol=1e-6)
 
 
@@ -85,7 +85,7 @@ def test_paired_values():
     assert found.peak_deflection.dims == ("run", "sensor")
     assert_allclose(found["run.gravity"], over["run.gravity"])
     for i in range(2):
-        expected = single({address: values[i] for address, values in over.items()})
+        expected = single_run_peaks({address: values[i] for address, values in over.items()})
         assert_allclose(found.peak_deflection[i], expected, rtol=1e-6)
 
 
@@ -100,22 +100,22 @@ def test_histories_on_request():
 def test_failed_run_is_marked_and_changes_no_other():
     """An infinite weight makes one run fail."""
     masses, gravity = [*MASSES, 100.0], [9.81, 9.81, 9.81, 1e308]
-    whole = sweep({"loads.0.mass": masses, "run.gravity": gravity}, paired=True)
-    assert whole.failed.values.tolist() == [False, False, False, True]
-    assert np.isnan(whole.peak_deflection[-1]).all()
-    sound = sweep({"loads.0.mass": MASSES, "run.gravity": gravity[:3]}, paired=True)
-    assert_allclose(whole.peak_deflection[:-1], sound.peak_deflection, rtol=1e-12)
+    dataset = sweep({"loads.0.mass": masses, "run.gravity": gravity}, paired=True)
+    assert dataset.failed.values.tolist() == [False, False, False, True]
+    assert np.isnan(dataset.peak_deflection[-1]).all()
+    without_failure = sweep({"loads.0.mass": MASSES, "run.gravity": gravity[:3]}, paired=True)
+    assert_allclose(dataset.peak_deflection[:-1], without_failure.peak_deflection, rtol=1e-12)
 
 
-def test_store_holds_the_returned_dataset(product, tmp_path):
+def test_store_holds_the_returned_dataset(grid_dataset, tmp_path):
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
     path = tmp_path / "runs.zarr"
-    xarray.testing.assert_identical(sweep(over, store=path), product)
+    xarray.testing.assert_identical(sweep(over, store=path), grid_dataset)
     stored = xarray.open_zarr(path, consolidated=False)
-    assert_array_equal(stored.peak_deflection, product.peak_deflection)
-    again = sweep(over, store=path, resume=True)
-    assert_array_equal(again.peak_deflection, product.peak_deflection)
-    assert_array_equal(again.sensor, product.sensor)
+    assert_array_equal(stored.peak_deflection, grid_dataset.peak_deflection)
+    resumed = sweep(over, store=path, resume=True)
+    assert_array_equal(resumed.peak_deflection, grid_dataset.peak_deflection)
+    assert_array_equal(resumed.sensor, grid_dataset.sensor)
     with pytest.raises(FileExistsError, match="holds a sweep already"):
         sweep(over, store=path)
     with pytest.raises(ValueError, match="cannot be resumed"):
@@ -139,17 +139,19 @@ def test_killed_sweep_resumes_bit_identically(tmp_path):
     def start(path):
         return subprocess.Popen([sys.executable, "-c", KILLED, str(path)])
 
-    whole, cut = tmp_path / "whole.zarr", tmp_path / "cut.zarr"
-    assert start(whole).wait() == 0
-    process = start(cut)
-    flags = cut / "blocks" / "done" / "c"
+    complete, interrupted = tmp_path / "whole.zarr", tmp_path / "cut.zarr"
+    assert start(complete).wait() == 0
+    process = start(interrupted)
+    flags = interrupted / "blocks" / "done" / "c"
     while process.poll() is None and not (flags.exists() and len(list(flags.iterdir())) > 2):
         time.sleep(0.001)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    assert (cut / "blocks").exists(), "killed after the sweep was complete"
-    assert start(cut).wait() == 0
-    first, second = (xarray.open_zarr(path, consolidated=False).load() for path in (whole, cut))
+    assert (interrupted / "blocks").exists(), "killed after the sweep was complete"
+    assert start(interrupted).wait() == 0
+    first, second = (
+        xarray.open_zarr(path, consolidated=False).load() for path in (complete, interrupted)
+    )
     xarray.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
 
 
@@ -196,8 +198,8 @@ def test_each_run_has_the_controller_designed_for_its_loads():
         run=jb.Run(duration=0.4, sample_rate=200.0),
     )  # fmt: skip
     found = jb.sweep(case, {"loads.0.mass": [0.2, 0.8]}, progress=False)
-    alone = jb.simulate(jb.replace(case, {"loads.0.mass": 0.8}))
-    np.testing.assert_allclose(found.peak_deflection[1], alone.peak_deflection, rtol=1e-6)
+    single_run = jb.simulate(jb.replace(case, {"loads.0.mass": 0.8}))
+    np.testing.assert_allclose(found.peak_deflection[1], single_run.peak_deflection, rtol=1e-6)
 
 
 @given(st.integers(1, 400), st.integers(1, 5), st.integers(0, 10))

@@ -48,21 +48,21 @@ def shaken(volts: float, damping=0.0) -> jb.Case:
 
 
 @pytest.fixture(scope="module")
-def best():
+def patch_bound():
     return bound(patched())
 
 
 @pytest.fixture(scope="module")
-def found():
+def influence():
     """Influence of the commands at the sensor."""
     return input_influence(patched(), np.array([0.3]), 0.01, 0.001)
 
 
 @pytest.fixture(scope="module")
-def numbers(found):
+def sensor_influence(influence):
     """Unforced deflection (time,) and responses (time, hold) at the sensor."""
-    response = np.einsum("m,tmk->tk", found.deflection_rows[0], found.response[..., 0])
-    return found.unforced @ found.deflection_rows[0], response
+    response = np.einsum("m,tmk->tk", influence.deflection_rows[0], influence.response[..., 0])
+    return influence.unforced @ influence.deflection_rows[0], response
 
 
 @pytest.mark.slow
@@ -71,9 +71,9 @@ def numbers(found):
 )
 def test_reference_numbers(name, modes):
     expected, case = DATA[name], patched(modes)
-    found = input_influence(case, np.array([0.3]), 0.01, 0.01)
-    free = np.max(np.abs(found.deflection(np.zeros((60, 1)))))
-    assert_allclose(free, expected["uncontrolled_m"], rtol=2e-9)
+    influence = input_influence(case, np.array([0.3]), 0.01, 0.01)
+    uncontrolled = np.max(np.abs(influence.deflection(np.zeros((60, 1)))))
+    assert_allclose(uncontrolled, expected["uncontrolled_m"], rtol=2e-9)
     # The programs of the reference are in metres, with feasibility tolerances of 1e-7.
     assert_allclose(bound(case, spacing=0.01).peak, expected["least_peak_m"], rtol=0, atol=1.1e-7)
 
@@ -89,74 +89,76 @@ def test_published_reductions(row):
     assert_allclose(100 * bound(case).reduction, row["percent"], atol=0.25)
 
 
-def test_multipliers_prove_the_bound(best, numbers):
+def test_multipliers_prove_the_bound(patch_bound, sensor_influence):
     """Weak duality: the weighted sum is at least the bound for all commands within the limits."""
-    free, response = numbers
-    weights = np.zeros(free.size)
-    indices = np.searchsorted(np.arange(601) / 1000, best.active_constraints.times - 1e-9)
-    np.add.at(weights, indices, best.active_constraints.weights)
+    unforced, response = sensor_influence
+    weights = np.zeros(unforced.size)
+    indices = np.searchsorted(np.arange(601) / 1000, patch_bound.active_constraints.times - 1e-9)
+    np.add.at(weights, indices, patch_bound.active_constraints.weights)
     assert np.sum(np.abs(weights)) <= 1 + 1e-9
     slopes = weights @ response
-    least = weights @ free + np.sum(np.minimum(-2.5 * slopes, 7.5 * slopes))
-    assert_allclose(least, best.peak, rtol=1e-8)
+    least = weights @ unforced + np.sum(np.minimum(-2.5 * slopes, 7.5 * slopes))
+    assert_allclose(least, patch_bound.peak, rtol=1e-8)
     # The commands attain the bound to 1e-5.
-    deflection = free + response @ best.commands[:, 0]
-    assert best.peak <= np.max(np.abs(deflection)) < best.peak * (1 + 1e-5)
-    assert np.min(best.commands) >= -2.5 and np.max(best.commands) <= 7.5
+    deflection = unforced + response @ patch_bound.commands[:, 0]
+    assert patch_bound.peak <= np.max(np.abs(deflection)) < patch_bound.peak * (1 + 1e-5)
+    assert np.min(patch_bound.commands) >= -2.5 and np.max(patch_bound.commands) <= 7.5
 
 
-def test_another_solver_agrees(best, numbers):
-    free, response = numbers
+def test_another_solver_agrees(patch_bound, sensor_influence):
+    unforced, response = sensor_influence
     count = response.shape[1]
-    one, scale = np.ones((free.size, 1)), 1e3  # mm
-    rows = np.block([[scale * response, -one], [-scale * response, -one]])
+    ones, scale = np.ones((unforced.size, 1)), 1e3  # mm
+    rows = np.block([[scale * response, -ones], [-scale * response, -ones]])
     box = np.block([[np.eye(count), np.zeros((count, 1))], [-np.eye(count), np.zeros((count, 1))]])
-    right = np.concatenate([-scale * free, scale * free, np.full(count, 7.5), np.full(count, 2.5)])
+    right_side = np.concatenate(
+        [-scale * unforced, scale * unforced, np.full(count, 7.5), np.full(count, 2.5)]
+    )
     options = clarabel.DefaultSettings()
     options.verbose = False
     solver = clarabel.DefaultSolver(
         sp.csc_matrix((count + 1, count + 1)),
         np.append(np.zeros(count), 1.0),
         sp.csc_matrix(np.concatenate([rows, box])),
-        right,
-        [clarabel.NonnegativeConeT(right.size)],
+        right_side,
+        [clarabel.NonnegativeConeT(right_side.size)],
         options,
     )
-    assert_allclose(best.peak, solver.solve().x[-1] / scale, rtol=1e-6)
+    assert_allclose(patch_bound.peak, solver.solve().x[-1] / scale, rtol=1e-6)
 
 
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
-def test_run_attains_the_bound(best):
-    case = dataclasses.replace(patched(), controller=best.controller())
+def test_run_attains_the_bound(patch_bound):
+    case = dataclasses.replace(patched(), controller=patch_bound.controller())
     record = jb.simulate(case, tolerance=1e-9)
     sampled = np.max(np.abs(record.deflection))
-    assert_allclose(sampled, best.peak, rtol=1e-5)
+    assert_allclose(sampled, patch_bound.peak, rtol=1e-5)
     # Between the times, a millisecond apart, it is slightly larger.
-    assert_allclose(record.peak_deflection[0], best.peak, rtol=1e-3)
-    assert best.peak < record.peak_deflection[0]
-    assert_allclose(best.share(record), 1.0, atol=4e-3)
-    expected = np.repeat(best.commands[:, 0], 10)
+    assert_allclose(record.peak_deflection[0], patch_bound.peak, rtol=1e-3)
+    assert patch_bound.peak < record.peak_deflection[0]
+    assert_allclose(patch_bound.share(record), 1.0, atol=4e-3)
+    expected = np.repeat(patch_bound.commands[:, 0], 10)
     rounding = 1e-12 * np.max(np.abs(expected))
     assert_allclose(record.command[:-1, 0], expected, rtol=1e-12, atol=rounding)
 
 
-def test_shares_of_attainable_reduction(best):
-    free = jb.simulate(patched(), tolerance=1e-9)
-    assert_allclose(best.uncontrolled, free.peak_deflection[0], rtol=1e-8)
-    assert_allclose(best.share(free), 0.0, atol=1e-7)
-    assert_allclose(best.reduction, 1 - best.peak / best.uncontrolled)
-    nearby = dataclasses.replace(best, positions=np.array([0.3, 0.31]))
-    middle = np.max(np.abs(free.at(np.array([0.3, 0.31]))))
-    expected = (best.uncontrolled - middle) / (best.uncontrolled - best.peak)
-    assert_allclose(nearby.share(free), expected, rtol=1e-12)
+def test_shares_of_attainable_reduction(patch_bound):
+    uncontrolled = jb.simulate(patched(), tolerance=1e-9)
+    assert_allclose(patch_bound.uncontrolled, uncontrolled.peak_deflection[0], rtol=1e-8)
+    assert_allclose(patch_bound.share(uncontrolled), 0.0, atol=1e-7)
+    assert_allclose(patch_bound.reduction, 1 - patch_bound.peak / patch_bound.uncontrolled)
+    nearby = dataclasses.replace(patch_bound, positions=np.array([0.3, 0.31]))
+    middle = np.max(np.abs(uncontrolled.at(np.array([0.3, 0.31]))))
+    expected = (patch_bound.uncontrolled - middle) / (patch_bound.uncontrolled - patch_bound.peak)
+    assert_allclose(nearby.share(uncontrolled), expected, rtol=1e-12)
 
 
-RIVALS = patched(controller=jb.StateFeedback(np.zeros((1, 10)), period=0.01))
+FEEDBACK_CASE = patched(controller=jb.StateFeedback(np.zeros((1, 10)), period=0.01))
 
 
 @pytest.fixture(scope="module")
-def rivals_plan():
-    return integration_plan(jb.replace(RIVALS, {"controller.gain": np.ones((1, 10))}))
+def feedback_plan():
+    return integration_plan(jb.replace(FEEDBACK_CASE, {"controller.gain": np.ones((1, 10))}))
 
 
 @pytest.mark.slow
@@ -168,35 +170,35 @@ def rivals_plan():
     strength=st.floats(1.0, 6.0),
     seed=st.integers(0, 10**6),
 )
-def test_no_state_feedback_is_below_the_bound(rivals_plan, mass, speed, strength, seed):
+def test_no_state_feedback_is_below_the_bound(feedback_plan, mass, speed, strength, seed):
     """Full state feedback with random gains, saturated by the limits of the actuator."""
     gain = np.random.default_rng(seed).standard_normal((1, 10)) * 10**strength
     gain[0, 5:] *= 0.01  # rates in m/s beside deflections in m
-    numbers = {"loads.0.mass": mass, "loads.0.speed": speed, "controller.gain": gain}
-    case = jb.replace(RIVALS, numbers)
-    record = jb.simulate(case, plan=rivals_plan)
+    sensor_influence = {"loads.0.mass": mass, "loads.0.speed": speed, "controller.gain": gain}
+    case = jb.replace(FEEDBACK_CASE, sensor_influence)
+    record = jb.simulate(case, plan=feedback_plan)
     least = bound(case)
     assert least.period == 0.01
     assert np.max(np.abs(record.deflection)) >= least.peak * (1 - 1e-6)
     assert least.share(record) <= 1 + 1e-6
 
 
-def test_more_positions_raise_the_bound(best):
-    whole = bound(patched(), positions=np.linspace(0.0, 0.6, 61))
-    assert best.peak < whole.peak < best.uncontrolled
-    assert whole.uncontrolled >= best.uncontrolled * (1 - 1e-9)
+def test_more_positions_raise_the_bound(patch_bound):
+    whole_beam = bound(patched(), positions=np.linspace(0.0, 0.6, 61))
+    assert patch_bound.peak < whole_beam.peak < patch_bound.uncontrolled
+    assert whole_beam.uncontrolled >= patch_bound.uncontrolled * (1 - 1e-9)
 
 
-def test_slower_actuators_raise_the_bound(best, found):
+def test_slower_actuators_raise_the_bound(patch_bound, influence):
     low, high, change = np.array([[-2.5], [7.5], [0.1]])
-    peak, commands, _ = least_peak(found, low, high, change)
-    assert best.peak * 1.001 < peak < best.uncontrolled
+    peak, commands, _ = least_peak(influence, low, high, change)
+    assert patch_bound.peak * 1.001 < peak < patch_bound.uncontrolled
     assert np.max(np.abs(np.diff(commands[:, 0], prepend=0.0))) <= 0.1 * (1 + 1e-9)
     with pytest.raises(ValueError, match="no commands, starting from zero, meet limits"):
-        least_peak(found, low + 3.0, high, change)
+        least_peak(influence, low + 3.0, high, change)
 
 
-def test_solver_that_fails_is_replaced(best, found, monkeypatch):
+def test_solver_that_fails_is_replaced(patch_bound, influence, monkeypatch):
     """The simplex method fails on about one program in some hundred."""
 
     def failing_simplex(*program, method, **options):
@@ -205,17 +207,19 @@ def test_solver_that_fails_is_replaced(best, found, monkeypatch):
         return linprog(*program, method=method, **options)
 
     monkeypatch.setattr("scipy.optimize.linprog", failing_simplex)
-    peak, *_ = least_peak(found, *np.array([[-2.5], [7.5], [np.inf]]))
-    assert_allclose(peak, best.peak, rtol=1e-6)
+    peak, *_ = least_peak(influence, *np.array([[-2.5], [7.5], [np.inf]]))
+    assert_allclose(peak, patch_bound.peak, rtol=1e-6)
 
 
-def test_without_limits_one_position_is_held_at_zero_once_a_hold(found):
-    parts = {name: getattr(found, name)[::10] for name in ("times", "unforced", "response")}
+def test_without_limits_one_position_is_held_at_zero_once_a_hold(influence):
+    parts = {name: getattr(influence, name)[::10] for name in ("times", "unforced", "response")}
     unlimited = np.array([np.inf])
-    rare = dataclasses.replace(found, **parts)
-    peak, commands, _ = least_peak(rare, -unlimited, unlimited, unlimited)
-    assert peak < 1e-6 * np.max(np.abs(found.unforced @ found.deflection_rows.T))
-    assert np.max(np.abs(rare.deflection(commands))) < 1e-4 * np.max(np.abs(found.unforced))
+    at_hold_ends = dataclasses.replace(influence, **parts)
+    peak, commands, _ = least_peak(at_hold_ends, -unlimited, unlimited, unlimited)
+    assert peak < 1e-6 * np.max(np.abs(influence.unforced @ influence.deflection_rows.T))
+    assert np.max(np.abs(at_hold_ends.deflection(commands))) < 1e-4 * np.max(
+        np.abs(influence.unforced)
+    )
 
 
 @pytest.mark.slow
@@ -235,8 +239,8 @@ def test_two_actuators_and_a_shorter_last_hold():
     both = bound(case)
     assert both.commands.shape == (34, 2)
     # Limits near zero leave the patch alone, with the compiled programs of both.
-    alone = bound(jb.replace(case, {"actuators.1.limits.1": 1e-9}))
-    assert both.peak < alone.peak * (1 - 1e-6)
+    patch_only = bound(jb.replace(case, {"actuators.1.limits.1": 1e-9}))
+    assert both.peak < patch_only.peak * (1 - 1e-6)
     assert np.all((both.commands[:, 1] >= 0) & (both.commands[:, 1] <= 1))
 
 
@@ -263,14 +267,14 @@ def test_errors_are_named(words):
         ERRORS[words]()
 
 
-def test_former_names_warn(best):
+def test_former_names_warn(patch_bound):
     with pytest.warns(DeprecationWarning, match="Bound.places is called positions now"):
-        assert best.places is best.positions
+        assert patch_bound.places is patch_bound.positions
     with pytest.warns(DeprecationWarning, match="Bound.binding is called active_constraints"):
-        constraints = best.binding
+        constraints = patch_bound.binding
     with pytest.warns(DeprecationWarning, match="ActiveConstraints.instants is called times now"):
-        assert constraints.instants is best.active_constraints.times
+        assert constraints.instants is patch_bound.active_constraints.times
     with pytest.warns(DeprecationWarning, match="the argument places of bound is called positions"):
-        assert bound(patched(), places=[0.3]).peak == pytest.approx(best.peak, rel=1e-9)
+        assert bound(patched(), places=[0.3]).peak == pytest.approx(patch_bound.peak, rel=1e-9)
     with pytest.raises(TypeError, match="places is the former name of positions"):
         bound(patched(), positions=[0.3], places=[0.3])

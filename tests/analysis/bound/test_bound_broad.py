@@ -12,7 +12,7 @@ from jaxbeam.analysis.bound.bound import bound
 from jaxbeam.simulation.integration_plan import integration_plan
 
 PERIOD = 0.01
-WHOLE = np.linspace(0.05, 1.15, 23)
+BEAM_POSITIONS = np.linspace(0.05, 1.15, 23)
 # Two patches, each with a sensor above it, and a shaker with a suspension under the second span.
 PATCHES = [
     jb.Patch(x, x + 0.085, 8.292e-4, correction=0.39, amplifier_gain=200.0, limits=[-2.5, 7.5])
@@ -54,7 +54,7 @@ def test_no_state_feedback_is_below_the_bound(plan, masses, speed, gap, strength
     for i, mass in enumerate(masses):
         numbers |= {f"loads.{i}.mass": mass, f"loads.{i}.speed": speed}
     case = jb.replace(CASE, numbers)
-    positions = WHOLE if everywhere else None
+    positions = BEAM_POSITIONS if everywhere else None
     record = jb.simulate(case, plan=plan)
     least = bound(case, positions)
     deflection = record.deflection if positions is None else record.at(positions)
@@ -67,7 +67,7 @@ def test_no_state_feedback_is_below_the_bound(plan, masses, speed, gap, strength
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_commands_attain_the_bound_on_the_whole_beam():
     """To 1e-3: the change of the deflection between the times of the bound."""
-    least = bound(CASE, WHOLE)
+    least = bound(CASE, BEAM_POSITIONS)
     record = jb.simulate(dataclasses.replace(CASE, controller=least.controller()), tolerance=1e-8)
-    assert np.max(np.abs(record.at(WHOLE))) < least.peak * (1 + 1e-3)
+    assert np.max(np.abs(record.at(BEAM_POSITIONS))) < least.peak * (1 + 1e-3)
     assert least.peak < least.uncontrolled

@@ -74,14 +74,14 @@ def reference_influence() -> InputInfluence:
 
 
 def test_linear_program_has_the_bound_of_the_reference():
-    found = reference_influence()
-    uncontrolled = np.max(np.abs(found.unforced @ found.deflection_rows.T))
+    influence = reference_influence()
+    uncontrolled = np.max(np.abs(influence.unforced @ influence.deflection_rows.T))
     assert_allclose(uncontrolled, KNOWN["uncontrolled_m"], rtol=1e-6)
     low, high = np.array([[-2.5, -2.5], [7.5, 7.5]]) * 200
-    peak, commands, _ = least_peak(found, low, high, np.full(2, np.inf))
+    peak, commands, _ = least_peak(influence, low, high, np.full(2, np.inf))
     # The program of the reference is in metres, with feasibility tolerances of 1e-7.
     assert_allclose(peak, KNOWN["least_peak_m"], rtol=0, atol=1.1e-7)
-    assert_allclose(np.max(np.abs(found.deflection(commands))), peak, rtol=1e-5)
+    assert_allclose(np.max(np.abs(influence.deflection(commands))), peak, rtol=1e-5)
 
 
 @pytest.mark.slow
