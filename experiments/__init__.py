@@ -1,1 +1,1 @@
-"""Studies that stand on jaxbeam and tuning: what was published, done again, and benchmarks."""
+"""Reproduction of a thesis, studies, validation and benchmarks with jaxbeam and tuning."""

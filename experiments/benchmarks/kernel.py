@@ -5,7 +5,7 @@
 The sweep of the speed benchmark by `kernel.c` (gcc -O3 -march=native, 64 masses side by side), with
 the time steps and propagators that jaxbeam chooses, whose computation is not in its time, and with
 the closed form of the mode shapes. The time of jaxbeam includes all of that, and is on all cores.
-Without a C compiler the benchmark says so and ends.
+Without a C compiler the benchmark ends with a message.
 """
 
 import ctypes

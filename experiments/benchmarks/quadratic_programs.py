@@ -7,7 +7,7 @@ are those of the sampling instants of its crossing, scaled so that the largest e
 OSQP is set up once and updated by the vectors of each sample; it starts from the last solution,
 keeps its factors, and polishes. The table has its own report of the times of updates and solutions,
 and the time of a call from Python. jaxbeam starts anew each time: on one core, compiled, one after
-the other in a loop and 256 at once. Without OSQP the benchmark says so and ends.
+the other in a loop and 256 at once. Without OSQP the benchmark ends with a message.
 """
 
 from experiments.benchmarks.cores import use_one_core
@@ -133,7 +133,7 @@ def solve_by_osqp(package: ModuleType, H, f, M, gamma) -> tuple[np.ndarray, floa
 
 @contextlib.contextmanager
 def _suppress_output():
-    """Discard what is printed, by C too: OSQP reports its polishing whatever its settings."""
+    """Discard printed output, of C code too: no setting of OSQP turns off reports of polishing."""
     sys.stdout.flush()
     stdout = os.dup(1)
     with open(os.devnull, "w") as null_device:

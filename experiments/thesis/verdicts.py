@@ -193,7 +193,7 @@ class ExperimentResult:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """One table or group of figures of the thesis: what it covers and claims, and its computation.
+    """One table or group of figures of the thesis: its subject, its claim, and its computation.
 
     `run(load_rig)` computes the result; `load_rig(name)` returns the case of a published rig, as
     `jaxbeam.rigs.load` does.
