@@ -9,7 +9,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -20,6 +19,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, number
 from jaxbeam.case.loads import AbstractLoad, trajectory
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.runtime.arrays import set_at, xp
 
 
 class Run(eqx.Module):
@@ -74,7 +74,7 @@ class Case(eqx.Module):
     @property
     def sensor_positions(self) -> Float[Array, " sensor"]:
         """Positions of the sensors, distances from the left end (m)."""
-        return jnp.array([sensor.position for sensor in self.sensors]).reshape(-1)
+        return xp.array([sensor.position for sensor in self.sensors]).reshape(-1)
 
 
 class PartClass(typing.NamedTuple):
@@ -130,8 +130,8 @@ def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
     numbers = {}
     for address, leaf in _leaves_by_address(case).items():
         numbers[address] = leaf
-        if jnp.ndim(leaf):
-            entries = np.ndindex(jnp.shape(leaf))
+        if xp.ndim(leaf):
+            entries = np.ndindex(xp.shape(leaf))
             numbers |= {".".join([address, *map(str, entry)]): leaf[entry] for entry in entries}
     return numbers
 
@@ -179,19 +179,19 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     leaves = [leaf for _, leaf in paths]
     index = {".".join(_key_name(key) for key in path): i for i, (path, _) in enumerate(paths)}
     for address, value in values.items():
-        value, address = jnp.asarray(value, float), current_address(address)
+        value, address = xp.asarray(value, float), current_address(address)
         parent, entry = _parent_and_entry(address, index)
         if address in index:
             current = leaves[index[address]]
-            if jnp.shape(value) != jnp.shape(current):
+            if xp.shape(value) != xp.shape(current):
                 raise ValueError(
-                    f"{address} takes a value of shape {jnp.shape(current)}, not {jnp.shape(value)}"
+                    f"{address} takes a value of shape {xp.shape(current)}, not {xp.shape(value)}"
                 )
             leaves[index[address]] = value
         elif parent is not None and _has_entry(leaves[index[parent]], entry):
             if value.shape:
                 raise ValueError(f"{address} takes one number, not {value.shape}")
-            leaves[index[parent]] = leaves[index[parent]].at[entry].set(value)
+            leaves[index[parent]] = set_at(leaves[index[parent]], entry, value)
         else:
             raise unknown_address_error(case, address)
     return jax.tree_util.tree_unflatten(structure, leaves)
@@ -213,7 +213,7 @@ def _parent_and_entry(address: str, leaves: dict[str, Any]) -> tuple[str | None,
 
 def _has_entry(leaf, entry: tuple[int, ...]) -> bool:
     """Whether a list or matrix has an entry of these indices."""
-    shape = jnp.shape(leaf)
+    shape = xp.shape(leaf)
     return len(entry) == len(shape) and all(i < n for i, n in zip(entry, shape, strict=True))
 
 
@@ -222,7 +222,7 @@ def concrete_case(case: Case) -> Case:
 
     Raises `jax.errors.ConcretizationTypeError` if it is traced by `jit` or `vmap`.
     """
-    return jax.tree.map(lambda leaf: jnp.asarray(concrete(leaf)), case)
+    return jax.tree.map(lambda leaf: concrete(leaf), case)
 
 
 def stack_cases(cases: Sequence[Case]) -> Case:

@@ -8,11 +8,11 @@ import abc
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 from jaxbeam.case.former_arguments import AcceptsFormerArguments
+from jaxbeam.runtime.arrays import xp
 
 Command = Float[Array, " actuator"]
 Time = Float[Array, ""]
@@ -94,7 +94,7 @@ class AbstractContinuousLaw(eqx.Module):
         self, state: Float[Array, " law_state"], measurement: Measurement, command: Command, t: Time
     ) -> Float[Array, " law_state"]:
         """Rates of the states (1/s) under the command that the actuators receive."""
-        return jnp.zeros_like(state)
+        return xp.zeros_like(state)
 
 
 class AbstractStaticLaw(AbstractSampledLaw, AbstractContinuousLaw):

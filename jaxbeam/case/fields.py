@@ -1,7 +1,8 @@
 """Field declarations shared by all data classes of a case.
 
-A number of a case is a JAX array leaf, so that it can be traced, batched and differentiated;
-words and counts are static. The metadata of a field holds its SI unit and its meaning, which
+A number of a case is an array leaf of its tree, of NumPy where it is known and of JAX where it is
+traced, batched or differentiated; words and counts are static. The metadata of a field holds its
+SI unit and its meaning, which
 error messages, tables and plots read.
 """
 
@@ -11,15 +12,16 @@ import typing
 import equinox as eqx
 import jax
 import jax.extend
-import jax.numpy as jnp
 import numpy as np
+
+from jaxbeam.runtime.arrays import xp
 
 
 def _as_array(value):
     """A number as a float array; tracers and placeholders of JAX as they are."""
-    if isinstance(value, int | float | np.ndarray | np.generic):
-        return jnp.asarray(np.asarray(value, float))  # half of the time that JAX takes for both
-    return jnp.asarray(value, float) if isinstance(value, list | tuple) else value
+    if isinstance(value, int | float | np.ndarray | np.generic | list | tuple):
+        return xp.asarray(value, float)
+    return value
 
 
 def _as_optional_array(value):

@@ -8,13 +8,12 @@ and sampling period may be traced, batched and differentiated.
 import functools
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
 from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
+from jaxbeam.runtime.arrays import scan, xp
 
 
 class Filter(eqx.Module):
@@ -74,7 +73,7 @@ def second_order_sections(
     if error is not None:
         raise ValueError(error)
     ratios, odd = _prototype_damping_ratios(filter.order)
-    warped = jnp.tan(jnp.pi * filter.cutoff * period)
+    warped = xp.tan(xp.pi * filter.cutoff * period)
     rows = []
     if odd:
         gain = warped / (1 + warped)
@@ -87,16 +86,16 @@ def second_order_sections(
             (1 - 2 * ratio * warped + warped**2) / denominator,
         )
         rows.append([gain, 2 * gain, gain, 1.0, a1, a2])
-    return jnp.stack([jnp.stack([jnp.asarray(x, float) for x in row]) for row in rows])
+    return xp.stack([xp.stack([xp.asarray(x, float) for x in row]) for row in rows])
 
 
 def steady_filter_state(
     sections: Float[Array, "section 6 ..."], value
 ) -> Float[Array, "section 2 *batch"]:
     """State of a digital filter in steady state under a constant input, which is its output."""
-    value = jnp.asarray(value, float)
-    rows = [jnp.stack([(1 - s[0]) * value, (s[2] - s[5]) * value]) for s in sections]
-    return jnp.stack(rows)
+    value = xp.asarray(value, float)
+    rows = [xp.stack([(1 - s[0]) * value, (s[2] - s[5]) * value]) for s in sections]
+    return xp.stack(rows)
 
 
 def filter_step(
@@ -113,10 +112,10 @@ def filter_step(
     for s, (first, second) in zip(sections, filter_state, strict=True):
         output = s[0] * sample + first
         next_state.append(
-            jnp.stack([s[1] * sample - s[4] * output + second, s[2] * sample - s[5] * output])
+            xp.stack([s[1] * sample - s[4] * output + second, s[2] * sample - s[5] * output])
         )
         sample = output
-    return sample, jnp.stack(next_state)
+    return sample, xp.stack(next_state)
 
 
 def filter_history(
@@ -136,12 +135,12 @@ def filter_history(
         sample, new = at
         output, next_state = filter_step(sections, state, sample)
         if new is not None:
-            output = jnp.where(new, output, held_output)
-            next_state = jnp.where(new, next_state, state)
+            output = xp.where(new, output, held_output)
+            next_state = xp.where(new, next_state, state)
         return (output, next_state), output
 
-    start = (jnp.zeros(samples.shape[1:]), filter_state)
-    return jax.lax.scan(step, start, (samples, new_samples))[1]
+    start = (xp.zeros(samples.shape[1:]), filter_state)
+    return scan(step, start, (samples, new_samples))[1]
 
 
 def analogue_state_space(
@@ -155,13 +154,13 @@ def analogue_state_space(
     by the cutoff frequency (rad/s); all have the unit of the signal.
     """
     matrix, column, row, _ = _prototype_state_space(filter.order)
-    cutoff = 2 * jnp.pi * filter.cutoff
-    return cutoff * matrix, cutoff * column, jnp.asarray(row), jnp.zeros(())
+    cutoff = 2 * xp.pi * filter.cutoff
+    return cutoff * matrix, cutoff * column, xp.asarray(row), xp.zeros(())
 
 
 def analogue_steady_state(filter: Filter, value) -> Float[Array, "state *batch"]:
     """State of an analogue filter in steady state under a constant input."""
-    return jnp.multiply.outer(_prototype_state_space(filter.order)[3], jnp.asarray(value, float))
+    return xp.multiply.outer(_prototype_state_space(filter.order)[3], xp.asarray(value, float))
 
 
 @functools.cache

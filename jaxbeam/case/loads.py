@@ -8,7 +8,6 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.declared_checks import validate_exactly_one
@@ -18,6 +17,7 @@ from jaxbeam.case.trajectory import (
     BrakingTrajectory,
     TabulatedTrajectory,
 )
+from jaxbeam.runtime.arrays import xp
 
 
 class AbstractLoad(eqx.Module):
@@ -115,7 +115,7 @@ class MovingForce(AbstractLoad):
     positions: Float[Array, " point"] | None = number("m", "table: positions", default=None)
 
     def inertia(self):
-        return jnp.zeros(())
+        return xp.zeros(())
 
     def validate(self, address):
         return validate_exactly_one(address, self, "force", "mass") or super().validate(address)

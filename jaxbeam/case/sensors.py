@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, number, part
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.runtime.arrays import xp
 
 
 class Sensor(eqx.Module):
@@ -70,7 +70,7 @@ class Sensor(eqx.Module):
     @property
     def noise_variance(self) -> Float[Array, ""]:
         """Variance of the noise of a reading, in the square of its unit; R of a Kalman filter."""
-        return jnp.zeros(()) if self.noise is None else self.noise**2
+        return xp.zeros(()) if self.noise is None else self.noise**2
 
     def validate(self, address: str) -> str | None:
         """First inconsistency between its fields as an error message, or None."""

@@ -13,7 +13,6 @@ import itertools
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -21,6 +20,7 @@ from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
+from jaxbeam.runtime.arrays import set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 EVENT_MARGIN_SHARE = (
@@ -53,11 +53,11 @@ def simulate_adaptive(
     ValueError for an invalid case.
     """
     check_case(case)
-    case, times = concrete_case(case), jnp.asarray(times, float)
+    case, times = concrete_case(case), xp.asarray(times, float)
     model, loads = compiled_modal_model(case), load_set(case)
     windows, legs = _event_times(model, loads, float(times[-1]))
     absolute_tolerance = tolerance * _state_scales(case, model, loads, float(times[-1]))
-    state, histories = jnp.zeros(model.state_count), []
+    state, histories = xp.zeros(model.state_count), []
     for start, stop in itertools.pairwise(legs):
         middle = (start + stop) / 2
         on_beam = (windows[:, 0] < middle) & (middle < windows[:, 1])
@@ -68,7 +68,7 @@ def simulate_adaptive(
         in_leg = (times >= start)[:, None]
         previous = histories or leg_histories
         histories = [
-            jnp.where(in_leg, new, old) for new, old in zip(leg_histories, previous, strict=True)
+            xp.where(in_leg, new, old) for new, old in zip(leg_histories, previous, strict=True)
         ]
     coordinates, rates, accelerations, force = histories
     deflection = coordinates @ model.shapes(case.sensor_positions, (0,))[0].T
@@ -104,27 +104,27 @@ def _solve_leg(
 
     start, stop = interval
     count, matrix = model.mode_count, model.A
-    mass = jnp.where(on_beam, loads.inertia[:, 0], 0.0)
-    weight = jnp.where(on_beam, loads.weight[:, 0], 0.0)
+    mass = xp.where(on_beam, loads.inertia[:, 0], 0.0)
+    weight = xp.where(on_beam, loads.weight[:, 0], 0.0)
 
     def accelerations(t, state):
         """Modal accelerations, and contact forces (N, downwards on the beam)."""
         offset = EVENT_MARGIN_SHARE * times[-1]
-        x, speed, acceleration = loads.kinematics(jnp.clip(t, start + offset, stop - offset))
-        shape, slope, curvature = model.shapes(jnp.where(on_beam, x, 0.0), (0, 1, 2))
+        x, speed, acceleration = loads.kinematics(xp.clip(t, start + offset, stop - offset))
+        shape, slope, curvature = model.shapes(xp.where(on_beam, x, 0.0), (0, 1, 2))
         q, u = state[model.coordinate_index], state[model.rate_index]
         convective = (
             2 * speed * (slope @ u) + speed**2 * (curvature @ q) + acceleration * (slope @ q)
         )
         free_force = weight + mass * convective
-        inertia = jnp.eye(count) + shape.T @ (mass[:, None] * shape)
-        modal_acceleration = jnp.linalg.solve(
+        inertia = xp.eye(count) + shape.T @ (mass[:, None] * shape)
+        modal_acceleration = xp.linalg.solve(
             inertia, (matrix @ state)[model.rate_index] - shape.T @ free_force
         )
         return modal_acceleration, free_force + mass * (shape @ modal_acceleration)
 
     def state_rate(t, state, _):
-        return (matrix @ state).at[model.rate_index].set(accelerations(t, state)[0])
+        return set_at(matrix @ state, model.rate_index, accelerations(t, state)[0])
 
     def save(t, state, _):
         return (
@@ -141,9 +141,9 @@ def _solve_leg(
         t1=stop,
         dt0=None,
         y0=state,
-        saveat=diffrax.SaveAt(ts=jnp.append(jnp.clip(times, start, stop), stop), fn=save),
+        saveat=diffrax.SaveAt(ts=xp.append(xp.clip(times, start, stop), stop), fn=save),
         stepsize_controller=diffrax.PIDController(
-            rtol=0.0, atol=1.0, norm=lambda error: jnp.max(jnp.abs(error / absolute_tolerance))
+            rtol=0.0, atol=1.0, norm=lambda error: xp.max(xp.abs(error / absolute_tolerance))
         ),
         max_steps=None,
         adjoint=diffrax.ForwardMode(),
@@ -159,12 +159,10 @@ def _state_scales(
 
     A rigid-body mode is scaled as a mode of angular frequency 1 / duration.
     """
-    stiffness = jnp.maximum(model.modes.stiffness, 1 / end**2)
-    weight = jnp.sum(jnp.abs(loads.weight)) + jnp.finfo(float).tiny
-    displacement = (
-        weight / jnp.sqrt(case.beam.linear_density * case.beam.length) / jnp.min(stiffness)
-    )
+    stiffness = xp.maximum(model.modes.stiffness, 1 / end**2)
+    weight = xp.sum(xp.abs(loads.weight)) + xp.finfo(float).tiny
+    displacement = weight / xp.sqrt(case.beam.linear_density * case.beam.length) / xp.min(stiffness)
     modal_scale = (
-        displacement * jnp.stack([jnp.ones_like(stiffness), jnp.sqrt(stiffness)], axis=-1).ravel()
+        displacement * xp.stack([xp.ones_like(stiffness), xp.sqrt(stiffness)], axis=-1).ravel()
     )
-    return jnp.ones(model.state_count).at[: modal_scale.shape[0]].set(modal_scale)
+    return set_at(xp.ones(model.state_count), np.s_[: modal_scale.shape[0]], modal_scale)

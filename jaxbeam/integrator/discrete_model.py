@@ -5,15 +5,14 @@ import operator
 from collections.abc import Callable
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.propagators import PEAK_NODES, Propagators, propagators
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.runtime.arrays import solve_triangular, xp
 
 
 class DiscreteModel(eqx.Module):
@@ -66,8 +65,8 @@ def discrete_model(
     transitions, force_responses = _peak_node_rows(
         step_propagators, np.arange(0, 2 * modes_per_block, 2)
     )
-    deflection_transition = jnp.einsum("wbm,lpbmj->lpwbj", rows, transitions)
-    deflection_force_response = jnp.einsum("wbm,lpfbmk->lpwfbk", rows, force_responses)
+    deflection_transition = xp.einsum("wbm,lpbmj->lpwbj", rows, transitions)
+    deflection_force_response = xp.einsum("wbm,lpfbmk->lpwfbk", rows, force_responses)
     flat_shape = (grid.lengths.shape[0], -1)
     return DiscreteModel(
         model,
@@ -83,19 +82,19 @@ def discrete_model(
 
 def _peak_node_rows(propagators: Propagators, rows):
     """Rows of the propagators (length, sample, ...) at the peak nodes of a step."""
-    identity = jnp.broadcast_to(
-        jnp.eye(propagators.transition_end.shape[-1]), propagators.transition_end.shape
+    identity = xp.broadcast_to(
+        xp.eye(propagators.transition_end.shape[-1]), propagators.transition_end.shape
     )
-    transitions = jnp.concatenate(
+    transitions = xp.concatenate(
         [identity[:, None], propagators.transition_nodes, propagators.transition_end[:, None]],
         axis=1,
     )
     force_responses = (
-        jnp.zeros_like(propagators.input_end)[:, None],
+        xp.zeros_like(propagators.input_end)[:, None],
         propagators.input_nodes,
         propagators.input_end[:, None],
     )
-    return transitions[..., rows, :], jnp.concatenate(force_responses, axis=1)[..., rows, :]
+    return transitions[..., rows, :], xp.concatenate(force_responses, axis=1)[..., rows, :]
 
 
 def _static_flexibility(
@@ -106,9 +105,9 @@ def _static_flexibility(
     Uncoupled modes need no factorisation, which would dominate the time.
     """
     if model.modes_per_block == 1:
-        return jnp.sum(shapes**2 / -model.state_matrix[:, 1, 0], axis=1)
-    half_solved = solve_triangular(jnp.linalg.cholesky(model.stiffness()), shapes.T, lower=True)
-    return jnp.sum(half_solved**2, axis=0)
+        return xp.sum(shapes**2 / -model.state_matrix[:, 1, 0], axis=1)
+    half_solved = solve_triangular(xp.linalg.cholesky(model.stiffness()), shapes.T, lower=True)
+    return xp.sum(half_solved**2, axis=0)
 
 
 def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
@@ -118,13 +117,13 @@ def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
         split = rows.reshape(
             rows.shape[0], len(PEAK_NODES), discrete.position_count, *rows.shape[2:]
         )
-        both = jnp.concatenate([split, -split], axis=2)
+        both = xp.concatenate([split, -split], axis=2)
         return both.reshape(rows.shape[0], -1, *rows.shape[2:])
 
     return dataclasses.replace(
         discrete,
         monitored_transition=both_signs(discrete.monitored_transition),
         monitored_input=both_signs(discrete.monitored_input),
-        flexibility=jnp.tile(discrete.flexibility, 2),
+        flexibility=xp.tile(discrete.flexibility, 2),
         magnitude=operator.pos,
     )

@@ -8,9 +8,10 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from jaxbeam.runtime.arrays import xp
 
 SAME_TIME_SHARE = 1e-9  # of the duration: closer times are one event
 MAX_DISTINCT_GAPS = 64  # with more different intervals, each has a length of its own
@@ -48,11 +49,11 @@ def sample_schedule(
     The first `lead_samples` times are events without a sample.
     """
     count = times.shape[0]
-    sample_events = jnp.arange(lead_samples, count)
+    sample_events = xp.arange(lead_samples, count)
     if equally_spaced:
         spacing = (times[-1] - times[0]) / (count - 1)
-        return EventSchedule(times, jnp.zeros(count - 1, int), spacing[None], sample_events)
-    return EventSchedule(times, jnp.arange(count - 1), jnp.diff(times), sample_events)
+        return EventSchedule(times, xp.zeros(count - 1, int), spacing[None], sample_events)
+    return EventSchedule(times, xp.arange(count - 1), xp.diff(times), sample_events)
 
 
 def controller_schedule(
@@ -135,15 +136,15 @@ def controller_schedule(
     mean_lengths = np.bincount(length_index, gaps) / np.bincount(length_index)
 
     def stack_columns(parts):
-        return jnp.asarray(np.array(parts).reshape(len(parts), times.size).T, int)
+        return xp.asarray(np.array(parts).reshape(len(parts), times.size).T, int)
 
     return EventSchedule(
-        jnp.asarray(times),
-        jnp.asarray(length_index),
-        jnp.asarray(mean_lengths),
-        jnp.asarray(event_indices(sample_times)),
-        control_sample=jnp.asarray(control_sample),
-        command_age=jnp.asarray(command_lag),
+        xp.asarray(times),
+        xp.asarray(length_index),
+        xp.asarray(mean_lengths),
+        xp.asarray(event_indices(sample_times)),
+        control_sample=xp.asarray(control_sample),
+        command_age=xp.asarray(command_lag),
         reading=stack_columns(reading_index),
         reading_age=stack_columns(reading_lag),
         max_age=int(max((part.max() for part in reading_lag), default=0)),
@@ -164,7 +165,7 @@ def stack_schedules(schedules: list[EventSchedule]) -> EventSchedule:
     largest = {name: max(getattr(s, name) for s in schedules) for name in maxima}
 
     def pad(schedule):
-        lengths = jnp.append(schedule.lengths, jnp.zeros(max_lengths - schedule.lengths.shape[0]))
+        lengths = xp.append(schedule.lengths, xp.zeros(max_lengths - schedule.lengths.shape[0]))
         return dataclasses.replace(schedule, lengths=lengths, **largest)
 
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(pad, schedules))
+    return jax.tree.map(lambda *leaves: xp.stack(leaves), *map(pad, schedules))

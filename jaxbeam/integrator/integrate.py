@@ -12,7 +12,6 @@ Commands to the actuators are polynomials through the same nodes, given by an in
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.loads import AbstractLoad, MovingMass
@@ -24,6 +23,15 @@ from jaxbeam.integrator.step import CHECKPOINT_NAME, advance, advance_unforced, 
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS, LoadPath, load_path, step_matrices
 from jaxbeam.model.contact import LoadSet
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.runtime.arrays import (
+    checkpoint,
+    collapse,
+    put,
+    scan,
+    stop_gradient,
+    while_loop,
+    xp,
+)
 
 # Largest phase (rad) of the highest mode in a step. Beyond twice the number of nodes, the contact
 # force of a mass, a polynomial in each step, cannot follow that mode's oscillation and excites it.
@@ -34,9 +42,9 @@ def max_stable_step(model: ModalModel, loads: tuple[AbstractLoad, ...]) -> Float
     """Longest step (s) at which the integration of these loads on the model is stable."""
     limit = MAX_STEP_NORM / state_matrix_norm(model)
     if any(isinstance(load, MovingMass) for load in loads):
-        highest_frequency = jnp.sqrt(jnp.max(jnp.linalg.eigvalsh(model.stiffness())))
-        limit = jnp.minimum(limit, MAX_PHASE_PER_STEP / highest_frequency)
-    return jax.lax.stop_gradient(limit)
+        highest_frequency = xp.sqrt(xp.max(xp.linalg.eigvalsh(model.stiffness())))
+        limit = xp.minimum(limit, MAX_PHASE_PER_STEP / highest_frequency)
+    return stop_gradient(limit)
 
 
 def _step_with_inputs(policy: AbstractInputPolicy, carry, step):
@@ -45,7 +53,7 @@ def _step_with_inputs(policy: AbstractInputPolicy, carry, step):
     matrices, inertia, weight, info = step
 
     def node_states(commands):
-        commands = jax.lax.collapse(commands, 0, 2)
+        commands = collapse(commands, 0, 2)
         forces = contact_forces(matrices, inertia, weight, state, commands)
         node_matrices = matrices.nodes
         node_values = (
@@ -56,11 +64,11 @@ def _step_with_inputs(policy: AbstractInputPolicy, carry, step):
         return node_values.reshape(len(GAUSS_NODES), *state.shape)
 
     node_commands, memory = policy.inputs(memory, state, info, node_states)
-    commands = jax.lax.collapse(node_commands, 0, 2)
+    commands = collapse(node_commands, 0, 2)
     next_state, (state, forces) = advance(state, (matrices, inertia, weight, commands))
     # A run that diverges becomes NaN here, without affecting the others, before it overflows.
-    diverged = jnp.any(~(jnp.abs(next_state) <= policy.state_bound[:, None]), axis=0)
-    next_state = jnp.where(diverged, jnp.nan, next_state)
+    diverged = xp.any(~(xp.abs(next_state) <= policy.state_bound[:, None]), axis=0)
+    next_state = xp.where(diverged, xp.nan, next_state)
     return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
 
 
@@ -68,8 +76,8 @@ def _values_by_row(
     values: Float[Array, "load batch"], path: LoadPath
 ) -> Float[Array, "step row batch"]:
     """A property of the loads for each row of the contact equations; zero off the beam."""
-    selected = jnp.where(path.on_beam[..., None], values[path.loads], 0.0)
-    return jnp.repeat(selected, len(GAUSS_NODES), axis=1)
+    selected = xp.where(path.on_beam[..., None], values[path.loads], 0.0)
+    return xp.repeat(selected, len(GAUSS_NODES), axis=1)
 
 
 def _chunk_function(
@@ -82,7 +90,7 @@ def _chunk_function(
     """
 
     def chunk(state, memory, running_peaks: Any, first_step):
-        index = first_step + jnp.arange(CHUNK_STEPS)
+        index = first_step + xp.arange(CHUNK_STEPS)
         chunk_path = load_path(discrete, loads, max_loads, index)
         matrices = step_matrices(discrete, chunk_path)
         inertia_and_weight = (
@@ -96,7 +104,7 @@ def _chunk_function(
             step_infos = StepInfo(
                 chunk_path.start, chunk_path.length, discrete.grid.event_at(index)
             )
-            (state, memory), (states, forces, commands, observed) = jax.lax.scan(
+            (state, memory), (states, forces, commands, observed) = scan(
                 lambda carry, step: _step_with_inputs(policy, carry, step),
                 (state, memory),
                 (matrices, *inertia_and_weight, step_infos),
@@ -146,17 +154,17 @@ def integrate_history(
         else initial_peaks(discrete.position_count, load_count, batch_size, discrete.magnitude)
     )
     memory = None if policy is None else policy.start(batch_size)
-    initial_state = jnp.zeros((discrete.model.state_count, batch_size))
-    first_steps = jnp.arange(0, steps, CHUNK_STEPS)
-    checkpointed_chunk = jax.checkpoint(
+    initial_state = xp.zeros((discrete.model.state_count, batch_size))
+    first_steps = xp.arange(0, steps, CHUNK_STEPS)
+    checkpointed_chunk = checkpoint(
         one_chunk, policy=jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
     )
-    (state, memory, running_peaks), history = jax.lax.scan(
+    (state, memory, running_peaks), history = scan(
         checkpointed_chunk, (initial_state, memory, running_peaks), first_steps
     )
-    history = jax.tree.map(lambda part: jax.lax.collapse(part, 0, 2)[:steps], history)
+    history = jax.tree.map(lambda part: collapse(part, 0, 2)[:steps], history)
     states, commands, observed = history
-    return running_peaks, jnp.concatenate([states, state[None]]), commands, observed, memory
+    return running_peaks, xp.concatenate([states, state[None]]), commands, observed, memory
 
 
 def integrate_peaks(
@@ -185,12 +193,10 @@ def integrate_peaks(
             state[discrete.model.coordinate_index],
             state[discrete.model.rate_index],
         )
-        energy = jnp.sum(rates**2, axis=0) + jnp.sum(
-            coordinates * (stiffness @ coordinates), axis=0
-        )
-        deflection_bound = jnp.sqrt(discrete.flexibility[:, None] * energy)
+        energy = xp.sum(rates**2, axis=0) + xp.sum(coordinates * (stiffness @ coordinates), axis=0)
+        deflection_bound = xp.sqrt(discrete.flexibility[:, None] * energy)
         # A run that has diverged cannot raise its peak further.
-        settled = jnp.all((deflection_bound < running_peaks.estimate) | ~jnp.isfinite(energy))
+        settled = xp.all((deflection_bound < running_peaks.estimate) | ~xp.isfinite(energy))
         return ~(all_loads_left & settled)
 
     def next_chunk(carry):
@@ -198,7 +204,7 @@ def integrate_peaks(
         state, memory, peaks, time, _ = chunk(state, memory, peaks, first_step)
         first_step = first_step + CHUNK_STEPS
         continues = (
-            jnp.any(peaks.finite) if policy is not None else can_raise_peak(state, peaks, time)
+            xp.any(peaks.finite) if policy is not None else can_raise_peak(state, peaks, time)
         )
         return state, memory, peaks, first_step, continues
 
@@ -208,13 +214,13 @@ def integrate_peaks(
     )
     memory = None if policy is None else policy.start(batch_size)
     start = (
-        jnp.zeros((discrete.model.state_count, batch_size)),
+        xp.zeros((discrete.model.state_count, batch_size)),
         memory,
         running_peaks,
-        jnp.zeros((), int),
-        jnp.ones((), bool),
+        xp.zeros((), int),
+        xp.ones((), bool),
     )
-    final: Any = jax.lax.while_loop(unfinished, next_chunk, start)
+    final: Any = while_loop(unfinished, next_chunk, start)
     return final[2], final[1]
 
 
@@ -235,15 +241,15 @@ def integrate_at_events(
 
     def next_chunk(carry):
         state, memory, kept, first_step = carry
-        event = grid.event_at(first_step + jnp.arange(CHUNK_STEPS))
+        event = grid.event_at(first_step + xp.arange(CHUNK_STEPS))
         state, memory, _, _, (states, *_) = chunk(state, memory, None, first_step)
-        kept = kept.at[jnp.where(event < 0, kept.shape[0], event)].set(states, mode="drop")
+        kept = put(kept, xp.where(event < 0, kept.shape[0], event), states)
         return state, memory, kept, first_step + CHUNK_STEPS
 
     batch_size = loads.inertia.shape[1]
-    initial_state = jnp.zeros((discrete.model.state_count, batch_size))
+    initial_state = xp.zeros((discrete.model.state_count, batch_size))
     memory = None if policy is None else policy.start(batch_size)
-    event_states = jnp.zeros((grid.event_panels.shape[0], *initial_state.shape))
-    start = initial_state, memory, event_states, jnp.zeros((), int)
-    final: Any = jax.lax.while_loop(lambda carry: carry[3] < grid.step_count, next_chunk, start)
+    event_states = xp.zeros((grid.event_panels.shape[0], *initial_state.shape))
+    start = initial_state, memory, event_states, xp.zeros((), int)
+    final: Any = while_loop(lambda carry: carry[3] < grid.step_count, next_chunk, start)
     return final[2]

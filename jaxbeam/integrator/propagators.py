@@ -16,12 +16,12 @@ import math
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.gauss import gauss_nodes, lagrange_coefficients
+from jaxbeam.runtime.arrays import scan, set_at, stop_gradient, vmap, xp
 
 NODE_COUNT = 6  # Gauss nodes in a step; the integrator has order 12
 DOUBLINGS = 7
@@ -56,7 +56,7 @@ def end_weights() -> np.ndarray:
 def _multiply(a, b):
     """Product of matrices (row, column, ...), spelt out for the small blocks of single modes."""
     if a.shape[1] > 3:
-        return jnp.einsum("ij...,jk...->ik...", a, b)
+        return xp.einsum("ij...,jk...->ik...", a, b)
     return sum(a[:, i, None] * b[None, i] for i in range(a.shape[1]))
 
 
@@ -64,7 +64,7 @@ def state_matrix_norm(model: ModalModel) -> Float[Array, ""]:
     """Norm of the scaled state matrix in 1/s; `MAX_STEP_NORM` over it bounds the step length."""
     scale = _state_scaling(model)
     matrix = model.state_matrix * scale[:, :, None] / scale[:, None, :]
-    return jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=-1)))
+    return stop_gradient(xp.max(xp.sum(xp.abs(matrix), axis=-1)))
 
 
 def _state_scaling(model: ModalModel):
@@ -72,9 +72,9 @@ def _state_scaling(model: ModalModel):
     blocks, side, _ = model.state_matrix.shape
     modes_per_block = model.modes_per_block
     modes = np.arange(modes_per_block)
-    square = jnp.abs(model.state_matrix[:, 2 * modes + 1, 2 * modes])
-    scale = jnp.ones((blocks, side)).at[:, 2 * modes].set(jnp.sqrt(1.0 + square))
-    return jax.lax.stop_gradient(scale)
+    square = xp.abs(model.state_matrix[:, 2 * modes + 1, 2 * modes])
+    scale = set_at(xp.ones((blocks, side)), np.s_[:, 2 * modes], xp.sqrt(1.0 + square))
+    return stop_gradient(scale)
 
 
 @jax.named_scope("propagators")
@@ -89,15 +89,15 @@ def propagators(
     blocks, side, _ = model.state_matrix.shape
     modes_per_block = model.modes_per_block
     matrix = model.state_matrix * state_scale[:, :, None] / state_scale[:, None, :]
-    input_matrix = jnp.eye(side)[:, 1 : 2 * modes_per_block : 2]
+    input_matrix = xp.eye(side)[:, 1 : 2 * modes_per_block : 2]
     if with_commands:
-        input_matrix = jnp.concatenate([input_matrix, model.command_matrix], axis=1)
+        input_matrix = xp.concatenate([input_matrix, model.command_matrix], axis=1)
     fractions = np.append(GAUSS_NODES, 1.0)
     durations = lengths[..., None] * fractions
     # Blocks and durations are the last axes, along which operations vectorise.
-    x = jnp.moveaxis(matrix, 0, -1)[..., None] * durations.ravel() / 2**DOUBLINGS
+    x = xp.moveaxis(matrix, 0, -1)[..., None] * durations.ravel() / 2**DOUBLINGS
     transition, phi_functions = _taylor_series(x, input_matrix)
-    (transition, phi_functions), _ = jax.lax.scan(
+    (transition, phi_functions), _ = scan(
         _double_argument, (transition, phi_functions), length=DOUBLINGS
     )
     phi_functions = phi_functions * durations.ravel()
@@ -109,8 +109,8 @@ def propagators(
         [math.factorial(p) for p in powers]
     )  # force, power
     weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
-    inputs = jnp.einsum("cfp,psmb...c->...cfbsm", weights, phi_functions)
-    transition = jnp.einsum("stb...c->...cbst", transition)
+    inputs = xp.einsum("cfp,psmb...c->...cfbsm", weights, phi_functions)
+    transition = xp.einsum("stb...c->...cbst", transition)
     # Inputs act on rates and actuators' own states, which the scaling leaves unchanged.
     inputs = inputs / state_scale[:, :, None]
     transition = transition * state_scale[:, None, :] / state_scale[:, :, None]
@@ -127,27 +127,27 @@ def _taylor_series(x, input_matrix):
     side, inputs = input_matrix.shape
     rest = x.shape[2:]
     # Both series at once: they differ only in the divisors of their terms.
-    starting_terms = jnp.concatenate([jnp.eye(side), input_matrix], axis=1).reshape(
+    starting_terms = xp.concatenate([xp.eye(side), input_matrix], axis=1).reshape(
         side, -1, *(1,) * len(rest)
     )
-    starting_terms = jnp.broadcast_to(starting_terms, (side, side + inputs, *rest))
+    starting_terms = xp.broadcast_to(starting_terms, (side, side + inputs, *rest))
     divisor_offset = np.repeat([0, NODE_COUNT], [side, inputs]).reshape(-1, *(1,) * len(rest))
 
     def horner(sums, term):
         return starting_terms + _multiply(x, sums) / (term + divisor_offset), None
 
-    sums, _ = jax.lax.scan(horner, starting_terms, np.arange(TAYLOR_TERMS, 0, -1.0))
+    sums, _ = scan(horner, starting_terms, np.arange(TAYLOR_TERMS, 0, -1.0))
     transition, highest_phi, input_matrix = sums[:, :side], sums[:, side:], starting_terms[:, side:]
     phi_functions = [highest_phi / math.factorial(NODE_COUNT)]
     for p in range(NODE_COUNT - 1, 0, -1):
         phi_functions.insert(0, input_matrix / math.factorial(p) + _multiply(x, phi_functions[0]))
-    return transition, jnp.stack(phi_functions)
+    return transition, xp.stack(phi_functions)
 
 
 def _double_argument(functions, _):
     """exp and phi functions of twice the argument."""
     transition, phi_functions = functions
-    propagated = jax.vmap(functools.partial(_multiply, transition))(phi_functions)
+    propagated = vmap(functools.partial(_multiply, transition))(phi_functions)
     # Spelt out: a product over the first axis would transpose the arrays twice.
     weights = _doubling_weights().T.reshape(NODE_COUNT, NODE_COUNT, *(1,) * transition.ndim)
     doubled = propagated + sum(

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -16,6 +15,7 @@ from jaxbeam.case.trajectory import NEVER
 from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
 from jaxbeam.integrator.step_matrices import LoadPath, StepMatrices
 from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
+from jaxbeam.runtime.arrays import cond, optimization_barrier, vmap, xp
 
 PEAK_MARGIN = 1.1  # upper bound of a peak over the highest of the samples around it
 
@@ -54,11 +54,11 @@ class RunningPeaks(eqx.Module):
         """Peak magnitude of each monitored deflection (m), and its time (s); NaN if not finite."""
         value, position = refine_peak(self.samples, PEAK_NODES, self.magnitude)
         time = self.step_start + position * self.step_length
-        return jnp.where(self.finite, value, jnp.nan), jnp.where(self.finite, time, jnp.nan)
+        return xp.where(self.finite, value, xp.nan), xp.where(self.finite, time, xp.nan)
 
     def peaks(self) -> Peaks:
         """Peaks at the end of the runs, with the batch axis first."""
-        lost = jnp.where(self.contact_lost_time < NEVER, self.contact_lost_time, jnp.nan)
+        lost = xp.where(self.contact_lost_time < NEVER, self.contact_lost_time, xp.nan)
         return Peaks(*(part.T for part in (*self.refined_peak(), self.lowest_contact_force, lost)))
 
 
@@ -70,24 +70,22 @@ def update_peaks(
     steps, batch_size = states.shape[0], states.shape[-1]
     start, length = path.start, path.length
     parts = (states, forces) if commands is None else (states, forces, commands)
-    deflections = matrices.monitored @ jnp.concatenate(parts, axis=1)
-    samples = jax.lax.optimization_barrier(
-        deflections.reshape(steps, len(PEAK_NODES), -1, batch_size)
-    )
+    deflections = matrices.monitored @ xp.concatenate(parts, axis=1)
+    samples = optimization_barrier(deflections.reshape(steps, len(PEAK_NODES), -1, batch_size))
 
     def updated(best):
-        estimate = jax.lax.optimization_barrier(
-            jax.vmap(lambda step: estimate_peak(step, PEAK_NODES, best.magnitude))(samples)
+        estimate = optimization_barrier(
+            vmap(lambda step: estimate_peak(step, PEAK_NODES, best.magnitude))(samples)
         )
         best_estimate, peak_step = max_with_ties(estimate)
-        peak_step = jnp.max(jnp.where(peak_step, np.arange(steps)[:, None, None], 0), axis=0)
+        peak_step = xp.max(xp.where(peak_step, np.arange(steps)[:, None, None], 0), axis=0)
         better = best_estimate > best.estimate
-        chosen = jnp.take_along_axis(samples, peak_step[None, None], axis=0)[0]
+        chosen = xp.take_along_axis(samples, peak_step[None, None], axis=0)[0]
         return RunningPeaks(
-            jnp.where(better, best_estimate, best.estimate),
-            jnp.where(better, chosen, best.samples),
-            jnp.where(better, start[peak_step], best.step_start),
-            jnp.where(better, length[peak_step], best.step_length),
+            xp.where(better, best_estimate, best.estimate),
+            xp.where(better, chosen, best.samples),
+            xp.where(better, start[peak_step], best.step_start),
+            xp.where(better, length[peak_step], best.step_length),
             best.lowest_contact_force,
             best.contact_lost_time,
             best.finite,
@@ -95,35 +93,35 @@ def update_peaks(
         )
 
     # Most chunks stay far below the peak so far and lose no contact: they skip the refinement.
-    largest = jnp.max(jnp.abs(samples), axis=(0, 1))
-    running_peaks = jax.lax.cond(
-        jnp.any(largest * PEAK_MARGIN > running_peaks.estimate),
+    largest = xp.max(xp.abs(samples), axis=(0, 1))
+    running_peaks = cond(
+        xp.any(largest * PEAK_MARGIN > running_peaks.estimate),
         updated,
         lambda best: best,
         running_peaks,
     )
-    least_of_step = jnp.min(-forces.reshape(steps, -1, len(GAUSS_NODES), batch_size), axis=2)
+    least_of_step = xp.min(-forces.reshape(steps, -1, len(GAUSS_NODES), batch_size), axis=2)
     # Loads off the beam do not count.
     is_load = (
         path.loads[:, :, None] == np.arange(running_peaks.lowest_contact_force.shape[0])
     ) & path.on_beam[..., None]
-    least_of_load = jnp.where(is_load[..., None], least_of_step[:, :, None], jnp.inf)
-    lowest_force = jnp.minimum(
-        running_peaks.lowest_contact_force, jnp.min(least_of_load, axis=(0, 1), initial=jnp.inf)
+    least_of_load = xp.where(is_load[..., None], least_of_step[:, :, None], xp.inf)
+    lowest_force = xp.minimum(
+        running_peaks.lowest_contact_force, xp.min(least_of_load, axis=(0, 1), initial=xp.inf)
     )
 
     def first_loss(earlier):
         tensile = -forces.reshape(steps, -1, 1, len(GAUSS_NODES), batch_size) < 0
-        times = (start[:, None] + length[:, None] * jnp.asarray(GAUSS_NODES, length.dtype))[
+        times = (start[:, None] + length[:, None] * xp.asarray(GAUSS_NODES, length.dtype))[
             :, None, None, :, None
         ]
-        when = jnp.where(tensile & is_load[..., None, None], times, NEVER)
-        return jnp.minimum(earlier, jnp.min(when, axis=(0, 1, 3), initial=NEVER))
+        when = xp.where(tensile & is_load[..., None, None], times, NEVER)
+        return xp.minimum(earlier, xp.min(when, axis=(0, 1, 3), initial=NEVER))
 
-    contact_lost_time = jax.lax.cond(
-        jnp.any(lowest_force < 0), first_loss, lambda first: first, running_peaks.contact_lost_time
+    contact_lost_time = cond(
+        xp.any(lowest_force < 0), first_loss, lambda first: first, running_peaks.contact_lost_time
     )
-    finite = running_peaks.finite & jnp.all(jnp.isfinite(largest), axis=0)
+    finite = running_peaks.finite & xp.all(xp.isfinite(largest), axis=0)
     return eqx.tree_at(
         lambda b: (b.lowest_contact_force, b.contact_lost_time, b.finite),
         running_peaks,
@@ -133,14 +131,14 @@ def update_peaks(
 
 def initial_peaks(positions: int, loads: int, batch_size: int, magnitude: Callable) -> RunningPeaks:
     """Running peaks at rest, before the first step; `magnitude` of a deflection is zero at rest."""
-    zeros = jnp.zeros((positions, batch_size))
+    zeros = xp.zeros((positions, batch_size))
     return RunningPeaks(
         zeros,
-        jnp.zeros((len(PEAK_NODES), positions, batch_size)),
+        xp.zeros((len(PEAK_NODES), positions, batch_size)),
         zeros,
         zeros,
-        jnp.full((loads, batch_size), jnp.inf),
-        jnp.full((loads, batch_size), NEVER),
-        jnp.ones(batch_size, bool),
+        xp.full((loads, batch_size), xp.inf),
+        xp.full((loads, batch_size), NEVER),
+        xp.ones(batch_size, bool),
         magnitude,
     )

@@ -6,7 +6,6 @@ remains to be done step by step, in forward and in reverse mode.
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.model.contact import solve_contact_forces
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_small
+from jaxbeam.runtime.arrays import cond, custom_jvp, scan, vmap, xp
 
 CHECKPOINT_NAME = "steps"  # states and contact forces that are saved for the reverse pass
 
@@ -31,7 +31,7 @@ def contact_forces(matrices: StepMatrices, inertia, weight, state, commands):
         )
 
     # Without loads on the beam there is nothing to solve, which halves the cost of such steps.
-    return jax.lax.cond(matrices.loaded, forces, lambda: jnp.zeros_like(weight))
+    return cond(matrices.loaded, forces, lambda: xp.zeros_like(weight))
 
 
 @jax.named_scope("propagation")
@@ -58,10 +58,10 @@ def free_response(transition: Float[Array, "block side side"], state: Float[Arra
     return next_state.reshape(state.shape)
 
 
-@jax.custom_jvp
+@custom_jvp
 def advance_unforced(matrices: StepMatrices, inertia, weight, state):
     """Steps without commands: final state, state before each step, and contact forces."""
-    final_state, (states, forces) = jax.lax.scan(advance, state, (matrices, inertia, weight, None))
+    final_state, (states, forces) = scan(advance, state, (matrices, inertia, weight, None))
     return final_state, states, forces
 
 
@@ -82,10 +82,10 @@ def _advance_unforced_jvp(primals, tangents):
     # Systems of all steps and runs at once.
     rows = forces.shape[1]
     matrix = inertia[:, :, None] * matrices.contact_compliance[..., None] + np.eye(rows)[:, :, None]
-    identity = jnp.broadcast_to(np.eye(rows)[:, :, None], matrix.shape)
-    inverse = jax.vmap(solve_small)(matrix, identity)
+    identity = xp.broadcast_to(np.eye(rows)[:, :, None], matrix.shape)
+    inverse = vmap(solve_small)(matrix, identity)
     force_feedback = inverse * inertia[:, None]
-    state_feedback = jnp.einsum("tir,trcl->ticl", matrices.force_response, force_feedback)
+    state_feedback = xp.einsum("tir,trcl->ticl", matrices.force_response, force_feedback)
     acceleration = _matvec_of_steps(matrices.contact_compliance, forces) + _matvec_of_steps(
         matrices.contact_response, states
     )
@@ -95,7 +95,7 @@ def _advance_unforced_jvp(primals, tangents):
     free_force_tangent = -_multiply_and_sum(
         inverse, inertia_tangent * acceleration + inertia * acceleration_tangent + weight_tangent
     )
-    free_state_tangent = jax.vmap(free_response)(matrix_tangents.transition, states)
+    free_state_tangent = vmap(free_response)(matrix_tangents.transition, states)
     free_state_tangent = (
         free_state_tangent
         + _matvec_of_steps(matrix_tangents.force_response, forces)
@@ -106,10 +106,10 @@ def _advance_unforced_jvp(primals, tangents):
         contact_response, transition, feedback, free_tangent = parts
         acceleration = matvec(contact_response, tangent)
         next_tangent = free_response(transition, tangent) + free_tangent
-        return next_tangent - jnp.sum(feedback * acceleration, axis=1), tangent
+        return next_tangent - xp.sum(feedback * acceleration, axis=1), tangent
 
     parts = matrices.contact_response, matrices.transition, state_feedback, free_state_tangent
-    final_tangent, state_tangents = jax.lax.scan(step, state_tangent, parts)
+    final_tangent, state_tangents = scan(step, state_tangent, parts)
     force_tangents = free_force_tangent - _multiply_and_sum(
         force_feedback, _matvec_of_steps(matrices.contact_response, state_tangents)
     )
@@ -127,4 +127,4 @@ def _matvec_of_steps(
 
 
 def _multiply_and_sum(matrix, vectors: Float[Array, "step column batch"]):
-    return jnp.sum(matrix * vectors[:, None], axis=2)
+    return xp.sum(matrix * vectors[:, None], axis=2)

@@ -10,13 +10,13 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.model.contact import LoadSet, contact_rows
+from jaxbeam.runtime.arrays import cond, index_in_dim, map_elements, xp
 
 CHUNK_STEPS = 16  # steps whose matrices are computed together
 
@@ -79,20 +79,20 @@ def load_path(
     panel, start, length_index = grid.locate_steps(index)
     length = grid.lengths[length_index]
     # As an array: JAX remembers a NumPy constant in the precision in which it met it first.
-    times = start[:, None] + length[:, None] * jnp.asarray(GAUSS_NODES, length.dtype)
-    position, speed, acceleration = (jnp.moveaxis(p, 0, 1) for p in loads.kinematics(times))
+    times = start[:, None] + length[:, None] * xp.asarray(GAUSS_NODES, length.dtype)
+    position, speed, acceleration = (xp.moveaxis(p, 0, 1) for p in loads.kinematics(times))
     on_beam = grid.loads_on_beam[panel]  # step, load
     if max_loads < len(loads.trajectories):
         # Loads on the beam first; those beyond the largest number are off the beam.
-        load_index = jnp.argsort(~on_beam, axis=1)[:, :max_loads]
+        load_index = xp.argsort(~on_beam, axis=1)[:, :max_loads]
         selection = load_index[:, :, None]
         position, speed, acceleration = (
-            jnp.take_along_axis(part, selection, axis=1) for part in (position, speed, acceleration)
+            xp.take_along_axis(part, selection, axis=1) for part in (position, speed, acceleration)
         )
-        on_beam = jnp.take_along_axis(on_beam, load_index, axis=1)
+        on_beam = xp.take_along_axis(on_beam, load_index, axis=1)
     else:
-        load_index = jnp.broadcast_to(jnp.arange(max_loads), on_beam.shape)
-    on_beam_at_nodes = jnp.broadcast_to(on_beam[:, :, None], position.shape)
+        load_index = xp.broadcast_to(xp.arange(max_loads), on_beam.shape)
+    on_beam_at_nodes = xp.broadcast_to(on_beam[:, :, None], position.shape)
     shape, rows = contact_rows(model, position, speed, acceleration, on_beam_at_nodes)
     return LoadPath(length_index, start, length, load_index, on_beam, shape, rows)
 
@@ -116,19 +116,19 @@ def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
             )
             return jax.tree.map(lambda matrix: matrix[0], matrices)
 
-        return jax.lax.map(single_step, (path.length_index, path.shape_rows, path.contact_rows))
+        return map_elements(single_step, (path.length_index, path.shape_rows, path.contact_rows))
 
     # In most chunks all steps are equally long and share their propagators.
-    matrices: Any = jax.lax.cond(
-        jnp.all(path.length_index == path.length_index[0]), equal_lengths, mixed_lengths, None
+    matrices: Any = cond(
+        xp.all(path.length_index == path.length_index[0]), equal_lengths, mixed_lengths, None
     )
-    return StepMatrices(*matrices, loaded=jnp.any(path.on_beam, axis=1))
+    return StepMatrices(*matrices, loaded=xp.any(path.on_beam, axis=1))
 
 
 def _propagators_of(discrete: DiscreteModel, length_index):
     """Propagators of steps of one length, and their rows of monitored deflections."""
     return jax.tree.map(
-        lambda part: jax.lax.dynamic_index_in_dim(part, length_index, keepdims=False),
+        lambda part: index_in_dim(part, length_index, keepdims=False),
         (discrete.propagators, discrete.monitored_transition, discrete.monitored_input),
     )
 
@@ -139,18 +139,18 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
     steps, load_count, nodes, _, modes = shape.shape
     size = load_count * nodes
     states = rows.shape[3] * rows.shape[4]
-    contact_response = jnp.einsum("tpcbi,cbij->tpcbj", rows, of_states.transition_nodes)
-    force_to_acceleration = jnp.einsum(
+    contact_response = xp.einsum("tpcbi,cbij->tpcbj", rows, of_states.transition_nodes)
+    force_to_acceleration = xp.einsum(
         "tpcbi,cfbim->tpcfbm", rows, of_states.input_nodes[..., :modes]
     )
-    force_coupling = jnp.einsum("tpcfbm,tqfbm->tpcqf", force_to_acceleration, shape)
-    direct = jnp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
+    force_coupling = xp.einsum("tpcfbm,tqfbm->tpcqf", force_to_acceleration, shape)
+    direct = xp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
     force_coupling = force_coupling + direct[..., None] * np.eye(nodes)[:, None, :]
-    force_response = jnp.einsum("tqfbm,fbim->tbiqf", shape, of_states.input_end[..., :modes])
+    force_response = xp.einsum("tqfbm,fbim->tbiqf", shape, of_states.input_end[..., :modes])
 
     def for_all_steps(matrix, *shape):
         matrix = matrix.reshape(shape or matrix.shape)
-        return jnp.broadcast_to(matrix, (steps, *matrix.shape))
+        return xp.broadcast_to(matrix, (steps, *matrix.shape))
 
     matrices = (
         contact_response.reshape(steps, size, states),
@@ -162,7 +162,7 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
         matrices = (*matrices, None)
     else:
         deflection_count = deflection_transition.shape[0]
-        force_to_deflection = jnp.einsum(
+        force_to_deflection = xp.einsum(
             "lfbm,tqfbm->tlqf", deflection_force_response[..., :modes], shape
         )
         parts = [
@@ -173,29 +173,29 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
             parts.append(
                 for_all_steps(deflection_force_response[:, :, 0, modes:], deflection_count, -1)
             )
-        matrices = (*matrices, jnp.concatenate(parts, axis=2))
+        matrices = (*matrices, xp.concatenate(parts, axis=2))
     commands = node_states = None
     if discrete.modal_command_matrix is not None:
         # The model of a run with commands is a single block.
         command_count = nodes * discrete.modal_command_matrix.shape[1]
         command_responses = of_states.input_nodes[:, :, 0, :, modes:]
-        command_to_acceleration = jnp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], command_responses)
-        feedthrough = jnp.einsum("tpcm,mu->tpcu", shape[..., 0, :], discrete.modal_command_matrix)
+        command_to_acceleration = xp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], command_responses)
+        feedthrough = xp.einsum("tpcm,mu->tpcu", shape[..., 0, :], discrete.modal_command_matrix)
         command_to_acceleration = (
             command_to_acceleration + feedthrough[:, :, :, None] * np.eye(nodes)[:, :, None]
         )
         commands = CommandMatrices(
             command_to_acceleration.reshape(steps, size, command_count),
             for_all_steps(
-                jnp.moveaxis(of_states.input_end[:, 0, :, modes:], 1, 0), states, command_count
+                xp.moveaxis(of_states.input_end[:, 0, :, modes:], 1, 0), states, command_count
             ),
         )
     if discrete.with_node_states:
         force_inputs = of_states.input_nodes[:, :, 0, :, :modes]
-        force_to_node_states = jnp.einsum("tqfm,cfim->tciqf", shape[..., 0, :], force_inputs)
+        force_to_node_states = xp.einsum("tqfm,cfim->tciqf", shape[..., 0, :], force_inputs)
         node_states = NodeMatrices(
             for_all_steps(of_states.transition_nodes, nodes * states, states),
             force_to_node_states.reshape(steps, nodes * states, size),
-            for_all_steps(jnp.moveaxis(command_responses, 1, 2), nodes * states, command_count),
+            for_all_steps(xp.moveaxis(command_responses, 1, 2), nodes * states, command_count),
         )
     return *matrices, commands, node_states

@@ -6,14 +6,13 @@ number of panels, so the grid can be compiled; a panel of zero length has no eff
 """
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads import trajectory
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.runtime.arrays import put, stop_gradient, xp
 
 
 class TimeGrid(eqx.Module):
@@ -39,7 +38,7 @@ class TimeGrid(eqx.Module):
     @property
     def last_exit(self) -> Float[Array, ""]:
         """Time (s) after which no load is on the beam."""
-        return jnp.max(self.on_beam_intervals[:, 1], initial=0.0)
+        return xp.max(self.on_beam_intervals[:, 1], initial=0.0)
 
     @property
     def step_count(self) -> Int[Array, ""]:
@@ -50,24 +49,24 @@ class TimeGrid(eqx.Module):
         """Panel, start time (s) and index of the length of the steps with these indices."""
         after_end = index >= self.step_count
         if self.event is None:
-            panel = jnp.searchsorted(
+            panel = xp.searchsorted(
                 self.cumulative_counts, index, side="right", method="compare_all"
             )
         else:  # all panels of a schedule have the same number of steps
             panel = index // self.counts[0]
-        panel = jnp.minimum(panel, self.counts.shape[0] - 1)
-        length_index = jnp.where(after_end, self.lengths.shape[0] - 1, self.length_index[panel])
+        panel = xp.minimum(panel, self.counts.shape[0] - 1)
+        length_index = xp.where(after_end, self.lengths.shape[0] - 1, self.length_index[panel])
         start = (
             self.boundaries[panel]
             + (index - self._first_step(panel)) * self.lengths[self.length_index[panel]]
         )
-        return panel, jnp.where(after_end, self.boundaries[-1], start), length_index
+        return panel, xp.where(after_end, self.boundaries[-1], start), length_index
 
     def event_at(self, index: Int[Array, " step"]) -> Int[Array, " step"]:
         """Index of the scheduled event at which each of some steps starts, -1 for none."""
         panel, _, _ = self.locate_steps(index)
         starts = (index == self._first_step(panel)) & (index < self.step_count)
-        return jnp.where(starts, self.event[panel], -1)
+        return xp.where(starts, self.event[panel], -1)
 
     def _first_step(self, panel):
         """Index of the first step of a panel."""
@@ -79,10 +78,10 @@ def _load_events(case: Case, model: ModalModel):
     inner_nodes = model.modes.nodes[1:-1]
     trajectories = [trajectory(load, case.beam.length) for load in case.loads]
     if not trajectories:
-        return jnp.zeros((0, 2)), jnp.zeros(0)
-    windows = jnp.stack([jnp.stack(path.entry_exit_times()) for path in trajectories])
+        return xp.zeros((0, 2)), xp.zeros(0)
+    windows = xp.stack([xp.stack(path.entry_exit_times()) for path in trajectories])
     nonsmooth_times = [path.passage_times(inner_nodes) for path in trajectories]
-    return windows, jnp.concatenate([windows.ravel(), *nonsmooth_times])
+    return windows, xp.concatenate([windows.ravel(), *nonsmooth_times])
 
 
 def _loads_on_beam(windows, boundaries):
@@ -101,17 +100,17 @@ def grid_by_step_length(
     """
     windows, events = _load_events(case, model)
     end = case.run.duration
-    boundaries = jnp.concatenate([jnp.zeros(1), jnp.clip(jnp.sort(events), 0.0, end), end[None]])
-    panel_lengths = jnp.diff(boundaries)
-    counts = jnp.ceil(jax.lax.stop_gradient(panel_lengths / max_step)).astype(int) + extra_steps * (
+    boundaries = xp.concatenate([xp.zeros(1), xp.clip(xp.sort(events), 0.0, end), end[None]])
+    panel_lengths = xp.diff(boundaries)
+    counts = xp.ceil(stop_gradient(panel_lengths / max_step)).astype(int) + extra_steps * (
         panel_lengths > 0
     )
-    lengths = panel_lengths / jnp.maximum(counts, 1)
-    length_index = jnp.arange(panel_lengths.shape[0])
-    lengths = jnp.append(lengths, 0.0)
+    lengths = panel_lengths / xp.maximum(counts, 1)
+    length_index = xp.arange(panel_lengths.shape[0])
+    lengths = xp.append(lengths, 0.0)
     loads_on_beam = _loads_on_beam(windows, boundaries)
     return TimeGrid(
-        boundaries, counts, jnp.cumsum(counts), length_index, lengths, loads_on_beam, windows
+        boundaries, counts, xp.cumsum(counts), length_index, lengths, loads_on_beam, windows
     )
 
 
@@ -126,31 +125,31 @@ def grid_by_schedule(
     windows, events = _load_events(case, model)
     if schedule.control_sample is not None:
         # A step of zero length after the end: the controller acts at the last event too.
-        events = jnp.append(events, times[-1])
-    boundary_times = jnp.concatenate([times, jnp.clip(events, times[0], times[-1])])
-    order = jnp.argsort(boundary_times)
+        events = xp.append(events, times[-1])
+    boundary_times = xp.concatenate([times, xp.clip(events, times[0], times[-1])])
+    order = xp.argsort(boundary_times)
     boundaries = boundary_times[order]
-    panel_lengths = jnp.diff(boundaries)
+    panel_lengths = xp.diff(boundaries)
     is_scheduled = order < times.shape[0]
     # The other panels adjoin a load event: at most two each.
     between_scheduled = is_scheduled[1:] & is_scheduled[:-1]
     length_count = schedule.lengths.shape[0]
-    length_index = jnp.where(
+    length_index = xp.where(
         between_scheduled,
         schedule.length_index[
-            jnp.clip(jnp.cumsum(is_scheduled)[:-1] - 1, 0, schedule.length_index.shape[0] - 1)
+            xp.clip(xp.cumsum(is_scheduled)[:-1] - 1, 0, schedule.length_index.shape[0] - 1)
         ],
-        length_count - 1 + jnp.cumsum(~between_scheduled),
+        length_count - 1 + xp.cumsum(~between_scheduled),
     )
-    lengths = jnp.concatenate([schedule.lengths, jnp.zeros(2 * events.shape[0] + 1)])
-    lengths = lengths.at[jnp.where(between_scheduled, lengths.shape[0], length_index)].set(
-        panel_lengths, mode="drop"
+    lengths = xp.concatenate([schedule.lengths, xp.zeros(2 * events.shape[0] + 1)])
+    lengths = put(
+        lengths, xp.where(between_scheduled, lengths.shape[0], length_index), panel_lengths
     )
-    counts = jnp.full(panel_lengths.shape, substeps)
+    counts = xp.full(panel_lengths.shape, substeps)
     loads_on_beam = _loads_on_beam(windows, boundaries)
-    scheduled_event = jnp.where(is_scheduled[:-1], order[:-1], -1)
-    cumulative_counts, lengths = jnp.cumsum(counts), lengths / substeps
-    event_boundary = jnp.argsort(order)
+    scheduled_event = xp.where(is_scheduled[:-1], order[:-1], -1)
+    cumulative_counts, lengths = xp.cumsum(counts), lengths / substeps
+    event_boundary = xp.argsort(order)
     return TimeGrid(
         boundaries,
         counts,

@@ -17,7 +17,6 @@ The forces of an actuator that acts on slopes, such as a patch, are moments.
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.case.actuators.base import AbstractActuator
@@ -28,6 +27,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import row_on_states, sensor_rows
+from jaxbeam.runtime.arrays import set_at, xp
 
 POINT_QUANTITIES = tuple(name for name, quantity in QUANTITIES.items() if not quantity.at_fibre)
 ACTUATOR_QUANTITIES = ("current", "active_force", "transmitted_force")
@@ -104,17 +104,17 @@ def check_pairs(case: Case, pairs: Iterable[Sequence[str]]) -> tuple[ChannelPair
 
 def input_column(case: Case, model: ModalModel, input: str):
     """Input vector (state,) on the rates of the states, and commands (actuator,), of an input."""
-    commands = jnp.zeros(len(case.actuators))
+    commands = xp.zeros(len(case.actuators))
     if "@" in input:
         position = float(input.partition("@")[2])
         return row_on_states(model, model.shapes(position, (0,))[0], 1), commands
     index = int(input.split(".")[1])
-    return model.command_matrix[:, index], commands.at[index].set(1.0)
+    return model.command_matrix[:, index], set_at(commands, index, 1.0)
 
 
 def output_row(case: Case, model: ModalModel, output: str):
     """Rows of an output on the states, on their rates (both (state,)) and on the commands."""
-    zero_row, feedthrough = jnp.zeros(model.state_count), jnp.zeros(len(case.actuators))
+    zero_row, feedthrough = xp.zeros(model.state_count), xp.zeros(len(case.actuators))
     name, at_point, position = output.partition("@")
     if at_point or name.startswith("sensors."):
         sensor = (
@@ -129,9 +129,9 @@ def output_row(case: Case, model: ModalModel, output: str):
     start = 2 * model.mode_count + sum(sizes[:index])
     attachment, device_states = attachments[index], np.arange(start, start + sizes[index])
     if actuator_output == "current":
-        return zero_row.at[device_states].set(1.0), zero_row, feedthrough
-    active_force = zero_row.at[device_states].set(attachment.output_matrix)
-    feedthrough = feedthrough.at[index].set(attachment.feedthrough)
+        return set_at(zero_row, device_states, 1.0), zero_row, feedthrough
+    active_force = set_at(zero_row, device_states, attachment.output_matrix)
+    feedthrough = set_at(feedthrough, index, attachment.feedthrough)
     if actuator_output == "active_force":
         return active_force, zero_row, feedthrough
     displacement = model.displacement_map[index]

@@ -10,8 +10,6 @@ f on the modes, D2w/Dt2 = (contact row) . z + (shape row) . f.
 """
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -20,6 +18,7 @@ from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import solve_small
+from jaxbeam.runtime.arrays import add_at, custom_jvp, xp
 
 
 class LoadSet(eqx.Module):
@@ -35,9 +34,9 @@ class LoadSet(eqx.Module):
     def kinematics(self, times: Float[Array, "*time"]) -> tuple[Float[Array, "load *time"], ...]:
         """Positions (m), speeds (m/s) and accelerations (m/s^2) at given times (s)."""
         if not self.trajectories:
-            return (jnp.zeros((0, *times.shape)),) * 3
+            return (xp.zeros((0, *times.shape)),) * 3
         paths = zip(*(path.kinematics(times) for path in self.trajectories), strict=True)
-        position, speed, acceleration = (jnp.stack(parts) for parts in paths)
+        position, speed, acceleration = (xp.stack(parts) for parts in paths)
         return position, speed, acceleration
 
     def cubics(self) -> tuple[Float[Array, "load piece"], Float[Array, "load piece 4"]]:
@@ -47,20 +46,20 @@ class LoadSet(eqx.Module):
         `AbstractPiecewiseTrajectory`, which those of cases are.
         """
         if not self.trajectories:
-            return jnp.zeros((0, 1)), jnp.zeros((0, 1, 4))
+            return xp.zeros((0, 1)), xp.zeros((0, 1, 4))
         cubics_by_load = [path.cubics() for path in self.trajectories]
         max_pieces = max(times.shape[0] for times, _ in cubics_by_load)
         padding = [(0, max_pieces - times.shape[0]) for times, _ in cubics_by_load]
         pairs = list(zip(cubics_by_load, padding, strict=True))
-        times = [jnp.pad(times, more, constant_values=np.inf) for (times, _), more in pairs]
-        cubics = [jnp.pad(cubics, [more, (0, 0)]) for (_, cubics), more in pairs]
-        return jnp.stack(times), jnp.stack(cubics)
+        times = [xp.pad(times, more, constant_values=np.inf) for (times, _), more in pairs]
+        cubics = [xp.pad(cubics, [more, (0, 0)]) for (_, cubics), more in pairs]
+        return xp.stack(times), xp.stack(cubics)
 
     def on_beam(self, times: Float[Array, "*time"]) -> Bool[Array, "load *time"]:
         """Whether each load is on the beam at given times (s), from entry until before exit."""
         windows = [path.entry_exit_times() for path in self.trajectories]
         on = [(entry <= times) & (times < leave) for entry, leave in windows]
-        return jnp.array(on, bool).reshape(len(on), *jnp.shape(times))
+        return xp.array(on, bool).reshape(len(on), *xp.shape(times))
 
 
 def load_set(case: Case) -> LoadSet:
@@ -71,7 +70,7 @@ def load_set(case: Case) -> LoadSet:
     weight = [load.weight(gravity) for load in case.loads]
     column = (len(trajectories), 1)
     return LoadSet(
-        trajectories, jnp.array(inertia).reshape(column), jnp.array(weight).reshape(column)
+        trajectories, xp.array(inertia).reshape(column), xp.array(weight).reshape(column)
     )
 
 
@@ -81,8 +80,8 @@ def contact_rows(model: ModalModel, position, speed, acceleration, active):
     Position (m), speed (m/s), acceleration (m/s^2) and `active` (on the beam) of the loads all have
     the shape (*position,); rows of loads off the beam are zero.
     """
-    position_on_beam = jnp.where(active, position, 0.0)
-    shape, slope, curvature = jnp.where(
+    position_on_beam = xp.where(active, position, 0.0)
+    shape, slope, curvature = xp.where(
         active[..., None], model.shapes(position_on_beam, (0, 1, 2)), 0.0
     )
     speed, acceleration = speed[..., None], acceleration[..., None]
@@ -93,13 +92,11 @@ def contact_rows(model: ModalModel, position, speed, acceleration, active):
     shape = shape.reshape(block_shape)
     rates = model.state_matrix[:, 1 : 2 * modes_per_block : 2, :]
     state_rows = (
-        jnp.sum(shape[..., None] * rates, axis=-2) if modes_per_block == 1 else shape @ rates
+        xp.sum(shape[..., None] * rates, axis=-2) if modes_per_block == 1 else shape @ rates
     )
-    convective = jnp.stack(
-        [convective.reshape(block_shape), coriolis.reshape(block_shape)], axis=-1
-    )
+    convective = xp.stack([convective.reshape(block_shape), coriolis.reshape(block_shape)], axis=-1)
     convective = convective.reshape(*block_shape[:-1], 2 * modes_per_block)
-    rows = state_rows.at[..., : 2 * modes_per_block].add(convective)
+    rows = add_at(state_rows, np.s_[..., : 2 * modes_per_block], convective)
     return shape, rows
 
 
@@ -129,15 +126,15 @@ def contact_at(
             modal_acceleration + command_acceleration,
             acceleration_under_load + shape @ command_acceleration,
         )
-    mass = jnp.where(active[:, None], loads.inertia, 0.0)
-    weight = jnp.where(active[:, None], loads.weight, 0.0)
+    mass = xp.where(active[:, None], loads.inertia, 0.0)
+    weight = xp.where(active[:, None], loads.weight, 0.0)
     # The contact law: (1 + m S S') r = -W - m (contact row) . z.
-    matrix = jnp.eye(load_count)[:, :, None] + mass[:, None] * (shape @ shape.T)[:, :, None]
+    matrix = xp.eye(load_count)[:, :, None] + mass[:, None] * (shape @ shape.T)[:, :, None]
     force = -solve_small(matrix, (weight + mass * acceleration_under_load)[:, None])[:, 0]
     return force, modal_acceleration + shape.T @ force
 
 
-@jax.custom_jvp
+@custom_jvp
 def solve_contact_forces(compliance, inertia, load):
     """Contact forces r (row, batch) from (delta_ij + m_i G_ij) r_j = -d_i.
 

@@ -10,13 +10,13 @@ import dataclasses
 import math
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, assemble_matrices, section_properties, supported_matrices
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
+from jaxbeam.runtime.arrays import set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 # Least stiffness against rigid-body motion of a statically supported beam, in E I / L^3.
@@ -63,12 +63,12 @@ class Flexibility(eqx.Module):
 
 def _factorial_power(x, exponent: int):
     """x^n / n!, and zero for negative n."""
-    return jnp.zeros_like(x) if exponent < 0 else x**exponent / math.factorial(exponent)
+    return xp.zeros_like(x) if exponent < 0 else x**exponent / math.factorial(exponent)
 
 
 def _macaulay(x, exponent: int):
     """<x>^n / n! of Macaulay's method: zero up to x = 0."""
-    return jnp.where(x > 0, _factorial_power(x, exponent), 0.0)
+    return xp.where(x > 0, _factorial_power(x, exponent), 0.0)
 
 
 def _clamped_segment_bending(nodes, rigidity, x, x_derivative: int, y, y_derivative: int):
@@ -79,7 +79,7 @@ def _clamped_segment_bending(nodes, rigidity, x, x_derivative: int, y, y_derivat
     """
     inner_nodes = nodes[1:-1]
     segment_of_x, segment_of_y = (
-        jnp.sum(position[..., None] >= inner_nodes, axis=-1) for position in (x, y)
+        xp.sum(position[..., None] >= inner_nodes, axis=-1) for position in (x, y)
     )
     left, right = nodes[segment_of_y], nodes[segment_of_y + 1]
     length, s, y_to_right = right - left, x - left, right - y
@@ -91,7 +91,7 @@ def _clamped_segment_bending(nodes, rigidity, x, x_derivative: int, y, y_derivat
         - deflection / length**x_derivative * _factorial_power(y_to_right, 3 - y_derivative)
         - slope * length / length**x_derivative * _factorial_power(y_to_right, 2 - y_derivative)
     )
-    return jnp.where(
+    return xp.where(
         segment_of_x == segment_of_y, (-1) ** y_derivative * bending / rigidity[segment_of_y], 0.0
     )
 
@@ -100,12 +100,12 @@ def _segment_bending(
     nodes, rigidity, x, x_derivative: int, sources: FlexibilityPoints
 ) -> Float[Array, "*position point"]:
     """Bending of the segment of each point at positions x, or its x-derivative."""
-    total = jnp.zeros((*x.shape, len(sources.derivatives)))
+    total = xp.zeros((*x.shape, len(sources.derivatives)))
     for derivative, index in sources.by_derivative():
         part = _clamped_segment_bending(
             nodes, rigidity, x[..., None], x_derivative, sources.positions[index], derivative
         )
-        total = total.at[..., index].set(part)
+        total = set_at(total, np.s_[..., index], part)
     return total
 
 
@@ -119,28 +119,28 @@ def flexibility(
     """
     length = case.beam.length
     nodes, stiffness, _, to_series = assemble_matrices(case, _cubic_layout(layout))
-    rigidity = jnp.stack(
+    rigidity = xp.stack(
         [section_properties(case, layout, i)[0] for i in range(len(layout.degrees))]
     )
 
     def nodal_forces(sources):
         """Consistent nodal forces (point, unknown) of unit sources."""
-        rows = jnp.zeros((len(sources.derivatives), stiffness.shape[0]))
+        rows = xp.zeros((len(sources.derivatives), stiffness.shape[0]))
         for derivative, index in sources.by_derivative():
             shape_values = piecewise_chebyshev(
                 nodes, to_series, sources.positions[index], (derivative,)
             )[0]
-            rows = rows.at[index].set(shape_values)
+            rows = set_at(rows, index, shape_values)
         return rows
 
     def bending_between(observed, sources):
         """Bending within segments (point, point) at observed points due to sources."""
-        matrix = jnp.zeros((len(observed.derivatives), len(sources.derivatives)))
+        matrix = xp.zeros((len(observed.derivatives), len(sources.derivatives)))
         for derivative, index in observed.by_derivative():
             there = _segment_bending(
                 nodes, rigidity, observed.positions[index], derivative, sources
             )
-            matrix = matrix.at[index].set(there)
+            matrix = set_at(matrix, index, there)
         return matrix
 
     unit_sources = FlexibilityPoints(x / length, (x_derivative,) * x.shape[0])
@@ -148,29 +148,29 @@ def flexibility(
     suspension_rows = factors @ nodal_forces(suspension_points)
     suspension_bending = factors @ bending_between(suspension_points, suspension_points) @ factors.T
     source_bending = factors @ bending_between(suspension_points, unit_sources)
-    system = jnp.block(
+    system = xp.block(
         [
             [stiffness, -suspension_rows.T],
             [
                 suspension_stiffness * suspension_rows,
-                jnp.eye(suspension_rows.shape[0]) + suspension_stiffness * suspension_bending,
+                xp.eye(suspension_rows.shape[0]) + suspension_stiffness * suspension_bending,
             ],
         ]
     )
-    solution = jnp.linalg.solve(
+    solution = xp.linalg.solve(
         system,
-        jnp.concatenate([nodal_forces(unit_sources).T, -suspension_stiffness * source_bending]),
+        xp.concatenate([nodal_forces(unit_sources).T, -suspension_stiffness * source_bending]),
     )
-    nodal_displacements, suspension_forces = jnp.split(solution, [stiffness.shape[0]])
+    nodal_displacements, suspension_forces = xp.split(solution, [stiffness.shape[0]])
     return Flexibility(
         nodes,
         rigidity,
-        jnp.einsum("std,dx->stx", to_series, nodal_displacements),
+        xp.einsum("std,dx->stx", to_series, nodal_displacements),
         FlexibilityPoints(
-            jnp.concatenate([unit_sources.positions, suspension_points.positions]),
+            xp.concatenate([unit_sources.positions, suspension_points.positions]),
             unit_sources.derivatives + suspension_points.derivatives,
         ),
-        jnp.concatenate([jnp.eye(x.shape[0]), factors.T @ suspension_forces]),
+        xp.concatenate([xp.eye(x.shape[0]), factors.T @ suspension_forces]),
     )
 
 
@@ -183,13 +183,13 @@ def _suspensions(case: Case):
     displacements = [actuator.displacement_map() for actuator in case.actuators]
     terms = [(i, *term) for i, stroke in enumerate(displacements) for term in stroke]
     points = FlexibilityPoints(
-        jnp.array([position for _, position, _, _ in terms]).reshape(-1) / length,
+        xp.array([position for _, position, _, _ in terms]).reshape(-1) / length,
         tuple(derivative for _, _, derivative, _ in terms),
     )
-    factors = jnp.zeros((len(displacements), len(terms)))
+    factors = xp.zeros((len(displacements), len(terms)))
     for column, (i, _, derivative, factor) in enumerate(terms):
-        factors = factors.at[i, column].set(factor / length**derivative)
-    stiffness = jnp.array([actuator.attachment().stiffness for actuator in case.actuators])
+        factors = set_at(factors, (i, column), factor / length**derivative)
+    stiffness = xp.array([actuator.attachment().stiffness for actuator in case.actuators])
     return points, factors, stiffness.reshape(-1, 1) * length**3 / case.beam.bending_stiffness
 
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
@@ -23,6 +22,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
+from jaxbeam.runtime.arrays import add_at, set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 if TYPE_CHECKING:
@@ -46,12 +46,12 @@ class FrequencyResponse(eqx.Module):
     @property
     def magnitude(self) -> Float[Array, "frequency pair"]:
         """Amplitude of the output per amplitude of the input, in the unit of the pair."""
-        return jnp.abs(self.values)
+        return xp.abs(self.values)
 
     @property
     def phase(self) -> Float[Array, "frequency pair"]:
         """Phase by which the output leads the input in degrees, without jumps of a full turn."""
-        return jnp.degrees(jnp.unwrap(jnp.angle(self.values), axis=0))
+        return xp.degrees(xp.unwrap(xp.angle(self.values), axis=0))
 
     def of(self, input: str, output: str) -> Complex[Array, " frequency"]:
         """Response of one pair. Raises ValueError if there is none of it."""
@@ -126,9 +126,9 @@ def frequency_response(
 def _responses(case: Case, layout: Layout, frequencies, stationary, pairs: tuple[ChannelPair, ...]):
     model = modal_model(case, layout)
     inputs = [input_column(case, model, pair.excitation) for pair in pairs]
-    input_matrix = jnp.stack([input_vector for input_vector, _ in inputs], axis=-1)
+    input_matrix = xp.stack([input_vector for input_vector, _ in inputs], axis=-1)
     states = _state_responses(model, stationary, frequencies, input_matrix)
-    s = 2j * jnp.pi * frequencies
+    s = 2j * xp.pi * frequencies
     responses = []
     for i, (pair, (_, command)) in enumerate(zip(pairs, inputs, strict=True)):
         response = _evaluate_output(
@@ -139,7 +139,7 @@ def _responses(case: Case, layout: Layout, frequencies, stationary, pairs: tuple
                 output_row(case, model, pair.input), states[:, :, i], s, command
             )
         responses.append(response)
-    return jnp.stack(responses, axis=-1)
+    return xp.stack(responses, axis=-1)
 
 
 def _evaluate_output(row, states, s, command):
@@ -152,8 +152,8 @@ def _state_responses(
 ) -> Complex[Array, "frequency state input"]:
     """States per unit of each input (column of the input matrix), at every frequency (Hz)."""
     A, E = descriptor_matrices(model, stationary)
-    s = 2j * jnp.pi * frequencies[:, None, None]
-    return jnp.linalg.solve(s * E - A, input_matrix + 0j)
+    s = 2j * xp.pi * frequencies[:, None, None]
+    return xp.linalg.solve(s * E - A, input_matrix + 0j)
 
 
 def descriptor_matrices(model: ModalModel, stationary):
@@ -162,7 +162,7 @@ def descriptor_matrices(model: ModalModel, stationary):
     shapes = model.shapes(positions, (0,))[0]
     added_mass = (shapes.T * kilograms) @ shapes
     rates = model.rate_index
-    return model.A, jnp.eye(model.state_count).at[rates, rates].add(added_mass)
+    return model.A, add_at(xp.eye(model.state_count), (rates, rates), added_mass)
 
 
 def receptance(
@@ -191,8 +191,8 @@ def receptance(
 @compiled
 def _receptance(case: Case, layout: Layout, frequencies, stationary, x, y):
     model = modal_model(case, layout)
-    input_matrix = jnp.zeros((model.state_count, y.size))
-    input_matrix = input_matrix.at[model.rate_index].set(model.shapes(y.reshape(-1), (0,))[0].T)
+    input_matrix = xp.zeros((model.state_count, y.size))
+    input_matrix = set_at(input_matrix, model.rate_index, model.shapes(y.reshape(-1), (0,))[0].T)
     states = _state_responses(model, stationary, frequencies, input_matrix)
     amplitudes = states[:, model.coordinate_index]
     response = model.shapes(x.reshape(-1), (0,))[0] @ amplitudes
@@ -227,7 +227,7 @@ def accelerance(
 
 
 def _differentiated(frequencies, response):
-    s = 2j * jnp.pi * jnp.asarray(frequencies, float)
+    s = 2j * xp.pi * xp.asarray(frequencies, float)
     return s.reshape(-1, *(1,) * (response.ndim - 1)) * response
 
 
@@ -253,7 +253,7 @@ def resonances_and_antiresonances(
 
 
 def _checked_frequencies(frequencies):
-    frequencies = jnp.atleast_1d(jnp.asarray(frequencies, float))
+    frequencies = xp.atleast_1d(xp.asarray(frequencies, float))
     if frequencies.ndim != 1:
         raise ValueError(f"frequencies must be a list of numbers, not of shape {frequencies.shape}")
     if is_concrete(frequencies):
@@ -271,8 +271,8 @@ def checked_masses(case: Case, stationary_masses: StationaryMasses):
 
     Raises ValueError for a negative mass and a position off the beam.
     """
-    positions = jnp.array([position for position, _ in stationary_masses], float).reshape(-1)
-    masses = jnp.array([mass for _, mass in stationary_masses], float).reshape(-1)
+    positions = xp.array([position for position, _ in stationary_masses], float).reshape(-1)
+    masses = xp.array([mass for _, mass in stationary_masses], float).reshape(-1)
     if is_concrete(masses):
         for mass in concrete(masses):
             if not 0 <= mass < np.inf:
@@ -281,6 +281,6 @@ def checked_masses(case: Case, stationary_masses: StationaryMasses):
 
 
 def _checked_position(case: Case, name: str, x):
-    x = jnp.asarray(x, float)
+    x = xp.asarray(x, float)
     check_on_beam(name, x, case.beam.length)
     return x

@@ -4,12 +4,12 @@ import os
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
 from jaxbeam.numerics.discretisation import c2d
+from jaxbeam.runtime.arrays import xp
 
 
 class Signal(NamedTuple):
@@ -44,7 +44,7 @@ class StateSpace(eqx.Module):
         transition, input_matrix = c2d(self.A, self.B, period)
         parts = self.states, self.inputs, self.outputs
         return StateSpace(
-            transition, input_matrix[0], self.C, self.D, *parts, jnp.asarray(period, float)
+            transition, input_matrix[0], self.C, self.D, *parts, xp.asarray(period, float)
         )
 
     def static_response(self, outputs: Any) -> Float[Array, "output state"]:
@@ -53,7 +53,7 @@ class StateSpace(eqx.Module):
         Times B they are the static gains of the inputs. `outputs` is an index or a slice. Not
         finite where a mode has no stiffness.
         """
-        return -jnp.linalg.solve(self.A.T, self.C[outputs].T).T
+        return -xp.linalg.solve(self.A.T, self.C[outputs].T).T
 
     def to_control(self) -> Any:
         """A `control.StateSpace` of the package python-control, with the same signal names.

@@ -1,12 +1,12 @@
 """Readings of the sensors from histories of the modal coordinates."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.output_rows import quantity_history
 from jaxbeam.model.sensor_signals import needs_times, noise_samples, sampled_readings, to_reading
+from jaxbeam.runtime.arrays import xp
 
 
 def sensor_readings(
@@ -50,4 +50,4 @@ def sensor_readings(
             )
         except ValueError as error:
             raise ValueError(f"sensors.{i}: {error}") from None
-    return jnp.array(columns).reshape(-1, samples).T
+    return xp.array(columns).reshape(-1, samples).T

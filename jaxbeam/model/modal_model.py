@@ -9,13 +9,12 @@ the shape (block, side, side).
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag, solve_triangular
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, Modes, mesh_layout, modes
+from jaxbeam.runtime.arrays import block_diag, set_at, solve_triangular, xp
 from jaxbeam.runtime.compiling import compiled
 
 
@@ -113,33 +112,33 @@ def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> Moda
     """Modal model of a case from its modes; `coupled` is `full_matrix` of `modal_model`."""
     count = case.beam.modes
     if not coupled:
-        zero, one = jnp.zeros(count), jnp.ones(count)
-        blocks = jnp.stack([zero, one, -modes.stiffness, -modes.damping], axis=-1)
-        no_actuators = jnp.zeros((2 * count, 0)), jnp.zeros((0, count))
+        zero, one = xp.zeros(count), xp.ones(count)
+        blocks = xp.stack([zero, one, -modes.stiffness, -modes.damping], axis=-1)
+        no_actuators = xp.zeros((2 * count, 0)), xp.zeros((0, count))
         return ModalModel(modes, None, blocks.reshape(count, 2, 2), *no_actuators)
-    stiffness = jnp.diag(modes.stiffness) + modes.coupling
-    damping = jnp.diag(modes.damping) + modes.damping_coupling
+    stiffness = xp.diag(modes.stiffness) + modes.coupling
+    damping = xp.diag(modes.damping) + modes.damping_coupling
     for support in case.supports:
         if support.damping is not None:
             shape = modes.shapes(support.position)
-            damping = damping + support.damping * jnp.outer(shape, shape)
+            damping = damping + support.damping * xp.outer(shape, shape)
     attachments = [actuator.attachment() for actuator in case.actuators]
-    displacement_map = jnp.zeros((len(attachments), count))
-    mass = jnp.eye(count)
+    displacement_map = xp.zeros((len(attachments), count))
+    mass = xp.eye(count)
     for i, (actuator, attachment) in enumerate(zip(case.actuators, attachments, strict=True)):
         terms = (
             factor * modes.shapes(x, order) for x, order, factor in actuator.displacement_map()
         )
-        shape = sum(terms, jnp.zeros(count))
-        displacement_map = displacement_map.at[i].set(shape)
-        stiffness = stiffness + attachment.stiffness * jnp.outer(shape, shape)
-        damping = damping + attachment.damping * jnp.outer(shape, shape)
+        shape = sum(terms, xp.zeros(count))
+        displacement_map = set_at(displacement_map, i, shape)
+        stiffness = stiffness + attachment.stiffness * xp.outer(shape, shape)
+        damping = damping + attachment.damping * xp.outer(shape, shape)
         if attachment.mass is not None:
-            mass = mass + attachment.mass * jnp.outer(shape, shape)
+            mass = mass + attachment.mass * xp.outer(shape, shape)
     transformation = None
     if any(device.mass is not None for device in attachments):
-        cholesky_factor = jnp.linalg.cholesky(mass)
-        transformation = solve_triangular(cholesky_factor.T, jnp.eye(count), lower=False)
+        cholesky_factor = xp.linalg.cholesky(mass)
+        transformation = solve_triangular(cholesky_factor.T, xp.eye(count), lower=False)
         stiffness, damping = (
             transformation.T @ stiffness @ transformation,
             transformation.T @ damping @ transformation,
@@ -155,21 +154,25 @@ def _state_space_matrices(stiffness, damping, displacement_map, attachments):
     device_sizes = [device.state_matrix.shape[0] for device in attachments]
     total = 2 * count + sum(device_sizes)
     displacement, velocity_index = np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2)
-    matrix = jnp.zeros((total, total)).at[displacement, velocity_index].set(1.0)
-    matrix = matrix.at[np.ix_(velocity_index, displacement)].set(-stiffness)
-    matrix = matrix.at[np.ix_(velocity_index, velocity_index)].set(-damping)
-    command = jnp.zeros((total, len(attachments)))
+    matrix = set_at(xp.zeros((total, total)), (displacement, velocity_index), 1.0)
+    matrix = set_at(matrix, np.ix_(velocity_index, displacement), -stiffness)
+    matrix = set_at(matrix, np.ix_(velocity_index, velocity_index), -damping)
+    command = xp.zeros((total, len(attachments)))
     start = 2 * count
     for i, (device, size) in enumerate(zip(attachments, device_sizes, strict=True)):
         device_index = np.arange(start, start + size)
         start += size
-        matrix = matrix.at[np.ix_(device_index, device_index)].set(device.state_matrix)
-        matrix = matrix.at[np.ix_(device_index, velocity_index)].set(
-            jnp.outer(device.velocity_matrix, displacement_map[i])
+        matrix = set_at(matrix, np.ix_(device_index, device_index), device.state_matrix)
+        matrix = set_at(
+            matrix,
+            np.ix_(device_index, velocity_index),
+            xp.outer(device.velocity_matrix, displacement_map[i]),
         )
-        matrix = matrix.at[np.ix_(velocity_index, device_index)].set(
-            jnp.outer(displacement_map[i], device.output_matrix)
+        matrix = set_at(
+            matrix,
+            np.ix_(velocity_index, device_index),
+            xp.outer(displacement_map[i], device.output_matrix),
         )
-        command = command.at[device_index, i].set(device.input_matrix)
-        command = command.at[velocity_index, i].set(device.feedthrough * displacement_map[i])
+        command = set_at(command, (device_index, i), device.input_matrix)
+        command = set_at(command, (velocity_index, i), device.feedthrough * displacement_map[i])
     return matrix, command

@@ -14,7 +14,6 @@ import functools
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.polynomial import legendre
@@ -24,6 +23,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
+from jaxbeam.runtime.arrays import add_at, set_at, stop_gradient, xp
 
 NODE_TOLERANCE = 1e-9  # of the length: closer nodes are one node
 
@@ -153,13 +153,13 @@ class Modes(eqx.Module):
     @property
     def frequencies(self) -> Float[Array, " mode"]:
         """Natural frequencies in Hz, ascending."""
-        return self.angular_frequencies / (2 * jnp.pi)
+        return self.angular_frequencies / (2 * xp.pi)
 
     @property
     def has_repeated(self) -> Bool[Array, ""]:
         """Whether any two of the modes have (nearly) the same frequency."""
         low, high = self.stiffness[:-1], self.stiffness[1:]
-        return jnp.any(
+        return xp.any(
             high - low <= REPEATED_EIGENVALUE_TOLERANCE * (self.stiffness_unit + low + high)
         )
 
@@ -167,8 +167,8 @@ class Modes(eqx.Module):
     def damping_ratios(self) -> Float[Array, " mode"]:
         """Modal damping ratios; zero for rigid-body modes."""
         elastic = self.stiffness > 0
-        return jnp.where(
-            elastic, self.damping / (2 * jnp.where(elastic, _safe_sqrt(self.stiffness), 1)), 0
+        return xp.where(
+            elastic, self.damping / (2 * xp.where(elastic, _safe_sqrt(self.stiffness), 1)), 0
         )
 
     def shapes(self, x, derivative: int = 0) -> Float[Array, "*position mode"]:
@@ -187,7 +187,7 @@ class Modes(eqx.Module):
 
 def _safe_sqrt(square):
     """Square root whose derivative at zero is zero."""
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1.0)), 0.0)
 
 
 @jax.named_scope("modes")
@@ -208,8 +208,8 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
         values[lowest] * _stiffness_unit(beam),
         coupling[lowest, lowest] * _stiffness_unit(beam),
     )
-    series = jnp.einsum("std,dm->stm", to_series, vectors[:, lowest])
-    series = series / jnp.sqrt(beam.linear_density * beam.length)
+    series = xp.einsum("std,dm->stm", to_series, vectors[:, lowest])
+    series = series / xp.sqrt(beam.linear_density * beam.length)
     return normalised_modes(beam, values, coupling, nodes * beam.length, series)
 
 
@@ -217,7 +217,7 @@ def normalised_modes(beam, values, coupling, nodes, series) -> Modes:
     """Modes of given stiffness (1/s^2) with the beam's damping, positive near the left end."""
     damping, damping_coupling = _damping(beam, values, coupling)
     left_values = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
-    signs = jax.lax.stop_gradient(jnp.where(left_values < 0, -1.0, 1.0))
+    signs = stop_gradient(xp.where(left_values < 0, -1.0, 1.0))
     sign_products = signs[:, None] * signs[None, :]
     return Modes(
         values,
@@ -241,7 +241,7 @@ def assemble_matrices(case: Case, layout: Layout):
     The series have the shape (segment, degree, unknown).
     """
     beam, degrees = case.beam, layout.degrees
-    positions = jnp.stack([x / beam.length for x in _node_positions(case)])
+    positions = xp.stack([x / beam.length for x in _node_positions(case)])
     nodes = positions[np.array([node[0] for node in layout.nodes])]
     nodal_unknowns = [[-1, -1] for _ in layout.nodes]
     size = 0
@@ -251,7 +251,7 @@ def assemble_matrices(case: Case, layout: Layout):
                 nodal_unknowns[i][j], size = size, size + 1
     series_terms = max(degrees) + 1
     total = size + sum(degree - 3 for degree in degrees)
-    stiffness, mass = jnp.zeros((total, total)), jnp.zeros((total, total))
+    stiffness, mass = xp.zeros((total, total)), xp.zeros((total, total))
     to_series = []
     for i, degree in enumerate(degrees):
         half_length = (nodes[i + 1] - nodes[i]) / 2
@@ -262,35 +262,35 @@ def assemble_matrices(case: Case, layout: Layout):
         size += degree - 3
         free = np.flatnonzero(index >= 0)
         basis, mass_element, bending_element = _reference_element(degree)
-        unity = jnp.ones(())
-        bubble_scale = jnp.broadcast_to(half_length**1.5 / jnp.sqrt(rigidity), (degree - 3,))
-        scale = jnp.concatenate(
-            [jnp.stack([unity, half_length, unity, half_length]), bubble_scale]
-        )[free]
+        unity = xp.ones(())
+        bubble_scale = xp.broadcast_to(half_length**1.5 / xp.sqrt(rigidity), (degree - 3,))
+        scale = xp.concatenate([xp.stack([unity, half_length, unity, half_length]), bubble_scale])[
+            free
+        ]
         free_unknowns = np.ix_(index[free], index[free])
         scales = scale[:, None] * scale[None, :]
         block = bending_element[np.ix_(free, free)] * scales
-        stiffness = stiffness.at[free_unknowns].add(block * rigidity / half_length**3)
-        mass = mass.at[free_unknowns].add(
-            mass_element[np.ix_(free, free)] * scales * density * half_length
+        stiffness = add_at(stiffness, free_unknowns, block * rigidity / half_length**3)
+        mass = add_at(
+            mass, free_unknowns, mass_element[np.ix_(free, free)] * scales * density * half_length
         )
-        segment_series = jnp.zeros((series_terms, total))
+        segment_series = xp.zeros((series_terms, total))
         rows = np.ix_(np.arange(degree + 1), index[free])
-        to_series.append(segment_series.at[rows].set(basis[:, free] * scale))
+        to_series.append(set_at(segment_series, rows, basis[:, free] * scale))
     spring_unit = beam.length**3 / beam.bending_stiffness
     for support, node in supported_matrices(case, layout):
         deflection, rotation = nodal_unknowns[node]
         if support.stiffness is not None and deflection >= 0:
-            stiffness = stiffness.at[deflection, deflection].add(support.stiffness * spring_unit)
+            stiffness = add_at(stiffness, (deflection, deflection), support.stiffness * spring_unit)
         if rotation >= 0:
             rotational_spring = support.rotational_stiffness * beam.length / beam.bending_stiffness
-            stiffness = stiffness.at[rotation, rotation].add(rotational_spring)
-    return nodes, stiffness, mass, jnp.stack(to_series)
+            stiffness = add_at(stiffness, (rotation, rotation), rotational_spring)
+    return nodes, stiffness, mass, xp.stack(to_series)
 
 
 def section_properties(case: Case, layout: Layout, segment: int):
     """Bending stiffness and mass per length of a segment, relative to the beam without patches."""
-    rigidity, density = jnp.ones(()), jnp.ones(())
+    rigidity, density = xp.ones(()), xp.ones(())
     for actuator in layout.patches[segment]:
         patch = case.actuators[actuator].section_stiffening()
         rigidity = rigidity + patch.bending_stiffness / case.beam.bending_stiffness
@@ -315,10 +315,10 @@ def _damping(beam, values, coupling):
     if beam.rayleigh_damping is not None:
         mass_factor, stiffness_factor = beam.rayleigh_damping
         return mass_factor + stiffness_factor * values, stiffness_factor * coupling
-    ratios = jnp.broadcast_to(beam.damping_ratio, values.shape)
+    ratios = xp.broadcast_to(beam.damping_ratio, values.shape)
     omega = _safe_sqrt(values)
     sums = omega[:, None] + omega[None, :]
-    coupling_factor = jnp.where(
-        sums > 0, (ratios[:, None] + ratios) / jnp.where(sums > 0, sums, 1.0), 0.0
+    coupling_factor = xp.where(
+        sums > 0, (ratios[:, None] + ratios) / xp.where(sums > 0, sums, 1.0), 0.0
     )
     return 2 * ratios * omega, coupling_factor * coupling

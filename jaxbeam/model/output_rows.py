@@ -10,7 +10,6 @@ commands.
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -18,6 +17,7 @@ from jaxbeam.case.quantities import quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
+from jaxbeam.runtime.arrays import set_at, xp
 
 # Positions x (m) and orders of derivation to the shapes (order, *position, mode), as
 # `ModalModel.shapes` and `Modes.shape_derivatives`.
@@ -31,7 +31,7 @@ def modal_row(shapes: Shapes, x, name: str, fibre_distance=None) -> Float[Array,
     """
     quantity = quantity_of(name, fibre_distance)
     row = shapes(x, (quantity.x_derivative,))[0]
-    return -jnp.asarray(fibre_distance)[..., None] * row if quantity.at_fibre else row
+    return -xp.asarray(fibre_distance)[..., None] * row if quantity.at_fibre else row
 
 
 class OutputRows(eqx.Module):
@@ -49,13 +49,13 @@ class OutputRows(eqx.Module):
         self, model: ModalModel
     ) -> tuple[Float[Array, "output state"], Float[Array, "output state"]]:
         """C and C' of y = C z + C' z', z being the states of the model."""
-        C = jnp.zeros((len(self.time_derivatives), model.state_count))
+        C = xp.zeros((len(self.time_derivatives), model.state_count))
         on_rates = C
         for i, order in enumerate(self.time_derivatives):
             if order < 2:
-                C = C.at[i].set(row_on_states(model, self.rows[i], order))
+                C = set_at(C, i, row_on_states(model, self.rows[i], order))
             else:
-                on_rates = on_rates.at[i].set(row_on_states(model, self.rows[i], 1))
+                on_rates = set_at(on_rates, i, row_on_states(model, self.rows[i], 1))
         return C, on_rates
 
     def of_system(
@@ -63,10 +63,10 @@ class OutputRows(eqx.Module):
     ) -> tuple[Float[Array, "output state"], Float[Array, "output input"]]:
         """C and D of y = C z + D u where z' = A z + B u; the states are those of the model."""
         C, _ = self.on_states(model)
-        D = jnp.zeros((C.shape[0], B.shape[1]))
+        D = xp.zeros((C.shape[0], B.shape[1]))
         rates = model.rate_index
         for i in np.flatnonzero(self.has_feedthrough):
-            C, D = C.at[i].set(self.rows[i] @ A[rates]), D.at[i].set(self.rows[i] @ B[rates])
+            C, D = set_at(C, i, self.rows[i] @ A[rates]), set_at(D, i, self.rows[i] @ B[rates])
         return C, D
 
     def with_accelerations(
@@ -74,7 +74,7 @@ class OutputRows(eqx.Module):
     ) -> Float[Array, "output *batch"]:
         """Outputs whose entries with feedthrough follow from modal accelerations q''."""
         for i in np.flatnonzero(self.has_feedthrough):
-            outputs = outputs.at[i].set(self.rows[i] @ accelerations)
+            outputs = set_at(outputs, i, self.rows[i] @ accelerations)
         return outputs
 
 
@@ -83,7 +83,7 @@ def sensor_rows(model: ModalModel, sensors: Sequence[Sensor]) -> OutputRows:
     quantities = [quantity_of(s.quantity, s.fibre_distance) for s in sensors]
     rows = [modal_row(model.shapes, s.position, s.quantity, s.fibre_distance) for s in sensors]
     return OutputRows(
-        jnp.array(rows).reshape(len(rows), model.mode_count),
+        xp.array(rows).reshape(len(rows), model.mode_count),
         tuple(quantity.time_derivative for quantity in quantities),
     )
 
@@ -93,7 +93,7 @@ def row_on_states(
 ) -> Float[Array, " state"]:
     """A row on q (time derivative 0) or q' (1) as a row on the states of the model."""
     index = model.rate_index if time_derivative else model.coordinate_index
-    return jnp.zeros(model.state_count).at[index].set(row)
+    return set_at(xp.zeros(model.state_count), index, row)
 
 
 def quantity_history(
@@ -105,4 +105,4 @@ def quantity_history(
     """
     rows = modal_row(modes.shape_derivatives, x, name, fibre_distance)
     amplitudes = modal_histories[quantity_of(name, fibre_distance).time_derivative]
-    return jnp.tensordot(amplitudes, rows, axes=[1, -1])
+    return xp.tensordot(amplitudes, rows, axes=[1, -1])

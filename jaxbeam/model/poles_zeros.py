@@ -1,6 +1,5 @@
 """Poles and transmission zeros of beam, supports and actuators, with stationary masses."""
 
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Complex
@@ -14,6 +13,7 @@ from jaxbeam.model.frequency_response import (
     descriptor_matrices,
 )
 from jaxbeam.model.modal_model import compiled_modal_model
+from jaxbeam.runtime.arrays import xp
 
 
 def poles(case: Case, stationary_masses: StationaryMasses = ()) -> Complex[np.ndarray, " state"]:
@@ -40,9 +40,9 @@ def zeros(
     A, E = descriptor_matrices(model, checked_masses(case, stationary_masses))
     input_vector, command = input_column(case, model, checked_pair.excitation)
     state_row, rate_row, feedthrough_row = output_row(case, model, checked_pair.output)
-    feedthrough = jnp.atleast_1d(feedthrough_row @ command)
-    pencil_A = jnp.block([[A, input_vector[:, None]], [state_row, feedthrough]])
-    pencil_E = jnp.block([[E, jnp.zeros_like(input_vector)[:, None]], [-rate_row, jnp.zeros(1)]])
+    feedthrough = xp.atleast_1d(feedthrough_row @ command)
+    pencil_A = xp.block([[A, input_vector[:, None]], [state_row, feedthrough]])
+    pencil_E = xp.block([[E, xp.zeros_like(input_vector)[:, None]], [-rate_row, xp.zeros(1)]])
     eigenvalues = scipy.linalg.eigvals(np.asarray(pencil_A), np.asarray(pencil_E))
     # Zeros at infinity are computed as infinite or as numbers far beyond the poles.
     largest_pole = np.abs(scipy.linalg.eigvals(np.asarray(A))).max()

@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import ControllerFilter
@@ -13,6 +11,7 @@ from jaxbeam.case.filters import analogue_state_space
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import add_at, block_diag, set_at, xp
 
 
 def with_sensor_filters(
@@ -47,19 +46,21 @@ def with_sensor_filters(
 
     def expand(row):
         """A row on the states of some parts as a row on all states."""
-        row_parts = [row.get(i, jnp.zeros(part.shape[0])) for i, part in enumerate(state_matrices)]
-        return jnp.concatenate(row_parts)
+        row_parts = [row.get(i, xp.zeros(part.shape[0])) for i, part in enumerate(state_matrices)]
+        return xp.concatenate(row_parts)
 
     state_matrix = block_diag(*state_matrices)
     for i, column, row in filter_inputs:
-        state_matrix = state_matrix.at[first_states[i] : first_states[i + 1]].add(
-            jnp.outer(column, expand(row))
+        state_matrix = add_at(
+            state_matrix,
+            np.s_[first_states[i] : first_states[i + 1]],
+            xp.outer(column, expand(row)),
         )
-    filter_input = jnp.stack([expand(row) for row in rows]) if rows else jnp.zeros((0, total))
-    command_matrix = (
-        jnp.zeros((total, model.command_matrix.shape[1]))
-        .at[: model.state_count]
-        .set(model.command_matrix)
+    filter_input = xp.stack([expand(row) for row in rows]) if rows else xp.zeros((0, total))
+    command_matrix = set_at(
+        xp.zeros((total, model.command_matrix.shape[1])),
+        np.s_[: model.state_count],
+        model.command_matrix,
     )
     augmented = eqx.tree_at(
         lambda r: (r.state_matrix, r.command_matrix), model, (state_matrix[None], command_matrix)

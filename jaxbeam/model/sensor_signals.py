@@ -8,7 +8,6 @@ value; `sampled_readings` makes all readings of a history, with analogue filter,
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -24,6 +23,7 @@ from jaxbeam.case.filters import (
 )
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
+from jaxbeam.runtime.arrays import scan, stop_gradient, xp
 
 CLOCK_TOLERANCE_PERIODS = 1e-6  # a time this much before a sampling instant counts as at it
 
@@ -70,10 +70,10 @@ def to_reading(sensor: Sensor, value, noise=None) -> Float[Array, "..."]:
     if sensor.noise is not None and noise is not None:
         reading = reading + sensor.noise * noise
     if sensor.range is not None:
-        reading = jnp.clip(reading, sensor.range[0], sensor.range[1])
+        reading = xp.clip(reading, sensor.range[0], sensor.range[1])
     if sensor.resolution is not None:
-        rounded = sensor.resolution * jnp.round(reading / sensor.resolution)
-        reading = reading + jax.lax.stop_gradient(rounded - reading)
+        rounded = sensor.resolution * xp.round(reading / sensor.resolution)
+        reading = reading + stop_gradient(rounded - reading)
     return reading
 
 
@@ -81,7 +81,7 @@ def noise_samples(seed: int, sensors: int, samples: int) -> Float[Array, "sample
     """Standard normal samples, one a reading; a sensor's depend on the seed and its index only."""
     keys = [jax.random.fold_in(jax.random.key(seed), sensor) for sensor in range(sensors)]
     columns = [jax.random.normal(key, (samples,)) for key in keys]
-    return jnp.array(columns).reshape(sensors, samples).T
+    return xp.array(columns).reshape(sensors, samples).T
 
 
 def needs_times(sensor: Sensor) -> bool:
@@ -112,12 +112,12 @@ def sampled_readings(
         values, rates = _apply_filter(sensor.filter, times, spacing, values, rates)
     sample_times, new_reading = times, None
     if sensor.sampling_period is not None:
-        sample_index = jnp.floor(
+        sample_index = xp.floor(
             (times - times[0]) / sensor.sampling_period + CLOCK_TOLERANCE_PERIODS
         )
         sample_times = times[0] + sensor.sampling_period * sample_index
-        new_reading = jnp.concatenate([jnp.ones(1, bool), jnp.diff(sample_index) > 0])
-        noise = None if noise is None else noise[jnp.cumsum(new_reading) - 1]
+        new_reading = xp.concatenate([xp.ones(1, bool), xp.diff(sample_index) > 0])
+        noise = None if noise is None else noise[xp.cumsum(new_reading) - 1]
     sampled = values
     if sensor.sampling_period is not None or sensor.delay is not None:
         signal_times = sample_times if sensor.delay is None else sample_times - sensor.delay
@@ -142,7 +142,7 @@ def _apply_filter(filter: Filter, times, spacing, values, rates):
         return after, after
 
     start = analogue_steady_state(filter, values[0])
-    states = jnp.concatenate([start[None], jax.lax.scan(step, start, forced_response)[1]])
+    states = xp.concatenate([start[None], scan(step, start, forced_response)[1]])
     return states @ row, states @ (row @ matrix) + values * (row @ column)
 
 

@@ -8,7 +8,6 @@ I + sum m psi psi^T of the beam with its loads is a low-rank update, one rank fo
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -20,6 +19,7 @@ from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.numerics.batched_linalg import solve_small
+from jaxbeam.runtime.arrays import set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 
@@ -70,7 +70,7 @@ class Plant(eqx.Module):
 
         At the instant at which a load enters or leaves, the system just after it.
         """
-        return _plant_at(self, jnp.asarray(t, float))
+        return _plant_at(self, xp.asarray(t, float))
 
     def A(self, t: Float[Array, ""] | float) -> Float[Array, "state state"]:
         """State matrix A(t) with the masses on the beam."""
@@ -98,14 +98,14 @@ class Plant(eqx.Module):
         loads = frozen_system.inputs[commands:]
         zero_rows = np.zeros((len(loads), len(frozen_system.states)))
         return StateSpace(
-            A=jnp.block(
+            A=xp.block(
                 [
                     [frozen_system.A, frozen_system.B[:, commands:]],
                     [zero_rows, np.zeros((len(loads),) * 2)],
                 ]
             ),
-            B=jnp.concatenate([frozen_system.B[:, :commands], np.zeros((len(loads), commands))]),
-            C=jnp.concatenate([frozen_system.C, frozen_system.D[:, commands:]], axis=1),
+            B=xp.concatenate([frozen_system.B[:, :commands], np.zeros((len(loads), commands))]),
+            C=xp.concatenate([frozen_system.C, frozen_system.D[:, commands:]], axis=1),
             D=frozen_system.D[:, :commands],
             states=frozen_system.states + loads,
             inputs=frozen_system.inputs[:commands],
@@ -122,10 +122,8 @@ class Plant(eqx.Module):
     @property
     def _state_scales(self) -> Float[Array, " state"]:
         """Scale of each state z relative to that of the modal model."""
-        actuator_scales = jnp.ones(
-            self.modal_model.state_count - 2 * self.coordinate_scale.shape[0]
-        )
-        return jnp.concatenate([self.coordinate_scale, self.coordinate_scale, actuator_scales])
+        actuator_scales = xp.ones(self.modal_model.state_count - 2 * self.coordinate_scale.shape[0])
+        return xp.concatenate([self.coordinate_scale, self.coordinate_scale, actuator_scales])
 
     def _contact_matrices(self, t):
         """Shape rows (load, mode), contact rows (load, state) and masses (kg) on the beam at t."""
@@ -134,7 +132,7 @@ class Plant(eqx.Module):
         active = loads.on_beam(t)
         shape, contact = contact_rows(self.modal_model, position, speed, acceleration, active)
         count = len(loads.trajectories)
-        mass = jnp.where(active, loads.inertia[:, 0], 0.0)
+        mass = xp.where(active, loads.inertia[:, 0], 0.0)
         return (
             shape.reshape(count, self.coordinate_scale.size),
             contact.reshape(count, self.modal_model.state_count),
@@ -146,14 +144,14 @@ class Plant(eqx.Module):
         model = self.modal_model
         rates, matrix, command = model.rate_index, model.A, model.command_matrix
         # The contact forces: (1 + m S S') r = -W - m (rows z + S forces of the commands).
-        force_input = (
-            jnp.zeros((model.state_count, shape_rows.shape[0])).at[rates].set(shape_rows.T)
+        force_input = set_at(
+            xp.zeros((model.state_count, shape_rows.shape[0])), rates, shape_rows.T
         )
-        contact_matrix = jnp.eye(len(mass)) + mass * (shape_rows @ shape_rows.T)
+        contact_matrix = xp.eye(len(mass)) + mass * (shape_rows @ shape_rows.T)
         force_input = solve_small(contact_matrix[:, :, None], force_input.T[:, :, None])[:, :, 0].T
         matrix = matrix - force_input @ (mass[:, None] * contact_rows)
         command = command - force_input @ (mass[:, None] * (shape_rows @ command[rates]))
-        inputs = jnp.concatenate([command, -force_input], axis=1)
+        inputs = xp.concatenate([command, -force_input], axis=1)
         C, D = sensor_rows(model, self.case.sensors).of_system(model, matrix, inputs)
         order, scales = self._state_order, self._state_scales
         loads = tuple(Signal(f"load_{i}", "N") for i in range(len(mass)))
@@ -179,7 +177,7 @@ def _plant_at(plant: Plant, t) -> StateSpace:
 @compiled
 def _unloaded_plant(plant: Plant) -> StateSpace:
     modes, states = plant.coordinate_scale.shape[0], plant.modal_model.state_count
-    return plant._system_with_loads(jnp.zeros((0, modes)), jnp.zeros((0, states)), jnp.zeros(0))
+    return plant._system_with_loads(xp.zeros((0, modes)), xp.zeros((0, states)), xp.zeros(0))
 
 
 def _command_signals(case: Case) -> tuple[Signal, ...]:
@@ -204,7 +202,7 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
 def build_plant(case: Case, model: ModalModel, coordinates: str = "modal") -> Plant:
     """State space of a case from its modal model; raises ValueError as `state_space` does."""
     if coordinates == "modal":
-        scale, coordinate = jnp.ones(case.beam.modes), Signal("q", "m kg^0.5")
+        scale, coordinate = xp.ones(case.beam.modes), Signal("q", "m kg^0.5")
     elif coordinates == "sine":
         scale, coordinate = _sine_scale(case, model), Signal("a", "m")
     else:
@@ -220,7 +218,7 @@ def _sine_scale(case: Case, model: ModalModel) -> Float[Array, " mode"]:
     relative_positions = (np.arange(64) + 0.5) / 64
     shapes = model.shapes(case.beam.length * relative_positions, (0,))[0]
     sines = np.sin(np.pi * np.outer(relative_positions, np.arange(1, case.beam.modes + 1)))
-    scale = jnp.sum(shapes * sines, axis=0) / np.sum(sines**2, axis=0)
+    scale = xp.sum(shapes * sines, axis=0) / np.sum(sines**2, axis=0)
     residual = shapes - scale * sines
     if is_concrete(residual) and np.max(np.abs(concrete(residual))) > 1e-6 * np.max(
         np.abs(concrete(scale))

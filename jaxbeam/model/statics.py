@@ -3,7 +3,6 @@ and peaks of a slow crossing (see `flexibility`).
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -16,6 +15,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.flexibility import check_supported, flexibility
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.numerics.peak_search import refine_peak
+from jaxbeam.runtime.arrays import set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 # Positions on an interval between events that determine the deflection exactly there: ten for a
@@ -53,7 +53,7 @@ def influence_line(
     >>> print(f"{jb.influence_line(beam, x=1.0, load_positions=1.0):.6f}")  # -L^3 / (48 E I)
     -0.027778
     """
-    x, load_positions = jnp.asarray(x, float), jnp.asarray(load_positions, float)
+    x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
     layout = _validated_layout(case, layout, x=x, positions=load_positions)
     return _influence_line(case, layout, x, load_positions, derivative)
 
@@ -78,19 +78,19 @@ def static_deflection(
     >>> print(f"{jb.static_deflection(beam, 1.0, load_positions=[1.0], forces=[18.0]):.3f}")
     -0.500
     """
-    positions = jnp.atleast_1d(jnp.asarray(load_positions, float))
+    positions = xp.atleast_1d(xp.asarray(load_positions, float))
     if forces is None:
-        forces = jnp.array([load.weight(case.run.gravity) for load in case.loads]).reshape(-1)
+        forces = xp.array([load.weight(case.run.gravity) for load in case.loads]).reshape(-1)
         described = "loads of the case"
     else:
-        forces = jnp.atleast_1d(jnp.asarray(forces, float))
+        forces = xp.atleast_1d(xp.asarray(forces, float))
         described = "forces"
     if forces.shape != positions.shape or forces.ndim != 1:
         raise ValueError(
             f"load_positions must be one for each of the {forces.size} {described};"
             f" their shape is {positions.shape}"
         )
-    return jnp.tensordot(forces, influence_line(case, x, positions, derivative, layout), axes=1)
+    return xp.tensordot(forces, influence_line(case, x, positions, derivative, layout), axes=1)
 
 
 def static_deflection_per_command(
@@ -102,7 +102,7 @@ def static_deflection_per_command(
     a discontinuity, such as that of the curvature at the end of a patch, its value to the right.
     Inside `jit`, pass the `layout`. Raises ValueError as `influence_line` does.
     """
-    x = jnp.asarray(x, float)
+    x = xp.asarray(x, float)
     layout = _validated_layout(case, layout, x=x)
     return _deflection_per_command(case, layout, x, derivative)
 
@@ -111,11 +111,11 @@ def static_deflection_per_command(
 def _deflection_per_command(case: Case, layout: Layout, x, derivative: int):
     length = case.beam.length
     greens = flexibility(case, layout, x.reshape(-1), derivative)  # by reciprocity: forces at x
-    gains = jnp.zeros((len(case.actuators), x.size))
+    gains = xp.zeros((len(case.actuators), x.size))
     for i, actuator in enumerate(case.actuators):
         terms = actuator.displacement_map()
         displacement = sum(f / length**d * greens(position / length, d) for position, d, f in terms)
-        gains = gains.at[i].set(actuator.attachment().static_gain * displacement)
+        gains = set_at(gains, i, actuator.attachment().static_gain * displacement)
     return (gains * length ** (3 - derivative) / case.beam.bending_stiffness).reshape(-1, *x.shape)
 
 
@@ -131,10 +131,10 @@ def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*p
     Differentiable in every number where the maximum is unique. Raises ValueError as
     `influence_line` does.
     """
-    x = jnp.asarray(x, float)
+    x = xp.asarray(x, float)
     layout = _validated_layout(case, layout, x=x)
     if not case.loads:
-        return jnp.zeros(x.shape)
+        return xp.zeros(x.shape)
     return _static_peak(case, layout, x)
 
 
@@ -143,28 +143,28 @@ def _static_peak(case: Case, layout: Layout, x):
     length = case.beam.length
     greens = flexibility(case, layout, x.reshape(-1), 0)
     trajectories = [trajectory(load, length) for load in case.loads]
-    windows = jnp.stack([jnp.stack(path.entry_exit_times()) for path in trajectories])
-    nodes = jnp.concatenate([greens.nodes, greens.sources.positions])
+    windows = xp.stack([xp.stack(path.entry_exit_times()) for path in trajectories])
+    nodes = xp.concatenate([greens.nodes, greens.sources.positions])
     table_times = [load.times for load in case.loads if load.times is not None]
     events = [
         windows.ravel(),
         *(path.passage_times(nodes * length) for path in trajectories),
         *table_times,
     ]
-    events = jnp.concatenate(events)
-    event_times = jnp.sort(jnp.where(events < NEVER, events, windows[0, 0]))
+    events = xp.concatenate(events)
+    event_times = xp.sort(xp.where(events < NEVER, events, windows[0, 0]))
     starts, ends = event_times[:-1], event_times[1:]
     middle = (starts + ends) / 2
     times = starts + (ends - starts) * np.array(PEAK_POSITIONS)[:, None]
-    total = jnp.zeros((*times.shape, x.size))
+    total = xp.zeros((*times.shape, x.size))
     for load, path, window in zip(case.loads, trajectories, windows, strict=True):
         active = (window[0] < middle) & (middle < window[1])
-        relative_position = jnp.clip(path.kinematics(times)[0] / length, 0.0, 1.0)
+        relative_position = xp.clip(path.kinematics(times)[0] / length, 0.0, 1.0)
         load_deflection = (
             load.weight(case.run.gravity) * active[:, None] * greens(relative_position)
         )
         total = total + load_deflection
-    highest = jnp.max(refine_peak(total, PEAK_POSITIONS)[0], axis=0)
+    highest = xp.max(refine_peak(total, PEAK_POSITIONS)[0], axis=0)
     return (highest * length**3 / case.beam.bending_stiffness).reshape(x.shape)
 
 

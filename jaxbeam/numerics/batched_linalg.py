@@ -9,9 +9,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from jaxbeam.runtime.arrays import any_jax, fori_loop, xp
 
 MAX_UNROLLED_TERMS = 12  # of a sum that takes as long as the call of a library for the product
 
@@ -24,7 +25,15 @@ def solve_small(
     For matrices that need no pivoting: positive definite ones, or the identity plus masses times a
     positive definite one. Linear in the right side, so that it can be transposed.
     """
-    return right if matrix.shape[0] == 0 else _block_eliminate(matrix, right)[0]
+    if matrix.shape[0] == 0:
+        return right
+    return _block_eliminate(matrix, right)[0] if any_jax(matrix, right) else _solve(matrix, right)
+
+
+def _solve(matrix, right):
+    """Solve known systems, batch axis last."""
+    batch_first = (np.moveaxis(part, -1, 0) for part in (matrix, right))
+    return np.moveaxis(np.linalg.solve(*batch_first), 0, -1)
 
 
 def _block_eliminate(matrix, *rights):
@@ -46,7 +55,7 @@ def _block_eliminate(matrix, *rights):
     )
     pairs = zip(upper_solutions, lower_solutions, strict=True)
     return tuple(
-        jnp.concatenate([top - _unrolled_matmul(upper_coupling, end), end]) for top, end in pairs
+        xp.concatenate([top - _unrolled_matmul(upper_coupling, end), end]) for top, end in pairs
     )
 
 
@@ -62,7 +71,7 @@ def _cofactor_inverse(matrix):
         return 1 / matrix
     if size == 2:
         (a, b), (c, d) = matrix
-        return jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)
+        return xp.stack([xp.stack([d, -b]), xp.stack([-c, a])]) / (a * d - b * c)
     minors = [
         [
             matrix[i - 2, j - 2] * matrix[i - 1, j - 1]
@@ -71,15 +80,15 @@ def _cofactor_inverse(matrix):
         ]
         for j in range(3)
     ]
-    adjugate = jnp.stack([jnp.stack(row) for row in minors])
-    return adjugate / jnp.sum(matrix[0] * adjugate[:, 0], axis=0)
+    adjugate = xp.stack([xp.stack(row) for row in minors])
+    return adjugate / xp.sum(matrix[0] * adjugate[:, 0], axis=0)
 
 
 def matvec(
     matrix: Float[Array, "row column"], vectors: Float[Array, "column batch"]
 ) -> Float[Array, "row batch"]:
     """Product of one matrix with a batch of vectors, unrolled where the sums are short."""
-    if not 0 < vectors.shape[0] <= MAX_UNROLLED_TERMS:
+    if not (0 < vectors.shape[0] <= MAX_UNROLLED_TERMS and any_jax(matrix, vectors)):
         return matrix @ vectors
     return _unrolled_matmul(matrix[..., None], vectors[:, None])[:, 0]
 
@@ -93,6 +102,8 @@ def solve_unpivoted(
     factorisations of batches may deadlock where several run at the same time: jaxlib hands parts of
     a batch to the threads that wait for it.
     """
+    if not any_jax(matrix, right):
+        return np.linalg.solve(matrix, right)
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x,
         right,
@@ -111,21 +122,19 @@ def _gauss_jordan(matrix, right):
         row = jax.lax.dynamic_index_in_dim(augmented_matrix, k, 0, keepdims=False)
         row = row / jax.lax.dynamic_index_in_dim(row, k, 0)
         column = jax.lax.dynamic_index_in_dim(augmented_matrix, k, 1)
-        return jnp.where(rows == k, row, augmented_matrix - column * row)
+        return xp.where(rows == k, row, augmented_matrix - column * row)
 
-    augmented_matrix = jnp.concatenate([matrix, right], axis=1)
-    return jax.lax.fori_loop(0, size, step, augmented_matrix)[:, size:]
+    augmented_matrix = xp.concatenate([matrix, right], axis=1)
+    return fori_loop(0, size, step, augmented_matrix)[:, size:]
 
 
 @_gauss_jordan.def_vmap
 def _(count, batched, *systems):
     systems = [
-        jnp.moveaxis(part, 0, -1)
-        if has
-        else jnp.broadcast_to(part[..., None], (*part.shape, count))
+        xp.moveaxis(part, 0, -1) if has else xp.broadcast_to(part[..., None], (*part.shape, count))
         for part, has in zip(systems, batched, strict=True)
     ]
-    return jnp.moveaxis(_gauss_jordan(*systems), -1, 0), True
+    return xp.moveaxis(_gauss_jordan(*systems), -1, 0), True
 
 
 def matmul(
@@ -133,26 +142,26 @@ def matmul(
 ) -> Float[Array, "row column batch"]:
     """Products of matrices, unrolled where the sums are short, else by a library."""
     if a.shape[2] == 1:
-        return jnp.tensordot(a[..., 0], b, 1)
+        return xp.tensordot(a[..., 0], b, 1)
     if b.shape[2] == 1:
-        return jnp.moveaxis(jnp.tensordot(a, b[..., 0], ((1,), (0,))), -1, 1)
+        return xp.moveaxis(xp.tensordot(a, b[..., 0], ((1,), (0,))), -1, 1)
     return (
         _unrolled_matmul(a, b)
         if b.shape[0] <= MAX_UNROLLED_TERMS
-        else jnp.einsum("ik...,kj...->ij...", a, b)
+        else xp.einsum("ik...,kj...->ij...", a, b)
     )
 
 
 def transpose(matrix: Float[Array, "row column batch"]) -> Float[Array, "column row batch"]:
     """Transposes of matrices."""
-    return jnp.swapaxes(matrix, 0, 1)
+    return xp.swapaxes(matrix, 0, 1)
 
 
 def hstack(*parts: Float[Array, "row _ _"]) -> Float[Array, "row column batch"]:
     """Matrices with equal rows, concatenated along the columns."""
     batch_size = batch_size_of(parts)
-    return jnp.concatenate(
-        [jnp.broadcast_to(part, (*part.shape[:2], batch_size)) for part in parts], axis=1
+    return xp.concatenate(
+        [xp.broadcast_to(part, (*part.shape[:2], batch_size)) for part in parts], axis=1
     )
 
 
@@ -161,7 +170,9 @@ def solve_batch(
 ) -> Float[Array, "row column batch"]:
     """`solve_unpivoted` of a batch, batch axis last."""
     batch_size = batch_size_of(matrix, right)
-    matrix, right = (jnp.broadcast_to(x, (*x.shape[:2], batch_size)) for x in (matrix, right))
+    matrix, right = (xp.broadcast_to(x, (*x.shape[:2], batch_size)) for x in (matrix, right))
+    if not any_jax(matrix, right):
+        return _solve(matrix, right)
     return jax.lax.custom_linear_solve(
         lambda x: _unrolled_matmul(matrix, x),
         right,
@@ -215,10 +226,10 @@ def batch_axis_last(function: Callable, *args: Any) -> Any:
     @mapped_function.def_vmap
     def _(count, mapped, given):
         def to_last(part, is_mapped):
-            return jnp.moveaxis(part, 0, -1) if is_mapped else part[..., None]
+            return xp.moveaxis(part, 0, -1) if is_mapped else part[..., None]
 
         def to_first(part):
-            return jnp.moveaxis(jnp.broadcast_to(part, (*part.shape[:-1], count)), -1, 0)
+            return xp.moveaxis(xp.broadcast_to(part, (*part.shape[:-1], count)), -1, 0)
 
         result = jax.tree.map(to_first, call(jax.tree.map(to_last, given, *mapped)))
         return result, jax.tree.map(lambda _: True, result)

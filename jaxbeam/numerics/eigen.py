@@ -1,14 +1,12 @@
 """Generalised symmetric eigenvalue problem, with derivatives valid at repeated eigenvalues too."""
 
-import jax
-import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
+from jaxbeam.runtime.arrays import custom_jvp, solve_triangular, xp
 
 REPEATED_EIGENVALUE_TOLERANCE = 1e-6  # relative: closer eigenvalues are treated as repeated
 RIGID_BODY_EIGENVALUE = 1e-10  # in beam units: eigenvalues below are zero, of rigid-body modes
 
 
-@jax.custom_jvp
+@custom_jvp
 def eigen(stiffness, mass):
     """Ascending eigenvalues and mass-normalised eigenvectors X of K x = lambda M x, and coupling.
 
@@ -16,17 +14,17 @@ def eigen(stiffness, mass):
     rotate them. The coupling, the off-diagonal part of X' K X, is zero and carries the derivative
     instead; a model that includes it has exact derivatives of its response.
     """
-    factor = jnp.linalg.cholesky(stiffness + mass)  # shifted: rigid-body modes are not singular
+    factor = xp.linalg.cholesky(stiffness + mass)  # shifted: rigid-body modes are not singular
     mass_half_solved = solve_triangular(factor, mass, lower=True)
     flexibility = solve_triangular(factor, mass_half_solved.T, lower=True)
-    inverse, vectors = jnp.linalg.eigh((flexibility + flexibility.T) / 2)
+    inverse, vectors = xp.linalg.eigh((flexibility + flexibility.T) / 2)
     vectors = solve_triangular(factor.T, vectors[:, ::-1], lower=False)
-    inverse = jnp.maximum(inverse[::-1], jnp.finfo(inverse.dtype).tiny)
-    vectors = vectors / jnp.sqrt(jnp.sum(vectors * (mass @ vectors), axis=0))
+    inverse = xp.maximum(inverse[::-1], xp.finfo(inverse.dtype).tiny)
+    vectors = vectors / xp.sqrt(xp.sum(vectors * (mass @ vectors), axis=0))
     # The error of Rayleigh's quotient is that of the vector squared.
-    values = jnp.sum(vectors * (stiffness @ vectors), axis=0)
-    values = jnp.where(values > RIGID_BODY_EIGENVALUE, values, 0.0)
-    return values, vectors, jnp.zeros_like(mass)
+    values = xp.sum(vectors * (stiffness @ vectors), axis=0)
+    values = xp.where(values > RIGID_BODY_EIGENVALUE, values, 0.0)
+    return values, vectors, xp.zeros_like(mass)
 
 
 @eigen.defjvp
@@ -34,16 +32,16 @@ def _eigen_jvp(primals, tangents):
     values, vectors, coupling = eigen(*primals)
     stiffness, mass = (vectors.T @ tangent @ vectors for tangent in tangents)
     gap = values[None, :] - values[:, None]
-    repeated = jnp.abs(gap) <= REPEATED_EIGENVALUE_TOLERANCE * (
+    repeated = xp.abs(gap) <= REPEATED_EIGENVALUE_TOLERANCE * (
         1 + values[None, :] + values[:, None]
     )
-    rotation = (stiffness - values[None, :] * mass) / jnp.where(repeated, 1.0, gap)
-    rotation = jnp.where(repeated, -mass / 2, rotation)
+    rotation = (stiffness - values[None, :] * mass) / xp.where(repeated, 1.0, gap)
+    rotation = xp.where(repeated, -mass / 2, rotation)
     coupling_tangent = stiffness - (values[None, :] + values[:, None]) / 2 * mass
     # Zero, but with a derivative, which second derivatives need.
     rotated_coupling = rotation.T @ coupling + coupling @ rotation
-    rotation = rotation + jnp.where(repeated, 0.0, rotated_coupling / jnp.where(repeated, 1.0, gap))
+    rotation = rotation + xp.where(repeated, 0.0, rotated_coupling / xp.where(repeated, 1.0, gap))
     coupling_tangent = coupling_tangent + rotated_coupling
-    diagonal = jnp.diag(coupling_tangent)
-    coupling_tangent = jnp.where(repeated, coupling_tangent, 0.0) - jnp.diag(diagonal)
+    diagonal = xp.diag(coupling_tangent)
+    coupling_tangent = xp.where(repeated, coupling_tangent, 0.0) - xp.diag(diagonal)
     return (values, vectors, coupling), (diagonal, vectors @ rotation, coupling_tangent)

@@ -5,9 +5,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from jaxbeam.runtime.arrays import fori_loop, optimization_barrier, stop_gradient, xp
 
 ESTIMATE_ITERATIONS = 2  # of Newton's method in an estimate
 TIE_ROUNDING_UNITS = 8  # by which equal numbers may differ
@@ -42,7 +43,7 @@ def _to_unit_interval(points: tuple[float, ...]) -> np.ndarray:
 
 def _interpolate(samples: Float[Array, "point *rest"], points: tuple[float, ...]) -> Curve:
     count = len(points)
-    rows = list(jnp.tensordot(interpolation_matrix(points), samples, axes=1))
+    rows = list(xp.tensordot(interpolation_matrix(points), samples, axes=1))
     return Curve(rows[:count], rows[count : 2 * count - 1], rows[2 * count - 1 :])
 
 
@@ -60,14 +61,14 @@ def _newton_stationary_point(curve: Curve, start, step_limit: float, iterations:
     def newton_step(_, position):
         second_derivative = _horner(curve.curvature, position)
         singular = second_derivative == 0
-        step = jnp.where(
+        step = xp.where(
             singular,
             0.0,
-            _horner(curve.slope, position) / jnp.where(singular, 1.0, second_derivative),
+            _horner(curve.slope, position) / xp.where(singular, 1.0, second_derivative),
         )
-        return jnp.clip(position - jnp.clip(step, -step_limit, step_limit), -1.0, 1.0)
+        return xp.clip(position - xp.clip(step, -step_limit, step_limit), -1.0, 1.0)
 
-    return jax.lax.fori_loop(0, iterations, newton_step, start)
+    return fori_loop(0, iterations, newton_step, start)
 
 
 def max_with_ties(
@@ -78,61 +79,61 @@ def max_with_ties(
     They may differ by rounding, as XLA may compute a candidate once for the maximum and once more,
     rounded otherwise, for the comparison.
     """
-    maximum = jnp.max(values, axis=0)
-    tolerance = TIE_ROUNDING_UNITS * jnp.finfo(values.dtype).eps
-    return maximum, values >= maximum - tolerance * jnp.abs(maximum)
+    maximum = xp.max(values, axis=0)
+    tolerance = TIE_ROUNDING_UNITS * xp.finfo(values.dtype).eps
+    return maximum, values >= maximum - tolerance * xp.abs(maximum)
 
 
 def estimate_peak(
-    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = jnp.abs
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = xp.abs
 ) -> Float[Array, " *rest"]:
     """Estimate of the peak, searched from the largest sample only.
 
     It tells which of many steps has the peak, which `refine_peak` then finds.
     """
     magnitudes = magnitude(samples)
-    largest = jnp.max(magnitudes, axis=0)
-    start = jnp.asarray(_to_unit_interval(points), samples.dtype)[jnp.argmax(magnitudes, axis=0)]
+    largest = xp.max(magnitudes, axis=0)
+    start = xp.asarray(_to_unit_interval(points), samples.dtype)[xp.argmax(magnitudes, axis=0)]
     curve = _interpolate(samples, points)
     position = _newton_stationary_point(
         curve, start, newton_step_limit(points), iterations=ESTIMATE_ITERATIONS
     )
-    return jnp.maximum(magnitude(_horner(curve.value, position)), largest)
+    return xp.maximum(magnitude(_horner(curve.value, position)), largest)
 
 
 @jax.named_scope("peaks")
 def locate_peak(
-    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = jnp.abs
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = xp.abs
 ) -> Float[Array, " *rest"]:
     """Position in [-1, 1] of the largest magnitude of the polynomial through the samples."""
     curve = _interpolate(samples, points)
     # The start points are candidates too: Newton's method may leave an end for a lower extremum.
     starts = np.linspace(-1.0, 1.0, START_POINTS).reshape(-1, *(1,) * (samples.ndim - 1))
-    starts = jnp.broadcast_to(starts.astype(samples.dtype), (START_POINTS, *samples.shape[1:]))
-    positions = jnp.concatenate(
+    starts = xp.broadcast_to(starts.astype(samples.dtype), (START_POINTS, *samples.shape[1:]))
+    positions = xp.concatenate(
         [starts, _newton_stationary_point(curve, starts, 2 / START_POINTS, NEWTON_ITERATIONS)]
     )
     _, ties = max_with_ties(magnitude(_horner(curve.value, positions)))
-    position = jnp.max(jnp.where(ties, positions, -1.0), axis=0)
+    position = xp.max(xp.where(ties, positions, -1.0), axis=0)
     # The magnitude is accurate to nearly rounding by now, the position to the square root of that:
     # further iterations improve it, unless the peak is at an end without stationary point nearby.
     stationary_point = _newton_stationary_point(
         curve, position, 2 / START_POINTS, NEWTON_ITERATIONS
     )
     _, ties_of_two = max_with_ties(
-        magnitude(_horner(curve.value, jnp.stack([stationary_point, position])))
+        magnitude(_horner(curve.value, xp.stack([stationary_point, position])))
     )
-    return jnp.where(ties_of_two[0], stationary_point, position)
+    return xp.where(ties_of_two[0], stationary_point, position)
 
 
 def refine_peak(
-    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = jnp.abs
+    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = xp.abs
 ) -> tuple[Float[Array, " *rest"], ...]:
     """Largest magnitude of the polynomial through the samples, and its position in [0, 1].
 
     `points` are the positions in [0, 1] of the samples, ascending and with both ends. The
     derivative is that at a fixed position, exact for a peak inside the curve or at a fixed end.
     """
-    position = locate_peak(jax.lax.stop_gradient(samples), points, magnitude)
-    position = jax.lax.optimization_barrier(jax.lax.stop_gradient(position))
+    position = locate_peak(stop_gradient(samples), points, magnitude)
+    position = optimization_barrier(stop_gradient(position))
     return magnitude(_horner(_interpolate(samples, points).value, position)), (position + 1) / 2

@@ -2,40 +2,37 @@
 
 import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import chebyshev, legendre
 
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import custom_jvp, optimization_barrier, slice_in_dim, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 
-# Eagerly the first call takes 5 s, as small programs compile, and the next 4 ms; compiled 0.5 s
-# and 0.1 ms. `Modes` and tests call it eagerly.
-@compiled
+@compiled_if_traced
 def piecewise_chebyshev(nodes, series, x, derivatives) -> Float[Array, "order *position column"]:
     """Derivatives of given orders at positions x, of series (segment, degree, column).
 
     The derivatives are by x, in the unit of the nodes.
     """
-    x = jnp.asarray(x, float)
-    half_length = jnp.diff(nodes) / 2
+    x = xp.asarray(x, float)
+    half_length = xp.diff(nodes) / 2
     segments, terms, modes = series.shape
     derivative_series = [
-        jnp.asarray(_derivative_matrix(terms, d), series.dtype)
+        xp.asarray(_derivative_matrix(terms, d), series.dtype)
         @ series
         / half_length[:, None, None] ** d
         for d in derivatives
     ]
-    series = jnp.stack(derivative_series, axis=2).reshape(segments, terms, len(derivatives) * modes)
-    segment = jnp.sum(x[..., None] >= nodes[1:-1], axis=-1)
+    series = xp.stack(derivative_series, axis=2).reshape(segments, terms, len(derivatives) * modes)
+    segment = xp.sum(x[..., None] >= nodes[1:-1], axis=-1)
     local = (x - nodes[segment]) / half_length[segment] - 1
     values = _evaluate_series(series, local, segment)
-    return jnp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
+    return xp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
 
 
-@jax.custom_jvp
+@custom_jvp
 def _evaluate_series(series, local, segment):
     """Values of the series at local positions, -1 to 1, in their segments."""
     return _sum_series(_segment_polynomials(series, local, segment), series)
@@ -47,9 +44,9 @@ def _evaluate_series_jvp(primals, tangents):
     series, local, segment = primals
     series_tangent, local_tangent, _ = tangents
     table = _segment_polynomials(series, local, segment)
-    derivative_series = jnp.asarray(_derivative_matrix(series.shape[1], 1), series.dtype) @ series
-    values, slopes = jnp.split(
-        _sum_series(table, jnp.concatenate([series, derivative_series], axis=2)), 2, -1
+    derivative_series = xp.asarray(_derivative_matrix(series.shape[1], 1), series.dtype) @ series
+    values, slopes = xp.split(
+        _sum_series(table, xp.concatenate([series, derivative_series], axis=2)), 2, -1
     )
     return values, _sum_series(table, series_tangent) + slopes * local_tangent[..., None]
 
@@ -64,8 +61,8 @@ def _segment_polynomials(series, local, segment):
     segments, terms, _ = series.shape
     table = _chebyshev_polynomials(local, terms)
     masks = (segment[..., None] == s for s in range(segments))
-    parts = [jnp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
-    return jnp.concatenate(parts, axis=-1)
+    parts = [xp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
+    return xp.concatenate(parts, axis=-1)
 
 
 @functools.cache
@@ -91,12 +88,11 @@ def _chebyshev_polynomials(t, terms: int):
     By doubling, T_(k+j) = 2 T_k T_j - T_(k-j): few steps, and accurate.
     """
     axis = t.ndim
-    table = jnp.stack([jnp.ones_like(t), t], axis=axis)
+    table = xp.stack([xp.ones_like(t), t], axis=axis)
     while table.shape[axis] < terms:
-        table = jax.lax.optimization_barrier(table)
-        # Slices by lax: indexing makes the program several times as long to compile.
-        last = 2 * jax.lax.slice_in_dim(table, -1, None, axis=axis)
-        lower = jax.lax.rev(jax.lax.slice_in_dim(table, 0, -1, axis=axis), (axis,))
-        higher = last * jax.lax.slice_in_dim(table, 1, None, axis=axis) - lower
-        table = jnp.concatenate([table, higher], axis=axis)
-    return jax.lax.slice_in_dim(table, 0, terms, axis=axis)
+        table = optimization_barrier(table)
+        last = 2 * slice_in_dim(table, -1, None, axis)
+        lower = xp.flip(slice_in_dim(table, 0, -1, axis), axis)
+        higher = last * slice_in_dim(table, 1, None, axis) - lower
+        table = xp.concatenate([table, higher], axis=axis)
+    return slice_in_dim(table, 0, terms, axis)

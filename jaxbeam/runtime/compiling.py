@@ -189,6 +189,27 @@ def compiled(function: Any = None, **settings: bool | int) -> Any:
     return Compiled(function, settings)
 
 
+def compiled_if_traced(function: Callable[P, R]) -> Callable[P, R]:
+    """Compute a function of known numbers at once; compile it where it is traced, as `compiled`.
+
+    The function and all that it calls use `jaxbeam.runtime.arrays`. Known arrays of JAX are handed
+    on as arrays of NumPy.
+    """
+    program = Compiled(function, {})
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        arrays, *rest = _partition((args, kwargs))
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in arrays):
+            return program(*args, **kwargs)
+        known = [None if leaf is None else np.asarray(leaf) for leaf in arrays]
+        args, kwargs = _combine(known, *rest)
+        with np.errstate(all="ignore"):  # as compiled code, which yields inf and nan
+            return function(*args, **kwargs)
+
+    return call
+
+
 def _renamed(program, name: str):
     """A function under another name, which is that of its program in profiles and logs."""
     program = functools.partial(program)

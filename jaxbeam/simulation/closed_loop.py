@@ -5,8 +5,6 @@ continuous time (`continuous_loop`).
 """
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -20,6 +18,7 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import noise_samples, sensor_sections
 from jaxbeam.model.state_space import state_space
+from jaxbeam.runtime.arrays import block_diag, set_at, xp
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
 
@@ -100,9 +99,9 @@ def _state_bound(case: Case, model: ModalModel) -> Float[Array, " state"]:
     Mode shapes are of the order sqrt(2 / mass).
     """
     beam = case.beam
-    max_coordinate = beam.length * jnp.sqrt(beam.linear_density * beam.length / 2)
-    bound = jnp.full(model.state_count, jnp.inf)
-    return bound.at[0 : 2 * beam.modes : 2].set(max_coordinate)
+    max_coordinate = beam.length * xp.sqrt(beam.linear_density * beam.length / 2)
+    bound = xp.full(model.state_count, xp.inf)
+    return set_at(bound, np.s_[0 : 2 * beam.modes : 2], max_coordinate)
 
 
 def _with_controller_states(
@@ -111,8 +110,8 @@ def _with_controller_states(
     """Model with more states, whose rates are its last commands and which no output contains."""
     if count == 0:
         return model, output_rows
-    state_matrix = jnp.pad(model.state_matrix, ((0, 0), (0, count), (0, count)))
-    command_matrix = jax.scipy.linalg.block_diag(model.command_matrix, jnp.eye(count))
+    state_matrix = xp.pad(model.state_matrix, ((0, 0), (0, count), (0, count)))
+    command_matrix = block_diag(model.command_matrix, xp.eye(count))
     parts = state_matrix, command_matrix
     augmented = eqx.tree_at(lambda r: (r.state_matrix, r.command_matrix), model, parts)
-    return augmented, jnp.pad(output_rows, ((0, 0), (0, count)))
+    return augmented, xp.pad(output_rows, ((0, 0), (0, count)))

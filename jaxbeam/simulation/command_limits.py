@@ -1,19 +1,18 @@
 """Commands as the actuators receive them: rounded, and within their limits and rate limits."""
 
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.runtime.arrays import stop_gradient, xp
 
 
 def command_ranges(case: Case) -> tuple[Float[Array, " actuator"], ...]:
     """Lowest and highest command and rate limit (1/s) of each actuator; infinite without one."""
     limits = [actuator.command_limits() for actuator in case.actuators]
     rates = [actuator.command_rate_limit() for actuator in case.actuators]
-    low = jnp.array([-jnp.inf if pair is None else pair[0] for pair in limits])
-    high = jnp.array([jnp.inf if pair is None else pair[1] for pair in limits])
-    return low, high, jnp.array([jnp.inf if rate is None else rate for rate in rates])
+    low = xp.array([-xp.inf if pair is None else pair[0] for pair in limits])
+    high = xp.array([xp.inf if pair is None else pair[1] for pair in limits])
+    return low, high, xp.array([xp.inf if rate is None else rate for rate in rates])
 
 
 def limit_commands(
@@ -28,13 +27,13 @@ def limit_commands(
     """
     controller = case.controller
     if controller.resolution is not None:
-        rounded = controller.resolution * jnp.round(commands / controller.resolution)
-        commands = commands + jax.lax.stop_gradient(rounded - commands)
+        rounded = controller.resolution * xp.round(commands / controller.resolution)
+        commands = commands + stop_gradient(rounded - commands)
     low, high, rate = (
         part.reshape(-1, *[1] * (commands.ndim - 1)) for part in command_ranges(case)
     )
-    commands = jnp.clip(commands, low, high)
+    commands = xp.clip(commands, low, high)
     if previous is not None and any(a.command_rate_limit() is not None for a in case.actuators):
         change = rate * controller.period
-        commands = jnp.clip(commands, previous - change, previous + change)
+        commands = xp.clip(commands, previous - change, previous + change)
     return commands

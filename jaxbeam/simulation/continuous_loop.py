@@ -5,7 +5,6 @@ They are found by Newton's method together with the states at the nodes.
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import AbstractContinuousLaw, Measurement
@@ -14,6 +13,7 @@ from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensor_signals import filtered_reading
 from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import scan, vmap, xp
 from jaxbeam.simulation.command_limits import limit_commands
 
 NEWTON_ITERATIONS = 4  # for the commands of a step; one suffices for a linear law
@@ -36,18 +36,18 @@ class ContinuousLoop(AbstractInputPolicy):
     controller_states: int = eqx.field(static=True)
 
     def start(self, batch_size):
-        return jnp.zeros((self.model.command_matrix.shape[1], batch_size))
+        return xp.zeros((self.model.command_matrix.shape[1], batch_size))
 
     def inputs(self, memory, state, info: StepInfo, states):
         times = info.start + info.length * GAUSS_NODES
         if not self.implicit:
-            commands = jax.vmap(lambda time: self._commands(state, time))(times)
+            commands = vmap(lambda time: self._commands(state, time))(times)
             return commands, commands[-1]
 
         def commands_for(commands):
-            return jax.vmap(self._commands)(states(commands), times)
+            return vmap(self._commands)(states(commands), times)
 
-        guess = jnp.broadcast_to(memory, (NODE_COUNT, *memory.shape))
+        guess = xp.broadcast_to(memory, (NODE_COUNT, *memory.shape))
         commands = newton_fixed_point(commands_for, guess, NEWTON_ITERATIONS)
         return commands, commands[-1]
 
@@ -56,15 +56,13 @@ class ContinuousLoop(AbstractInputPolicy):
 
     def failures(self, memory) -> Float[Array, " batch"]:
         """Number of samples without a solution: none, as there are no samples."""
-        return jnp.zeros(memory.shape[-1])
+        return xp.zeros(memory.shape[-1])
 
     def commands_at(
         self, states: Float[Array, "time state"], times: Float[Array, " time"]
     ) -> Float[Array, "time command"]:
         """Commands of a single run at some times (s): those to the actuators, then the rates."""
-        return jax.vmap(lambda state, time: self._commands(state[:, None], time)[:, 0])(
-            states, times
-        )
+        return vmap(lambda state, time: self._commands(state[:, None], time)[:, 0])(states, times)
 
     def _commands(self, state, time):
         """Commands and rates of the law's states, (command, batch), for states (state, batch)."""
@@ -73,18 +71,18 @@ class ContinuousLoop(AbstractInputPolicy):
         pairs = zip(case.sensors, outputs[:sensors], strict=True)
         readings = [filtered_reading(sensor, None, None, value)[0] for sensor, value in pairs]
         if outputs.shape[0]:
-            outputs = jnp.stack([*readings, *outputs[sensors:]])  # filters of the law follow
+            outputs = xp.stack([*readings, *outputs[sensors:]])  # filters of the law follow
 
         def law(law_state, readings, plant_state):
-            no_command = jnp.zeros(len(case.actuators))
+            no_command = xp.zeros(len(case.actuators))
             measurement = Measurement(readings, plant_state, no_command)
             command = limit_commands(case, self.law.command(law_state, measurement, time))
             rates = self.law.rates(law_state, measurement, command, time)
-            return jnp.concatenate([command, rates])
+            return xp.concatenate([command, rates])
 
         law_state = state[state.shape[0] - self.controller_states :]
         plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
-        return jax.vmap(law, in_axes=-1, out_axes=-1)(law_state, outputs, plant_state)
+        return vmap(law, in_axes=-1, out_axes=-1)(law_state, outputs, plant_state)
 
 
 def newton_fixed_point(
@@ -93,15 +91,15 @@ def newton_fixed_point(
     """Fixed point of a function by Newton's method, for each entry of a batch by itself."""
     batch_size = guess.shape[-1]
     size = guess.size // batch_size
-    unit_vectors = jnp.broadcast_to(jnp.eye(size)[..., None], (size, size, batch_size))
+    unit_vectors = xp.broadcast_to(xp.eye(size)[..., None], (size, size, batch_size))
 
     def iterate(value, _):
         function_value, derivative = jax.linearize(function, value)
-        slopes = jax.vmap(derivative)(unit_vectors.reshape(size, *guess.shape)).reshape(
+        slopes = vmap(derivative)(unit_vectors.reshape(size, *guess.shape)).reshape(
             unit_vectors.shape
         )
         residual = (function_value - value).reshape(size, batch_size)
-        step = jnp.linalg.solve((unit_vectors - slopes).T, residual.T[..., None])
+        step = xp.linalg.solve((unit_vectors - slopes).T, residual.T[..., None])
         return value + step[..., 0].T.reshape(guess.shape), None
 
-    return jax.lax.scan(iterate, guess, length=iterations)[0]
+    return scan(iterate, guess, length=iterations)[0]

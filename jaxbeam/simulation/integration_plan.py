@@ -9,7 +9,6 @@ import functools
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -25,7 +24,8 @@ from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 
 TOLERANCE = 1e-7  # relative to the largest deflection
@@ -60,12 +60,12 @@ def static_shapes(case: Case) -> StaticShapes:
     )
 
 
-@compiled
+@compiled_if_traced
 def _model_limits(case: Case, layout: Layout):
     """Longest stable step (s), whether frequencies repeat, entry and exit times (load, 2) in s."""
     model = modal_model(case, layout)
     trajectories = [trajectory(load, case.beam.length) for load in case.loads]
-    entry_exit = jnp.array([path.entry_exit_times() for path in trajectories]).reshape(-1, 2)
+    entry_exit = xp.array([path.entry_exit_times() for path in trajectories]).reshape(-1, 2)
     return max_stable_step(model, case.loads), model.modes.has_repeated, entry_exit
 
 
@@ -183,12 +183,12 @@ def sample_times(case: Case) -> Float[Array, " time"]:
             f"run.duration ({duration:g} s) and run.sample_rate ({rate:g} Hz) make"
             f" {duration * rate:.3g} samples, more than {MAX_STEPS:.0e}: lower one of them"
         )
-    return jnp.arange(max(2, int(np.floor(duration * rate * (1 + 1e-12))) + 1)) / rate
+    return xp.arange(max(2, int(np.floor(duration * rate * (1 + 1e-12))) + 1)) / rate
 
 
-@compiled
+@compiled_if_traced
 def _trial_run(case, shapes, max_step, load_batch):
-    positions = case.beam.length * jnp.array(TRIAL_POSITIONS)
+    positions = case.beam.length * xp.array(TRIAL_POSITIONS)
     return run_peaks(case, shapes, max_step, positions, load_batch).refined_peak()[0]
 
 
@@ -221,7 +221,7 @@ def choose_step_size(
     _check_step_count(float(concrete(case.run.duration)) / step, step)
 
     def peaks(halvings):
-        return np.asarray(_trial_run(case, shapes, jnp.asarray(step / 2**halvings), load_batch))
+        return np.asarray(_trial_run(case, shapes, xp.asarray(step / 2**halvings), load_batch))
 
     halvings, error = _halve_until_converged(peaks, tolerance, 20)
     return step / 2**halvings, error
@@ -242,7 +242,7 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
     @functools.cache
     def response(halvings):
         return np.asarray(
-            _closed_loop_trial_run(case, shapes, schedule, jnp.asarray(min_substeps * 2**halvings))
+            _closed_loop_trial_run(case, shapes, schedule, xp.asarray(min_substeps * 2**halvings))
         )
 
     # A loop that diverges does so with any step, so its error is not defined. A stiff law in
@@ -261,7 +261,7 @@ def _closed_loop_trial_run(case, shapes, schedule, substeps):
     Peaks would hide errors: where a command saturates, the deflection has its error everywhere but
     at a peak, where it is stationary.
     """
-    positions = case.beam.length * jnp.array(TRIAL_POSITIONS)
+    positions = case.beam.length * xp.array(TRIAL_POSITIONS)
     loads = load_set(case)
     policy = closed_loop(case, shapes.layout, loads, schedule)
     grid = grid_by_schedule(case, policy.model, schedule, substeps)

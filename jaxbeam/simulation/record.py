@@ -5,7 +5,6 @@ import os
 from typing import TYPE_CHECKING
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -16,6 +15,7 @@ from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.output_rows import quantity_history
+from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.result_variables import MODE_FIELDS, MODE_VARIABLES, VARIABLES
 
 if TYPE_CHECKING:
@@ -93,10 +93,10 @@ class Record(eqx.Module):
     def strain(self) -> Float[Array, "time sensor"]:
         """Bending strain at the sensors; NaN at those without a fibre distance."""
         columns = [
-            self.at(s.position, "strain", jnp.nan if s.fibre_distance is None else s.fibre_distance)
+            self.at(s.position, "strain", xp.nan if s.fibre_distance is None else s.fibre_distance)
             for s in self.case.sensors
         ]
-        return jnp.array(columns).reshape(-1, self.times.shape[0]).T
+        return xp.array(columns).reshape(-1, self.times.shape[0]).T
 
     @property
     def measured(self) -> Float[Array, "time sensor"]:
@@ -115,29 +115,29 @@ class Record(eqx.Module):
     @property
     def saturated(self) -> Bool[Array, "time actuator"]:
         """Whether each command is at a limit of its actuator, to 1e-9 of its range."""
-        columns = [jnp.zeros(self.times.shape, bool) for _ in self.case.actuators]
+        columns = [xp.zeros(self.times.shape, bool) for _ in self.case.actuators]
         for i, actuator in enumerate(self.case.actuators):
             limits, command = actuator.command_limits(), self.command[:, i]
             if limits is not None:
                 rounding = 1e-9 * (limits[1] - limits[0])
                 columns[i] = (command <= limits[0] + rounding) | (command >= limits[1] - rounding)
-        return jnp.array(columns).reshape(len(columns), -1).T
+        return xp.array(columns).reshape(len(columns), -1).T
 
     @property
     def peak_command(self) -> Float[Array, " actuator"]:
         """Largest absolute command among the samples."""
-        return jnp.max(jnp.abs(self.command), axis=0, initial=0.0)
+        return xp.max(xp.abs(self.command), axis=0, initial=0.0)
 
     @property
     def effort(self) -> Float[Array, " actuator"]:
         """Integral of the squared command over the run (command^2 s), by the trapezoidal rule."""
-        return jnp.trapezoid(self.command**2, self.times, axis=0)
+        return xp.trapezoid(self.command**2, self.times, axis=0)
 
     @property
     def diverged_time(self) -> Float[Array, ""]:
         """Time (s) of the first sample after the closed loop diverged, NaN if it did not."""
-        diverged = jnp.any(jnp.isnan(self.coordinates), axis=1)
-        return jnp.where(jnp.any(diverged), self.times[jnp.argmax(diverged)], jnp.nan)
+        diverged = xp.any(xp.isnan(self.coordinates), axis=1)
+        return xp.where(xp.any(diverged), self.times[xp.argmax(diverged)], xp.nan)
 
     @property
     def verdict(self) -> str:
@@ -242,19 +242,19 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
     missing = [name for name in required if name not in dataset.variables]
     if missing:
         raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(missing)}")
-    values = {name: jnp.asarray(dataset[name].values) for name in _STORED_VARIABLES}
+    values = {name: xp.asarray(dataset[name].values) for name in _STORED_VARIABLES}
     return Record(
         case=case,
         modes=Modes(
             **{
-                MODE_FIELDS.get(name, name): jnp.asarray(dataset[label].values)
+                MODE_FIELDS.get(name, name): xp.asarray(dataset[label].values)
                 for name, label in mode_variables.items()
             }
         ),
-        times=jnp.asarray(dataset["time"].values),
-        error_estimate=jnp.asarray(float(dataset.attrs["error_estimate"])),
+        times=xp.asarray(dataset["time"].values),
+        error_estimate=xp.asarray(float(dataset.attrs["error_estimate"])),
         steps=int(dataset.attrs["steps"]),
-        controller_readings=jnp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
+        controller_readings=xp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
         **values,
     )
 

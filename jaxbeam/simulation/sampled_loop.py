@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.controller import AbstractSampledLaw, Measurement
@@ -20,6 +20,7 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import cond, set_at, vmap, xp
 from jaxbeam.simulation.command_limits import limit_commands
 
 
@@ -58,32 +59,32 @@ class SampledLoop(AbstractInputPolicy):
     implicit: bool = eqx.field(static=True, default=False)
 
     def start(self, batch_size):
-        sensors, zero = self.plant.case.sensors, jnp.zeros(batch_size)
+        sensors, zero = self.plant.case.sensors, xp.zeros(batch_size)
         pairs = list(zip(sensors, self.filter_sections, strict=True))
         filter_states = [initial_filter_state(sensor, part, zero) for sensor, part in pairs]
         readings = [
             filtered_reading(*pair, state, zero)[0]
             for pair, state in zip(pairs, filter_states, strict=True)
         ]
-        readings = jnp.stack(readings) if readings else jnp.zeros((0, batch_size))
-        command = jnp.zeros((len(self.plant.case.actuators), batch_size))
+        readings = xp.stack(readings) if readings else xp.zeros((0, batch_size))
+        command = xp.zeros((len(self.plant.case.actuators), batch_size))
         return LoopMemory(
             _broadcast_to_batch(self.law.initial_state(), batch_size),
             command,
             filter_states,
-            jnp.broadcast_to(readings, (self.schedule.max_age + 1, *readings.shape)),
-            jnp.zeros((self.schedule.max_waiting + 1, *command.shape)),
+            xp.broadcast_to(readings, (self.schedule.max_age + 1, *readings.shape)),
+            xp.zeros((self.schedule.max_waiting + 1, *command.shape)),
             zero,
         )
 
     def inputs(self, memory: LoopMemory, state, info: StepInfo, states):
-        memory = jax.lax.cond(
+        memory = cond(
             info.event >= 0,
             lambda memory: self._process_event(memory, state, info),
             lambda memory: memory,
             memory,
         )
-        return jnp.broadcast_to(memory.command, (NODE_COUNT, *memory.command.shape)), memory
+        return xp.broadcast_to(memory.command, (NODE_COUNT, *memory.command.shape)), memory
 
     def observe(self, memory, info):
         """Available readings (sensor, batch), and number of failures of the law (batch)."""
@@ -105,17 +106,17 @@ class SampledLoop(AbstractInputPolicy):
                 law_state, available, state, memory.command, info.start
             )
             command = limit_commands(self.plant.case, command, queue[0])
-            queue = jnp.roll(queue, 1, axis=0).at[0].set(command)
+            queue = set_at(xp.roll(queue, 1, axis=0), 0, command)
             return law_state, queue, failures + ~solved
 
-        law_state, queue, failures = jax.lax.cond(
+        law_state, queue, failures = cond(
             schedule.control_sample[event] >= 0,
             step,
             lambda inputs: inputs,
             (memory.law_state, memory.command_queue, memory.failures),
         )
         age = schedule.command_age[event]
-        command = jnp.where(age >= 0, queue[jnp.maximum(age, 0)], memory.command)
+        command = xp.where(age >= 0, queue[xp.maximum(age, 0)], memory.command)
         return LoopMemory(law_state, command, filter_states, readings, queue, failures)
 
     def _sample_sensors(self, memory, state, info):
@@ -129,10 +130,10 @@ class SampledLoop(AbstractInputPolicy):
                 sensor, self.filter_sections[i], memory.filter_states[i], signals[i], noise
             )
             due = number >= 0
-            reading = jnp.where(due, reading, readings[0, i])
+            reading = xp.where(due, reading, readings[0, i])
             filter_states.append(_tree_where(due, filter_state, memory.filter_states[i]))
-            shifted = jnp.where(due, jnp.roll(readings[:, i], 1, axis=0), readings[:, i])
-            readings = readings.at[:, i].set(shifted.at[0].set(reading))
+            shifted = xp.where(due, xp.roll(readings[:, i], 1, axis=0), readings[:, i])
+            readings = set_at(readings, np.s_[:, i], set_at(shifted, 0, reading))
         return filter_states, readings
 
     def _available_readings(self, readings, event):
@@ -140,7 +141,7 @@ class SampledLoop(AbstractInputPolicy):
         latest = [
             readings[self.schedule.reading_age[event, i], i] for i in range(readings.shape[1])
         ]
-        return jnp.stack(latest) if latest else readings[0]
+        return xp.stack(latest) if latest else readings[0]
 
     def _sensor_inputs(self, state, command, time):
         """Inputs of the sensors (sensor, batch) at a time (s)."""
@@ -157,16 +158,16 @@ class SampledLoop(AbstractInputPolicy):
             return self.law.step(law_state, Measurement(*measured), time)
 
         plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
-        return jax.vmap(step, in_axes=-1, out_axes=-1)(law_state, readings, plant_state, command)
+        return vmap(step, in_axes=-1, out_axes=-1)(law_state, readings, plant_state, command)
 
 
 def _broadcast_to_batch(state, batch_size: int):
     """The same state for each run, along a new last axis."""
     return jax.tree.map(
-        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf)[..., None], (*jnp.shape(leaf), batch_size)),
+        lambda leaf: xp.broadcast_to(xp.asarray(leaf)[..., None], (*xp.shape(leaf), batch_size)),
         state,
     )
 
 
 def _tree_where(condition, new, old):
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+    return jax.tree.map(lambda a, b: xp.where(condition, a, b), new, old)

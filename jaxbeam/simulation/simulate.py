@@ -4,8 +4,6 @@ import dataclasses
 import warnings
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -21,7 +19,8 @@ from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.contact import LoadSet, contact_at, load_set
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import vmap, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.command_limits import command_ranges
 from jaxbeam.simulation.integration_plan import (
@@ -59,10 +58,10 @@ def simulate(
         _check_times(times)
     if plan is None:
         plan = integration_plan(case, times, tolerance)
-    times = sample_times(case) if times is None else jnp.asarray(times, float)
+    times = sample_times(case) if times is None else xp.asarray(times, float)
     # Plans that differ in their error only share compiled programs.
     record = _simulate_record(
-        case, dataclasses.replace(plan, error=0.0), times, jnp.asarray(plan.error)
+        case, dataclasses.replace(plan, error=0.0), times, xp.asarray(plan.error)
     )
     if is_concrete(record.contact_lost_time):
         lost = np.isfinite(concrete(record.contact_lost_time))
@@ -83,17 +82,17 @@ def _check_times(times) -> None:
         raise ValueError("times (s from the start of the run) must be finite and ascend")
 
 
-@compiled
+@compiled_if_traced
 def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
     running_peaks, outputs, modal, steps = _integrate(case, plan, times, case.sensor_positions)
     coordinates, rates, accelerations, position, force, commands, readings, failures = outputs
     if commands is None:
-        commands = jnp.zeros((times.shape[0], len(case.actuators)))
+        commands = xp.zeros((times.shape[0], len(case.actuators)))
     if failures is None:
-        failures = jnp.zeros(times.shape)
+        failures = xp.zeros(times.shape)
     peaks = Peaks(*(part[0] for part in running_peaks.peaks()))
     loads, lost_times = load_set(case), peaks.contact_lost_time
-    lost_positions = jnp.array(
+    lost_positions = xp.array(
         [
             path.kinematics(time)[0]
             for path, time in zip(loads.trajectories, lost_times, strict=True)
@@ -151,7 +150,7 @@ def simulate_histories(
     _, outputs, modal, _ = _integrate(case, plan, times, None)
     coordinates, _, _, _, forces, commands, *_ = outputs
     if commands is None:
-        commands = jnp.zeros((times.shape[0], len(case.actuators)))
+        commands = xp.zeros((times.shape[0], len(case.actuators)))
     return Histories(coordinates @ modal.shapes(positions).T, commands, forces)
 
 
@@ -178,9 +177,9 @@ def integration_setup(
         model, policy = modal_model(case, layout, plan.shapes.coupled), None
         # From rest at t = 0 to the first sample in steps as those between samples.
         spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
-        lead_times = times[0] - spacing * jnp.arange(plan.lead_samples, 0, -1)
+        lead_times = times[0] - spacing * xp.arange(plan.lead_samples, 0, -1)
         schedule = sample_schedule(
-            jnp.concatenate([lead_times, times]), plan.equally_spaced, plan.lead_samples
+            xp.concatenate([lead_times, times]), plan.equally_spaced, plan.lead_samples
         )
     else:
         schedule = plan.schedule
@@ -223,9 +222,9 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
 def _commands_at_steps(case: Case, commands, steps):
     """Commands (time, actuator) at the starts of steps, by extrapolation from their Gauss nodes."""
     histories = commands[..., 0].reshape(commands.shape[0], NODE_COUNT, -1)
-    commands_at_start = jnp.tensordot(histories, end_weights()[:, 0], axes=[1, 0])[steps]
+    commands_at_start = xp.tensordot(histories, end_weights()[:, 0], axes=[1, 0])[steps]
     low, high, _ = command_ranges(case)
-    return jnp.clip(commands_at_start, low, high)
+    return xp.clip(commands_at_start, low, high)
 
 
 def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states, commands):
@@ -236,10 +235,10 @@ def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states,
         force, accelerations = contact_at(model, loads, time, state, column)
         return force[:, 0], accelerations[:, 0]
 
-    force, accelerations = jax.vmap(outputs_at)(times, states, commands)
+    force, accelerations = vmap(outputs_at)(times, states, commands)
     count = 2 * accelerations.shape[1]
     coordinates = states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations
     if model.mode_map is not None:
         coordinates = tuple(part @ model.mode_map.T for part in coordinates)
     position = loads.kinematics(times)[0].T
-    return *coordinates, jnp.where(loads.on_beam(times).T, position, jnp.nan), -force, commands
+    return *coordinates, xp.where(loads.on_beam(times).T, position, xp.nan), -force, commands

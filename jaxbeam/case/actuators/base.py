@@ -4,8 +4,9 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxbeam.runtime.arrays import xp
 
 
 class Attachment(eqx.Module):
@@ -32,7 +33,7 @@ class Attachment(eqx.Module):
     @property
     def static_gain(self) -> Float[Array, ""]:
         """Generalised force per unit of a steady command, with the port at rest."""
-        steady_states = jnp.linalg.solve(self.state_matrix, self.input_matrix)
+        steady_states = xp.linalg.solve(self.state_matrix, self.input_matrix)
         return self.feedthrough - self.output_matrix @ steady_states
 
 

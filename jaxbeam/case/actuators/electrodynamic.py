@@ -2,11 +2,11 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
+from jaxbeam.runtime.arrays import xp
 
 
 class Electrodynamic(AbstractActuator):
@@ -43,7 +43,7 @@ class Electrodynamic(AbstractActuator):
             input_matrix=1 / self.inductance[None],
             velocity_matrix=-(back_emf / self.inductance)[None],
             output_matrix=self.force_constant[None],
-            feedthrough=jnp.zeros(()),
+            feedthrough=xp.zeros(()),
             stiffness=self.stiffness,
             damping=self.damping,
             mass=self.mass,

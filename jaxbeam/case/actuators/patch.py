@@ -2,7 +2,6 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment, SectionStiffening
@@ -16,6 +15,7 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
 )
+from jaxbeam.runtime.arrays import xp
 
 # Fields from which the moment per volt is derived where it is not given.
 MOMENT_SOURCES = (
@@ -98,24 +98,24 @@ class Patch(AbstractActuator):
         return ((self.start, 1, 1.0), (self.end, 1, -1.0))
 
     def attachment(self) -> Attachment:
-        no_states, zero = jnp.zeros(0), jnp.zeros(())
+        no_states, zero = xp.zeros(0), xp.zeros(())
         moment = self.moment_constant * self.correction * self.amplifier_gain
-        return Attachment(jnp.zeros((0, 0)), no_states, no_states, no_states, moment, zero, zero)
+        return Attachment(xp.zeros((0, 0)), no_states, no_states, no_states, moment, zero, zero)
 
     def section_stiffening(self) -> SectionStiffening | None:
         if self.added_mass is None and self.added_rigidity is None:
             return None
-        mass = jnp.zeros(()) if self.added_mass is None else self.added_mass
-        rigidity = jnp.zeros(()) if self.added_rigidity is None else self.added_rigidity
+        mass = xp.zeros(()) if self.added_mass is None else self.added_mass
+        rigidity = xp.zeros(()) if self.added_rigidity is None else self.added_rigidity
         return SectionStiffening(self.start, self.end, rigidity, mass)
 
     def command_limits(self) -> Float[Array, "2"]:
         depolarisation_limits = self.depolarisation / self.amplifier_gain
         if self.limits is None:
             return depolarisation_limits
-        lowest = jnp.maximum(depolarisation_limits[0], self.limits[0])
-        highest = jnp.minimum(depolarisation_limits[1], self.limits[1])
-        return jnp.stack([lowest, highest])
+        lowest = xp.maximum(depolarisation_limits[0], self.limits[0])
+        highest = xp.minimum(depolarisation_limits[1], self.limits[1])
+        return xp.stack([lowest, highest])
 
     def command_rate_limit(self) -> Float[Array, ""] | None:
         return self.rate_limit

@@ -2,11 +2,11 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment
 from jaxbeam.case.fields import INCREASING, ON_BEAM, number
+from jaxbeam.runtime.arrays import xp
 
 
 class PointForce(AbstractActuator):
@@ -23,7 +23,7 @@ class PointForce(AbstractActuator):
         return ((self.position, 0, 1.0),)
 
     def attachment(self) -> Attachment:
-        no_states, zero = jnp.zeros(0), jnp.zeros(())
+        no_states, zero = xp.zeros(0), xp.zeros(())
         return Attachment(
-            jnp.zeros((0, 0)), no_states, no_states, no_states, jnp.ones(()), zero, zero
+            xp.zeros((0, 0)), no_states, no_states, no_states, xp.ones(()), zero, zero
         )

@@ -2,11 +2,11 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
+from jaxbeam.runtime.arrays import xp
 
 
 class Shaker(AbstractActuator):
@@ -37,9 +37,9 @@ class Shaker(AbstractActuator):
         return Attachment(
             state_matrix=-self.bandwidth[None, None],
             input_matrix=self.bandwidth[None],
-            velocity_matrix=jnp.zeros(1),
+            velocity_matrix=xp.zeros(1),
             output_matrix=self.force_per_volt[None],
-            feedthrough=jnp.zeros(()),
+            feedthrough=xp.zeros(()),
             stiffness=self.stiffness,
             damping=self.damping,
         )

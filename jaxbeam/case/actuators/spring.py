@@ -2,11 +2,11 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number
+from jaxbeam.runtime.arrays import xp
 
 
 class SpringDamper(AbstractActuator):
@@ -29,8 +29,8 @@ class SpringDamper(AbstractActuator):
         return ((self.position, 0, 1.0),)
 
     def attachment(self) -> Attachment:
-        no_states, zero = jnp.zeros(0), jnp.zeros(())
-        square = jnp.zeros((0, 0))
+        no_states, zero = xp.zeros(0), xp.zeros(())
+        square = xp.zeros((0, 0))
         return Attachment(
             square, no_states, no_states, no_states, zero, self.stiffness, self.damping
         )

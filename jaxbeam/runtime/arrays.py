@@ -1,0 +1,230 @@
+"""Array functions for NumPy and JAX: known numbers are computed at once, traced ones are recorded.
+
+`xp` has the functions that `numpy` and `jax.numpy` share. A function of `xp` is that of JAX if one
+of its arguments is an array of JAX (in `jit`, `grad` or `vmap` a tracer), else that of NumPy, which
+needs no compiler: the same lines serve the first answer and the compiled, differentiated program.
+The other functions here replace what the two write differently: indexed updates, loops, branches.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+_KNOWN = (np.ndarray, np.generic, float, int, bool, str, type(None), type, slice)
+
+
+def is_jax(value: Any) -> bool:
+    """Whether a value, or any in a nested list or tuple, is an array of JAX."""
+    if isinstance(value, _KNOWN):
+        return False
+    if isinstance(value, list | tuple):
+        return any(map(is_jax, value))
+    return isinstance(value, jax.Array)
+
+
+def any_jax(*trees: Any) -> bool:
+    """Whether any leaf of some trees is an array of JAX."""
+    return any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(trees))
+
+
+class _Namespace:
+    """Functions of two libraries under one name; see the module."""
+
+    def __init__(self, known, traced):
+        self._known, self._traced = known, traced
+
+    def __getattr__(self, name):
+        known, traced = getattr(self._known, name), getattr(self._traced, name)
+        if name == "linalg":
+            attribute = _Namespace(known, traced)
+        elif isinstance(known, type) or not callable(known):
+            attribute = known
+        else:
+
+            @functools.wraps(known)
+            def attribute(*args, **kwargs):
+                if any(map(is_jax, args)) or (kwargs and any(map(is_jax, kwargs.values()))):
+                    return traced(*args, **kwargs)
+                return known(*args, **kwargs)
+
+        setattr(self, name, attribute)  # found without this method from now on
+        return attribute
+
+
+if TYPE_CHECKING:
+    xp = jnp
+else:
+    xp = _Namespace(np, jnp)
+
+
+def set_at(array, index, value):
+    """Copy of an array with the entries at an index replaced."""
+    if is_jax(array) or is_jax(index) or is_jax(value):
+        return jnp.asarray(array).at[index].set(value)
+    array = np.array(array, np.result_type(array, value))
+    array[index] = value
+    return array
+
+
+def add_at(array, index, value):
+    """Copy of an array with a value added to the entries at an index; repeated ones accumulate."""
+    if is_jax(array) or is_jax(index) or is_jax(value):
+        return jnp.asarray(array).at[index].add(value)
+    array = np.array(array, np.result_type(array, value))
+    np.add.at(array, index, value)
+    return array
+
+
+def put(array, index, values):
+    """Copy of an array with the rows at some indices replaced; indices beyond the end are left out.
+
+    One index at most may lie within the array more than once.
+    """
+    if is_jax(array) or is_jax(index) or is_jax(values):
+        return jnp.asarray(array).at[index].set(values, mode="drop")
+    array, inside = np.array(array), np.asarray(index) < len(array)
+    array[np.asarray(index)[inside]] = np.asarray(values)[inside]
+    return array
+
+
+def checkpoint(function: Callable, policy: Callable) -> Callable:
+    """`jax.checkpoint`: in reverse mode, save only what the policy names."""
+    checkpointed = jax.checkpoint(function, policy=policy)
+
+    def call(*args):
+        return checkpointed(*args) if any_jax(args) else function(*args)
+
+    return call
+
+
+def stop_gradient(tree):
+    """The same numbers, of which derivatives are zero."""
+    return jax.lax.stop_gradient(tree) if any_jax(tree) else tree
+
+
+def scan(step: Callable, carry, inputs=None, length: int | None = None):
+    """`jax.lax.scan`: a loop over the first axis of inputs; the final carry and stacked outputs."""
+    if any_jax(carry, inputs):
+        return jax.lax.scan(step, carry, inputs, length)
+    leaves, structure = jax.tree.flatten(inputs)
+    outputs = []
+    for i in range(len(leaves[0]) if leaves else length):
+        carry, output = step(carry, structure.unflatten([leaf[i] for leaf in leaves]))
+        outputs.append(output)
+    return carry, jax.tree.map(lambda *parts: np.stack(parts), *outputs)
+
+
+def map_elements(function: Callable, inputs):
+    """`jax.lax.map`: results of a function of each element along the first axis, stacked."""
+    return scan(lambda _, element: (None, function(element)), None, inputs)[1]
+
+
+def while_loop(condition: Callable, step: Callable, carry):
+    """`jax.lax.while_loop`."""
+    if any_jax(carry):
+        return jax.lax.while_loop(condition, step, carry)
+    while condition(carry):
+        carry = step(carry)
+    return carry
+
+
+def cond(predicate, if_true: Callable, if_false: Callable, *operands):
+    """`jax.lax.cond`; only one branch is computed where the predicate is known."""
+    if is_jax(predicate):
+        return jax.lax.cond(predicate, if_true, if_false, *operands)
+    return if_true(*operands) if predicate else if_false(*operands)
+
+
+class custom_jvp:
+    """`jax.custom_jvp` of a function that known numbers call as it stands."""
+
+    def __init__(self, function: Callable):
+        self.function, self.traced = function, jax.custom_jvp(function)
+        functools.update_wrapper(self, function)
+
+    def __call__(self, *args):
+        return self.traced(*args) if any_jax(args) else self.function(*args)
+
+    def defjvp(self, rule: Callable) -> Callable:
+        """Set the rule of derivatives; see `jax.custom_jvp`."""
+        return self.traced.defjvp(rule)
+
+
+def fori_loop(start: int, end: int, step: Callable, carry):
+    """`jax.lax.fori_loop`."""
+    if any_jax(carry):
+        return jax.lax.fori_loop(start, end, step, carry)
+    for i in range(start, end):
+        carry = step(i, carry)
+    return carry
+
+
+def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
+    """`jax.vmap`; a loop for known arguments, so for few elements."""
+
+    def mapped(*args):
+        if any_jax(args):
+            return jax.vmap(function, in_axes, out_axes)(*args)
+        axes = in_axes if isinstance(in_axes, tuple) else (in_axes,) * len(args)
+        pairs = [(arg, axis) for arg, axis in zip(args, axes, strict=True) if axis is not None]
+        sizes = [np.shape(leaf)[axis] for arg, axis in pairs for leaf in jax.tree.leaves(arg)]
+
+        def element(arg, axis, i):
+            return jax.tree.map(lambda leaf: leaf if axis is None else np.take(leaf, i, axis), arg)
+
+        results = [
+            function(*(element(arg, axis, i) for arg, axis in zip(args, axes, strict=True)))
+            for i in range(sizes[0])
+        ]
+        return jax.tree.map(lambda *parts: np.stack(parts, out_axes), *results)
+
+    return mapped
+
+
+def optimization_barrier(tree):
+    """`jax.lax.optimization_barrier`: values that XLA does not compute twice."""
+    return jax.lax.optimization_barrier(tree) if any_jax(tree) else tree
+
+
+def solve_triangular(matrix, right, lower: bool):
+    """Solution of a triangular system."""
+    if is_jax(matrix) or is_jax(right):
+        return jax.scipy.linalg.solve_triangular(matrix, right, lower=lower)
+    import scipy.linalg  # 0.1 s, which compiled programs need not wait for
+
+    return scipy.linalg.solve_triangular(matrix, right, lower=lower, check_finite=False)
+
+
+def block_diag(*blocks):
+    """Block-diagonal matrix."""
+    if any(map(is_jax, blocks)):
+        return jax.scipy.linalg.block_diag(*blocks)
+    sizes = np.array([block.shape for block in blocks])
+    matrix = np.zeros(sizes.sum(axis=0))
+    for block, (row, column) in zip(blocks, np.cumsum(sizes, axis=0) - sizes, strict=True):
+        matrix[row : row + block.shape[0], column : column + block.shape[1]] = block
+    return matrix
+
+
+def slice_in_dim(array, start: int | None, end: int | None, axis: int):
+    """Slice along one axis; XLA compiles it several times as fast as an index of JAX."""
+    if isinstance(array, jax.Array):
+        return jax.lax.slice_in_dim(array, start, end, axis=axis)
+    return array[(slice(None),) * (axis % array.ndim) + (slice(start, end),)]
+
+
+def index_in_dim(array, index, axis: int = 0, keepdims: bool = True):
+    """Entry at an index along one axis."""
+    if is_jax(array) or is_jax(index):
+        return jax.lax.dynamic_index_in_dim(array, index, axis, keepdims)
+    return np.take(array, [index] if keepdims else index, axis)
+
+
+def collapse(array, start: int, end: int):
+    """The array with the axes from start until before end made one."""
+    shape = array.shape
+    return array.reshape(*shape[:start], -1, *shape[end:])
