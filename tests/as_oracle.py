@@ -6,10 +6,10 @@ from tests.oracles import finite_elements
 
 def as_oracle(case: Case, elements: int = 40) -> finite_elements.Beam:
     """Finite-element beam of a case with supports, patches and suspensions, without loads."""
-    bonded = [
+    stiffenings = [
         b for b in (actuator.section_stiffening() for actuator in case.actuators) if b is not None
     ]
-    hung = [(a.displacement_map(), a.attachment()) for a in case.actuators]
+    attachments = [(a.displacement_map(), a.attachment()) for a in case.actuators]
     supports = [
         finite_elements.Support(
             float(s.position),
@@ -29,12 +29,14 @@ def as_oracle(case: Case, elements: int = 40) -> finite_elements.Beam:
             finite_elements.Patch(
                 float(b.start), float(b.end), float(b.bending_stiffness), float(b.mass_per_length)
             )
-            for b in bonded
+            for b in stiffenings
         ],
         [
-            finite_elements.Suspension(float(stroke[0][0]), float(a.stiffness), float(a.damping))
-            for stroke, a in hung
-            if len(stroke) == 1 and stroke[0][1] == 0
+            finite_elements.Suspension(
+                float(displacement_map[0][0]), float(a.stiffness), float(a.damping)
+            )
+            for displacement_map, a in attachments
+            if len(displacement_map) == 1 and displacement_map[0][1] == 0
         ],
         elements=elements,
     )

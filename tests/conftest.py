@@ -1,4 +1,4 @@
-"""Settings of all tests, made before anything else is imported.
+"""Settings of all tests, before any other import.
 
 float64 is not set here: importing `jaxbeam` sets it, for the tests as for users.
 """
@@ -28,9 +28,9 @@ os.environ["XLA_FLAGS"] = " ".join(
 if importlib.metadata.version("jaxlib").startswith(("0.10.", "0.11.0")):
     # Later versions do not have this flag, and an unknown flag ends the process.
     os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
-# What one process has compiled, the other test processes, later files, and commands that tests
-# start need not compile again: they use the same folder, set before the test processes start. It
-# is also their cache folder, as what a user compiled by `jaxbeam native` must not change a test.
+# Compiled programs are shared by all test processes, later files, and commands that tests start:
+# they use one folder, set before the test processes start. It is also their cache folder, so that
+# a library which a user compiled by `jaxbeam native` changes no test.
 if "PYTEST_XDIST_WORKER" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="compiled", ignore_cleanup_errors=True)
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _cache.name)

@@ -70,18 +70,18 @@ def contents(draw, content: bytes) -> bytes:
             break
         # More often near the beginning, where headers are.
         limit = draw(st.sampled_from([60, 300, len(changed)]))
-        at = draw(st.integers(0, min(limit, len(changed)) - 1))
+        index = draw(st.integers(0, min(limit, len(changed)) - 1))
         change = draw(st.sampled_from(["flip", "cut", "fill", "snippet", "repeat", "end"]))
         if change == "flip":
-            changed[at] ^= 1 << draw(st.integers(0, 7))
+            changed[index] ^= 1 << draw(st.integers(0, 7))
         elif change == "cut":
-            del changed[at : at + draw(st.integers(1, 50))]
+            del changed[index : index + draw(st.integers(1, 50))]
         elif change == "fill":
-            changed[at:at] = draw(st.binary(min_size=1, max_size=20))
+            changed[index:index] = draw(st.binary(min_size=1, max_size=20))
         elif change == "snippet":
-            changed[at:at] = draw(st.sampled_from(SNIPPETS))
+            changed[index:index] = draw(st.sampled_from(SNIPPETS))
         elif change == "repeat":
-            changed[at:at] = changed[at // 2 : at // 2 + 40]
+            changed[index:index] = changed[index // 2 : index // 2 + 40]
         else:
-            del changed[at:]
+            del changed[index:]
     return bytes(changed)

@@ -1,4 +1,4 @@
-"""CONTRIBUTING is true: its paths and commands exist, and its picture shows today's imports."""
+"""CONTRIBUTING: its paths and commands exist, and its picture shows the present imports."""
 
 import html
 import re
@@ -63,6 +63,6 @@ def test_pytest_accepts_its_options(command):
     assert ended.returncode == 0, ended.stdout + ended.stderr
 
 
-def test_the_picture_shows_the_imports_of_today():
+def test_the_picture_shows_the_present_imports():
     text = html.unescape(PICTURE.read_text(encoding="utf-8"))
     assert listing(package_imports()) in text, "run: .venv/bin/uv run python -m docs.draw_rooms"

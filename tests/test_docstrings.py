@@ -1,4 +1,4 @@
-"""Docstrings: every public module, class, function and method has one, with what it raises."""
+"""Docstrings: every public module, class, function and method has one, with its exceptions."""
 
 import ast
 import doctest
@@ -58,5 +58,5 @@ def test_docstrings_say_what_is_raised(name):
     "name", [name for name, path in FILES.items() if ">>> " in path.read_text(encoding="utf-8")]
 )
 def test_examples_in_docstrings_print_what_they_show(name):
-    found = doctest.testmod(importlib.import_module(name.removesuffix(".__init__")))
-    assert found.attempted and not found.failed
+    results = doctest.testmod(importlib.import_module(name.removesuffix(".__init__")))
+    assert results.attempted and not results.failed

@@ -53,10 +53,10 @@ def package(module: str) -> str:
         return "jaxbeam"
     parts = module.split(".")
     names = [".".join(parts[:end]) for end in range(len(parts), 1, -1)]
-    found = next((name for name in names if name in RANKS), None)
-    found = found or (parts[0] if parts[0] in RANKS and len(parts) <= 2 else None)
-    assert found, f"give the package of {module} a place in ORDER of tests/test_imports.py"
-    return found
+    entry = next((name for name in names if name in RANKS), None)
+    entry = entry or (parts[0] if parts[0] in RANKS and len(parts) <= 2 else None)
+    assert entry, f"give the package of {module} a place in ORDER of tests/test_imports.py"
+    return entry
 
 
 def imported(tree: ast.AST, files: Mapping[str, object]) -> Iterator[tuple[str, int]]:
@@ -81,13 +81,13 @@ def imported(tree: ast.AST, files: Mapping[str, object]) -> Iterator[tuple[str, 
 
 def violations(imports: Mapping[str, set[str]]) -> list[str]:
     """Sentences on imports of packages that are not above in ORDER."""
-    found = []
+    sentences = []
     for module, others in imports.items():
         for other in others:
             here, there = package(module), package(other)
             if here != there and not RANKS[there] < RANKS[here]:
-                found.append(f"{module} imports {other}, which is not above it in ORDER")
-    return found
+                sentences.append(f"{module} imports {other}, which is not above it in ORDER")
+    return sentences
 
 
 def circle(imports: Mapping[str, set[str]]) -> list[str]:
@@ -134,16 +134,20 @@ def test_experiments_are_imported_only_when_a_command_needs_them():
         tree = parse(path)
         eager = [node for node in tree.body if not isinstance(node, ast.FunctionDef)]
         names = itertools.chain.from_iterable(imported(node, FILES) for node in eager)
-        found = [name for name, _ in names if name.startswith("experiments")]
-        assert not found, f"{module} imports {found} outside a function"
+        imported_experiments = [name for name, _ in names if name.startswith("experiments")]
+        assert not imported_experiments, (
+            f"{module} imports {imported_experiments} outside a function"
+        )
 
 
 def test_only_the_validation_page_imports_the_tests():
     """Its references are the independent sources of the tests, which the wheel does not have."""
-    found = {
+    importing_modules = {
         module
         for module, path in FILES.items()
         for node in ast.walk(parse(path))
         if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "tests"
     }
-    assert found and all(module.startswith("experiments.validation.") for module in found)
+    assert importing_modules and all(
+        module.startswith("experiments.validation.") for module in importing_modules
+    )

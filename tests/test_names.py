@@ -7,9 +7,9 @@ from tests.modules import module_files, parse
 
 
 def test_no_class_name_is_used_twice():
-    found = collections.defaultdict(list)
+    modules_by_class = collections.defaultdict(list)
     for module, path in module_files().items():
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.ClassDef):
-                found[node.name].append(module)
-    assert {name: modules for name, modules in found.items() if len(modules) > 1} == {}
+                modules_by_class[node.name].append(module)
+    assert {name: modules for name, modules in modules_by_class.items() if len(modules) > 1} == {}

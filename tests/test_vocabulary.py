@@ -38,7 +38,7 @@ def subclasses(base: type) -> set[type]:
 
 
 def resolved(name: str):
-    """Module, or what is in it, of a dotted name."""
+    """Module, class, function or attribute of a dotted name."""
     module, _, attribute = name.rpartition(".")
     try:
         return importlib.import_module(name)

@@ -1,4 +1,4 @@
-"""Compiling with optimisations, for programs that run so long in a test that it pays."""
+"""Compiling with optimisations, for programs whose run time in a test outweighs compiling."""
 
 import contextlib
 import os

@@ -139,12 +139,12 @@ def time_fits() -> dict[str, float]:
     # A fit estimates the noise; here it is given, for the same weights as scipy.
     noise = np.full(solution.noise.shape, NOISE)
     weighting = (
-        search.step_scale(solution.unbounded, noise)[None],
+        search.step_scale(solution.unbounded, noise),
         search.weights(noise),
         dataset.measured,
     )
-    points, _ = search.minimise(solution.unbounded[None], *weighting, np.ones(len(numbers), bool))
-    by_jaxbeam = search.values_at(points[0])
+    point, _ = search.minimise(solution.unbounded, *weighting, np.ones(len(numbers), bool))
+    by_jaxbeam = search.values_at(point)
     return {
         "first_fit_s": first,
         "fit_s": again,

@@ -90,25 +90,24 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     for i, speed in enumerate(runner.batches.shared_values[:, 0]):
         model = jax.tree.map(lambda leaf, i=i: leaf[i], discrete_models)
         panels = np.flatnonzero(model.grid.counts)  # the crossing, and the time after the exit
-        kinds = [int(model.grid.kind[panel]) for panel in panels]
+        length_indices = [int(model.grid.length_index[panel]) for panel in panels]
         counts = [int(model.grid.counts[panel]) for panel in panels]
-        step_length = float(model.grid.lengths[kinds[0]])
-        crossings.append(
-            (*(_step_matrices(model, kind) for kind in kinds), float(speed), step_length, *counts)
-        )
+        step_length = float(model.grid.lengths[length_indices[0]])
+        matrices = [_step_matrices(model, index) for index in length_indices]
+        crossings.append((*matrices, float(speed), step_length, *counts))
     return beam, crossings
 
 
-def _step_matrices(model, kind: int) -> np.ndarray:
-    """Step matrices of one kind of step as `StepMatrices` of kernel.c."""
+def _step_matrices(model, length_index: int) -> np.ndarray:
+    """Step matrices of one step length as `StepMatrices` of kernel.c."""
     step = model.propagators
     parts = (
-        step.transition_nodes[kind],
-        step.input_nodes[kind][..., 0],
-        step.transition_end[kind],
-        step.input_end[kind][..., 0],
-        model.monitored_transition[kind],
-        model.monitored_input[kind][..., 0],
+        step.transition_nodes[length_index],
+        step.input_nodes[length_index][..., 0],
+        step.transition_end[length_index],
+        step.input_end[length_index][..., 0],
+        model.monitored_transition[length_index],
+        model.monitored_input[length_index][..., 0],
     )
     return np.concatenate([np.ravel(part) for part in parts])
 

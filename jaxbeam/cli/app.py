@@ -94,8 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def current_words(arguments: Sequence[str]) -> Iterator[str]:
-    """Words of a command line, renamed commands and options in their new words; warns of each."""
-    command = None
+    """Words of a command line, renamed commands and options in their new words; warns once each."""
+    command, warned = None, set()
     for word in arguments:
         name, equals, value = word.partition("=")
         if command is None:
@@ -103,7 +103,8 @@ def current_words(arguments: Sequence[str]) -> Iterator[str]:
             command = new
         else:
             new = RENAMED_OPTIONS.get(command, {}).get(name, name)
-        if new != name:
+        if new != name and name not in warned:
+            warned.add(name)
             print_message(f"warning: {name} is called {new} now; the old word will be removed")
         yield new + equals + value
 

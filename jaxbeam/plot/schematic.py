@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.path import Path
 
 from jaxbeam.case.actuators.base import AbstractActuator
+from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, colour, separate_labels
@@ -27,9 +28,13 @@ ACTUATOR_MARKER = Path(
     [(0, 0), (0, -0.4), (-0.5, -0.4), (-0.5, -1), (0.5, -1), (0.5, -0.4), (0, -0.4)]
 )
 LOAD_MARKER = Path.circle((0, 1), 1)
+# By what an end condition holds: deflection, rotation.
 END_MARKERS = {
-    "clamped": _line_segments(_WALL_LINES),
-    "guided": _line_segments([*((x - 0.5, y) for x, y in _WALL_LINES), (0.0, -1.0), (0.0, 1.0)]),
+    (True, False): PIN_MARKER,
+    (True, True): _line_segments(_WALL_LINES),
+    (False, True): _line_segments(
+        [*((x - 0.5, y) for x, y in _WALL_LINES), (0.0, -1.0), (0.0, 1.0)]
+    ),
 }
 
 
@@ -42,10 +47,8 @@ def draw_supports(axes, case: Case, y: int | float = 0, size: int | float = 22) 
     """Draw the ends and supports of a case at height y (data units); `size` is in points."""
     length = float(concrete(case.beam.length))
     for x, end, side in ((0.0, case.beam.left_end, 1), (length, case.beam.right_end, -1)):
-        if end == "pinned":
-            _draw_marker(axes, x, y, PIN_MARKER, size)
-        elif end in END_MARKERS:
-            marker = END_MARKERS[end]
+        marker = END_MARKERS.get(END_CONDITIONS[end])
+        if marker is not None:
             _draw_marker(axes, x, y, Path(marker.vertices * (side, 1), marker.codes), size)
     for support in case.supports:
         marker_path = PIN_MARKER if support.stiffness is None else SPRING_MARKER

@@ -80,13 +80,15 @@ def test_power_balance_of_a_coil(back_emf):
     volts, current, rates = 3.0, state[6], state[1:6:2]
     change = matrix @ state + np.asarray(model.command_matrix)[:, 0] * volts
     displacements, stiffness = state[0:6:2], np.asarray(model.stiffness())
-    stored = rates @ change[1:6:2] + displacements @ stiffness @ rates + 5e-5 * current * change[6]
-    lost = -rates @ matrix[1:6:2, 1:6:2] @ rates + 0.82 * current**2
-    assert lost > 0
-    created = ((4.2 - (4.2 if back_emf is None else back_emf)) * current) * float(
+    stored_power = (
+        rates @ change[1:6:2] + displacements @ stiffness @ rates + 5e-5 * current * change[6]
+    )
+    dissipated = -rates @ matrix[1:6:2, 1:6:2] @ rates + 0.82 * current**2
+    assert dissipated > 0
+    mismatch_power = ((4.2 - (4.2 if back_emf is None else back_emf)) * current) * float(
         model.displacement_map[0] @ rates
     )
-    assert_allclose(volts * current + created, stored + lost, rtol=1e-10)
+    assert_allclose(volts * current + mismatch_power, stored_power + dissipated, rtol=1e-10)
 
 
 @pytest.mark.slow
@@ -103,20 +105,22 @@ def test_crossing_mass_on_a_beam_with_a_shorted_coil():
     wave = np.arange(1, 4) * np.pi / beam["length"]
     omega = wave**2 * np.sqrt(beam["rigidity"] / beam["density"])
     size = np.sqrt(2 / (beam["density"] * beam["length"]))
-    at = size * np.sin(wave * 0.5)
+    shape_at_coil = size * np.sin(wave * 0.5)
 
     def rates(t, y, on):
         q, u, current = y[:3], y[3:6], y[6]
-        mass = np.eye(3) + 0.02 * np.outer(at, at)
+        mass = np.eye(3) + 0.02 * np.outer(shape_at_coil, shape_at_coil)
         force = -2 * 0.03 * omega * u - omega**2 * q
-        force += at * (4.2 * current - 9700 * at @ q - 0.55 * at @ u)
+        force += shape_at_coil * (
+            4.2 * current - 9700 * shape_at_coil @ q - 0.55 * shape_at_coil @ u
+        )
         if on:
             x, speed = 2.0 * t, 2.0
             shape = size * np.sin(wave * x)
             slope, curvature = size * wave * np.cos(wave * x), -size * wave**2 * np.sin(wave * x)
             mass += 0.5 * np.outer(shape, shape)
             force -= shape * 0.5 * (9.81 + 2 * speed * slope @ u + speed**2 * curvature @ q)
-        coil = (-0.82 * current - 4.2 * at @ u) / 5e-5
+        coil = (-0.82 * current - 4.2 * shape_at_coil @ u) / 5e-5
         return np.concatenate([u, np.linalg.solve(mass, force), [coil]])
 
     options = {"method": "Radau", "rtol": 1e-9, "atol": 1e-12}

@@ -24,7 +24,7 @@ PERIOD = 1e-3
 SIGNAL = np.random.default_rng(7).normal(size=(400, 3)).cumsum(axis=0)
 
 
-def designed(order, cutoff):
+def scipy_sections(order, cutoff):
     """Sections of the same digital filter by scipy."""
     return scipy.signal.butter(order, cutoff, fs=1 / PERIOD, output="sos")
 
@@ -35,9 +35,9 @@ def test_frequency_response_of_a_digital_filter(order, cutoff):
     frequencies = np.linspace(0.01, 499.0, 200)
     ours = np.asarray(second_order_sections(Filter(cutoff, order), PERIOD))
     found = scipy.signal.sosfreqz(ours, frequencies, fs=1 / PERIOD)[1]
-    expected = scipy.signal.sosfreqz(designed(order, cutoff), frequencies, fs=1 / PERIOD)[1]
-    seen = np.abs(expected) > 1e-12
-    assert_allclose(found[seen], expected[seen], rtol=1e-9)
+    expected = scipy.signal.sosfreqz(scipy_sections(order, cutoff), frequencies, fs=1 / PERIOD)[1]
+    significant = np.abs(expected) > 1e-12
+    assert_allclose(found[significant], expected[significant], rtol=1e-9)
     at_cutoff = scipy.signal.sosfreqz(ours, [cutoff], fs=1 / PERIOD)[1]
     assert_allclose(np.abs(at_cutoff), 1 / np.sqrt(2), rtol=1e-9)
 
@@ -47,7 +47,7 @@ def test_frequency_response_of_a_digital_filter(order, cutoff):
 def test_history_equals_sosfilt(order, cutoff):
     rows = second_order_sections(Filter(cutoff, order), PERIOD)
     rest = steady_filter_state(rows, np.zeros(3))
-    expected = scipy.signal.sosfilt(designed(order, cutoff), SIGNAL, axis=0)
+    expected = scipy.signal.sosfilt(scipy_sections(order, cutoff), SIGNAL, axis=0)
     found = filter_history(rows, rest, jnp.asarray(SIGNAL))
     assert_allclose(found, expected, rtol=0, atol=1e-10 * np.max(np.abs(SIGNAL)))
 
@@ -74,7 +74,7 @@ def test_each_run_of_a_batch_may_have_its_own_filter():
     rows = jax.vmap(lambda c: second_order_sections(Filter(c, 3), PERIOD), out_axes=-1)(cutoffs)
     found = filter_history(rows, steady_filter_state(rows, np.zeros(3)), jnp.asarray(SIGNAL))
     for i, cutoff in enumerate(cutoffs):
-        expected = scipy.signal.sosfilt(designed(3, float(cutoff)), SIGNAL[:, i])
+        expected = scipy.signal.sosfilt(scipy_sections(3, float(cutoff)), SIGNAL[:, i])
         assert_allclose(found[:, i], expected, rtol=0, atol=1e-11 * np.max(np.abs(SIGNAL)))
 
 
@@ -146,10 +146,10 @@ def test_derivatives_with_respect_to_the_cutoff(order):
         matrix, column, _, _ = analogue_state_space(Filter(cutoff[0], order))
         return jnp.concatenate([part.ravel() for part in c2d(matrix, column[:, None], 0.01)])
 
-    at = jnp.array([60.0])
+    point = jnp.array([60.0])
     for function in (digital, continuous):
-        expected = central(function, at, step=0.05)
+        expected = central(function, point, step=0.05)
         size = np.max(np.abs(expected))
         for derivative in (jax.jacfwd, jax.jacrev):
-            found = jax.jit(derivative(function))(at)
+            found = jax.jit(derivative(function))(point)
             assert_allclose(found, expected, rtol=0, atol=1e-7 * size)

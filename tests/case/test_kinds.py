@@ -1,4 +1,4 @@
-"""Kinds: a class that declares one is found by it, without being registered anywhere."""
+"""Kinds: a class is found by the kind that it declares, without registration."""
 
 import abc
 from typing import ClassVar
@@ -107,4 +107,6 @@ def test_every_class_of_a_case_has_a_kind(key):
 
 
 def _subclasses(part_class):
-    return {deep for each in part_class.__subclasses__() for deep in {each, *_subclasses(each)}}
+    return {
+        subclass for each in part_class.__subclasses__() for subclass in {each, *_subclasses(each)}
+    }

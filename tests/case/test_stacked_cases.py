@@ -1,4 +1,4 @@
-"""Helpers on cases: several stacked to one, and times at which loads enter and leave."""
+"""Cases stacked along a first axis, and times at which loads enter and leave."""
 
 import dataclasses
 

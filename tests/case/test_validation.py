@@ -90,7 +90,7 @@ NUMBERS = [
 
 @pytest.mark.parametrize(("address", "value", "message"), NUMBERS)
 def test_invalid_numbers_are_refused(address, value, message):
-    refuses(replace(CASE, {address: value}), message)
+    assert_refused(replace(CASE, {address: value}), message)
 
 
 # Inconsistent cases, and a part of the error message.
@@ -183,19 +183,19 @@ CASES = [
 
 @pytest.mark.parametrize(("case", "message"), CASES)
 def test_contradictions_are_refused(case, message):
-    refuses(case, message)
+    assert_refused(case, message)
 
 
 def test_wrong_shapes_and_types_are_refused():
     """Constructors do not check shapes outside of tests; `tree_at` goes past them here."""
     lengths = eqx.tree_at(lambda c: c.beam.length, CASE, jnp.ones(2))
-    refuses(lengths, "beam.length must be one number, not an array of shape (2,)")
+    assert_refused(lengths, "beam.length must be one number, not an array of shape (2,)")
     nothing = eqx.tree_at(lambda c: c.beam.length, CASE, None)
-    refuses(nothing, "beam.length is missing; give the total length in m")
+    assert_refused(nothing, "beam.length is missing; give the total length in m")
     word = eqx.tree_at(lambda c: c.loads[0].mass, CASE, "heavy")
-    refuses(word, "loads.0.mass must be one number, not 'heavy'")
+    assert_refused(word, "loads.0.mass must be one number, not 'heavy'")
     limit = eqx.tree_at(lambda c: c.actuators[0].limits, CASE, jnp.ones(()))
-    refuses(limit, "actuators.0.limits must be a list of 2 numbers, not one number")
+    assert_refused(limit, "actuators.0.limits must be a list of 2 numbers, not one number")
 
 
 def test_negative_speed_and_rounded_positions_pass():
@@ -225,7 +225,7 @@ def test_validation_takes_milliseconds():
     assert time.perf_counter() - start < 0.5, "ten should take far less than 50 ms"
 
 
-def refuses(case, message):
+def assert_refused(case, message):
     """Assert that the case is refused with one line that contains the message."""
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         check_case(case)

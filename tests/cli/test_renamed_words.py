@@ -34,6 +34,12 @@ def test_old_options(capsys, command, old, new):
     assert old not in parameters(command)
 
 
+def test_an_old_option_given_twice_is_one_warning(capsys):
+    line = ["tune", "a.toml", "--over", "mean", "--over", "worst"]
+    assert list(current_words(line)).count("--aggregate") == 2
+    assert capsys.readouterr().err.count("--over is called --aggregate now") == 1
+
+
 def test_new_words_and_those_of_other_commands_are_left_alone(capsys):
     line = ["sweep", "case.toml", "--over", "loads.0.mass=1,2"]
     assert list(current_words(line)) == line

@@ -155,7 +155,7 @@ def test_part_without_a_kind_is_not_written():
         case_to_dict(case)
 
 
-# Text in the file above, what replaces it, and a part of the error message.
+# Text in the file above, its replacement, and a part of the error message.
 REFUSED = [
     ("[beam]", "[bean]", "a case has no 'bean'; did you mean 'beam'?"),
     ("length = 0.6", "lenght = 0.6", "beam has no key 'lenght'; did you mean 'length'?"),

@@ -1,4 +1,4 @@
-"""Files of gains: exact round trips, equal commands of the C header, damage is detected."""
+"""Files of gains: exact round trips, equal commands by the C header, and damaged files."""
 
 import dataclasses
 import importlib.util
@@ -55,14 +55,14 @@ CONSTANT = dataclasses.replace(
 )
 # Estimator of five states, of which four are fed back; two commands, three readings.
 ESTIMATED = dataclasses.replace(CONSTANT, estimator=RANDOM.normal(size=(8, 12)), reading_count=3)
-EVERY = {
+ALL_GAINS = {
     "table": TABLE,
     "constant": CONSTANT,
     "family": FAMILY,
     "nearest": NEAREST,
     "estimated": ESTIMATED,
 }
-every = pytest.mark.parametrize("gains", EVERY.values(), ids=EVERY)
+all_gains = pytest.mark.parametrize("gains", ALL_GAINS.values(), ids=ALL_GAINS)
 SHARES = [-0.1, 0.0, 0.37, 0.5, float(POINTS[4]), 0.999, 1.0, 1.7]
 SINCE = [0.0] * 7 + [0.11]
 MASSES = [0.3, 0.1, 0.2, 0.24, 0.3, 0.44, 0.5, 0.8]
@@ -74,25 +74,25 @@ TDMS = pytest.mark.skipif(importlib.util.find_spec("nptdms") is None, reason="ne
 COMPILER = shutil.which("gcc") or shutil.which("cc")
 
 
-def same(found, expected):
+def assert_equal_gains(found, expected):
     for field in dataclasses.fields(Gains):
         assert_array_equal(getattr(found, field.name), getattr(expected, field.name))
 
 
-@every
+@all_gains
 @pytest.mark.parametrize("ending", [".csv", ".mat", pytest.param(".tdms", marks=TDMS)])
 def test_gains_of_a_file_give_the_same_commands(gains, ending, tmp_path):
     path = tmp_path / f"gains{ending}"
     write_gains(gains, path)
-    back = read_gains(path)
-    same(back, gains)
-    for given, state in zip(INPUTS, STATES, strict=True):
-        assert_array_equal(back.command(state, *given), gains.command(state, *given))
+    stored = read_gains(path)
+    assert_equal_gains(stored, gains)
+    for inputs, state in zip(INPUTS, STATES, strict=True):
+        assert_array_equal(stored.command(state, *inputs), gains.command(state, *inputs))
     with pytest.raises(FileExistsError, match="exists already"):
         write_gains(gains, path)
 
 
-@every
+@all_gains
 def test_gains_are_interpolated(gains):
     """As by numpy and scipy; no command before the entry, the decaying gain after the exit."""
     method = "nearest" if gains.interpolation == "nearest" else "linear"
@@ -106,8 +106,8 @@ def test_gains_are_interpolated(gains):
         gain = members[0, 0]
         if grid != (1, 1):
             axes = gains.masses, gains.speeds
-            held = np.clip([mass, speed], [g[0] for g in axes], [g[-1] for g in axes])
-            (gain,) = scipy.interpolate.interpn(axes, members, held, method)
+            clipped = np.clip([mass, speed], [g[0] for g in axes], [g[-1] for g in axes])
+            (gain,) = scipy.interpolate.interpn(axes, members, clipped, method)
         expected = -gain @ state if share >= 0 else np.zeros(2)
         found = gains.command(state, share, since, mass, speed)
         assert_allclose(found, expected, rtol=1e-11, atol=1e-10)
@@ -121,14 +121,14 @@ def test_files_are_readable_by_other_programs(tmp_path):
     assert content["period"].item() == 2e-3
     write_gains(TABLE, tmp_path / "gains.csv")
     first, heading, *rows = (tmp_path / "gains.csv").read_text().splitlines()
-    about = json.loads(first[2:])
-    assert about["period_s"] == 2e-3 and about["columns"][0] == ["q_0", "m kg^0.5"]
+    header = json.loads(first[2:])
+    assert header["period_s"] == 2e-3 and header["columns"][0] == ["q_0", "m kg^0.5"]
     assert heading.split(",")[4] == "K u_0/q_0 [V/(m kg^0.5)]"
     numbers = [float(x) for row in rows if row.startswith("gain") for x in row.split(",")[3:]]
     shares, table = np.array(numbers).reshape(11, 9)[:, 0], np.array(numbers).reshape(11, 9)[:, 1:]
     parts = [[2e-3, 0.6, np.inf, 0.0, 0.0], shares, table, TABLE.rest, TABLE.filters]
-    whole = np.concatenate([np.ravel(part) for part in parts]).astype("<f8").tobytes()
-    assert about["crc32"] == zlib.crc32(whole)
+    content_bytes = np.concatenate([np.ravel(part) for part in parts]).astype("<f8").tobytes()
+    assert header["crc32"] == zlib.crc32(content_bytes)
 
 
 @pytest.mark.parametrize("ending", [".csv", ".mat"])
@@ -147,7 +147,7 @@ def test_changed_numbers_are_refused(ending, tmp_path):
 
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
-@every
+@all_gains
 def test_c_header_gives_the_same_commands(gains, tmp_path):
     write_gains(gains, tmp_path / "gains.h")
     calls = "".join(
@@ -167,7 +167,7 @@ def test_c_header_gives_the_same_commands(gains, tmp_path):
         [tmp_path / "run"], capture_output=True, text=True, check=True
     ).stdout.splitlines()
     found = [[float.fromhex(word) for word in line.split()] for line in printed]
-    expected = [gains.command(z, *given) for given, z in zip(INPUTS, STATES, strict=True)]
+    expected = [gains.command(z, *inputs) for inputs, z in zip(INPUTS, STATES, strict=True)]
     assert_array_equal(found, [*expected, gains.test_command])
 
 
@@ -196,11 +196,11 @@ def test_command_line_exports_the_designed_gains(sampled, tmp_path, capsys):
         main(["export", str(tmp_path / "case.toml"), "-o", str(path), "--json"])
     assert ended.value.code == 0
     assert json.loads(capsys.readouterr().out)["crc32"] == gains.checksum
-    same(read_gains(path), gains)
+    assert_equal_gains(read_gains(path), gains)
     assert gains.columns[-1] == ("last_command_0", "V") and gains.commands == (("command_0", "V"),)
     assert_array_equal(gains.filters[:, 0], [1.0, 1.0])
-    taps = scipy.signal.butter(3, 60.0, fs=500.0, output="sos")
-    _, expected = scipy.signal.freqz_sos(taps, [10.0, 60.0], fs=500.0)
+    sections = scipy.signal.butter(3, 60.0, fs=500.0, output="sos")
+    _, expected = scipy.signal.freqz_sos(sections, [10.0, 60.0], fs=500.0)
     _, found = scipy.signal.freqz_sos(gains.filters[:, 1:], [10.0, 60.0], fs=500.0)
     assert_allclose(found, expected, rtol=1e-9)
 

@@ -43,18 +43,18 @@ def test_exported_estimator_gives_the_commands_of_a_simulation(estimator, tmp_pa
     law = jb.LQR(**WEIGHTS, delay=1e-3, estimator=estimator)
     case = shaker_case(law)
     if isinstance(estimator, jb.Kalman):
-        late = dataclasses.replace(case.sensors[0], delay=jnp.asarray(1e-3))
-        case = dataclasses.replace(case, sensors=(late, case.sensors[1]))
+        delayed = dataclasses.replace(case.sensors[0], delay=jnp.asarray(1e-3))
+        case = dataclasses.replace(case, sensors=(delayed, case.sensors[1]))
     write_gains(export_gains(case), tmp_path / "gains.csv")
     gains = read_gains(tmp_path / "gains.csv")
     times = 2e-3 * jnp.arange(60)
     record = jb.simulate(case, times)
     # A command begins half a period after its sample, so it acts at the next sample.
-    sent, state = [np.zeros(1), np.zeros(1)], np.zeros(gains.estimator_size)
+    commands, state = [np.zeros(1), np.zeros(1)], np.zeros(gains.estimator_size)
     for reading in np.asarray(record.measured):
-        state = gains.estimate(state, sent[-2], sent[-1], reading)
-        sent.append(gains.command(state[: len(gains.columns)]))
-    found = np.array(sent[1:-1])[:, 0]
+        state = gains.estimate(state, commands[-2], commands[-1], reading)
+        commands.append(gains.command(state[: len(gains.columns)]))
+    found = np.array(commands[1:-1])[:, 0]
     size = np.max(np.abs(record.command))
     assert size > 0
     assert_allclose(found, record.command[:, 0], rtol=0, atol=1e-9 * size)

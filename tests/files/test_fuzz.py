@@ -144,7 +144,7 @@ LINES = (
     "weigh case.toml log.csv",
     "reproduce xyz",
 )
-WRONG = """
+INVALID_WORDS = """
     modes bad.toml none.toml folder --set --over --free -o --json --plot --resume --paired --pair
     --from -- --points beam.length=nan beam.length=1:2 loads.0.speed=1:2:1e300 beam=3 beam.=3
     =1 loads.-1.speed=2 loads.99999999999.speed=1 run.duration=1e300 beam.modes=10000000 nan
@@ -156,7 +156,7 @@ WRONG = """
 @settings(max_examples=150)
 @given(
     st.sampled_from(LINES),
-    st.lists(st.sampled_from(WRONG.split()), min_size=1, max_size=3),
+    st.lists(st.sampled_from(INVALID_WORDS.split()), min_size=1, max_size=3),
     st.data(),
 )
 def test_invalid_command_line_ends_in_one_error_message(folder, line, words, data):
@@ -164,22 +164,22 @@ def test_invalid_command_line_ends_in_one_error_message(folder, line, words, dat
     (folder / "bad.toml").write_text("[beam\n")
     (folder / "case.toml").write_text(SMALL)
     (folder / "log.csv").write_text("time [s],d1 [mm]\n0,1\n0.1,2\n")
-    given = line.split()
+    arguments = line.split()
     for word in words:
-        given.insert(data.draw(st.integers(1, len(given))), word)
+        arguments.insert(data.draw(st.integers(1, len(arguments))), word)
     # Makes the few valid lines invalid too, which would take long to run.
-    given += ["--set", "beam.length=-1"]
-    said, printed = io.StringIO(), io.StringIO()
+    arguments += ["--set", "beam.length=-1"]
+    stderr, stdout = io.StringIO(), io.StringIO()
     with (
         contextlib.chdir(folder),
-        contextlib.redirect_stderr(said),
-        contextlib.redirect_stdout(printed),
+        contextlib.redirect_stderr(stderr),
+        contextlib.redirect_stdout(stdout),
         pytest.raises(SystemExit) as ended,
     ):
-        main(given)
-    assert ended.value.code == 1 and printed.getvalue() == ""
-    *notes, sentence = said.getvalue().splitlines()
-    assert sentence.startswith("jaxbeam: ") and len(sentence) < 700
+        main(arguments)
+    assert ended.value.code == 1 and stdout.getvalue() == ""
+    *notes, message = stderr.getvalue().splitlines()
+    assert message.startswith("jaxbeam: ") and len(message) < 700
     assert all(note.startswith("jaxbeam: ") for note in notes) and len(notes) < 2
 
 

@@ -1,4 +1,4 @@
-"""Reports in Markdown, HTML and plain text, read back from what was written."""
+"""Reports in Markdown, HTML and plain text, and the files written."""
 
 import pytest
 from matplotlib.figure import Figure

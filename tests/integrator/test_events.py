@@ -24,10 +24,8 @@ def test_commands_and_readings_come_when_they_are_due(
     """Against a replay event by event with plain lists, in whole milliseconds."""
     end = 200 // spacing * spacing
     samples = MILLI * np.arange(0, end + 1, spacing)
-    control_instants, sensor_instants = (
-        MILLI * np.arange(0, end + 1, period),
-        MILLI * np.arange(0, end + 1, sensor_period),
-    )
+    control_instants = MILLI * np.arange(0, end + 1, period)
+    sensor_instants = MILLI * np.arange(0, end + 1, sensor_period)
     breakpoints = np.array([0.0777])
     found = controller_schedule(
         samples,

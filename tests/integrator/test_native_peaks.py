@@ -157,7 +157,7 @@ def test_narrower_registers_give_equal_results(without, tmp_path, monkeypatch):
         assert np.any(found.peak_deflection != plain)
 
 
-def test_one_of_these_cases_loses_contact():
+def test_contact_is_lost_in_one_of_the_cases():
     contact_lost_time = jb.sweep(
         LOST_CONTACT, {"loads.0.mass": [0.5, 5.0]}, progress=False
     ).contact_lost_time

@@ -33,7 +33,7 @@ RIG_A = jb.Case(
     actuators=[V4],
     sensors=[jb.Sensor(0.25), jb.Sensor(0.35, "velocity")],
 )
-HALF_KILO = [(0.3, 0.5)]
+HALF_KILOGRAM = [(0.3, 0.5)]
 GENERAL = jb.Case(
     jb.Beam(1.3, 2.0, 0.7, damping_ratio=0.02, ends="clamped-free", modes=4),
     supports=[jb.Support(0.3, 500.0, 0.4, 3.0), jb.Support(0.91)],
@@ -55,24 +55,26 @@ F = np.array([0.0, 0.7, 3.0, 11.0, 26.5, 84.0, 190.0, 900.0])
 
 
 def formulas(frequencies, modes=4, ratio=0.03, masses=()):
-    """The chain as eqs (2.26) to (2.34) have it: U/I, F_c/U, F/F_c, F/U, for sine modes."""
+    """I/U, F_c/U, F/F_c and F/U by eqs (2.26) to (2.34) with sine modes (frequency, 4)."""
     wave = np.arange(1, modes + 1) * np.pi / 0.6
     omega = wave**2 * np.sqrt(11.68 / 0.535)
     size = np.sqrt(2 / (0.535 * 0.6))
-    at = size * np.sin(wave * 0.5)
-    chain = []
+    shape = size * np.sin(wave * 0.5)
+    responses = []
     for s in 2j * np.pi * np.asarray(frequencies):
         mass = np.eye(modes)
         for position, added in masses:
             mass += added * np.outer(np.sin(wave * position), np.sin(wave * position)) * size**2
         beam = mass * s**2 + np.diag(2 * ratio * omega * s + omega**2)
-        mobility_beam = s * at @ np.linalg.solve(beam, at)
+        mobility_beam = s * shape @ np.linalg.solve(beam, shape)
         mobility_shaker = s / (s**2 * 0.02 + s * 0.55 + 9700)
-        joined = mobility_beam / (1 + mobility_beam / mobility_shaker)
-        impedance = 0.82 + s * 5e-5 + 4.2 * 4.2 * joined
-        passed = mobility_shaker / (mobility_shaker + mobility_beam)
-        chain.append([1 / impedance, 4.2 / impedance, passed, 4.2 / impedance * passed])
-    return np.array(chain)
+        coupled_mobility = mobility_beam / (1 + mobility_beam / mobility_shaker)
+        impedance = 0.82 + s * 5e-5 + 4.2 * 4.2 * coupled_mobility
+        transmitted = mobility_shaker / (mobility_shaker + mobility_beam)
+        responses.append(
+            [1 / impedance, 4.2 / impedance, transmitted, 4.2 / impedance * transmitted]
+        )
+    return np.array(responses)
 
 
 def dips_and_peaks(frequencies, size):
@@ -86,8 +88,8 @@ def dips_and_peaks(frequencies, size):
 # The electrodynamic shaker of section 2.2
 
 
-@pytest.mark.parametrize("masses", [[], HALF_KILO, [(0.1, 0.2), (0.45, 0.7)]])
-def test_the_chain_of_the_thesis(masses):
+@pytest.mark.parametrize("masses", [[], HALF_KILOGRAM, [(0.1, 0.2), (0.45, 0.7)]])
+def test_responses_of_the_shaker_by_the_formulas_of_the_thesis(masses):
     found = frequency_response(RIG_A, F[1:], shaker_channels(0), masses)
     assert_allclose(found.values, formulas(F[1:], masses=masses), rtol=1e-9)
     assert [pair.unit for pair in found.pairs] == ["A/V", "N/V", "1", "N/V"]
@@ -96,29 +98,31 @@ def test_the_chain_of_the_thesis(masses):
 def test_figures_2_15_and_2_18_without_a_mass():
     f = np.linspace(0.5, 400.0, 40001)
     found = frequency_response(RIG_A, f, shaker_channels(0))
-    current, _, passed, total = np.asarray(found.magnitude).T
-    assert_allclose(total[0], 2.38, atol=0.005)
-    assert np.ptp(total[f < 5]) < 0.1 * total[0]
-    dips, peaks = dips_and_peaks(f, total)
+    current, _, transmitted, force_per_volt = np.asarray(found.magnitude).T
+    assert_allclose(force_per_volt[0], 2.38, atol=0.005)
+    assert np.ptp(force_per_volt[f < 5]) < 0.1 * force_per_volt[0]
+    dips, peaks = dips_and_peaks(f, force_per_volt)
     assert_allclose(dips[:, 0], [20.3, 81.3, 184.4, 330.1], atol=0.1)
     assert_allclose(peaks[0], [27.5, 10.2], atol=0.06)
-    # Figs 2.17 and 2.18: what resists the voltage, and what lifts the force, is one resonance.
+    # Figs 2.17 and 2.18: impedance and transmitted force peak at one resonance.
     impedance = dips_and_peaks(f, 1 / current)[1][0]
-    assert_allclose([impedance[0], dips_and_peaks(f, passed)[1][0, 0]], 26.65, atol=0.1)
+    assert_allclose([impedance[0], dips_and_peaks(f, transmitted)[1][0, 0]], 26.65, atol=0.1)
 
 
 def test_figure_2_16_with_half_a_kilogram_in_the_middle():
     f = np.linspace(0.5, 40.0, 8001)
-    total = np.asarray(frequency_response(RIG_A, f, shaker_channels(0)[3:], HALF_KILO).magnitude)[
-        :, 0
-    ]
-    dips, peaks = dips_and_peaks(f, total)
+    force_per_volt = np.asarray(
+        frequency_response(RIG_A, f, shaker_channels(0)[3:], HALF_KILOGRAM).magnitude
+    )[:, 0]
+    dips, peaks = dips_and_peaks(f, force_per_volt)
     assert_allclose(peaks, [[13.1, 20.2]], atol=0.05)
-    # Force drops where the beam alone, with the mass, would ring: finite elements.
+    # The force drops at the natural frequency of the bare beam with the mass: finite elements.
     assert_allclose(dips[:, 0], loaded_frequency(), rtol=5e-3)
     undamped = replace(RIG_A, {"beam.damping_ratio": 0.0})
-    total = np.asarray(frequency_response(undamped, f, shaker_channels(0)[3:], HALF_KILO).magnitude)
-    assert_allclose(dips_and_peaks(f, total[:, 0])[1], [[13.05, 27.6]], atol=0.05)
+    force_per_volt = np.asarray(
+        frequency_response(undamped, f, shaker_channels(0)[3:], HALF_KILOGRAM).magnitude
+    )
+    assert_allclose(dips_and_peaks(f, force_per_volt[:, 0])[1], [[13.05, 27.6]], atol=0.05)
 
 
 def loaded_frequency() -> float:
@@ -139,34 +143,36 @@ def test_figure_2_19_the_first_order_shaker():
 
 
 def test_figure_2_20_a_beam_less_mobile_than_the_shaker():
-    """Coil force reaches it whole, and voltage to force is a first-order lag, R / L."""
+    """The whole coil force is transmitted; voltage to force is a first-order lag, R / L."""
     stiff = jb.Case(jb.Beam(0.6, 1.022e5, 11.016, damping_ratio=0.03, modes=4), actuators=[V4])
     f = np.array([1.0, 10.0, 30.0, 100.0])
-    *_, passed, total = np.asarray(frequency_response(stiff, f, shaker_channels(0)).values).T
-    assert_allclose(passed, 1.0, atol=2e-3)
-    assert_allclose(total, 4.2 / (0.82 + 5e-5 * 2j * np.pi * f), rtol=5e-3)
+    *_, transmitted, force_per_volt = np.asarray(
+        frequency_response(stiff, f, shaker_channels(0)).values
+    ).T
+    assert_allclose(transmitted, 1.0, atol=2e-3)
+    assert_allclose(force_per_volt, 4.2 / (0.82 + 5e-5 * 2j * np.pi * f), rtol=5e-3)
 
 
 def test_poles_and_zeros_of_the_shaker():
-    """Force drops where the bare beam is free to ring; the coil adds one fast pole."""
+    """Zeros of the force are the poles of the bare beam; the coil adds one fast pole."""
     bare = jb.Case(RIG_A.beam)
     found = zeros(RIG_A, shaker_channels(0)[3])
     assert_allclose(found, poles(bare), rtol=1e-7)
     assert_allclose(
-        zeros(RIG_A, shaker_channels(0)[3], HALF_KILO), poles(bare, HALF_KILO), rtol=1e-7
+        zeros(RIG_A, shaker_channels(0)[3], HALF_KILOGRAM), poles(bare, HALF_KILOGRAM), rtol=1e-7
     )
     natural = (np.arange(1, 5) * np.pi / 0.6) ** 2 * np.sqrt(11.68 / 0.535)
     assert_allclose(np.abs(poles(bare)), np.repeat(natural, 2), rtol=1e-9)
-    ringing = poles(RIG_A)
-    assert ringing.shape == (9,)
-    assert np.all(ringing.real < 0)
-    assert_allclose(ringing[-1], -0.82 / 5e-5, rtol=0.05)
+    shaker_poles = poles(RIG_A)
+    assert shaker_poles.shape == (9,)
+    assert np.all(shaker_poles.real < 0)
+    assert_allclose(shaker_poles[-1], -0.82 / 5e-5, rtol=0.05)
 
 
 # Cases of all kinds
 
 
-def test_python_control_has_the_same_responses_of_the_state_space():
+def test_responses_of_the_state_space_by_python_control():
     """Deflection, velocity, slope and strain are rows on the states; acceleration needs B too."""
     model = eqx.filter_jit(modal_model)(GENERAL, mesh_layout(GENERAL))
     A, B = np.asarray(model.state_matrix[0]), np.asarray(model.command_matrix)
@@ -200,8 +206,8 @@ def test_receptance_of_a_pinned_beam_in_closed_form():
     sinh = np.sinh(k * low) * np.sinh(k * high) / np.sinh(k * 0.6)
     expected = (sines - sinh) / (2 * 11.68 * k**3)
     found = receptance(case, f, x, y)
-    missed = 2 * 0.6**3 / (np.pi**4 * 11.68) * np.sum(1 / np.arange(41.0, 1000.0) ** 4)
-    assert_allclose(found, expected, rtol=0, atol=missed)
+    truncation_error = 2 * 0.6**3 / (np.pi**4 * 11.68) * np.sum(1 / np.arange(41.0, 1000.0) ** 4)
+    assert_allclose(found, expected, rtol=0, atol=truncation_error)
     s = 2j * np.pi * f[:, None, None]
     assert_allclose(mobility(case, f, x, y), s * found, rtol=1e-12)
     assert_allclose(accelerance(case, f, x, y), s**2 * found, rtol=1e-12)
@@ -215,28 +221,28 @@ def test_finite_elements_with_patch_coil_and_stationary_masses():
     beam = jb.Beam(1.0, 12.0, 0.8, ends="clamped-pinned", modes=24)
     case = jb.Case(beam, [jb.Support(0.6, 2e4, 0.0, 5.0)], [patch, coil], [jb.Sensor(0.45)])
     model = finite_elements.assemble(as_oracle(case, elements=60), [0.4, 0.45, 0.75, 0.9])
-    free, at = model.free, model.shape(0.75)
-    inertia = model.mass + 0.02 * np.outer(at, at)
+    free, shape = model.free, model.shape(0.75)
+    inertia = model.mass + 0.02 * np.outer(shape, shape)
     for position, mass in ((0.4, 0.3), (0.9, 0.1)):
         inertia += mass * np.outer(model.shape(position), model.shape(position))
     frequencies, expected = np.array([2.0, 17.0, 46.0, 120.0]), []
     for s in 2j * np.pi * frequencies:
         coupled = 900.0 + 0.5 * s + 4.2 * 3.9 * s / (0.8 + 5e-3 * s)
-        matrix = s**2 * inertia + model.stiffness + coupled * np.outer(at, at)
-        pushes = np.array([1e-3 * model.patch_row(0.1, 0.3), at * 4.2 / (0.8 + 5e-3 * s)])
-        motion = np.linalg.solve(matrix[np.ix_(free, free)], pushes[:, free].T)
-        expected.append(model.shape(0.45)[free] @ motion)
+        matrix = s**2 * inertia + model.stiffness + coupled * np.outer(shape, shape)
+        nodal_forces = np.array([1e-3 * model.patch_row(0.1, 0.3), shape * 4.2 / (0.8 + 5e-3 * s)])
+        displacements = np.linalg.solve(matrix[np.ix_(free, free)], nodal_forces[:, free].T)
+        expected.append(model.shape(0.45)[free] @ displacements)
     pairs = [("actuators.0", "sensors.0"), ("actuators.1", "deflection@0.45")]
     found = frequency_response(case, frequencies, pairs, [(0.4, 0.3), (0.9, 0.1)])
     assert [pair.unit for pair in found.pairs] == ["m/V", "m/V"]
     errors = np.abs(np.asarray(found.values) - expected)
     assert np.all(errors < 1e-3 * np.abs(expected).max(axis=0))
-    # What the other modes add to the slowly converging patch hardly depends on the frequency.
+    # The residual of the neglected modes, large for a patch, hardly depends on the frequency.
     corrected = np.asarray(found.values)[:, 0] + float(residual_actuator_gain(case, 0.45)[0])
     assert np.abs(corrected - np.array(expected)[:, 0]).max() < errors[:, 0].max() / 5
 
 
-def test_a_static_force_is_what_is_left_at_zero_frequency():
+def test_transmitted_force_at_zero_frequency_is_the_static_one():
     pair = ("actuators.1", "actuators.1.transmitted_force")
     at_rest = float(frequency_response(GENERAL, [0.0], [pair]).of(*pair)[0].real)
     lift = float(receptance(GENERAL, 0.0, 0.7, 0.7)[0].real)
@@ -256,19 +262,21 @@ def test_responses_differentiate_inside_jit():
     point = np.array([11.68, 0.82, 0.25])
 
     @jax.jit
-    def sizes(values):
+    def log_magnitudes(values):
         case = replace(RIG_A, dict(zip(names, values * point, strict=True)))
-        response = frequency_response(case, [3.0, 25.0, 80.0], pairs, HALF_KILO, layout)
+        response = frequency_response(case, [3.0, 25.0, 80.0], pairs, HALF_KILOGRAM, layout)
         return jnp.log(response.magnitude).ravel()
 
     ones = jnp.ones(3)
-    expected = central(sizes, ones, 1e-3)
-    assert_allclose(jax.jacrev(sizes)(ones), expected, rtol=1e-6, atol=1e-7)
+    expected = central(log_magnitudes, ones, 1e-3)
+    assert_allclose(jax.jacrev(log_magnitudes)(ones), expected, rtol=1e-6, atol=1e-7)
 
-    def moved(x):
+    def magnitude(x):
         return jnp.abs(receptance(RIG_A, [25.0], x, 0.2, [(x, 0.5)], layout))[0]
 
-    assert_allclose(jax.grad(moved)(0.3), central(lambda x: moved(x[0]), [0.3])[0], rtol=1e-6)
+    assert_allclose(
+        jax.grad(magnitude)(0.3), central(lambda x: magnitude(x[0]), [0.3])[0], rtol=1e-6
+    )
 
 
 # The record
@@ -308,14 +316,14 @@ def test_peaks_and_dips_lie_between_the_frequencies():
     assert_allclose(peak[1:], [27.54, 10.163], rtol=2e-4)
 
 
-def test_without_actuators_a_force_at_each_sensor():
+def test_default_pairs_without_actuators_are_forces_at_the_sensors():
     case = jb.Case(jb.Beam(0.6, 11.68, 0.535), sensors=[jb.Sensor(0.25), jb.Sensor(0.3)])
     assert common_pairs(case) == (("force@0.25", "sensors.0"), ("force@0.3", "sensors.1"))
     found = frequency_response(case, [7.0]).values[0]
     assert_allclose(found[0], receptance(case, 7.0, 0.25, 0.25)[0], rtol=1e-12)
 
 
-BAD = [
+INVALID = [
     ({"frequencies": [-1.0]}, "frequencies must be finite and not negative, in Hz; found -1"),
     ({"frequencies": [np.nan]}, "found nan"),
     ({"frequencies": [[1.0]]}, "frequencies must be a list of numbers, not of shape"),
@@ -339,7 +347,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "message"), BAD)
+@pytest.mark.parametrize(("changes", "message"), INVALID)
 def test_invalid_arguments_are_refused(changes, message):
     arguments = {"frequencies": [1.0], "pairs": None, "stationary_masses": ()} | changes
     with pytest.raises(ValueError) as caught:

@@ -38,24 +38,24 @@ NUMBERS = [
 BOTH, REVERSE = (jax.jacfwd, jax.jacrev), (jax.jacrev,)
 
 
-def assert_derivatives(function, size: int, ways=REVERSE, floor: float = 0.0) -> None:
+def assert_derivatives(function, size: int, jacobians=REVERSE, floor: float = 0.0) -> None:
     """Automatic derivatives against central differences, at zero, each result on its scale.
 
-    Reverse mode transposes what forward mode does, so where it is right, both are. What is smaller
-    than `floor` times the largest, and so only rounding, is on that scale.
+    Reverse mode is the transpose of forward mode: where it is right, both are. Results below
+    `floor` times the largest, which are rounding errors, are on that scale.
     """
     expected = central(function, np.zeros(size), 1e-3)
     scale = np.abs(expected).max(axis=1, keepdims=True)
     scale = np.maximum(scale, floor * scale.max())
     scale = np.where(scale > 0, scale, 1.0)
-    for jacobian in ways:
+    for jacobian in jacobians:
         found = jax.jit(jacobian(function))(jnp.zeros(size))
         assert_allclose(found / scale, expected / scale, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("case", "numbers", "ways"),
+    ("case", "numbers", "jacobians"),
     [
         (BY_SECTION, NUMBERS, BOTH),
         (
@@ -66,7 +66,7 @@ def assert_derivatives(function, size: int, ways=REVERSE, floor: float = 0.0) ->
     ],
     ids=["section", "rigidity"],
 )
-def test_derivatives_of_frequencies_and_shapes_in_every_number(case, numbers, ways):
+def test_derivatives_of_frequencies_and_shapes_in_every_number(case, numbers, jacobians):
     layout, x = mesh_layout(case), jnp.array([0.1, 0.62, 1.0])
     start = np.array([float(value_at(case, address)) for address in numbers])
 
@@ -77,11 +77,11 @@ def test_derivatives_of_frequencies_and_shapes_in_every_number(case, numbers, wa
         shapes = found.shape_derivatives(x, (0, 1, 2))
         return jnp.concatenate([found.stiffness, found.damping, shapes.ravel()])
 
-    assert_derivatives(quantities, len(numbers), ways)
+    assert_derivatives(quantities, len(numbers), jacobians)
 
 
 def flexibility(found: Modes, x) -> jax.Array:
-    """psi(x)' (s^2 + s D + K)^-1 psi(x), what the response is made of, free of how modes mix."""
+    """Dynamic flexibility psi(x)' (s^2 + s D + K)^-1 psi(x), the same for all bases of modes."""
     s = jnp.sqrt(found.stiffness_unit)
     stiffness = jnp.diag(found.stiffness) + found.coupling
     damping = jnp.diag(found.damping) + found.damping_coupling
@@ -144,7 +144,7 @@ def response(case: Case, numbers: list[str]):
 def test_responses_have_derivatives_where_frequencies_are_repeated(name):
     case, numbers = REPEATED[name]
     assert bool(solve(case).has_repeated)
-    # Spans that a stiff spring keeps apart answer each other with 1e-11 of their own response.
+    # Through the stiff spring a span responds with 1e-11 of the response of the driven one.
     assert_derivatives(response(case, numbers), len(numbers), floor=1e-4)
 
 
@@ -161,7 +161,7 @@ def test_second_derivatives_where_frequencies_are_repeated(case):
     assert_allclose(found.reshape(expected.shape), expected, rtol=0, atol=1e-6 * scale)
 
 
-def test_a_free_beam_feels_the_first_newton_per_metre_that_holds_it():
+def test_derivatives_of_a_free_beam_by_springs_of_zero_stiffness():
     """Rigid-body modes at zero: one-sided differences, for a stiffness cannot be negative."""
     case = Case(Beam(1.2, **PROPERTIES, ends="free-free", modes=5), [Support(0.3, 0.0, 0.0, 0.0)])
     layout, x = mesh_layout(case), jnp.array([0.13, 0.8])

@@ -20,7 +20,7 @@ from tests.solved_modes import PAIRS, PATCHED, PROPERTIES, parameters, solve, su
 
 
 def assert_frequencies(case: Case, rtol: float = 1e-12) -> None:
-    """The same as the Wittrick-Williams count, rigid-body modes included."""
+    """Assert the frequencies of the Wittrick-Williams count, rigid-body modes included."""
     expected = exact_frequencies(as_oracle(case), case.beam.modes)
     assert_allclose(solve(case).angular_frequencies, expected, rtol=rtol)
 
@@ -68,18 +68,20 @@ def test_an_elastic_support_ranges_from_none_to_a_rigid_one():
 
 
 def test_rotational_springs_range_from_none_to_a_clamp():
-    def turned(stiffness):
+    def with_rotational_spring(stiffness):
         supports = [Support(0.0, rotational_stiffness=stiffness)]
         return Case(Beam(1.2, **PROPERTIES, modes=12), supports)
 
     for stiffness in (0.0, 1.0, 1e3, 1e8, 1e16):
-        assert_frequencies(turned(stiffness))
+        assert_frequencies(with_rotational_spring(stiffness))
         assert_frequencies(supported_beam(None, stiffness))
     clamped = solve(Case(Beam(1.2, **PROPERTIES, ends="clamped-pinned", modes=12))).frequencies
-    assert_allclose(solve(turned(1e14)).frequencies, clamped, rtol=1e-10)
-    # Two spans that a stiff spring clamps at their common support know nothing of each other.
-    apart = [Case(Beam(x, **PROPERTIES, ends="clamped-pinned", modes=12)) for x in (0.5, 0.7)]
-    expected = np.sort(np.concatenate([solve(case).frequencies for case in apart]))[:12]
+    assert_allclose(solve(with_rotational_spring(1e14)).frequencies, clamped, rtol=1e-10)
+    # Two spans that a stiff spring clamps at their common support are decoupled.
+    single_spans = [
+        Case(Beam(x, **PROPERTIES, ends="clamped-pinned", modes=12)) for x in (0.5, 0.7)
+    ]
+    expected = np.sort(np.concatenate([solve(case).frequencies for case in single_spans]))[:12]
     assert_allclose(solve(supported_beam(None, 1e14)).frequencies, expected, rtol=1e-10)
 
 
@@ -128,7 +130,7 @@ def random_beams(draw) -> Case:
 @given(random_beams())
 @hypothesis.settings(max_examples=6)
 def test_random_beams_have_exact_frequencies(case):
-    # What is softer than a thousandth of the beam is zero to the oracle.
+    # The oracle returns zero for frequencies below a thousandth of the unit.
     expected = exact_frequencies(as_oracle(case), 5)
     unit = np.sqrt(float(solve(case).stiffness_unit))
     assert_allclose(solve(case).angular_frequencies, expected, rtol=1e-9, atol=1e-3 * unit)

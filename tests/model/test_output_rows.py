@@ -54,7 +54,7 @@ def test_outputs_on_states_are_those_of_histories(name):
     assert rows.has_feedthrough.tolist() == [sensor(name).has_feedthrough]
 
 
-def test_a_quantity_is_one_entry_of_the_list(monkeypatch):
+def test_a_quantity_is_declared_by_one_entry(monkeypatch):
     """Sensors of a rate of rotation, with unit and rows, by the entry alone."""
     monkeypatch.setitem(QUANTITIES, "rotation_rate", Quantity("rad/s", 1, 1))
     model = modal_model(CASE)

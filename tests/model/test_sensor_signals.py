@@ -1,4 +1,4 @@
-"""Sensors: from what the beam does to what is read."""
+"""Sensors: readings from histories of deflection, velocity and acceleration."""
 
 import dataclasses
 import re
@@ -30,7 +30,7 @@ TIMES = jnp.arange(201) / 1000.0
 OMEGA = 2 * np.pi * np.array([3.0, 8.0])
 
 
-def wave(t, derivative=0):
+def signal(t, derivative=0):
     """A smooth signal that starts from rest, and its derivatives by time."""
     t = np.asarray(t)
     if derivative:
@@ -38,7 +38,7 @@ def wave(t, derivative=0):
     return sum(1 - np.cos(w * t) for w in OMEGA)
 
 
-VALUES, RATES = jnp.asarray(wave(TIMES)), jnp.asarray(wave(TIMES, 1))
+VALUES, RATES = jnp.asarray(signal(TIMES)), jnp.asarray(signal(TIMES, 1))
 
 
 def test_offset_noise_range_and_resolution_in_this_order():
@@ -54,14 +54,14 @@ def test_derivatives_pass_through_rounding_and_stop_at_the_range():
     assert_allclose(slope, [1.0, 1.0, 0.0, 0.0], rtol=0, atol=0)
 
 
-def test_noise_is_that_of_the_seed_and_of_the_stated_size():
-    drawn = noise_samples(3, 2, 20000)
-    assert_array_equal(drawn, noise_samples(3, 2, 20000))
-    assert_array_equal(drawn[:, 0], noise_samples(3, 1, 20000)[:, 0])
-    assert np.max(np.abs(drawn - noise_samples(4, 2, 20000))) > 1
+def test_noise_depends_on_the_seed_and_has_the_stated_deviation():
+    samples = noise_samples(3, 2, 20000)
+    assert_array_equal(samples, noise_samples(3, 2, 20000))
+    assert_array_equal(samples[:, 0], noise_samples(3, 1, 20000)[:, 0])
+    assert np.max(np.abs(samples - noise_samples(4, 2, 20000))) > 1
     assert Sensor(0.3, noise=0.1).noise_variance == 0.1**2 and Sensor(0.3).noise_variance == 0
-    assert_allclose(np.std(drawn, axis=0), 1.0, atol=0.02)
-    assert_allclose(np.corrcoef(drawn.T)[0, 1], 0.0, atol=0.03)
+    assert_allclose(np.std(samples, axis=0), 1.0, atol=0.02)
+    assert_allclose(np.corrcoef(samples.T)[0, 1], 0.0, atol=0.03)
 
 
 def test_readings_sample_by_sample_are_those_of_the_whole_history():
@@ -96,7 +96,7 @@ def test_an_analogue_filter_is_that_of_scipy(order):
     sensor = Sensor(0.3, filter=Filter(15.0, order, realisation="analogue"))
     fine = np.linspace(0.0, 0.2, 20001)  # lsim takes the signal to be straight in between
     system = scipy.signal.butter(order, 2 * np.pi * 15.0, analog=True)
-    expected = scipy.signal.lsim(system, wave(fine), fine)[1][::100]
+    expected = scipy.signal.lsim(system, signal(fine), fine)[1][::100]
     found = sampled_readings(sensor, TIMES, VALUES, RATES)
     assert_allclose(found, expected, rtol=0, atol=1e-7)
 
@@ -107,7 +107,7 @@ def test_delayed_readings_are_those_of_an_earlier_signal():
     assert_allclose(whole[:10], 0.0, atol=1e-15)
     between = sampled_readings(Sensor(0.3, delay=0.00437), TIMES, VALUES, RATES)
     # Cubics are right to (omega h)^4 / 384.
-    assert_allclose(between[5:], wave(TIMES - 0.00437)[5:], rtol=0, atol=5e-8)
+    assert_allclose(between[5:], signal(TIMES - 0.00437)[5:], rtol=0, atol=5e-8)
 
 
 def test_readings_are_held_between_sampling_instants():
@@ -119,7 +119,7 @@ def test_readings_are_held_between_sampling_instants():
     # Not a multiple of the time between samples: the readings are those at its own times.
     odd = sampled_readings(Sensor(0.3, sampling_period=0.0033), TIMES, VALUES, RATES)
     instants = 0.0033 * np.floor(np.asarray(TIMES) / 0.0033 + 1e-9)
-    assert_allclose(odd, wave(instants), rtol=0, atol=5e-8)
+    assert_allclose(odd, signal(instants), rtol=0, atol=5e-8)
 
 
 def test_a_digital_filter_runs_at_the_sampling_period_of_its_sensor():
@@ -142,10 +142,10 @@ def test_unsuitable_times_are_refused():
 
 @pytest.mark.parametrize("realisation", ["digital", "analogue"])
 def test_derivatives_of_readings(realisation):
-    """By offset, cutoff and delay, through clock and filter, against differences."""
+    """By offset, cutoff and delay, through sampling and filter, against differences."""
 
-    def readings(point):
-        offset, cutoff, delay = point
+    def readings(parameters):
+        offset, cutoff, delay = parameters
         sensor = Sensor(
             0.3,
             offset=offset,
@@ -155,11 +155,11 @@ def test_derivatives_of_readings(realisation):
         )
         return sampled_readings(sensor, TIMES, VALUES, RATES)
 
-    at = jnp.array([0.1, 1.0, 0.53])
+    point = jnp.array([0.1, 1.0, 0.53])
     readings = jax.jit(readings)
-    expected = central(readings, at, step=1e-3, order=4)
+    expected = central(readings, point, step=1e-3, order=4)
     for derivative in (jax.jacfwd, jax.jacrev):
-        found = derivative(readings)(at)
+        found = derivative(readings)(point)
         assert_allclose(found, expected, rtol=0, atol=1e-6 * np.max(np.abs(expected)))
 
 
@@ -192,9 +192,9 @@ def test_a_record_reads_every_quantity_through_filter_and_delay(record):
     filter = Filter(40.0, 4)
     found = with_sensors(record, filter=filter, delay=0.004).measured
     sos = scipy.signal.butter(4, 40.0, fs=2000.0, output="sos")
-    late = np.asarray(record.measured)[np.maximum(np.arange(801) - 8, 0)]
-    rest = scipy.signal.sosfilt_zi(sos)[:, :, None] * late[0]
-    expected = scipy.signal.sosfilt(sos, late, axis=0, zi=rest)[0]
+    delayed = np.asarray(record.measured)[np.maximum(np.arange(801) - 8, 0)]
+    rest = scipy.signal.sosfilt_zi(sos)[:, :, None] * delayed[0]
+    expected = scipy.signal.sosfilt(sos, delayed, axis=0, zi=rest)[0]
     assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected), axis=0).max())
     analogue = Filter(40.0, 4, realisation="analogue")
     smooth = with_sensors(record, filter=analogue, delay=0.004).measured
@@ -211,7 +211,7 @@ def test_noise_is_in_the_record_but_not_in_predictions(record):
     assert_array_equal(sensor_readings(noisy.case, noisy.modes, *motion), record.measured)
 
 
-def test_readings_that_need_times_ask_for_them(record):
+def test_delayed_readings_without_times_are_refused(record):
     delayed = with_sensors(record, delay=0.1)
     motion = delayed.coordinates, delayed.rates, delayed.accelerations
     with pytest.raises(ValueError, match=r"sensors.0 .* its readings need times"):
@@ -229,9 +229,9 @@ def test_case_files_hold_every_property_of_a_sensor(tmp_path):
     )  # fmt: skip
     case = dataclasses.replace(CASE, sensors=(sensor, CASE.sensors[1]))
     jb.save_case(case, tmp_path / "case.toml")
-    back = jb.load_case(tmp_path / "case.toml")
-    assert jax.tree.structure(back) == jax.tree.structure(case)
-    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), back, case))
+    loaded = jb.load_case(tmp_path / "case.toml")
+    assert jax.tree.structure(loaded) == jax.tree.structure(case)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), loaded, case))
     assert jb.replace(case, {"sensors.0.filter.cutoff": 12.0}).sensors[0].filter.cutoff == 12.0
     path = tmp_path / "table.toml"
     path.write_text(
@@ -241,7 +241,7 @@ def test_case_files_hold_every_property_of_a_sensor(tmp_path):
     assert jb.load_case(path).sensors[0].filter == filter
 
 
-FAULTS = [
+INVALID_SENSORS = [
     ({"resolution": 0.0}, "sensors.0.resolution must be positive; it is 0"),
     ({"noise": -1.0}, "sensors.0.noise must not be negative; it is -1"),
     ({"range": [1.0, -1.0]}, "sensors.0.range.1 must be above the entry before it; -1 follows 1"),
@@ -256,7 +256,7 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "message"), FAULTS)
+@pytest.mark.parametrize(("changes", "message"), INVALID_SENSORS)
 def test_invalid_sensors_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         check_case(dataclasses.replace(CASE, sensors=(Sensor(0.25, **changes),)))

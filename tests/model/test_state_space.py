@@ -1,4 +1,4 @@
-"""State space: against independent equations, scipy, python-control and our own simulation."""
+"""State space: against independent equations, scipy, python-control and simulations."""
 
 import builtins
 
@@ -60,12 +60,12 @@ def in_sines(states):
 def test_matrices_are_those_of_the_modal_equations(t):
     """Columns of A(t) from unit states of the oracle, B_f(t) W from its state at rest."""
     kinds = ("mass", 0.509, 2.0, 1.5), ("force", 0.3, 3.0, 0.0), ("mass", 0.2, -2.5, 0.0)
-    loads, ours = [], []
+    loads, case_loads = [], []
     for kind, mass, speed, braking in kinds:
         make = {"mass": jb.MovingMass, "force": jb.MovingForce}[kind]
-        ours.append(make(mass=mass, speed=speed, deceleration=braking))
+        case_loads.append(make(mass=mass, speed=speed, deceleration=braking))
         loads.append(Load(mass, speed, 0.0, braking, kind))
-    case = jb.Case(BEAM, loads=ours, run=jb.Run(1.0, gravity=GRAVITY))
+    case = jb.Case(BEAM, loads=case_loads, run=jb.Run(1.0, gravity=GRAVITY))
     oracle = _System(SPAN, loads, t)
     rest = oracle.rate(t, np.zeros(6))
     expected = np.array([oracle.rate(t, unit) - rest for unit in np.eye(6)]).T
@@ -79,8 +79,8 @@ def test_matrices_are_those_of_the_modal_equations(t):
     assert_allclose(sines.B_f(t) @ sines.weights, in_sines(rest), rtol=1e-9, atol=1e-9)
 
 
-def test_integrating_the_state_space_is_simulating(system, record):
-    """z' = A(t) z + B_f(t) W by DOP853, the thesis's (2.36), gives what `simulate` gives."""
+def test_integrated_state_space_equals_the_simulation(system, record):
+    """z' = A(t) z + B_f(t) W, eq. (2.36) of the thesis, by DOP853, against `simulate`."""
     rate = jax.jit(lambda t, z: system.A(t) @ z + system.B_f(t) @ system.weights)
     times = np.asarray(record.times)
     states, start = [np.zeros((1, 7))], 0.0
@@ -95,8 +95,8 @@ def test_integrating_the_state_space_is_simulating(system, record):
         states.append(found.y.T)
         start = end
     states = np.concatenate(states)
-    read = jax.jit(jax.vmap(lambda t, z: system.at(t).C @ z + _direct(system, t)))
-    expected = np.asarray(read(record.times, jnp.asarray(states)))
+    outputs = jax.jit(jax.vmap(lambda t, z: system.at(t).C @ z + _direct(system, t)))
+    expected = np.asarray(outputs(record.times, jnp.asarray(states)))
     for i in range(len(SENSORS)):
         size = np.max(np.abs(expected[:, i]))
         assert_allclose(record.measured[:, i], expected[:, i], rtol=0, atol=1e-8 * size)
@@ -108,21 +108,21 @@ def _direct(system, t):
 
 
 def test_free_vibration_is_that_of_python_control(system, record):
-    left = np.flatnonzero(np.asarray(record.times) > 0.3)[0]
+    first = np.flatnonzero(np.asarray(record.times) > 0.3)[0]
     modal = np.stack([record.coordinates, record.rates], axis=2).reshape(-1, 6)
-    start = system.from_modal(jnp.append(modal[left], 0.0))  # the shaker is not driven
+    start = system.from_modal(jnp.append(modal[first], 0.0))  # the shaker is not driven
     model = system.unloaded.to_control()
-    times = np.asarray(record.times[left:]) - float(record.times[left])
+    times = np.asarray(record.times[first:]) - float(record.times[first])
     found = control.initial_response(model, times, np.asarray(start)).outputs.T
-    expected = np.asarray(record.measured[left:])
+    expected = np.asarray(record.measured[first:])
     for i in range(len(SENSORS)):
         size = np.max(np.abs(np.asarray(record.measured[:, i])))
         assert_allclose(found[:, i], expected[:, i], rtol=0, atol=1e-9 * size)
-    assert_allclose(system.to_modal(start), jnp.append(modal[left], 0.0), rtol=1e-15)
+    assert_allclose(system.to_modal(start), jnp.append(modal[first], 0.0), rtol=1e-15)
 
 
-def test_frequency_response_is_that_of_the_physics():
-    """Force and moment to deflection, from impedances written out here."""
+def test_frequency_response_is_that_of_the_modal_impedances():
+    """Force and moment to deflection, from impedances computed here."""
     case = jb.Case(
         BEAM,
         actuators=[jb.PointForce(0.5), *CASE.actuators],
@@ -146,16 +146,16 @@ def test_frequency_response_is_that_of_the_physics():
 
 
 def test_the_augmented_system_is_that_of_equation_5_8(system):
-    frozen, whole = system.at(0.1), system.augmented(0.1)
-    assert whole.A.shape == (9, 9) and whole.B.shape == (9, 2)
-    assert_array_equal(whole.A[:7, :7], frozen.A)
-    assert_array_equal(whole.A[:7, 7:], system.B_f(0.1))
-    assert not np.any(whole.A[7:]) and not np.any(whole.B[7:])
-    assert [s.name for s in whole.states[-2:]] == ["load_0", "load_1"]
+    frozen, augmented = system.at(0.1), system.augmented(0.1)
+    assert augmented.A.shape == (9, 9) and augmented.B.shape == (9, 2)
+    assert_array_equal(augmented.A[:7, :7], frozen.A)
+    assert_array_equal(augmented.A[:7, 7:], system.B_f(0.1))
+    assert not np.any(augmented.A[7:]) and not np.any(augmented.B[7:])
+    assert [s.name for s in augmented.states[-2:]] == ["load_0", "load_1"]
     assert_allclose(system.weights, [0.509 * GRAVITY, 2.0])
     z = jnp.linspace(-1.0, 1.0, 7)
     inputs = jnp.append(jnp.zeros(2), system.weights)
-    found = whole.C @ jnp.append(z, system.weights)
+    found = augmented.C @ jnp.append(z, system.weights)
     assert_allclose(found, frozen.C @ z + frozen.D @ inputs, rtol=1e-12)
 
 
@@ -197,7 +197,7 @@ def test_signals_are_named_with_units(system):
     assert state_space(CASE, "sine").states[0] == ("a_1", "m")
 
 
-def test_a_mat_file_holds_it_all(system, tmp_path):
+def test_mat_file_has_matrices_names_and_units(system, tmp_path):
     path = tmp_path / "plant.mat"
     frozen = system.at(0.1)
     frozen.to_mat(path)
@@ -212,7 +212,7 @@ def test_a_mat_file_holds_it_all(system, tmp_path):
     assert scipy.io.loadmat(path)["period"] == 0.01
 
 
-def test_without_python_control_the_error_says_what_to_install(system, monkeypatch):
+def test_without_python_control_the_error_names_the_package_to_install(system, monkeypatch):
     real = builtins.__import__
 
     def without(name, *rest, **more):
@@ -236,19 +236,19 @@ def test_sine_amplitudes_are_refused_where_modes_are_no_sines():
 def test_derivatives_by_mass_speed_and_rigidity():
     layout = mesh_layout(CASE)
 
-    def discrete(point):
+    def discrete(factors):
         names = ["loads.0.mass", "loads.0.speed", "beam.flexural_rigidity"]
         sizes = jnp.array([0.5, 2.0, 12.0])
-        case = jb.replace(CASE, dict(zip(names, point * sizes, strict=True)))
+        case = jb.replace(CASE, dict(zip(names, factors * sizes, strict=True)))
         found = state_space(case, layout=layout).augmented(0.1).discretize(0.01)
         scale = jnp.array([200.0, 800.0, 1800.0, 1, 1, 1, 1, 1, 1])
         return (found.A * scale[:, None] / scale).ravel()
 
     discrete = jax.jit(discrete)
-    at = jnp.ones(3)
-    expected = central(discrete, at, step=1e-3)
+    ones = jnp.ones(3)
+    expected = central(discrete, ones, step=1e-3)
     for derivative in (jax.jacfwd, jax.jacrev):
-        found = derivative(discrete)(at)
+        found = derivative(discrete)(ones)
         assert_allclose(found, expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
 
 

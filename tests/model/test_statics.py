@@ -45,7 +45,7 @@ def oracle_line(case: Case, x, positions) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ends", [f"{a}-{b}" for a in END_CONDITIONS for b in END_CONDITIONS])
-def test_one_span_has_the_line_of_macaulays_method(ends):
+def test_influence_line_of_one_span_by_macaulays_method(ends):
     case, positions = Case(Beam(1.7, **PROPERTIES, ends=ends)), np.linspace(0.0, 1.7, 8)
     if ends in UNSTABLE:
         with pytest.raises(ValueError, match="rigid body.*hold its ends or add supports"):
@@ -65,21 +65,21 @@ def test_two_spans_have_the_textbook_deflections():
     assert_allclose(static_peak(loaded, 0.5), 0.015012, atol=5e-7)
 
 
-def test_everything_at_once_as_finite_elements_have_it():
+def test_supports_springs_and_patches_together_against_finite_elements():
     # No load so close to another node that the short element spoils the oracle.
     y = np.array([0.02, 0.11, 0.3, 0.47, 0.7, 0.95, 1.15])
     expected = oracle_line(GENERAL, X, y)
     found = influence_line(GENERAL, X, y)
     assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    at, forces = [0.2, 0.95], [3.0, -1.5]
+    load_positions, forces = [0.2, 0.95], [3.0, -1.5]
     expected = finite_elements.static_deflection(
         as_oracle(GENERAL, 1), X, [(0.2, -3.0), (0.95, 1.5)]
     )
-    found = static_deflection(GENERAL, X, at, forces)
+    found = static_deflection(GENERAL, X, load_positions, forces)
     assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-def test_without_forces_the_loads_of_the_case_press_with_their_weights():
+def test_forces_left_out_are_the_weights_of_the_loads():
     found = static_deflection(GENERAL, X, [0.2, 0.95])
     expected = static_deflection(GENERAL, X, [0.2, 0.95], [0.5 * 9.81, 2.0])
     assert_allclose(found, expected, rtol=1e-14)
@@ -138,7 +138,7 @@ def sampled_peak(case: Case, x, until: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("speed", [0.01, 3.0, -3.0])
-def test_one_load_makes_the_extreme_of_the_influence_line_at_any_speed(speed):
+def test_static_peak_of_one_load_is_the_extreme_of_the_influence_line(speed):
     """Pinned, midspan: P L^3 / 48 E I; a quarter span, by Roark's largest deflection."""
     case = Case(Beam(2.0, **PROPERTIES), loads=[MovingMass(0.4, speed)])
     a = 0.5  # the load at a: deflection elsewhere is largest sqrt((L^2 - a^2) / 3) from the far end
@@ -164,7 +164,7 @@ def test_peaks_of_a_stream_are_those_of_a_fine_sampling(loads):
     assert_allclose(found, expected, rtol=2e-4)  # samples miss the instant of an exit
 
 
-def test_loads_of_equal_speed_keep_their_distance():
+def test_static_peak_depends_on_the_distance_of_the_loads_only():
     """A stream twice as fast whose members follow in half the time."""
     slow = [MovingMass(0.3, 0.5), MovingMass(mass=0.3, speed=0.5, entry_time=1.0)]
     fast = [MovingMass(0.3, 1.0), MovingMass(mass=0.3, speed=1.0, entry_time=0.5)]
@@ -172,7 +172,7 @@ def test_loads_of_equal_speed_keep_their_distance():
     assert_allclose(*peaks, rtol=1e-12)
 
 
-def test_no_load_no_peak():
+def test_static_peak_without_loads_is_zero():
     assert_allclose(static_peak(replace_loads(GENERAL, []), X), 0.0)
 
 
@@ -191,7 +191,7 @@ NUMBERS = [
 def test_gradients_of_lines_and_peaks():
     """Relative changes of every number, against central differences.
 
-    In reverse mode, which transposes what forward mode does: where it is right, both are.
+    In reverse mode, the transpose of forward mode: where it is right, both are.
     """
     # A support at the very end cannot follow when the length changes alone.
     case = replace(GENERAL, {"supports.2.position": 1.2, "actuators.2.end": 0.75})

@@ -2,8 +2,8 @@
 
 The motion follows the modal equations of `modal_equations` with actuators added, integrated anew
 from one event to the next: a load enters or leaves, a sensor takes a sample, the controller acts,
-its command begins. Every event is carried out by plain bookkeeping on a list of times. Without a
-clock the law acts at every instant, as part of the differential equations.
+its command begins. Events are processed in order, from a list of times. Without a clock the law
+acts continuously, as part of the differential equations.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Motion:
     times: np.ndarray  # (time,) s
     deflection: np.ndarray  # (time, sensor) m
     command: np.ndarray  # (time, actuator), just after a change
-    shown: np.ndarray  # (time, sensor) newest reading that has arrived; 0 without a clock
+    arrived_readings: np.ndarray  # (time, sensor) newest that has arrived; 0 without a clock
     modal: np.ndarray  # (time, mode) sqrt(kg) m
     modal_rate: np.ndarray  # (time, mode)
 
@@ -114,7 +114,7 @@ def respond(
                     if 0.0 <= t <= times[-1] + 10.0**-DIGITS})  # fmt: skip
     samples = {round(t, DIGITS): k for k, t in enumerate(times)}
     states, commands = np.zeros((len(times), plant.size)), np.zeros((len(times), len(actuators)))
-    shown = np.zeros((len(times), len(sensors)))
+    arrived_readings = np.zeros((len(times), len(sensors)))
 
     state = np.zeros(plant.size)
     for start, end in zip(marks, [*marks[1:], None], strict=True):
@@ -126,7 +126,7 @@ def respond(
             states[samples[start]] = state
             commands[samples[start]] = loop.command(start, state)
             if clock is not None:
-                shown[samples[start]] = loop.shown(start)
+                arrived_readings[samples[start]] = loop.arrived_readings(start)
         if end is None:
             break
         solution = solve_ivp(
@@ -139,7 +139,7 @@ def respond(
     n = span.modes
     rows = np.array([span.shapes(s.position) for s in sensors]).reshape(-1, n)
     deflection, modal, rates = states[:, :n] @ rows.T, states[:, :n], states[:, n : 2 * n]
-    return Motion(np.asarray(times), deflection, commands, shown, modal, rates)
+    return Motion(np.asarray(times), deflection, commands, arrived_readings, modal, rates)
 
 
 class _Plant:
@@ -181,10 +181,10 @@ class _Plant:
     def accelerations(self, t, y, command, active):
         n = self.span.modes
         q, u = y[:n], y[n : 2 * n]
-        drive = np.array(command, float)
-        drive[self.lagging] = y[2 * n : self.controlled]
+        actuator_states = np.array(command, float)
+        actuator_states[self.lagging] = y[2 * n : self.controlled]
         gains = [a.gain for a in self.actuators]
-        mass, force = np.eye(n), (gains * drive) @ self.strokes
+        mass, force = np.eye(n), (gains * actuator_states) @ self.strokes
         force = force - self.damping @ u - self.stiffness @ q
         for load in active:
             x, dx, ddx = load.motion(t, self.span.length, t > load.stop_time)
@@ -192,8 +192,8 @@ class _Plant:
             force = force - load.mass * GRAVITY * phi
             if load.kind == "mass":
                 mass += load.mass * phi[:, None] * phi
-                follow = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
-                force = force - load.mass * follow * phi
+                convective = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
+                force = force - load.mass * convective * phi
         return np.linalg.solve(mass, force)
 
     def signal(self, i, y):
@@ -210,28 +210,29 @@ class _Plant:
 
 
 class _Loop:
-    """Readings, the controller's memory of them, and its commands."""
+    """Readings, and commands of the controller: last, delayed and active."""
 
     def __init__(self, plant: _Plant, law: Law, clock: Clock | None, end: float):
         self.plant, self.law, self.clock = plant, law, clock
         count = len(plant.actuators)
-        self.held, self.given, self.waiting = np.zeros(count), np.zeros(count), {}
-        self.seen, self.arrives, self.digital = [], [], []
-        self.acts, self.times = set(), []
+        self.active_command, self.last_command = np.zeros(count), np.zeros(count)
+        self.delayed_commands = {}
+        self.sample_numbers, self.readings, self.digital = [], [], []
+        self.control_instants, self.times = set(), []
         if clock is None:
             return
         instants = clock.period * np.arange(int(end / clock.period + 1e-9) + 1)
-        self.acts = {round(t, DIGITS) for t in instants}
+        self.control_instants = {round(t, DIGITS) for t in instants}
         self.times = [*instants, *(instants + clock.delay)]
         for sensor in plant.sensors:
             period = sensor.period or clock.period
             numbers = range(int(end / period + 1e-9) + 1)
-            looks = {round(k * period - sensor.delay, DIGITS): k for k in numbers}
-            self.seen.append(looks)
-            self.times += list(looks)
+            samples = {round(k * period - sensor.delay, DIGITS): k for k in numbers}
+            self.sample_numbers.append(samples)
+            self.times += list(samples)
             rest = sensor.convert(0.0)
-            # What is shown of each reading; those from before the run are those at rest.
-            self.arrives.append([(k * period, rest) for k in numbers])
+            # Time at which each reading arrives, and its value: at rest until it is taken.
+            self.readings.append([(k * period, rest) for k in numbers])
             if sensor.order and not sensor.analogue:
                 sos = scipy.signal.butter(sensor.order, sensor.cutoff, fs=1 / period, output="sos")
                 self.digital.append([sos, scipy.signal.sosfilt_zi(sos) * rest])
@@ -241,45 +242,45 @@ class _Loop:
     def carry_out(self, t, state, active):
         """Take the readings and give the commands that are due at an event."""
         for i, sensor in enumerate(self.plant.sensors if self.clock else ()):
-            if t in self.seen[i]:
-                self._read(i, sensor, self.seen[i][t], t, state, active)
-        if t in self.acts:
-            wanted = self.law(self.shown(t), state[: self.plant.controlled], t)
-            self.given = self._limited(wanted, self.given)
-            self.waiting[round(t + self.clock.delay, DIGITS)] = self.given
-        self.held = self.waiting.pop(t, self.held)
+            if t in self.sample_numbers[i]:
+                self._read(i, sensor, self.sample_numbers[i][t], t, state, active)
+        if t in self.control_instants:
+            law_output = self.law(self.arrived_readings(t), state[: self.plant.controlled], t)
+            self.last_command = self._limited(law_output, self.last_command)
+            self.delayed_commands[round(t + self.clock.delay, DIGITS)] = self.last_command
+        self.active_command = self.delayed_commands.pop(t, self.active_command)
 
-    def shown(self, t):
+    def arrived_readings(self, t):
         """The newest reading of each sensor that has arrived."""
-        return np.array([max(r for r in each if r[0] <= t + 1e-11)[1] for each in self.arrives])
+        return np.array([max(r for r in each if r[0] <= t + 1e-11)[1] for each in self.readings])
 
     def _read(self, i, sensor, number, t, state, active):
         if sensor.quantity == "acceleration":
-            moving = self.plant.accelerations(t, state, self.held, active)
-            reading = sensor.convert(self.plant.rows[i] @ moving)
+            accelerations = self.plant.accelerations(t, state, self.active_command, active)
+            reading = sensor.convert(self.plant.rows[i] @ accelerations)
         else:
             reading = sensor.convert(self.plant.smooth(i, state))
         if self.digital[i] is not None:
             sos, memory = self.digital[i]
             (reading,), self.digital[i][1] = scipy.signal.sosfilt(sos, [reading], zi=memory)
-        self.arrives[i][number] = (self.arrives[i][number][0], reading)
+        self.readings[i][number] = (self.readings[i][number][0], reading)
 
     def command(self, t, state):
         if self.clock is not None:
-            return self.held
+            return self.active_command
         readings = [
             s.convert(self.plant.smooth(i, state)) for i, s in enumerate(self.plant.sensors)
         ]
         return self._limited(self.law(np.array(readings), state[: self.plant.controlled], t), None)
 
-    def _limited(self, wanted, before):
-        command = np.array(wanted, float)
+    def _limited(self, law_output, previous):
+        command = np.array(law_output, float)
         if self.clock is not None and self.clock.resolution is not None:
             command = self.clock.resolution * np.round(command / self.clock.resolution)
         for i, actuator in enumerate(self.plant.actuators):
             if actuator.limits is not None:
                 command[i] = np.clip(command[i], *actuator.limits)
-            if actuator.rate is not None and before is not None:
+            if actuator.rate is not None and previous is not None:
                 change = actuator.rate * self.clock.period
-                command[i] = np.clip(command[i], before[i] - change, before[i] + change)
+                command[i] = np.clip(command[i], previous[i] - change, previous[i] + change)
         return command

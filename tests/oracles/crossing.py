@@ -65,38 +65,40 @@ def respond(
     def accelerations(t: float, y: np.ndarray, active: list[_Contact]) -> tuple:
         """Modal accelerations and the contact forces of the active loads."""
         q, u = y[:n], y[n:]
-        push = -damping @ u - stiffness @ q
+        modal_force = -damping @ u - stiffness @ q
         if force is not None:
-            push = push + shapes.T @ force(t)
+            modal_force = modal_force + shapes.T @ force(t)
         rows = np.empty((len(active), n))
-        excess = np.empty(len(active))  # contact acceleration but for the modal accelerations
+        convective = np.empty(len(active))  # contact acceleration but for the modal accelerations
         for i, contact in enumerate(active):
             x, dx, ddx = contact.load.motion(t, beam.length, contact.stopped)
             s = x - contact.left
             nodal = shapes[2 * contact.element : 2 * contact.element + 4]
             rows[i] = hermite(s, contact.h) @ nodal
             slope, curvature = (hermite(s, contact.h, d) @ nodal for d in (1, 2))
-            excess[i] = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
+            convective[i] = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
         pressing = np.array([c.load.mass * GRAVITY for c in active])
-        heavy = np.array([c.load.kind == "mass" for c in active], dtype=bool)
-        push = push - pressing[~heavy] @ rows[~heavy]
-        spread = mobility @ rows[heavy].T
-        masses = np.array([c.load.mass for c in active])[heavy]
-        compliance = np.diag(1.0 / masses) + rows[heavy] @ spread
-        known = GRAVITY + excess[heavy] + spread.T @ push
-        pressing[heavy] = np.linalg.solve(compliance, known)
-        push = push - pressing[heavy] @ rows[heavy]
-        return mobility @ push, pressing
+        is_mass = np.array([c.load.kind == "mass" for c in active], dtype=bool)
+        modal_force = modal_force - pressing[~is_mass] @ rows[~is_mass]
+        modal_responses = mobility @ rows[is_mass].T
+        masses = np.array([c.load.mass for c in active])[is_mass]
+        compliance = np.diag(1.0 / masses) + rows[is_mass] @ modal_responses
+        unconstrained_acceleration = GRAVITY + convective[is_mass] + modal_responses.T @ modal_force
+        pressing[is_mass] = np.linalg.solve(compliance, unconstrained_acceleration)
+        modal_force = modal_force - pressing[is_mass] @ rows[is_mass]
+        return mobility @ modal_force, pressing
 
     y = np.zeros(2 * n) if initial is None else np.concatenate(initial)
     states = np.zeros((len(times), 2 * n))
-    second = np.zeros((len(times), n))
+    modal_accelerations = np.zeros((len(times), n))
     contact_force = np.zeros((len(times), len(loads)))
     limits = _break_points(model, loads, breaks, times[-1])
     for k, (start, end) in enumerate(zip(limits[:-1], limits[1:], strict=True)):
         last = k == len(limits) - 2
-        wanted = np.flatnonzero((times >= start) & ((times <= end) if last else (times < end)))
-        marks = np.append(times[wanted], end)
+        sample_indices = np.flatnonzero(
+            (times >= start) & ((times <= end) if last else (times < end))
+        )
+        marks = np.append(times[sample_indices], end)
         active = _contacts(model, loads, 0.5 * (start + end))
         if active or force is not None:
             solution = solve_ivp(
@@ -114,15 +116,17 @@ def respond(
                     propagators[key] = expm(state_matrix * (mark - t)) * scale / scale[:, None]
                 path[i] = propagators[key] @ (path[i - 1] if i else y)
                 t = mark
-        for i, state in zip(wanted, path, strict=False):
+        for i, state in zip(sample_indices, path, strict=False):
             states[i] = state
-            second[i], pressing = accelerations(times[i], state, active)
+            modal_accelerations[i], pressing = accelerations(times[i], state, active)
             contact_force[i, [c.index for c in active]] = pressing
         y = path[-1]
 
     rows = np.array([model.shape(x) for x in sensors]).reshape(len(sensors), -1) @ shapes
     q, u = states[:, :n], states[:, n:]
-    return Response(times, q @ rows.T, u @ rows.T, second @ rows.T, contact_force, q, u)
+    return Response(
+        times, q @ rows.T, u @ rows.T, modal_accelerations @ rows.T, contact_force, q, u
+    )
 
 
 @dataclass(frozen=True)
@@ -139,15 +143,15 @@ class _Contact:
 
 def _contacts(model: Model, loads: Sequence[Load], t: float) -> list[_Contact]:
     """The loads on the beam at time t."""
-    length, found = model.beam.length, []
+    length, contacts = model.beam.length, []
     for index, load in enumerate(loads):
         if load.entry_time < t < load.time_at(length):
             stopped = t > load.stop_time
             x = load.motion(t, length, stopped)[0]
             element = int(np.clip(np.searchsorted(model.nodes, x) - 1, 0, len(model.nodes) - 2))
             left, right = model.nodes[element : element + 2]
-            found.append(_Contact(load, index, element, left, right - left, stopped))
-    return found
+            contacts.append(_Contact(load, index, element, left, right - left, stopped))
+    return contacts
 
 
 def _break_points(
@@ -158,8 +162,8 @@ def _break_points(
     for load in loads:
         distances = model.nodes if load.speed > 0.0 else model.beam.length - model.nodes
         points += [load.stop_time, *(load.time_at(d) for d in distances)]
-    found = np.unique(np.clip([p for p in points if p <= end], 0.0, None))
-    return found[np.append(True, np.diff(found) > 1e-13 * end)]
+    times = np.unique(np.clip([p for p in points if p <= end], 0.0, None))
+    return times[np.append(True, np.diff(times) > 1e-13 * end)]
 
 
 def _modal_matrices(

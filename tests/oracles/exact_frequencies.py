@@ -34,16 +34,16 @@ def exact_frequencies(beam: Beam, count: int) -> np.ndarray:
     def below(omega: float) -> int:
         return _count_below(omega, members, springs, free)
 
-    found = [0.0] * min(below(1e-3 * scale), count)
-    for number in range(len(found), count):
-        low = max(found[-1], 1e-3 * scale) if found else 1e-3 * scale
+    frequencies = [0.0] * min(below(1e-3 * scale), count)
+    for number in range(len(frequencies), count):
+        low = max(frequencies[-1], 1e-3 * scale) if frequencies else 1e-3 * scale
         high = low + scale
         while below(high) <= number:
             high *= 2.0
         while low < (middle := 0.5 * (low + high)) < high:
             low, high = (middle, high) if below(middle) <= number else (low, middle)
-        found.append(high)
-    return np.array(found)
+        frequencies.append(high)
+    return np.array(frequencies)
 
 
 def wavenumbers(beam: Beam, count: int) -> np.ndarray:
@@ -61,7 +61,7 @@ def _count_below(omega: float, members: list, springs: np.ndarray, free: np.ndar
     for k, n, start, (length, rigidity, _) in zip(wave, pieces, starts, members, strict=False):
         for at in range(int(start), int(start) + 2 * n, 2):
             stiffness[at : at + 4, at : at + 4] += _piece(k * length / n, length / n, rigidity)
-    ends = (starts[:, None] + [0, 1]).ravel()  # where the given springs and restraints are
+    ends = (starts[:, None] + [0, 1]).ravel()  # degrees of freedom with springs and restraints
     np.add.at(stiffness, (ends, ends), springs)
     kept = np.setdiff1d(np.arange(len(stiffness)), np.delete(ends, free))
     stiffness = stiffness[np.ix_(kept, kept)]

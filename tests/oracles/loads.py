@@ -1,4 +1,4 @@
-"""How a load travels along a beam at constant deceleration, shared by the oracles."""
+"""Trajectory of a load along a beam at constant deceleration, shared by the oracles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Load:
     kind: str = "mass"  # or "force", which is the weight of `mass` alone
 
     def time_at(self, distance: float) -> float:
-        """When the load has travelled `distance` from its entry; infinite if it never does."""
+        """Time (s) at which the load has travelled `distance` (m); infinite if it never does."""
         v, a = abs(self.speed), self.deceleration
         root = v**2 - 2.0 * a * distance
         return self.entry_time + 2.0 * distance / (v + root**0.5) if root >= 0.0 else np.inf

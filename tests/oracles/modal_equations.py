@@ -1,6 +1,6 @@
 """The modal equations of a simply supported span under travelling loads, from analytic sine modes.
 
-Written apart from the finite-element solver: no contact forces, but the whole mass matrix. With
+Independent of the finite-element solver: no contact forces, but the full mass matrix. With
 mass-normalised modes phi_n = sqrt(2 / (m L)) sin(n pi x / L) and every load's own mass M (zero
 for a force), weight P, position x(t) and column phi = phi(x(t)),
 
@@ -84,23 +84,23 @@ def respond(
     events = np.unique(np.clip(events, 0.0, times[-1]))
 
     state = np.zeros(2 * n) if initial is None else np.concatenate(initial)
-    states, pressing = np.zeros((len(times), 2 * n)), np.zeros((len(times), len(loads)))
+    states, contact_force = np.zeros((len(times), 2 * n)), np.zeros((len(times), len(loads)))
     for start, end in zip(events[:-1], events[1:], strict=True):
         system = _System(span, loads, 0.5 * (start + end))
-        wanted = np.flatnonzero((times >= start) & (times <= end))
+        sample_indices = np.flatnonzero((times >= start) & (times <= end))
         solution = solve_ivp(
             system.rate, (start, end), state, method="DOP853",
-            t_eval=np.append(times[wanted[times[wanted] < end]], end),
+            t_eval=np.append(times[sample_indices[times[sample_indices] < end]], end),
             rtol=1e-12, atol=1e-15,
         )  # fmt: skip
         if not solution.success:
             raise RuntimeError(solution.message)
-        for i, k in enumerate(wanted):
+        for i, k in enumerate(sample_indices):
             states[k] = solution.y[:, i]
-            pressing[k] = system.contact_forces(times[k], states[k])
+            contact_force[k] = system.contact_forces(times[k], states[k])
         state = solution.y[:, -1]
     deflection = states[:, :n] @ span.shapes(np.asarray(sensors)).T
-    return ModalResponse(times, deflection, pressing, states[:, :n], states[:, n:])
+    return ModalResponse(times, deflection, contact_force, states[:, :n], states[:, n:])
 
 
 class _System:
@@ -127,8 +127,8 @@ class _System:
             force = force - load.mass * GRAVITY * phi
             if load.kind == "mass":
                 mass += load.mass * phi[:, None] * phi
-                follow = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
-                force = force - load.mass * follow * phi
+                convective = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
+                force = force - load.mass * convective * phi
         return np.concatenate([u, np.linalg.solve(mass, force)])
 
     def contact_forces(self, t: float, state: np.ndarray) -> np.ndarray:
@@ -141,6 +141,6 @@ class _System:
                 forces[i] = load.mass * GRAVITY
                 if load.kind == "mass":
                     phi, slope, curvature, dx, ddx = self._shapes_under(i, t)
-                    follow = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
-                    forces[i] += load.mass * (phi @ accelerations + follow)
+                    convective = 2 * dx * slope @ u + dx**2 * curvature @ q + ddx * slope @ q
+                    forces[i] += load.mass * (phi @ accelerations + convective)
         return forces

@@ -1,8 +1,8 @@
 """A span with actuators and at most one load as a linear plant, in continuous time and sampled.
 
-Its matrices are probed from the modal equations, its transitions integrated by scipy. The last
-state is the weight of the load, if there is one. Also Gaussian conditioning by brute force: all
-states and readings stacked into one vector.
+Its matrices are rates of the modal equations for unit states and inputs, its transitions are
+integrated by scipy. The last state is the weight of the load, if there is one. Also Gaussian
+conditioning of the joint vector of all states and readings.
 """
 
 from __future__ import annotations
@@ -50,26 +50,26 @@ class SampledPlant:
         length = self.plant.span.length
         active = [x for x in self.loads if x.entry_time <= t < x.time_at(length)]
 
-        def outcome(y, command):
-            moving = self.plant.rate(t, y, command, active)
+        def rates_and_outputs(y, command):
+            rates = self.plant.rate(t, y, command, active)
             n = self.plant.span.modes
-            seen = [
-                self.plant.rows[i] @ moving[n : 2 * n]
+            outputs = [
+                self.plant.rows[i] @ rates[n : 2 * n]
                 if sensor.quantity == "acceleration"
                 else self.plant.signal(i, y)
                 for i, sensor in enumerate(self.plant.sensors)
             ]
-            return np.append(moving, seen)
+            return np.append(rates, outputs)
 
-        rest = outcome(np.zeros(self.inner), np.zeros(self.inputs))
-        states = [outcome(e, np.zeros(self.inputs)) - rest for e in np.eye(self.inner)]
+        rest = rates_and_outputs(np.zeros(self.inner), np.zeros(self.inputs))
+        states = [rates_and_outputs(e, np.zeros(self.inputs)) - rest for e in np.eye(self.inner)]
         weights = [rest / (load.mass * GRAVITY) for load in self.loads]
-        inputs = [outcome(np.zeros(self.inner), e) - rest for e in np.eye(self.inputs)]
-        whole, pushed = np.array([*states, *weights]).T, np.array(inputs).T
-        still = np.zeros((len(self.loads), self.size + self.inputs))
-        top = np.vstack([np.hstack([whole, pushed])[: self.inner], still])
+        inputs = [rates_and_outputs(np.zeros(self.inner), e) - rest for e in np.eye(self.inputs)]
+        state_columns, input_columns = np.array([*states, *weights]).T, np.array(inputs).T
+        zero_rows = np.zeros((len(self.loads), self.size + self.inputs))
+        top = np.vstack([np.hstack([state_columns, input_columns])[: self.inner], zero_rows])
         A, B = top[:, : self.size], top[:, self.size :]
-        return A, B, whole[self.inner :], pushed[self.inner :]
+        return A, B, state_columns[self.inner :], input_columns[self.inner :]
 
     def step(self, t: float, period: float, delay: float, intensity: np.ndarray) -> Step:
         """From t - period to t, white noise of this intensity on the rates of the states."""
@@ -80,21 +80,21 @@ class SampledPlant:
         return Step(last @ first, last @ before, after, late + last @ early @ last.T)
 
     def _integrated(self, begin, end, intensity):
-        n, wide = self.size, self.size + self.inputs
+        n, columns = self.size, self.size + self.inputs
         if end <= begin:
             return np.eye(n), np.zeros((n, self.inputs)), np.zeros((n, n))
 
         def rate(t, y):
-            flow, noise = y[: n * wide].reshape(n, wide), y[n * wide :].reshape(n, n)
+            transition, noise = y[: n * columns].reshape(n, columns), y[n * columns :].reshape(n, n)
             A, B, _, _ = self.matrices(t)
-            moved = A @ flow
-            moved[:, n:] += B
-            return np.append(moved, A @ noise + noise @ A.T + intensity)
+            transition_rate = A @ transition
+            transition_rate[:, n:] += B
+            return np.append(transition_rate, A @ noise + noise @ A.T + intensity)
 
-        y = np.append(np.eye(n, wide), np.zeros((n, n)))
+        y = np.append(np.eye(n, columns), np.zeros((n, n)))
         y = solve_ivp(rate, (begin, end), y, method="DOP853", rtol=1e-10, atol=1e-14).y[:, -1]
-        flow = y[: n * wide].reshape(n, wide)
-        return flow[:, :n], flow[:, n:], y[n * wide :].reshape(n, n)
+        transition = y[: n * columns].reshape(n, columns)
+        return transition[:, :n], transition[:, n:], y[n * columns :].reshape(n, n)
 
 
 def conditioned(
@@ -112,27 +112,28 @@ def conditioned(
     """
     mean, covariance = start
     size, count = mean.size, len(steps)
-    means, spread = [], np.zeros((count * size, count * size))
+    means, joint_covariance = [], np.zeros((count * size, count * size))
     before = np.zeros(commands.shape[1])
     for k, step in enumerate(steps):
         mean = step.transition @ mean + step.before @ before + step.after @ commands[k]
         covariance = step.transition @ covariance @ step.transition.T + step.noise
         means.append(mean)
         here = slice(k * size, (k + 1) * size)
-        spread[here, here] = covariance
-        spread[here, : k * size] = (
-            step.transition @ spread[(k - 1) * size : k * size, : k * size] if k else 0.0
+        joint_covariance[here, here] = covariance
+        joint_covariance[here, : k * size] = (
+            step.transition @ joint_covariance[(k - 1) * size : k * size, : k * size] if k else 0.0
         )
-        spread[: k * size, here] = spread[here, : k * size].T
+        joint_covariance[: k * size, here] = joint_covariance[here, : k * size].T
         before = commands[k]
     C = np.zeros((readings.size, count * size))
     outputs = readings.shape[1]
     for k, (row, _) in enumerate(rows):
         C[k * outputs : (k + 1) * outputs, k * size : (k + 1) * size] = row
-    direct = np.concatenate([D @ u for (_, D), u in zip(rows, commands, strict=True)])
-    seen = C @ spread @ C.T + np.kron(np.eye(count), noise)
-    gain = np.linalg.solve(seen, C @ spread).T[-size:]
-    surprise = readings.reshape(-1) - C @ np.concatenate(means) - direct
-    return means[-1] + gain @ surprise, (spread - np.linalg.solve(seen, C @ spread).T @ C @ spread)[
-        -size:, -size:
-    ]
+    feedthrough = np.concatenate([D @ u for (_, D), u in zip(rows, commands, strict=True)])
+    output_covariance = C @ joint_covariance @ C.T + np.kron(np.eye(count), noise)
+    gain = np.linalg.solve(output_covariance, C @ joint_covariance).T[-size:]
+    innovation = readings.reshape(-1) - C @ np.concatenate(means) - feedthrough
+    return means[-1] + gain @ innovation, (
+        joint_covariance
+        - np.linalg.solve(output_covariance, C @ joint_covariance).T @ C @ joint_covariance
+    )[-size:, -size:]

@@ -8,7 +8,7 @@ from tests.oracles.make_demo_log import DEMO, NOISE, SAMPLING, measure, truth
 
 
 @pytest.mark.parametrize("name", SAMPLING)
-def test_a_demo_log_is_small_and_says_its_units(name):
+def test_a_demo_log_is_small_and_has_units(name):
     path = DEMO / f"{name}.csv"
     assert path.stat().st_size < 60_000
     first = path.read_text(encoding="utf-8").splitlines()[0]
@@ -25,7 +25,7 @@ def test_making_the_demo_logs_again_gives_the_committed_numbers():
 
 @pytest.mark.slow
 def test_the_nominal_number_of_modes_is_enough_for_the_noise():
-    """What the model of the case file leaves out stays far below the noise of a reading."""
+    """The error of the modes that the model neglects is far below the noise of a reading."""
     rig, logs = truth()
     few, many = (
         measure(rig, logs["log_2"]["loads"], *SAMPLING["log_2"], modes=modes)

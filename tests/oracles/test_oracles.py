@@ -211,15 +211,15 @@ def test_a_mode_stays_at_rest_after_a_crossing_at_its_cancellation_speed(mode, o
 
 
 def reference_run(case: dict) -> tuple[dict, list[Load], list[float], np.ndarray]:
-    """What a reference case says: its tables, loads, sensor positions and sample times."""
-    told = tomllib.loads(case["case_toml"])
-    loads = [Load(**load) for load in told["loads"]]
-    samples = round(told["run"]["duration"] * told["run"]["sample_rate"])
-    times = np.arange(samples + 1) / told["run"]["sample_rate"]
-    return told, loads, [s["position"] for s in told["sensors"]], times
+    """Tables, loads, sensor positions (m) and sample times (s) of a reference case."""
+    tables = tomllib.loads(case["case_toml"])
+    loads = [Load(**load) for load in tables["loads"]]
+    samples = round(tables["run"]["duration"] * tables["run"]["sample_rate"])
+    times = np.arange(samples + 1) / tables["run"]["sample_rate"]
+    return tables, loads, [s["position"] for s in tables["sensors"]], times
 
 
-def assert_as_referred(case: dict, deflection: np.ndarray, tolerance: float) -> None:
+def assert_reference_deflection(case: dict, deflection: np.ndarray, tolerance: float) -> None:
     """Deflections at the samples and their largest values, relative to the largest of all."""
     largest = np.abs(deflection).max()
     assert_allclose(
@@ -234,24 +234,24 @@ def assert_as_referred(case: dict, deflection: np.ndarray, tolerance: float) -> 
     "case", [c for c in REFERENCE if "supports" not in c["case_toml"]], ids=lambda c: c["title"]
 )
 def test_modal_equations_agree_with_the_reference_implementation(case):
-    told, loads, sensors, times = reference_run(case)
+    tables, loads, sensors, times = reference_run(case)
     keys = ("length", "flexural_rigidity", "mass_per_length", "modes", "damping_ratio")
-    span = Span(**{key: told["beam"][key] for key in keys})
+    span = Span(**{key: tables["beam"][key] for key in keys})
     found = modal_equations.respond(span, loads, sensors, times)
     assert_allclose(span.frequencies / (2 * np.pi), case["natural_frequencies_hz"], rtol=1e-12)
-    assert_as_referred(case, found.deflection, 1e-12)
+    assert_reference_deflection(case, found.deflection, 1e-12)
 
 
 @pytest.mark.parametrize("index", [1, 4, 6], ids=lambda i: REFERENCE[i]["title"])
 def test_finite_elements_agree_with_the_reference_implementation(index):
     case = REFERENCE[index]
-    told, loads, sensors, times = reference_run(case)
-    supports = [Support(**support) for support in told.get("supports", [])]
+    tables, loads, sensors, times = reference_run(case)
+    supports = [Support(**support) for support in tables.get("supports", [])]
     beam = Beam(
-        **{k: v for k, v in told["beam"].items() if k != "modes"}, supports=supports, elements=120
+        **{k: v for k, v in tables["beam"].items() if k != "modes"}, supports=supports, elements=120
     )
-    found = crossing.respond(beam, loads, sensors, times, modes=told["beam"]["modes"])
-    assert_as_referred(case, found.deflection, 2e-7)
+    found = crossing.respond(beam, loads, sensors, times, modes=tables["beam"]["modes"])
+    assert_reference_deflection(case, found.deflection, 2e-7)
 
 
 @pytest.mark.parametrize("speed", [1.5, -1.5])
@@ -284,7 +284,7 @@ def test_all_finite_element_modes_agree_with_many_sine_modes():
 
 
 def test_a_suspension_of_all_modes_is_an_elastic_support():
-    """Seen twice: as a coupling of the pinned beam's modes, and inside the modes."""
+    """As a coupling of the modes of the pinned beam, and as part of the modes."""
     plain = Beam(0.6, 11.68, 0.535, elements=6)
     spring = {"position": 0.5, "stiffness": 3500.0, "damping": 20.0}
     times, load = np.linspace(0.0, 0.1, 21), Load(0.5, 8.0)
@@ -295,19 +295,19 @@ def test_a_suspension_of_all_modes_is_an_elastic_support():
     assert_allclose(first, second, rtol=0, atol=1e-7 * np.abs(first).max())
 
 
-def test_free_vibration_loses_what_the_dampers_take():
+def test_energy_lost_in_free_vibration_is_the_work_of_the_dampers():
     """Energy of the supported, suspended beam against the work of its two dampers."""
     beam = refined(GENERAL, 13)
     model = assemble(beam)
     n = len(model.free)
     start = np.zeros(n), np.append([0.3, -0.2, 0.1], np.zeros(n - 3))
     times = np.linspace(0.0, 0.5, 20001)
-    at = [0.3, 1.3, 0.7]  # two support dampers and the suspension
-    moved = crossing.respond(beam, [], at, times, initial=start)
+    damper_positions = [0.3, 1.3, 0.7]  # two support dampers and the suspension
+    motion = crossing.respond(beam, [], damper_positions, times, initial=start)
     omega, _ = model.modes()
-    energy = 0.5 * np.sum(moved.modal_rate**2 + (omega * moved.modal) ** 2, axis=1)
-    energy += 0.5 * 0.05 * moved.velocity[:, 2] ** 2 + 0.5 * 300.0 * moved.deflection[:, 2] ** 2
-    power = moved.velocity**2 @ np.array([0.4, 0.2, 1.2])
+    energy = 0.5 * np.sum(motion.modal_rate**2 + (omega * motion.modal) ** 2, axis=1)
+    energy += 0.5 * 0.05 * motion.velocity[:, 2] ** 2 + 0.5 * 300.0 * motion.deflection[:, 2] ** 2
+    power = motion.velocity**2 @ np.array([0.4, 0.2, 1.2])
     work = np.trapezoid(power, times)
     assert work > 0.2 * energy[0]
     assert_allclose(energy[0] - energy[-1], work, rtol=1e-4)

@@ -47,7 +47,7 @@ class TwoSpans:
 
     @cached_property
     def scale(self) -> np.ndarray:
-        """Factor that makes the modal masses one."""
+        """Factors that normalise the modal masses (mode,), in 1/sqrt(kg)."""
         points, weights = np.polynomial.legendre.leggauss(60 + 4 * self.modes)
         x = self.length / 4 * (points + 1)  # half is enough: the other is its image
         squares = self._left(x, 0) ** 2
@@ -66,10 +66,11 @@ class TwoSpans:
         k, span = self.wavenumbers, self.length / 2
         phase = np.multiply.outer(x, k)
         sine = np.sin(phase + 0.5 * np.pi * derivative)
-        grown = (np.exp(phase - k * span) - (-1) ** derivative * np.exp(-phase - k * span)) / 2
-        grown = grown / ((1 - np.exp(-2 * k * span)) / 2)  # sinh(k x) / sinh(k l), or cosh
-        held = np.where(np.arange(self.modes) % 2 == 0, 0.0, np.sin(k * span))
-        return k**derivative * (sine - held * grown)
+        hyperbolic = (np.exp(phase - k * span) - (-1) ** derivative * np.exp(-phase - k * span)) / 2
+        # sinh(k x) / sinh(k l), or cosh
+        hyperbolic = hyperbolic / ((1 - np.exp(-2 * k * span)) / 2)
+        sinh_share = np.where(np.arange(self.modes) % 2 == 0, 0.0, np.sin(k * span))
+        return k**derivative * (sine - sinh_share * hyperbolic)
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,13 @@ class ProjectedSines:
     def _solved(self):
         """Squared angular frequencies, and the map from modal coordinates to those of the sines."""
         size = self.mass_per_length * self.length / 2
-        kept = null_space(np.sin(self._whole * self.length / 2)[None])
+        constrained_basis = null_space(np.sin(self._whole * self.length / 2)[None])
         stiffness = self.flexural_rigidity * self._whole**4 * self.length / 2
-        squares, vectors = eigh(kept.T @ (stiffness[:, None] * kept), size * np.eye(self.modes))
-        return squares, kept @ vectors
+        squares, vectors = eigh(
+            constrained_basis.T @ (stiffness[:, None] * constrained_basis),
+            size * np.eye(self.modes),
+        )
+        return squares, constrained_basis @ vectors
 
     @cached_property
     def frequencies(self) -> np.ndarray:

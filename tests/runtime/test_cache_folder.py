@@ -182,7 +182,7 @@ def no_home():
     raise RuntimeError("Could not determine home directory.")
 
 
-def test_a_relative_cache_home_is_ignored(monkeypatch, tmp_path):
+def test_a_relative_cache_folder_is_ignored(monkeypatch, tmp_path):
     """Else the folder a command is started in would be trusted."""
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     monkeypatch.setenv("HOME", str(tmp_path))

@@ -173,7 +173,7 @@ def changed_flags(patch):
 @pytest.mark.parametrize(
     "change", [changed_setting, changed_source, changed_machine, changed_flags]
 )
-def test_options_source_machine_and_settings_decide_a_program(folder, change, monkeypatch):
+def test_the_key_depends_on_options_source_machine_and_settings(folder, change, monkeypatch):
     call(unoptimised, POINTS)
     clear_process_caches()
     with monkeypatch.context() as patch:
@@ -391,7 +391,7 @@ def test_jax_stores_programs_without_a_key(folder, jax_cache, monkeypatch):
     assert any("unoptimised" in path.name for path in jax_cache.iterdir())
 
 
-def test_threads_that_compile_leave_the_settings_of_jax_as_they_were():
+def test_threads_that_compile_restore_the_settings_of_jax():
     name = compile_cache.MIN_COMPILE_TIME
     before = getattr(jax.config, name)
     inside, leave = threading.Event(), threading.Event()

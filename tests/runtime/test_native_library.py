@@ -110,7 +110,7 @@ def test_a_change_of_source_flags_or_headers_is_another_library(source):
     assert len(names) == 4
 
 
-def test_all_headers_of_the_integrator_are_part_of_its_name(monkeypatch):
+def test_the_file_name_depends_on_all_headers_of_the_integrator(monkeypatch):
     monkeypatch.undo()
     folder, library = native_library.C_FOLDER, native_peaks.LIBRARY
     files = sorted(path.name for path in folder.iterdir())

@@ -2,7 +2,7 @@
 
 The published rigs with the parameters fitted by hand in the thesis, as finite elements with twelve
 modes, integrated by scipy: crossed by the heaviest load while their actuators are driven by sine
-sweeps, with white noise in the readings. Nothing of it is computed by jaxbeam.
+sweeps, with white noise in the readings. No response is computed by jaxbeam.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ import jaxbeam as jb
 from experiments.thesis.chapter2.identification import HAND_FITTED, with_log_modes
 from jaxbeam import rigs
 from tests.oracles import finite_elements
-from tests.tuning.rehearsals import Plant
+from tests.tuning.finite_element_rigs import Plant
 
 FOLDER = Path(__file__).parents[2] / "experiments" / "thesis" / "chapter2" / "logs"
 RATE, NOISE, SEED, SPEED = 100.0, 1e-5, 3, 1.0  # Hz, m, -, m/s
@@ -44,13 +44,13 @@ def plant(name: str) -> Plant:
 
 def make(name: str) -> np.ndarray:
     """A log: rows of time in s, readings in mm, commands in V."""
-    made = plant(name)
-    duration = float(made.case.beam.length) / SPEED + 0.4
+    rig = plant(name)
+    duration = float(rig.case.beam.length) / SPEED + 0.4
     times = np.arange(round(duration * RATE) + 1) / RATE
-    phases = 90.0 * np.arange(len(made.case.actuators))
+    phases = 90.0 * np.arange(len(rig.case.actuators))
     sweeps = [scipy.signal.chirp(times, LOWEST, duration, HIGHEST, phi=phi) for phi in phases]
     commands = VOLTS * np.stack(sweeps, axis=1)
-    readings = made.readings(times, commands)
+    readings = rig.readings(times, commands)
     readings = readings + NOISE * np.random.default_rng(SEED).normal(size=readings.shape)
     return np.column_stack([times, 1e3 * readings, commands])
 

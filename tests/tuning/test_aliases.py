@@ -7,7 +7,7 @@ from tuning.aliases import OLD_NAMES, accepts_old_arguments
 
 
 @pytest.mark.parametrize("old", OLD_NAMES)
-def test_old_names_are_the_new_objects(old):
+def test_old_names_are_aliases_of_the_new_ones(old):
     new = OLD_NAMES[old]
     with pytest.warns(DeprecationWarning, match=f"tuning.{old} is called tuning.{new} now"):
         assert getattr(tuning, old) is getattr(tuning, new)

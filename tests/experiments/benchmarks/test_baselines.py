@@ -187,7 +187,7 @@ def test_loops_for_numba_find_the_peaks_uncompiled(modes):
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-def test_numba_and_the_uncompiled_loops_agree():
+def test_numba_agrees_with_the_uncompiled_loops():
     package = pytest.importorskip("numba")
     found, plain = (
         numba_peaks.numba_peaks(numba_peaks.compile_peaks(p), PinnedBeam(3), MASSES, SPEEDS)

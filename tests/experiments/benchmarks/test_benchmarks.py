@@ -131,7 +131,7 @@ def test_scipy_identifies_the_same_optimum(monkeypatch):
 
 
 @pytest.mark.slow
-def test_evolution_never_ends_above_its_start():
+def test_evolution_does_not_end_above_its_start():
     case, free = tuning_methods.tuning_problem()
     result = tuning_methods.run_evolution(case, free, evaluations=1)
     assert jnp.isfinite(result.peak) and 0 < result.peak <= 0.83

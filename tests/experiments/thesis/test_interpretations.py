@@ -66,7 +66,7 @@ def force_per_volt(frequency, in_impedance, in_transmission):
     return 4.2 / impedance * shaker_mobility / (shaker_mobility + transmission_mobility)
 
 
-def test_the_mass_in_one_equation_only():
+def test_response_with_the_mass_in_the_impedance_only():
     beam = dataclasses.replace(rigs.load("A").beam, modes=4)
     found = shaker._mass_in_impedance_only(beam)
     every_97th = slice(None, None, 97)

@@ -109,7 +109,7 @@ def verdict_counts(name, load_rig=rigs.load):
     return {verdict: run.count(verdict) for verdict in VERDICTS}
 
 
-def test_a_wrong_model_gets_a_bad_verdict():
+def test_a_wrong_model_is_not_reproduced():
     """With half the rigidity no frequency and no critical speed is reproduced."""
 
     def wrong(name):

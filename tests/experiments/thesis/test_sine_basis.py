@@ -22,13 +22,13 @@ def two_spans(count: int) -> Case:
     return Case(Beam(1.2, 11.68, 0.535, modes=count), supports=[Support(0.6)])
 
 
-def test_the_approximate_row_of_table_2_2_to_all_printed_digits():
+def test_approximate_frequencies_of_table_2_2_to_all_printed_digits():
     found = sine_basis_modes(two_spans(8)).frequencies
     assert_allclose(found[:7], APPROXIMATE[:7], rtol=0, atol=5.1e-4)
     assert_allclose(found[7], APPROXIMATE[7], rtol=0, atol=5)  # five digits: spurious
 
 
-def test_the_analytical_row_of_table_2_2_is_that_of_the_exact_modes():
+def test_analytical_frequencies_of_table_2_2_are_the_exact_ones():
     found = modes(two_spans(8)).frequencies
     # 11.68 and 0.535 are rounded, which changes frequencies by 0.002 Hz.
     assert_allclose(found, ANALYTICAL, rtol=0, atol=2.1e-3)

@@ -68,9 +68,9 @@ def test_a_killed_tuning_is_resumed(tmp_path):
 def test_a_killed_multi_start_search_is_resumed(tmp_path):
     killed(SEARCH, tmp_path / "search.npz")
     problem = least_squares()
-    given = problem, problem.data.measured, 12, 1
-    resumed = multi_start(*given, Checkpoint(tmp_path / "search.npz", "digest"))
-    for one, other in zip(resumed, multi_start(*given), strict=True):
+    arguments = problem, problem.data.measured, 12, 1
+    resumed = multi_start(*arguments, Checkpoint(tmp_path / "search.npz", "digest"))
+    for one, other in zip(resumed, multi_start(*arguments), strict=True):
         assert one.cost == other.cost and one.starts == other.starts
         np.testing.assert_array_equal(one.values, other.values)
 

@@ -56,7 +56,7 @@ def test_quasi_newton_methods_follow_a_valley_and_return_from_undefined_points(n
     assert name != "lbfgs" or undefined > 0
 
 
-def test_adam_takes_a_step_back_and_makes_shorter_ones():
+def test_adam_reverts_a_step_to_an_undefined_point_and_shortens_the_next():
     method = optimiser("adam", 10)
     start = jnp.zeros(1)
     first, state = method.step(method.init(start), start, jnp.ones(()), -jnp.ones(1), True)

@@ -34,13 +34,13 @@ def swept():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["adam", "lbfgs", "bfgs"])
 def test_every_method_finds_what_a_sweep_finds(swept, method):
-    found = tuning.tune(rig(), FREE, CASES, method=method, starts=2, seed=3, **OPTIONS)
-    assert found.run_sets[0].objective[1] <= swept["peak"].min() * 1.002
-    assert found.history.shape == (40, 2) and np.isfinite(found.history).all()
-    values = [minimum.value for minimum in found.start_results]
+    tuned = tuning.tune(rig(), FREE, CASES, method=method, starts=2, seed=3, **OPTIONS)
+    assert tuned.run_sets[0].objective[1] <= swept["peak"].min() * 1.002
+    assert tuned.history.shape == (40, 2) and np.isfinite(tuned.history).all()
+    values = [minimum.value for minimum in tuned.start_results]
     assert values == sorted(values) and len(values) == 2
-    assert values[0] == pytest.approx(found.run_sets[0].objective[1], rel=1e-6)
-    assert "minima by start:" in str(found)
+    assert values[0] == pytest.approx(tuned.run_sets[0].objective[1], rel=1e-6)
+    assert "minima by start:" in str(tuned)
 
 
 @pytest.mark.slow
@@ -76,23 +76,23 @@ def test_lexicographic_order(swept):
 def test_mini_batches(swept):
     """Steps on two of four runs reach the same objective, and repeat with the same seed."""
     options = OPTIONS | {"batch": 2}
-    found, again = (tuning.tune(rig(), FREE, CASES, seed=1, **options) for _ in range(2))
-    assert found.run_sets[0].objective[1] <= swept["peak"].min() * 1.01
-    np.testing.assert_array_equal(found.history, again.history)
+    first, again = (tuning.tune(rig(), FREE, CASES, seed=1, **options) for _ in range(2))
+    assert first.run_sets[0].objective[1] <= swept["peak"].min() * 1.01
+    np.testing.assert_array_equal(first.history, again.history)
     other = tuning.tune(rig(), FREE, CASES, seed=2, **options)
-    assert not np.array_equal(found.history, other.history)
+    assert not np.array_equal(first.history, other.history)
 
 
 def test_limits_that_held_out_runs_exceed_are_in_the_verdict():
     metrics = {"peak": 1.0, "effort": 0.3}
     peaks = (np.full(1, x) for x in (1.0, 0.9, 0.8, 0.7))
     outcome = RunSetResult("held out", ({},), *peaks, np.zeros(1), [1.0, 0.8], metrics)
-    found = tuning.TuningResult(
+    result = tuning.TuningResult(
         rig(), [], np.zeros(0), tuning.Objective(limits={"effort": 0.2, "peak": 1.0}),
         np.zeros((1, 1)), 0, [outcome, outcome],
     )  # fmt: skip
-    assert found.limit_excess == {"effort": pytest.approx(0.1)}
-    assert "effort exceeds its limit of 0.2 by 0.1" in found.verdict
+    assert result.limit_excess == {"effort": pytest.approx(0.1)}
+    assert "effort exceeds its limit of 0.2 by 0.1" in result.verdict
 
 
 def test_integers():
@@ -112,13 +112,14 @@ def test_integers():
 @pytest.mark.slow
 def test_the_best_integer_is_selected():
     """A power of 1 or 3 of the reading: with such gains a cubic law hardly acts."""
-    found = tuning.tune_integers(
+    search = tuning.tune_integers(
         rig(), {"controller.power": [1, 3]}, FREE, CASES, **(OPTIONS | {"steps": 3})
     )
-    ends = [each.run_sets[0].objective[1] for each in found.tuned]
-    assert [each["controller.power"] for each in found.choices] == [1, 3] and ends[0] < ends[1]
-    assert found.best is found.tuned[0] and found.best.case.controller.power == 1
-    assert "(best)" in str(found)
+    objectives = [each.run_sets[0].objective[1] for each in search.tuned]
+    assert [each["controller.power"] for each in search.choices] == [1, 3]
+    assert objectives[0] < objectives[1]
+    assert search.best is search.tuned[0] and search.best.case.controller.power == 1
+    assert "(best)" in str(search)
 
 
 BAD = [

@@ -16,44 +16,48 @@ from tuning.fit.uncertainty.posterior import Posterior
 
 
 @pytest.fixture(scope="module")
-def found():
+def identified_fit():
     return fit()
 
 
-def drawn(found, count=4000, seed=0):
-    rows = tuning.draw_plants(found, count, seed)
+def drawn_plants(identified_fit, count=4000, seed=0):
+    rows = tuning.draw_plants(identified_fit, count, seed)
     return np.array([list(row.values()) for row in rows])
 
 
-def test_plants_have_the_covariance_of_the_fit(found):
-    rows = drawn(found)
-    scatter = found.errors / np.sqrt(len(rows))
-    assert np.all(np.abs(rows.mean(axis=0) - found.values) < 4 * scatter)
-    np.testing.assert_allclose(rows.std(axis=0), found.errors, rtol=0.05)
-    np.testing.assert_allclose(np.corrcoef(rows.T), found.correlation, atol=0.06)
-    np.testing.assert_array_equal(drawn(found, 3), drawn(found, 3))
-    assert not np.array_equal(drawn(found, 3), drawn(found, 3, seed=1))
+def test_plants_have_the_covariance_of_the_fit(identified_fit):
+    rows = drawn_plants(identified_fit)
+    scatter = identified_fit.errors / np.sqrt(len(rows))
+    assert np.all(np.abs(rows.mean(axis=0) - identified_fit.values) < 4 * scatter)
+    np.testing.assert_allclose(rows.std(axis=0), identified_fit.errors, rtol=0.05)
+    np.testing.assert_allclose(np.corrcoef(rows.T), identified_fit.correlation, atol=0.06)
+    np.testing.assert_array_equal(drawn_plants(identified_fit, 3), drawn_plants(identified_fit, 3))
+    assert not np.array_equal(
+        drawn_plants(identified_fit, 3), drawn_plants(identified_fit, 3, seed=1)
+    )
 
 
-def test_plants_have_students_distribution_for_few_samples(found):
+def test_plants_have_students_distribution_for_few_samples(identified_fit):
     """95 % of the plants lie in the 95 % interval of the fit."""
-    few = dataclasses.replace(found, degrees_of_freedom=3.0)
-    rows = drawn(few)[:, 2]
+    few = dataclasses.replace(identified_fit, degrees_of_freedom=3.0)
+    rows = drawn_plants(few)[:, 2]
     inside = np.mean((rows > few.intervals[2, 0]) & (rows < few.intervals[2, 1]))
     assert inside == pytest.approx(0.95, abs=0.015)
     standard = (rows - few.values[2]) / few.errors[2]
     assert scipy.stats.kstest(standard, scipy.stats.t(3).cdf).pvalue > 1e-3
 
 
-def test_plants_are_within_bounds(found):
-    low = float(found.values[1])
-    parameters = list(found.parameters)
+def test_plants_are_within_bounds(identified_fit):
+    low = float(identified_fit.values[1])
+    parameters = list(identified_fit.parameters)
     parameters[1] = dataclasses.replace(parameters[1], low=low)
-    bounded = dataclasses.replace(found, parameters=parameters)
-    assert drawn(bounded, 300)[:, 1].min() >= low
-    parameters[1] = dataclasses.replace(parameters[1], low=low + 9 * float(found.errors[1]))
+    bounded = dataclasses.replace(identified_fit, parameters=parameters)
+    assert drawn_plants(bounded, 300)[:, 1].min() >= low
+    parameters[1] = dataclasses.replace(
+        parameters[1], low=low + 9 * float(identified_fit.errors[1])
+    )
     with pytest.raises(ValueError, match="lie within the bounds of the fit"):
-        drawn(dataclasses.replace(found, parameters=parameters), 5)
+        drawn_plants(dataclasses.replace(identified_fit, parameters=parameters), 5)
 
 
 def test_draws_of_a_posterior_are_plants():
@@ -66,32 +70,32 @@ def test_draws_of_a_posterior_are_plants():
         tuning.draw_plants(posterior, 101)
 
 
-def test_plants_that_cannot_be_drawn_are_refused(found):
-    blind = dataclasses.replace(found, errors=np.array([1.0, np.inf, 1.0]))
+def test_fits_from_which_no_plants_can_be_drawn_are_refused(identified_fit):
+    unidentifiable = dataclasses.replace(identified_fit, errors=np.array([1.0, np.inf, 1.0]))
     with pytest.raises(
         ValueError, match="not identifiable from the data: beam.damping_ratio; to draw plants"
     ):
-        tuning.draw_plants(blind, 3)
+        tuning.draw_plants(unidentifiable, 3)
     with pytest.raises(ValueError, match="must be 1 or more, not 0"):
-        tuning.draw_plants(found, 0)
+        tuning.draw_plants(identified_fit, 0)
     loads = Posterior(["logs.0.loads.0.mass"], np.ones((1, 5, 1)), np.ones(1), np.ones(1), 0)
     with pytest.raises(ValueError, match="no parameter of the plant was identified"):
         tuning.draw_plants(loads, 3)
 
 
-def test_a_case_with_the_identified_plant(found):
+def test_a_case_with_the_identified_plant(identified_fit):
     other = dataclasses.replace(CASE, loads=(jb.MovingMass(mass=0.1, speed=2.0),))
-    changed = tuning.with_identified_plant(other, found)
-    assert float(changed.beam.flexural_rigidity) == found.values[0]
-    assert float(changed.sensors[0].offset) == found.values[2]
+    changed = tuning.with_identified_plant(other, identified_fit)
+    assert float(changed.beam.flexural_rigidity) == identified_fit.values[0]
+    assert float(changed.sensors[0].offset) == identified_fit.values[2]
     assert float(changed.loads[0].mass) == 0.1
 
 
 def test_runs_are_simulated_on_every_plant():
     cases = tuning.LoadCases(({"a": 1.0}, {"a": 2.0}), ({"a": 3.0},))
-    found = cases.across(({"b": 5.0}, {"b": 6.0}), ({"b": 7.0},))
-    assert found.training == tuple({"a": a, "b": b} for a in (1.0, 2.0) for b in (5.0, 6.0))
-    assert found.held_out == ({"a": 3.0, "b": 7.0},)
+    load_cases = cases.across(({"b": 5.0}, {"b": 6.0}), ({"b": 7.0},))
+    assert load_cases.training == tuple({"a": a, "b": b} for a in (1.0, 2.0) for b in (5.0, 6.0))
+    assert load_cases.held_out == ({"a": 3.0, "b": 7.0},)
     assert cases.across(({"b": 5.0},)).held_out == cases.held_out
 
 

@@ -13,7 +13,7 @@ from tests.tuning.small_rig import rig
 FREE = {"controller.command_weight.0": (1e-5, 1e-1)}
 CASES = tuning.LoadCases(({"loads.0.mass": 0.3}, {"loads.0.mass": 0.5}))
 OPTIONS = {"steps": 30, "least_peaks": False, "progress": False}
-KEEP, STATES = 1, 4
+FED_BACK_COUNT, STATE_COUNT = 1, 4
 
 
 @pytest.fixture(scope="module")
@@ -26,23 +26,24 @@ def regulated():
 
 @pytest.mark.slow
 def test_the_states_selected_are_the_best_of_all_choices(regulated):
-    found = tuning.tune_reduced(regulated, KEEP, FREE, CASES, **OPTIONS)
-    ends = {}
-    for fed_back in itertools.combinations(range(STATES), KEEP):
-        shares = np.isin(np.arange(STATES), fed_back).astype(float)
+    reduced = tuning.tune_reduced(regulated, FED_BACK_COUNT, FREE, CASES, **OPTIONS)
+    objectives = {}
+    for fed_back in itertools.combinations(range(STATE_COUNT), FED_BACK_COUNT):
+        shares = np.isin(np.arange(STATE_COUNT), fed_back).astype(float)
         law = dataclasses.replace(regulated.controller, feedback=shares)
         one = tuning.tune(dataclasses.replace(regulated, controller=law), FREE, CASES, **OPTIONS)
-        ends[fed_back] = one.run_sets[0].objective[1]
-    assert found.fed_back == min(ends, key=ends.get)
-    rounded, end = found.tuned.run_sets[0].objective
-    assert end <= rounded and end < 1.002 * ends[found.fed_back]
+        objectives[fed_back] = one.run_sets[0].objective[1]
+    assert reduced.fed_back == min(objectives, key=objectives.get)
+    rounded, end = reduced.tuned.run_sets[0].objective
+    assert end <= rounded and end < 1.002 * objectives[reduced.fed_back]
     # The choice matters, and the sum of the shares is as required.
-    assert max(ends.values()) > 1.05 * end
-    assert found.shares.sum() == pytest.approx(KEEP, abs=0.05)
+    assert max(objectives.values()) > 1.05 * end
+    assert reduced.shares.sum() == pytest.approx(FED_BACK_COUNT, abs=0.05)
     np.testing.assert_array_equal(
-        np.asarray(found.tuned.case.controller.feedback), np.isin(range(STATES), found.fed_back)
+        np.asarray(reduced.tuned.case.controller.feedback),
+        np.isin(range(STATE_COUNT), reduced.fed_back),
     )
-    assert "when the other parameters are tuned again" in str(found)
+    assert "when the other parameters are tuned again" in str(reduced)
 
 
 def test_wrong_controllers_and_numbers_of_states_are_refused(regulated):

@@ -1,4 +1,4 @@
-"""Number of XLA threads in a process that imports tuning: two waited for each other for ever."""
+"""Number of XLA threads in a process that imports tuning: with two, XLA deadlocks."""
 
 import os
 import subprocess
@@ -17,11 +17,13 @@ print(sum("XLAEigen" in name for name in names))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
-@pytest.mark.parametrize(("asked", "least", "most"), [(None, 8, os.cpu_count() or 8), (3, 3, 3)])
-def test_xla_has_at_least_eight_threads_unless_set_otherwise(asked, least, most):
+@pytest.mark.parametrize(
+    ("requested", "least", "most"), [(None, 8, os.cpu_count() or 8), (3, 3, 3)]
+)
+def test_xla_has_at_least_eight_threads_unless_set_otherwise(requested, least, most):
     environment = {name: value for name, value in os.environ.items() if name != "PJRT_NPROC"}
-    if asked is not None:
-        environment["PJRT_NPROC"] = str(asked)
+    if requested is not None:
+        environment["PJRT_NPROC"] = str(requested)
     line = [sys.executable, "-c", COUNT]
     counted = subprocess.run(line, capture_output=True, text=True, env=environment, check=True)
     assert least <= int(counted.stdout) <= max(least, most)

@@ -58,22 +58,24 @@ def metrics(run_set):
 
 
 @pytest.mark.slow
-def test_merits_are_those_of_the_simulated_runs(metrics):
+def test_metrics_are_those_of_the_simulated_runs(metrics):
     metrics = metrics(5000.0)
     for i, run in enumerate(RUNS):
         record = jb.simulate(jb.replace(run_case(rig(), run), {GAIN: 5000.0}))
         plain = jb.simulate(run_case(jb.Case(rig().beam, sensors=rig().sensors, loads=rig().loads,
                                           run=rig().run), run))  # fmt: skip
-        bent, free = np.abs(record.deflection), np.abs(plain.deflection)
-        assert metrics["peak"][i] == pytest.approx(bent.max() / free.max(), rel=1e-4)
+        controlled, uncontrolled = np.abs(record.deflection), np.abs(plain.deflection)
+        assert metrics["peak"][i] == pytest.approx(controlled.max() / uncontrolled.max(), rel=1e-4)
         assert metrics["rms"][i] == pytest.approx(
-            np.sqrt(np.mean(bent**2) / np.mean(free**2)), rel=1e-4
+            np.sqrt(np.mean(controlled**2) / np.mean(uncontrolled**2)), rel=1e-4
         )
         limit = jb.bound(run_case(rig(), run)).peak
-        missed = (bent.max() - limit) / (free.max() - limit)
-        assert metrics["shortfall"][i] == pytest.approx(missed, rel=1e-3)
+        shortfall = (controlled.max() - limit) / (uncontrolled.max() - limit)
+        assert metrics["shortfall"][i] == pytest.approx(shortfall, rel=1e-3)
         late = np.asarray(record.times) > 0.4
-        assert metrics["after_exit"][i] == pytest.approx(bent[late].max() / free.max(), rel=1e-3)
+        assert metrics["after_exit"][i] == pytest.approx(
+            controlled[late].max() / uncontrolled.max(), rel=1e-3
+        )
         effort = np.sqrt(np.mean(np.asarray(record.command) ** 2)) / 7.5
         assert metrics["effort"][i] == pytest.approx(effort, rel=1e-4)
         weight = 9.81 * run["loads.0.mass"]
@@ -105,12 +107,12 @@ def test_forward_and_reverse_gradients_are_equal(run_set, monkeypatch):
     points = jnp.asarray(search.start_points(2, 1))
     values_and_gradients = penalised_objective.values_and_gradients.__wrapped__
 
-    def found(points):
+    def objectives_and_gradients(points):
         return values_and_gradients(*search._step_arguments(points, 40.0, range(len(RUNS)), target))
 
-    (smooth, true), forward = jax.jit(found)(points)
+    (smooth, true), forward = jax.jit(objectives_and_gradients)(points)
     monkeypatch.setattr(penalised_objective, "MAX_FORWARD_PARAMETERS", 0)
-    in_reverse = jax.jit(lambda points: found(points))
+    in_reverse = jax.jit(lambda points: objectives_and_gradients(points))
     values, reverse = in_reverse(points)
     np.testing.assert_allclose([smooth, true], values, rtol=1e-12)
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)
@@ -200,8 +202,8 @@ def test_the_start_is_the_result_if_nothing_is_better():
     cases, free = tuning.LoadCases(RUNS), {GAIN: (1999.0, 2001.0)}
     worse = tuning.Objective({"effort": 1.0})
     options = OPTIONS | {"steps": 2, "least_peaks": False}
-    found = tuning.tune(rig(1999.0), free, cases, worse, **options)
-    assert found.run_sets[0].objective[1] <= found.run_sets[0].objective[0] * (1 + 1e-6)
+    tuned = tuning.tune(rig(1999.0), free, cases, worse, **options)
+    assert tuned.run_sets[0].objective[1] <= tuned.run_sets[0].objective[0] * (1 + 1e-6)
 
 
 PLAIN = jb.Case(rig().beam, loads=rig().loads, sensors=rig().sensors)
@@ -215,14 +217,14 @@ def test_tuning_with_a_stability_constraint():
     stable = tuning.StabilityConstraint(
         max_real_part=-0.5, extra_delay=0.005, parameter_tolerance={"beam.flexural_rigidity": 0.1}
     )
-    found = tuning.tune(
+    tuned = tuning.tune(
         rig(100.0), free, cases, stable=stable, steps=20, least_peaks=False, progress=False
     )
-    assert found.stability_violation == 0.0 and found.values[0] > 100.0
+    assert tuned.stability_violation == 0.0 and tuned.values[0] > 100.0
     # Against eigenvalues of cases with the delay and each change of the rigidity.
-    late = jb.Feedback(found.case.controller.gains, period=0.01, delay=0.005)
+    delayed = jb.Feedback(tuned.case.controller.gains, period=0.01, delay=0.005)
     for factor in (0.9, 1.0, 1.1):
-        case = dataclasses.replace(run_case(found.case, light), controller=late)
+        case = dataclasses.replace(run_case(tuned.case, light), controller=delayed)
         case = jb.replace(case, {"beam.flexural_rigidity": 13.211 * factor})
         assert frozen_poles(case, np.linspace(0.0, 0.4, 30)).largest_real_part.max() <= -0.5 + 0.1
 
@@ -259,9 +261,9 @@ BAD = [
 
 @pytest.mark.parametrize(("changes", "message"), BAD, ids=[message[:24] for _, message in BAD])
 def test_wrong_arguments_are_refused(changes, message):
-    given = {"case": rig(), "free": {GAIN: None}, "cases": tuning.LoadCases(RUNS)} | changes
+    arguments = {"case": rig(), "free": {GAIN: None}, "cases": tuning.LoadCases(RUNS)} | changes
     with pytest.raises(ValueError, match=message):
-        tuning.tune(**given, progress=False)
+        tuning.tune(**arguments, progress=False)
 
 
 def test_faulty_held_out_runs_are_refused_before_the_search(tmp_path):
@@ -277,9 +279,9 @@ def test_load_cases_from_a_file(tmp_path):
         '[training]\n"loads.0.mass" = [0.2, 0.5]\n"loads.0.speed" = [1, 2]\n'
         '[held_out]\n"loads.0.mass" = [0.3]\n'
     )
-    found = tuning.read_load_cases(file)
-    assert len(found.training) == 4 and found.held_out == ({"loads.0.mass": 0.3},)
-    assert {"loads.0.mass": 0.2, "loads.0.speed": 2.0} in found.training
+    load_cases = tuning.read_load_cases(file)
+    assert len(load_cases.training) == 4 and load_cases.held_out == ({"loads.0.mass": 0.3},)
+    assert {"loads.0.mass": 0.2, "loads.0.speed": 2.0} in load_cases.training
     for text, message in {
         "[train]\na = [1]": "there is no table .train.; it has .training., .held_out.",
         '[training]\n"loads.0.mass" = 0.2': "training.loads.0.mass must be a list of numbers",

@@ -36,8 +36,8 @@ def call(tmp_path, monkeypatch, capsys):
 def test_from_a_fit_to_a_tuned_case(call, tmp_path, monkeypatch):
     """From the file written by identify to a tuned case that can be simulated."""
     monkeypatch.setattr(storage, "make_dataset", lambda case, logs: dataset())
-    found = fit(least_squares(free={RIGIDITY: None, "beam.damping_ratio": None}))
-    tuning.save_fit(found, tmp_path / "fit.npz")
+    identified = fit(least_squares(free={RIGIDITY: None, "beam.damping_ratio": None}))
+    tuning.save_fit(identified, tmp_path / "fit.npz")
     code, out, err = call(f"{TUNE} --fit fit.toml --plants 2 --aggregate cvar -o tuned.toml --json")
     assert code == 0, err
     result = json.loads(out)
@@ -45,16 +45,16 @@ def test_from_a_fit_to_a_tuned_case(call, tmp_path, monkeypatch):
     assert len(result["runs"]["held out"]["cases"]) == 2
     plants = [run[RIGIDITY] for kind in result["runs"].values() for run in kind["cases"]]
     assert len(set(plants)) == 4
-    assert np.all(np.abs(np.array(plants) - found.values[0]) < 6 * found.errors[0])
+    assert np.all(np.abs(np.array(plants) - identified.values[0]) < 6 * identified.errors[0])
     tuned = jb.load_case(tmp_path / "tuned.toml")
-    assert float(tuned.beam.flexural_rigidity) == found.values[0]
+    assert float(tuned.beam.flexural_rigidity) == identified.values[0]
     assert float(tuned.controller.gains[0]) == result["numbers"][GAIN]["after"]
     assert not (tmp_path / "tuned.search.npz").exists()
     assert call("simulate tuned.toml -o run.nc")[0] == 0
 
 
 def test_arguments_of_a_pareto_front(call, tmp_path, monkeypatch):
-    asked = {}
+    arguments = {}
 
     class Front:
         tuned = ()
@@ -63,21 +63,21 @@ def test_arguments_of_a_pareto_front(call, tmp_path, monkeypatch):
             return "a front"
 
     def pareto(*given, **options):
-        asked.update(given=given, options=options)
+        arguments.update(given=given, options=options)
         return Front()
 
     monkeypatch.setattr(tuning, "pareto", pareto)
     code, out, err = call(f"{TUNE} --pareto effort=0.1,0.2 --limit after_exit=0.5 --aggregate mean")
     assert code == 0 and "a front" in out, err
-    case, free, cases, objective, metric, limits = asked["given"]
+    case, free, cases, objective, metric, limits = arguments["given"]
     assert free == {GAIN: (500.0, 7500.0)} and len(cases.training) == 2
     assert (metric, limits) == ("effort", [0.1, 0.2])
     assert objective == tuning.Objective({"peak": 1.0}, "mean", limits={"after_exit": 0.5})
-    assert asked["options"]["method"] == "lbfgs" and asked["options"]["steps"] == 2
+    assert arguments["options"]["method"] == "lbfgs" and arguments["options"]["steps"] == 2
 
 
 def test_arguments_of_the_other_kinds_of_tuning(call, monkeypatch):
-    asked = {}
+    arguments = {}
 
     class Result:
         def to_dict(self):
@@ -87,15 +87,15 @@ def test_arguments_of_the_other_kinds_of_tuning(call, monkeypatch):
         best = Result()
 
     def lexicographic(*given, **options):
-        asked["lexicographic"] = given[3], options["aggregation"]
+        arguments["lexicographic"] = given[3], options["aggregation"]
         return Result(), Result()
 
     def tune_integers(*given, **options):
-        asked["integers"] = given[1], options["method"]
+        arguments["integers"] = given[1], options["method"]
         return IntegerSearch()
 
     def tune_reduced(*given, **options):
-        asked["states"] = given[1], list(given[2]), options["starts"]
+        arguments["states"] = given[1], list(given[2]), options["starts"]
         return Reduced()
 
     class Reduced:
@@ -107,7 +107,7 @@ def test_arguments_of_the_other_kinds_of_tuning(call, monkeypatch):
     assert json.loads(call(f"{TUNE} --lexicographic peak,effort --json")[1]) == {"verdict": "fine"}
     assert json.loads(call(f"{TUNE} --integers controller.power=1,3 --json")[1])
     assert json.loads(call(f"{TUNE} --states 1 --starts 2 --json")[1]) == {"verdict": "fine"}
-    assert asked == {
+    assert arguments == {
         "states": (1, [GAIN], 2),
         "lexicographic": (["peak", "effort"], "worst"),
         "integers": ({"controller.power": [1, 3]}, "adam"),

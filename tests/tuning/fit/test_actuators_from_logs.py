@@ -27,18 +27,18 @@ def shapes(x, derivative=0):
 def respond(times, shaker_volts, patch_volts):
     """Deflections (m) at the positions, by scipy's exact response to linear inputs."""
     frequencies = (np.arange(1, MODES + 1) * np.pi / LENGTH) ** 2 * np.sqrt(RIGIDITY / DENSITY)
-    here = shapes(SHAKER["position"])
-    stiffness = np.diag(frequencies**2) + SHAKER["stiffness"] * np.outer(here, here)
-    damping = np.diag(2 * DAMPING * frequencies) + SHAKER["damping"] * np.outer(here, here)
-    lift = shapes(PATCH["start"], 1) - shapes(PATCH["end"], 1)
-    lift = lift * PATCH["moment_per_volt"] * PATCH["correction"] * GAIN
+    shape = shapes(SHAKER["position"])
+    stiffness = np.diag(frequencies**2) + SHAKER["stiffness"] * np.outer(shape, shape)
+    damping = np.diag(2 * DAMPING * frequencies) + SHAKER["damping"] * np.outer(shape, shape)
+    modal_moment = shapes(PATCH["start"], 1) - shapes(PATCH["end"], 1)
+    modal_moment = modal_moment * PATCH["moment_per_volt"] * PATCH["correction"] * GAIN
     n = MODES
     A = np.zeros((2 * n + 1, 2 * n + 1))
     A[:n, n : 2 * n] = np.eye(n)
-    A[n : 2 * n] = np.hstack([-stiffness, -damping, SHAKER["force_per_volt"] * here[:, None]])
+    A[n : 2 * n] = np.hstack([-stiffness, -damping, SHAKER["force_per_volt"] * shape[:, None]])
     A[2 * n, 2 * n] = -BANDWIDTH
     B = np.zeros((2 * n + 1, 2))
-    B[2 * n, 0], B[n : 2 * n, 1] = BANDWIDTH, lift
+    B[2 * n, 0], B[n : 2 * n, 1] = BANDWIDTH, modal_moment
     C = np.hstack([[shapes(x) for x in POSITIONS], np.zeros((2, n + 1))])
     inputs = np.column_stack([shaker_volts, patch_volts])
     return scipy.signal.lsim((A, B, C, np.zeros((2, 2))), inputs, times)[1]
@@ -103,8 +103,8 @@ def test_shaker_and_patch_together():
 
 @pytest.mark.slow
 def test_a_patch_alone_from_a_file(tmp_path):
-    made = log(0 * SWEPT, STEPS)
-    table = np.column_stack([made.times, made.values[:, [0, 1, 3]]])
+    steps = log(0 * SWEPT, STEPS)
+    table = np.column_stack([steps.times, steps.values[:, [0, 1, 3]]])
     path = tmp_path / "steps.csv"
     np.savetxt(path, table, delimiter=",", header="t [s],d1 [m],d2 [m],v [V]", comments="")
     path.with_suffix(".toml").write_text(

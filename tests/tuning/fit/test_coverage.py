@@ -25,7 +25,7 @@ SMALL = {
 STARTS = {"beam.flexural_rigidity": 11.0, "beam.damping_ratio": 0.02, "loads.0.speed": 2.05}
 
 
-class Rehearsal:
+class RepeatedFits:
     """Many logs of one rig, fitted by one compiled problem with starts near the true values.
 
     The mass of the load is held at its true value unless a test frees it.
@@ -44,23 +44,25 @@ class Rehearsal:
         """Errors in half widths of the intervals (log, parameter), and the standard errors."""
         free = np.arange(7) < 6
         problem = self.least_squares
-        found = [problem.solve((self.clean + noise)[None], free=free) for noise in noises]
-        errors = np.array([each.uncertainty.errors[:6] for each in found])
-        values = np.array([each.values[:6] for each in found])
-        assert all(each.converged for each in found)
-        halves = errors * np.array([[t_quantile(each.degrees_of_freedom)] for each in found])
-        return (values - list(SMALL.values())) / halves, errors
+        solutions = [problem.solve((self.clean + noise)[None], free=free) for noise in noises]
+        errors = np.array([each.uncertainty.errors[:6] for each in solutions])
+        values = np.array([each.values[:6] for each in solutions])
+        assert all(each.converged for each in solutions)
+        half_widths = errors * np.array(
+            [[t_quantile(each.degrees_of_freedom)] for each in solutions]
+        )
+        return (values - list(SMALL.values())) / half_widths, errors
 
 
 @pytest.fixture(scope="module")
-def rehearsal():
-    """Its problem is solved six hundred times, so it is compiled with optimisation."""
-    made = Rehearsal()
+def repeated_fits():
+    """The least-squares problem, compiled with optimisation: it is solved six hundred times."""
+    problem = RepeatedFits()
     with well_compiled():
-        yield made
+        yield problem
 
 
-def coloured(white, memory: float):
+def autocorrelated(white, memory: float):
     """A first-order process of the same power as the white noise (log, time, channel)."""
     noise = np.array(white)
     for i in range(1, noise.shape[1]):
@@ -69,19 +71,19 @@ def coloured(white, memory: float):
 
 
 @pytest.mark.slow
-def test_intervals_cover_the_truth(rehearsal):
-    noises = NOISE * np.random.default_rng(5).normal(size=(500, *rehearsal.clean.shape))
-    errors, _ = rehearsal.deviations(noises)
+def test_intervals_cover_the_truth(repeated_fits):
+    noises = NOISE * np.random.default_rng(5).normal(size=(500, *repeated_fits.clean.shape))
+    errors, _ = repeated_fits.deviations(noises)
     covered = np.mean(np.abs(errors) < 1, axis=0)
     assert np.all((covered >= 0.92) & (covered <= 0.97)), dict(zip(SMALL, covered, strict=True))
     assert np.all(np.abs(np.mean(errors, axis=0)) < 3 / 1.96 / np.sqrt(500))
 
 
 @pytest.mark.slow
-def test_autocorrelated_residuals_widen_intervals(rehearsal):
-    white = NOISE * np.random.default_rng(6).normal(size=(100, *rehearsal.clean.shape))
-    _, narrow = rehearsal.deviations(white[:10])
-    errors, wide = rehearsal.deviations(coloured(white, 0.6))
+def test_autocorrelated_residuals_widen_intervals(repeated_fits):
+    white = NOISE * np.random.default_rng(6).normal(size=(100, *repeated_fits.clean.shape))
+    _, narrow = repeated_fits.deviations(white[:10])
+    errors, wide = repeated_fits.deviations(autocorrelated(white, 0.6))
     widening = np.median(wide, axis=0) / np.median(narrow, axis=0)
     np.testing.assert_allclose(widening, 2.0, rtol=0.25)  # sqrt((1 + r) / (1 - r))
     covered = np.mean(np.abs(errors) < 1, axis=0)
@@ -89,12 +91,14 @@ def test_autocorrelated_residuals_widen_intervals(rehearsal):
 
 
 @pytest.mark.slow
-def test_a_common_factor_is_reported_as_unidentifiable(rehearsal):
+def test_a_common_factor_is_reported_as_unidentifiable(repeated_fits):
     """Rigidity, mass per length and load mass times a factor lead to the same deflection."""
     scaled = ["beam.flexural_rigidity", "beam.mass_per_length", "loads.0.mass"]
-    noise = NOISE * np.random.default_rng(0).normal(size=rehearsal.clean.shape)
-    problem = rehearsal.least_squares
-    fit = fit_result(rehearsal.case, problem, problem.solve((rehearsal.clean + noise)[None]))
+    noise = NOISE * np.random.default_rng(0).normal(size=repeated_fits.clean.shape)
+    problem = repeated_fits.least_squares
+    fit = fit_result(
+        repeated_fits.case, problem, problem.solve((repeated_fits.clean + noise)[None])
+    )
     (direction,) = fit.unidentifiable
     assert set(direction) == set(scaled)
     values = dict(zip(fit.addresses, fit.values, strict=True))

@@ -42,24 +42,24 @@ def errors_by_differences(positions, noise):
 @pytest.mark.slow
 def test_the_best_sensor_position_for_the_mass():
     bounds = (0.05, 0.55)
-    found = design_experiment(
+    design = design_experiment(
         CASE, FREE, {"sensors.0.position": bounds}, target=FREE[1], noise=2e-5
     )
     positions = np.linspace(*bounds, 101)
     grid = errors_by_differences(positions, 2e-5)
     np.testing.assert_allclose(
-        found.errors_before, errors_by_differences(np.array([0.12]), 2e-5)[0], rtol=1e-3
+        design.errors_before, errors_by_differences(np.array([0.12]), 2e-5)[0], rtol=1e-3
     )
     best = int(np.argmin(grid[:, 1]))
-    assert found.after[0] == pytest.approx(positions[best], abs=0.005)
-    assert found.errors_after[1] == pytest.approx(grid[best, 1], rel=2e-3)
-    assert found.errors_after[1] < found.errors_before[1]
+    assert design.after[0] == pytest.approx(positions[best], abs=0.005)
+    assert design.errors_after[1] == pytest.approx(grid[best, 1], rel=2e-3)
+    assert design.errors_after[1] < design.errors_before[1]
     near = errors_by_differences(np.array([0.1195, 0.1205]), 2e-5)[:, 1]
-    assert found.error_sensitivities[1, 0] == pytest.approx(
+    assert design.error_sensitivities[1, 0] == pytest.approx(
         np.diff(np.log(near))[0] / 1e-3, rel=0.02
     )
-    assert str(found).startswith("sensors.0.position: 0.12 -> ")
-    assert float(found.case.sensors[0].position) == found.after[0]
+    assert str(design).startswith("sensors.0.position: 0.12 -> ")
+    assert float(design.case.sensors[0].position) == design.after[0]
 
 
 @pytest.mark.parametrize(

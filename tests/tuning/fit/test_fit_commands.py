@@ -17,11 +17,11 @@ __all__ = ["call"]
 
 def test_weighing(call, tmp_path, monkeypatch):
     fit = stand_in.fit()
-    asked = {}
+    arguments = {}
 
     class Weighed:
         def __init__(self, *given, **settings):
-            asked.update(given=given, settings=settings)
+            arguments.update(given=given, settings=settings)
             self.fit = fit
 
         def to_dict(self):
@@ -34,7 +34,8 @@ def test_weighing(call, tmp_path, monkeypatch):
     (tmp_path / "log.csv").write_text("t [s],a [mm]\n0,1\n1,2\n2,1\n")
     code, out, _ = call("weigh case.toml log.csv --speeds 0.5:3 --one-way -o found.toml")
     assert (code, out) == (0, "one load found\nwritten: found.toml\n")
-    assert asked["given"][2:] == ((0.5, 3.0), 3) and asked["settings"] == {"both_ways": False}
+    assert arguments["given"][2:] == ((0.5, 3.0), 3)
+    assert arguments["settings"] == {"both_ways": False}
     code, out, _ = call("weigh case.toml log.csv --speeds 0.5:3 --json")
     assert json.loads(out) == {"loads": [1.0, 1.0]}
     code, _, err = call("weigh case.toml log.csv --speeds fast")
@@ -42,7 +43,7 @@ def test_weighing(call, tmp_path, monkeypatch):
 
 
 def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):
-    """The criteria printed are those of the library; superfluous parameters cost."""
+    """The criteria printed are those of the library; superfluous parameters raise them."""
     held = stand_in.least_squares({"beam.flexural_rigidity": None})
     fits = {"three": stand_in.fit(), "one": stand_in.fit(held)}
     for name in fits:
@@ -61,17 +62,17 @@ def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):
     (tmp_path / "new.csv").write_text("t [s],a [mm],b [mm]\n0,1,1\n1,2,2\n2,1,1\n")
     code, out, _ = call("compare-models one.npz --held-out new.csv")
     assert out == "one: new: predicted; residuals are 1.1 times the noise at most\n"
-    told = json.loads(call("compare-models three.npz one.npz --held-out new.csv --json")[1])
-    assert [rival["name"] for rival in told["models"]] == ["one", "three"]
-    assert told["held_out"]["one"] == {"new": [1.1]}
+    result = json.loads(call("compare-models three.npz one.npz --held-out new.csv --json")[1])
+    assert [rival["name"] for rival in result["models"]] == ["one", "three"]
+    assert result["held_out"]["one"] == {"new": [1.1]}
     assert "one fit alone: give another" in call("compare-models one.npz")[2]
 
 
-def test_an_experiment_is_planned(call, monkeypatch):
-    asked = {}
+def test_design_of_an_experiment(call, monkeypatch):
+    arguments = {}
 
     def design_experiment(case, free, over, **settings):
-        asked.update(free=free, over=over, settings=settings)
+        arguments.update(free=free, over=over, settings=settings)
         return ExperimentDesign(
             ["sensors.0.position"], ["m"], np.array([0.1]), np.array([0.3]), ["beam.length"],
             np.array([2.0]), np.array([1.0]), np.ones((1, 1)), case,
@@ -82,26 +83,26 @@ def test_an_experiment_is_planned(call, monkeypatch):
     line = f"design-experiment case.toml --free beam.length {vary} --noise 1e-6"
     code, out, err = call(f"{line} -o better.toml")
     assert code == 0, err
-    assert asked["over"] == {"sensors.0.position": (0.1, 0.5)}
-    assert asked["settings"] == {"target": None, "noise": 1e-6}
+    assert arguments["over"] == {"sensors.0.position": (0.1, 0.5)}
+    assert arguments["settings"] == {"target": None, "noise": 1e-6}
     assert "standard error of beam.length: 2 -> 1" in out and "written: better.toml" in out
-    told = json.loads(call(f"{line} --json")[1])
-    assert told["standard_errors"]["beam.length"] == {"before": 2.0, "after": 1.0}
+    result = json.loads(call(f"{line} --json")[1])
+    assert result["standard_errors"]["beam.length"] == {"before": 2.0, "after": 1.0}
     without_choice = call("design-experiment case.toml --free beam.length")[2]
     assert "name what can be chosen with --vary" in without_choice
     assert "--vary takes ADDRESS=VALUE" in call(f"{line} --vary loads.0.speed")[2]
 
 
-def test_responses_are_fitted(call, monkeypatch):
+def test_fit_to_responses(call, monkeypatch):
     fit = tuning.identify_responses(
         test_frequency_responses.CASE,
         test_frequency_responses.measured(),
         ["beam.flexural_rigidity"],
     )
-    asked = {}
+    arguments = {}
 
     def identify_responses(case, measured, free):
-        asked.update(measured=measured, free=free)
+        arguments.update(measured=measured, free=free)
         return fit
 
     monkeypatch.setattr(tuning, "responses_of", lambda log, segment: (log.source, segment))
@@ -112,8 +113,11 @@ def test_responses_are_fitted(call, monkeypatch):
         file.write("t [s],a [mm],b [mm]\n0,1,1\n1,2,2\n2,1,1\n")
     code, out, err = call(f"{line} --segment 4 -o fit.toml")
     assert code == 0, err
-    assert asked == {"measured": ("new.csv", 4.0), "free": {"beam.flexural_rigidity": (5.0, 20.0)}}
+    assert arguments == {
+        "measured": ("new.csv", 4.0),
+        "free": {"beam.flexural_rigidity": (5.0, 20.0)},
+    }
     assert out == f"{fit}\nwritten: fit.toml\n"
-    told = json.loads(call(f"{line} --json")[1])
-    assert told["numbers"]["beam.flexural_rigidity"]["value"] == pytest.approx(fit.values[0])
+    result = json.loads(call(f"{line} --json")[1])
+    assert result["numbers"]["beam.flexural_rigidity"]["value"] == pytest.approx(fit.values[0])
     assert "name what to identify" in call("identify-responses case.toml new.csv")[2]

@@ -22,10 +22,10 @@ def sum_of_modes(frequencies, rigidity=RIGIDITY, damping=DAMPING):
     w = 2 * np.pi * frequencies[:, None]
     total = np.zeros((frequencies.size, len(POSITIONS)), complex)
     for i in range(1, MODES + 1):
-        own = (i * np.pi / LENGTH) ** 2 * np.sqrt(rigidity / DENSITY)
-        here = np.sin(i * np.pi * HAMMER / LENGTH) * 2 / (DENSITY * LENGTH)
+        natural = (i * np.pi / LENGTH) ** 2 * np.sqrt(rigidity / DENSITY)
+        amplitude = np.sin(i * np.pi * HAMMER / LENGTH) * 2 / (DENSITY * LENGTH)
         shape = np.sin(i * np.pi * np.array(POSITIONS) / LENGTH)
-        total += here * shape / (own**2 - w**2 + 2j * damping * own * w)
+        total += amplitude * shape / (natural**2 - w**2 + 2j * damping * natural * w)
     return total
 
 
@@ -46,7 +46,7 @@ CASE = jb.Case(
 )  # fmt: skip
 
 
-def test_rigidity_and_damping_from_a_hammer():
+def test_rigidity_and_damping_from_hammer_responses():
     fit = identify_responses(CASE, measured(), ["beam.flexural_rigidity", "beam.damping_ratio"])
     truth = np.array([RIGIDITY, DAMPING])
     assert np.all(np.abs(fit.values - truth) < 3.5 * fit.errors)
@@ -66,11 +66,11 @@ def test_responses_estimated_from_a_log_of_a_shaker():
     log = Log(times, np.column_stack([readings, volts]), ("a", "b", "u"),
               ("deflection", "deflection", "voltage"), ("m", "m", "V"),
               sensors=(0, 1, None), actuators=(None, None, 0))  # fmt: skip
-    found = responses_of(log, segment=4.0)
-    assert found.pairs == (("actuators.0", "sensors.0"), ("actuators.0", "sensors.1"))
-    kept = found.frequencies < 100
-    exact = frequency_response(rigs.case(), found.frequencies[kept], found.pairs).values
-    error = np.abs(found.values[kept] / np.asarray(exact) - 1)
+    responses = responses_of(log, segment=4.0)
+    assert responses.pairs == (("actuators.0", "sensors.0"), ("actuators.0", "sensors.1"))
+    low = responses.frequencies < 100
+    exact = frequency_response(rigs.case(), responses.frequencies[low], responses.pairs).values
+    error = np.abs(responses.values[low] / np.asarray(exact) - 1)
     assert np.median(error) < 0.02
     with pytest.raises(ValueError, match="responses need one command and at least one sensor"):
         responses_of(dataclasses.replace(log, actuators=(None, None, None)))

@@ -36,10 +36,10 @@ def call(tmp_path, monkeypatch, capsys):
 
 
 def test_a_fit_with_all_options(call, tmp_path, monkeypatch):
-    asked = {}
+    arguments = {}
 
     def identify(case, logs, free, **settings):
-        asked.update(case=case, logs=logs, free=free, settings=settings)
+        arguments.update(case=case, logs=logs, free=free, settings=settings)
         return stand_in.fit()
 
     monkeypatch.setattr(tuning, "identify", identify)
@@ -50,15 +50,15 @@ def test_a_fit_with_all_options(call, tmp_path, monkeypatch):
         " --profile sensors.0.offset --validate --report report -o fit.toml --plot"
     )
     assert code == 0, err
-    assert [log.source for log in asked["logs"]] == ["runs.csv:1", "runs.csv:2"]
-    assert np.flatnonzero(~asked["logs"][0].valid[:, 1]).tolist() == [2]
-    assert asked["free"] == {
+    assert [log.source for log in arguments["logs"]] == ["runs.csv:1", "runs.csv:2"]
+    assert np.flatnonzero(~arguments["logs"][0].valid[:, 1]).tolist() == [2]
+    assert arguments["free"] == {
         "beam.flexural_rigidity": Prior(5.0, 20.0, scale="log"),
         "beam.damping_ratio": Prior(mean=0.02, deviation=0.01),
     }
-    assert asked["settings"]["stages"] == [["beam.flexural_rigidity"]]
-    assert asked["settings"]["checkpoint"].name == "fit.search.npz"
-    chosen = {key: asked["settings"][key] for key in ("loss", "starts", "seed", "resume")}
+    assert arguments["settings"]["stages"] == [["beam.flexural_rigidity"]]
+    assert arguments["settings"]["checkpoint"].name == "fit.search.npz"
+    chosen = {key: arguments["settings"][key] for key in ("loss", "starts", "seed", "resume")}
     assert chosen == {"loss": "huber", "starts": 4, "seed": 7, "resume": False}
     assert "sensors.0.offset is between 0.19" in out and "run 2: predicted; " in out
     for name in ("fit.toml", "fit.npz", "fit.png", "report/report.html", "report/profiles.png"):
@@ -95,7 +95,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("options", "words"), REFUSED)
-def test_wrong_options_end_in_one_sentence(call, options, words):
+@pytest.mark.parametrize(("options", "message"), REFUSED)
+def test_wrong_options_end_in_one_error_message(call, options, message):
     code, out, err = call(f"identify case.toml runs.csv {options}")
-    assert code == 1 and out == "" and words in err and err.count("\n") == 1
+    assert code == 1 and out == "" and message in err and err.count("\n") == 1

@@ -34,7 +34,7 @@ def plain():
     return fit()
 
 
-def test_the_optimum_is_that_of_scipy():
+def test_optimum_equals_that_of_scipy():
     """Least squares with derivatives by differences, from the same start."""
     plain = fit(least_squares(logs=1))
 
@@ -42,10 +42,10 @@ def test_the_optimum_is_that_of_scipy():
         residuals = plain.dataset.measured[0, :, 0] - formula(*values, AMPLITUDES[0])
         return np.asarray(residuals) / plain.noise[0, 0]
 
-    found = scipy.optimize.least_squares(residuals, plain.start_values, x_scale=[20, 0.03, 0.2],
+    solution = scipy.optimize.least_squares(residuals, plain.start_values, x_scale=[20, 0.03, 0.2],
                                          xtol=1e-12, ftol=1e-14, gtol=1e-12)  # fmt: skip
-    np.testing.assert_allclose(plain.values, found.x, rtol=1e-6)
-    errors = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    np.testing.assert_allclose(plain.values, solution.x, rtol=1e-6)
+    errors = np.sqrt(np.diag(np.linalg.inv(solution.jac.T @ solution.jac)))
     np.testing.assert_allclose(
         plain.errors, errors, rtol=0.15
     )  # some residuals look autocorrelated
@@ -81,8 +81,8 @@ def test_unknown_losses_are_refused():
 def test_outliers_hardly_move_a_robust_fit(loss):
     rng = np.random.default_rng(3)
     measured = clean() + NOISE * rng.normal(size=clean().shape)
-    hit = rng.random(measured.shape) < 0.08
-    measured[hit] += 0.7
+    outliers = rng.random(measured.shape) < 0.08
+    measured[outliers] += 0.7
     ordinary, robust = (
         fit(least_squares(loss=name, measured=measured)) for name in ("squares", loss)
     )
@@ -96,24 +96,24 @@ def test_outliers_hardly_move_a_robust_fit(loss):
 def test_masked_samples_do_not_count():
     measured, mask = clean() + 0.0, np.ones(clean().shape)
     measured[0, 30:40], mask[0, 30:40] = 50.0, 0.0
-    found = fit(least_squares(measured=measured, mask=mask))
-    np.testing.assert_allclose(found.values, VALUES, rtol=1e-6)
-    assert np.isnan(found.residuals[0, 30:40]).all()
+    masked = fit(least_squares(measured=measured, mask=mask))
+    np.testing.assert_allclose(masked.values, VALUES, rtol=1e-6)
+    assert np.isnan(masked.residuals[0, 30:40]).all()
 
 
 def test_a_prior_counts_as_a_measurement(plain):
     """With a prior as narrow as the likelihood, the value lies midway, the error is smaller."""
     damping = ADDRESSES.index("beam.damping_ratio")
     error, value = plain.errors[damping], plain.values[damping]
-    known = Prior(mean=float(value + 2 * error), deviation=float(error))
-    found = fit(least_squares(free=dict.fromkeys(TRUTH) | {"beam.damping_ratio": known}))
-    assert found.values[damping] == pytest.approx(value + error, abs=0.1 * error)
-    assert found.errors[damping] == pytest.approx(error / np.sqrt(2), rel=0.05)
+    prior = Prior(mean=float(value + 2 * error), deviation=float(error))
+    with_prior = fit(least_squares(free=dict.fromkeys(TRUTH) | {"beam.damping_ratio": prior}))
+    assert with_prior.values[damping] == pytest.approx(value + error, abs=0.1 * error)
+    assert with_prior.errors[damping] == pytest.approx(error / np.sqrt(2), rel=0.05)
 
 
 def test_residual_of_a_prior():
-    known = {"beam.mass_per_length": Prior(mean=2.0, deviation=0.1)}
-    parameter = free_parameters([CASE], known, 1.0)[0]
+    priors = {"beam.mass_per_length": Prior(mean=2.0, deviation=0.1)}
+    parameter = free_parameters([CASE], priors, 1.0)[0]
     assert parameter.low == 0.0
     assert parameter.prior.prior_residual(jnp.asarray(2.2)) == pytest.approx(2.0)
 
@@ -154,8 +154,10 @@ def test_faulty_priors(given, words):
 
 
 def test_parameters_of_every_log():
-    found = free_parameters([CASE, CASE], {"logs.*.loads.0.speed": (0.5, 2.0)}, 1.0)
-    assert [parameter.address for parameter in found] == [f"logs.{i}.loads.0.speed" for i in (0, 1)]
+    parameters = free_parameters([CASE, CASE], {"logs.*.loads.0.speed": (0.5, 2.0)}, 1.0)
+    assert [parameter.address for parameter in parameters] == [
+        f"logs.{i}.loads.0.speed" for i in (0, 1)
+    ]
     with pytest.raises(ValueError, match=r"logs.0.loads.0.speed is free twice; name it once"):
         twice = {"logs.*.loads.0.speed": None, "logs.0.loads.0.speed": None}
         free_parameters([CASE, CASE], twice, 1.0)
@@ -164,9 +166,9 @@ def test_parameters_of_every_log():
 def test_stages_move_only_their_parameters(plain):
     mask = _stage_mask(plain.parameters, ["beam.damping_ratio", "sensors.0.offset"])
     assert mask.tolist() == [False, True, True]
-    moved = plain.least_squares.solve(plain.dataset.measured, free=mask)
-    assert moved.values[0] == pytest.approx(19.0) and moved.values[2] != pytest.approx(0.0)
-    assert moved.uncertainty.errors[0] == 0.0 < moved.uncertainty.errors[1]
+    solution = plain.least_squares.solve(plain.dataset.measured, free=mask)
+    assert solution.values[0] == pytest.approx(19.0) and solution.values[2] != pytest.approx(0.0)
+    assert solution.uncertainty.errors[0] == 0.0 < solution.uncertainty.errors[1]
     with pytest.raises(ValueError, match="a stage fits beam.length, which is not free; free are"):
         _stage_mask(plain.parameters, ["beam.length"])
 
@@ -186,8 +188,8 @@ def wide():
 def test_many_starts_find_several_minima(wide):
     """The misfit of two oscillations of different frequencies has several minima."""
     minima = multi_start(wide, wide.data.measured, 12, seed=1)
-    assert len(minima) > 1 and sum(found.starts for found in minima) == 12
-    costs = [found.cost for found in minima]
+    assert len(minima) > 1 and sum(minimum.starts for minimum in minima) == 12
+    costs = [minimum.cost for minimum in minima]
     assert costs == sorted(costs) and costs[1] > 2 * costs[0]
     np.testing.assert_allclose(minima[0].values, VALUES, rtol=0.1)
 
@@ -222,7 +224,7 @@ def test_a_stopped_search_is_resumed_to_the_same_result(wide, tmp_path, monkeypa
         multi_start(*arguments, Checkpoint(file, "this"))
     monkeypatch.undo()
     resumed = multi_start(*arguments, Checkpoint(file, "this"))
-    assert [found.cost for found in resumed] == [found.cost for found in whole]
+    assert [minimum.cost for minimum in resumed] == [minimum.cost for minimum in whole]
     np.testing.assert_array_equal(resumed[0].values, whole[0].values)
     with pytest.raises(ValueError, match="belongs to another search"):
         multi_start(*arguments, Checkpoint(file, "that"))
@@ -230,21 +232,21 @@ def test_a_stopped_search_is_resumed_to_the_same_result(wide, tmp_path, monkeypa
 
 def test_identify_takes_the_lowest_minimum_and_resumes(tmp_path, monkeypatch):
     """All of `identify` with a formula for a dataset; from the start alone it would fail."""
-    made = dataset()
-    monkeypatch.setattr(sys.modules["tuning.fit.identify"], "make_dataset", lambda *given: made)
-    far = {address: BOUNDS[address] for address in ADDRESSES}
+    data = dataset()
+    monkeypatch.setattr(sys.modules["tuning.fit.identify"], "make_dataset", lambda *given: data)
+    bounds = {address: BOUNDS[address] for address in ADDRESSES}
     file = tmp_path / "search.npz"
-    found = identify(CASE, made.logs, far, starts=12, seed=1, checkpoint=file)
-    assert np.all(np.abs(found.values - VALUES) < 4 * found.errors)
-    assert sum(minimum.starts for minimum in found.minima) == 12 and file.exists()
-    assert "minima from 12 starts:" in str(found)
+    first = identify(CASE, data.logs, bounds, starts=12, seed=1, checkpoint=file)
+    assert np.all(np.abs(first.values - VALUES) < 4 * first.errors)
+    assert sum(minimum.starts for minimum in first.minima) == 12 and file.exists()
+    assert "minima from 12 starts:" in str(first)
     with pytest.raises(FileExistsError, match="exists: resume that search, or delete it"):
-        identify(CASE, made.logs, far, starts=12, seed=1, checkpoint=file)
-    again = identify(CASE, made.logs, far, starts=12, seed=1, checkpoint=file, resume=True)
-    np.testing.assert_array_equal(again.values, found.values)
+        identify(CASE, data.logs, bounds, starts=12, seed=1, checkpoint=file)
+    again = identify(CASE, data.logs, bounds, starts=12, seed=1, checkpoint=file, resume=True)
+    np.testing.assert_array_equal(again.values, first.values)
     with pytest.raises(ValueError, match="belongs to another search"):
-        identify(CASE, made.logs, far, starts=12, seed=2, checkpoint=file, resume=True)
-    staged = identify(CASE, made.logs, list(TRUTH), stages=[["sensors.0.offset"]])
-    np.testing.assert_allclose(staged.values, found.values, rtol=1e-5)
+        identify(CASE, data.logs, bounds, starts=12, seed=2, checkpoint=file, resume=True)
+    staged = identify(CASE, data.logs, list(TRUTH), stages=[["sensors.0.offset"]])
+    np.testing.assert_allclose(staged.values, first.values, rtol=1e-5)
     with pytest.raises(ValueError, match="starts must be 1 or more, not 0"):
-        identify(CASE, made.logs, far, starts=0)
+        identify(CASE, data.logs, bounds, starts=0)

@@ -44,8 +44,8 @@ def refit(plain, measured, **options):
     """Fit of other samples by the same compiled program."""
     solution = plain.least_squares.solve(measured, **options)
     data = dataclasses.replace(plain.dataset, measured=measured)
-    found = fit_result(plain.case, plain.least_squares, solution)
-    return dataclasses.replace(found, dataset=data)
+    refitted = fit_result(plain.case, plain.least_squares, solution)
+    return dataclasses.replace(refitted, dataset=data)
 
 
 # Model validation.
@@ -60,23 +60,25 @@ def test_whiteness_of_known_noise():
 
 
 def test_no_remarks_on_the_residuals_of_a_good_fit(plain):
-    found = plain.channel_residuals
-    assert [(c.log, c.sensor) for c in found] == [(0, 0), (1, 0), (2, 0)]
-    assert residual_remarks(found, ["run 0", "run 1", "run 2"]) == []
-    np.testing.assert_allclose([c.noise for c in found], NOISE, rtol=0.2)
+    channels = plain.channel_residuals
+    assert [(c.log, c.sensor) for c in channels] == [(0, 0), (1, 0), (2, 0)]
+    assert residual_remarks(channels, ["run 0", "run 1", "run 2"]) == []
+    np.testing.assert_allclose([c.noise for c in channels], NOISE, rtol=0.2)
 
 
-def test_remarks_on_a_late_channel_and_autocorrelated_residuals(plain):
+def test_remarks_on_a_delayed_channel_and_autocorrelated_residuals(plain):
     measured = np.array(plain.dataset.measured)
-    late = np.interp(TIMES - 0.004, TIMES, clean()[1, :, 0])
-    measured[1, :, 0] = late + measured[1, :, 0] - clean()[1, :, 0]
+    delayed = np.interp(TIMES - 0.004, TIMES, clean()[1, :, 0])
+    measured[1, :, 0] = delayed + measured[1, :, 0] - clean()[1, :, 0]
     # Fitted to the other logs, so that no parameter compensates the delay.
-    found = refit(plain, measured, included_logs=np.array([True, False, True]))
-    _, channel, _ = found.channel_residuals
+    refitted = refit(plain, measured, included_logs=np.array([True, False, True]))
+    _, channel, _ = refitted.channel_residuals
     assert channel.time_shift == pytest.approx(0.004, abs=4 * channel.time_shift_sd)
     assert channel.time_shift_sd < 0.001
-    colour, delay = residual_remarks([channel], ["run 0", "run 1", "run 2"])
-    assert colour.startswith("run 1: residuals are no white noise, so the model misses something")
+    autocorrelation, delay = residual_remarks([channel], ["run 0", "run 1", "run 2"])
+    assert autocorrelation.startswith(
+        "run 1: residuals are no white noise, so the model misses something"
+    )
     assert delay.startswith("run 1: sensor 0 seems ") and " ms late (+- " in delay
 
 
@@ -93,10 +95,10 @@ def test_information_criteria(plain):
     # White residuals, one channel per log: textbook formulas with independent samples.
     squares = np.nansum(plain.residuals**2, axis=(1, 2)) / TIMES.size
     counts = TIMES.size / plain.autocorrelation_factor[:, 0]
-    likely = -np.sum(counts * (np.log(2 * np.pi * squares) + 1)) / 2
-    assert best.log_likelihood == pytest.approx(likely)
-    assert best.aic == pytest.approx(6 - 2 * likely)
-    assert best.bic == pytest.approx(3 * np.log(counts.sum()) - 2 * likely)
+    log_likelihood = -np.sum(counts * (np.log(2 * np.pi * squares) + 1)) / 2
+    assert best.log_likelihood == pytest.approx(log_likelihood)
+    assert best.aic == pytest.approx(6 - 2 * log_likelihood)
+    assert best.bic == pytest.approx(3 * np.log(counts.sum()) - 2 * log_likelihood)
     with pytest.raises(ValueError, match="at least two"):
         compare_fits({"one": plain})
     with pytest.raises(ValueError, match="of different samples"):
@@ -105,13 +107,13 @@ def test_information_criteria(plain):
 
 def test_cross_validation(plain):
     left_out = cross_validate(plain)
-    assert [found.log for found in left_out] == ["run 0", "run 1", "run 2"]
-    ratios = np.array([found.residual_ratio[0] for found in left_out])
+    assert [prediction.log for prediction in left_out] == ["run 0", "run 1", "run 2"]
+    ratios = np.array([prediction.residual_ratio[0] for prediction in left_out])
     np.testing.assert_allclose(ratios, 1.0, atol=0.3)
     assert left_out[0].verdict.startswith("run 0: predicted; residuals are ")
     measured = np.array(plain.dataset.measured)
     measured[2] *= 1.3  # an effect that the model does not have
-    verdicts = [found.verdict for found in cross_validate(refit(plain, measured))]
+    verdicts = [prediction.verdict for prediction in cross_validate(refit(plain, measured))]
     assert "run 2: not predicted" in verdicts[2]
     with pytest.raises(ValueError, match="at least two"):
         cross_validate(fit(least_squares(logs=1)))
@@ -133,14 +135,16 @@ def test_prediction_of_held_out_logs(plain, monkeypatch):
 
 
 def test_the_profile_of_a_linear_parameter_is_a_parabola(plain):
-    found = profile(plain, "sensors.0.offset")
-    error, centre = plain.errors[2], found.values[found.deviance.argmin()]
+    offset_profile = profile(plain, "sensors.0.offset")
+    error, centre = plain.errors[2], offset_profile.values[offset_profile.deviance.argmin()]
     assert abs(centre - plain.values[2]) < 0.1 * error
-    expected = ((found.values - centre) / error) ** 2
-    np.testing.assert_allclose(found.deviance, expected, rtol=0.02, atol=1e-6)
-    np.testing.assert_allclose(found.interval, plain.intervals[2], atol=0.1 * error)
-    assert found.verdict.endswith("as the linearised fit says")
-    assert found.critical_deviance == pytest.approx(t_quantile(plain.degrees_of_freedom) ** 2)
+    expected = ((offset_profile.values - centre) / error) ** 2
+    np.testing.assert_allclose(offset_profile.deviance, expected, rtol=0.02, atol=1e-6)
+    np.testing.assert_allclose(offset_profile.interval, plain.intervals[2], atol=0.1 * error)
+    assert offset_profile.verdict.endswith("as the linearised fit says")
+    assert offset_profile.critical_deviance == pytest.approx(
+        t_quantile(plain.degrees_of_freedom) ** 2
+    )
 
 
 def test_a_parameter_at_its_bound_has_a_profile_on_one_side():
@@ -149,9 +153,9 @@ def test_a_parameter_at_its_bound_has_a_profile_on_one_side():
         ..., None
     ]
     noise = NOISE * np.random.default_rng(1).normal(size=undamped.shape)
-    found = profile(fit(least_squares(measured=undamped + noise)), "beam.damping_ratio")
-    assert found.interval[0] == -np.inf and 0.0 < found.interval[1] < 1.0
-    assert found.verdict.startswith("the data only say that beam.damping_ratio is below ")
+    damping_profile = profile(fit(least_squares(measured=undamped + noise)), "beam.damping_ratio")
+    assert damping_profile.interval[0] == -np.inf and 0.0 < damping_profile.interval[1] < 1.0
+    assert damping_profile.verdict.startswith("the data only say that beam.damping_ratio is below ")
 
 
 def test_the_profile_of_a_parameter_that_is_not_free(plain):
@@ -171,19 +175,19 @@ def test_the_sampler_draws_from_a_known_density(tmp_path):
     def density(z):
         return -z @ inverse @ z / 2
 
-    given = (density, 2, 400, 2, 100, 0)
-    draws, divergences = draw_by_nuts(*given)
-    found = with_diagnostics(["a", "b"], draws, divergences)
+    arguments = (density, 2, 400, 2, 100, 0)
+    draws, divergences = draw_by_nuts(*arguments)
+    posterior = with_diagnostics(["a", "b"], draws, divergences)
     np.testing.assert_allclose(np.cov(draws.reshape(-1, 2).T), covariance, atol=0.25)
-    np.testing.assert_allclose(found.means, 0.0, atol=0.2)
-    assert found.verdict.startswith("mixed: R-hat up to ") and divergences == 0
+    np.testing.assert_allclose(posterior.means, 0.0, atol=0.2)
+    assert posterior.verdict.startswith("mixed: R-hat up to ") and divergences == 0
     file = tmp_path / "draws.npz"
     first, _ = draw_by_nuts(density, 2, 100, 2, 100, 0, Checkpoint(file, "this"))
     np.testing.assert_array_equal(first, draws[:, :100])
-    resumed, _ = draw_by_nuts(*given, Checkpoint(file, "this"))
+    resumed, _ = draw_by_nuts(*arguments, Checkpoint(file, "this"))
     np.testing.assert_array_equal(resumed, draws)
     with pytest.raises(ValueError, match="belongs to another search"):
-        draw_by_nuts(*given, Checkpoint(file, "that"))
+        draw_by_nuts(*arguments, Checkpoint(file, "that"))
 
 
 def test_a_checkpoint_is_not_overwritten(plain, tmp_path):
@@ -206,26 +210,26 @@ def test_verdicts_on_chains_that_do_not_mix():
 def test_the_posterior_of_a_fit_is_as_wide_as_its_intervals(plain):
     """The model is nearly linear within its errors, so that both agree."""
     pytest.importorskip("blackjax")
-    found = sample(plain, draws=300, chains=2, warmup=100)
-    np.testing.assert_allclose(found.deviations, plain.errors, rtol=0.2)
-    assert np.all(np.abs(found.means - plain.values) < 0.3 * plain.errors)
-    assert str(found).splitlines()[1].startswith("beam.flexural_rigidity ")
+    posterior = sample(plain, draws=300, chains=2, warmup=100)
+    np.testing.assert_allclose(posterior.deviations, plain.errors, rtol=0.2)
+    assert np.all(np.abs(posterior.means - plain.values) < 0.3 * plain.errors)
+    assert str(posterior).splitlines()[1].startswith("beam.flexural_rigidity ")
 
 
 def test_unknown_noise_levels_are_integrated_out():
     """Twelve samples: against the integral over the level, by quadrature."""
     mask = np.zeros((1, TIMES.size, 1))
     mask[0, :12] = 1.0
-    found = fit(least_squares({"sensors.0.offset": None}, logs=1, mask=mask))
-    density, _, start, whitening = _log_density(found, "estimated")
+    offset_fit = fit(least_squares({"sensors.0.offset": None}, logs=1, mask=mask))
+    density, _, start, whitening = _log_density(offset_fit, "estimated")
     points = np.linspace(-4.0, 4.0, 9)
-    ours = np.array([density(jnp.array([point])) for point in points])
+    log_densities = np.array([density(jnp.array([point])) for point in points])
     offsets = start[0] + whitening[0, 0] * points
-    rest = (dataset(logs=1).measured - clean(1))[0, :12, 0] + TRUTH["sensors.0.offset"]
-    count = 12 / found.autocorrelation_factor[0, 0]
+    deviations = (dataset(logs=1).measured - clean(1))[0, :12, 0] + TRUTH["sensors.0.offset"]
+    count = 12 / offset_fit.autocorrelation_factor[0, 0]
 
     def evidence(offset):
-        squares = np.sum((rest - offset) ** 2) / found.autocorrelation_factor[0, 0]
+        squares = np.sum((deviations - offset) ** 2) / offset_fit.autocorrelation_factor[0, 0]
         return quad(
             lambda s: np.exp(-(count + 1) * np.log(s / NOISE) - squares / (2 * s**2)),
             NOISE / 10,
@@ -234,11 +238,13 @@ def test_unknown_noise_levels_are_integrated_out():
             points=[NOISE],
         )[0]
 
-    theirs = np.log([evidence(offset) for offset in offsets])
-    np.testing.assert_allclose(ours - ours[4], theirs - theirs[4], atol=1e-3)
+    expected = np.log([evidence(offset) for offset in offsets])
+    np.testing.assert_allclose(log_densities - log_densities[4], expected - expected[4], atol=1e-3)
     # Wider than with fixed noise: the tails of Student's distribution.
-    fixed = _log_density(found)[0]
-    assert ours[-1] - ours[4] > float(fixed(jnp.array([4.0])) - fixed(jnp.array([0.0])))
+    fixed = _log_density(offset_fit)[0]
+    assert log_densities[-1] - log_densities[4] > float(
+        fixed(jnp.array([4.0])) - fixed(jnp.array([0.0]))
+    )
 
 
 def test_unknown_noise_models_are_refused(plain):

@@ -1,4 +1,4 @@
-"""Parameters of finite-element rigs are recovered under coloured noise, by models of fewer modes.
+"""Parameters of finite-element rigs recovered under autocorrelated noise by models of fewer modes.
 
 They are fitted one by one, the others known, and all together; a wrong model is called unreliable.
 """
@@ -9,19 +9,19 @@ import scipy.stats
 
 import jaxbeam as jb
 from tests.oracles import finite_elements
-from tests.tuning.rehearsals import (
+from tests.tuning.finite_element_rigs import (
     SAGGING,
     SHAKER,
     YIELDING,
-    Rehearsal,
-    coloured,
+    SimulatedIdentification,
+    autocorrelated,
     patch,
     plant,
 )
 from tuning.parameters.free import to_unbounded
 
-WIDE = 3 / 1.96  # half widths of an interval in three standard errors
-FEWEST = 4  # parameters of the smallest rig
+THREE_ERRORS = 3 / 1.96  # half widths of an interval in three standard errors
+SMALLEST_COUNT = 4  # parameters of the smallest rig
 
 PLANTS = {
     "one span, shaker": plant(
@@ -58,47 +58,49 @@ PLANTS = {
 
 
 @pytest.fixture(scope="module", params=PLANTS)
-def rehearsal(request) -> Rehearsal:
-    return Rehearsal(PLANTS[request.param])
+def identification(request) -> SimulatedIdentification:
+    return SimulatedIdentification(PLANTS[request.param])
 
 
 @pytest.mark.slow
-def test_all_parameters_together_lie_within_their_intervals(rehearsal):
+def test_all_parameters_together_lie_within_their_intervals(identification):
     """None is off by more than three standard errors; together, by the 99.9 % quantile."""
-    free = np.ones(len(rehearsal.truth), bool)
-    found = rehearsal.fit(coloured(rehearsal.clean.shape, seed=0), free)
-    assert found.converged
-    errors = rehearsal.errors(found, free)
-    said = dict(zip(rehearsal.truth, errors, strict=True))
-    assert np.all(np.abs(errors) < WIDE), said
-    distance = errors @ np.linalg.solve(found.uncertainty.correlation, errors) * 1.96**2
-    assert distance < scipy.stats.chi2.ppf(0.999, errors.size), said
+    free = np.ones(len(identification.truth), bool)
+    solution = identification.fit(autocorrelated(identification.clean.shape, seed=0), free)
+    assert solution.converged
+    errors = identification.errors(solution, free)
+    errors_by_address = dict(zip(identification.truth, errors, strict=True))
+    assert np.all(np.abs(errors) < THREE_ERRORS), errors_by_address
+    distance = errors @ np.linalg.solve(solution.uncertainty.correlation, errors) * 1.96**2
+    assert distance < scipy.stats.chi2.ppf(0.999, errors.size), errors_by_address
 
 
 @pytest.mark.slow
-def test_each_parameter_alone_lies_within_its_interval(rehearsal):
+def test_each_parameter_alone_lies_within_its_interval(identification):
     """Parameters of the beam, which all rigs have, on the rig with one patch only."""
-    names = list(rehearsal.truth)
+    names = list(identification.truth)
     own = ("actuators", "supports")
-    wanted = [n for n in names if n.startswith(own) or len(names) == FEWEST]
-    for seed, name in enumerate(wanted):
+    addresses = [n for n in names if n.startswith(own) or len(names) == SMALLEST_COUNT]
+    for seed, name in enumerate(addresses):
         free = np.array([n == name for n in names])
-        found = rehearsal.fit(coloured(rehearsal.clean.shape, seed + 1), free)
-        assert found.converged
-        (error,) = rehearsal.errors(found, free)
-        assert abs(error) < WIDE, (name, error)
+        solution = identification.fit(autocorrelated(identification.clean.shape, seed + 1), free)
+        assert solution.converged
+        (error,) = identification.errors(solution, free)
+        assert abs(error) < THREE_ERRORS, (name, error)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rehearsal", ["one span, patch"], indirect=True)
-def test_intervals_of_a_wrong_model_are_called_unreliable(rehearsal):
-    """A rigidity held 10 % too high biases the other parameters; the fit says so."""
-    noise = np.random.default_rng(0).normal(size=rehearsal.clean.shape)
-    free = np.array([name != "beam.flexural_rigidity" for name in rehearsal.truth])
-    right = rehearsal.fit(noise, free)
-    assert np.all(np.abs(rehearsal.errors(right, free)) < WIDE)
-    assert right.converged and "unreliable" not in str(rehearsal.result(noise, right))
-    stiffer = to_unbounded(rehearsal.parameters, [1.1 * x for x in rehearsal.truth.values()])
-    wrong = rehearsal.fit(noise, free, stiffer)
-    assert np.any(np.abs(rehearsal.errors(wrong, free)) > WIDE)
-    assert "unreliable" in str(rehearsal.result(noise, wrong))
+@pytest.mark.parametrize("identification", ["one span, patch"], indirect=True)
+def test_intervals_of_a_wrong_model_are_called_unreliable(identification):
+    """A rigidity fixed 10 % too high biases the other parameters; the fit warns of it."""
+    noise = np.random.default_rng(0).normal(size=identification.clean.shape)
+    free = np.array([name != "beam.flexural_rigidity" for name in identification.truth])
+    right = identification.fit(noise, free)
+    assert np.all(np.abs(identification.errors(right, free)) < THREE_ERRORS)
+    assert right.converged and "unreliable" not in str(identification.result(noise, right))
+    stiffer = to_unbounded(
+        identification.parameters, [1.1 * x for x in identification.truth.values()]
+    )
+    wrong = identification.fit(noise, free, stiffer)
+    assert np.any(np.abs(identification.errors(wrong, free)) > THREE_ERRORS)
+    assert "unreliable" in str(identification.result(noise, wrong))

@@ -22,7 +22,7 @@ def plain():
 
 def test_a_report_with_all_sections(plain, tmp_path):
     minima = tuple(LocalMinimum(cost, plain.values, plain.values, 3, True) for cost in (1.5, 40.0))
-    found = dataclasses.replace(plain, minima=minima)
+    with_minima = dataclasses.replace(plain, minima=minima)
     values = np.linspace(0.19, 0.21, 5)
     offset = Profile("sensors.0.offset", "m", values, (values - 0.2) ** 2 * 1e5, 4.0,
                      (0.195, np.inf), (0.194, 0.206))  # fmt: skip
@@ -31,7 +31,7 @@ def test_a_report_with_all_sections(plain, tmp_path):
     worse = dataclasses.replace(plain, fitted=held.predicted, parameters=plain.parameters[:2])
     write_report(
         tmp_path / "report",
-        found,
+        with_minima,
         profiles=[offset],
         posterior=with_diagnostics(plain.addresses, draws, 0),
         held_out=cross_validate(plain),
@@ -45,7 +45,7 @@ def test_a_report_with_all_sections(plain, tmp_path):
     assert "the data only say that sensors.0.offset is above 0.195 m." in text
     assert re.search(r"\| beam.flexural_rigidity \| N m\^2 \| 19 \|  \| 20\.\d+ \| 0\.\d+ \|", text)
     assert "<td>held &amp; &lt;fast&gt;</td>" in page
-    assert "2 minima from 6 starts:\n  misfit 1.5 from 3 starts: " in str(found)
+    assert "2 minima from 6 starts:\n  misfit 1.5 from 3 starts: " in str(with_minima)
     for name in re.findall(r"!\[.*\]\((.*)\)", text):
         assert (tmp_path / "report" / name).stat().st_size > 1000
         assert f'src="{name}"' in page
@@ -56,8 +56,8 @@ def test_a_report_with_all_sections(plain, tmp_path):
 def test_remarks_on_priors_and_on_logs():
     measured = clean() + NOISE * np.random.default_rng(0).normal(size=clean().shape)
     measured[1, 60] += 2.0
-    known = {"beam.damping_ratio": Prior(mean=0.03, deviation=1e-5)}
-    found = fit(least_squares(measured=measured, free=dict.fromkeys(TRUTH) | known))
-    said = "\n".join(found.remarks)
-    assert "beam.damping_ratio is determined by its prior more than by the logs" in said
-    assert "run 1: w has spikes (one sample), first at t = 1.2 s (not masked)" in said
+    prior = {"beam.damping_ratio": Prior(mean=0.03, deviation=1e-5)}
+    fitted = fit(least_squares(measured=measured, free=dict.fromkeys(TRUTH) | prior))
+    remarks = "\n".join(fitted.remarks)
+    assert "beam.damping_ratio is determined by its prior more than by the logs" in remarks
+    assert "run 1: w has spikes (one sample), first at t = 1.2 s (not masked)" in remarks

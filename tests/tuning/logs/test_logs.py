@@ -159,7 +159,7 @@ def make(times):
     return Log(np.asarray(times, float), values, ("a",), ("deflection",), ("m",))
 
 
-def test_sampling_comes_from_the_times():
+def test_sample_rate_follows_from_the_times():
     rounded = np.round(np.arange(2000) / 2048, 4)  # half the last printed digit: 0.1 of a step
     assert make(rounded).sample_rate == pytest.approx(2048, rel=1e-3)
     uneven = make(np.r_[0, 1, 2, 3, 5, 6])
@@ -168,7 +168,7 @@ def test_sampling_comes_from_the_times():
         _ = uneven.sample_rate
 
 
-def test_a_log_checks_what_it_is_given():
+def test_inconsistent_times_and_names_are_refused():
     with pytest.raises(ValueError, match="sample 2: time 0.5 s comes after 1 s"):
         make([0, 1, 0.5])
     with pytest.raises(ValueError, match="2 names for 1 channels"):

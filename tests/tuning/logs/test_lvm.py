@@ -40,19 +40,19 @@ ROWS = {
 
 def lvm(clocks="One", separator="Comma", decimal=".", starts=("23:59:59.5",), multi="Yes"):
     """Text of a file with one segment for each start time."""
-    marks = {
+    fields = {
         "s": "," if separator == "Comma" else "\t",
         "separator": separator,
         "decimal": decimal,
         "clocks": clocks,
         "multi": multi,
     }
-    text = HEAD.format(**marks)
+    text = HEAD.format(**fields)
     for start in starts:
         date, _, clock = start.rpartition(" ")
-        segment = SEGMENT.format(start=clock.replace(".", decimal), **marks)
+        segment = SEGMENT.format(start=clock.replace(".", decimal), **fields)
         text += segment.replace("2024/03/01", date or "2024/03/01")
-        text += ROWS[clocks].format(**marks) + "\n"
+        text += ROWS[clocks].format(**fields) + "\n"
     return text
 
 

@@ -41,8 +41,8 @@ def test_spikes():
     assert str(fault) == "run.csv: a has spikes (2 samples), first at t = 0.2 s"
 
 
-def test_an_impact_that_rings_has_no_spikes():
-    """Faster than cubics, like a roller on a footbridge, but not for a single sample."""
+def test_ringing_after_an_impact_is_no_spike():
+    """Faster than cubics, as a roller on a footbridge, but longer than a single sample."""
     after = np.maximum(TIMES - 0.4, 0.0)
     ringing = np.exp(-5 * after) * np.sin(2 * np.pi * 90 * after)
     assert find_faults(log_of(np.column_stack([ringing, ringing]))) == []
@@ -64,11 +64,11 @@ def test_a_stuck_channel():
 
 
 def test_gaps_and_a_drifting_clock():
-    kept = np.r_[:200, 230:600]
-    (gap,) = find_faults(log_of(CLEAN[kept], TIMES[kept]))
+    indices = np.r_[:200, 230:600]
+    (gap,) = find_faults(log_of(CLEAN[indices], TIMES[indices]))
     assert gap.message == "run.csv: about 30 samples are missing after t = 0.398 s"
-    bent = TIMES + 0.004 * (TIMES / 1.2) * (1 - TIMES / 1.2) * 4
-    (drift,) = find_faults(log_of(times=bent))
+    drifting_times = TIMES + 0.004 * (TIMES / 1.2) * (1 - TIMES / 1.2) * 4
+    (drift,) = find_faults(log_of(times=drifting_times))
     assert "the clock drifts: midway the times are 2 steps" in drift.message
     assert find_faults(log_of(times=np.round(TIMES, 3))) == []
 

@@ -15,9 +15,11 @@ def tdms(path, runs=("",), step=0.002, extra=None):
     nptdms = pytest.importorskip("nptdms")
     channels = []
     for i, run in enumerate(runs):
-        about = {"wf_increment": step, "wf_start_offset": 0.0, "unit_string": "mm"}
-        channels.append(nptdms.ChannelObject(run or "log", "d1", D1 + i, about))
-        channels.append(nptdms.ChannelObject(run or "log", "d2", D2 + i, about | (extra or {})))
+        properties = {"wf_increment": step, "wf_start_offset": 0.0, "unit_string": "mm"}
+        channels.append(nptdms.ChannelObject(run or "log", "d1", D1 + i, properties))
+        channels.append(
+            nptdms.ChannelObject(run or "log", "d2", D2 + i, properties | (extra or {}))
+        )
     with nptdms.TdmsWriter(path) as writer:
         writer.write_segment(channels)
 
@@ -143,21 +145,23 @@ def test_missing_samples_are_masked_only_on_request(tmp_path):
 def test_transducers_with_a_sensitivity(tmp_path):
     path = tmp_path / "run.csv"
     path.write_text("t [s],a [V],d [mV]\n0,1,2\n1,2,4\n")
-    side = path.with_suffix(".toml")
-    side.write_text('[columns]\na = {sensitivity = "100 mV/g"}\nd = {sensitivity = "-0.5 V/mm"}\n')
+    description = path.with_suffix(".toml")
+    description.write_text(
+        '[columns]\na = {sensitivity = "100 mV/g"}\nd = {sensitivity = "-0.5 V/mm"}\n'
+    )
     log = read_log(path)
     assert log.quantities == ("acceleration", "deflection")
     np.testing.assert_allclose(log.values, [[98.0665, -4e-6], [196.133, -8e-6]])
-    side.write_text('[columns]\na = {sensitivity = "100 g"}\n')
+    description.write_text('[columns]\na = {sensitivity = "100 g"}\n')
     with pytest.raises(ValueError, match="column 'a': the sensitivity '100 g' should be like"):
         read_log(path)
-    side.write_text('[columns]\na = {sensitivity = "3 N/mm"}\n')
+    description.write_text('[columns]\na = {sensitivity = "3 N/mm"}\n')
     with pytest.raises(ValueError, match="is for force, but the column is voltage"):
         read_log(path)
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_file_cut_off_is_refused_in_one_sentence(tmp_path, name):
+def test_a_truncated_file_is_refused_with_one_message(tmp_path, name):
     whole, cut = tmp_path / name, tmp_path / f"cut_{name}"
     FORMATS[name](whole)
     data = whole.read_bytes()
@@ -174,7 +178,7 @@ def test_a_file_cut_off_is_refused_in_one_sentence(tmp_path, name):
 
 
 @pytest.mark.parametrize("suffix", [".tdms", ".mat", ".h5", ".nc", ".parquet"])
-def test_a_file_that_is_not_what_it_is_called(tmp_path, suffix):
+def test_a_file_whose_content_is_not_that_of_its_suffix(tmp_path, suffix):
     path = tmp_path / f"run{suffix}"
     path.write_text("t [s],d [mm]\n0,1\n1,2\n")
     with pytest.raises(ValueError, match="whatever it is called: it starts with b't .s.,d"):

@@ -30,7 +30,7 @@ def test_unit(text, si, factor, quantity):
 
 
 def test_quantities_are_those_of_sensors():
-    """What a sensor can measure has, in a log, the SI unit the sensor says."""
+    """The SI unit of each quantity in a log is that of the sensor."""
     for entry in UNITS.values():
         if entry.quantity in QUANTITIES:
             assert entry.si == QUANTITIES[entry.quantity].unit

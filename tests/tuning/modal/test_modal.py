@@ -31,8 +31,8 @@ def make_log(values, rate, quantity="acceleration"):
 
 
 def root(frequency, damping):
-    turn = 2 * np.pi * frequency
-    return turn * (-damping + 1j * np.sqrt(1 - damping**2))
+    omega = 2 * np.pi * frequency
+    return omega * (-damping + 1j * np.sqrt(1 - damping**2))
 
 
 def decay(seed, noise=0.05, rate=100.0, release=3.0, hum=0.0, drift=0.1, duration=12.0):
@@ -59,8 +59,8 @@ def ambient(seed, duration=200.0, rate=40.0, noise=0.1, finer=8):
     for frequency, damping, shape in ((3.0, 0.02, (1, 0.7)), (7.0, 0.01, (0.8, -0.9))):
         pole = np.exp(root(frequency, damping) / rate / finer)
         force = random.normal(size=finer * (count + 2000))
-        swing = lfilter([1.0], [1, -2 * pole.real, abs(pole) ** 2], force)[::finer][2000:]
-        values += np.outer(swing / swing.std(), shape)
+        response = lfilter([1.0], [1, -2 * pole.real, abs(pole) ** 2], force)[::finer][2000:]
+        values += np.outer(response / response.std(), shape)
     return make_log(values, rate, "deflection")
 
 
@@ -89,7 +89,7 @@ def test_decay_is_found_and_fitted():
     assert np.sum((fit.measured - fit.fitted) ** 2) < 0.1 * np.sum(fit.measured**2)
 
 
-def test_hum_is_no_mode():
+def test_mains_hum_is_no_mode():
     fit = identify_modes(decay(2, hum=0.2), window=(3.0, 9.0), band=BAND)
     np.testing.assert_allclose(fit.frequencies, FREQUENCIES, rtol=2e-3)
     hum = [why for mode, why in fit.rejected if abs(mode.frequency - 16.7) < 0.05]
@@ -104,11 +104,11 @@ def test_ambient():
 
 
 @pytest.mark.parametrize("quantity", ["acceleration", "deflection"])
-@pytest.mark.parametrize("colour", [0.0, 0.7])
-def test_noise_has_no_modes(quantity, colour):
+@pytest.mark.parametrize("pole", [0.0, 0.7])
+def test_noise_has_no_modes(quantity, pole):
     for seed in range(5):
         noise = np.random.default_rng(seed).normal(size=(4000, 2))
-        log = make_log(lfilter([1.0], [1.0, -colour], noise, axis=0), 100.0, quantity)
+        log = make_log(lfilter([1.0], [1.0, -pole], noise, axis=0), 100.0, quantity)
         fit = identify_modes(log)
         assert not fit.modes, str(fit)
         assert "no mode is well identified" in str(fit)

@@ -28,7 +28,7 @@ RANGES = [(-1.0, 3.0), (0.5, np.inf), (-np.inf, 2.0), (-np.inf, np.inf)]
 
 @pytest.mark.parametrize("low, high", RANGES)
 @pytest.mark.parametrize("value", [0.6, 1.0, 1.9])
-def test_mapping_returns_and_stays_within(low, high, value):
+def test_mapping_is_inverted_and_within_the_bounds(low, high, value):
     parameter = FreeParameter("x", "m", 1.0, low, high, 1.0)
     np.testing.assert_allclose(
         float(parameter.from_unbounded(jnp.asarray(parameter.to_unbounded(value)))),
@@ -40,7 +40,7 @@ def test_mapping_returns_and_stays_within(low, high, value):
 
 
 @pytest.mark.parametrize("low, high", RANGES[:3])
-def test_a_start_on_a_bound_is_moved_in(low, high):
+def test_a_start_on_a_bound_is_moved_inside(low, high):
     parameter = FreeParameter("x", "m", 1.0, low, high, 1.0)
     bound = low if np.isfinite(low) else high
     inner = float(parameter.from_unbounded(jnp.asarray(parameter.to_unbounded(bound))))
@@ -93,7 +93,7 @@ def test_units_of_all_numbers():
 
 
 @pytest.mark.parametrize(
-    "bounds, words",
+    "bounds, message",
     [
         ({}, "name at least one address"),
         ({"beam.rigidty": None}, "did you mean"),
@@ -111,7 +111,7 @@ def test_units_of_all_numbers():
     ],
     ids=lambda value: None if isinstance(value, str) else ",".join(value) or "none",
 )
-def test_faulty_addresses_and_bounds_are_refused(bounds, words):
+def test_faulty_addresses_and_bounds_are_refused(bounds, message):
     with pytest.raises(ValueError) as refused:
         free_parameters(CASES, bounds, 0.01)
-    assert words in str(refused.value)
+    assert message in str(refused.value)

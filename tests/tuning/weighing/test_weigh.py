@@ -24,28 +24,28 @@ def crossing(loads, noise=1e-5):
 TWO = [Load(0.5, 1.2, 0.1), Load(0.3, -1.6, 0.5)]
 
 
-def test_matching_pursuit_comes_close_without_dynamics():
+def test_matching_pursuit_is_close_without_dynamics():
     pursuit = MatchingPursuit(CASE, crossing(TWO), (0.8, 2.5), both_ways=True)
-    found = pursuit.find(2)
-    parameters = sorted([float(n.mass), float(n.speed), float(n.entry_time)] for n in found.loads)
+    match = pursuit.find(2)
+    parameters = sorted([float(n.mass), float(n.speed), float(n.entry_time)] for n in match.loads)
     np.testing.assert_allclose(parameters, [[0.3, -1.6, 0.5], [0.5, 1.2, 0.1]], atol=0.05)
-    assert found.residual_rms < 0.2 * pursuit.readings_rms < 0.5 * pursuit.find(1).residual_rms
+    assert match.residual_rms < 0.2 * pursuit.readings_rms < 0.5 * pursuit.find(1).residual_rms
 
 
 @pytest.mark.slow
 def test_two_loads_that_meet_on_the_beam():
-    found = weigh(CASE, crossing(TWO), (0.8, 2.5))
+    weighed = weigh(CASE, crossing(TWO), (0.8, 2.5))
     truth = {
         "loads.0.mass": 0.5, "loads.0.speed": 1.2, "loads.0.entry_time": 0.1,
         "loads.1.mass": 0.3, "loads.1.speed": -1.6, "loads.1.entry_time": 0.5,
         "sensors.0.offset": 0.0, "sensors.1.offset": 0.0,
     }  # fmt: skip
-    assert len(found.loads) == 2
-    assert found.load_counts == []  # the residuals are white noise
-    assert np.all(np.abs(deviations(found.fit, truth)) < 3.5)
-    assert found.fit.errors[0] < 0.01 and found.fit.errors[3] < 0.01  # kg
-    assert str(found).startswith("2 loads found\nparameter ")
-    assert found.to_dict()["loads"][1]["mass"]["value"] == pytest.approx(0.3, rel=0.02)
+    assert len(weighed.loads) == 2
+    assert weighed.load_counts == []  # the residuals are white noise
+    assert np.all(np.abs(deviations(weighed.fit, truth)) < 3.5)
+    assert weighed.fit.errors[0] < 0.01 and weighed.fit.errors[3] < 0.01  # kg
+    assert str(weighed).startswith("2 loads found\nparameter ")
+    assert weighed.to_dict()["loads"][1]["mass"]["value"] == pytest.approx(0.3, rel=0.02)
 
 
 def test_logs_and_cases_that_cannot_be_weighed():

@@ -61,22 +61,22 @@ def test_the_objective_never_rises_and_is_that_of_the_saved_case(problem):
     ]
     cases = tuning.LoadCases(tuple(runs[:2]), tuple(runs[2:]))
     case = small(**problem)
-    found = tuning.tune(case, FREE, cases, steps=4, least_peaks=False, progress=False)
-    training, held_out = found.run_sets
+    tuned = tuning.tune(case, FREE, cases, steps=4, least_peaks=False, progress=False)
+    training, held_out = tuned.run_sets
     before, after = training.objective
     assert after <= before
     assert all(low <= value <= high for (low, high), value in
-               zip(FREE.values(), found.values, strict=True))  # fmt: skip
+               zip(FREE.values(), tuned.values, strict=True))  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "tuned.toml"
-        jb.save_case(found.case, file)
+        jb.save_case(tuned.case, file)
         saved = jb.load_case(file)
     # The true objective is that of the saved case, simulated run by run.
     position = float(case.sensors[0].position)
     peaks = [relative_peak(run_case(saved, run), position) for run in cases.training]
     assert after == pytest.approx(max(peaks), rel=1e-3)
     # The same for the held-out run; peaks between samples may be slightly larger.
-    own = run_case(saved, cases.held_out[0])
-    assert 1 - 1e-3 < held_out.peaks_after[0] / peak(own, position) < 1.02
+    saved_run = run_case(saved, cases.held_out[0])
+    assert 1 - 1e-3 < held_out.peaks_after[0] / peak(saved_run, position) < 1.02
     below = 1 - held_out.peaks_after[0] / held_out.uncontrolled_peaks[0]
-    assert f"worst held out run: peak {below:.1%} below no control" in found.verdict
+    assert f"worst held out run: peak {below:.1%} below no control" in tuned.verdict

@@ -1,4 +1,4 @@
-"""Rigs of finite elements, their readings, and fits of models to these.
+"""Finite-element rigs, their readings, and fits of models to these readings.
 
 The plant is a finite-element beam with its first modes, integrated by scipy; the model fitted to
 its readings has as many modes, or fewer.
@@ -23,7 +23,7 @@ from tuning.parameters.free import free_parameters, to_unbounded
 RATE, MEMORY = 100.0, 0.5  # Hz, correlation from sample to sample
 NOISE = {"deflection": 1e-5, "acceleration": 2e-3}  # m, m/s^2
 UNITS = {"deflection": "m", "acceleration": "m/s^2"}
-# N/m: under 0.5 kg supports yield by half the noise, and by twelve times the noise.
+# N/m: under 0.5 kg the supports deflect by half the noise, and by twelve times the noise.
 YIELDING, SAGGING = 1e6, 4e4
 MOMENT, AMPLIFIER = 8.292e-4, 200.0  # N m/V
 SHAKER = {"position": 0.5, "stiffness": 3500.0, "damping": 80.0, "force_per_volt": 4.6}
@@ -45,7 +45,9 @@ class Plant:
 
         def force(t):
             columns = zip(rows, commands.T, strict=True)
-            return sum(row * np.interp(t - late, times, column) for (row, late), column in columns)
+            return sum(
+                row * np.interp(t - delay, times, column) for (row, delay), column in columns
+            )
 
         loads = self.case.loads if loaded else ()
         run = crossing.respond(
@@ -124,25 +126,25 @@ def plant(
     return Plant(beam, case, truth)
 
 
-def coloured(shape, seed):
-    """First-order noise (time, sensor) of standard deviation one."""
+def autocorrelated(shape, seed):
+    """First-order autoregressive noise (time, sensor) of standard deviation one."""
     white = np.random.default_rng(seed).normal(size=shape)
     filtered = scipy.signal.lfilter([np.sqrt(1 - MEMORY**2)], [1, -MEMORY], white, axis=0)
     return np.asarray(filtered)
 
 
-class Rehearsal:
+class SimulatedIdentification:
     """Readings of a plant, and one compiled least-squares problem in all its parameters."""
 
-    def __init__(self, made: Plant):
-        self.truth, count = made.truth, len(made.case.actuators)
+    def __init__(self, rig: Plant):
+        self.truth, count = rig.truth, len(rig.case.actuators)
         times = np.arange(round(0.8 * RATE)) / RATE
         phases = 90.0 * np.arange(count)
         commands = np.stack(
             [2.0 * scipy.signal.chirp(times, 2.0, times[-1], 30.0, phi=phi) for phi in phases], 1
         )
-        self.clean = made.readings(times, commands)
-        quantities = tuple(sensor.quantity for sensor in made.case.sensors)
+        self.clean = rig.readings(times, commands)
+        quantities = tuple(sensor.quantity for sensor in rig.case.sensors)
         self.noise = np.array([NOISE[quantity] for quantity in quantities])
         sensors = len(quantities)
         log = Log(
@@ -153,28 +155,28 @@ class Rehearsal:
             tuple(UNITS[quantity] for quantity in quantities) + ("V",) * count,
             actuators=(None,) * sensors + tuple(range(count)),
         )
-        start = {address: 1.06 * value for address, value in made.truth.items()}
-        dataset = make_dataset(replace(made.case, start), [log])
+        start = {address: 1.06 * value for address, value in rig.truth.items()}
+        dataset = make_dataset(replace(rig.case, start), [log])
         scale = np.ptp(self.clean)
-        self.parameters = free_parameters(dataset.cases, dict.fromkeys(made.truth), scale)
+        self.parameters = free_parameters(dataset.cases, dict.fromkeys(rig.truth), scale)
         self.least_squares = LeastSquares(dataset, self.parameters)
-        self.true_point = to_unbounded(self.parameters, made.truth.values())
+        self.true_point = to_unbounded(self.parameters, rig.truth.values())
 
-    def fit(self, noise, free, held=None):
-        """Solution for the free parameters, others held at a point or at the truth; unit noise."""
+    def fit(self, noise, free, fixed_values=None):
+        """Solution for the free parameters, others fixed (at the truth if left out); unit noise."""
         measured = (self.clean + self.noise * noise)[None]
-        held = self.true_point if held is None else held
-        start = np.where(free, self.least_squares.start_point, held)
+        fixed_values = self.true_point if fixed_values is None else fixed_values
+        start = np.where(free, self.least_squares.start_point, fixed_values)
         return self.least_squares.solve(measured, start=start, free=free)
 
-    def errors(self, found, free):
+    def errors(self, solution, free):
         """Errors of the free parameters, in half widths of the stated intervals."""
-        halves = t_quantile(found.degrees_of_freedom) * found.uncertainty.errors[free]
-        return (found.values[free] - np.array(list(self.truth.values()))[free]) / halves
+        half_widths = t_quantile(solution.degrees_of_freedom) * solution.uncertainty.errors[free]
+        return (solution.values[free] - np.array(list(self.truth.values()))[free]) / half_widths
 
-    def result(self, noise, found) -> Fit:
+    def result(self, noise, solution) -> Fit:
         """The fit of a solution."""
         dataset = self.least_squares.data
-        fit = fit_result(dataset.cases[0], self.least_squares, found)
+        fit = fit_result(dataset.cases[0], self.least_squares, solution)
         noisy = dataclasses.replace(dataset, measured=(self.clean + self.noise * noise)[None])
         return dataclasses.replace(fit, dataset=noisy)
