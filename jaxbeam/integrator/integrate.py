@@ -20,7 +20,7 @@ from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.running_peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.step import CHECKPOINT_NAME, advance, advance_unforced, contact_forces
-from jaxbeam.integrator.step_matrices import CHUNK_STEPS, LoadPath, load_path, step_matrices
+from jaxbeam.integrator.step_matrices import LoadPath, chunk_length, load_path, step_matrices
 from jaxbeam.model.contact import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (
@@ -83,14 +83,16 @@ def _values_by_row(
 def _chunk_function(
     discrete: DiscreteModel, loads: LoadSet, max_loads: int, policy: AbstractInputPolicy | None
 ):
-    """Function that advances state, memory and running peaks by the chunk from a given step on.
+    """Function that advances state, memory and running peaks by a chunk of steps; their number.
 
     It also returns the time (s) at the end of the chunk, and the histories (states before each
     step, commands at the nodes, observations).
     """
 
+    chunk_steps = chunk_length(discrete, max_loads, loads.inertia.shape[1])
+
     def chunk(state, memory, running_peaks: Any, first_step):
-        index = first_step + xp.arange(CHUNK_STEPS)
+        index = first_step + xp.arange(chunk_steps)
         chunk_path = load_path(discrete, loads, max_loads, index)
         matrices = step_matrices(discrete, chunk_path)
         inertia_and_weight = (
@@ -121,7 +123,7 @@ def _chunk_function(
             (states, commands, observed),
         )
 
-    return chunk
+    return chunk, chunk_steps
 
 
 def integrate_history(
@@ -140,7 +142,7 @@ def integrate_history(
     `max_loads` is the largest number of loads on the beam at once. The reverse pass saves states
     and contact forces of every step; under a policy, one state for each chunk.
     """
-    chunk = _chunk_function(discrete, loads, max_loads, policy)
+    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
     batch_size, load_count = loads.inertia.shape[1], len(loads.trajectories)
 
     def one_chunk(carry, first):
@@ -155,7 +157,7 @@ def integrate_history(
     )
     memory = None if policy is None else policy.start(batch_size)
     initial_state = xp.zeros((discrete.model.state_count, batch_size))
-    first_steps = xp.arange(0, steps, CHUNK_STEPS)
+    first_steps = xp.arange(0, steps, chunk_steps)
     checkpointed_chunk = checkpoint(
         one_chunk, policy=jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
     )
@@ -180,7 +182,7 @@ def integrate_peaks(
     after the last exit cannot raise any peak. `max_loads` is the largest number of loads on the
     beam at once. Forward mode only.
     """
-    chunk = _chunk_function(discrete, loads, max_loads, policy)
+    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
     grid, stiffness = discrete.grid, discrete.model.stiffness()
 
     def unfinished(carry):
@@ -202,7 +204,7 @@ def integrate_peaks(
     def next_chunk(carry):
         state, memory, peaks, first_step, _ = carry
         state, memory, peaks, time, _ = chunk(state, memory, peaks, first_step)
-        first_step = first_step + CHUNK_STEPS
+        first_step = first_step + chunk_steps
         continues = (
             xp.any(peaks.finite) if policy is not None else can_raise_peak(state, peaks, time)
         )
@@ -236,15 +238,15 @@ def integrate_at_events(
     The number of steps between events may be traced. The state at the last event is zero, unless a
     step with a policy starts there. Forward mode only.
     """
-    chunk = _chunk_function(discrete, loads, max_loads, policy)
+    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
     grid = discrete.grid
 
     def next_chunk(carry):
         state, memory, kept, first_step = carry
-        event = grid.event_at(first_step + xp.arange(CHUNK_STEPS))
+        event = grid.event_at(first_step + xp.arange(chunk_steps))
         state, memory, _, _, (states, *_) = chunk(state, memory, None, first_step)
         kept = put(kept, xp.where(event < 0, kept.shape[0], event), states)
-        return state, memory, kept, first_step + CHUNK_STEPS
+        return state, memory, kept, first_step + chunk_steps
 
     batch_size = loads.inertia.shape[1]
     initial_state = xp.zeros((discrete.model.state_count, batch_size))

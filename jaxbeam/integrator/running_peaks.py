@@ -15,7 +15,7 @@ from jaxbeam.case.trajectory import NEVER
 from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
 from jaxbeam.integrator.step_matrices import LoadPath, StepMatrices
 from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
-from jaxbeam.runtime.arrays import cond, optimization_barrier, vmap, xp
+from jaxbeam.runtime.arrays import cond, optimization_barrier, xp
 
 PEAK_MARGIN = 1.1  # upper bound of a peak over the highest of the samples around it
 
@@ -75,7 +75,7 @@ def update_peaks(
 
     def updated(best):
         estimate = optimization_barrier(
-            vmap(lambda step: estimate_peak(step, PEAK_NODES, best.magnitude))(samples)
+            estimate_peak(xp.moveaxis(samples, 1, 0), PEAK_NODES, best.magnitude)
         )
         best_estimate, peak_step = max_with_ties(estimate)
         peak_step = xp.max(xp.where(peak_step, np.arange(steps)[:, None, None], 0), axis=0)

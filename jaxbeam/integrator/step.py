@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.model.contact import solve_contact_forces
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_small
-from jaxbeam.runtime.arrays import cond, custom_jvp, scan, vmap, xp
+from jaxbeam.runtime.arrays import any_jax, cond, custom_jvp, scan, vmap, xp
 
 CHECKPOINT_NAME = "steps"  # states and contact forces that are saved for the reverse pass
 
@@ -61,8 +61,35 @@ def free_response(transition: Float[Array, "block side side"], state: Float[Arra
 @custom_jvp
 def advance_unforced(matrices: StepMatrices, inertia, weight, state):
     """Steps without commands: final state, state before each step, and contact forces."""
+    if not any_jax(matrices, inertia, weight, state):
+        return _advance_known(matrices, inertia, weight, state)
     final_state, (states, forces) = scan(advance, state, (matrices, inertia, weight, None))
     return final_state, states, forces
+
+
+def _advance_known(matrices: StepMatrices, inertia, weight, state):
+    """`advance_unforced` of known numbers: z' = Phi z - Gamma S (m R z + w) as one map a step.
+
+    The systems of all steps are solved at once; NumPy takes a tenth of the time of one by one.
+    """
+    steps, rows, batch_size = inertia.shape
+    inertia, weight = (np.swapaxes(part, 1, 2)[..., None] for part in (inertia, weight))
+    system = np.eye(rows) + inertia * matrices.contact_compliance[:, None]
+    right = np.concatenate([inertia * matrices.contact_response[:, None], weight], axis=-1)
+    forces_of_state = -np.linalg.solve(system, right)  # (step, batch, row, state and one)
+    maps = matrices.force_response[:, None] @ forces_of_state
+    blocks, side = matrices.transition.shape[1:3]
+    state_index = np.arange(blocks * side).reshape(blocks, side)
+    index = np.s_[:, :, state_index[:, :, None], state_index[:, None, :]]
+    maps[index] += matrices.transition[:, None]
+    states = np.empty((steps + 1, batch_size, blocks * side, 1))
+    states[0] = state.T[..., None]
+    state_maps, offsets = maps[..., :-1], maps[..., -1:]
+    for i in range(steps):
+        states[i + 1] = state_maps[i] @ states[i] + offsets[i]
+    forces = forces_of_state[..., :-1] @ states[:-1] + forces_of_state[..., -1:]
+    states, forces = (np.swapaxes(part[..., 0], 1, 2) for part in (states, forces))
+    return states[-1], states[:-1], forces
 
 
 @advance_unforced.defjvp

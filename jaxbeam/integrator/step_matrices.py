@@ -6,19 +6,18 @@ state at the start, to the acceleration under the loads at the nodes, the state 
 deflections at monitored positions.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
-from jaxbeam.integrator.propagators import GAUSS_NODES
+from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.model.contact import LoadSet, contact_rows
-from jaxbeam.runtime.arrays import cond, index_in_dim, map_elements, xp
+from jaxbeam.runtime.arrays import cond, index_in_dim, is_jax, map_elements, xp
 
-CHUNK_STEPS = 16  # steps whose matrices are computed together
+CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
+KNOWN_CHUNK_ENTRIES = 2**20  # of matrices that NumPy computes together
 
 
 class CommandMatrices(eqx.Module):
@@ -70,6 +69,17 @@ class LoadPath(eqx.Module):
     contact_rows: Float[Array, "step load node block side"]
 
 
+def chunk_length(discrete: DiscreteModel, max_loads: int, batch_size: int) -> int:
+    """Number of steps whose matrices are computed together.
+
+    In NumPy, where each operation takes microseconds to begin, as many as memory allows.
+    """
+    if is_jax(discrete.grid.step_count):
+        return CHUNK_STEPS
+    side = max(max_loads * NODE_COUNT, discrete.model.state_count)
+    return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // side**2 // batch_size)))
+
+
 @jax.named_scope("load_path")
 def load_path(
     discrete: DiscreteModel, loads: LoadSet, max_loads: int, index: Int[Array, " step"]
@@ -100,6 +110,33 @@ def load_path(
 @jax.named_scope("load_path")
 def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
     """Matrices of the steps of a chunk."""
+    if is_jax(path.length_index):
+        matrices = _matrices_by_branch(discrete, path)
+    else:
+        matrices = _matrices_by_length(discrete, path)
+    return StepMatrices(*matrices, loaded=xp.any(path.on_beam, axis=1))
+
+
+def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):
+    """Matrices of the steps of a chunk of known lengths: those of one length together."""
+    indices = [np.flatnonzero(path.length_index == kind) for kind in set(path.length_index)]
+    parts = [
+        _matrices_of_one_length(
+            discrete,
+            _propagators_of(discrete, path.length_index[index[0]]),
+            path.shape_rows[index],
+            path.contact_rows[index],
+        )
+        for index in indices
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    order = np.argsort(np.concatenate(indices))
+    return jax.tree.map(lambda *matrices: xp.concatenate(matrices)[order], *parts)
+
+
+def _matrices_by_branch(discrete: DiscreteModel, path: LoadPath):
+    """Matrices of the steps of a chunk of traced lengths."""
     # Chosen outside the branches: inside, derivatives would pass through all lengths.
     first_propagators = _propagators_of(discrete, path.length_index[0])
 
@@ -119,10 +156,9 @@ def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
         return map_elements(single_step, (path.length_index, path.shape_rows, path.contact_rows))
 
     # In most chunks all steps are equally long and share their propagators.
-    matrices: Any = cond(
+    return cond(
         xp.all(path.length_index == path.length_index[0]), equal_lengths, mixed_lengths, None
     )
-    return StepMatrices(*matrices, loaded=xp.any(path.on_beam, axis=1))
 
 
 def _propagators_of(discrete: DiscreteModel, length_index):

@@ -12,7 +12,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.loads import trajectory
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.runtime.arrays import put, stop_gradient, xp
+from jaxbeam.runtime.arrays import put, searchsorted, stop_gradient, xp
 
 
 class TimeGrid(eqx.Module):
@@ -49,9 +49,7 @@ class TimeGrid(eqx.Module):
         """Panel, start time (s) and index of the length of the steps with these indices."""
         after_end = index >= self.step_count
         if self.event is None:
-            panel = xp.searchsorted(
-                self.cumulative_counts, index, side="right", method="compare_all"
-            )
+            panel = searchsorted(self.cumulative_counts, index)
         else:  # all panels of a schedule have the same number of steps
             panel = index // self.counts[0]
         panel = xp.minimum(panel, self.counts.shape[0] - 1)

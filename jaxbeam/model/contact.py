@@ -103,35 +103,48 @@ def contact_rows(model: ModalModel, position, speed, acceleration, active):
 def contact_at(
     model: ModalModel,
     loads: LoadSet,
-    time: Float[Array, ""],
-    state: Float[Array, "state batch"],
-    command: Float[Array, "actuator batch"] | None = None,
-) -> tuple[Float[Array, "load batch"], Float[Array, "mode batch"]]:
-    """Contact forces r (N, upwards on the beam) and accelerations of q at an instant (s).
+    times: Float[Array, "*time"],
+    states: Float[Array, "*time state batch"],
+    commands: Float[Array, "*time actuator batch"] | None = None,
+) -> tuple[Float[Array, "*time load batch"], Float[Array, "*time mode batch"]]:
+    """Contact forces r (N, upwards on the beam) and accelerations of q at instants (s).
 
     At the instant at which a load enters or leaves, those just after it.
     """
-    position, speed, acceleration = loads.kinematics(time)
-    active = loads.on_beam(time)
+    kinematics = (*loads.kinematics(times), loads.on_beam(times))
+    position, speed, acceleration, active = (xp.moveaxis(part, 0, -1) for part in kinematics)
     shape, rows = contact_rows(model, position, speed, acceleration, active)
-    load_count, mode_count = position.shape[0], model.mode_count
-    shape, rows = shape.reshape(load_count, mode_count), rows.reshape(load_count, model.state_count)
+    shape = shape.reshape(*position.shape, model.mode_count)
     blocks, side, _ = model.state_matrix.shape
-    rates = (model.state_matrix @ state.reshape(blocks, side, -1)).reshape(state.shape)
-    modal_acceleration = rates[model.rate_index]
-    acceleration_under_load = rows @ state
-    if command is not None:
-        command_acceleration = model.command_matrix[model.rate_index] @ command
+    state_blocks = states.reshape(*times.shape, blocks, side, -1)
+    rates = (model.state_matrix @ state_blocks).reshape(states.shape)
+    modal_acceleration = rates[..., model.rate_index, :]
+    acceleration_under_load = rows.reshape(*position.shape, model.state_count) @ states
+    if commands is not None:
+        command_acceleration = model.command_matrix[model.rate_index] @ commands
         modal_acceleration, acceleration_under_load = (
             modal_acceleration + command_acceleration,
             acceleration_under_load + shape @ command_acceleration,
         )
-    mass = xp.where(active[:, None], loads.inertia, 0.0)
-    weight = xp.where(active[:, None], loads.weight, 0.0)
+    mass = xp.where(active[..., None], loads.inertia, 0.0)
+    weight = xp.where(active[..., None], loads.weight, 0.0)
     # The contact law: (1 + m S S') r = -W - m (contact row) . z.
-    matrix = xp.eye(load_count)[:, :, None] + mass[:, None] * (shape @ shape.T)[:, :, None]
-    force = -solve_small(matrix, (weight + mass * acceleration_under_load)[:, None])[:, 0]
-    return force, modal_acceleration + shape.T @ force
+    identity = np.eye(position.shape[-1])[..., None]
+    matrix = identity + mass[..., None, :] * (shape @ shape.mT)[..., None]
+    right = weight + mass * acceleration_under_load
+    force = -_solve_at_instants(matrix, right)
+    return force, modal_acceleration + shape.mT @ force
+
+
+def _solve_at_instants(
+    matrix: Float[Array, "*time load load batch"], right: Float[Array, "*time load batch"]
+) -> Float[Array, "*time load batch"]:
+    """Solutions of small systems, with instants and batch as one batch axis."""
+    loads = right.shape[-2]
+    matrix = xp.moveaxis(matrix, (-3, -2), (0, 1)).reshape(loads, loads, -1)
+    columns = xp.moveaxis(right, -2, 0)
+    solution = solve_small(matrix, columns.reshape(loads, 1, -1))
+    return xp.moveaxis(solution.reshape(columns.shape), 0, -2)
 
 
 @custom_jvp

@@ -228,3 +228,10 @@ def collapse(array, start: int, end: int):
     """The array with the axes from start until before end made one."""
     shape = array.shape
     return array.reshape(*shape[:start], -1, *shape[end:])
+
+
+def searchsorted(ascending, values):
+    """Number of the ascending entries that are not above each value; for few entries."""
+    if is_jax(ascending) or is_jax(values):
+        return jnp.searchsorted(ascending, values, side="right", method="compare_all")
+    return np.searchsorted(ascending, values, side="right")

@@ -19,8 +19,8 @@ from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.contact import LoadSet, contact_at, load_set
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.runtime.arrays import vmap, xp
-from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.command_limits import command_ranges
 from jaxbeam.simulation.integration_plan import (
@@ -60,7 +60,8 @@ def simulate(
         plan = integration_plan(case, times, tolerance)
     times = sample_times(case) if times is None else xp.asarray(times, float)
     # Plans that differ in their error only share compiled programs.
-    record = _simulate_record(
+    simulate_record = _simulate_open_loop if case.controller is None else _simulate_closed_loop
+    record = simulate_record(
         case, dataclasses.replace(plan, error=0.0), times, xp.asarray(plan.error)
     )
     if is_concrete(record.contact_lost_time):
@@ -82,7 +83,6 @@ def _check_times(times) -> None:
         raise ValueError("times (s from the start of the run) must be finite and ascend")
 
 
-@compiled_if_traced
 def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
     running_peaks, outputs, modal, steps = _integrate(case, plan, times, case.sensor_positions)
     coordinates, rates, accelerations, position, force, commands, readings, failures = outputs
@@ -115,6 +115,10 @@ def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
         error_estimate=error,
         steps=steps,
     )
+
+
+_simulate_open_loop = compiled_if_traced(_simulate_record)
+_simulate_closed_loop = compiled(_simulate_record)
 
 
 def simulate_readings(
@@ -230,12 +234,9 @@ def _commands_at_steps(case: Case, commands, steps):
 def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states, commands):
     """Modal coordinates, rates and accelerations, load positions, contact forces, commands."""
 
-    def outputs_at(time, state, command):
-        column = None if command is None else command[:, None]
-        force, accelerations = contact_at(model, loads, time, state, column)
-        return force[:, 0], accelerations[:, 0]
-
-    force, accelerations = vmap(outputs_at)(times, states, commands)
+    columns = None if commands is None else commands[..., None]
+    force, accelerations = contact_at(model, loads, times, states, columns)
+    force, accelerations = force[..., 0], accelerations[..., 0]
     count = 2 * accelerations.shape[1]
     coordinates = states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations
     if model.mode_map is not None:
