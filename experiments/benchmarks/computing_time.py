@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep, Measurement
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.state_space import state_space
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.record import Record
 

@@ -4,13 +4,14 @@ import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.integrator.discrete_model import signed_both_ways
 from jaxbeam.integrator.integrate import integrate_peaks
 from jaxbeam.model.statics import static_peak
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
 from jaxbeam.simulation.simulate import integration_setup

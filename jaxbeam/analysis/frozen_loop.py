@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
@@ -22,6 +22,7 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state, sensor_sections
 from jaxbeam.model.state_space import Plant, build_plant
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 
 PERIOD_TOLERANCE = 1e-9  # of a period; smaller differences of times count as zero

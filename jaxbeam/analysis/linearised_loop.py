@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.analysis.frozen_loop import PERIOD_TOLERANCE, LoopDynamics, LoopTiming, loop_dynamics
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 
 NEWTON_ITERATIONS = 8  # towards the equilibrium about which the loop is linearised

@@ -6,12 +6,13 @@ deflection is small; curvature and third derivative, hence section forces, need 
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.model.statics import influence_line, static_deflection_per_command
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.record import Record
 

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.declared_checks import suggestion, validate_direct_or_derived
 from jaxbeam.case.fields import (
@@ -15,6 +15,7 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
 )
+from jaxbeam.runtime.arrays import Array
 
 MAX_MODES = 1000  # more modes would take minutes to compute
 

@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.aliases import current_address
@@ -19,7 +19,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, number
 from jaxbeam.case.loads import AbstractLoad, trajectory
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.runtime.arrays import set_at, xp
+from jaxbeam.runtime.arrays import Array, set_at, xp
 
 
 class Run(eqx.Module):

@@ -8,11 +8,11 @@ import abc
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 from jaxbeam.case.former_arguments import AcceptsFormerArguments
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 Command = Float[Array, " actuator"]
 Time = Float[Array, ""]

@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import (
     INCREASING,
@@ -26,6 +26,7 @@ from jaxbeam.case.fields import (
     is_concrete,
 )
 from jaxbeam.case.kinds import kinds
+from jaxbeam.runtime.arrays import Array
 
 SHORT_REPR = reprlib.Repr()  # shortens wrong values, which error messages quote
 SHORT_REPR.maxstring, SHORT_REPR.maxlist, SHORT_REPR.maxdict = 80, 10, 10

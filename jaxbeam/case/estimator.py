@@ -9,10 +9,11 @@ import abc
 from typing import Any, ClassVar
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import Command, Measurement, Time
 from jaxbeam.case.former_arguments import AcceptsFormerArguments
+from jaxbeam.runtime.arrays import Array
 
 
 class Estimate(eqx.Module):

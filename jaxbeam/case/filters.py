@@ -10,10 +10,10 @@ import functools
 import equinox as eqx
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
-from jaxbeam.runtime.arrays import scan, xp
+from jaxbeam.runtime.arrays import Array, scan, xp
 
 
 class Filter(eqx.Module):
@@ -160,7 +160,7 @@ def analogue_state_space(
 
 def analogue_steady_state(filter: Filter, value) -> Float[Array, "state *batch"]:
     """State of an analogue filter in steady state under a constant input."""
-    return xp.multiply.outer(_prototype_state_space(filter.order)[3], xp.asarray(value, float))
+    return xp.tensordot(_prototype_state_space(filter.order)[3], xp.asarray(value, float), 0)
 
 
 @functools.cache

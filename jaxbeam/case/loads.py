@@ -8,7 +8,7 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.declared_checks import validate_exactly_one
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
@@ -17,7 +17,7 @@ from jaxbeam.case.trajectory import (
     BrakingTrajectory,
     TabulatedTrajectory,
 )
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class AbstractLoad(eqx.Module):

@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, number, part
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class Sensor(eqx.Module):

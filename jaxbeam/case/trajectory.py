@@ -4,9 +4,9 @@ import abc
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import fori_loop, set_at, stop_gradient, vmap, xp
+from jaxbeam.runtime.arrays import Array, fori_loop, set_at, stop_gradient, take, vmap, xp
 
 NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that derivatives exist
 
@@ -156,8 +156,8 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
             xp.searchsorted(breakpoints, clipped, side="right") - 1, 0, breakpoints.shape[0] - 2
         )
         elapsed, (start, speed, half_acceleration, sixth_jerk) = (
-            clipped - breakpoints[i],
-            xp.moveaxis(cubics[i], -1, 0),
+            clipped - take(breakpoints, i),
+            xp.moveaxis(take(cubics, i), -1, 0),
         )
         position = start + elapsed * (speed + elapsed * (half_acceleration + elapsed * sixth_jerk))
         velocity = speed + elapsed * (2 * half_acceleration + elapsed * 3 * sixth_jerk)
@@ -171,7 +171,7 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
         """
         passed = xp.sign(self.positions - target) * xp.sign(self.positions[0] - target) <= 0
         last = xp.argmax(passed)
-        low, high = self.times[xp.maximum(last - 1, 0)], self.times[last]
+        low, high = take(self.times, xp.maximum(last - 1, 0)), take(self.times, last)
         start_side = xp.sign(self.positions[0] - target)
 
         def halve(_, bracket):

@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
@@ -24,6 +24,7 @@ from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
 from jaxbeam.case.loads import AbstractLoad
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.runtime.arrays import Array
 
 # Parts with a method `validate(address)`.
 SELF_VALIDATING = Beam | AbstractActuator | Sensor | AbstractLoad

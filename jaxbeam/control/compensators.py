@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from numpy.polynomial import polynomial
 
 from jaxbeam.case.controller import (
@@ -24,6 +24,7 @@ from jaxbeam.case.controller import (
 from jaxbeam.case.fields import POSITIVE, axis_names, concrete, is_concrete, number
 from jaxbeam.case.filters import filter_step
 from jaxbeam.control.feedback import pairing_error
+from jaxbeam.runtime.arrays import Array
 
 Polynomials = Float[Array, "power actuator"]  # in s (rad/s), the coefficients ascending
 

@@ -5,11 +5,12 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, count, number
 from jaxbeam.model.modal_model import assemble_modal_model
 from jaxbeam.model.state_space import Plant, build_plant
+from jaxbeam.runtime.arrays import Array
 
 ACTUATOR_FIELDS = ("force_per_volt", "stiffness", "damping", "correction")
 LOAD_FIELDS = ("mass", "speed", "entry_time")

@@ -3,10 +3,11 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractStaticController
 from jaxbeam.case.fields import count, number
+from jaxbeam.runtime.arrays import Array
 
 
 def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:

@@ -9,12 +9,13 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.runtime.arrays import Array
 
 
 class Feedforward(AbstractController):

@@ -12,11 +12,12 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.case.fields import INCREASING, POSITIVE, concrete, is_concrete, number
 from jaxbeam.case.filters import filter_step, second_order_sections, steady_filter_state
+from jaxbeam.runtime.arrays import Array
 
 
 class InternalModel(AbstractController):

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
@@ -23,6 +23,7 @@ from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.observability import deflection_outputs
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import Plant, state_space
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 
 INFLUENCE_POSITIONS = 201  # load positions along the beam at which influence lines are tabulated

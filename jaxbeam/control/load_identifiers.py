@@ -12,9 +12,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import Measurement, Time
+from jaxbeam.runtime.arrays import Array
 
 # A line through identified positions is accepted when these scatter by this share of the distance
 # over which they are identified, and their weights add up to this many of the largest weight: at

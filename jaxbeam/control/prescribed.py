@@ -3,10 +3,11 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractStaticController
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, number
+from jaxbeam.runtime.arrays import Array
 
 
 class Prescribed(AbstractStaticController):

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import (
     AbstractContinuousLaw,
@@ -21,6 +21,7 @@ from jaxbeam.case.fields import INCREASING, choice, concrete, count, is_concrete
 from jaxbeam.control.feedback import pairing_error, power_law
 from jaxbeam.control.load_identification import LoadIdentification, identification_error
 from jaxbeam.control.load_identifiers import AbstractLoadSource, given_load
+from jaxbeam.runtime.arrays import Array
 
 
 class ScheduledFeedback(AbstractController):

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
@@ -25,6 +25,7 @@ from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.output_rows import modal_row
 from jaxbeam.model.state_space import Plant, build_plant, state_space
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 
 

@@ -2,11 +2,12 @@
 
 from typing import ClassVar
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import number
 from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.control.state_law import GainLaw
+from jaxbeam.runtime.arrays import Array
 
 
 class StateFeedback(AbstractStateController):

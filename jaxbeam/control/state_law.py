@@ -5,7 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import (
     AbstractContinuousLaw,
@@ -19,6 +19,7 @@ from jaxbeam.case.estimator import (
     AbstractSampledFilter,
     Estimate,
 )
+from jaxbeam.runtime.arrays import Array
 
 
 class AbstractStateLaw(eqx.Module):

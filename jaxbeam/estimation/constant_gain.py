@@ -2,11 +2,12 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
 from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import Array
 
 
 class ConstantGainFilter(AbstractSampledFilter):

@@ -7,12 +7,13 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractContinuousFilter, Estimate
 from jaxbeam.estimation.sensor_chain import FilteredPlant
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.numerics.gain_table import GainTable
+from jaxbeam.runtime.arrays import Array
 
 
 class AbstractLinearFilter(AbstractContinuousFilter):

@@ -4,13 +4,14 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.gains import filter_gain
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
 from jaxbeam.numerics.matrices import symmetric_part
+from jaxbeam.runtime.arrays import Array
 
 Square = Float[Array, "state state"]
 

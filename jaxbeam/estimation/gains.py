@@ -1,10 +1,11 @@
 """Gains of time-invariant estimators: Kalman filters and pole placement."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.riccati import care, dare
+from jaxbeam.runtime.arrays import Array
 
 Square = Float[Array, "state state"]
 Rows = Float[Array, "output state"]

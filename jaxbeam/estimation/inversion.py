@@ -6,7 +6,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractEstimator, AbstractSampledFilter, Estimate
 from jaxbeam.case.fields import POSITIVE, concrete, number
@@ -20,6 +20,7 @@ from jaxbeam.estimation.observability import (
 )
 from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.numerics.discretisation import balance
+from jaxbeam.runtime.arrays import Array
 
 MAX_CONDITION_NUMBER = 100.0  # of the mode shapes at the sensors; beyond, there is a warning
 

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractEstimator
 from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
@@ -19,6 +19,7 @@ from jaxbeam.estimation.sensor_chain import filtered_plant, sensor_chain
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.finite_horizon import finite_horizon
+from jaxbeam.runtime.arrays import Array
 
 MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of the table
 

@@ -2,10 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.linear_system import StateSpace
+from jaxbeam.runtime.arrays import Array
 
 UNOBSERVABLE = 1e-9  # relative to the most observable mode; below, a mode is unobservable
 

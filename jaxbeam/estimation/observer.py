@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractEstimator
 from jaxbeam.case.fields import POSITIVE, concrete, number
@@ -15,6 +15,7 @@ from jaxbeam.estimation.observability import mode_count, observability_error
 from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.numerics.discretisation import balance, c2d
+from jaxbeam.runtime.arrays import Array
 
 
 class Observer(AbstractEstimator):

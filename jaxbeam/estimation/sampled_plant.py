@@ -11,10 +11,11 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.numerics.discretisation import exponential_and_gramian
+from jaxbeam.runtime.arrays import Array
 
 PERIOD_ROUNDING = 1e-9  # of a period; delays that exceed whole periods by less count as whole
 

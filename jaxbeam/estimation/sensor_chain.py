@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.filters import filter_step
 from jaxbeam.estimation.sampled_plant import SampleTiming, Transition, split_delay
@@ -19,6 +19,7 @@ from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import Sections, sensor_sections
 from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import Array
 
 # Noise that a digital filter is assumed to add to its output, relative to that of its samples.
 # Without it the filter would be inverted exactly, and attenuated components count as known.

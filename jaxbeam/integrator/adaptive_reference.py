@@ -14,13 +14,13 @@ import itertools
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
-from jaxbeam.runtime.arrays import set_at, xp
+from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 EVENT_MARGIN_SHARE = (

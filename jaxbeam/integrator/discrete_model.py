@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.propagators import PEAK_NODES, Propagators, propagators
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.runtime.arrays import solve_triangular, xp
+from jaxbeam.runtime.arrays import Array, solve_triangular, xp
 
 
 class DiscreteModel(eqx.Module):

@@ -9,9 +9,9 @@ import dataclasses
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 SAME_TIME_SHARE = 1e-9  # of the duration: closer times are one event
 MAX_DISTINCT_GAPS = 64  # with more different intervals, each has a length of its own

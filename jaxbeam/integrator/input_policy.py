@@ -4,7 +4,9 @@ import abc
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
+
+from jaxbeam.runtime.arrays import Array
 
 
 class StepInfo(eqx.Module):

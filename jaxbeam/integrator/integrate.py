@@ -12,7 +12,7 @@ Commands to the actuators are polynomials through the same nodes, given by an in
 from typing import Any
 
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.loads import AbstractLoad, MovingMass
 from jaxbeam.integrator.discrete_model import DiscreteModel
@@ -24,13 +24,16 @@ from jaxbeam.integrator.step_matrices import LoadPath, chunk_length, load_path, 
 from jaxbeam.model.contact import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (
+    Array,
     checkpoint,
     collapse,
     put,
     scan,
     stop_gradient,
+    take,
     while_loop,
     xp,
+    zeros,
 )
 
 # Largest phase (rad) of the highest mode in a step. Beyond twice the number of nodes, the contact
@@ -76,7 +79,7 @@ def _values_by_row(
     values: Float[Array, "load batch"], path: LoadPath
 ) -> Float[Array, "step row batch"]:
     """A property of the loads for each row of the contact equations; zero off the beam."""
-    selected = xp.where(path.on_beam[..., None], values[path.loads], 0.0)
+    selected = xp.where(path.on_beam[..., None], take(values, path.loads), 0.0)
     return xp.repeat(selected, len(GAUSS_NODES), axis=1)
 
 
@@ -156,7 +159,7 @@ def integrate_history(
         else initial_peaks(discrete.position_count, load_count, batch_size, discrete.magnitude)
     )
     memory = None if policy is None else policy.start(batch_size)
-    initial_state = xp.zeros((discrete.model.state_count, batch_size))
+    initial_state = zeros((discrete.model.state_count, batch_size), (discrete, loads, policy))
     first_steps = xp.arange(0, steps, chunk_steps)
     checkpointed_chunk = checkpoint(
         one_chunk, policy=jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
@@ -216,7 +219,7 @@ def integrate_peaks(
     )
     memory = None if policy is None else policy.start(batch_size)
     start = (
-        xp.zeros((discrete.model.state_count, batch_size)),
+        zeros((discrete.model.state_count, batch_size), (discrete, loads, policy)),
         memory,
         running_peaks,
         xp.zeros((), int),
@@ -249,7 +252,7 @@ def integrate_at_events(
         return state, memory, kept, first_step + chunk_steps
 
     batch_size = loads.inertia.shape[1]
-    initial_state = xp.zeros((discrete.model.state_count, batch_size))
+    initial_state = zeros((discrete.model.state_count, batch_size), (discrete, loads, policy))
     memory = None if policy is None else policy.start(batch_size)
     event_states = xp.zeros((grid.event_panels.shape[0], *initial_state.shape))
     start = initial_state, memory, event_states, xp.zeros((), int)

@@ -12,7 +12,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
@@ -38,6 +38,7 @@ from jaxbeam.numerics.peak_search import (
     interpolation_matrix,
     newton_step_limit,
 )
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.native_library import Library
 
 PADDING = 8  # doubles in the widest vector register

@@ -17,11 +17,11 @@ import math
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.gauss import gauss_nodes, lagrange_coefficients
-from jaxbeam.runtime.arrays import scan, set_at, stop_gradient, vmap, xp
+from jaxbeam.runtime.arrays import Array, scan, set_at, stop_gradient, vmap, xp
 
 NODE_COUNT = 6  # Gauss nodes in a step; the integrator has order 12
 DOUBLINGS = 7

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
 from jaxbeam.integrator.step_matrices import LoadPath, StepMatrices
 from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
-from jaxbeam.runtime.arrays import cond, optimization_barrier, xp
+from jaxbeam.runtime.arrays import Array, cond, optimization_barrier, take, xp
 
 PEAK_MARGIN = 1.1  # upper bound of a peak over the highest of the samples around it
 
@@ -84,8 +84,8 @@ def update_peaks(
         return RunningPeaks(
             xp.where(better, best_estimate, best.estimate),
             xp.where(better, chosen, best.samples),
-            xp.where(better, start[peak_step], best.step_start),
-            xp.where(better, length[peak_step], best.step_length),
+            xp.where(better, take(start, peak_step), best.step_start),
+            xp.where(better, take(length, peak_step), best.step_length),
             best.lowest_contact_force,
             best.contact_lost_time,
             best.finite,

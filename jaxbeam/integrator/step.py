@@ -8,12 +8,12 @@ remains to be done step by step, in forward and in reverse mode.
 import jax
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.model.contact import solve_contact_forces
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_small
-from jaxbeam.runtime.arrays import any_jax, cond, custom_jvp, scan, vmap, xp
+from jaxbeam.runtime.arrays import Array, any_jax, cond, custom_jvp, scan, vmap, xp
 
 CHECKPOINT_NAME = "steps"  # states and contact forces that are saved for the reverse pass
 

@@ -9,12 +9,12 @@ deflections at monitored positions.
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.model.contact import LoadSet, contact_rows
-from jaxbeam.runtime.arrays import cond, index_in_dim, is_jax, map_elements, xp
+from jaxbeam.runtime.arrays import Array, cond, index_in_dim, is_jax, map_elements, take, xp
 
 CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
 KNOWN_CHUNK_ENTRIES = 2**20  # of matrices that NumPy computes together
@@ -87,11 +87,11 @@ def load_path(
     """Load path in the steps with the given indices, for at most `max_loads` loads on the beam."""
     model, grid = discrete.model, discrete.grid
     panel, start, length_index = grid.locate_steps(index)
-    length = grid.lengths[length_index]
+    length = take(grid.lengths, length_index)
     # As an array: JAX remembers a NumPy constant in the precision in which it met it first.
     times = start[:, None] + length[:, None] * xp.asarray(GAUSS_NODES, length.dtype)
     position, speed, acceleration = (xp.moveaxis(p, 0, 1) for p in loads.kinematics(times))
-    on_beam = grid.loads_on_beam[panel]  # step, load
+    on_beam = take(grid.loads_on_beam, panel)  # step, load
     if max_loads < len(loads.trajectories):
         # Loads on the beam first; those beyond the largest number are off the beam.
         load_index = xp.argsort(~on_beam, axis=1)[:, :max_loads]

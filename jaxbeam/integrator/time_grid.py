@@ -6,13 +6,13 @@ number of panels, so the grid can be compiled; a panel of zero length has no eff
 """
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads import trajectory
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.runtime.arrays import put, searchsorted, stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, put, searchsorted, stop_gradient, take, xp
 
 
 class TimeGrid(eqx.Module):
@@ -53,10 +53,11 @@ class TimeGrid(eqx.Module):
         else:  # all panels of a schedule have the same number of steps
             panel = index // self.counts[0]
         panel = xp.minimum(panel, self.counts.shape[0] - 1)
-        length_index = xp.where(after_end, self.lengths.shape[0] - 1, self.length_index[panel])
-        start = (
-            self.boundaries[panel]
-            + (index - self._first_step(panel)) * self.lengths[self.length_index[panel]]
+        length_index = xp.where(
+            after_end, self.lengths.shape[0] - 1, take(self.length_index, panel)
+        )
+        start = take(self.boundaries, panel) + (index - self._first_step(panel)) * take(
+            self.lengths, take(self.length_index, panel)
         )
         return panel, xp.where(after_end, self.boundaries[-1], start), length_index
 
@@ -64,11 +65,11 @@ class TimeGrid(eqx.Module):
         """Index of the scheduled event at which each of some steps starts, -1 for none."""
         panel, _, _ = self.locate_steps(index)
         starts = (index == self._first_step(panel)) & (index < self.step_count)
-        return xp.where(starts, self.event[panel], -1)
+        return xp.where(starts, take(self.event, panel), -1)
 
     def _first_step(self, panel):
         """Index of the first step of a panel."""
-        return self.cumulative_counts[panel] - self.counts[panel]
+        return take(self.cumulative_counts, panel) - take(self.counts, panel)
 
 
 def _load_events(case: Case, model: ModalModel):
@@ -134,9 +135,10 @@ def grid_by_schedule(
     length_count = schedule.lengths.shape[0]
     length_index = xp.where(
         between_scheduled,
-        schedule.length_index[
-            xp.clip(xp.cumsum(is_scheduled)[:-1] - 1, 0, schedule.length_index.shape[0] - 1)
-        ],
+        take(
+            schedule.length_index,
+            xp.clip(xp.cumsum(is_scheduled)[:-1] - 1, 0, schedule.length_index.shape[0] - 1),
+        ),
         length_count - 1 + xp.cumsum(~between_scheduled),
     )
     lengths = xp.concatenate([schedule.lengths, xp.zeros(2 * events.shape[0] + 1)])

@@ -11,14 +11,14 @@ f on the modes, D2w/Dt2 = (contact row) . z + (shape row) . f.
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import solve_small
-from jaxbeam.runtime.arrays import add_at, custom_jvp, xp
+from jaxbeam.runtime.arrays import Array, add_at, custom_jvp, xp
 
 
 class LoadSet(eqx.Module):

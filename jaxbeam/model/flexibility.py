@@ -11,12 +11,12 @@ import math
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, assemble_matrices, section_properties, supported_matrices
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
-from jaxbeam.runtime.arrays import set_at, xp
+from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 # Least stiffness against rigid-body motion of a statically supported beam, in E I / L^3.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
@@ -22,7 +22,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
-from jaxbeam.runtime.arrays import add_at, set_at, xp
+from jaxbeam.runtime.arrays import Array, add_at, set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 if TYPE_CHECKING:

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 import scipy
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import c2d
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class Signal(NamedTuple):

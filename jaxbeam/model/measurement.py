@@ -1,12 +1,12 @@
 """Readings of the sensors from histories of the modal coordinates."""
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.output_rows import quantity_history
 from jaxbeam.model.sensor_signals import needs_times, noise_samples, sampled_readings, to_reading
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 
 def sensor_readings(

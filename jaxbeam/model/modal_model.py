@@ -10,11 +10,11 @@ the shape (block, side, side).
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, Modes, mesh_layout, modes
-from jaxbeam.runtime.arrays import block_diag, set_at, solve_triangular, xp
+from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve_triangular, xp
 from jaxbeam.runtime.compiling import compiled
 
 

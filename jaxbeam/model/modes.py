@@ -15,7 +15,7 @@ import functools
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
 from jaxbeam.case.beam import END_CONDITIONS
@@ -23,7 +23,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
-from jaxbeam.runtime.arrays import add_at, set_at, stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
 
 NODE_TOLERANCE = 1e-9  # of the length: closer nodes are one node
 

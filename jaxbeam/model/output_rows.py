@@ -11,13 +11,13 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.quantities import quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
-from jaxbeam.runtime.arrays import set_at, xp
+from jaxbeam.runtime.arrays import Array, set_at, xp
 
 # Positions x (m) and orders of derivation to the shapes (order, *position, mode), as
 # `ModalModel.shapes` and `Modes.shape_derivatives`.

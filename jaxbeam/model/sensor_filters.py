@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import ControllerFilter
 from jaxbeam.case.filters import analogue_state_space
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import add_at, block_diag, set_at, xp
+from jaxbeam.runtime.arrays import Array, add_at, block_diag, set_at, xp
 
 
 def with_sensor_filters(

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.filters import (
@@ -23,7 +23,7 @@ from jaxbeam.case.filters import (
 )
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
-from jaxbeam.runtime.arrays import scan, stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, scan, stop_gradient, xp
 
 CLOCK_TOLERANCE_PERIODS = 1e-6  # a time this much before a sampling instant counts as at it
 

@@ -9,7 +9,7 @@ I + sum m psi psi^T of the beam with its loads is a low-rank update, one rank fo
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
@@ -19,7 +19,7 @@ from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.numerics.batched_linalg import solve_small
-from jaxbeam.runtime.arrays import set_at, xp
+from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 

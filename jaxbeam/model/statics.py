@@ -4,7 +4,7 @@ and peaks of a slow crossing (see `flexibility`).
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.declared_checks import check_on_beam
@@ -15,15 +15,15 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.flexibility import check_supported, flexibility
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.numerics.peak_search import refine_peak
-from jaxbeam.runtime.arrays import set_at, xp
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 # Positions on an interval between events that determine the deflection exactly there: ten for a
 # cubic (flexibility) of a cubic (trajectory), a polynomial of degree nine.
 PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 10))
 
 
-@compiled
+@compiled_if_traced
 def _influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
     greens = flexibility(case, layout, x.reshape(-1), derivative)
     length = case.beam.length
@@ -107,7 +107,7 @@ def static_deflection_per_command(
     return _deflection_per_command(case, layout, x, derivative)
 
 
-@compiled
+@compiled_if_traced
 def _deflection_per_command(case: Case, layout: Layout, x, derivative: int):
     length = case.beam.length
     greens = flexibility(case, layout, x.reshape(-1), derivative)  # by reciprocity: forces at x
@@ -138,7 +138,7 @@ def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*p
     return _static_peak(case, layout, x)
 
 
-@compiled
+@compiled_if_traced
 def _static_peak(case: Case, layout: Layout, x):
     length = case.beam.length
     greens = flexibility(case, layout, x.reshape(-1), 0)

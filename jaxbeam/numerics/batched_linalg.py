@@ -10,9 +10,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import any_jax, fori_loop, xp
+from jaxbeam.runtime.arrays import Array, any_jax, fori_loop, xp
 
 MAX_UNROLLED_TERMS = 12  # of a sum that takes as long as the call of a library for the product
 

@@ -18,12 +18,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbeam.numerics.batched_linalg import solve_unpivoted
 from jaxbeam.numerics.gauss import gauss_weights, lagrange_coefficients
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square
 from jaxbeam.numerics.stages import GAUSS_NODES, NODE_COUNT, Stage, command_cost_matrix
+from jaxbeam.runtime.arrays import Array
 
 TAYLOR_TERMS = 12  # of the series for the shortest intervals
 

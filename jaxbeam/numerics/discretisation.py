@@ -5,7 +5,9 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from jaxbeam.runtime.arrays import Array
 
 DOUBLINGS = 14  # of the short interval of the series
 SERIES_TERMS = 10  # exact to rounding while the norm of the matrix over that interval is below 0.05

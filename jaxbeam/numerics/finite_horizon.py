@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbeam.numerics.batched_linalg import (
     batch_axis_last,
@@ -38,6 +38,7 @@ from jaxbeam.numerics.stages import (
     command_cost_matrix,
     riccati_recursion,
 )
+from jaxbeam.runtime.arrays import Array
 
 INTERVALS_PER_GROUP = 8
 # Boundary layer: backward in time from an event, P approaches that of the next plant and oscillates

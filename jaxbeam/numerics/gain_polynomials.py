@@ -6,11 +6,12 @@ equation. The batch axis is the last.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.numerics.batched_linalg import hstack, matmul, transpose
 from jaxbeam.numerics.coupled_stages import ConstantPlant
 from jaxbeam.numerics.gain_table import derivatives_at_breakpoints, hermite_polynomials
+from jaxbeam.runtime.arrays import Array
 
 
 def interpolate_gains(

@@ -6,11 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.numerics.matrices import InputWeight, Square
 from jaxbeam.numerics.riccati import lqr
 from jaxbeam.numerics.stages import GAUSS_NODES
+from jaxbeam.runtime.arrays import Array
 
 END_OFFSET = 1e-9  # of an interval: ends are evaluated so far inside, as the plant may jump there
 

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.matrices import Square
+from jaxbeam.runtime.arrays import Array
 
 MAX_DOUBLINGS = 60  # after which an equation is taken for unsolvable
 TRANSITION_TOLERANCE = 1e-9  # norm of a transition matrix whose square is below rounding

@@ -1,6 +1,8 @@
 """Types of matrices of linear systems and quadratic costs."""
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from jaxbeam.runtime.arrays import Array
 
 Square = Float[Array, "state state"]
 InputMatrix = Float[Array, "state input"]

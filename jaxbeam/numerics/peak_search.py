@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from jaxbeam.runtime.arrays import fori_loop, optimization_barrier, stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, fori_loop, optimization_barrier, stop_gradient, take, xp
 
 ESTIMATE_ITERATIONS = 2  # of Newton's method in an estimate
 TIE_ROUNDING_UNITS = 8  # by which equal numbers may differ
@@ -93,7 +93,7 @@ def estimate_peak(
     """
     magnitudes = magnitude(samples)
     largest = xp.max(magnitudes, axis=0)
-    start = xp.asarray(_to_unit_interval(points), samples.dtype)[xp.argmax(magnitudes, axis=0)]
+    start = take(_to_unit_interval(points), xp.argmax(magnitudes, axis=0)).astype(samples.dtype)
     curve = _interpolate(samples, points)
     position = _newton_stationary_point(
         curve, start, newton_step_limit(points), iterations=ESTIMATE_ITERATIONS

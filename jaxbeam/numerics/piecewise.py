@@ -3,10 +3,10 @@
 import functools
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from numpy.polynomial import chebyshev, legendre
 
-from jaxbeam.runtime.arrays import custom_jvp, optimization_barrier, slice_in_dim, xp
+from jaxbeam.runtime.arrays import Array, custom_jvp, optimization_barrier, slice_in_dim, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 
 
@@ -27,7 +27,7 @@ def piecewise_chebyshev(nodes, series, x, derivatives) -> Float[Array, "order *p
     ]
     series = xp.stack(derivative_series, axis=2).reshape(segments, terms, len(derivatives) * modes)
     segment = xp.sum(x[..., None] >= nodes[1:-1], axis=-1)
-    local = (x - nodes[segment]) / half_length[segment] - 1
+    local = (x - take(nodes, segment)) / take(half_length, segment) - 1
     values = _evaluate_series(series, local, segment)
     return xp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.numerics.discretisation import balance
@@ -22,6 +22,7 @@ from jaxbeam.numerics.lyapunov import (
     stein,
 )
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
+from jaxbeam.runtime.arrays import Array
 
 GainAndCost = tuple[Float[Array, "input state"], Square]
 

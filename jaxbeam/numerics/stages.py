@@ -12,12 +12,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.numerics.batched_linalg import batch_size_of, matmul, solve_batch, transpose
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.gauss import gauss_nodes, gauss_weights, integration_matrix
 from jaxbeam.numerics.matrices import InputWeight, Square, symmetric_part
+from jaxbeam.runtime.arrays import Array
 
 NODE_COUNT = 6  # Gauss nodes of an interval; order 12
 GAUSS_NODES = gauss_nodes(NODE_COUNT)

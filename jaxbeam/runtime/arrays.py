@@ -57,8 +57,15 @@ class _Namespace:
 
 if TYPE_CHECKING:
     xp = jnp
+    Array = jax.Array
 else:
     xp = _Namespace(np, jnp)
+    Array = jax.Array | np.ndarray | np.generic
+
+
+def take(array, index):
+    """Entries at an index along the first axis, one that may be traced in a known array."""
+    return jnp.asarray(array)[index] if is_jax(index) else array[index]
 
 
 def set_at(array, index, value):
@@ -106,14 +113,24 @@ def stop_gradient(tree):
     return jax.lax.stop_gradient(tree) if any_jax(tree) else tree
 
 
+def zeros(shape: tuple[int, ...], like: Any):
+    """Zeros, of JAX if any leaf of `like` is: the start of a loop that will hold such numbers."""
+    return (jnp if any_jax(like) else np).zeros(shape)
+
+
 def scan(step: Callable, carry, inputs=None, length: int | None = None):
-    """`jax.lax.scan`: a loop over the first axis of inputs; the final carry and stacked outputs."""
+    """`jax.lax.scan`: a loop over the first axis of inputs; the final carry and stacked outputs.
+
+    Known numbers become those of JAX where the function of a step has others among its own.
+    """
     if any_jax(carry, inputs):
         return jax.lax.scan(step, carry, inputs, length)
     leaves, structure = jax.tree.flatten(inputs)
-    outputs = []
+    start, outputs = carry, []
     for i in range(len(leaves[0]) if leaves else length):
         carry, output = step(carry, structure.unflatten([leaf[i] for leaf in leaves]))
+        if i == 0 and any_jax(carry, output):
+            return jax.lax.scan(step, start, inputs, length)
         outputs.append(output)
     return carry, jax.tree.map(lambda *parts: np.stack(parts), *outputs)
 
@@ -125,11 +142,12 @@ def map_elements(function: Callable, inputs):
 
 def while_loop(condition: Callable, step: Callable, carry):
     """`jax.lax.while_loop`."""
-    if any_jax(carry):
-        return jax.lax.while_loop(condition, step, carry)
-    while condition(carry):
+    start = carry
+    while not any_jax(carry) and not is_jax(going_on := condition(carry)):
+        if not going_on:
+            return carry
         carry = step(carry)
-    return carry
+    return jax.lax.while_loop(condition, step, start)
 
 
 def cond(predicate, if_true: Callable, if_false: Callable, *operands):
@@ -156,11 +174,7 @@ class custom_jvp:
 
 def fori_loop(start: int, end: int, step: Callable, carry):
     """`jax.lax.fori_loop`."""
-    if any_jax(carry):
-        return jax.lax.fori_loop(start, end, step, carry)
-    for i in range(start, end):
-        carry = step(i, carry)
-    return carry
+    return scan(lambda carry, i: (step(i, carry), None), carry, np.arange(start, end))[0]
 
 
 def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:

@@ -6,7 +6,7 @@ continuous time (`continuous_loop`).
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw
@@ -18,7 +18,7 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import noise_samples, sensor_sections
 from jaxbeam.model.state_space import state_space
-from jaxbeam.runtime.arrays import block_diag, set_at, xp
+from jaxbeam.runtime.arrays import Array, block_diag, set_at, xp
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
 

@@ -1,9 +1,9 @@
 """Commands as the actuators receive them: rounded, and within their limits and rate limits."""
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.runtime.arrays import stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, stop_gradient, xp
 
 
 def command_ranges(case: Case) -> tuple[Float[Array, " actuator"], ...]:

@@ -5,7 +5,7 @@ They are found by Newton's method together with the states at the nodes.
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractContinuousLaw, Measurement
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
@@ -13,7 +13,7 @@ from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensor_signals import filtered_reading
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import scan, vmap, xp
+from jaxbeam.runtime.arrays import Array, scan, vmap, xp
 from jaxbeam.simulation.command_limits import limit_commands
 
 NEWTON_ITERATIONS = 4  # for the commands of a step; one suffices for a linear law

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
@@ -24,7 +24,7 @@ from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 

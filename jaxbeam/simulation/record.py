@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
@@ -15,7 +15,7 @@ from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.output_rows import quantity_history
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation.result_variables import MODE_FIELDS, MODE_VARIABLES, VARIABLES
 
 if TYPE_CHECKING:

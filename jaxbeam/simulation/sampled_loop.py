@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractSampledLaw, Measurement
 from jaxbeam.integrator.events import EventSchedule
@@ -20,7 +20,7 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import cond, set_at, vmap, xp
+from jaxbeam.runtime.arrays import Array, cond, set_at, vmap, xp
 from jaxbeam.simulation.command_limits import limit_commands
 
 

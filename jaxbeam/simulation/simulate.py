@@ -5,7 +5,7 @@ import warnings
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
@@ -19,7 +19,7 @@ from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.contact import LoadSet, contact_at, load_set
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.command_limits import command_ranges

@@ -5,12 +5,13 @@ from typing import ClassVar
 
 import equinox as eqx
 import pytest
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case, part_classes
 from jaxbeam.case.fields import POSITIVE, number
 from jaxbeam.case.kinds import kind_of, kinds
 from jaxbeam.files.case_file import read_part
+from jaxbeam.runtime.arrays import Array
 
 
 class AbstractMassDamper(eqx.Module):

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.simulation.simulate import Histories
 from tuning.aliases import accepts_old_arguments
 

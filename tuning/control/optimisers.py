@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 import optax
 import optimistix
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+
+from jaxbeam.runtime.arrays import Array
 
 METHODS = ("adam", "lbfgs", "bfgs")
 ADAM_STEP = 0.1  # first step of Adam, in search variables, which are of order one

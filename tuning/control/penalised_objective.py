@@ -5,8 +5,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 from tuning.control.objective import Objective, WeightsAndLimits
 from tuning.control.run_set import RunSet

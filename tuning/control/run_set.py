@@ -9,11 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, least_achievable_peak
 from jaxbeam.case.case import Case, crossing_times, replace, stack_cases, value_at
 from jaxbeam.model.contact import load_set
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import (
     IntegrationPlan,

@@ -7,11 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.analysis.linearised_loop import linearise, loop_dynamics, loop_timing
 from jaxbeam.case.case import Case, concrete_case, crossing_times, replace, stack_cases, value_at
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.runtime.arrays import Array
 from tuning.aliases import accepts_old_arguments
 from tuning.control.fixed_design import with_fixed_design
 from tuning.control.load_cases import AddressValues, run_case

@@ -6,7 +6,9 @@ r is a residual over the standard deviation of the noise.
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from jaxbeam.runtime.arrays import Array
 
 LOSSES = ("squares", "soft-l1", "huber")
 HUBER_THRESHOLD = 1.345  # 95 % of the efficiency of squares for normal noise

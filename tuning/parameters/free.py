@@ -8,10 +8,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace, unit_at, value_at
 from jaxbeam.case.fields import concrete
+from jaxbeam.runtime.arrays import Array
 from tuning.parameters.prior import Prior, as_prior
 
 LOG_ADDRESS = re.compile(r"logs\.(\d+)\.(.+)")

@@ -5,8 +5,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxbeam.runtime.arrays import Array
 from tuning.aliases import current_word
 
 SCALES = ("linear", "log", "logit")

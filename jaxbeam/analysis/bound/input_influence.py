@@ -13,7 +13,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
@@ -24,6 +24,7 @@ from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import modal_model
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import (
     StaticShapes,

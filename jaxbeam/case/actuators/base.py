@@ -4,9 +4,9 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class Attachment(eqx.Module):

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment, SectionStiffening
 from jaxbeam.case.declared_checks import validate_direct_or_derived
@@ -15,7 +15,7 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
 )
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 # Fields from which the moment per volt is derived where it is not given.
 MOMENT_SOURCES = (

@@ -2,11 +2,11 @@
 
 from typing import ClassVar
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class Shaker(AbstractActuator):

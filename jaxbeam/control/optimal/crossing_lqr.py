@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, is_concrete, number
@@ -25,6 +25,7 @@ from jaxbeam.numerics.gain_table import (
     frozen_time_gains,
     uniform_fractions,
 )
+from jaxbeam.runtime.arrays import Array
 
 MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of a table
 

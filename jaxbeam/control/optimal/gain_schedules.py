@@ -2,13 +2,14 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.gain_table import GainTable
+from jaxbeam.runtime.arrays import Array
 
 
 class GainSchedule(AbstractStateLaw):

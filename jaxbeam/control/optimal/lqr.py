@@ -8,7 +8,7 @@ The weights are those of the states of the design plant in the chosen coordinate
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, concrete, number
 from jaxbeam.control.optimal.sampling_loss import warn_slow_sampling
@@ -16,6 +16,7 @@ from jaxbeam.control.state_controller import AbstractStateController, deflection
 from jaxbeam.control.state_law import GainLaw
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.riccati import lqr
+from jaxbeam.runtime.arrays import Array
 
 
 class AbstractRegulator(AbstractStateController):

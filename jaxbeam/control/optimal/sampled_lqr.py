@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.control.optimal.lqr import AbstractRegulator
@@ -15,6 +15,7 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance, exponential_and_gramian
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
 from jaxbeam.numerics.riccati import dlqr
+from jaxbeam.runtime.arrays import Array
 
 # With the previous command among the states.
 AugmentedSquare = Float[Array, "augmented augmented"]

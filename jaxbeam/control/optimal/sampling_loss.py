@@ -9,13 +9,14 @@ import warnings
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.state_space import state_space
+from jaxbeam.runtime.arrays import Array
 
 MIN_REACHABILITY = 0.3  # of the controllability Gramian; below, there is a warning
 UNCONTROLLABLE = 1e-9  # of the largest possible modal input; below, a mode is uncontrollable

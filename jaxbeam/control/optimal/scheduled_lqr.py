@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.fields import INCREASING, choice, concrete, is_concrete, number, part
@@ -18,6 +18,7 @@ from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.contact import load_set
 from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import Array
 
 
 class ScheduledLQR(AbstractFiniteHorizonRegulator):

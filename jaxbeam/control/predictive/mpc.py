@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
@@ -35,6 +35,7 @@ from jaxbeam.control.predictive.qp import METHODS
 from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.riccati import dare
+from jaxbeam.runtime.arrays import Array
 
 
 class MPC(AbstractStateController):

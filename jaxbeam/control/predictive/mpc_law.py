@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.control.predictive.prediction import (
@@ -17,6 +17,7 @@ from jaxbeam.control.predictive.prediction import (
 from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import Array
 
 
 class CommandLimits(NamedTuple):

@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import c2d
+from jaxbeam.runtime.arrays import Array
 
 
 class SampledPlant(NamedTuple):

@@ -17,7 +17,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
+
+from jaxbeam.runtime.arrays import Array
 
 METHODS = ("interior", "hildreth")
 SOLVED, INFEASIBLE, UNFINISHED = range(3)

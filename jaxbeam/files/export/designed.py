@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
@@ -27,6 +27,7 @@ from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensor_signals import sensor_sections
 from jaxbeam.model.state_space import state_space
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 
 EXPORTABLE = (LQR, DiscreteLQR, StateFeedback, AbstractCrossingRegulator)

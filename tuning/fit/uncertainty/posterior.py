@@ -10,9 +10,10 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbeam.files.report import ReportTable, text_table
+from jaxbeam.runtime.arrays import Array
 from tuning.aliases import current_word, has_old_attributes
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.result import Fit
