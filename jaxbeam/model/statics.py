@@ -30,7 +30,7 @@ def _influence_line(case: Case, layout: Layout, x, load_positions, derivative: i
     line = (
         -greens(load_positions / length) * length ** (3 - derivative) / case.beam.bending_stiffness
     )
-    return line.reshape(*load_positions.shape, *x.shape)
+    return line.reshape((*load_positions.shape, *x.shape))
 
 
 def influence_line(

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from cycler import cycler
 from jaxtyping import Float
 from matplotlib import rc_context
@@ -110,8 +109,21 @@ def separate_labels(positions, gap: float) -> Float[np.ndarray, " label"]:
     steps = gap * np.arange(positions.size)
     separated = np.empty_like(positions)
     # With the gaps subtracted, positions must not decrease: isotonic regression.
-    separated[order] = scipy.optimize.isotonic_regression(positions[order] - steps).x + steps
+    separated[order] = _isotonic_regression(positions[order] - steps) + steps
     return separated
+
+
+def _isotonic_regression(values):
+    """Nondecreasing values nearest to given ones in least squares: x_k = max_i min_j mean(i to j).
+
+    i <= k <= j (Robertson, Wright and Dykstra 1988, eq 1.4.6); scipy.optimize has it too, but
+    takes as long to import as to draw a figure.
+    """
+    sums, numbers = np.append(0.0, np.cumsum(values)), np.arange(values.size)
+    count = numbers + 1 - numbers[:, None]
+    means = np.where(count > 0, (sums[1:] - sums[:-1, None]) / np.maximum(count, 1), np.inf)
+    least = np.minimum.accumulate(means[:, ::-1], axis=1)[:, ::-1]
+    return np.max(np.where(count > 0, least, -np.inf), axis=0, initial=-np.inf)
 
 
 def margin_labels(axes, heights, labels, colours) -> None:

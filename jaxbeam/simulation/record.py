@@ -12,6 +12,7 @@ from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.output_rows import quantity_history
@@ -167,10 +168,8 @@ class Record(eqx.Module):
         parts.append(f"estimated error {float(concrete(self.error_estimate)):.1e} of the peak")
         return "; ".join(parts)
 
-    def to_xarray(self) -> "xarray.Dataset":
-        """Labelled dataset with units; `record_from_xarray` restores the record exactly."""
-        import xarray
-
+    def _dataset_parts(self) -> tuple[dict, dict, dict]:
+        """Variables, coordinates and attributes of the labelled dataset."""
         variables = {
             name: (dims, np.asarray(getattr(self, name)), {"units": unit, "long_name": words})
             for name, (dims, unit, words) in VARIABLES.items()
@@ -196,7 +195,13 @@ class Record(eqx.Module):
             "steps": self.steps,
             "verdict": self.verdict,
         }
-        return xarray.Dataset(variables, coordinates, attributes)
+        return variables, coordinates, attributes
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Labelled dataset with units; `record_from_xarray` restores the record exactly."""
+        import xarray
+
+        return xarray.Dataset(*self._dataset_parts())
 
     def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the labelled dataset to a netCDF file.
@@ -205,10 +210,7 @@ class Record(eqx.Module):
         """
         if not overwrite and os.path.exists(path):
             raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
-        dataset = self.to_xarray()
-        empty = [name for name, variable in dataset.variables.items() if variable.size == 0]
-        # An empty dimension would become an unlimited one in the file.
-        dataset.drop_vars(empty).to_netcdf(path, engine="scipy")
+        write_netcdf(path, *self._dataset_parts())
 
 
 _STORED_VARIABLES = [name for name in VARIABLES if name in Record.__annotations__]

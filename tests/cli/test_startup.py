@@ -51,6 +51,20 @@ def test_nothing_heavy_is_imported(folder, line):
     assert json.loads(imported) == []
 
 
+def test_a_record_and_a_picture_need_no_package_that_takes_as_long_as_the_run(folder):
+    slow = ("xarray", "pandas", "dask", "scipy.signal", "scipy.optimize", "matplotlib.pyplot")
+    code = (
+        "import json, sys\n"
+        "from jaxbeam.cli import main\n"
+        "try: main()\n"
+        f"finally: print(json.dumps([name for name in {slow} if name in sys.modules]))"
+    )
+    command = [sys.executable, "-c", code, "simulate", "case.toml", "-o", "run.nc", "--plot"]
+    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    assert (folder / "run.nc").exists() and (folder / "run.png").exists()
+    assert json.loads(ended.stdout.splitlines()[-1]) == []
+
+
 def test_help_names_every_command(run):
     printed = run("--help")
     for command in ("demo", "modes", "simulate", "sweep", "frf", "compare", "identify"):
