@@ -3,7 +3,6 @@
 import dataclasses
 from typing import NamedTuple
 
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
@@ -11,8 +10,8 @@ from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.integrator.discrete_model import signed_both_ways
 from jaxbeam.integrator.integrate import integrate_peaks
 from jaxbeam.model.statics import static_peak
-from jaxbeam.runtime.arrays import Array
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
 from jaxbeam.simulation.simulate import integration_setup
 
@@ -41,20 +40,24 @@ def envelope(case: Case, x, tolerance: float = TOLERANCE) -> Envelope:
     >>> print(f"{1e3 * low[0]:.2f} mm")
     -2.00 mm
     """
-    x = jnp.asarray(x, float)
+    x = xp.asarray(x, float)
     plan = integration_plan(case, tolerance=tolerance)
     check_on_beam("x", x, case.beam.length)
-    return _compiled_envelope(case, dataclasses.replace(plan, error=0.0), sample_times(case), x)
+    calculate = _open_loop_envelope if case.controller is None else _closed_loop_envelope
+    return calculate(case, dataclasses.replace(plan, error=0.0), sample_times(case), x)
 
 
-@compiled
-def _compiled_envelope(case, plan, times, x):
+def _envelope(case, plan, times, x):
     discrete, loads, policy, *_ = integration_setup(case, plan, times, x)
     running_peaks, _ = integrate_peaks(
         signed_both_ways(discrete), loads, max_loads=plan.shapes.max_loads, policy=policy
     )
-    highest, lowest = jnp.split(running_peaks.refined_peak()[0][:, 0], 2)
+    highest, lowest = xp.split(running_peaks.refined_peak()[0][:, 0], 2)
     return Envelope(-lowest, highest)
+
+
+_open_loop_envelope = compiled_if_traced(_envelope)
+_closed_loop_envelope = compiled(_envelope)
 
 
 def amplification(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, " position"]:
@@ -74,4 +77,4 @@ def amplification(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, "
     1.06
     """
     lowest, highest = envelope(case, x, tolerance)
-    return jnp.maximum(-lowest, highest) / static_peak(case, jnp.asarray(x, float))
+    return xp.maximum(-lowest, highest) / static_peak(case, xp.asarray(x, float))

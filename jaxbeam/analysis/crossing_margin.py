@@ -4,7 +4,6 @@ import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.analysis.frozen_loop import LoopDynamics, loop_dynamics
@@ -14,6 +13,7 @@ from jaxbeam.case.case import Case, concrete_case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.control.predictive.mpc import MPC
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.runtime.arrays import xp
 
 LOAD_POSITIONS = 13  # load positions along a crossing at which margins are computed
 MIN_RATE = 1e-6  # 1/s; a pole whose real part is smaller counts as marginally stable
@@ -65,7 +65,7 @@ def stability_margin(case: Case) -> StabilityMargin:
     loops, unstable = [], []
     for t in _crossing_times(case):
         stationary = _without_constant_states(
-            linearise(_with_stationary_loads(loop, t), timing, jnp.asarray(t))
+            linearise(_with_stationary_loads(loop, t), timing, xp.asarray(t))
         )
         if not np.all(np.isfinite(stationary.closed_matrix)):
             return _no_margin("the law has no equilibrium under stationary loads")
@@ -93,7 +93,7 @@ def _no_margin(obstacle: str) -> StabilityMargin:
 
 def _with_stationary_loads(loop: LoopDynamics, t: float) -> LoopDynamics:
     """Loop with stationary loads at their positions of t (s)."""
-    loop, zero = loop.freeze_loads(jnp.asarray(t)), jnp.zeros(())
+    loop, zero = loop.freeze_loads(xp.asarray(t)), xp.zeros(())
     stationary = tuple(
         dataclasses.replace(load, speed=zero, acceleration=zero)
         for load in loop.augmented_plant.loads.trajectories

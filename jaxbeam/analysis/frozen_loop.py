@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
@@ -22,7 +21,7 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state, sensor_sections
 from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, scan, xp
 from jaxbeam.runtime.compiling import compiled
 
 PERIOD_TOLERANCE = 1e-9  # of a period; smaller differences of times count as zero
@@ -46,15 +45,15 @@ class FrozenTrajectory(AbstractTrajectory):
     length: Float[Array, ""]
 
     def kinematics(self, t):
-        shape = jnp.shape(t)
+        shape = xp.shape(t)
         parts = self.position, self.speed, self.acceleration
-        return tuple(jnp.broadcast_to(part, shape) for part in parts)
+        return tuple(xp.broadcast_to(part, shape) for part in parts)
 
     def entry_exit_times(self):
-        return jnp.where(self.on_beam, -NEVER, NEVER), jnp.asarray(NEVER)
+        return xp.where(self.on_beam, -NEVER, NEVER), xp.asarray(NEVER)
 
     def passage_times(self, positions):
-        return jnp.zeros(0)
+        return xp.zeros(0)
 
 
 class LoopDynamics(eqx.Module):
@@ -85,7 +84,7 @@ class LoopDynamics(eqx.Module):
         The last states are those of the law, about their values at the start of a run.
         """
         system, command_count = self.augmented_plant.at(t), len(self.plant.case.actuators)
-        size, zero_command = system.A.shape[0], jnp.zeros(command_count)
+        size, zero_command = system.A.shape[0], xp.zeros(command_count)
 
         def measure(state):
             # Sensors are ideal in continuous time; outputs of the law's filters follow.
@@ -100,13 +99,13 @@ class LoopDynamics(eqx.Module):
             return self.law.rates(*measure(state), given, t)
 
         controller_states = self.law.state_count
-        zero_state = jnp.zeros(size + controller_states)
+        zero_state = xp.zeros(size + controller_states)
         controller_rows, controller_inputs = jax.jacfwd(rates, argnums=(0, 1))(
             zero_state, zero_command
         )
-        A = jnp.concatenate([jnp.pad(system.A, ((0, 0), (0, controller_states))), controller_rows])
-        input_matrix = jnp.concatenate([system.B[:, :command_count], controller_inputs])
-        weight_rates = jnp.append(
+        A = xp.concatenate([xp.pad(system.A, ((0, 0), (0, controller_states))), controller_rows])
+        input_matrix = xp.concatenate([system.B[:, :command_count], controller_inputs])
+        weight_rates = xp.append(
             system.B[:, command_count:] @ self.augmented_plant.weights,
             rates(zero_state, zero_command),
         )
@@ -116,16 +115,16 @@ class LoopDynamics(eqx.Module):
         """State of the sampled loop at rest as one vector, and the function that unpacks it."""
         case = self.plant.case
         filters = [
-            initial_filter_state(sensor, sensor_sections(sensor, timing.period), jnp.zeros(()))
+            initial_filter_state(sensor, sensor_sections(sensor, timing.period), xp.zeros(()))
             for sensor in case.sensors
         ]
         signal_history = [
-            jnp.zeros(_split_delay(lag / timing.period)[2]) for lag in timing.sensor_delays
+            xp.zeros(_split_delay(lag / timing.period)[2]) for lag in timing.sensor_delays
         ]
-        command_queue = jnp.zeros(
+        command_queue = xp.zeros(
             (_split_delay(timing.delay / timing.period)[0] + 1, len(case.actuators))
         )
-        state = jnp.zeros(self.augmented_plant.modal_model.state_count)
+        state = xp.zeros(self.augmented_plant.modal_model.state_count)
         return ravel_pytree(
             (
                 state,
@@ -152,7 +151,7 @@ class LoopDynamics(eqx.Module):
             if remainder:
                 delayed_samples.setdefault((1 - remainder) * timing.period, []).append(i)
             else:
-                signal_history[i] = jnp.concatenate([signals[i : i + 1], signal_history[i]])
+                signal_history[i] = xp.concatenate([signals[i : i + 1], signal_history[i]])
             sections = sensor_sections(sensor, timing.period)
             reading, after = filtered_reading(
                 _ideal_sensor(sensor), sections, filters[i], signal_history[i][whole]
@@ -160,10 +159,10 @@ class LoopDynamics(eqx.Module):
             readings.append(reading)
             states.append(after)
             signal_history[i] = signal_history[i][:history_length]
-        readings = jnp.stack(readings) if readings else jnp.zeros(0)
+        readings = xp.stack(readings) if readings else xp.zeros(0)
         measurement = self._measurement(readings, plant_state, command_queue[whole_periods])
         controller_command, law_state, _ = self.law.step(law_state, measurement, t)
-        command_queue = jnp.concatenate(
+        command_queue = xp.concatenate(
             [(controller_command if command_given is None else command_given)[None], command_queue]
         )
         # Within the period the command changes once, and delayed sensors take their samples.
@@ -178,7 +177,7 @@ class LoopDynamics(eqx.Module):
             )
             for i in delayed_samples.get(end, ()):
                 signal = self._sensor_inputs(plant_state, command, t + end)[i : i + 1]
-                signal_history[i] = jnp.concatenate([signal, signal_history[i]])[
+                signal_history[i] = xp.concatenate([signal, signal_history[i]])[
                     : signal_history[i].shape[0]
                 ]
         return (
@@ -195,15 +194,15 @@ class LoopDynamics(eqx.Module):
         Each substep is two exponentials of matrices at Gauss nodes (order 4; Blanes and Moan,
         Applied Numerical Mathematics 56, 2006), exact for frozen loads.
         """
-        inputs = jnp.concatenate([command, self.augmented_plant.weights])
+        inputs = xp.concatenate([command, self.augmented_plant.weights])
 
         def augmented_matrix(time):
             # Held inputs as further states.
             system = self.augmented_plant.at(time)
-            top = jnp.concatenate([system.A, system.B], axis=1)
-            return jnp.pad(top, ((0, inputs.shape[0]), (0, 0)))
+            top = xp.concatenate([system.A, system.B], axis=1)
+            return xp.pad(top, ((0, inputs.shape[0]), (0, 0)))
 
-        start = jnp.concatenate([state, inputs])
+        start = xp.concatenate([state, inputs])
         return propagate(augmented_matrix, t, duration, substeps, start)[: state.shape[0]]
 
     def _sensor_inputs(self, state, command, t):
@@ -213,10 +212,10 @@ class LoopDynamics(eqx.Module):
         if not has_feedthrough.any():
             return signals
         system = self.augmented_plant.at(t)
-        accelerations = system.C @ state + system.D @ jnp.concatenate(
+        accelerations = system.C @ state + system.D @ xp.concatenate(
             [command, self.augmented_plant.weights]
         )
-        return jnp.where(has_feedthrough, accelerations, signals)
+        return xp.where(has_feedthrough, accelerations, signals)
 
     def _measurement(self, readings, state, command):
         model_state = self.augmented_plant.to_modal(state)[: self.plant.modal_model.state_count]
@@ -256,7 +255,7 @@ def propagate(matrix, t, duration, substeps: int, start):
             state = jax.scipy.linalg.expm(part, max_squarings=40) @ state
         return state, None
 
-    return jax.lax.scan(step_state, start, t + step * np.arange(substeps))[0]
+    return scan(step_state, start, t + step * np.arange(substeps))[0]
 
 
 def _ideal_sensor(sensor):
@@ -265,7 +264,7 @@ def _ideal_sensor(sensor):
     return eqx.tree_at(
         lambda s: [getattr(s, name) for name in fields],
         sensor,
-        [None, None, jnp.zeros(())],
+        [None, None, xp.zeros(())],
         is_leaf=lambda x: x is None,
     )
 

@@ -8,7 +8,6 @@ them. Limits, ranges and resolution are left out.
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
@@ -18,7 +17,7 @@ from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, scan, stop_gradient, xp
 from jaxbeam.runtime.compiling import compiled
 
 NEWTON_ITERATIONS = 8  # towards the equilibrium about which the loop is linearised
@@ -49,19 +48,19 @@ class LinearisedLoop(eqx.Module):
 
         The rightmost pole must be simple; others may coincide, as those of a delay do.
         """
-        constant_matrix = jax.lax.stop_gradient(self.closed_matrix)
-        values, vectors = jnp.linalg.eig(constant_matrix)
-        dominant = jnp.argmax(values.real if self.period is None else jnp.abs(values))
+        constant_matrix = stop_gradient(self.closed_matrix)
+        values, vectors = xp.linalg.eig(constant_matrix)
+        dominant = xp.argmax(values.real if self.period is None else xp.abs(values))
         value, right = values[dominant], vectors[:, dominant]
         # Left eigenvector by inverse iteration: multiple poles may have too few eigenvectors.
-        shifted = constant_matrix.T - value * (1 + EIGENVALUE_OFFSET) * jnp.eye(
+        shifted = constant_matrix.T - value * (1 + EIGENVALUE_OFFSET) * xp.eye(
             constant_matrix.shape[0]
         )
-        left = jnp.ones_like(right)
+        left = xp.ones_like(right)
         for _ in range(2):
-            left = jnp.linalg.solve(shifted, left / jnp.linalg.norm(left))
+            left = xp.linalg.solve(shifted, left / xp.linalg.norm(left))
         value = value + left @ ((self.closed_matrix - constant_matrix) @ right) / (left @ right)
-        return value.real if self.period is None else jnp.log(jnp.abs(value)) / self.period
+        return value.real if self.period is None else xp.log(xp.abs(value)) / self.period
 
     def poles(self) -> np.ndarray:
         """Poles of the closed loop in 1/s, the largest real part first.
@@ -84,7 +83,7 @@ def linearised_loop(case: Case, t: float) -> LinearisedLoop:
     """
     timing = loop_timing(case)
     return linearise(
-        loop_dynamics(case, mesh_layout(concrete_case(case))), timing, jnp.asarray(float(t))
+        loop_dynamics(case, mesh_layout(concrete_case(case))), timing, xp.asarray(float(t))
     )
 
 
@@ -125,7 +124,7 @@ def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoo
         A, input_matrix, weight_rates, command = loop.continuous_dynamics(t)
         equilibrium = _equilibrium(
             lambda state: A @ state + input_matrix @ command(state) + weight_rates,
-            jnp.zeros(A.shape[0]),
+            xp.zeros(A.shape[0]),
         )
         return LinearisedLoop(A, input_matrix, jax.jacfwd(command)(equilibrium), None, modal_states)
     start, rebuild = loop.rest_state(timing)
@@ -144,9 +143,9 @@ def _equilibrium(change, start):
     """State of zero change, by Newton's method from a start; the start if it does not converge."""
 
     def newton_step(state, _):
-        step = jnp.linalg.lstsq(jax.jacfwd(change)(state), -change(state))[0]
+        step = xp.linalg.lstsq(jax.jacfwd(change)(state), -change(state))[0]
         return state + step, None
 
-    state = jax.lax.scan(newton_step, start, length=NEWTON_ITERATIONS)[0]
+    state = scan(newton_step, start, length=NEWTON_ITERATIONS)[0]
     # Derivatives of the poles by the equilibrium, non-zero for a nonlinear law, are left out.
-    return jax.lax.stop_gradient(jnp.where(jnp.all(jnp.isfinite(state)), state, start))
+    return stop_gradient(xp.where(xp.all(xp.isfinite(state)), state, start))

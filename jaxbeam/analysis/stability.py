@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax.flatten_util import ravel_pytree
@@ -24,6 +23,7 @@ from jaxbeam.case.case import Case, concrete_case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.runtime.arrays import scan, xp
 from jaxbeam.runtime.compiling import compiled
 
 MAX_PHASE_PER_STEP = 0.15  # rad: phase of the fastest mode per step of the transition matrix
@@ -87,7 +87,7 @@ def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) ->
         times = np.linspace(*_crossing_interval(case), 101)[:-1] if case.loads else np.zeros(1)
     times = np.asarray(times, float)
     loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
-    loops = _frozen_loops(loop, timing, jnp.asarray(times))
+    loops = _frozen_loops(loop, timing, xp.asarray(times))
     poles = [jax.tree.map(lambda part, i=i: part[i], loops).poles() for i in range(times.size)]
     return FrozenPoles(times, _tracked_branches(np.stack(poles)))
 
@@ -114,7 +114,7 @@ def growth(case: Case, points: int = 100) -> Growth:
         )
         times = sampling_instants * timing.period
     steps = _substeps(loop, timing, times)
-    transitions, energy = _transition_matrices(loop, timing, jnp.asarray(times), steps)
+    transitions, energy = _transition_matrices(loop, timing, xp.asarray(times), steps)
     transitions, energy = np.asarray(transitions), np.asarray(energy)
     size = energy.shape[0]
     energy_root = np.linalg.cholesky(energy).T
@@ -158,7 +158,7 @@ def stream(case: Case, spacing: float) -> Stream:
     intervals = 1 if timing is None else round(spacing / timing.period)
     times = start + np.linspace(0.0, spacing, max(intervals, 20 if timing is None else 1) + 1)
     steps = _substeps(loop, timing, times)
-    transitions, _ = _transition_matrices(loop, timing, jnp.asarray(times), steps)
+    transitions, _ = _transition_matrices(loop, timing, xp.asarray(times), steps)
     return Stream(np.linalg.eigvals(np.asarray(transitions[-1])), float(spacing))
 
 
@@ -173,7 +173,7 @@ def _crossing_interval(case: Case) -> tuple[float, float]:
 
 def _substeps(loop, timing, times) -> int:
     """Steps between two of the times, short enough for MAX_PHASE_PER_STEP."""
-    fastest = float(jnp.max(loop.plant.modal_model.modes.angular_frequencies))
+    fastest = float(xp.max(loop.plant.modal_model.modes.angular_frequencies))
     longest = float(np.max(np.diff(times))) if timing is None else timing.period
     return max(1, math.ceil(fastest * longest / MAX_PHASE_PER_STEP))
 
@@ -182,25 +182,25 @@ def _substeps(loop, timing, times) -> int:
 def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, substeps: int):
     """Transition matrices (time, state, state) from the first time; energy matrix of q and q'."""
     model, modes = loop.plant, loop.plant.coordinate_scale.shape[0]
-    stiffness = model.modal_model.stiffness() / jnp.outer(
+    stiffness = model.modal_model.stiffness() / xp.outer(
         model.coordinate_scale, model.coordinate_scale
     )
-    mass = jnp.diag(1 / model.coordinate_scale**2)
-    zeros = jnp.zeros((modes, modes))
-    energy = jnp.block([[stiffness, zeros], [zeros, mass]])
+    mass = xp.diag(1 / model.coordinate_scale**2)
+    zeros = xp.zeros((modes, modes))
+    energy = xp.block([[stiffness, zeros], [zeros, mass]])
     if timing is None:
 
         def closed_matrix(t):
             A, input_matrix, _, command = loop.continuous_dynamics(t)
-            return A + input_matrix @ jax.jacfwd(command)(jnp.zeros(A.shape[0]))
+            return A + input_matrix @ jax.jacfwd(command)(xp.zeros(A.shape[0]))
 
         def advance(transition, t):
             transition = propagate(closed_matrix, t[0], t[1] - t[0], substeps, transition)
             return transition, transition
 
-        start = jnp.eye(closed_matrix(times[0]).shape[0])
-        spans = jnp.stack([times[:-1], times[1:]], axis=1)
-        transitions = jax.lax.scan(advance, start, spans)[1]
+        start = xp.eye(closed_matrix(times[0]).shape[0])
+        spans = xp.stack([times[:-1], times[1:]], axis=1)
+        transitions = scan(advance, start, spans)[1]
     else:
         rest_state, rebuild = loop.rest_state(timing)
         # Deviations from rest: weights left out.
@@ -219,9 +219,9 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
             transition = jax.jacfwd(after)(rest_state) @ transition
             return transition, transition
 
-        start = jnp.eye(rest_state.shape[0])
-        transitions = jax.lax.scan(advance_sample, start, times[:-1])[1]
-    return jnp.concatenate([start[None], transitions]), energy
+        start = xp.eye(rest_state.shape[0])
+        transitions = scan(advance_sample, start, times[:-1])[1]
+    return xp.concatenate([start[None], transitions]), energy
 
 
 def _tracked_branches(

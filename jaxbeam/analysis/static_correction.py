@@ -5,15 +5,14 @@ quasi-statically: by the exact static response less that of the modes kept. The 
 deflection is small; curvature and third derivative, hence section forces, need it.
 """
 
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.model.statics import influence_line, static_deflection_per_command
-from jaxbeam.runtime.arrays import Array
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import Array, solve, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.record import Record
 
 
@@ -27,15 +26,15 @@ def residual_actuator_gain(
     """
     layout = mesh_layout(case) if layout is None else layout
     exact = static_deflection_per_command(case, x, derivative, layout)
-    return exact - _modal_actuator_gain(case, layout, jnp.asarray(x, float), derivative)
+    return exact - _modal_actuator_gain(case, layout, xp.asarray(x, float), derivative)
 
 
-@compiled
+@compiled_if_traced
 def _modal_actuator_gain(case: Case, layout: Layout, x, derivative: int):
     model = modal_model(case, layout)
-    steady_forces = jnp.array([a.attachment().static_gain for a in case.actuators]).reshape(-1)
-    amplitudes = jnp.linalg.solve(model.stiffness(), model.displacement_map.T * steady_forces)
-    return jnp.moveaxis(model.shapes(x, (derivative,))[0] @ amplitudes, -1, 0)
+    steady_forces = xp.array([a.attachment().static_gain for a in case.actuators]).reshape(-1)
+    amplitudes = solve(model.stiffness(), model.displacement_map.T * steady_forces)
+    return xp.moveaxis(model.shapes(x, (derivative,))[0] @ amplitudes, -1, 0)
 
 
 def residual_flexibility(
@@ -47,17 +46,17 @@ def residual_flexibility(
     """
     layout = mesh_layout(case) if layout is None else layout
     exact = influence_line(case, x, load_positions, derivative, layout)
-    x, load_positions = jnp.asarray(x, float), jnp.asarray(load_positions, float)
+    x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
     return exact - _modal_influence_line(case, layout, x, load_positions, derivative)
 
 
-@compiled
+@compiled_if_traced
 def _modal_influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
     model = modal_model(case, layout)
     load_shapes = model.shapes(load_positions.reshape(-1), (0,))[0]
-    amplitudes = jnp.linalg.solve(model.stiffness(), -load_shapes.T)
+    amplitudes = solve(model.stiffness(), -load_shapes.T)
     line = model.shapes(x.reshape(-1), (derivative,))[0] @ amplitudes
-    return line.T.reshape(*load_positions.shape, *x.shape)
+    return line.T.reshape((*load_positions.shape, *x.shape))
 
 
 def corrected_deflection(
@@ -70,16 +69,16 @@ def corrected_deflection(
     commands change slowly compared with the first truncated mode. Raises ValueError as
     `influence_line` does.
     """
-    case, x = record.case, jnp.asarray(x, float)
+    case, x = record.case, xp.asarray(x, float)
     shapes = record.modes.shapes(x, derivative)
-    history = jnp.tensordot(record.coordinates, shapes, axes=[1, -1])
+    history = xp.tensordot(record.coordinates, shapes, axes=[1, -1])
     if case.loads:
-        load_positions = jnp.where(jnp.isfinite(record.load_position), record.load_position, 0.0)
+        load_positions = xp.where(xp.isfinite(record.load_position), record.load_position, 0.0)
         residual = residual_flexibility(case, x, load_positions, derivative, layout)
-        history = history + jnp.einsum("tl,tl...->t...", record.contact_force, residual)
+        history = history + xp.einsum("tl,tl...->t...", record.contact_force, residual)
     if case.controller is not None:
         residual = residual_actuator_gain(case, x, derivative, layout)
-        history = history + jnp.tensordot(record.command, residual, axes=1)
+        history = history + xp.tensordot(record.command, residual, axes=1)
     return history
 
 
@@ -101,7 +100,7 @@ def bending_moment(case: Case, x, curvature, commands=None) -> Float[Array, "...
     >>> print(f"{jb.bending_moment(beam, 0.5, curvature):.3f} N m")  # F x / 2
     0.250 N m
     """
-    x = jnp.asarray(x, float)
+    x = xp.asarray(x, float)
     moment = _bending_stiffness(case, x) * curvature
     for i, actuator in enumerate(case.actuators if commands is not None else ()):
         # Couples come in opposite pairs, and the section between them carries them.
@@ -111,9 +110,9 @@ def bending_moment(case: Case, x, curvature, commands=None) -> Float[Array, "...
             if order == 1
         ]
         steps = (factor * _unit_step(case, x, position) for position, factor in couples)
-        inside = sum(steps, jnp.zeros(x.shape))
-        couple = actuator.attachment().static_gain * jnp.asarray(commands, float)[..., i]
-        moment = moment + jnp.tensordot(couple, inside, axes=0)
+        inside = sum(steps, xp.zeros(x.shape))
+        couple = actuator.attachment().static_gain * xp.asarray(commands, float)[..., i]
+        moment = moment + xp.tensordot(couple, inside, axes=0)
     return moment
 
 
@@ -123,12 +122,12 @@ def shear_force(case: Case, x, third_derivative) -> Float[Array, "..."]:
     `third_derivative` (..., *position) is that of the deflection by x, in 1/m^2. At a point force,
     the shear force to the right of it.
     """
-    return _bending_stiffness(case, jnp.asarray(x, float)) * third_derivative
+    return _bending_stiffness(case, xp.asarray(x, float)) * third_derivative
 
 
 def _bending_stiffness(case: Case, x):
     """Bending stiffness E I at x in N m^2, patches included."""
-    rigidity = jnp.full(x.shape, case.beam.bending_stiffness)
+    rigidity = xp.full(x.shape, case.beam.bending_stiffness)
     for patch in filter(None, (actuator.section_stiffening() for actuator in case.actuators)):
         inside = _unit_step(case, x, patch.start) - _unit_step(case, x, patch.end)
         rigidity = rigidity + patch.bending_stiffness * inside
@@ -137,4 +136,4 @@ def _bending_stiffness(case: Case, x):
 
 def _unit_step(case: Case, x, position):
     """1 from a position on, 0 before it; at the right end, the value left of it."""
-    return jnp.where((x >= position) & (position < case.beam.length), 1.0, 0.0)
+    return xp.where((x >= position) & (position < case.beam.length), 1.0, 0.0)

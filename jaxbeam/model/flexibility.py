@@ -16,8 +16,8 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, assemble_matrices, section_properties, supported_matrices
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
-from jaxbeam.runtime.arrays import Array, set_at, xp
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import Array, set_at, take, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 # Least stiffness against rigid-body motion of a statically supported beam, in E I / L^3.
 MIN_RIGID_BODY_STIFFNESS = 1e-10
@@ -81,7 +81,7 @@ def _clamped_segment_bending(nodes, rigidity, x, x_derivative: int, y, y_derivat
     segment_of_x, segment_of_y = (
         xp.sum(position[..., None] >= inner_nodes, axis=-1) for position in (x, y)
     )
-    left, right = nodes[segment_of_y], nodes[segment_of_y + 1]
+    left, right = take(nodes, segment_of_y), take(nodes, segment_of_y + 1)
     length, s, y_to_right = right - left, x - left, right - y
     z = s / length
     deflection = (z**2 * (3 - 2 * z), 6 * z * (1 - z), 6 - 12 * z, -12 + 0 * z)[x_derivative]
@@ -91,9 +91,8 @@ def _clamped_segment_bending(nodes, rigidity, x, x_derivative: int, y, y_derivat
         - deflection / length**x_derivative * _factorial_power(y_to_right, 3 - y_derivative)
         - slope * length / length**x_derivative * _factorial_power(y_to_right, 2 - y_derivative)
     )
-    return xp.where(
-        segment_of_x == segment_of_y, (-1) ** y_derivative * bending / rigidity[segment_of_y], 0.0
-    )
+    bending = (-1) ** y_derivative * bending / take(rigidity, segment_of_y)
+    return xp.where(segment_of_x == segment_of_y, bending, 0.0)
 
 
 def _segment_bending(
@@ -197,7 +196,7 @@ def _cubic_layout(layout: Layout) -> Layout:
     return dataclasses.replace(layout, degrees=(3,) * len(layout.degrees))
 
 
-@compiled  # operation by operation, compiling takes seconds
+@compiled_if_traced
 def _support_conditions(case: Case, layout: Layout):
     """Node positions (in L), and points, factors and stiffness of the suspensions."""
     return assemble_matrices(case, _cubic_layout(layout))[0], *_suspensions(case)

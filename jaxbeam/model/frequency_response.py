@@ -22,8 +22,8 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
-from jaxbeam.runtime.arrays import Array, add_at, set_at, xp
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import Array, add_at, set_at, solve, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -122,7 +122,7 @@ def frequency_response(
     return FrequencyResponse(frequencies, values, checked_pairs, case.title)
 
 
-@compiled
+@compiled_if_traced
 def _responses(case: Case, layout: Layout, frequencies, stationary, pairs: tuple[ChannelPair, ...]):
     model = modal_model(case, layout)
     inputs = [input_column(case, model, pair.excitation) for pair in pairs]
@@ -153,7 +153,7 @@ def _state_responses(
     """States per unit of each input (column of the input matrix), at every frequency (Hz)."""
     A, E = descriptor_matrices(model, stationary)
     s = 2j * xp.pi * frequencies[:, None, None]
-    return xp.linalg.solve(s * E - A, input_matrix + 0j)
+    return solve(s * E - A, input_matrix + 0j)
 
 
 def descriptor_matrices(model: ModalModel, stationary):
@@ -188,7 +188,7 @@ def receptance(
     return _receptance(case, layout, frequencies, masses, x, y)
 
 
-@compiled
+@compiled_if_traced
 def _receptance(case: Case, layout: Layout, frequencies, stationary, x, y):
     model = modal_model(case, layout)
     input_matrix = xp.zeros((model.state_count, y.size))

@@ -9,7 +9,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import c2d
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, solve, xp
 
 
 class Signal(NamedTuple):
@@ -53,7 +53,7 @@ class StateSpace(eqx.Module):
         Times B they are the static gains of the inputs. `outputs` is an index or a slice. Not
         finite where a mode has no stiffness.
         """
-        return -xp.linalg.solve(self.A.T, self.C[outputs].T).T
+        return -solve(self.A.T, self.C[outputs].T).T
 
     def to_control(self) -> Any:
         """A `control.StateSpace` of the package python-control, with the same signal names.

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, Modes, mesh_layout, modes
 from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve_triangular, xp
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 
 class ModalModel(eqx.Module):
@@ -92,14 +92,11 @@ def modal_model(case: Case, layout: Layout | None = None, full_matrix: bool = Tr
     return assemble_modal_model(case, modes(case, layout), full_matrix)
 
 
-_compiled = compiled(modal_model)
+_compiled = compiled_if_traced(modal_model)
 
 
 def compiled_modal_model(case: Case, layout: Layout | None = None) -> ModalModel:
-    """Modal model by one compiled program; operation by operation, compiling takes seconds.
-
-    Cases that differ only in their controllers share the program.
-    """
+    """Modal model of a case; traced, by one program that cases of other controllers share."""
     layout = mesh_layout(case) if layout is None else layout
     uncontrolled_case = eqx.tree_at(
         lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None

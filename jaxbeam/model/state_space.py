@@ -20,7 +20,7 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.runtime.arrays import Array, set_at, xp
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 
 class Plant(eqx.Module):
@@ -168,13 +168,12 @@ class Plant(eqx.Module):
         )
 
 
-# Compiled as a whole: operation by operation, compiling takes seconds.
-@compiled
+@compiled_if_traced
 def _plant_at(plant: Plant, t) -> StateSpace:
     return plant._system_with_loads(*plant._contact_matrices(t))
 
 
-@compiled
+@compiled_if_traced
 def _unloaded_plant(plant: Plant) -> StateSpace:
     modes, states = plant.coordinate_scale.shape[0], plant.modal_model.state_count
     return plant._system_with_loads(xp.zeros((0, modes)), xp.zeros((0, states)), xp.zeros(0))

@@ -7,6 +7,7 @@ The other functions here replace what the two write differently: indexed updates
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,32 @@ def any_jax(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(trees))
 
 
+def _einsum(subscripts: str, *operands: np.ndarray) -> np.ndarray | np.generic:
+    """`numpy.einsum`; of two operands as products of matrices, several times as fast."""
+    inputs, _, output = subscripts.partition("->")
+    if len(operands) != 2 or "." in subscripts or not output:
+        return np.einsum(subscripts, *operands)
+    (first, second), (a, b) = inputs.split(","), operands
+    sizes = dict(zip(first + second, a.shape + b.shape, strict=True))
+    shared = [label for label in first if label in second]
+    batch = [label for label in shared if label in output]
+    summed = [label for label in shared if label not in output]
+    left = [label for label in first if label not in second]
+    right = [label for label in second if label not in first]
+    if set(left + right) - set(output):
+        return np.einsum(subscripts, *operands)
+
+    def matrices(array, labels, rows, columns):
+        array = array.transpose([labels.index(label) for label in batch + rows + columns])
+        shape = (math.prod(sizes[label] for label in part) for part in (rows, columns))
+        return array.reshape(*(sizes[label] for label in batch), *shape)
+
+    product = matrices(a, first, left, summed) @ matrices(b, second, summed, right)
+    labels = batch + left + right
+    product = product.reshape([sizes[label] for label in labels])
+    return product.transpose([labels.index(label) for label in output])
+
+
 class _Namespace:
     """Functions of two libraries under one name; see the module."""
 
@@ -39,6 +66,7 @@ class _Namespace:
 
     def __getattr__(self, name):
         known, traced = getattr(self._known, name), getattr(self._traced, name)
+        known = _einsum if name == "einsum" else known
         if name == "linalg":
             attribute = _Namespace(known, traced)
         elif isinstance(known, type) or not callable(known):
@@ -71,7 +99,7 @@ def take(array, index):
 def set_at(array, index, value):
     """Copy of an array with the entries at an index replaced."""
     if is_jax(array) or is_jax(index) or is_jax(value):
-        return jnp.asarray(array).at[index].set(value)
+        return jnp.asarray(array, jnp.result_type(array, value)).at[index].set(value)
     array = np.array(array, np.result_type(array, value))
     array[index] = value
     return array
@@ -80,7 +108,7 @@ def set_at(array, index, value):
 def add_at(array, index, value):
     """Copy of an array with a value added to the entries at an index; repeated ones accumulate."""
     if is_jax(array) or is_jax(index) or is_jax(value):
-        return jnp.asarray(array).at[index].add(value)
+        return jnp.asarray(array, jnp.result_type(array, value)).at[index].add(value)
     array = np.array(array, np.result_type(array, value))
     np.add.at(array, index, value)
     return array
@@ -187,13 +215,19 @@ def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
         pairs = [(arg, axis) for arg, axis in zip(args, axes, strict=True) if axis is not None]
         sizes = [np.shape(leaf)[axis] for arg, axis in pairs for leaf in jax.tree.leaves(arg)]
 
+        if sizes[0] == 0:
+            shapes = jax.eval_shape(jax.vmap(function, in_axes, out_axes), *args)
+            return jax.tree.map(lambda part: np.zeros(part.shape, part.dtype), shapes)
+
         def element(arg, axis, i):
             return jax.tree.map(lambda leaf: leaf if axis is None else np.take(leaf, i, axis), arg)
 
-        results = [
-            function(*(element(arg, axis, i) for arg, axis in zip(args, axes, strict=True)))
-            for i in range(sizes[0])
-        ]
+        results: list[Any] = []
+        for i in range(sizes[0]):
+            pairs = zip(args, axes, strict=True)
+            results.append(function(*(element(arg, axis, i) for arg, axis in pairs)))
+            if any_jax(results[0]):  # from others than its arguments
+                return jax.vmap(function, in_axes, out_axes)(*args)
         return jax.tree.map(lambda *parts: np.stack(parts, out_axes), *results)
 
     return mapped
@@ -202,6 +236,19 @@ def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
 def optimization_barrier(tree):
     """`jax.lax.optimization_barrier`: values that XLA does not compute twice."""
     return jax.lax.optimization_barrier(tree) if any_jax(tree) else tree
+
+
+def solve(matrix, right):
+    """Solutions of linear systems (..., row, column); not finite where the matrix is singular."""
+    if is_jax(matrix) or is_jax(right):
+        return jnp.linalg.solve(matrix, right)
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:  # of any matrix of a stack
+        singular = np.linalg.matrix_rank(matrix) < matrix.shape[-1]
+        regular = np.where(singular[..., None, None], np.eye(matrix.shape[-1]), matrix)
+        solution = np.linalg.solve(regular, right)
+        return np.where(singular[..., None, None] if right.ndim > 1 else singular, np.nan, solution)
 
 
 def solve_triangular(matrix, right, lower: bool):
@@ -235,7 +282,8 @@ def index_in_dim(array, index, axis: int = 0, keepdims: bool = True):
     """Entry at an index along one axis."""
     if is_jax(array) or is_jax(index):
         return jax.lax.dynamic_index_in_dim(array, index, axis, keepdims)
-    return np.take(array, [index] if keepdims else index, axis)
+    index = slice(index, index + 1) if keepdims else index
+    return array[(slice(None),) * axis + (index,)]
 
 
 def collapse(array, start: int, end: int):

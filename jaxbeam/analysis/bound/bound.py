@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -28,14 +27,14 @@ from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.model.channels import accepts_commands
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.command_limits import command_ranges
 from jaxbeam.simulation.integration_plan import choose_step_size, run_peaks, static_shapes
 from jaxbeam.simulation.record import Record
 
 DEFAULT_PERIOD = 0.01  # s, over which commands are held without a sampled controller
 
-_run_peaks = compiled(run_peaks)
+_run_peaks = compiled_if_traced(run_peaks)
 
 
 class ActiveConstraints(NamedTuple):
@@ -205,8 +204,8 @@ def _uncontrolled_peak(case: Case, positions) -> float:
     uncontrolled_case = dataclasses.replace(case, controller=None)
     shapes = static_shapes(uncontrolled_case)
     step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
-    running_peaks = _run_peaks(uncontrolled_case, shapes, jnp.asarray(step), jnp.asarray(positions))
-    return float(jnp.max(running_peaks.refined_peak()[0]))
+    running_peaks = _run_peaks(uncontrolled_case, shapes, np.asarray(step), positions)
+    return float(np.max(running_peaks.refined_peak()[0]))
 
 
 def _command_limits(case: Case, period: float):

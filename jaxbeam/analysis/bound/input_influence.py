@@ -11,7 +11,6 @@ Both parts come from the integrator of `simulate`, in batches of unit commands o
 import dataclasses
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -24,8 +23,8 @@ from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.contact import LoadSet, load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.runtime.arrays import Array
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.integration_plan import (
     StaticShapes,
     choose_step_size,
@@ -71,14 +70,14 @@ class _UnitCommands(AbstractInputPolicy):
     implicit: bool = eqx.field(static=True, default=False)
 
     def start(self, batch_size):
-        return jnp.zeros((), int)
+        return xp.zeros((), int)
 
     def inputs(self, memory, state, step_info, states):
-        hold_started = self.schedule.control_sample[step_info.event]
-        current_hold = jnp.where((step_info.event >= 0) & (hold_started >= 0), hold_started, memory)
+        hold_started = take(self.schedule.control_sample, step_info.event)
+        current_hold = xp.where((step_info.event >= 0) & (hold_started >= 0), hold_started, memory)
         is_commanded = self.actuator_index == np.arange(self.actuators)[:, None]
-        command = jnp.where(is_commanded & (self.hold_index == current_hold), 1.0, 0.0)
-        return jnp.broadcast_to(command, (NODE_COUNT, *command.shape)), current_hold
+        command = xp.where(is_commanded & (self.hold_index == current_hold), 1.0, 0.0)
+        return xp.broadcast_to(command, (NODE_COUNT, *command.shape)), current_hold
 
     def observe(self, memory, step_info):
         return None
@@ -124,7 +123,7 @@ def input_influence(
     )
     coordinates = np.concatenate(
         [
-            np.asarray(_unit_responses(uncontrolled_case, shapes, schedule, substeps, *indices))
+            _unit_responses(uncontrolled_case, shapes, schedule, substeps, *indices)
             for indices in zip(
                 hold_index.reshape(-1, batch_size),
                 actuator_index.reshape(-1, batch_size),
@@ -135,7 +134,7 @@ def input_influence(
     )
     response = coordinates[..., 1 : count * actuators + 1]
     return InputInfluence(
-        np.asarray(_deflection_rows(uncontrolled_case, shapes, jnp.asarray(positions))),
+        _deflection_rows(uncontrolled_case, shapes, positions),
         hold_times,
         times,
         coordinates[..., 0],
@@ -143,12 +142,12 @@ def input_influence(
     )
 
 
-@compiled
+@compiled_if_traced
 def _deflection_rows(case: Case, shapes: StaticShapes, positions):
     return modal_model(case, shapes.layout).shapes(positions, (0,))[0]
 
 
-@compiled
+@compiled_if_traced
 def _unit_responses(
     case: Case,
     shapes: StaticShapes,
@@ -162,10 +161,10 @@ def _unit_responses(
     size = (len(case_loads.trajectories), hold_index.shape[0])
     loads = LoadSet(
         case_loads.trajectories,
-        jnp.broadcast_to(case_loads.inertia, size),
-        jnp.where(hold_index == -1, jnp.broadcast_to(case_loads.weight, size), 0.0),
+        xp.broadcast_to(case_loads.inertia, size),
+        xp.where(hold_index == -1, xp.broadcast_to(case_loads.weight, size), 0.0),
     )
-    state_bound = jnp.full(model.state_count, jnp.inf)
+    state_bound = xp.full(model.state_count, xp.inf)
     policy = _UnitCommands(
         schedule=schedule,
         hold_index=hold_index,
