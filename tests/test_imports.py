@@ -13,7 +13,8 @@ from tests.modules import PACKAGES, module_files, parse
 # A package imports only those in lines above its own. A name stands for all modules within it that
 # no longer name here covers.
 ORDER = """
-jaxbeam.case  jaxbeam.runtime
+jaxbeam.runtime
+jaxbeam.case
 jaxbeam.numerics
 jaxbeam.model
 jaxbeam.integrator  jaxbeam.estimation

@@ -92,12 +92,12 @@ def _chunk_function(
     step, commands at the nodes, observations).
     """
 
-    chunk_steps = chunk_length(discrete, max_loads, loads.inertia.shape[1])
+    chunk_steps = chunk_length(discrete, loads, max_loads)
 
     def chunk(state, memory, running_peaks: Any, first_step):
         index = first_step + xp.arange(chunk_steps)
         chunk_path = load_path(discrete, loads, max_loads, index)
-        matrices = step_matrices(discrete, chunk_path)
+        matrices = step_matrices(discrete, chunk_path, loads.massless)
         inertia_and_weight = (
             _values_by_row(loads.inertia, chunk_path),
             _values_by_row(loads.weight, chunk_path),

@@ -11,7 +11,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Float
 
 from jaxbeam.integrator.step_matrices import StepMatrices
-from jaxbeam.model.contact import solve_contact_forces
+from jaxbeam.model.contact import ModalCompliance, solve_contact_forces
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_small
 from jaxbeam.runtime.arrays import Array, any_jax, cond, custom_jvp, scan, vmap, xp
 
@@ -22,13 +22,19 @@ CHECKPOINT_NAME = "steps"  # states and contact forces that are saved for the re
 def contact_forces(matrices: StepMatrices, inertia, weight, state, commands):
     """Contact forces (row, batch) in N of a step from a state, under commands if given."""
 
+    if matrices.contact_response is None:
+        return -weight
+
     def forces():
         acceleration = matvec(matrices.contact_response, state)
         if commands is not None:
             acceleration = acceleration + matrices.commands.contact_response @ commands
-        return solve_contact_forces(
-            matrices.contact_compliance, inertia, weight + inertia * acceleration
-        )
+        right = weight + inertia * acceleration
+        compliance = matrices.contact_compliance
+        if isinstance(compliance, ModalCompliance):
+            by_run = vmap(lambda m, d: compliance.solve(m[:, None], d[:, None])[:, 0], -1, -1)
+            return by_run(inertia, right)
+        return solve_contact_forces(compliance, inertia, right)
 
     # Without loads on the beam there is nothing to solve, which halves the cost of such steps.
     return cond(matrices.loaded, forces, lambda: xp.zeros_like(weight))
@@ -58,11 +64,16 @@ def free_response(transition: Float[Array, "block side side"], state: Float[Arra
     return next_state.reshape(state.shape)
 
 
-@custom_jvp
 def advance_unforced(matrices: StepMatrices, inertia, weight, state):
     """Steps without commands: final state, state before each step, and contact forces."""
     if not any_jax(matrices, inertia, weight, state):
         return _advance_known(matrices, inertia, weight, state)
+    has_matrix = isinstance(matrices.contact_compliance, Array)
+    advance_all = _advance_with_rule if has_matrix else _advance_all
+    return advance_all(matrices, inertia, weight, state)
+
+
+def _advance_all(matrices, inertia, weight, state):
     final_state, (states, forces) = scan(advance, state, (matrices, inertia, weight, None))
     return final_state, states, forces
 
@@ -74,9 +85,20 @@ def _advance_known(matrices: StepMatrices, inertia, weight, state):
     """
     steps, rows, batch_size = inertia.shape
     inertia, weight = (np.swapaxes(part, 1, 2)[..., None] for part in (inertia, weight))
-    system = np.eye(rows) + inertia * matrices.contact_compliance[:, None]
-    right = np.concatenate([inertia * matrices.contact_response[:, None], weight], axis=-1)
-    forces_of_state = -np.linalg.solve(system, right)  # (step, batch, row, state and one)
+    compliance, response = matrices.contact_compliance, matrices.contact_response
+    if response is None:
+        no_response = np.zeros((*weight.shape[:-1], len(state)))
+        right = np.concatenate([no_response, weight], axis=-1)
+        forces_of_state = -right
+    else:
+        right = np.concatenate([inertia * response[:, None], weight], axis=-1)
+        if isinstance(compliance, ModalCompliance):
+            compliance = jax.tree.map(lambda part: part[:, None], compliance)
+            forces_of_state = compliance.solve(inertia, right)
+        else:
+            system = np.eye(rows) + inertia * compliance[:, None]
+            forces_of_state = -np.linalg.solve(system, right)
+    # From state and one to forces (step, batch, row, state and one), and to the next state.
     maps = matrices.force_response[:, None] @ forces_of_state
     blocks, side = matrices.transition.shape[1:3]
     state_index = np.arange(blocks * side).reshape(blocks, side)
@@ -92,8 +114,11 @@ def _advance_known(matrices: StepMatrices, inertia, weight, state):
     return states[-1], states[:-1], forces
 
 
-@advance_unforced.defjvp
-def _advance_unforced_jvp(primals, tangents):
+_advance_with_rule = custom_jvp(_advance_all)
+
+
+@_advance_with_rule.defjvp
+def _advance_jvp(primals, tangents):
     """Tangents of steps f + m (G f + R z) + w = 0, z' = Phi z + Gamma f, with contact forces f.
 
     With S = (1 + m G)^-1: f. = c - S m R z.  and  z.' = Phi z. - Gamma S m R z. + e, where c and e
@@ -101,7 +126,7 @@ def _advance_unforced_jvp(primals, tangents):
     """
     matrices, inertia, weight, state = primals
     matrix_tangents, inertia_tangent, weight_tangent, state_tangent = tangents
-    final_state, states, forces = advance_unforced(*primals)
+    final_state, states, forces = _advance_with_rule(*primals)
     states, forces = (
         checkpoint_name(states, CHECKPOINT_NAME),
         checkpoint_name(forces, CHECKPOINT_NAME),

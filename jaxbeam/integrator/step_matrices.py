@@ -6,6 +6,8 @@ state at the start, to the acceleration under the loads at the nodes, the state 
 deflections at monitored positions.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -13,17 +15,26 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
-from jaxbeam.model.contact import LoadSet, contact_rows
-from jaxbeam.runtime.arrays import Array, cond, index_in_dim, is_jax, map_elements, take, xp
+from jaxbeam.model.contact import LoadSet, ModalCompliance, contact_rows
+from jaxbeam.runtime.arrays import (
+    Array,
+    any_jax,
+    cond,
+    index_in_dim,
+    is_jax,
+    map_elements,
+    take,
+    xp,
+)
 
 CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
-KNOWN_CHUNK_ENTRIES = 2**20  # of matrices that NumPy computes together
+KNOWN_CHUNK_ENTRIES = 2**22  # of matrices that NumPy computes together
 
 
 class CommandMatrices(eqx.Module):
     """From commands at the nodes to the acceleration under the loads and the state at the end."""
 
-    contact_response: Float[Array, "step row command"]
+    contact_response: Float[Array, "step row command"] | None
     input_matrix: Float[Array, "step state command"]
 
 
@@ -39,12 +50,13 @@ class StepMatrices(eqx.Module):
     """Matrices of the steps of a chunk; rows are (load, node), commands (node, actuator).
 
     `contact_response` maps the state at the start to the acceleration under the loads at the
-    nodes, `contact_compliance` the contact forces. `monitored` acts on state at the start, contact
-    forces and commands, one after the other. A step is `loaded` with a load on the beam.
+    nodes, `contact_compliance` the contact forces; both are None where no load has inertia.
+    `monitored` acts on state at the start, contact forces and commands, one after the other. A step
+    is `loaded` with a load on the beam.
     """
 
-    contact_response: Float[Array, "step row state"]
-    contact_compliance: Float[Array, "step row row"]
+    contact_response: Float[Array, "step row state"] | None
+    contact_compliance: Float[Array, "step row row"] | ModalCompliance | None
     transition: Float[Array, "step block side side"]
     force_response: Float[Array, "step state row"]
     monitored: Float[Array, "step sample input"] | None
@@ -66,18 +78,20 @@ class LoadPath(eqx.Module):
     loads: Int[Array, "step load"]
     on_beam: Bool[Array, "step load"]
     shape_rows: Float[Array, "step load node block mode"]
-    contact_rows: Float[Array, "step load node block side"]
+    contact_rows: Float[Array, "step load node block side"] | None
 
 
-def chunk_length(discrete: DiscreteModel, max_loads: int, batch_size: int) -> int:
+def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int:
     """Number of steps whose matrices are computed together.
 
     In NumPy, where each operation takes microseconds to begin, as many as memory allows.
     """
-    if is_jax(discrete.grid.step_count):
+    if any_jax(discrete, loads):
         return CHUNK_STEPS
-    side = max(max_loads * NODE_COUNT, discrete.model.state_count)
-    return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // side**2 // batch_size)))
+    rows, states = max_loads * NODE_COUNT, discrete.model.state_count
+    compliance = rows * min(rows, NODE_COUNT * discrete.model.mode_count)
+    entries = loads.inertia.shape[1] * max(compliance, rows * states, states**2)
+    return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // entries)))
 
 
 @jax.named_scope("load_path")
@@ -108,8 +122,10 @@ def load_path(
 
 
 @jax.named_scope("load_path")
-def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
-    """Matrices of the steps of a chunk."""
+def step_matrices(discrete: DiscreteModel, path: LoadPath, massless: bool = False) -> StepMatrices:
+    """Matrices of the steps of a chunk; without accelerations under `massless` loads."""
+    if massless:
+        path = dataclasses.replace(path, contact_rows=None)
     if is_jax(path.length_index):
         matrices = _matrices_by_branch(discrete, path)
     else:
@@ -125,7 +141,7 @@ def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):
             discrete,
             _propagators_of(discrete, path.length_index[index[0]]),
             path.shape_rows[index],
-            path.contact_rows[index],
+            None if path.contact_rows is None else path.contact_rows[index],
         )
         for index in indices
     ]
@@ -149,7 +165,10 @@ def _matrices_by_branch(discrete: DiscreteModel, path: LoadPath):
         def single_step(step):
             kind, shape, rows = step
             matrices = _matrices_of_one_length(
-                discrete, _propagators_of(discrete, kind), shape[None], rows[None]
+                discrete,
+                _propagators_of(discrete, kind),
+                shape[None],
+                None if rows is None else rows[None],
             )
             return jax.tree.map(lambda matrix: matrix[0], matrices)
 
@@ -174,14 +193,12 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
     of_states, deflection_transition, deflection_force_response = propagators
     steps, load_count, nodes, _, modes = shape.shape
     size = load_count * nodes
-    states = rows.shape[3] * rows.shape[4]
-    contact_response = xp.einsum("tpcbi,cbij->tpcbj", rows, of_states.transition_nodes)
-    force_to_acceleration = xp.einsum(
-        "tpcbi,cfbim->tpcfbm", rows, of_states.input_nodes[..., :modes]
-    )
-    force_coupling = xp.einsum("tpcfbm,tqfbm->tpcqf", force_to_acceleration, shape)
-    direct = xp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
-    force_coupling = force_coupling + direct[..., None] * np.eye(nodes)[:, None, :]
+    states = discrete.model.state_count
+    contact_response = contact_compliance = None
+    if rows is not None:
+        contact_response = xp.einsum("tpcbi,cbij->tpcbj", rows, of_states.transition_nodes)
+        contact_response = contact_response.reshape(steps, size, states)
+        contact_compliance = _contact_compliance(of_states.input_nodes[..., :modes], shape, rows)
     force_response = xp.einsum("tqfbm,fbim->tbiqf", shape, of_states.input_end[..., :modes])
 
     def for_all_steps(matrix, *shape):
@@ -189,8 +206,8 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
         return xp.broadcast_to(matrix, (steps, *matrix.shape))
 
     matrices = (
-        contact_response.reshape(steps, size, states),
-        force_coupling.reshape(steps, size, size),
+        contact_response,
+        contact_compliance,
         for_all_steps(of_states.transition_end),
         force_response.reshape(steps, states, size),
     )
@@ -213,15 +230,14 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
     commands = node_states = None
     if discrete.modal_command_matrix is not None:
         # The model of a run with commands is a single block.
-        command_count = nodes * discrete.modal_command_matrix.shape[1]
         command_responses = of_states.input_nodes[:, :, 0, :, modes:]
-        command_to_acceleration = xp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], command_responses)
-        feedthrough = xp.einsum("tpcm,mu->tpcu", shape[..., 0, :], discrete.modal_command_matrix)
-        command_to_acceleration = (
-            command_to_acceleration + feedthrough[:, :, :, None] * np.eye(nodes)[:, :, None]
-        )
+        command_count = nodes * discrete.modal_command_matrix.shape[1]
         commands = CommandMatrices(
-            command_to_acceleration.reshape(steps, size, command_count),
+            None
+            if rows is None
+            else _command_response(discrete, command_responses, shape, rows).reshape(
+                steps, size, command_count
+            ),
             for_all_steps(
                 xp.moveaxis(of_states.input_end[:, 0, :, modes:], 1, 0), states, command_count
             ),
@@ -235,3 +251,29 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
             for_all_steps(xp.moveaxis(command_responses, 1, 2), nodes * states, command_count),
         )
     return *matrices, commands, node_states
+
+
+def _contact_compliance(input_nodes, shape, rows):
+    """Acceleration under the loads at the nodes due to contact forces of one newton.
+
+    As a product of two factors where the generalised forces are fewer than the contact forces.
+    """
+    steps, load_count, nodes, blocks, modes = shape.shape
+    size = load_count * nodes
+    response = xp.einsum("tpcbi,cfbim->tpcfbm", rows, input_nodes)
+    if load_count > blocks * modes:
+        own_node = np.eye(nodes)[:, :, None, None]
+        response = response + shape[:, :, :, None] * own_node
+        shape_rows = shape.reshape(steps, load_count, nodes, -1)
+        return ModalCompliance(response.reshape(steps, size, -1), shape_rows)
+    compliance = xp.einsum("tpcfbm,tqfbm->tpcqf", response, shape)
+    direct = xp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
+    compliance = compliance + direct[..., None] * np.eye(nodes)[:, None, :]
+    return compliance.reshape(steps, size, size)
+
+
+def _command_response(discrete: DiscreteModel, command_responses, shape, rows):
+    """Acceleration under the loads at the nodes due to commands of one at the nodes."""
+    response = xp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], command_responses)
+    feedthrough = xp.einsum("tpcm,mu->tpcu", shape[..., 0, :], discrete.modal_command_matrix)
+    return response + feedthrough[:, :, :, None] * np.eye(shape.shape[2])[:, :, None]

@@ -9,6 +9,8 @@ eqs 2.3 to 2.13 of the thesis; a force has m = 0). With the states z of the moda
 f on the modes, D2w/Dt2 = (contact row) . z + (shape row) . f.
 """
 
+import math
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,7 +20,7 @@ from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import solve_small
-from jaxbeam.runtime.arrays import Array, add_at, custom_jvp, xp
+from jaxbeam.runtime.arrays import Array, add_at, custom_jvp, is_jax, xp
 
 
 class LoadSet(eqx.Module):
@@ -54,6 +56,11 @@ class LoadSet(eqx.Module):
         times = [xp.pad(times, more, constant_values=np.inf) for (times, _), more in pairs]
         cubics = [xp.pad(cubics, [more, (0, 0)]) for (_, cubics), more in pairs]
         return xp.stack(times), xp.stack(cubics)
+
+    @property
+    def massless(self) -> bool:
+        """Whether all loads are known to have no inertia, so that contact forces are weights."""
+        return not is_jax(self.inertia) and not np.any(self.inertia)
 
     def on_beam(self, times: Float[Array, "*time"]) -> Bool[Array, "load *time"]:
         """Whether each load is on the beam at given times (s), from entry until before exit."""
@@ -126,8 +133,10 @@ def contact_at(
             modal_acceleration + command_acceleration,
             acceleration_under_load + shape @ command_acceleration,
         )
-    mass = xp.where(active[..., None], loads.inertia, 0.0)
     weight = xp.where(active[..., None], loads.weight, 0.0)
+    if loads.massless:
+        return -weight, modal_acceleration - shape.mT @ weight
+    mass = xp.where(active[..., None], loads.inertia, 0.0)
     # The contact law: (1 + m S S') r = -W - m (contact row) . z.
     identity = np.eye(position.shape[-1])[..., None]
     matrix = identity + mass[..., None, :] * (shape @ shape.mT)[..., None]
@@ -141,10 +150,44 @@ def _solve_at_instants(
 ) -> Float[Array, "*time load batch"]:
     """Solutions of small systems, with instants and batch as one batch axis."""
     loads = right.shape[-2]
-    matrix = xp.moveaxis(matrix, (-3, -2), (0, 1)).reshape(loads, loads, -1)
     columns = xp.moveaxis(right, -2, 0)
-    solution = solve_small(matrix, columns.reshape(loads, 1, -1))
+    systems = math.prod(columns.shape[1:])
+    matrix = xp.moveaxis(matrix, (-3, -2), (0, 1)).reshape(loads, loads, systems)
+    solution = solve_small(matrix, columns.reshape(loads, 1, systems))
     return xp.moveaxis(solution.reshape(columns.shape), 0, -2)
+
+
+class ModalCompliance(eqx.Module):
+    """Compliance G = U V' of contact forces that act through fewer modes than there are loads.
+
+    `response` U maps generalised forces at the Gauss nodes (node and mode) to the acceleration
+    under the loads (load and node). V' maps contact forces to generalised forces, with the mode
+    shapes at the loads, `shape_rows`.
+    """
+
+    response: Float[Array, "*step row node_mode"]
+    shape_rows: Float[Array, "*step load node mode"]
+
+    def generalised_forces(
+        self, forces: Float[Array, "*batch row column"]
+    ) -> Float[Array, "*batch node_mode column"]:
+        """Generalised forces V' f of contact forces."""
+        *_, loads, nodes, modes = self.shape_rows.shape
+        forces = forces.reshape(*forces.shape[:-2], loads, nodes, -1)
+        by_node = xp.moveaxis(self.shape_rows, -3, -1) @ xp.moveaxis(forces, -3, -2)
+        return by_node.reshape(*by_node.shape[:-3], nodes * modes, -1)
+
+    def solve(
+        self, inertia: Float[Array, "*batch row 1"], right: Float[Array, "*batch row column"]
+    ) -> Float[Array, "*batch row column"]:
+        """Contact forces f of f + m G f = -d, by the generalised forces Q of Q + V'm U Q = -V'd.
+
+        The cost is linear in the number of loads.
+        """
+        coupling = self.generalised_forces(inertia * self.response)
+        system = np.eye(coupling.shape[-1]) + coupling
+        generalised = -xp.linalg.solve(system, self.generalised_forces(right))
+        return -right - inertia * (self.response @ generalised)
 
 
 @custom_jvp
