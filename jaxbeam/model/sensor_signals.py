@@ -7,7 +7,6 @@ value; `sampled_readings` makes all readings of a history, with analogue filter,
 
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -23,7 +22,8 @@ from jaxbeam.case.filters import (
 )
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
-from jaxbeam.runtime.arrays import Array, scan, stop_gradient, xp
+from jaxbeam.numerics.normal_samples import normal_samples
+from jaxbeam.runtime.arrays import Array, scan, stop_gradient, take, xp
 
 CLOCK_TOLERANCE_PERIODS = 1e-6  # a time this much before a sampling instant counts as at it
 
@@ -79,9 +79,8 @@ def to_reading(sensor: Sensor, value, noise=None) -> Float[Array, "..."]:
 
 def noise_samples(seed: int, sensors: int, samples: int) -> Float[Array, "sample sensor"]:
     """Standard normal samples, one a reading; a sensor's depend on the seed and its index only."""
-    keys = [jax.random.fold_in(jax.random.key(seed), sensor) for sensor in range(sensors)]
-    columns = [jax.random.normal(key, (samples,)) for key in keys]
-    return xp.array(columns).reshape(sensors, samples).T
+    columns = [normal_samples(seed, sensor, samples) for sensor in range(sensors)]
+    return np.array(columns).reshape(sensors, samples).T
 
 
 def needs_times(sensor: Sensor) -> bool:
@@ -117,7 +116,7 @@ def sampled_readings(
         )
         sample_times = times[0] + sensor.sampling_period * sample_index
         new_reading = xp.concatenate([xp.ones(1, bool), xp.diff(sample_index) > 0])
-        noise = None if noise is None else noise[xp.cumsum(new_reading) - 1]
+        noise = None if noise is None else take(noise, xp.cumsum(new_reading) - 1)
     sampled = values
     if sensor.sampling_period is not None or sensor.delay is not None:
         signal_times = sample_times if sensor.delay is None else sample_times - sensor.delay

@@ -20,7 +20,7 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array, cond, set_at, vmap, xp
+from jaxbeam.runtime.arrays import Array, cond, set_at, take, vmap, xp
 from jaxbeam.simulation.command_limits import limit_commands
 
 
@@ -125,7 +125,7 @@ class SampledLoop(AbstractInputPolicy):
         signals = self._sensor_inputs(state, memory.command, info.start)
         for i, sensor in enumerate(self.plant.case.sensors):
             number = self.schedule.reading[info.event, i]
-            noise = None if self.noise is None else self.noise[number, i]
+            noise = None if self.noise is None else take(self.noise, (number, i))
             reading, filter_state = filtered_reading(
                 sensor, self.filter_sections[i], memory.filter_states[i], signals[i], noise
             )
