@@ -21,7 +21,7 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state, sensor_sections
 from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.runtime.arrays import Array, scan, xp
+from jaxbeam.runtime.arrays import Array, expm, scan, xp
 from jaxbeam.runtime.compiling import compiled
 
 PERIOD_TOLERANCE = 1e-9  # of a period; smaller differences of times count as zero
@@ -252,7 +252,7 @@ def propagate(matrix, t, duration, substeps: int, start):
             larger_weight * first + smaller_weight * second,
             smaller_weight * first + larger_weight * second,
         ):
-            state = jax.scipy.linalg.expm(part, max_squarings=40) @ state
+            state = expm(part) @ state
         return state, None
 
     return scan(step_state, start, t + step * np.arange(substeps))[0]

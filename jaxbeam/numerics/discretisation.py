@@ -2,12 +2,10 @@
 
 import math
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, expm, fori_loop, scan, set_at, stop_gradient, take, xp
 
 DOUBLINGS = 14  # of the short interval of the series
 SERIES_TERMS = 10  # exact to rounding while the norm of the matrix over that interval is below 0.05
@@ -30,15 +28,15 @@ def c2d(
     states, inputs = B.shape
     powers = degree + 1
     # The derivatives of the input by s / h are further states, each the rate of the previous one.
-    block = jnp.zeros((states + inputs * powers,) * 2)
-    block = block.at[:states, :states].set(A * period)
-    block = block.at[:states, states : states + inputs].set(B * period)
-    block = block.at[states:, states:].set(np.kron(np.eye(powers, k=1), np.eye(inputs)))
-    exponential = jax.scipy.linalg.expm(block, max_squarings=40)
+    block = xp.zeros((states + inputs * powers,) * 2)
+    block = set_at(block, np.s_[:states, :states], A * period)
+    block = set_at(block, np.s_[:states, states : states + inputs], B * period)
+    block = set_at(block, np.s_[states:, states:], np.kron(np.eye(powers, k=1), np.eye(inputs)))
+    exponential = expm(block)
     input_matrix = exponential[:states, states:].reshape(states, powers, inputs)
     factorials = np.array([math.factorial(k) for k in range(powers)], float)
     transition = exponential[:states, :states] * scale[:, None] / scale
-    return transition, jnp.moveaxis(input_matrix, 1, 0) * factorials[:, None, None] * scale[:, None]
+    return transition, xp.moveaxis(input_matrix, 1, 0) * factorials[:, None, None] * scale[:, None]
 
 
 def exponential_and_gramian(
@@ -50,7 +48,7 @@ def exponential_and_gramian(
     (Van Loan 1978), this is accurate however fast the plant decays.
     """
     scaled_matrix, scaled_intensity = matrix / 2**DOUBLINGS, intensity / 2**DOUBLINGS
-    identity = jnp.eye(matrix.shape[0])
+    identity = xp.eye(matrix.shape[0])
 
     def horner(sums, k):
         exponential, integral = sums
@@ -64,8 +62,8 @@ def exponential_and_gramian(
         exponential, integral = sums
         return (exponential @ exponential, integral + exponential @ integral @ exponential.T), None
 
-    sums, _ = jax.lax.scan(horner, (identity, scaled_intensity), np.arange(SERIES_TERMS, 0.0, -1.0))
-    return jax.lax.scan(double, sums, length=DOUBLINGS)[0]
+    sums, _ = scan(horner, (identity, scaled_intensity), np.arange(SERIES_TERMS, 0.0, -1.0))
+    return scan(double, sums, length=DOUBLINGS)[0]
 
 
 def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
@@ -74,17 +72,17 @@ def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
     Without it, squaring an exponential of deflections in m and their rates in m/s loses digits.
     The balanced matrix is A * scale / scale[:, None].
     """
-    size = jnp.abs(matrix) * (1 - np.eye(matrix.shape[0]))
+    size = xp.abs(matrix) * (1 - np.eye(matrix.shape[0]))
 
     def equalise(_, scale):
         scaled = size * scale / scale[:, None]
-        rows, columns = jnp.sum(scaled, axis=1), jnp.sum(scaled, axis=0)
+        rows, columns = xp.sum(scaled, axis=1), xp.sum(scaled, axis=0)
         both = (rows > 0) & (columns > 0)
-        ratio = jnp.where(both, rows, 1.0) / jnp.where(both, columns, 1.0)
+        ratio = xp.where(both, rows, 1.0) / xp.where(both, columns, 1.0)
         return scale * ratio**0.25  # half the step for one state, as all change at once
 
-    start = jnp.ones(matrix.shape[0])
-    return jax.lax.stop_gradient(jax.lax.fori_loop(0, 20, equalise, start))
+    start = xp.ones(matrix.shape[0])
+    return stop_gradient(fori_loop(0, 20, equalise, start))
 
 
 def hermite_cubics(
@@ -96,12 +94,12 @@ def hermite_cubics(
 
     Straight lines without rates.
     """
-    difference = jnp.diff(values)
+    difference = xp.diff(values)
     start, end = (difference, difference)
     if rates is not None:
-        duration = jnp.diff(times)
+        duration = xp.diff(times)
         start, end = rates[:-1] * duration, rates[1:] * duration
-    return jnp.stack(
+    return xp.stack(
         [values[:-1], start, 3 * difference - 2 * start - end, start + end - 2 * difference], -1
     )
 
@@ -112,12 +110,13 @@ def evaluate_cubics(
     query_times: Float[Array, " *query"],
 ) -> Float[Array, " *query"]:
     """Values of piecewise cubics at any times (s); held before the first and after the last."""
-    interval = jnp.clip(
-        jnp.searchsorted(times, query_times, side="right") - 1, 0, coefficients.shape[0] - 1
+    interval = xp.clip(
+        xp.searchsorted(times, query_times, side="right") - 1, 0, coefficients.shape[0] - 1
     )
-    fraction = (query_times - times[interval]) / (times[interval + 1] - times[interval])
-    fraction = jnp.clip(fraction, 0.0, 1.0)[..., None]
-    interval_coefficients = coefficients[interval]
-    return jnp.sum(
+    start = take(times, interval)
+    fraction = (query_times - start) / (take(times, interval + 1) - start)
+    fraction = xp.clip(fraction, 0.0, 1.0)[..., None]
+    interval_coefficients = take(coefficients, interval)
+    return xp.sum(
         interval_coefficients * fraction ** np.arange(interval_coefficients.shape[-1]), axis=-1
     )

@@ -260,6 +260,15 @@ def solve_triangular(matrix, right, lower: bool):
     return scipy.linalg.solve_triangular(matrix, right, lower=lower, check_finite=False)
 
 
+def expm(matrix):
+    """Exponential of a matrix."""
+    if is_jax(matrix):
+        return jax.scipy.linalg.expm(matrix, max_squarings=40)
+    import scipy.linalg
+
+    return scipy.linalg.expm(matrix)
+
+
 def block_diag(*blocks):
     """Block-diagonal matrix."""
     if any(map(is_jax, blocks)):
