@@ -21,7 +21,7 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state, sensor_sections
 from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.runtime.arrays import Array, expm, scan, xp
+from jaxbeam.runtime.arrays import Array, expm, known, scan, xp
 from jaxbeam.runtime.compiling import compiled
 
 PERIOD_TOLERANCE = 1e-9  # of a period; smaller differences of times count as zero
@@ -224,7 +224,7 @@ class LoopDynamics(eqx.Module):
 
 def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
     """Loop dynamics of a case that has a controller; may be traced and batched."""
-    return _loop_dynamics(case, compiled_modal_model(case, layout))
+    return known(_loop_dynamics(case, compiled_modal_model(case, layout)))
 
 
 @compiled

@@ -17,7 +17,7 @@ from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.runtime.arrays import Array, scan, stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, known, scan, solve, stop_gradient, xp, zeros
 from jaxbeam.runtime.compiling import compiled
 
 NEWTON_ITERATIONS = 8  # towards the equilibrium about which the loop is linearised
@@ -58,7 +58,7 @@ class LinearisedLoop(eqx.Module):
         )
         left = xp.ones_like(right)
         for _ in range(2):
-            left = xp.linalg.solve(shifted, left / xp.linalg.norm(left))
+            left = solve(shifted, left / xp.linalg.norm(left))
         value = value + left @ ((self.closed_matrix - constant_matrix) @ right) / (left @ right)
         return value.real if self.period is None else xp.log(xp.abs(value)) / self.period
 
@@ -116,15 +116,19 @@ def loop_timing(case: Case) -> LoopTiming | None:
     return LoopTiming(period, delay, sensor_delays)
 
 
-@compiled
 def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoop:
     """Loop with loads frozen at t (s), linearised about the equilibrium under their weights."""
+    return known(_linearise(loop, timing, t))
+
+
+@compiled
+def _linearise(loop, timing, t):
     loop, modal_states = loop.freeze_loads(t), 2 * loop.plant.coordinate_scale.shape[0]
     if timing is None:
         A, input_matrix, weight_rates, command = loop.continuous_dynamics(t)
         equilibrium = _equilibrium(
             lambda state: A @ state + input_matrix @ command(state) + weight_rates,
-            xp.zeros(A.shape[0]),
+            zeros(A.shape[:1], like=A),
         )
         return LinearisedLoop(A, input_matrix, jax.jacfwd(command)(equilibrium), None, modal_states)
     start, rebuild = loop.rest_state(timing)

@@ -87,14 +87,8 @@ def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) ->
         times = np.linspace(*_crossing_interval(case), 101)[:-1] if case.loads else np.zeros(1)
     times = np.asarray(times, float)
     loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
-    loops = _frozen_loops(loop, timing, xp.asarray(times))
-    poles = [jax.tree.map(lambda part, i=i: part[i], loops).poles() for i in range(times.size)]
+    poles = [linearise(loop, timing, t).poles() for t in times]
     return FrozenPoles(times, _tracked_branches(np.stack(poles)))
-
-
-@compiled
-def _frozen_loops(loop, timing, times):
-    return jax.lax.map(lambda t: linearise(loop, timing, t), times)
 
 
 def growth(case: Case, points: int = 100) -> Growth:
@@ -114,7 +108,7 @@ def growth(case: Case, points: int = 100) -> Growth:
         )
         times = sampling_instants * timing.period
     steps = _substeps(loop, timing, times)
-    transitions, energy = _transition_matrices(loop, timing, xp.asarray(times), steps)
+    transitions, energy = _transition_matrices(loop, timing, times, steps)
     transitions, energy = np.asarray(transitions), np.asarray(energy)
     size = energy.shape[0]
     energy_root = np.linalg.cholesky(energy).T
@@ -158,7 +152,7 @@ def stream(case: Case, spacing: float) -> Stream:
     intervals = 1 if timing is None else round(spacing / timing.period)
     times = start + np.linspace(0.0, spacing, max(intervals, 20 if timing is None else 1) + 1)
     steps = _substeps(loop, timing, times)
-    transitions, _ = _transition_matrices(loop, timing, xp.asarray(times), steps)
+    transitions, _ = _transition_matrices(loop, timing, times, steps)
     return Stream(np.linalg.eigvals(np.asarray(transitions[-1])), float(spacing))
 
 
@@ -173,7 +167,7 @@ def _crossing_interval(case: Case) -> tuple[float, float]:
 
 def _substeps(loop, timing, times) -> int:
     """Steps between two of the times, short enough for MAX_PHASE_PER_STEP."""
-    fastest = float(xp.max(loop.plant.modal_model.modes.angular_frequencies))
+    fastest = float(np.max(loop.plant.modal_model.modes.angular_frequencies))
     longest = float(np.max(np.diff(times))) if timing is None else timing.period
     return max(1, math.ceil(fastest * longest / MAX_PHASE_PER_STEP))
 

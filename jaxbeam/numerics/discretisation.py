@@ -81,7 +81,7 @@ def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
         ratio = xp.where(both, rows, 1.0) / xp.where(both, columns, 1.0)
         return scale * ratio**0.25  # half the step for one state, as all change at once
 
-    start = xp.ones(matrix.shape[0])
+    start = xp.ones_like(xp.diagonal(matrix))
     return stop_gradient(fori_loop(0, 20, equalise, start))
 
 

@@ -136,6 +136,16 @@ def checkpoint(function: Callable, policy: Callable) -> Callable:
     return call
 
 
+def known(tree):
+    """The same tree with arrays of NumPy for those of JAX that are not traced."""
+
+    def to_numpy(leaf):
+        is_known = isinstance(leaf, jax.Array) and not isinstance(leaf, jax.core.Tracer)
+        return np.asarray(leaf) if is_known else leaf
+
+    return jax.tree.map(to_numpy, tree)
+
+
 def stop_gradient(tree):
     """The same numbers, of which derivatives are zero."""
     return jax.lax.stop_gradient(tree) if any_jax(tree) else tree

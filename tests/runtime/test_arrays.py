@@ -62,6 +62,8 @@ FUNCTIONS = {
     ),
     "solve": (arrays.solve, FACTOR, MATRIX),
     "solve, stacked": (arrays.solve, np.stack([FACTOR, FACTOR.T]), np.stack([MATRIX, MATRIX**2])),
+    "expm": (arrays.expm, FACTOR / 7 - np.eye(4)),
+    "known": (lambda a: arrays.known({"a": a, "b": (1, VECTOR)}), MATRIX),
     "block_diag": (lambda a, b: arrays.block_diag(a, b, np.eye(2)), MATRIX, FACTOR),
     "slice_in_dim": (lambda a: arrays.slice_in_dim(a, 1, None, axis=-1), MATRIX),
     "index_in_dim": (lambda a, i: arrays.index_in_dim(a, i, axis=1), MATRIX, 2),
@@ -222,3 +224,10 @@ def test_products_of_any_subscripts(product):
     of_jax = xp.einsum(subscripts, jnp.asarray(a), b)
     assert isinstance(of_jax, jax.Array)
     assert_allclose(of_jax, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_known_numbers_of_jax_become_those_of_numpy():
+    tree = arrays.known({"a": jnp.asarray(VECTOR), "b": "words"})
+    assert isinstance(tree["a"], np.ndarray)
+    np.testing.assert_array_equal(tree["a"], VECTOR)
+    assert tree["b"] == "words"
