@@ -1,0 +1,250 @@
+"""Every physics function gives the same from known numbers, in NumPy, as traced by `jax.jit`.
+
+Both come from the same lines (see `jaxbeam.runtime.arrays`); here they are called both ways, with
+the same numbers. What compiles nothing is counted in a process of its own.
+"""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.case.filters import Filter
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.integrator.discrete_model import discrete_model
+from jaxbeam.integrator.integrate import max_stable_step
+from jaxbeam.integrator.propagators import propagators
+from jaxbeam.integrator.time_grid import grid_by_step_length
+from jaxbeam.model.contact import contact_at, load_set
+from jaxbeam.model.flexibility import flexibility
+from jaxbeam.model.modal_model import has_coupling, modal_model
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.output_rows import sensor_rows
+from jaxbeam.model.statics import static_deflection_per_command
+from jaxbeam.runtime.arrays import any_jax
+from jaxbeam.simulation.integration_plan import (
+    integration_plan,
+    run_peaks,
+    sample_times,
+    static_shapes,
+)
+
+TOLERANCE = 1e-11  # relative to the largest entry of each array
+# Where a curve is flat, its values differ by the square of a difference in time.
+PEAK_TIME_TOLERANCE = 1e-7
+
+BEAM = jb.Beam(
+    length=1.2,
+    flexural_rigidity=11.68,
+    mass_per_length=0.535,
+    damping_ratio=[0.03, 0.02, 0.02, 0.01],
+    ends="clamped-pinned",
+    modes=4,
+)
+SENSORS = tuple(
+    jb.Sensor(0.2 + 0.2 * i, quantity, fibre_distance=1e-3 if entry.at_fibre else None)
+    for i, (quantity, entry) in enumerate(QUANTITIES.items())
+)
+TABLE = {"times": [0.0, 0.05, 0.2, 0.3], "positions": [0.9, 0.6, 0.7, 0.2]}
+RUN = jb.Run(duration=0.25, sample_rate=200.0)
+MASSES = jb.Case(
+    BEAM,
+    supports=[jb.Support(0.5), jb.Support(1.2, rotational_stiffness=3.0)],
+    sensors=SENSORS,
+    loads=[
+        jb.MovingMass(mass=0.1, speed=6.0),
+        jb.MovingMass(mass=0.05, speed=-5.0, entry_time=0.05, deceleration=8.0),
+        jb.MovingForce(force=3.0, speed=9.0, entry_time=0.02),
+    ],
+    run=RUN,
+)
+CASES = {
+    "masses on two spans": MASSES,
+    "a table of positions": dataclasses.replace(
+        MASSES, supports=(), loads=(jb.MovingMass(mass=0.1, **TABLE),)
+    ),
+    "forces": dataclasses.replace(
+        MASSES, loads=(jb.MovingForce(force=3.0, speed=6.0), jb.MovingForce(mass=0.2, **TABLE))
+    ),
+    "no loads": dataclasses.replace(MASSES, loads=()),
+    "coupled": dataclasses.replace(
+        MASSES,
+        supports=(jb.Support(0.5, stiffness=3e3, damping=2.0),),
+        actuators=(
+            jb.SpringDamper(0.3, 500.0, 1.5),
+            jb.Patch(0.6, 0.8, 1e-3, added_mass=0.05, added_rigidity=2.0),
+            jb.Shaker(0.9, stiffness=200.0),
+            jb.Electrodynamic(0.35, resistance=2.0, inductance=1e-3, force_constant=4.0, mass=0.03),
+        ),
+    ),
+}
+
+
+def _model(case, layout):
+    return modal_model(case, layout, has_coupling(case))
+
+
+def _forces_on_the_beam(case, layout):
+    """Contact forces and accelerations at some instants, for arbitrary states."""
+    model, times = _model(case, layout), np.linspace(0.01, 0.2, 7)
+    states = 1e-3 * np.sin(np.arange(times.size * model.state_count)).reshape(times.size, -1, 1)
+    return contact_at(model, load_set(case), times, states)
+
+
+def _discrete_model(case, layout):
+    model = _model(case, layout)
+    grid = grid_by_step_length(case, model, np.float64(0.004))
+    return grid, discrete_model(model, grid, case.sensor_positions)
+
+
+PAIR = [("force@0.3", "velocity@0.7")]
+X = np.array([0.1, 0.45, 0.77])
+FUNCTIONS = {
+    "modes": lambda case, layout: jb.modes(case, layout),
+    "mode shapes": lambda case, layout: jb.modes(case, layout).shape_derivatives(X, (0, 1, 2)),
+    "modal model": _model,
+    "full modal model": lambda case, layout: modal_model(case, layout),
+    "contact": _forces_on_the_beam,
+    "propagators": lambda case, layout: propagators(
+        _model(case, layout), np.array([0.0, 1e-4, 0.01]), with_commands=has_coupling(case)
+    ),
+    "longest step": lambda case, layout: max_stable_step(_model(case, layout), case.loads),
+    "discrete model": _discrete_model,
+    "output rows": lambda case, layout: sensor_rows(_model(case, layout), case.sensors),
+    "flexibility": lambda case, layout: flexibility(case, layout, X, 0)(X / 1.2, 0),
+    "influence line": lambda case, layout: [
+        jb.influence_line(case, X, X[:2, None], derivative, layout) for derivative in (0, 2, 3)
+    ],
+    "influence at a point": lambda case, layout: jb.influence_line(case, 0.3, 0.8, layout=layout),
+    "static deflection": lambda case, layout: jb.static_deflection(
+        case, X, X[:2], np.array([2.0, -1.0]), layout=layout
+    ),
+    "deflection per command": lambda case, layout: static_deflection_per_command(
+        case, X, layout=layout
+    ),
+    "static peak": lambda case, layout: jb.static_peak(case, X, layout),
+    "frequency response": lambda case, layout: jb.frequency_response(
+        case,
+        np.array([1.0, 20.0, 70.0]),
+        [("force@0.3", "velocity@0.7")],
+        stationary_masses=[(0.3, 0.2)],
+        layout=layout,
+    ),
+    "receptance": lambda case, layout: jb.receptance(
+        case, np.array([5.0, 40.0]), 0.3, 0.7, layout=layout
+    ),
+    "state space": lambda case, layout: [
+        jb.state_space(case, layout=layout).at(t) for t in (0.01, 0.06)
+    ],
+}
+
+
+def both_ways(function, case: jb.Case):
+    """Arrays that a function of a case returns with its numbers known, and with them traced."""
+    numbers, rest = eqx.partition(case, eqx.is_array)
+
+    def arrays(numbers):
+        return eqx.filter(function(eqx.combine(numbers, rest)), eqx.is_array)
+
+    known = arrays(numbers)
+    assert not any_jax(known), "known numbers give arrays of NumPy"
+    return known, jax.jit(arrays)(numbers)
+
+
+def assert_equal(known, traced):
+    """Equal structure, and arrays that agree to TOLERANCE; infinite and missing entries alike."""
+    known, traced = (jax.tree.leaves_with_path(tree) for tree in (known, traced))
+    assert [path for path, _ in known] == [path for path, _ in traced]
+    for (path, ours), (_, theirs) in zip(known, traced, strict=True):
+        scale = np.max(np.abs(theirs), initial=0.0, where=np.isfinite(theirs))
+        name = jax.tree_util.keystr(path)
+        tolerance = PEAK_TIME_TOLERANCE if name.endswith("peak_time") else TOLERANCE
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * scale, err_msg=name)
+
+
+OF_LOADS = ("contact", "longest step", "discrete model", "static peak", "state space")
+PAIRS = [
+    (function, name)
+    for function in FUNCTIONS
+    for name in (CASES if function in OF_LOADS else ("masses on two spans", "coupled"))
+    if (function, name) != ("longest step", "no loads")  # no load limits it
+]
+
+
+@pytest.mark.parametrize(("function", "name"), PAIRS)
+def test_known_and_traced_numbers_give_the_same(function, name):
+    case, layout = CASES[name], mesh_layout(CASES[name])
+    assert_equal(*both_ways(lambda case: FUNCTIONS[function](case, layout), case))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_records_of_known_and_traced_numbers_are_the_same(name):
+    """Histories of the modes and of every quantity at the sensors, contact forces and peaks."""
+    plan, times = integration_plan(CASES[name]), sample_times(CASES[name])
+
+    def simulate(case):
+        record = jb.simulate(case, times, plan)
+        histories = [record.at(0.33, quantity, 1e-3) for quantity in QUANTITIES]
+        return record, histories, record.measured, record.strain
+
+    assert_equal(*both_ways(simulate, CASES[name]))
+
+
+@pytest.mark.parametrize("name", ["masses on two spans", "forces", "coupled"])
+def test_peaks_of_known_and_traced_numbers_are_the_same(name):
+    case = CASES[name]
+    shapes = static_shapes(case)
+
+    def peaks(case):
+        return run_peaks(case, shapes, np.float64(2e-3), case.sensor_positions).peaks()
+
+    assert_equal(*both_ways(peaks, case))
+
+
+@pytest.mark.parametrize(
+    "reading",
+    [
+        {"resolution": 1e-6, "range": [-1.0, 1.0], "offset": 0.2},
+        {"delay": 0.004, "sampling_period": 0.01},
+        {"filter": Filter(40.0, 2)},
+        {"noise": 1e-6},
+    ],
+    ids=["quantised", "delayed", "filtered", "noisy"],
+)
+def test_readings_of_known_and_traced_numbers_are_the_same(reading):
+    case = dataclasses.replace(MASSES, sensors=(jb.Sensor(0.3, **reading),))
+    plan, times = integration_plan(case), sample_times(case)
+    assert_equal(*both_ways(lambda case: jb.simulate(case, times, plan).measured, case))
+
+
+COMPILES_NOTHING = {
+    "modes": "jb.modes(case)",
+    "simulate": "jb.simulate(case)",
+    "another number of loads and modes": "jb.simulate(other)",
+}
+
+
+@pytest.mark.parametrize("name", COMPILES_NOTHING)
+def test_plain_calls_compile_nothing(name, tmp_path):
+    jb.save_case(MASSES, tmp_path / "case.toml")
+    code = (
+        "import jax; jax.config.update('jax_log_compiles', True)\n"
+        "import dataclasses, jaxbeam as jb\n"
+        f"case = jb.load_case({str(tmp_path / 'case.toml')!r})\n"
+        "beam = dataclasses.replace(case.beam, modes=7, damping_ratio=0.01)\n"
+        "other = dataclasses.replace(case, beam=beam, loads=case.loads[:2])\n"
+        f"{COMPILES_NOTHING[name]}\n"
+    )
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    ended = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert [line for line in ended.stderr.splitlines() if "ompil" in line] == []
