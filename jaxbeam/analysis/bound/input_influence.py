@@ -33,7 +33,7 @@ from jaxbeam.simulation.integration_plan import (
 )
 
 TOLERANCE = 1e-9  # relative to the largest deflection
-MAX_BATCH_SIZE = 256  # unit commands at once; more exceed the cache of the processor
+MAX_BATCH_SIZE = 1024  # unit commands at once; more take gigabytes
 MAX_RESPONSE_SIZE = 3e8  # numbers in `response`: 2.4 GB
 
 

@@ -16,6 +16,7 @@ from jaxbeam.analysis.bound.input_influence import InputInfluence
 LP_TOLERANCE = 1e-9  # feasibility tolerance of the solver
 VIOLATION_TOLERANCE = 1e-7  # rows violated by less are not added
 ACTIVITY_PENALTY = 1e-6  # on a change of a command, or its mean absolute value, of its scale
+FIRST_ROWS = 0.5  # deflection without commands above which rows are in the first round
 MAX_ROUNDS = 100  # of adding rows; about five are usual
 HIGHS_METHODS = ("highs", "highs-ipm")  # the simplex method fails on some programs
 SOLVED, INFEASIBLE = 0, 2  # status of linprog
@@ -35,7 +36,7 @@ def least_peak(
     Raises ValueError if no commands meet the limits, RuntimeError if the solver fails.
     """
     program = _LinearProgram(influence, low, high, max_change)
-    commands, peak = np.zeros(influence.response.shape[2:]), 0.0
+    commands, peak = np.zeros(influence.response.shape[2:]), FIRST_ROWS
     for _ in range(MAX_ROUNDS):
         if not program.add_violated_rows(commands, peak):
             break
