@@ -18,7 +18,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import Array, known, scan, solve, stop_gradient, xp, zeros
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.compiling import LOW_OPTIMISATION, compiled
 
 NEWTON_ITERATIONS = 8  # towards the equilibrium about which the loop is linearised
 EIGENVALUE_OFFSET = 1e-10  # of the shift of inverse iteration from an eigenvalue, relative
@@ -121,7 +121,7 @@ def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoo
     return known(_linearise(loop, timing, t))
 
 
-@compiled
+@compiled(**LOW_OPTIMISATION)
 def _linearise(loop, timing, t):
     loop, modal_states = loop.freeze_loads(t), 2 * loop.plant.coordinate_scale.shape[0]
     if timing is None:
