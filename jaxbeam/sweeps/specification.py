@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.aliases import current_address
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.declared_checks import describe_value
 from jaxbeam.case.validation import check_case
@@ -145,6 +146,7 @@ def sweep_specification(
         raise ValueError("give at least one address to sweep over, with a list of values")
     if not case.sensors:
         raise ValueError("the case has no sensors, and peaks are taken there; add one to `sensors`")
+    over = {current_address(address): given for address, given in over.items()}
     axes = {address: _checked_values(case, address, given) for address, given in over.items()}
     for address in axes:
         if histories and address in ("run.duration", "run.sample_rate"):

@@ -20,6 +20,7 @@ from jaxbeam.files.case_file import (
     with_settings,
 )
 from jaxbeam.simulation.record import record_from_xarray
+from jaxbeam.sweeps.specification import specification_from_dict, sweep_specification
 
 BEAM = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535, "modes": 1}
 CASE = {
@@ -106,6 +107,28 @@ def test_old_words_in_a_saved_record():
     dataset.attrs["case"] = json.dumps(content)
     with pytest.warns(FutureWarning, match="controller.recognition is called"):
         assert eqx.tree_equal(record_from_xarray(dataset).case, record.case)
+
+
+def test_old_words_in_a_stored_sweep():
+    """A store made before the renaming is continued: the case and the addresses are read."""
+    case = case_from_dict(CASE | {"controller": present(IDENTIFIED)})
+    old, new = "controller.recognition.until", "controller.load_identification.until"
+    settings = {
+        "paired": False,
+        "histories": False,
+        "tolerance": 1e-6,
+        "precision": "double",
+    }.values()
+    expected = sweep_specification(case, {new: [0.3, 0.4]}, *settings)
+    content = json.loads(json.dumps(expected.to_dict()))
+    controller = content["case"]["controller"]
+    controller["recognition"] = controller.pop("load_identification")
+    with pytest.warns(FutureWarning, match="controller.recognition is called"):
+        specification = specification_from_dict(content)
+    assert eqx.tree_equal(specification.case, expected.case)
+    with pytest.warns(FutureWarning, match="controller.recognition.until is called"):
+        by_old_address = sweep_specification(case, {old: [0.3, 0.4]}, *settings)
+    assert by_old_address.axes.keys() == expected.axes.keys()
 
 
 @pytest.mark.parametrize(("old", "new"), aliases.NAMES.items())
