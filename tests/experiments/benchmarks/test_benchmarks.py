@@ -29,6 +29,7 @@ def test_one_command_runs_all_benchmarks(capsys, monkeypatch):
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     folder = Path(benchmarks.__file__ or "").parent
     runnable = {path.stem for path in folder.glob("[a-z]*.py") if "def main()" in path.read_text()}
+    runnable |= {path.parent.name for path in folder.glob("*/__main__.py")}
     assert set(listed) == runnable
     monkeypatch.setattr(sys, "argv", ["benchmarks", "sweeep"])
     with pytest.raises(SystemExit):

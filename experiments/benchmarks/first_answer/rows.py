@@ -1,0 +1,242 @@
+"""Rows of the benchmark `first_answer`: what is timed, and the goal in seconds. Imports no JAX."""
+
+from typing import NamedTuple
+
+# Six modes on two spans, two loads, 2 s at 1 kHz; `rivals/two_spans_script.py` has the same.
+TWO_SPANS = """
+[beam]
+length = 1.2
+flexural_rigidity = 11.68
+mass_per_length = 0.535
+damping_ratio = 0.03
+ends = "clamped-pinned"
+modes = 6
+[[supports]]
+position = 0.5
+[[sensors]]
+position = 0.2
+[[sensors]]
+position = 0.8
+[[loads]]
+kind = "mass"
+mass = 0.3
+speed = 1.0
+[[loads]]
+kind = "force"
+force = 3.0
+speed = 1.3
+entry_time = 0.3
+[run]
+duration = 2.0
+sample_rate = 1000
+"""
+PATCHES = "".join(
+    f"""
+[[actuators]]
+kind = "patch"
+start = {start}
+end = {start + 0.085}
+moment_per_volt = 8.292e-4
+amplifier_gain = 200.0
+limits = [-2.5, 7.5]
+"""
+    for start in (0.16, 0.76)
+)
+WEIGHTS = f"""
+state_weight = {[1e6] * 12}
+command_weight = [1.0, 1.0]
+period = 0.002
+"""
+KALMAN = """
+[controller.estimator]
+kind = "kalman"
+process_noise = 0.02
+measurement_noise = 1e-5
+loads = "known"
+"""
+CONTROLLERS = {
+    "feedback": 'kind = "feedback"\ngains = [2e3, 2e3]\nperiod = 0.002\n',
+    "LQR": f'kind = "dlqr"{WEIGHTS}',
+    "LQR with Kalman filter": f'kind = "dlqr"{WEIGHTS}{KALMAN}',
+    "MPC": 'kind = "mpc"\nhorizon = 6\nmoves = 4\nmove_weight = 1e-11\nloads = "known"\n'
+    "period = 0.002\n",
+}
+
+# Axles of the train HSLM-A1 of EN 1991-2: 50 of 170 kN, the first at 0 (m).
+POWER_CAR, BOGIE = (0.0, 3.0, 14.0, 17.0), (0.0, 2.0)
+AXLES = [
+    *POWER_CAR,
+    *(20.525 + x for x in BOGIE),
+    *(35.7625 + 18.0 * i + x for i in range(19) for x in BOGIE),
+    *(375.0 + x for x in BOGIE),
+    *(380.525 + x for x in POWER_CAR),
+]
+SPAN, TRAIN_SPEED = 25.0, 64.5  # m, m/s
+SPEEDS = [40.0 + 0.5 * i for i in range(101)]  # m/s
+
+
+def train(axles: int, kind: str = 'force"\nforce = 170e3', speed: float = TRAIN_SPEED) -> str:
+    """Case file of a bridge under the first axles of the train."""
+    loads = [
+        f'[[loads]]\nkind = "{kind}\nspeed = {speed}\nentry_time = {x / speed}\n'
+        for x in AXLES[:axles]
+    ]
+    return f"""
+[beam]
+length = {SPAN}
+flexural_rigidity = 3.05e10
+mass_per_length = 15000.0
+damping_ratio = 0.01
+modes = 6
+[[sensors]]
+position = {SPAN / 2}
+{"".join(loads)}
+[run]
+duration = {(AXLES[axles - 1] + SPAN) / speed + 1.0}
+sample_rate = 1000
+"""
+
+
+def over_speeds() -> tuple[str, ...]:
+    """Options of `jaxbeam sweep` for the whole train at all speeds."""
+    values = {f"loads.{i}.speed": SPEEDS for i in range(len(AXLES))}
+    values |= {f"loads.{i}.entry_time": [x / v for v in SPEEDS] for i, x in enumerate(AXLES)}
+    options = [f"--over={a}={','.join(map(repr, numbers))}" for a, numbers in values.items()]
+    return (*options, "--paired")
+
+
+class Row(NamedTuple):
+    """A row of the table.
+
+    Either `command`, arguments of `jaxbeam` in a process of its own, or `code` in a process that
+    has run SETUP and `setup`; `{case}` stands for the case file, of text `case`. The `goal` (s) is
+    of processor time; with `beyond_jax` it is beyond `import jax`. Rows that follow from the one
+    before (`again`) find its cache and files. `slow` rows are measured once.
+    """
+
+    name: str
+    goal: float
+    command: tuple[str, ...] = ()
+    code: str = ""
+    setup: str = ""
+    case: str = TWO_SPANS
+    beyond_jax: bool = False
+    again: bool = False
+    slow: bool = False
+    fails: bool = False
+
+
+SETUP = """
+import dataclasses, numpy as np, jaxbeam as jb
+jb.modes, jb.simulate, jb.sweep, jb.state_space, jb.frequency_response, jb.static_peak, jb.bound
+from jaxbeam.analysis.linearised_loop import linearised_loop
+from jaxbeam.analysis.margins import margins
+from jaxbeam.analysis.stability import frozen_poles, growth
+case = jb.load_case("{case}")
+"""
+SWEPT = "loads.0.mass", "loads.0.speed"
+RECORD = ("simulate", "{case}", "-o", "run.nc", "--plot", "--overwrite")
+DEMO = """
+import tomllib, tuning
+from importlib import resources
+data = resources.files("jaxbeam") / "demo"
+case, truth = jb.load_case(data / "rig.toml"), tomllib.loads((data / "truth.toml").read_text())
+logs = [tuning.read_log(data / f"log_{i}.csv") for i in (1, 2, 3)]
+"""
+CONTROLLED = {name: f"{TWO_SPANS}{PATCHES}[controller]\n{c}" for name, c in CONTROLLERS.items()}
+ROWS = (
+    Row("`jaxbeam --help`", 0.4, ("--help",)),
+    Row("a wrong argument", 0.4, ("simulate", "{case}", "--plott"), fails=True),
+    Row("`jaxbeam modes`", 0.5, ("modes", "{case}"), beyond_jax=True),
+    Row("`jaxbeam simulate`, record and picture", 1.0, RECORD, beyond_jax=True),
+    Row(
+        "... after a changed number",
+        1.0,
+        (*RECORD, "--set", "loads.0.mass=0.31"),
+        beyond_jax=True,
+        again=True,
+    ),
+    *(
+        Row(f"... with {name}", 3.0, RECORD, case=case, beyond_jax=True)
+        for name, case in CONTROLLED.items()
+    ),
+    Row("`jb.modes`", 0.05, code="jb.modes(case)"),
+    Row("`jb.simulate`", 0.3, code="jb.simulate(case)"),
+    Row(
+        "... after a changed number",
+        0.3,
+        setup="jb.simulate(case)\nbeam = dataclasses.replace(case.beam, flexural_rigidity=12.0)",
+        code="jb.simulate(dataclasses.replace(case, beam=beam))",
+    ),
+    *(
+        Row(f"... with {name}", 3.0, code="jb.simulate(case)", case=case)
+        for name, case in CONTROLLED.items()
+    ),
+    *(
+        Row(f"a train of {axles} forces", goal, code="jb.simulate(case)", case=train(axles))
+        for axles, goal in ((4, 0.5), (16, 1.0), (50, 3.0))
+    ),
+    Row(
+        "a train of 50 masses",
+        3.0,
+        code="jb.simulate(case)",
+        case=train(50, 'mass"\nmass = 17000.0'),
+    ),
+    Row(
+        "HSLM-A1, 50 forces x 101 speeds, command",
+        10.0,
+        ("sweep", "{case}", *over_speeds(), "-o", "speeds.zarr"),
+        case=train(len(AXLES), speed=SPEEDS[0]),
+        slow=True,
+    ),
+    Row(
+        "... again",
+        3.0,
+        ("sweep", "{case}", *over_speeds(), "-o", "again.zarr"),
+        case=train(len(AXLES), speed=SPEEDS[0]),
+        again=True,
+        slow=True,
+    ),
+    Row("`jb.state_space`", 0.3, code="jb.state_space(case).at(0.5).A"),
+    Row(
+        "`jb.frequency_response`",
+        0.3,
+        code='jb.frequency_response(case, np.geomspace(1, 400, 2000), [("force@0.3", '
+        '"deflection@0.8")])',
+    ),
+    Row("`jb.static_peak`", 0.3, code="jb.static_peak(case, [0.2, 0.8])"),
+    Row("`jb.influence_line`", 0.3, code="jb.influence_line(case, 0.8, np.linspace(0, 1.2, 101))"),
+    Row("`jb.bound`", 2.0, code="jb.bound(case)", case=CONTROLLED["feedback"]),
+    Row(
+        "stability: margins, poles, growth",
+        0.3,
+        code="margins(linearised_loop(case, -1.0), 0), frozen_poles(case), growth(case)",
+        case=CONTROLLED["feedback"],
+    ),
+    Row(
+        "`jaxbeam sweep`, 4096 runs",
+        2.5,
+        (
+            "sweep",
+            "{case}",
+            *(f"--over={SWEPT[i]}={limits}:64" for i, limits in enumerate(("0.1:0.5", "0.7:3"))),
+            "-o",
+            "runs.zarr",
+        ),
+        beyond_jax=True,
+    ),
+    Row(
+        "`jb.sweep`, 4096 runs",
+        1.0,
+        code="jb.sweep(case, over, progress=False)",
+        setup=f"over = dict(zip({SWEPT}, (np.linspace(0.1, 0.5, 64), np.linspace(0.7, 3, 64))))",
+    ),
+    Row(
+        "`tuning.identify` of the demo",
+        10.0,
+        code="tuning.identify(case, logs, dict.fromkeys(truth))",
+        setup=DEMO,
+        slow=True,
+    ),
+    Row("`jaxbeam demo`", 30.0, ("demo",), slow=True),
+)
