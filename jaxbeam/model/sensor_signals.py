@@ -80,7 +80,7 @@ def to_reading(sensor: Sensor, value, noise=None) -> Float[Array, "..."]:
 def noise_samples(seed: int, sensors: int, samples: int) -> Float[Array, "sample sensor"]:
     """Standard normal samples, one a reading; a sensor's depend on the seed and its index only."""
     columns = [normal_samples(seed, sensor, samples) for sensor in range(sensors)]
-    return np.array(columns).reshape(sensors, samples).T
+    return xp.array(columns).reshape(sensors, samples).T
 
 
 def needs_times(sensor: Sensor) -> bool:

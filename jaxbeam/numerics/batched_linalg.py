@@ -103,7 +103,7 @@ def solve_unpivoted(
     a batch to the threads that wait for it.
     """
     if not any_jax(matrix, right):
-        return np.linalg.solve(matrix, right)
+        return xp.linalg.solve(matrix, right)
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x,
         right,

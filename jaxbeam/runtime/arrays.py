@@ -68,16 +68,18 @@ class _Namespace:
         known, traced = getattr(self._known, name), getattr(self._traced, name)
         known = _einsum if name == "einsum" else known
         if name == "linalg":
-            attribute = _Namespace(known, traced)
+            attribute: Any = _Namespace(known, traced)
         elif isinstance(known, type) or not callable(known):
             attribute = known
         else:
 
             @functools.wraps(known)
-            def attribute(*args, **kwargs):
+            def call(*args, **kwargs):
                 if any(map(is_jax, args)) or (kwargs and any(map(is_jax, kwargs.values()))):
                     return traced(*args, **kwargs)
                 return known(*args, **kwargs)
+
+            attribute = call
 
         setattr(self, name, attribute)  # found without this method from now on
         return attribute
@@ -91,12 +93,12 @@ else:
     Array = jax.Array | np.ndarray | np.generic
 
 
-def take(array, index):
+def take(array, index) -> Any:
     """Entries at an index along the first axis, one that may be traced in a known array."""
     return jnp.asarray(array)[index] if is_jax(index) else array[index]
 
 
-def set_at(array, index, value):
+def set_at(array, index, value) -> Any:
     """Copy of an array with the entries at an index replaced."""
     if is_jax(array) or is_jax(index) or is_jax(value):
         return jnp.asarray(array, jnp.result_type(array, value)).at[index].set(value)
@@ -105,7 +107,7 @@ def set_at(array, index, value):
     return array
 
 
-def add_at(array, index, value):
+def add_at(array, index, value) -> Any:
     """Copy of an array with a value added to the entries at an index; repeated ones accumulate."""
     if is_jax(array) or is_jax(index) or is_jax(value):
         return jnp.asarray(array, jnp.result_type(array, value)).at[index].add(value)
@@ -114,7 +116,7 @@ def add_at(array, index, value):
     return array
 
 
-def put(array, index, values):
+def put(array, index, values) -> Any:
     """Copy of an array with the rows at some indices replaced; indices beyond the end are left out.
 
     One index at most may lie within the array more than once.
@@ -136,7 +138,7 @@ def checkpoint(function: Callable, policy: Callable) -> Callable:
     return call
 
 
-def known(tree):
+def known(tree) -> Any:
     """The same tree with arrays of NumPy for those of JAX that are not traced."""
 
     def to_numpy(leaf):
@@ -146,17 +148,17 @@ def known(tree):
     return jax.tree.map(to_numpy, tree)
 
 
-def stop_gradient(tree):
+def stop_gradient(tree) -> Any:
     """The same numbers, of which derivatives are zero."""
     return jax.lax.stop_gradient(tree) if any_jax(tree) else tree
 
 
-def zeros(shape: tuple[int, ...], like: Any):
+def zeros(shape: tuple[int, ...], like: Any) -> Any:
     """Zeros, of JAX if any leaf of `like` is: the start of a loop that will hold such numbers."""
     return (jnp if any_jax(like) else np).zeros(shape)
 
 
-def scan(step: Callable, carry, inputs=None, length: int | None = None):
+def scan(step: Callable, carry, inputs=None, length: int | None = None) -> Any:
     """`jax.lax.scan`: a loop over the first axis of inputs; the final carry and stacked outputs.
 
     Known numbers become those of JAX where the function of a step has others among its own.
@@ -173,12 +175,12 @@ def scan(step: Callable, carry, inputs=None, length: int | None = None):
     return carry, jax.tree.map(lambda *parts: np.stack(parts), *outputs)
 
 
-def map_elements(function: Callable, inputs):
+def map_elements(function: Callable, inputs) -> Any:
     """`jax.lax.map`: results of a function of each element along the first axis, stacked."""
     return scan(lambda _, element: (None, function(element)), None, inputs)[1]
 
 
-def while_loop(condition: Callable, step: Callable, carry):
+def while_loop(condition: Callable, step: Callable, carry) -> Any:
     """`jax.lax.while_loop`."""
     start = carry
     while not any_jax(carry) and not is_jax(going_on := condition(carry)):
@@ -188,7 +190,7 @@ def while_loop(condition: Callable, step: Callable, carry):
     return jax.lax.while_loop(condition, step, start)
 
 
-def cond(predicate, if_true: Callable, if_false: Callable, *operands):
+def cond(predicate, if_true: Callable, if_false: Callable, *operands) -> Any:
     """`jax.lax.cond`; only one branch is computed where the predicate is known."""
     if is_jax(predicate):
         return jax.lax.cond(predicate, if_true, if_false, *operands)
@@ -202,7 +204,7 @@ class custom_jvp:
         self.function, self.traced = function, jax.custom_jvp(function)
         functools.update_wrapper(self, function)
 
-    def __call__(self, *args):
+    def __call__(self, *args) -> Any:
         return self.traced(*args) if any_jax(args) else self.function(*args)
 
     def defjvp(self, rule: Callable) -> Callable:
@@ -210,7 +212,7 @@ class custom_jvp:
         return self.traced.defjvp(rule)
 
 
-def fori_loop(start: int, end: int, step: Callable, carry):
+def fori_loop(start: int, end: int, step: Callable, carry) -> Any:
     """`jax.lax.fori_loop`."""
     return scan(lambda carry, i: (step(i, carry), None), carry, np.arange(start, end))[0]
 
@@ -243,12 +245,12 @@ def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
     return mapped
 
 
-def optimization_barrier(tree):
+def optimization_barrier(tree) -> Any:
     """`jax.lax.optimization_barrier`: values that XLA does not compute twice."""
     return jax.lax.optimization_barrier(tree) if any_jax(tree) else tree
 
 
-def solve(matrix, right):
+def solve(matrix, right) -> Any:
     """Solutions of linear systems (..., row, column); not finite where the matrix is singular."""
     if is_jax(matrix) or is_jax(right):
         return jnp.linalg.solve(matrix, right)
@@ -261,7 +263,7 @@ def solve(matrix, right):
         return np.where(singular[..., None, None] if right.ndim > 1 else singular, np.nan, solution)
 
 
-def solve_triangular(matrix, right, lower: bool):
+def solve_triangular(matrix, right, lower: bool) -> Any:
     """Solution of a triangular system."""
     if is_jax(matrix) or is_jax(right):
         return jax.scipy.linalg.solve_triangular(matrix, right, lower=lower)
@@ -270,7 +272,7 @@ def solve_triangular(matrix, right, lower: bool):
     return scipy.linalg.solve_triangular(matrix, right, lower=lower, check_finite=False)
 
 
-def expm(matrix):
+def expm(matrix) -> Any:
     """Exponential of a matrix."""
     if is_jax(matrix):
         return jax.scipy.linalg.expm(matrix, max_squarings=40)
@@ -279,7 +281,7 @@ def expm(matrix):
     return scipy.linalg.expm(matrix)
 
 
-def block_diag(*blocks):
+def block_diag(*blocks) -> Any:
     """Block-diagonal matrix."""
     if any(map(is_jax, blocks)):
         return jax.scipy.linalg.block_diag(*blocks)
@@ -290,14 +292,14 @@ def block_diag(*blocks):
     return matrix
 
 
-def slice_in_dim(array, start: int | None, end: int | None, axis: int):
+def slice_in_dim(array, start: int | None, end: int | None, axis: int) -> Any:
     """Slice along one axis; XLA compiles it several times as fast as an index of JAX."""
     if isinstance(array, jax.Array):
         return jax.lax.slice_in_dim(array, start, end, axis=axis)
     return array[(slice(None),) * (axis % array.ndim) + (slice(start, end),)]
 
 
-def index_in_dim(array, index, axis: int = 0, keepdims: bool = True):
+def index_in_dim(array, index, axis: int = 0, keepdims: bool = True) -> Any:
     """Entry at an index along one axis."""
     if is_jax(array) or is_jax(index):
         return jax.lax.dynamic_index_in_dim(array, index, axis, keepdims)
@@ -305,13 +307,13 @@ def index_in_dim(array, index, axis: int = 0, keepdims: bool = True):
     return array[(slice(None),) * axis + (index,)]
 
 
-def collapse(array, start: int, end: int):
+def collapse(array, start: int, end: int) -> Any:
     """The array with the axes from start until before end made one."""
     shape = array.shape
     return array.reshape(*shape[:start], -1, *shape[end:])
 
 
-def searchsorted(ascending, values):
+def searchsorted(ascending, values) -> Any:
     """Number of the ascending entries that are not above each value; for few entries."""
     if is_jax(ascending) or is_jax(values):
         return jnp.searchsorted(ascending, values, side="right", method="compare_all")
