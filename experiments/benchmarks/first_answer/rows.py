@@ -45,7 +45,7 @@ limits = [-2.5, 7.5]
 WEIGHTS = f"""
 state_weight = {[1e6] * 12}
 command_weight = [1.0, 1.0]
-period = 0.002
+period = 0.001
 """
 KALMAN = """
 [controller.estimator]
@@ -55,11 +55,11 @@ measurement_noise = 1e-5
 loads = "known"
 """
 CONTROLLERS = {
-    "feedback": 'kind = "feedback"\ngains = [2e3, 2e3]\nperiod = 0.002\n',
+    "feedback": 'kind = "feedback"\ngains = [2e3, 2e3]\nperiod = 0.001\n',
     "LQR": f'kind = "dlqr"{WEIGHTS}',
     "LQR with Kalman filter": f'kind = "dlqr"{WEIGHTS}{KALMAN}',
     "MPC": 'kind = "mpc"\nhorizon = 6\nmoves = 4\nmove_weight = 1e-11\nloads = "known"\n'
-    "period = 0.002\n",
+    "period = 0.001\n",
 }
 
 # Axles of the train HSLM-A1 of EN 1991-2: 50 of 170 kN, the first at 0 (m).
@@ -145,7 +145,7 @@ logs = [tuning.read_log(data / f"log_{i}.csv") for i in (1, 2, 3)]
 """
 CONTROLLED = {name: f"{TWO_SPANS}{PATCHES}[controller]\n{c}" for name, c in CONTROLLERS.items()}
 ROWS = (
-    Row("`jaxbeam --help`", 0.4, ("--help",)),
+    Row("help of the command line", 0.4, ("--help",)),
     Row("a wrong argument", 0.4, ("simulate", "{case}", "--plott"), fails=True),
     Row("`jaxbeam modes`", 0.5, ("modes", "{case}"), beyond_jax=True),
     Row("`jaxbeam simulate`, record and picture", 1.0, RECORD, beyond_jax=True),
@@ -206,7 +206,7 @@ ROWS = (
     ),
     Row("`jb.static_peak`", 0.3, code="jb.static_peak(case, [0.2, 0.8])"),
     Row("`jb.influence_line`", 0.3, code="jb.influence_line(case, 0.8, np.linspace(0, 1.2, 101))"),
-    Row("`jb.bound`", 2.0, code="jb.bound(case)", case=CONTROLLED["feedback"]),
+    Row("`jb.bound`, commands every 10 ms", 2.0, code="jb.bound(case)", case=TWO_SPANS + PATCHES),
     Row(
         "stability: margins, poles, growth",
         0.3,
