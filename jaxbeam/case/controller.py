@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 from jaxbeam.case.former_arguments import AcceptsFormerArguments
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 Command = Float[Array, " actuator"]
 Time = Float[Array, ""]
@@ -52,7 +53,7 @@ class ControlStep(NamedTuple):
     solved: Bool[Array, ""] | bool = True
 
 
-class AbstractSampledLaw(eqx.Module):
+class AbstractSampledLaw(Module):
     """Control law at samples, (u_k, x_k+1) = step(x_k, y_k, t_k), with a state x of any structure.
 
     Fields of the class are the design; they do not change during a run.
@@ -67,7 +68,7 @@ class AbstractSampledLaw(eqx.Module):
         """Command, in the units of the actuators, and next state at a sample at t (s)."""
 
 
-class AbstractContinuousLaw(eqx.Module):
+class AbstractContinuousLaw(Module):
     """Control law in continuous time, u = command(x, y, t), x' = rates(x, y, u, t), from x = 0.
 
     Its states are integrated together with those of the plant. Outputs of its `filters` follow the
@@ -134,6 +135,14 @@ class AbstractController(eqx.Module, metaclass=AcceptsFormerArguments):
     def design_depends_on_loads(self) -> bool:
         """Whether the design depends on masses and weights of the loads."""
         return True
+
+    @property
+    def runs_compiled(self) -> bool:
+        """Whether runs are compiled even if all numbers are known.
+
+        True where the steps of the law take longer in NumPy than its program takes to compile.
+        """
+        return self.period is None and not self.open_loop
 
     @abc.abstractmethod
     def design_law(self, plant: Any) -> Any:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from jaxbeam.case.controller import Command, Measurement, Time
 from jaxbeam.case.former_arguments import AcceptsFormerArguments
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.module import Module
 
 
 class Estimate(eqx.Module):
@@ -27,7 +28,7 @@ class Estimate(eqx.Module):
     weights: Float[Array, " load"] | None = None
 
 
-class AbstractSampledFilter(eqx.Module):
+class AbstractSampledFilter(Module):
     """Filter at samples: (estimate, x_k+1) = update(x_k, y_k, t_k), x of any structure.
 
     Fields of the class are the design; they do not change during a run.
@@ -42,7 +43,7 @@ class AbstractSampledFilter(eqx.Module):
         """Estimate at a sample at t (s), and the next state of the filter."""
 
 
-class AbstractContinuousFilter(eqx.Module):
+class AbstractContinuousFilter(Module):
     """Filter in continuous time, x' = rates(x, y, u, t), from x = 0, integrated with the plant."""
 
     @property
@@ -75,6 +76,11 @@ class AbstractEstimator(eqx.Module, metaclass=AcceptsFormerArguments):
 
     kind: ClassVar[str]
     continuous_time: ClassVar[bool] = False  # whether it has a filter in continuous time
+
+    @property
+    def runs_compiled(self) -> bool:
+        """As `AbstractController.runs_compiled`, in the steps of the filter."""
+        return False
 
     @abc.abstractmethod
     def sampled_filter(self, plant: Any, timing: Any) -> AbstractSampledFilter:

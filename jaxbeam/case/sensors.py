@@ -2,16 +2,16 @@
 
 from collections.abc import Iterator
 
-import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, number, part
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 
-class Sensor(eqx.Module):
+class Sensor(Module):
     """Point sensor of a quantity at a position on the beam; deflections are positive upwards.
 
     `strain` is the bending strain -z d2w/dx2 of the fibre at z = `fibre_distance` above the neutral

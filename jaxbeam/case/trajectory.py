@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.runtime.arrays import Array, fori_loop, set_at, stop_gradient, take, vmap, xp
+from jaxbeam.runtime.module import Module
 
 NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that derivatives exist
 
 
-class AbstractTrajectory(eqx.Module):
+class AbstractTrajectory(Module):
     """Trajectory x(t) of a load, on the beam from one entry to at most one exit."""
 
     length: eqx.AbstractVar[Float[Array, ""]]

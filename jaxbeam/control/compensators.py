@@ -9,7 +9,6 @@ import abc
 import dataclasses
 from typing import ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import polynomial
@@ -24,7 +23,7 @@ from jaxbeam.case.controller import (
 from jaxbeam.case.fields import POSITIVE, axis_names, concrete, is_concrete, number
 from jaxbeam.case.filters import filter_step
 from jaxbeam.control.feedback import pairing_error
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 Polynomials = Float[Array, "power actuator"]  # in s (rad/s), the coefficients ascending
 
@@ -57,7 +56,7 @@ class AbstractCompensator(AbstractController):
         loops = self.gains.shape[0]
         for field in dataclasses.fields(self):
             if "unit" in field.metadata and axis_names(field) == "*actuator":
-                shape = jnp.shape(getattr(self, field.name))
+                shape = xp.shape(getattr(self, field.name))
                 if shape not in ((), (loops,)):
                     return (
                         f"{field.name} must be one number for all {loops} loops or one for each,"
@@ -82,12 +81,12 @@ class AbstractCompensator(AbstractController):
         numerator, denominator = (
             _bilinear_transform(part, self.bilinear_factor()) for part in (numerator, denominator)
         )
-        section = jnp.concatenate([numerator, denominator]) / denominator[0]
+        section = xp.concatenate([numerator, denominator]) / denominator[0]
         return SampledCompensator(section[None])
 
     def _per_loop(self, *coefficients) -> Polynomials:
         """Coefficients as rows with an entry for each loop; a single number holds for all loops."""
-        return jnp.stack([jnp.broadcast_to(row, self.gains.shape) for row in coefficients])
+        return xp.stack([xp.broadcast_to(row, self.gains.shape) for row in coefficients])
 
 
 class SampledCompensator(AbstractSampledLaw):
@@ -96,7 +95,7 @@ class SampledCompensator(AbstractSampledLaw):
     sections: Float[Array, "1 6 actuator"]
 
     def initial_state(self):
-        return jnp.zeros((1, 2, self.sections.shape[-1]))
+        return xp.zeros((1, 2, self.sections.shape[-1]))
 
     def step(self, state, measurement, t):
         readings = measurement.readings[: self.sections.shape[-1]]
@@ -146,7 +145,7 @@ class Lead(AbstractCompensator):
     )
 
     def transfer_function(self):
-        zero_time, pole_time = (1 / (2 * jnp.pi * part) for part in (self.zero, self.pole))
+        zero_time, pole_time = (1 / (2 * xp.pi * part) for part in (self.zero, self.pole))
         numerator = self._per_loop(-self.gains, -self.gains * zero_time)
         return numerator, self._per_loop(1.0, pole_time)
 
@@ -169,14 +168,14 @@ class PositivePositionFeedback(AbstractCompensator):
     )
 
     def transfer_function(self):
-        angular_frequency = 2 * jnp.pi * self.frequency
+        angular_frequency = 2 * xp.pi * self.frequency
         stiffness = angular_frequency**2
         denominator = self._per_loop(stiffness, 2 * self.damping_ratio * angular_frequency, 1.0)
         return self._per_loop(self.gains * stiffness, 0.0, 0.0), denominator
 
     def bilinear_factor(self):
-        angular_frequency = 2 * jnp.pi * self.frequency
-        return angular_frequency / jnp.tan(angular_frequency * self.period / 2)
+        angular_frequency = 2 * xp.pi * self.frequency
+        return angular_frequency / xp.tan(angular_frequency * self.period / 2)
 
     def validate(self, case):
         frequency, period = self.frequency, self.period
@@ -202,17 +201,17 @@ def _reading_filter(
     if denominator.shape[0] == 2:
         rate = (denominator[0] / denominator[1])[None]
         return ControllerFilter(sensor, -rate[None], rate, output_row, feedthrough)
-    angular_frequency = jnp.sqrt(denominator[0] / denominator[2])
+    angular_frequency = xp.sqrt(denominator[0] / denominator[2])
     damping_rate = denominator[1] / denominator[2]
-    zero = jnp.zeros(())
-    matrix = jnp.stack(
-        [jnp.stack([zero, angular_frequency]), jnp.stack([-angular_frequency, -damping_rate])]
+    zero = xp.zeros(())
+    matrix = xp.stack(
+        [xp.stack([zero, angular_frequency]), xp.stack([-angular_frequency, -damping_rate])]
     )
     return ControllerFilter(
         sensor,
         matrix,
-        jnp.stack([zero, angular_frequency]),
-        jnp.stack([output_row[0], output_row[1] * angular_frequency]),
+        xp.stack([zero, angular_frequency]),
+        xp.stack([output_row[0], output_row[1] * angular_frequency]),
         feedthrough,
     )
 
@@ -229,5 +228,5 @@ def _bilinear_transform(coefficients: Polynomials, factor) -> Float[Array, "3 ac
             for n in powers
         ]
     )
-    scaled = coefficients * jnp.asarray(factor) ** powers[:, None]
-    return jnp.pad(terms.T @ scaled, ((0, 2 - degree), (0, 0)))
+    scaled = coefficients * xp.asarray(factor) ** powers[:, None]
+    return xp.pad(terms.T @ scaled, ((0, 2 - degree), (0, 0)))

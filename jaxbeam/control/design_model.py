@@ -4,13 +4,12 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, count, number
 from jaxbeam.model.modal_model import assemble_modal_model
 from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 ACTUATOR_FIELDS = ("force_per_volt", "stiffness", "damping", "correction")
 LOAD_FIELDS = ("mass", "speed", "entry_time")
@@ -80,7 +79,7 @@ class DesignModel(eqx.Module):
             value = getattr(self, name)
             if value is None:
                 continue
-            values = jnp.broadcast_to(value, (len(parts),))
+            values = xp.broadcast_to(value, (len(parts),))
             parts = tuple(_with_value(part, name, values[i]) for i, part in enumerate(parts))
         return parts
 

@@ -2,12 +2,11 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractStaticController
 from jaxbeam.case.fields import count, number
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
@@ -24,7 +23,7 @@ def power_law(
     gains: Float[Array, " actuator"], power: int, readings: Float[Array, " actuator"]
 ) -> Float[Array, " actuator"]:
     """Commands -k y |y|^(power - 1); the derivative at y = 0 is finite for every power."""
-    magnitude = jnp.abs(readings) ** (power - 1) if power > 1 else 1.0
+    magnitude = xp.abs(readings) ** (power - 1) if power > 1 else 1.0
     return -gains * readings * magnitude
 
 

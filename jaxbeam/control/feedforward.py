@@ -7,7 +7,6 @@ heavy load too: the schedule needs the position of the load, not its mass.
 from typing import ClassVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -15,7 +14,7 @@ from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, Cont
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class Feedforward(AbstractController):
@@ -58,7 +57,7 @@ class Feedforward(AbstractController):
         return None
 
     def design_law(self, plant):
-        gate_times = jnp.stack(
+        gate_times = xp.stack(
             [path.passage_times(self.gates)[:2] for path in plant.loads.trajectories]
         )
         return FeedforwardLaw(
@@ -77,16 +76,16 @@ class FeedforwardLaw(AbstractSampledLaw):
     length: Float[Array, ""]
 
     def step(self, state, measurement, t):
-        speeds = jnp.diff(self.gates) / jnp.diff(self.gate_times, axis=1)[:, 0]
-        gate_distance = jnp.where(speeds < 0, self.length - self.gates[1], self.gates[1])
-        distance = gate_distance + (t + self.lead - self.gate_times[:, 1]) * jnp.abs(speeds)
+        speeds = xp.diff(self.gates) / xp.diff(self.gate_times, axis=1)[:, 0]
+        gate_distance = xp.where(speeds < 0, self.length - self.gates[1], self.gates[1])
+        distance = gate_distance + (t + self.lead - self.gate_times[:, 1]) * xp.abs(speeds)
 
         def interpolate(row):
-            return jnp.interp(distance / self.length, self.shares, row, left=0.0, right=0.0)
+            return xp.interp(distance / self.length, self.shares, row, left=0.0, right=0.0)
 
-        commands = jax.vmap(interpolate)(self.values)
-        commands = jnp.where(t >= self.gate_times[:, 1], commands, 0.0)
-        return ControlStep(jnp.sum(commands, axis=1), state)
+        commands = xp.stack([interpolate(row) for row in self.values])
+        commands = xp.where(t >= self.gate_times[:, 1], commands, 0.0)
+        return ControlStep(xp.sum(commands, axis=1), state)
 
 
 def _gate_times(gates, loads, length) -> Float[np.ndarray, "load 2"]:

@@ -10,14 +10,12 @@ is the deflection due to the load, and feeding that back closes no loop if H is 
 
 from typing import ClassVar
 
-import jax
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.case.fields import INCREASING, POSITIVE, concrete, is_concrete, number
 from jaxbeam.case.filters import filter_step, second_order_sections, steady_filter_state
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class InternalModel(AbstractController):
@@ -96,12 +94,12 @@ class InternalModel(AbstractController):
 
     def _notch_sections(self) -> Float[Array, "notch 6"]:
         """Sampled notches: bilinear transforms, warped to be exact at their frequencies."""
-        warped = jnp.tan(jnp.pi * self.notches * self.period)
-        damping_term, ones = 2 * self.notch_damping * warped, jnp.ones_like(warped)
+        warped = xp.tan(xp.pi * self.notches * self.period)
+        damping_term, ones = 2 * self.notch_damping * warped, xp.ones_like(warped)
         leading = 1 + damping_term + warped**2
         middle, outer = 2 * (warped**2 - 1) / leading, (1 + warped**2) / leading
         last = (1 - damping_term + warped**2) / leading
-        return jnp.stack([outer, middle, outer, ones, middle, last], axis=1)
+        return xp.stack([outer, middle, outer, ones, middle, last], axis=1)
 
 
 class InternalModelLaw(AbstractSampledLaw):
@@ -125,7 +123,7 @@ class InternalModelLaw(AbstractSampledLaw):
         )
         if self.notch_sections is None:
             return filter_states, None
-        at_rest = jnp.zeros(len(self.sensor_filters))
+        at_rest = xp.zeros(len(self.sensor_filters))
         return filter_states, steady_filter_state(self.notch_sections, at_rest)
 
     def step(self, state, measurement, t):
@@ -139,14 +137,13 @@ class InternalModelLaw(AbstractSampledLaw):
             )
             filtered_lift.append(value)
             filter_states.append(filter_state)
-        load_deflection = measurement.readings[: lift.shape[0]] - self.compensation * jnp.stack(
+        load_deflection = measurement.readings[: lift.shape[0]] - self.compensation * xp.stack(
             filtered_lift
         )
         if self.notch_sections is not None:
             load_deflection, notch_states = filter_step(
                 self.notch_sections, notch_states, load_deflection
             )
-        command = jax.vmap(lambda x, row: jnp.interp(x, self.readings, row))(
-            load_deflection, self.values
-        )
+        pairs = zip(load_deflection, self.values, strict=True)
+        command = xp.stack([xp.interp(x, self.readings, row) for x, row in pairs])
         return ControlStep(command, (tuple(filter_states), notch_states))

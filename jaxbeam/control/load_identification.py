@@ -6,8 +6,6 @@ In a simulation the gate times are computed from the trajectory of the load.
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -23,8 +21,8 @@ from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.observability import deflection_outputs
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import Plant, state_space
-from jaxbeam.runtime.arrays import Array
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import Array, scan, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 INFLUENCE_POSITIONS = 201  # load positions along the beam at which influence lines are tabulated
 
@@ -137,20 +135,20 @@ def identified_load(record: Any, settings: LoadIdentification) -> IdentifiedLoad
     return IdentifiedLoad(mass, speed, mass / true_mass - 1, speed / true_speed - 1)
 
 
-@compiled
+@compiled_if_traced
 def _replay(settings: LoadIdentification, case: Case, layout, record):
     """Mass (kg) and speed (m/s) after the last sample of a record."""
     plant = state_space(case, layout=layout)
     identifier = settings.identifier(plant, plant)
-    no_state = jnp.zeros(plant.modal_model.state_count)
+    no_state = xp.zeros(plant.modal_model.state_count)
 
     def update(sums, sample):
         readings, command, t = sample
         return identifier.update(sums, Measurement(readings, no_state, command), t)[1], None
 
     # A sample of a record holds the command that begins there; the law received the previous one.
-    previous_commands = jnp.concatenate([jnp.zeros_like(record.command[:1]), record.command[:-1]])
+    previous_commands = xp.concatenate([xp.zeros_like(record.command[:1]), record.command[:-1]])
     samples = record.measured, previous_commands, record.times
-    sums, _ = jax.lax.scan(update, identifier.initial_state(), samples)
+    sums, _ = scan(update, identifier.initial_state(), samples)
     estimate = identifier.estimate(sums, record.times[-1])
     return estimate.mass, estimate.speed

@@ -9,13 +9,12 @@ import abc
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import Measurement, Time
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.runtime.module import Module
 
 # A line through identified positions is accepted when these scatter by this share of the distance
 # over which they are identified, and their weights add up to this many of the largest weight: at
@@ -37,7 +36,7 @@ class LoadEstimate(NamedTuple):
     mass_identified: Bool[Array, ""]
 
 
-class AbstractLoadSource(eqx.Module):
+class AbstractLoadSource(Module):
     """Source of mass, speed and entry time of the load for a scheduled law, with its own state."""
 
     def initial_state(self) -> Any:
@@ -57,14 +56,14 @@ class GivenLoad(AbstractLoadSource):
     entry_time: Float[Array, ""]
 
     def update(self, state, measurement, t):
-        true = jnp.ones((), bool)
+        true = xp.ones((), bool)
         return LoadEstimate(self.mass, self.speed, self.entry_time, true, true), state
 
 
 def given_load(load: Any) -> GivenLoad:
     """Load of a case as given; speed and entry time are NaN for a table of positions."""
     numbers = load.mass, load.speed, load.entry_time
-    return GivenLoad(*(jnp.asarray(jnp.nan if x is None else x) for x in numbers))
+    return GivenLoad(*(xp.asarray(xp.nan if x is None else x) for x in numbers))
 
 
 class AbstractLoadIdentifier(AbstractLoadSource):
@@ -104,7 +103,7 @@ class AbstractLoadIdentifier(AbstractLoadSource):
     def fitted_mass(self, cross_sum, square_sum) -> Float[Array, ""]:
         """Mass (kg) by least squares, sum a y / (g sum a^2) with influence a, reading y; or 0."""
         observable = square_sum > 0
-        weight = jnp.where(observable, cross_sum / jnp.where(observable, square_sum, 1.0), 0.0)
+        weight = xp.where(observable, cross_sum / xp.where(observable, square_sum, 1.0), 0.0)
         return weight / self.gravity
 
 
@@ -119,22 +118,22 @@ class GateIdentifier(AbstractLoadIdentifier):
     gate_times: Float[Array, "2"]
 
     def initial_state(self):
-        return jnp.zeros(2)
+        return xp.zeros(2)
 
     @property
     def speed(self) -> Float[Array, ""]:
         """Speed (m/s), negative to the left."""
-        return jnp.diff(self.gates)[0] / jnp.diff(self.gate_times)[0]
+        return xp.diff(self.gates)[0] / xp.diff(self.gate_times)[0]
 
     @property
     def entry_time(self) -> Float[Array, ""]:
         """Time (s) at which the load enters the beam at constant speed."""
-        start = jnp.where(self.speed < 0, self.length, 0.0)
+        start = xp.where(self.speed < 0, self.length, 0.0)
         return self.gate_times[1] + (start - self.gates[1]) / self.speed
 
     def crossing_share(self, t: Time) -> Float[Array, ""]:
         """Share of the crossing that is completed at t (s)."""
-        return (t - self.entry_time) * jnp.abs(self.speed) / self.length
+        return (t - self.entry_time) * xp.abs(self.speed) / self.length
 
     def estimate(self, sums, t):
         speed_identified = t >= self.gate_times[1]
@@ -145,13 +144,13 @@ class GateIdentifier(AbstractLoadIdentifier):
     def increments(self, sums, deflections, t):
         share = self.crossing_share(t)
         *_, speed_identified, mass_identified = self.estimate(sums, t)
-        relative_position = jnp.where(self.speed < 0, 1 - share, share)
+        relative_position = xp.where(self.speed < 0, 1 - share, share)
         positions = np.linspace(0, 1, self.influence_lines.shape[1])
-        influence = jax.vmap(lambda line: jnp.interp(relative_position, positions, line))(
-            self.influence_lines
+        influence = xp.stack(
+            [xp.interp(relative_position, positions, line) for line in self.influence_lines]
         )
         active = speed_identified & ~mass_identified & (share > 0)
-        return jnp.where(active, jnp.stack([influence @ deflections, influence @ influence]), 0.0)
+        return xp.where(active, xp.stack([influence @ deflections, influence @ influence]), 0.0)
 
 
 class DeflectionIdentifier(AbstractLoadIdentifier):
@@ -166,45 +165,45 @@ class DeflectionIdentifier(AbstractLoadIdentifier):
     threshold: Float[Array, ""]
 
     def initial_state(self):
-        return jnp.zeros(8)
+        return xp.zeros(8)
 
     def estimate(self, sums, t):
         speed, entry_time, determined = self._fitted_line(sums)
-        travelled = (t - entry_time) * jnp.abs(speed)
+        travelled = (t - entry_time) * xp.abs(speed)
         identified = determined & (travelled >= self.until * self.length)
         mass = self.fitted_mass(*sums[5:7])
         return LoadEstimate(mass, speed, entry_time, identified, identified)
 
     def increments(self, sums, deflections, t):
         position, cross_product, squared_influence = self._best_position(deflections)
-        weight = jnp.sum(deflections**2) ** 2
-        line_sums = weight * jnp.stack([jnp.ones(()), t, t**2, position, t * position])
-        peak_increment = jnp.maximum(weight - sums[7], 0.0)
-        increments = jnp.concatenate(
-            [line_sums, jnp.stack([cross_product, squared_influence, peak_increment])]
+        weight = xp.sum(deflections**2) ** 2
+        line_sums = weight * xp.stack([xp.ones(()), t, t**2, position, t * position])
+        peak_increment = xp.maximum(weight - sums[7], 0.0)
+        increments = xp.concatenate(
+            [line_sums, xp.stack([cross_product, squared_influence, peak_increment])]
         )
         identified = self.estimate(sums, t).mass_identified
-        active = ~identified & (jnp.max(jnp.abs(deflections)) > self.threshold)
-        return jnp.where(active, increments, 0.0)
+        active = ~identified & (xp.max(xp.abs(deflections)) > self.threshold)
+        return xp.where(active, increments, 0.0)
 
     def _best_position(self, deflections):
         """Position (m) whose influence lines a fit the deflections y best, with a y and a^2 there.
 
         The maximum of (a y)^2 / a^2 over the positions, refined by a parabola.
         """
-        squares = jnp.sum(self.influence_lines**2, axis=0)
+        squares = xp.sum(self.influence_lines**2, axis=0)
         products = deflections @ self.influence_lines
         # At a support the lines are zero but for rounding, whose ratio may fit any deflections.
-        observable = squares > INFLUENCE_ROUNDING * jnp.max(squares)
-        explained = jnp.where(observable, products**2 / jnp.where(observable, squares, 1.0), 0.0)
-        best = jnp.clip(jnp.argmax(explained), 1, squares.shape[0] - 2)
-        left, centre, right = (explained[best + k] for k in (-1, 0, 1))
+        observable = squares > INFLUENCE_ROUNDING * xp.max(squares)
+        explained = xp.where(observable, products**2 / xp.where(observable, squares, 1.0), 0.0)
+        best = xp.clip(xp.argmax(explained), 1, squares.shape[0] - 2)
+        left, centre, right = (take(explained, best + k) for k in (-1, 0, 1))
         curvature = left - 2 * centre + right
         concave = curvature < 0
-        vertex = jnp.where(concave, (left - right) / (2 * jnp.where(concave, curvature, -1.0)), 0.0)
-        index = best + jnp.clip(vertex, -0.5, 0.5)
+        vertex = xp.where(concave, (left - right) / (2 * xp.where(concave, curvature, -1.0)), 0.0)
+        index = best + xp.clip(vertex, -0.5, 0.5)
         position = index * self.length / (squares.shape[0] - 1)
-        return position, products[best], squares[best]
+        return position, take(products, best), take(squares, best)
 
     def _fitted_line(self, sums):
         """Speed (m/s) and entry time (s) of the fitted line, and whether they are determined.
@@ -214,15 +213,15 @@ class DeflectionIdentifier(AbstractLoadIdentifier):
         total, t, square, x, product = sums[:5]
         time_variance = total * square - t**2
         determined = time_variance > 1e-9 * total * square
-        speed = (total * product - t * x) / jnp.where(determined, time_variance, 1.0)
+        speed = (total * product - t * x) / xp.where(determined, time_variance, 1.0)
         min_travel = MIN_TRAVEL_SPREAD * self.until * self.length
         determined = (
             determined
             & (speed**2 * time_variance > (min_travel * total) ** 2)
             & (total > MIN_EFFECTIVE_SAMPLES * sums[7])
         )
-        speed = jnp.where(determined, speed, self.length)
-        start = jnp.where(speed < 0, self.length, 0.0)
-        total = jnp.where(determined, total, 1.0)
-        entry_time = jnp.where(determined, t / total + (start - x / total) / speed, 0.0)
+        speed = xp.where(determined, speed, self.length)
+        start = xp.where(speed < 0, self.length, 0.0)
+        total = xp.where(determined, total, 1.0)
+        entry_time = xp.where(determined, t / total + (start - x / total) / speed, 0.0)
         return speed, entry_time, determined

@@ -2,12 +2,11 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractStaticController
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, number
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class Prescribed(AbstractStaticController):
@@ -63,12 +62,12 @@ class Prescribed(AbstractStaticController):
     def command(self, state, measurement, t):
         command = self.offsets
         if self.amplitudes is not None:
-            angle = 2 * jnp.pi * self.frequencies * t
+            angle = 2 * xp.pi * self.frequencies * t
             angle = angle if self.phases is None else angle + self.phases
-            command = command + jnp.sum(self.amplitudes * jnp.sin(angle), axis=-1)
+            command = command + xp.sum(self.amplitudes * xp.sin(angle), axis=-1)
         if self.times is not None:
-            tabulated = [jnp.interp(t, self.times, row, left=0.0, right=0.0) for row in self.values]
-            command = command + jnp.stack(tabulated)
+            tabulated = [xp.interp(t, self.times, row, left=0.0, right=0.0) for row in self.values]
+            command = command + xp.stack(tabulated)
         return command
 
     def breakpoints(self, case):

@@ -6,8 +6,6 @@
 from typing import ClassVar
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -21,7 +19,7 @@ from jaxbeam.case.fields import INCREASING, choice, concrete, count, is_concrete
 from jaxbeam.control.feedback import pairing_error, power_law
 from jaxbeam.control.load_identification import LoadIdentification, identification_error
 from jaxbeam.control.load_identifiers import AbstractLoadSource, given_load
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, take, xp
 
 
 class ScheduledFeedback(AbstractController):
@@ -91,14 +89,14 @@ class ScheduledFeedbackLaw(AbstractSampledLaw, AbstractContinuousLaw):
     def gains_at(self, mass: Float[Array, ""]) -> Float[Array, " actuator"]:
         """Gains for a mass (kg)."""
         if self.interpolated:
-            return jax.vmap(lambda row: jnp.interp(mass, self.masses, row))(self.gains)
+            return xp.stack([xp.interp(mass, self.masses, row) for row in self.gains])
         last = self.masses.shape[0] - 1
-        interval = jnp.searchsorted(self.masses, mass, side="right") - 1
-        return self.gains[:, jnp.clip(interval, 0, last)]
+        interval = xp.searchsorted(self.masses, mass, side="right") - 1
+        return take(self.gains.T, xp.clip(interval, 0, last))
 
     def step(self, state, measurement, t):
         load, state = self.load_source.update(state, measurement, t)
-        mass = jnp.where(load.mass_identified, load.mass, self.masses[0])
+        mass = xp.where(load.mass_identified, load.mass, self.masses[0])
         readings = measurement.readings[: self.gains.shape[0]]
         return ControlStep(power_law(self.gains_at(mass), self.power, readings), state)
 

@@ -5,7 +5,6 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -25,8 +24,8 @@ from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.output_rows import modal_row
 from jaxbeam.model.state_space import Plant, build_plant, state_space
-from jaxbeam.runtime.arrays import Array
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 
 class AbstractStateController(AbstractController):
@@ -48,6 +47,11 @@ class AbstractStateController(AbstractController):
     @property
     def design_depends_on_loads(self) -> bool:
         return self.estimator is not None
+
+    @property
+    def runs_compiled(self) -> bool:
+        is_compiled = self.estimator is not None and self.estimator.runs_compiled
+        return is_compiled or super().runs_compiled
 
     @abc.abstractmethod
     def design_state_law(self, plant: Plant, design_plant: Plant) -> AbstractStateLaw:
@@ -103,7 +107,7 @@ class AbstractStateController(AbstractController):
         if error is None and all(is_concrete(leaf) for leaf in jax.tree.leaves((self, case))):
             # Concrete numbers also under differentiation.
             controller, concrete_case = jax.tree.map(
-                lambda leaf: jnp.asarray(concrete(leaf)),
+                lambda leaf: xp.asarray(concrete(leaf)),
                 (dataclasses.replace(self, nominal_plant=None), case),
             )
             system = _unloaded_design_plant(controller, concrete_case, mesh_layout(concrete_case))
@@ -128,7 +132,7 @@ class AbstractStateController(AbstractController):
         return 2 * self.mode_count(case) + actuator_states
 
 
-@compiled
+@compiled_if_traced
 def _unloaded_design_plant(controller: AbstractStateController, case, layout) -> StateSpace:
     """Design plant without loads."""
     return controller.design_plant(state_space(case, layout=layout)).unloaded
@@ -138,9 +142,9 @@ def _design_state_map(plant: Plant, design_plant: Plant) -> Float[Array, "design
     """Map from the states of a plant to those of its design plant: first modes, then actuators."""
     modal_states = 2 * plant.coordinate_scale.shape[0]
     design_modal_states = 2 * design_plant.coordinate_scale.shape[0]
-    states = plant.to_modal(jnp.eye(plant.modal_model.state_count))
+    states = plant.to_modal(xp.eye(plant.modal_model.state_count))
     return design_plant.from_modal(
-        jnp.concatenate([states[:design_modal_states], states[modal_states:]])
+        xp.concatenate([states[:design_modal_states], states[modal_states:]])
     )
 
 
@@ -149,4 +153,4 @@ def deflection_rows(
 ) -> Float[Array, "position state"]:
     """Rows that map the states of a plant to the deflections at positions (m)."""
     rows = modal_row(plant.modal_model.shapes, positions, "deflection") / plant.coordinate_scale
-    return jnp.pad(rows, ((0, 0), (0, plant.modal_model.state_count - rows.shape[1])))
+    return xp.pad(rows, ((0, 0), (0, plant.modal_model.state_count - rows.shape[1])))

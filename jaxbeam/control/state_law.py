@@ -4,7 +4,6 @@ import abc
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.controller import (
@@ -19,10 +18,11 @@ from jaxbeam.case.estimator import (
     AbstractSampledFilter,
     Estimate,
 )
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 
-class AbstractStateLaw(eqx.Module):
+class AbstractStateLaw(Module):
     """Control law fed by an estimate of the state of its plant; static laws have an empty state.
 
     Fields of the class hold the design; they are constant during a run.
@@ -48,7 +48,7 @@ class GainLaw(AbstractStateLaw):
     def step(self, state, estimate, measurement, t):
         x = estimate.state
         if self.feeds_back_command:
-            x = jnp.concatenate([x, measurement.command])
+            x = xp.concatenate([x, measurement.command])
         return ControlStep(-self.gain @ x, state)
 
 

@@ -1,13 +1,12 @@
 """Filter with a constant gain: prediction to the next sample, correction by the readings."""
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
 from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class ConstantGainFilter(AbstractSampledFilter):
@@ -25,7 +24,7 @@ class ConstantGainFilter(AbstractSampledFilter):
     plant_states: int = eqx.field(static=True)
 
     def initial_state(self):
-        return jnp.zeros(self.C.shape[1]), jnp.zeros(self.D.shape[1])
+        return xp.zeros(self.C.shape[1]), xp.zeros(self.D.shape[1])
 
     def update(self, state, measurement, t):
         x, command = state[0], measurement.command
@@ -37,4 +36,4 @@ class ConstantGainFilter(AbstractSampledFilter):
 
 def sensor_offsets(plant: Plant) -> Float[Array, " sensor"]:
     """Offsets of the sensors, in the units of their quantities."""
-    return jnp.array([sensor.offset for sensor in plant.case.sensors]).reshape(-1)
+    return xp.array([sensor.offset for sensor in plant.case.sensors]).reshape(-1)

@@ -6,14 +6,13 @@ x' = A(t) x + B u + L(t) (y - C x - D u - offset)
 import abc
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractContinuousFilter, Estimate
 from jaxbeam.estimation.sensor_chain import FilteredPlant
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class AbstractLinearFilter(AbstractContinuousFilter):
@@ -86,4 +85,4 @@ class ContinuousCrossingFilter(AbstractLinearFilter):
             return estimate
         plant = self.filtered.plant
         weights = (self.initial + state)[plant.modal_model.state_count :]
-        return Estimate(estimate.state, jnp.where(plant.loads.on_beam(t), weights, 0.0))
+        return Estimate(estimate.state, xp.where(plant.loads.on_beam(t), weights, 0.0))

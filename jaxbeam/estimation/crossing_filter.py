@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
@@ -11,7 +10,7 @@ from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.gains import filter_gain
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
 from jaxbeam.numerics.matrices import symmetric_part
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 Square = Float[Array, "state state"]
 
@@ -53,7 +52,7 @@ class CrossingFilter(AbstractSampledFilter):
 
     def initial_state(self):
         commands = len(self.filtered.plant.case.actuators)
-        return FilterState(self.initial, self.initial_covariance, jnp.zeros(commands))
+        return FilterState(self.initial, self.initial_covariance, xp.zeros(commands))
 
     def predict(self, state: FilterState, command, t: Float[Array, ""]) -> OneStepPrediction:
         """Prediction for the sample at t (s) under the command since the last sample."""
@@ -76,7 +75,7 @@ class CrossingFilter(AbstractSampledFilter):
         gain = filter_gain(prediction.covariance, prediction.C, noise)
         x = prediction.x + gain @ (measurement.readings - prediction.readings)
         # Joseph's form: symmetric and positive semidefinite in spite of rounding.
-        error_matrix = jnp.eye(x.shape[0]) - gain @ prediction.C
+        error_matrix = xp.eye(x.shape[0]) - gain @ prediction.C
         covariance = error_matrix @ prediction.covariance @ error_matrix.T + gain @ noise @ gain.T
         state = FilterState(x, symmetric_part(covariance), measurement.command)
         return self._estimate(x, t), state
@@ -86,4 +85,4 @@ class CrossingFilter(AbstractSampledFilter):
         if not self.estimates_weights:
             return Estimate(x[: self.plant_states])
         weights = x[plant.modal_model.state_count : self.sensor_chain.plant_states]
-        return Estimate(x[: self.plant_states], jnp.where(plant.loads.on_beam(t), weights, 0.0))
+        return Estimate(x[: self.plant_states], xp.where(plant.loads.on_beam(t), weights, 0.0))

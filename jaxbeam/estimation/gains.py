@@ -1,11 +1,10 @@
 """Gains of time-invariant estimators: Kalman filters and pole placement."""
 
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.riccati import care, dare
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, solve, xp
 
 Square = Float[Array, "state state"]
 Rows = Float[Array, "output state"]
@@ -21,7 +20,7 @@ def kalman_gain(A: Square, C: Rows, Q: Square, R: Outputs) -> Gain:
     ValueError as `riccati.care` does.
     """
     covariance = care(A.T, C.T, Q, R)
-    return jnp.linalg.solve(R, C @ covariance).T, covariance
+    return solve(R, C @ covariance).T, covariance
 
 
 def sampled_kalman_gain(A: Square, C: Rows, Q: Square, R: Outputs) -> Gain:
@@ -36,7 +35,7 @@ def sampled_kalman_gain(A: Square, C: Rows, Q: Square, R: Outputs) -> Gain:
 
 def filter_gain(covariance: Square, C: Rows, R: Outputs) -> Float[Array, "state output"]:
     """Gain K = P C' (C P C' + R)^-1 for a prediction of covariance P."""
-    return jnp.linalg.solve(C @ covariance @ C.T + R, C @ covariance).T
+    return solve(C @ covariance @ C.T + R, C @ covariance).T
 
 
 def placed_gain(A: Square, C: Rows, desired: Square) -> Float[Array, "state output"]:
@@ -49,9 +48,9 @@ def placed_gain(A: Square, C: Rows, desired: Square) -> Float[Array, "state outp
     scale = balance(A)
     A, desired = A * scale / scale[:, None], desired * scale / scale[:, None]
     rows = C * scale
-    row_norms = jnp.sqrt(jnp.sum(rows**2, axis=1))
+    row_norms = xp.sqrt(xp.sum(rows**2, axis=1))
     rows = rows / row_norms[:, None]
-    identity = jnp.eye(A.shape[0])
-    sylvester = jnp.kron(A.T, identity) - jnp.kron(identity, desired.T)
-    X = jnp.linalg.solve(sylvester, (rows.T @ rows).reshape(-1)).reshape(A.shape)
-    return scale[:, None] * jnp.linalg.solve(X.T, rows.T) / row_norms
+    identity = xp.eye(A.shape[0])
+    sylvester = xp.kron(A.T, identity) - xp.kron(identity, desired.T)
+    X = solve(sylvester, (rows.T @ rows).reshape(-1)).reshape(A.shape)
+    return scale[:, None] * solve(X.T, rows.T) / row_norms

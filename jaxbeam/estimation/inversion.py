@@ -4,7 +4,6 @@ import warnings
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -20,7 +19,7 @@ from jaxbeam.estimation.observability import (
 )
 from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, set_at, xp
 
 MAX_CONDITION_NUMBER = 100.0  # of the mode shapes at the sensors; beyond, there is a warning
 
@@ -44,23 +43,23 @@ class Inversion(AbstractEstimator):
         system = plant.unloaded
         rows = deflection_mode_shapes(system)
         modes, modal_states = rows.shape[1], 2 * rows.shape[1]
-        inverse = jnp.zeros((modes, system.C.shape[0]))
-        inverse = inverse.at[:, deflection_outputs(system)].set(jnp.linalg.pinv(rows))
+        inverse = xp.zeros((modes, system.C.shape[0]))
+        inverse = set_at(inverse, np.s_[:, deflection_outputs(system)], xp.linalg.pinv(rows))
         actuator_transition = None
         if system.A.shape[0] > modal_states:
             # Inputs of the states of actuators are the states of the beam, held, then the commands.
-            inputs = jnp.concatenate(
+            inputs = xp.concatenate(
                 [system.A[modal_states:, :modal_states], system.B[modal_states:]], axis=1
             )
             actuator_matrix = system.A[modal_states:, modal_states:]
-            no_noise, scale = jnp.zeros_like(actuator_matrix), balance(actuator_matrix)
+            no_noise, scale = xp.zeros_like(actuator_matrix), balance(actuator_matrix)
             actuator_transition = timing.transition(
                 lambda t: (actuator_matrix, inputs), no_noise, scale
             )
         smoothing = (
-            0.0 if self.time_constant is None else jnp.exp(-timing.period / self.time_constant)
+            0.0 if self.time_constant is None else xp.exp(-timing.period / self.time_constant)
         )
-        difference_gain = (1 - jnp.asarray(smoothing, float)) / timing.period
+        difference_gain = (1 - xp.asarray(smoothing, float)) / timing.period
         return InversionFilter(
             inverse,
             difference_gain,
@@ -113,7 +112,7 @@ class InversionFilter(AbstractSampledFilter):
     commands: int = eqx.field(static=True)
 
     def initial_state(self):
-        return jnp.zeros(self.plant_states), jnp.zeros(self.commands)
+        return xp.zeros(self.plant_states), xp.zeros(self.commands)
 
     def update(self, state, measurement, t):
         x, previous_command = state
@@ -124,7 +123,7 @@ class InversionFilter(AbstractSampledFilter):
         parts = [coordinates, smoothing * rates + self.difference_gain * (coordinates - previous)]
         if self.actuator_transition is not None:
             beam, actuator_states = x[: 2 * modes], x[2 * modes :]
-            inputs = (jnp.concatenate([beam, each]) for each in (previous_command, command))
+            inputs = (xp.concatenate([beam, each]) for each in (previous_command, command))
             parts.append(self.actuator_transition.predict(actuator_states, *inputs))
-        x = jnp.concatenate(parts)
+        x = xp.concatenate(parts)
         return Estimate(x), (x, command)

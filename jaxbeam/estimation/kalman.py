@@ -3,7 +3,6 @@
 import math
 from typing import ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -19,7 +18,7 @@ from jaxbeam.estimation.sensor_chain import filtered_plant, sensor_chain
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.finite_horizon import finite_horizon
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, set_at, xp
 
 MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of the table
 
@@ -70,6 +69,10 @@ class Kalman(AbstractEstimator):
     )
     points: int = count("intervals of the gain from event to event", default=400)
 
+    @property
+    def runs_compiled(self) -> bool:
+        return self.loads != "ignored"
+
     def sampled_filter(self, plant, timing):
         filtered = filtered_plant(plant)
         filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
@@ -86,14 +89,14 @@ class Kalman(AbstractEstimator):
             )
             return ConstantGainFilter(transition, C, D, sensor_offsets(plant), gain, plant_states)
         sensors = sensor_chain(plant, variance, timing, states + loads, self.max_delay_periods)
-        weight_states = jnp.zeros(sensors.state_count).at[states : states + loads]
+        no_state, weight_states = xp.zeros(sensors.state_count), np.s_[states : states + loads]
         return CrossingFilter(
             filtered,
             sensors,
-            jnp.append(scale, jnp.ones(loads)),
-            jnp.pad(intensity, (0, loads)),
-            weight_states.set(plant.weights),
-            jnp.diag(weight_states.set(self.weight_variance(plant))),
+            xp.append(scale, xp.ones(loads)),
+            xp.pad(intensity, (0, loads)),
+            set_at(no_state, weight_states, plant.weights),
+            xp.diag(set_at(no_state, weight_states, self.weight_variance(plant))),
             plant_states,
             self.loads == "estimated",
         )
@@ -101,10 +104,10 @@ class Kalman(AbstractEstimator):
     def continuous_filter(self, plant):
         filtered, count = filtered_plant(plant), len(plant.case.sensors)
         filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
-        noise = jnp.diag(jnp.broadcast_to(self.measurement_intensity, (count,)))
+        noise = xp.diag(xp.broadcast_to(self.measurement_intensity, (count,)))
         states, loads = intensity.shape[0], len(plant.case.loads)
         offset, plant_states = sensor_offsets(plant), plant.modal_model.state_count
-        zero_state = jnp.zeros(states)
+        zero_state = xp.zeros(states)
         if self.loads == "ignored":
             system = filtered.with_filtered_outputs(filtered_model.unloaded)
             gain, _ = kalman_gain(system.A, system.C, intensity, noise)
@@ -116,18 +119,18 @@ class Kalman(AbstractEstimator):
             plant = filtered.with_filtered_outputs(filtered_model.augmented(end - time_to_end))
             return plant.A.T, plant.C.T
 
-        crossing_times = jnp.array(
+        crossing_times = xp.array(
             [path.entry_exit_times() for path in filtered_model.loads.trajectories]
         ).reshape(-1)
-        events = jnp.concatenate([jnp.zeros(1), jnp.clip(crossing_times, 0.0, end), end[None]])
-        initial_covariance = jnp.diag(jnp.append(zero_state, self.weight_variance(plant)))
-        Q = jnp.pad(intensity, (0, loads))
+        events = xp.concatenate([xp.zeros(1), xp.clip(crossing_times, 0.0, end), end[None]])
+        initial_covariance = xp.diag(xp.append(zero_state, self.weight_variance(plant)))
+        Q = xp.pad(intensity, (0, loads))
         table = finite_horizon(
-            dual_system, jnp.sort(end - events), self.points, Q, noise, initial_covariance
+            dual_system, xp.sort(end - events), self.points, Q, noise, initial_covariance
         )[0]
         return ContinuousCrossingFilter(
             offset,
-            jnp.append(zero_state, plant.weights),
+            xp.append(zero_state, plant.weights),
             plant_states,
             filtered,
             table,
@@ -139,22 +142,22 @@ class Kalman(AbstractEstimator):
         """Variance of the weights of the loads (N^2) at the start; zero where they are known."""
         loads = len(plant.case.loads)
         if self.weight_deviation is None:
-            return jnp.zeros(loads)
-        return jnp.broadcast_to(self.weight_deviation**2, (loads,))
+            return xp.zeros(loads)
+        return xp.broadcast_to(self.weight_deviation**2, (loads,))
 
     def noise_intensity(self, plant: Plant) -> Square:
         """Intensity of the white noise in the rates of the states, (unit of each)^2 s."""
         modes = plant.coordinate_scale.shape[0]
         force = self.process_noise * plant.coordinate_scale**2
-        actuator_intensity = jnp.zeros(plant.modal_model.state_count - 2 * modes)
-        return jnp.diag(jnp.concatenate([jnp.zeros(modes), force, actuator_intensity]))
+        actuator_intensity = xp.zeros(plant.modal_model.state_count - 2 * modes)
+        return xp.diag(xp.concatenate([xp.zeros(modes), force, actuator_intensity]))
 
     def reading_variance(self, plant: Plant) -> Float[Array, " sensor"]:
         """Variance of the noise of each reading, in its unit squared."""
         sensors = plant.case.sensors
         if self.measurement_noise is None:
-            return jnp.stack([sensor.noise_variance for sensor in sensors])
-        return jnp.broadcast_to(self.measurement_noise**2, (len(sensors),))
+            return xp.stack([sensor.noise_variance for sensor in sensors])
+        return xp.broadcast_to(self.measurement_noise**2, (len(sensors),))
 
     def validate(self, case, system):
         if not case.sensors:

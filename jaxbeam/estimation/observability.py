@@ -1,12 +1,11 @@
 """Observability of the modes of a beam by a set of sensors, and conditioning of their shapes."""
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.linear_system import StateSpace
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 UNOBSERVABLE = 1e-9  # relative to the most observable mode; below, a mode is unobservable
 
@@ -38,7 +37,7 @@ def conditioning(system: StateSpace) -> Float[Array, ""]:
     those of the readings. Infinite, or beyond 1e12, where the sensors do not distinguish the modes.
     Differentiable, for choosing positions of sensors.
     """
-    values = jnp.linalg.svd(deflection_mode_shapes(system), compute_uv=False)
+    values = xp.linalg.svd(deflection_mode_shapes(system), compute_uv=False)
     return values[0] / values[-1]
 
 

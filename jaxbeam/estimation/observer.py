@@ -2,7 +2,6 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -15,7 +14,7 @@ from jaxbeam.estimation.observability import mode_count, observability_error
 from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.numerics.discretisation import balance, c2d
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, set_at, xp
 
 
 class Observer(AbstractEstimator):
@@ -39,7 +38,7 @@ class Observer(AbstractEstimator):
 
     def sampled_filter(self, plant, timing):
         system = plant.unloaded
-        no_noise = jnp.zeros_like(system.A)
+        no_noise = xp.zeros_like(system.A)
         transition = timing.transition(lambda t: (system.A, system.B), no_noise, balance(system.A))
         gain = self.gain(system, transition.matrix, timing)
         return ConstantGainFilter(
@@ -49,7 +48,7 @@ class Observer(AbstractEstimator):
     def continuous_filter(self, plant):
         system = plant.unloaded
         gain = _modal_placed_gain(system.A, system.C, self.desired_matrix(system))
-        initial = jnp.zeros(system.A.shape[0])
+        initial = xp.zeros(system.A.shape[0])
         return TimeInvariantFilter(sensor_offsets(plant), initial, initial.size, system, gain)
 
     def gain(
@@ -60,7 +59,7 @@ class Observer(AbstractEstimator):
     ) -> Float[Array, "state sensor"]:
         """Gain for a plant with this transition matrix of its states over a period."""
         desired, _ = c2d(
-            self.desired_matrix(system), jnp.zeros((2 * mode_count(system), 1)), timing.period
+            self.desired_matrix(system), xp.zeros((2 * mode_count(system), 1)), timing.period
         )
         return _modal_placed_gain(transition_matrix, system.C @ transition_matrix, desired)
 
@@ -69,10 +68,8 @@ class Observer(AbstractEstimator):
         modes = mode_count(system)
         if self.poles is None:
             return self.speed * system.A[: 2 * modes, : 2 * modes]
-        stiffness, real_parts = jnp.diag(jnp.sum(self.poles**2, axis=1)), jnp.diag(self.poles[:, 0])
-        return jnp.block(
-            [[jnp.zeros((modes, modes)), jnp.eye(modes)], [-stiffness, 2 * real_parts]]
-        )
+        stiffness, real_parts = xp.diag(xp.sum(self.poles**2, axis=1)), xp.diag(self.poles[:, 0])
+        return xp.block([[xp.zeros((modes, modes)), xp.eye(modes)], [-stiffness, 2 * real_parts]])
 
     def validate(self, case, system):
         if (self.poles is None) == (self.speed is None):
@@ -97,4 +94,4 @@ def _modal_placed_gain(A, C, desired) -> Float[Array, "state sensor"]:
     """Gain with which the error of the first states, those of the beam, has a desired matrix."""
     modal = desired.shape[0]
     gain = placed_gain(A[:modal, :modal], C[:, :modal], desired)
-    return jnp.zeros((A.shape[0], C.shape[0])).at[:modal].set(gain)
+    return set_at(xp.zeros((A.shape[0], C.shape[0])), np.s_[:modal], gain)

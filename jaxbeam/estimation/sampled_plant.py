@@ -8,14 +8,12 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.numerics.discretisation import exponential_and_gramian
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, stop_gradient, vmap, xp
+from jaxbeam.runtime.module import Module
 
 PERIOD_ROUNDING = 1e-9  # of a period; delays that exceed whole periods by less count as whole
 
@@ -25,7 +23,7 @@ Number = Float[Array, ""]
 StateAndInputMatrices = Callable[[Number], tuple[Float[Array, "..."], Float[Array, "..."]]]
 
 
-class Transition(eqx.Module):
+class Transition(Module):
     """Transition over a period: x+ = matrix x + previous_input_matrix u- + input_matrix u + w.
 
     `noise_covariance` is that of w.
@@ -58,7 +56,7 @@ class Transition(eqx.Module):
         )
 
 
-class SampleTiming(eqx.Module):
+class SampleTiming(Module):
     """Sampling period (s), and delay (s) within it after which a command begins, or None."""
 
     period: Number
@@ -94,17 +92,17 @@ class SampleTiming(eqx.Module):
         is that of `transition`, the end of each part (s from the start of the period), and whether
         the previous command acts in it.
         """
-        input_delay = jnp.zeros(()) if self.input_delay is None else self.input_delay
+        input_delay = xp.zeros(()) if self.input_delay is None else self.input_delay
         cuts = [*breaks, *([] if self.input_delay is None else [input_delay])]
-        ends = jnp.sort(jnp.stack([*cuts, self.period]))
-        starts = jnp.concatenate([jnp.zeros(1), ends[:-1]])
+        ends = xp.sort(xp.stack([*cuts, self.period]))
+        starts = xp.concatenate([xp.zeros(1), ends[:-1]])
         before_command = (ends <= input_delay)[:, None, None]
-        matrices, input_matrices, noises = jax.vmap(
+        matrices, input_matrices, noises = vmap(
             lambda *at: _magnus_step(matrices_at, noise_intensity, scale, *at)
         )(t - self.period + starts, ends - starts)
         previous_input_matrices, current_input_matrices = (
-            jnp.where(before_command, input_matrices, 0.0),
-            jnp.where(before_command, 0.0, input_matrices),
+            xp.where(before_command, input_matrices, 0.0),
+            xp.where(before_command, 0.0, input_matrices),
         )
         columns = zip(
             matrices, previous_input_matrices, current_input_matrices, noises, strict=True
@@ -120,19 +118,19 @@ def sample_timing(controller: AbstractController) -> SampleTiming:
 
 def split_delay(delay: Number, period: Number) -> tuple[Number, Number]:
     """Number of whole periods in a delay (s), and the rest (s); the number has no derivative."""
-    whole = jax.lax.stop_gradient(jnp.floor(delay / period + PERIOD_ROUNDING))
-    return whole, jnp.maximum(delay - whole * period, 0.0)
+    whole = stop_gradient(xp.floor(delay / period + PERIOD_ROUNDING))
+    return whole, xp.maximum(delay - whole * period, 0.0)
 
 
 def _magnus_step(matrices_at: StateAndInputMatrices, noise_intensity, scale, start, span):
     """Transition matrix, matrix of a held input, and covariance of the noise over a span (s)."""
     middle, node_offset = start + span / 2, math.sqrt(3) / 6 * span
-    nodes = jnp.stack([middle - node_offset, middle + node_offset])
-    early, late = jax.vmap(lambda time: _augmented_matrix(matrices_at, time, scale))(nodes)
+    nodes = xp.stack([middle - node_offset, middle + node_offset])
+    early, late = vmap(lambda time: _augmented_matrix(matrices_at, time, scale))(nodes)
     commutator = late @ early - early @ late
     matrix = span / 2 * (early + late) + span * node_offset / 2 * commutator
     states, covariance_scale = noise_intensity.shape[0], scale * scale[:, None]
-    noise = jnp.pad(noise_intensity / covariance_scale, (0, matrix.shape[0] - states))
+    noise = xp.pad(noise_intensity / covariance_scale, (0, matrix.shape[0] - states))
     noise_commutator = (late - early) @ noise
     noise = span * noise + span * node_offset / 2 * (noise_commutator + noise_commutator.T)
     propagator, noise = exponential_and_gramian(matrix, noise)
@@ -147,5 +145,5 @@ def _magnus_step(matrices_at: StateAndInputMatrices, noise_intensity, scale, sta
 def _augmented_matrix(matrices_at: StateAndInputMatrices, time, scale):
     """Matrix of the plant with its inputs as further, constant states; in scaled states."""
     A, B = matrices_at(time)
-    top = jnp.concatenate([A * scale / scale[:, None], B / scale[:, None]], axis=1)
-    return jnp.pad(top, ((0, B.shape[1]), (0, 0)))
+    top = xp.concatenate([A * scale / scale[:, None], B / scale[:, None]], axis=1)
+    return xp.pad(top, ((0, B.shape[1]), (0, 0)))

@@ -8,8 +8,6 @@ states m of digital filters; and the noise v of the samples that these filters r
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -19,7 +17,8 @@ from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensor_signals import Sections, sensor_sections
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, block_diag, set_at, xp
+from jaxbeam.runtime.module import Module
 
 # Noise that a digital filter is assumed to add to its output, relative to that of its samples.
 # Without it the filter would be inverted exactly, and attenuated components count as known.
@@ -29,7 +28,7 @@ FILTER_NOISE_RATIO = 1e-3
 SystemAtTime = Callable[[Float[Array, ""]], StateSpace]
 
 
-class FilteredPlant(eqx.Module):
+class FilteredPlant(Module):
     """Plant with the analogue filters of its sensors; `output_rows` of the filtered outputs."""
 
     plant: Plant
@@ -41,12 +40,12 @@ class FilteredPlant(eqx.Module):
         analogue = np.array([f is not None and f.realisation == "analogue" for f in filters])
         if not analogue.any():
             return system
-        filtered_rows = self.output_rows @ self.plant.to_modal(jnp.eye(self.output_rows.shape[1]))
-        filtered_rows = jnp.pad(
+        filtered_rows = self.output_rows @ self.plant.to_modal(xp.eye(self.output_rows.shape[1]))
+        filtered_rows = xp.pad(
             filtered_rows, ((0, 0), (0, system.C.shape[1] - filtered_rows.shape[1]))
         )
-        C = jnp.where(analogue[:, None], filtered_rows, system.C)
-        D = jnp.where(analogue[:, None], 0.0, system.D)
+        C = xp.where(analogue[:, None], filtered_rows, system.C)
+        D = xp.where(analogue[:, None], 0.0, system.D)
         return eqx.tree_at(lambda s: (s.C, s.D), system, (C, D))
 
 
@@ -56,7 +55,7 @@ def filtered_plant(plant: Plant) -> FilteredPlant:
     return FilteredPlant(eqx.tree_at(lambda m: m.modal_model, plant, filtered_model), output_rows)
 
 
-class SensorChain(eqx.Module):
+class SensorChain(Module):
     """States that the sensors add to the `plant_states` of the plant, and their transition.
 
     `filter_sections` are those of digital filters, `delays` (s) those of the sensors, None where
@@ -80,7 +79,7 @@ class SensorChain(eqx.Module):
     def noise_covariance(self) -> Float[Array, "sensor sensor"]:
         """Covariance of the noise of readings that is not among the states."""
         digital = np.array([part is not None for part in self.filter_sections])
-        return jnp.diag(jnp.where(digital, FILTER_NOISE_RATIO**2, 1.0) * self.variance)
+        return xp.diag(xp.where(digital, FILTER_NOISE_RATIO**2, 1.0) * self.variance)
 
     def output_matrices(
         self, C, D
@@ -103,7 +102,7 @@ class SensorChain(eqx.Module):
         first = system_at(start)
         matrix, feedthrough = self._jacobians(first.C, first.D, 1)
         transition = Transition(
-            matrix, feedthrough, jnp.zeros_like(feedthrough), jnp.zeros_like(matrix)
+            matrix, feedthrough, xp.zeros_like(feedthrough), xp.zeros_like(matrix)
         )
         sampling_offsets = {
             i: self._split_delay(lag)[1] for i, lag in enumerate(self.delays) if lag is not None
@@ -112,12 +111,12 @@ class SensorChain(eqx.Module):
             state_and_input_matrices, intensity, scale, t, list(sampling_offsets.values())
         )
         for k, part in enumerate(parts):
-            padded = jax.scipy.linalg.block_diag(part.matrix, np.eye(sensor_states))
+            padded = block_diag(part.matrix, np.eye(sensor_states))
             previous_input, present_input = (
-                jnp.pad(x, ((0, sensor_states), (0, 0)))
+                xp.pad(x, ((0, sensor_states), (0, 0)))
                 for x in (part.previous_input_matrix, part.input_matrix)
             )
-            noise = jnp.pad(part.noise_covariance, ((0, sensor_states), (0, sensor_states)))
+            noise = xp.pad(part.noise_covariance, ((0, sensor_states), (0, sensor_states)))
             transition = transition.compose(
                 Transition(padded, previous_input, present_input, noise)
             )
@@ -128,59 +127,62 @@ class SensorChain(eqx.Module):
                         i, system.C[i], system.D[i], is_sampled, before_command[k]
                     )
                 )
-        sample_noise = jnp.zeros(self.state_count)
+        sample_noise = xp.zeros(self.state_count)
         for index, variance in zip(self._state_layout()[2], self.variance, strict=True):
-            sample_noise = sample_noise if index is None else sample_noise.at[index].set(variance)
+            sample_noise = sample_noise if index is None else set_at(sample_noise, index, variance)
         return eqx.tree_at(
             lambda w: w.noise_covariance,
             transition,
-            transition.noise_covariance + jnp.diag(sample_noise),
+            transition.noise_covariance + xp.diag(sample_noise),
         )
 
     def _sampling_update(self, sensor, row, feedthrough, is_sampled, before_command) -> Transition:
         """Transition at a sample of a sensor, if `is_sampled`: the newest of its samples h."""
         index = self._state_layout()[0][sensor]
-        identity = jnp.eye(self.state_count)
-        output_row = jnp.pad(row, (0, self.state_count - self.plant_states))
-        matrix = identity.at[index].set(jnp.where(is_sampled, output_row, identity[index]))
-        no_input = jnp.zeros((self.state_count, feedthrough.shape[0]))
+        identity = xp.eye(self.state_count)
+        output_row = xp.pad(row, (0, self.state_count - self.plant_states))
+        matrix = set_at(identity, index, xp.where(is_sampled, output_row, identity[index]))
+        no_input = xp.zeros((self.state_count, feedthrough.shape[0]))
         previous_inputs, inputs = (
-            no_input.at[index].set(jnp.where(is_sampled & acts, feedthrough, 0.0))
+            set_at(no_input, index, xp.where(is_sampled & acts, feedthrough, 0.0))
             for acts in (before_command, ~before_command)
         )
-        return Transition(matrix, previous_inputs, inputs, jnp.zeros_like(identity))
+        return Transition(matrix, previous_inputs, inputs, xp.zeros_like(identity))
 
     def _jacobians(self, C, D, which: int):
-        """Jacobians by states and commands of the readings (0) or the states after a sample (1)."""
+        """Jacobians by states and commands of the readings (0) or the states after a sample (1).
 
-        def sample(state, command):
-            return self._sample(state, C @ state[: self.plant_states] + D @ command)[which]
-
-        return jax.jacfwd(sample, (0, 1))(jnp.zeros(self.state_count), jnp.zeros(D.shape[1]))
+        A sample is linear, so they are its results for unit vectors.
+        """
+        states, commands = np.eye(self.state_count), np.zeros((self.state_count, D.shape[1]))
+        signals = xp.pad(C, ((0, 0), (0, self.state_count - self.plant_states)))
+        return self._sample(states, signals)[which], self._sample(commands, D)[which]
 
     def _sample(self, state, signals):
-        """Readings, and the states just after a sample, from the states just before it."""
+        """Readings, and the states just after a sample, from the states just before it.
+
+        Of several samples, along a second axis of states and signals.
+        """
         delay_starts, filter_starts, noise_starts, _ = self._state_layout()
         readings, after = [], state
         for i, sections in enumerate(self.filter_sections):
             sample, delay = signals[i], self.delays[i]
             if delay is not None:
                 samples = state[delay_starts[i] : delay_starts[i] + self.max_delay_periods + 1]
-                sample = samples @ jax.nn.one_hot(
-                    self._split_delay(delay)[0], self.max_delay_periods + 1, dtype=float
-                )
-                after = after.at[
-                    delay_starts[i] + 1 : delay_starts[i] + self.max_delay_periods + 1
-                ].set(samples[:-1])
+                is_read = self._split_delay(delay)[0] == np.arange(self.max_delay_periods + 1)
+                sample = xp.where(is_read, 1.0, 0.0) @ samples
+                later = slice(delay_starts[i] + 1, delay_starts[i] + self.max_delay_periods + 1)
+                after = set_at(after, later, samples[:-1])
             if sections is not None:
                 states = slice(filter_starts[i], filter_starts[i] + 2 * sections.shape[0])
-                filter_states = state[states].reshape(-1, 2)
+                filter_states = state[states].reshape(-1, 2, state.shape[1])
                 sample, filter_states = filter_step(
                     sections, filter_states, sample + state[noise_starts[i]]
                 )
-                after = after.at[states].set(filter_states.reshape(-1)).at[noise_starts[i]].set(0.0)
+                after = set_at(after, states, filter_states.reshape(-1, state.shape[1]))
+                after = set_at(after, noise_starts[i], 0.0)
             readings.append(sample)
-        return jnp.stack(readings), after
+        return xp.stack(readings), after
 
     def _split_delay(self, delay) -> tuple[Array, Array]:
         """Whole periods of a delay, and the time in each period (s) at which the sensor samples."""

@@ -1,12 +1,13 @@
 """Input policy: commands to the actuators, as the integrator asks for them."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Float, Int
 
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.module import Module
 
 
 class StepInfo(eqx.Module):
@@ -20,12 +21,15 @@ class StepInfo(eqx.Module):
     event: Int[Array, " *step"]
 
 
-class AbstractInputPolicy(eqx.Module):
+class AbstractInputPolicy(Module):
     """Commands to the actuators of a run as a function of the state.
 
-    With `implicit`, commands depend on the states at the Gauss nodes of the step. A run is
-    abandoned as diverged where a state exceeds its `state_bound`.
+    With `implicit`, commands depend on the states at the Gauss nodes of the step. With
+    `holds_commands`, commands and memory change only at events of the schedule. A run is abandoned
+    as diverged where a state exceeds its `state_bound`.
     """
+
+    holds_commands: ClassVar[bool] = False
 
     implicit: eqx.AbstractVar[bool]
     state_bound: eqx.AbstractVar[Float[Array, " state"]]

@@ -12,6 +12,7 @@ Commands to the actuators are polynomials through the same nodes, given by an in
 from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.loads import AbstractLoad, MovingMass
@@ -19,12 +20,19 @@ from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.running_peaks import RunningPeaks, initial_peaks, update_peaks
-from jaxbeam.integrator.step import CHECKPOINT_NAME, advance, advance_unforced, contact_forces
+from jaxbeam.integrator.step import (
+    CHECKPOINT_NAME,
+    advance,
+    advance_unforced,
+    contact_forces,
+    known_maps,
+)
 from jaxbeam.integrator.step_matrices import LoadPath, chunk_length, load_path, step_matrices
 from jaxbeam.model.contact import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (
     Array,
+    any_jax,
     checkpoint,
     collapse,
     put,
@@ -75,6 +83,43 @@ def _step_with_inputs(policy: AbstractInputPolicy, carry, step):
     return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
 
 
+def _advance_known_with_inputs(policy, matrices, inertia, weight, infos, state, memory):
+    """Steps of known numbers under commands that do not depend on the states within a step.
+
+    Results as of a `scan` of `_step_with_inputs`; see `step.known_maps`. None if the policy
+    computes with JAX in spite of known numbers, as a law of a user may.
+    """
+    forces_map, maps = known_maps(matrices, inertia, weight)
+    steps, batch_size, state_count, columns = maps.shape
+    bound = policy.state_bound[:, None]
+    # State, commands, and one.
+    sources = np.ones((steps + 1, batch_size, columns, 1))
+    sources[0, :, :state_count, 0] = state.T
+    events, observations, held = infos.event.tolist(), [], None
+    for i in range(steps):
+        state = sources[i, :, :state_count]
+        if events[i] >= 0 or i == 0 or not policy.holds_commands:
+            info = StepInfo(infos.start[i], infos.length[i], infos.event[i])
+            node_commands, memory = policy.inputs(memory, state[..., 0].T, info, None)
+            if i == 0 and any_jax(node_commands, memory):
+                return None
+            held = collapse(node_commands, 0, 2).T[..., None]
+            observed = policy.observe(memory, info)
+        sources[i, :, state_count:-1] = held
+        observations.append(observed)
+        next_state = maps[i] @ sources[i]
+        within = np.abs(next_state) <= bound
+        if not within.all():
+            next_state = np.where(within.all(axis=1, keepdims=True), next_state, np.nan)
+        sources[i + 1, :, :state_count] = next_state
+    forces = forces_map @ sources[:-1]
+    forces, states = (np.swapaxes(part[..., 0], 1, 2) for part in (forces, sources))
+    commands = states[:-1, state_count:-1]
+    observed = jax.tree.map(lambda *parts: np.stack(parts), *observations)
+    states = states[:, :state_count]
+    return (states[-1], memory), (states[:-1], forces, commands, observed)
+
+
 def _values_by_row(
     values: Float[Array, "load batch"], path: LoadPath
 ) -> Float[Array, "step row batch"]:
@@ -109,7 +154,13 @@ def _chunk_function(
             step_infos = StepInfo(
                 chunk_path.start, chunk_path.length, discrete.grid.event_at(index)
             )
-            (state, memory), (states, forces, commands, observed) = scan(
+            is_known = not any_jax(matrices, inertia_and_weight, state, memory, policy)
+            result = None
+            if is_known and not policy.implicit:
+                result = _advance_known_with_inputs(
+                    policy, matrices, *inertia_and_weight, step_infos, state, memory
+                )
+            (state, memory), (states, forces, commands, observed) = result or scan(
                 lambda carry, step: _step_with_inputs(policy, carry, step),
                 (state, memory),
                 (matrices, *inertia_and_weight, step_infos),

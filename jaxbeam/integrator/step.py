@@ -79,39 +79,55 @@ def _advance_all(matrices, inertia, weight, state):
 
 
 def _advance_known(matrices: StepMatrices, inertia, weight, state):
-    """`advance_unforced` of known numbers: z' = Phi z - Gamma S (m R z + w) as one map a step.
+    """`advance_unforced` of known numbers, as one map a step.
 
     The systems of all steps are solved at once; NumPy takes a tenth of the time of one by one.
     """
-    steps, rows, batch_size = inertia.shape
+    forces_of_state, maps = known_maps(matrices, inertia, weight)
+    states = np.empty((len(maps) + 1, *maps.shape[1:3], 1))
+    states[0] = state.T[..., None]
+    state_maps, offsets = maps[..., :-1], maps[..., -1:]
+    for i in range(len(maps)):
+        states[i + 1] = state_maps[i] @ states[i] + offsets[i]
+    forces = forces_of_state[..., :-1] @ states[:-1] + forces_of_state[..., -1:]
+    states, forces = (np.swapaxes(part[..., 0], 1, 2) for part in (states, forces))
+    return states[-1], states[:-1], forces
+
+
+def known_maps(matrices: StepMatrices, inertia, weight):
+    """Maps of steps of known numbers to the contact forces and to the next state.
+
+    z' = Phi z + B u - Gamma S (m (R z + D u) + w) with commands u, if there are any. Both maps are
+    (step, batch, row, column), with the columns of the state z, of u, and of one.
+    """
+    rows = inertia.shape[1]
     inertia, weight = (np.swapaxes(part, 1, 2)[..., None] for part in (inertia, weight))
     compliance, response = matrices.contact_compliance, matrices.contact_response
+    commands = matrices.commands
+    blocks, side = matrices.transition.shape[1:3]
+    states = blocks * side
     if response is None:
-        no_response = np.zeros((*weight.shape[:-1], len(state)))
+        columns = states + (0 if commands is None else commands.input_matrix.shape[-1])
+        no_response = np.zeros((*weight.shape[:-1], columns))
         right = np.concatenate([no_response, weight], axis=-1)
         forces_of_state = -right
     else:
-        right = np.concatenate([inertia * response[:, None], weight], axis=-1)
+        parts = [response, *([] if commands is None else [commands.contact_response])]
+        right = [inertia * part[:, None] for part in parts]
+        right = np.concatenate([*right, weight], axis=-1)
         if isinstance(compliance, ModalCompliance):
             compliance = jax.tree.map(lambda part: part[:, None], compliance)
             forces_of_state = compliance.solve(inertia, right)
         else:
             system = np.eye(rows) + inertia * compliance[:, None]
             forces_of_state = -np.linalg.solve(system, right)
-    # From state and one to forces (step, batch, row, state and one), and to the next state.
     maps = matrices.force_response[:, None] @ forces_of_state
-    blocks, side = matrices.transition.shape[1:3]
-    state_index = np.arange(blocks * side).reshape(blocks, side)
+    state_index = np.arange(states).reshape(blocks, side)
     index = np.s_[:, :, state_index[:, :, None], state_index[:, None, :]]
     maps[index] += matrices.transition[:, None]
-    states = np.empty((steps + 1, batch_size, blocks * side, 1))
-    states[0] = state.T[..., None]
-    state_maps, offsets = maps[..., :-1], maps[..., -1:]
-    for i in range(steps):
-        states[i + 1] = state_maps[i] @ states[i] + offsets[i]
-    forces = forces_of_state[..., :-1] @ states[:-1] + forces_of_state[..., -1:]
-    states, forces = (np.swapaxes(part[..., 0], 1, 2) for part in (states, forces))
-    return states[-1], states[:-1], forces
+    if commands is not None:
+        maps[..., states:-1] += commands.input_matrix[:, None]
+    return forces_of_state, maps
 
 
 _advance_with_rule = custom_jvp(_advance_all)

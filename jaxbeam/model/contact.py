@@ -21,9 +21,10 @@ from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.runtime.arrays import Array, add_at, custom_jvp, is_jax, xp
+from jaxbeam.runtime.module import Module
 
 
-class LoadSet(eqx.Module):
+class LoadSet(Module):
     """All loads of a run: trajectories, inertia (kg) and weight (N).
 
     Inertia and weight may differ between the runs of a batch, which share everything else.

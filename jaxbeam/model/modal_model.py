@@ -16,9 +16,10 @@ from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, Modes, mesh_layout, modes
 from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve_triangular, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.module import Module
 
 
-class ModalModel(eqx.Module):
+class ModalModel(Module):
     """Linear model of beam, supports and actuators, without loads and control.
 
     The coordinates q have the unit mass matrix. Where the moving mass of an actuator couples the

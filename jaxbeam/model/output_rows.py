@@ -18,6 +18,7 @@ from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
 from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.runtime.module import Module
 
 # Positions x (m) and orders of derivation to the shapes (order, *position, mode), as
 # `ModalModel.shapes` and `Modes.shape_derivatives`.
@@ -34,7 +35,7 @@ def modal_row(shapes: Shapes, x, name: str, fibre_distance=None) -> Float[Array,
     return -xp.asarray(fibre_distance)[..., None] * row if quantity.at_fibre else row
 
 
-class OutputRows(eqx.Module):
+class OutputRows(Module):
     """Rows of outputs on q, q' or q'', by the order of the time derivative of each (0 to 2)."""
 
     rows: Float[Array, "output mode"]

@@ -21,9 +21,10 @@ from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.module import Module
 
 
-class Plant(eqx.Module):
+class Plant(Module):
     """State space of the beam with its loads, at any time t (s).
 
     The coordinates q of the states are `coordinate_scale` times those of the modal model (see

@@ -9,6 +9,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -213,6 +214,7 @@ def batch_axis_last(function: Callable, *args: Any) -> Any:
     which is longer than the matrices. Derivatives are those of a batch of one, mapped.
     """
     arrays, rest = eqx.partition(args, eqx.is_array)
+    arrays = jax.tree.map(jnp.asarray, arrays)  # custom_vmap takes no constants of NumPy
 
     def call(batched):
         return function(*eqx.combine(batched, rest))

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from jaxbeam.numerics.matrices import InputWeight, Square
 from jaxbeam.numerics.riccati import lqr
 from jaxbeam.numerics.stages import GAUSS_NODES
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.module import Module
 
 END_OFFSET = 1e-9  # of an interval: ends are evaluated so far inside, as the plant may jump there
 
@@ -19,7 +19,7 @@ END_OFFSET = 1e-9  # of an interval: ends are evaluated so far inside, as the pl
 PlantMatrices = Callable[[Float[Array, ""]], tuple[Float[Array, "..."], Float[Array, "..."]]]
 
 
-class GainTable(eqx.Module):
+class GainTable(Module):
     """Gain as a function of the fraction, 0 to 1, of its time span."""
 
     breakpoints: Float[Array, " breakpoint"]

@@ -7,8 +7,6 @@ eigenvalues, so they run on every device, in batches; derivatives are implicit, 
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -22,7 +20,7 @@ from jaxbeam.numerics.lyapunov import (
     stein,
 )
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, custom_jvp, solve, stop_gradient, while_loop, xp
 
 GainAndCost = tuple[Float[Array, "input state"], Square]
 
@@ -40,9 +38,9 @@ class Interval(NamedTuple):
 
     def compose(self, later: "Interval") -> "Interval":
         """This interval followed by a later one; associative, and stable for stiff plants."""
-        coupling = jnp.eye(self.transition.shape[0]) + self.G @ later.H
-        solved = jnp.linalg.solve(coupling, jnp.concatenate([self.transition, self.G], axis=1))
-        transition, G = jnp.split(solved, 2, axis=1)
+        coupling = xp.eye(self.transition.shape[0]) + self.G @ later.H
+        solved = solve(coupling, xp.concatenate([self.transition, self.G], axis=1))
+        transition, G = xp.split(solved, 2, axis=1)
         return Interval(
             transition=later.transition @ transition,
             G=later.G + symmetric_part(later.transition @ G @ later.transition.T),
@@ -74,7 +72,7 @@ def lqr(
     """
     cost = care(A, B, Q, R, N)
     cross = B.T @ cost if N is None else B.T @ cost + N.T
-    return jnp.linalg.solve(R, cross), cost
+    return solve(R, cross), cost
 
 
 def dare(
@@ -98,20 +96,20 @@ def dlqr(
     """
     cost = dare(A, B, Q, R, N)
     cross = B.T @ cost @ A if N is None else B.T @ cost @ A + N.T
-    return jnp.linalg.solve(R + B.T @ cost @ B, cross), cost
+    return solve(R + B.T @ cost @ B, cross), cost
 
 
-@jax.custom_jvp
+@custom_jvp
 def _care(A, G, H):
     """P of A'P + P A - P G P + H = 0."""
     A, G, H, unscale = _balanced(A, G, H)
     # Cayley's transform gives an equation in discrete time with the same solution.
     size = A.shape[0]
     shift = cayley_shift(A)
-    shifted = jnp.linalg.inv(A - shift * jnp.eye(size))
-    mixed = jnp.linalg.inv(A.T - shift * jnp.eye(size) + H @ shifted @ G)
+    shifted = solve(A - shift * xp.eye(size), xp.eye(size))
+    mixed = solve(A.T - shift * xp.eye(size) + H @ shifted @ G, xp.eye(size))
     start = Interval(
-        transition=jnp.eye(size) + 2 * shift * mixed.T,
+        transition=xp.eye(size) + 2 * shift * mixed.T,
         G=symmetric_part(2 * shift * shifted @ G @ mixed),
         H=symmetric_part(2 * shift * mixed @ H @ shifted),
     )
@@ -132,7 +130,7 @@ def _care_jvp(primals, tangents):
     return cost, lyapunov(A - G @ cost, source)
 
 
-@jax.custom_jvp
+@custom_jvp
 def _dare(A, G, H):
     """P of P = A'P (1 + G P)^-1 A + H."""
     A, G, H, unscale = _balanced(A, G, H)
@@ -169,15 +167,15 @@ def _balanced(A, G, H):
 
 def _costate_unit(G, H):
     """Unit of the costate in which G and H have equal norms; one if either is zero."""
-    G_size, H_size = jnp.sum(G**2), jnp.sum(H**2)
+    G_size, H_size = xp.sum(G**2), xp.sum(H**2)
     both = (G_size > 0) & (H_size > 0)
-    ratio = jnp.where(both, G_size, 1.0) / jnp.where(both, H_size, 1.0)
-    return jax.lax.stop_gradient(ratio**0.25)
+    ratio = xp.where(both, G_size, 1.0) / xp.where(both, H_size, 1.0)
+    return stop_gradient(ratio**0.25)
 
 
 def _closed_loop_matrix(A, G, cost):
     """State matrix (1 + G P)^-1 A of the closed loop in discrete time."""
-    return jnp.linalg.solve(jnp.eye(A.shape[0]) + G @ cost, A)
+    return solve(xp.eye(A.shape[0]) + G @ cost, A)
 
 
 def _infinite_horizon_cost(interval: Interval) -> Square:
@@ -188,17 +186,15 @@ def _infinite_horizon_cost(interval: Interval) -> Square:
 
     def unconverged(state):
         part, count = state
-        return (jnp.max(jnp.abs(part.transition)) > TRANSITION_TOLERANCE) & (count < MAX_DOUBLINGS)
+        return (xp.max(xp.abs(part.transition)) > TRANSITION_TOLERANCE) & (count < MAX_DOUBLINGS)
 
-    part, _ = jax.lax.while_loop(
-        unconverged, lambda s: (s[0].compose(s[0]), s[1] + 1), (interval, 0)
-    )
-    return jnp.where(jnp.max(jnp.abs(part.transition)) <= TRANSITION_TOLERANCE, part.H, jnp.nan)
+    part, _ = while_loop(unconverged, lambda s: (s[0].compose(s[0]), s[1] + 1), (interval, 0))
+    return xp.where(xp.max(xp.abs(part.transition)) <= TRANSITION_TOLERANCE, part.H, xp.nan)
 
 
 def _without_cross_weight(A, B, Q, R, N):
     """State matrix, G = B R^-1 B' and state weight of the equal problem without cross weight."""
-    inverse = jnp.linalg.inv(R)
+    inverse = solve(R, xp.eye(R.shape[0]))
     G = symmetric_part(B @ inverse @ B.T)
     if N is None:
         return A, G, Q

@@ -263,13 +263,23 @@ def solve(matrix, right) -> Any:
         return np.where(singular[..., None, None] if right.ndim > 1 else singular, np.nan, solution)
 
 
-def solve_triangular(matrix, right, lower: bool) -> Any:
-    """Solution of a triangular system."""
+def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> Any:
+    """Solution of a triangular system, or of that with the transposed matrix."""
     if is_jax(matrix) or is_jax(right):
-        return jax.scipy.linalg.solve_triangular(matrix, right, lower=lower)
+        return jax.scipy.linalg.solve_triangular(matrix, right, transposed, lower=lower)
     import scipy.linalg  # 0.1 s, which compiled programs need not wait for
 
-    return scipy.linalg.solve_triangular(matrix, right, lower=lower, check_finite=False)
+    return scipy.linalg.solve_triangular(matrix, right, transposed, lower=lower, check_finite=False)
+
+
+def cholesky(matrix) -> Any:
+    """Lower triangular factor of a matrix; nan where it is not positive definite."""
+    if is_jax(matrix):
+        return jnp.linalg.cholesky(matrix)
+    try:
+        return np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
 
 
 def expm(matrix) -> Any:

@@ -239,11 +239,11 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
     _check_step_count(schedule.times.size * interval / step, step)
     min_substeps = steps_per_interval(interval, step)
 
+    trial_run = _compiled_trial_run if case.controller.runs_compiled else _known_trial_run
+
     @functools.cache
     def response(halvings):
-        return np.asarray(
-            _closed_loop_trial_run(case, shapes, schedule, xp.asarray(min_substeps * 2**halvings))
-        )
+        return np.asarray(trial_run(case, shapes, schedule, xp.asarray(min_substeps * 2**halvings)))
 
     # A loop that diverges does so with any step, so its error is not defined. A stiff law in
     # continuous time may also overflow because the steps are too long.
@@ -254,7 +254,6 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
     return min_substeps * 2**halvings, error
 
 
-@compiled
 def _closed_loop_trial_run(case, shapes, schedule, substeps):
     """Deflections (m) at TRIAL_POSITIONS and all events, as (event and position, batch).
 
@@ -270,6 +269,10 @@ def _closed_loop_trial_run(case, shapes, schedule, substeps):
     rows = policy.model.shapes(positions, (0,))[0]
     deflections = rows @ states[:, 0 : 2 * case.beam.modes : 2]
     return deflections.reshape(-1, deflections.shape[-1])
+
+
+_known_trial_run = compiled_if_traced(_closed_loop_trial_run)
+_compiled_trial_run = compiled(_closed_loop_trial_run)
 
 
 def _halve_until_converged(

@@ -4,11 +4,10 @@ The law acts at multiples of its period on the readings available by then; its c
 delay later and is held, while the beam moves continuously in between.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
-import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractSampledLaw, Measurement
@@ -20,7 +19,7 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array, cond, set_at, take, vmap, xp
+from jaxbeam.runtime.arrays import Array, cond, is_jax, take, vmap, xp
 from jaxbeam.simulation.command_limits import limit_commands
 
 
@@ -57,6 +56,7 @@ class SampledLoop(AbstractInputPolicy):
     filter_sections: tuple
     noise: Float[Array, "sample sensor"] | None
     implicit: bool = eqx.field(static=True, default=False)
+    holds_commands: ClassVar[bool] = True
 
     def start(self, batch_size):
         sensors, zero = self.plant.case.sensors, xp.zeros(batch_size)
@@ -106,7 +106,7 @@ class SampledLoop(AbstractInputPolicy):
                 law_state, available, state, memory.command, info.start
             )
             command = limit_commands(self.plant.case, command, queue[0])
-            queue = set_at(xp.roll(queue, 1, axis=0), 0, command)
+            queue = xp.concatenate([command[None], queue[:-1]])
             return law_state, queue, failures + ~solved
 
         law_state, queue, failures = cond(
@@ -121,7 +121,7 @@ class SampledLoop(AbstractInputPolicy):
 
     def _sample_sensors(self, memory, state, info):
         """Filter states and readings after the samples that are due at an event."""
-        readings, filter_states = memory.readings, []
+        readings, filter_states, histories = memory.readings, [], []
         signals = self._sensor_inputs(state, memory.command, info.start)
         for i, sensor in enumerate(self.plant.case.sensors):
             number = self.schedule.reading[info.event, i]
@@ -130,11 +130,10 @@ class SampledLoop(AbstractInputPolicy):
                 sensor, self.filter_sections[i], memory.filter_states[i], signals[i], noise
             )
             due = number >= 0
-            reading = xp.where(due, reading, readings[0, i])
             filter_states.append(_tree_where(due, filter_state, memory.filter_states[i]))
-            shifted = xp.where(due, xp.roll(readings[:, i], 1, axis=0), readings[:, i])
-            readings = set_at(readings, np.s_[:, i], set_at(shifted, 0, reading))
-        return filter_states, readings
+            shifted = xp.concatenate([reading[None], readings[:-1, i]])
+            histories.append(_tree_where(due, shifted, readings[:, i]))
+        return filter_states, xp.stack(histories, axis=1) if histories else readings
 
     def _available_readings(self, readings, event):
         """Latest readings (sensor, batch) that are available at an event."""
@@ -170,4 +169,7 @@ def _broadcast_to_batch(state, batch_size: int):
 
 
 def _tree_where(condition, new, old):
+    """Numbers of one tree or of another with the same structure."""
+    if not is_jax(condition):
+        return new if condition else old
     return jax.tree.map(lambda a, b: xp.where(condition, a, b), new, old)

@@ -60,7 +60,8 @@ def simulate(
         plan = integration_plan(case, times, tolerance)
     times = sample_times(case) if times is None else xp.asarray(times, float)
     # Plans that differ in their error only share compiled programs.
-    simulate_record = _simulate_open_loop if case.controller is None else _simulate_closed_loop
+    is_compiled = case.controller is not None and case.controller.runs_compiled
+    simulate_record = _simulate_compiled if is_compiled else _simulate
     record = simulate_record(
         case, dataclasses.replace(plan, error=0.0), times, xp.asarray(plan.error)
     )
@@ -117,8 +118,8 @@ def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
     )
 
 
-_simulate_open_loop = compiled_if_traced(_simulate_record)
-_simulate_closed_loop = compiled(_simulate_record)
+_simulate = compiled_if_traced(_simulate_record)
+_simulate_compiled = compiled(_simulate_record)
 
 
 def simulate_readings(

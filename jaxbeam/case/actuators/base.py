@@ -7,6 +7,7 @@ import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 
 class Attachment(eqx.Module):
@@ -46,7 +47,7 @@ class SectionStiffening(eqx.Module):
     mass_per_length: Float[Array, ""]
 
 
-class AbstractActuator(eqx.Module):
+class AbstractActuator(Module):
     """Interface of actuators.
 
     To add one, write a file in `jaxbeam.case.actuators` with a subclass that declares its `kind`.

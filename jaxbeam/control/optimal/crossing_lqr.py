@@ -8,7 +8,6 @@ import math
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -25,7 +24,7 @@ from jaxbeam.numerics.gain_table import (
     frozen_time_gains,
     uniform_fractions,
 )
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, set_at, xp
 
 MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of a table
 
@@ -59,6 +58,10 @@ class AbstractCrossingRegulator(AbstractRegulator):
         return True
 
     @property
+    def runs_compiled(self) -> bool:
+        return True
+
+    @property
     def load_feedforward(self) -> bool:
         """Whether the weights of the loads are fed forward."""
         return False
@@ -80,15 +83,15 @@ class AbstractCrossingRegulator(AbstractRegulator):
     def gain_schedule(self, plant: Plant, design_plant: Plant) -> GainSchedule:
         """Schedule designed for one plant, for the times of entry and exit of the other."""
         table, shares = self.gain_table(design_plant), self.feedback_shares
-        load_weights = design_plant.weights if self.load_feedforward else jnp.zeros(0)
-        last_gain = table(jnp.ones(()))
+        load_weights = design_plant.weights if self.load_feedforward else xp.zeros(0)
+        last_gain = table(xp.ones(()))
         if self.after == "time-invariant":
             last_gain = self.time_invariant_gain(design_plant)
         states = shares.shape[0]
-        final_gain = jnp.zeros((last_gain.shape[0], states + load_weights.shape[0]))
+        final_gain = xp.zeros((last_gain.shape[0], states + load_weights.shape[0]))
         if self.after != "none":
-            final_gain = final_gain.at[:, :states].set(last_gain[:, :states])
-        shares = jnp.concatenate([shares, jnp.ones_like(load_weights)])
+            final_gain = set_at(final_gain, np.s_[:, :states], last_gain[:, :states])
+        shares = xp.concatenate([shares, xp.ones_like(load_weights)])
         events = crossing_events(design_plant if self.entries == "predicted" else plant)
         return GainSchedule(
             GainTable(table.breakpoints, table.coefficients * shares),
@@ -190,9 +193,9 @@ def finite_horizon_gains(
 ) -> tuple[GainTable, Float[Array, "breakpoint state state"]]:
     """Table of optimal gains for a plant, and P at its breakpoints, load states included."""
     Q, R = regulator.weights(plant)
-    F = Q if regulator.terminal_weight is None else jnp.diag(regulator.terminal_weight)
+    F = Q if regulator.terminal_weight is None else xp.diag(regulator.terminal_weight)
     load_count = len(plant.case.loads) if regulator.load_feedforward else 0
-    Q, F = (jnp.pad(weight, (0, load_count)) for weight in (Q, F))
+    Q, F = (xp.pad(weight, (0, load_count)) for weight in (Q, F))
     problem = crossing_events(plant), regulator.points, Q, R, F
     if plant.modal_model.state_count == 2 * plant.coordinate_scale.shape[0]:
         return finite_horizon_coupled(*crossing_plant(plant, load_count > 0), *problem)

@@ -1,12 +1,12 @@
 """Beam under moving loads as a constant plant coupled to time-varying contact forces."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.model.contact import contact_rows
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.coupled_stages import ConstantPlant, Coupling
 from jaxbeam.numerics.finite_horizon import CouplingFunction
+from jaxbeam.runtime.arrays import xp
 
 
 def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, CouplingFunction]:
@@ -21,28 +21,28 @@ def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, Cou
     rates = np.arange(1, 2 * modes, 2)
     unloaded, weight_states = plant.unloaded, load_count if with_weights else 0
     unloaded_plant = ConstantPlant(
-        jnp.pad(unloaded.A, (0, weight_states)),
-        jnp.pad(unloaded.B, ((0, weight_states), (0, 0))),
-        jnp.pad(plant.from_modal(jnp.eye(states)[:, rates]), ((0, weight_states), (0, 0))),
+        xp.pad(unloaded.A, (0, weight_states)),
+        xp.pad(unloaded.B, ((0, weight_states), (0, 0))),
+        xp.pad(plant.from_modal(xp.eye(states)[:, rates]), ((0, weight_states), (0, 0))),
     )
-    to_modal, command_rows = plant.to_modal(jnp.eye(states)), modal_model.command_matrix[rates]
+    to_modal, command_rows = plant.to_modal(xp.eye(states)), modal_model.command_matrix[rates]
     mass = plant.loads.inertia
 
     def contact_coupling(times):
         position, speed, acceleration = plant.loads.kinematics(times)
         active = plant.loads.on_beam(times)
         shape, rows = (
-            jnp.moveaxis(part.reshape(*active.shape, -1), 0, -2)
+            xp.moveaxis(part.reshape(*active.shape, -1), 0, -2)
             for part in contact_rows(modal_model, position, speed, acceleration, active)
         )
-        weight_columns = jnp.broadcast_to(
-            jnp.eye(load_count)[:, :weight_states], (*times.shape, load_count, weight_states)
+        weight_columns = xp.broadcast_to(
+            xp.eye(load_count)[:, :weight_states], (*times.shape, load_count, weight_states)
         )
         return Coupling(
-            force_distribution=jnp.swapaxes(shape, -1, -2),
-            force_state_rows=jnp.concatenate([-mass * (rows @ to_modal), -weight_columns], axis=-1),
+            force_distribution=xp.swapaxes(shape, -1, -2),
+            force_state_rows=xp.concatenate([-mass * (rows @ to_modal), -weight_columns], axis=-1),
             command_feedthrough=-mass * (shape @ command_rows),
-            force_feedthrough=mass * (shape @ jnp.swapaxes(shape, -1, -2)),
+            force_feedthrough=mass * (shape @ xp.swapaxes(shape, -1, -2)),
         )
 
     return unloaded_plant, contact_coupling

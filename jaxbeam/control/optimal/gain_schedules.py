@@ -1,7 +1,6 @@
 """Gain schedules over the crossing of loads, as control laws."""
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
@@ -9,7 +8,7 @@ from jaxbeam.case.trajectory import NEVER
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class GainSchedule(AbstractStateLaw):
@@ -33,21 +32,21 @@ class GainSchedule(AbstractStateLaw):
         crossing_share = (t - self.start) / (self.end - self.start)
         final_gain = self.final_gain
         if self.fade_time is not None:
-            final_gain = final_gain * jnp.exp(-jnp.maximum(t - self.end, 0.0) / self.fade_time)
-        gain = jnp.where(t < self.end, self.table(crossing_share), final_gain)
-        return jnp.where(t < self.start, 0.0, gain)
+            final_gain = final_gain * xp.exp(-xp.maximum(t - self.end, 0.0) / self.fade_time)
+        gain = xp.where(t < self.end, self.table(crossing_share), final_gain)
+        return xp.where(t < self.start, 0.0, gain)
 
     def step(self, state, estimate, measurement, t):
         load_weights = self.load_weights
         if self.load_feedforward and estimate.weights is not None:
             load_weights = estimate.weights
-        x = jnp.concatenate([estimate.state, load_weights])
+        x = xp.concatenate([estimate.state, load_weights])
         return ControlStep(-self.gain(t) @ x, state)
 
 
 def crossing_events(plant: Plant) -> Float[Array, " event"]:
     """Entry and exit times (s) of all loads, ascending; the end of the run for loads that stay."""
     windows = [path.entry_exit_times() for path in plant.loads.trajectories]
-    events = jnp.sort(jnp.array(windows).reshape(-1))
-    last_event = jnp.max(jnp.where(events < NEVER, events, plant.case.run.duration))
-    return jnp.minimum(events, last_event)
+    events = xp.sort(xp.array(windows).reshape(-1))
+    last_event = xp.max(xp.where(events < NEVER, events, plant.case.run.duration))
+    return xp.minimum(events, last_event)

@@ -7,7 +7,6 @@ The weights are those of the states of the design plant in the chosen coordinate
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, concrete, number
@@ -16,7 +15,7 @@ from jaxbeam.control.state_controller import AbstractStateController, deflection
 from jaxbeam.control.state_law import GainLaw
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.riccati import lqr
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class AbstractRegulator(AbstractStateController):
@@ -64,16 +63,16 @@ class AbstractRegulator(AbstractStateController):
 
     def weights(self, plant: Plant) -> tuple[Float[Array, "state state"], Float[Array, "..."]]:
         """Q (state, state) and R (command, command) for the states of a plant."""
-        Q = jnp.diag(self.state_weight)
+        Q = xp.diag(self.state_weight)
         if self.positions is not None:
             rows = deflection_rows(plant, self.positions)
             Q = Q + rows.T @ (self.position_weight[:, None] * rows)
-        return Q, jnp.diag(self.command_weight)
+        return Q, xp.diag(self.command_weight)
 
     @property
     def feedback_shares(self) -> Float[Array, " state"]:
         """Share of each state that is fed back."""
-        return jnp.ones_like(self.state_weight) if self.feedback is None else self.feedback
+        return xp.ones_like(self.state_weight) if self.feedback is None else self.feedback
 
     def time_invariant_gain(self, plant: Plant) -> Float[Array, "actuator state"]:
         """Gain of the regulator for a plant without its loads, eq. (5.7) of the thesis."""

@@ -2,9 +2,7 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag
 from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, concrete, is_concrete, number
@@ -15,7 +13,7 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance, exponential_and_gramian
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
 from jaxbeam.numerics.riccati import dlqr
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, add_at, block_diag, xp
 
 # With the previous command among the states.
 AugmentedSquare = Float[Array, "augmented augmented"]
@@ -54,10 +52,10 @@ class DiscreteLQR(AbstractRegulator):
             system.A, system.B, Q, R, timing.period, timing.input_delay
         )
         if self.input_rate_weight is not None:
-            rate_cost = jnp.diag(self.input_rate_weight) / timing.period
+            rate_cost = xp.diag(self.input_rate_weight) / timing.period
             states, commands = system.B.shape
-            Q = Q.at[states:, states:].add(rate_cost)
-            N = N.at[states:].add(-rate_cost)
+            Q = add_at(Q, np.s_[states:, states:], rate_cost)
+            N = add_at(N, np.s_[states:], -rate_cost)
             R = R + rate_cost
         if not self.feeds_back_command:
             states = system.A.shape[0]
@@ -66,8 +64,8 @@ class DiscreteLQR(AbstractRegulator):
 
     def design_state_law(self, plant, design_plant):
         gain = self.sampled_gain(design_plant)
-        command_shares = jnp.ones(gain.shape[1] - self.feedback_shares.shape[0])
-        shares = jnp.concatenate([self.feedback_shares, command_shares])
+        command_shares = xp.ones(gain.shape[1] - self.feedback_shares.shape[0])
+        shares = xp.concatenate([self.feedback_shares, command_shares])
         return GainLaw(gain * shares, self.feeds_back_command)
 
     def validate(self, case):
@@ -99,8 +97,8 @@ def discrete_lq_problem(
     Exact (Van Loan, IEEE Trans. Automatic Control 23, 1978), differentiable.
     """
     states, commands = B.shape
-    augmented_matrix = jnp.pad(jnp.concatenate([A, B], axis=1), ((0, commands), (0, 0)))
-    scale = jnp.concatenate([balance(A), jnp.ones(commands)])
+    augmented_matrix = xp.pad(xp.concatenate([A, B], axis=1), ((0, commands), (0, 0)))
+    scale = xp.concatenate([balance(A), xp.ones(commands)])
     cost_scale = scale * scale[:, None]
     cost_rate = block_diag(Q, R)
 
@@ -112,8 +110,8 @@ def discrete_lq_problem(
 
     identity, zeros = np.eye(commands), np.zeros((commands, commands))
     command_rows = np.concatenate([np.zeros((commands, states)), zeros, identity], axis=1)
-    state_at_change = jnp.eye(states + commands, states + 2 * commands)  # x and v, of (x, v, u)
-    cost = jnp.zeros((states + 2 * commands,) * 2)
+    state_at_change = xp.eye(states + commands, states + 2 * commands)  # x and v, of (x, v, u)
+    cost = xp.zeros((states + 2 * commands,) * 2)
     if input_delay is not None:
         propagator, interval_cost = propagator_and_cost(input_delay)
         cost = state_at_change.T @ interval_cost @ state_at_change
@@ -121,9 +119,9 @@ def discrete_lq_problem(
     propagator, interval_cost = propagator_and_cost(
         period if input_delay is None else period - input_delay
     )
-    state_after_change = jnp.concatenate([state_at_change[:states], command_rows])
+    state_after_change = xp.concatenate([state_at_change[:states], command_rows])
     cost = symmetric_part(cost + state_after_change.T @ interval_cost @ state_after_change)
-    next_state = jnp.concatenate([(propagator @ state_after_change)[:states], command_rows])
+    next_state = xp.concatenate([(propagator @ state_after_change)[:states], command_rows])
     state_count = states + commands
     return (
         next_state[:, :state_count],

@@ -6,7 +6,6 @@ advances by a multiple of pi, so that all commands move its state along one line
 
 import warnings
 
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Float
@@ -16,7 +15,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.state_space import state_space
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 MIN_REACHABILITY = 0.3  # of the controllability Gramian; below, there is a warning
 UNCONTROLLABLE = 1e-9  # of the largest possible modal input; below, a mode is uncontrollable
@@ -36,7 +35,7 @@ def sampling_limit(case: Case) -> Float[Array, " mode"]:
     Raises ValueError for an invalid case.
     """
     check_case(case)
-    return jnp.asarray(np.pi / _oscillatory_modes(state_space(case).unloaded)[0].imag)
+    return xp.asarray(np.pi / _oscillatory_modes(state_space(case).unloaded)[0].imag)
 
 
 def warn_slow_sampling(system: StateSpace, period: float, memory_time: float) -> None:

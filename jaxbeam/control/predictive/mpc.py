@@ -9,7 +9,6 @@ actuators, eq. (7.28). The first move is applied; the problem is solved again at
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.fields import (
@@ -35,7 +34,7 @@ from jaxbeam.control.predictive.qp import METHODS
 from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.riccati import dare
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class MPC(AbstractStateController):
@@ -98,6 +97,10 @@ class MPC(AbstractStateController):
     def design_depends_on_loads(self) -> bool:
         return True
 
+    @property
+    def runs_compiled(self) -> bool:
+        return self.loads != "ignored" or super().runs_compiled
+
     def validate(self, case):
         outputs = len(case.sensors) if self.positions is None else self.positions.shape[0]
         sizes = {
@@ -139,12 +142,12 @@ class MPC(AbstractStateController):
     def design_state_law(self, plant, design_plant):
         actuators, system = plant.case.actuators, design_plant.unloaded
         sampled = sampled_plant(
-            system.A, system.B, jnp.zeros((system.A.shape[0], 0)), self.period, self.delay
+            system.A, system.B, xp.zeros((system.A.shape[0], 0)), self.period, self.delay
         )
         states = sampled.A.shape[0]
         positions = design_plant.case.sensor_positions if self.positions is None else self.positions
         C = deflection_rows(design_plant, positions)
-        C = jnp.pad(C, ((0, 0), (0, states - C.shape[1])))  # the delay adds states
+        C = xp.pad(C, ((0, 0), (0, states - C.shape[1])))  # the delay adds states
         basis = move_basis(self.horizon, self.moves, self.laguerre_pole)
         maps = move_maps(basis, len(actuators))
         weights = output_weights(self.horizon, C.shape[0], self.horizon_weight, self.output_weight)
@@ -152,12 +155,12 @@ class MPC(AbstractStateController):
         limited_periods = self.horizon if self.laguerre_pole is not None else self.moves
         return MPCLaw(
             sampled_plant=sampled,
-            prediction=predict(repeat_plant(sampled, self.horizon), C, maps, jnp.zeros(0)),
+            prediction=predict(repeat_plant(sampled, self.horizon), C, maps, xp.zeros(0)),
             C=C,
             move_maps=maps,
             limits=command_limits(actuators, maps[:limited_periods], self.period),
             output_weights=weights,
-            move_weights=jnp.broadcast_to(self.move_weight, (len(actuators),)),
+            move_weights=xp.broadcast_to(self.move_weight, (len(actuators),)),
             soft_limit=self.soft_limit,
             soft_weight=self.soft_weight,
             terminal_cost=self._terminal_cost(sampled, C, weights),
@@ -174,7 +177,7 @@ class MPC(AbstractStateController):
             return design_plant
         if self.loads == "ignored":
             return None
-        return eqx.tree_at(lambda m: m.loads.inertia, design_plant, replace_fn=jnp.zeros_like)
+        return eqx.tree_at(lambda m: m.loads.inertia, design_plant, replace_fn=xp.zeros_like)
 
     def _terminal_cost(self, sampled, C, weights):
         """P of the terminal cost, of the incremental model under its regulator, or None."""
@@ -182,4 +185,4 @@ class MPC(AbstractStateController):
             return None
         A, B, output_rows = incremental_model(sampled.A, sampled.B, C)
         Q = output_rows.T @ (weights[-1, :, None] * output_rows)
-        return dare(A, B, Q, jnp.diag(jnp.broadcast_to(self.move_weight, B.shape[1])))
+        return dare(A, B, Q, xp.diag(xp.broadcast_to(self.move_weight, B.shape[1])))

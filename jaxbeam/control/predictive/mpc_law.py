@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
@@ -17,7 +17,7 @@ from jaxbeam.control.predictive.prediction import (
 from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve, vmap, xp
 
 
 class CommandLimits(NamedTuple):
@@ -63,38 +63,38 @@ class MPCLaw(AbstractStateLaw):
     solver: str = eqx.field(static=True)
 
     def initial_state(self):
-        return jnp.zeros(self.sampled_plant.A.shape[0])
+        return xp.zeros(self.sampled_plant.A.shape[0])
 
     def step(self, state, estimate, measurement, t):
         previous_state, previous_command, state = state, measurement.command, estimate.state
         if self.delay is not None:
-            state = jnp.concatenate([state, previous_command])
+            state = xp.concatenate([state, previous_command])
         past_plant, prediction, weights = self._predict(t, estimate)
         predicted_state = (
             past_plant.A @ previous_state + past_plant.B @ previous_command + past_plant.E @ weights
         )
-        initial = jnp.concatenate([state, state - predicted_state, previous_command, jnp.ones(1)])
+        initial = xp.concatenate([state, state - predicted_state, previous_command, xp.ones(1)])
         move, solved = self._first_move(prediction, initial, previous_command)
-        return ControlStep(previous_command + jnp.where(solved, move, 0.0), state, solved)
+        return ControlStep(previous_command + xp.where(solved, move, 0.0), state, solved)
 
     def _predict(self, t, estimate):
         """Plant over the last period, prediction from t (s), and the weights of the loads in it."""
         if self.loaded_plant is None:
-            return self.sampled_plant, self.prediction, jnp.zeros(0)
+            return self.sampled_plant, self.prediction, xp.zeros(0)
         plant, weights = self.loaded_plant, self.loaded_plant.weights
         if not self.known_weights:
-            weights = jnp.zeros_like(weights)
+            weights = xp.zeros_like(weights)
         elif estimate.weights is not None:
             weights = estimate.weights
 
         def sample(time):
             system, actuators = plant.at(time), self.move_weights.shape[0]
-            B, B_f = jnp.split(system.B, [actuators], axis=1)
+            B, B_f = xp.split(system.B, [actuators], axis=1)
             return sampled_plant(system.A, B, B_f, self.period, self.delay)
 
         horizon = self.move_maps.shape[0]
-        midpoints = t + (jnp.arange(-1, horizon) + 0.5) * self.period
-        plants = jax.vmap(sample)(midpoints)
+        midpoints = t + (xp.arange(-1, horizon) + 0.5) * self.period
+        plants = vmap(sample)(midpoints)
         past, future = (jax.tree.map(lambda p, s=s: p[s], plants) for s in (0, slice(1, None)))
         return past, predict(future, self.C, self.move_maps, weights), weights
 
@@ -107,10 +107,10 @@ class MPCLaw(AbstractStateLaw):
         free_response = prediction.F @ initial
         weight, Phi, maps = self.output_weights, prediction.Phi, self.move_maps
         if self.terminal_cost is not None:
-            weight = weight.at[-1].set(0.0)  # included in P
-        move_cost = jnp.einsum("hav,a,haw->vw", maps, self.move_weights, maps)
-        H = jnp.einsum("hov,ho,how->vw", Phi, weight, Phi) + move_cost
-        f = jnp.einsum("hov,ho,ho->v", Phi, weight, free_response)
+            weight = set_at(weight, -1, 0.0)  # included in P
+        move_cost = xp.einsum("hav,a,haw->vw", maps, self.move_weights, maps)
+        H = xp.einsum("hov,ho,how->vw", Phi, weight, Phi) + move_cost
+        f = xp.einsum("hov,ho,ho->v", Phi, weight, free_response)
         if self.terminal_cost is not None:
             terminal_gradient = prediction.terminal_phi.T @ self.terminal_cost
             H = H + terminal_gradient @ prediction.terminal_phi
@@ -128,36 +128,36 @@ class MPCLaw(AbstractStateLaw):
         program = self.quadratic_program(prediction, initial, previous_command)
         maps = self.move_maps
         if program.M.shape[0] == 0:
-            return maps[0] @ -jnp.linalg.solve(program.H, program.f), jnp.ones((), bool)
+            return maps[0] @ -solve(program.H, program.f), xp.ones((), bool)
         solution = solve_qp(*program, self.solver)
         return maps[0] @ solution.x[: maps.shape[2]], solution.solved
 
     def _with_soft_limits(self, H, f, M, gamma, Phi, free_response):
         """Program with the excess over the soft limit of each output as a further variable."""
         horizon, outputs, variables = Phi.shape
-        H = jax.scipy.linalg.block_diag(H, 2 * self.soft_weight * jnp.eye(outputs))
-        excess = jnp.tile(jnp.eye(outputs), (horizon, 1))
+        H = block_diag(H, 2 * self.soft_weight * xp.eye(outputs))
+        excess = xp.tile(xp.eye(outputs), (horizon, 1))
         rows, free_deflections = Phi.reshape(-1, variables), free_response.reshape(-1)
-        limit = jnp.tile(jnp.broadcast_to(self.soft_limit, (outputs,)), horizon)
-        M = jnp.block([[M, jnp.zeros((M.shape[0], outputs))], [rows, -excess], [-rows, -excess]])
-        gamma = jnp.concatenate([gamma, limit - free_deflections, limit + free_deflections])
-        return QuadraticProgram(H, jnp.pad(f, (0, outputs)), M, gamma)
+        limit = xp.tile(xp.broadcast_to(self.soft_limit, (outputs,)), horizon)
+        M = xp.block([[M, xp.zeros((M.shape[0], outputs))], [rows, -excess], [-rows, -excess]])
+        gamma = xp.concatenate([gamma, limit - free_deflections, limit + free_deflections])
+        return QuadraticProgram(H, xp.pad(f, (0, outputs)), M, gamma)
 
 
 def output_weights(
     horizon: int, outputs: int, horizon_weight, output_weight
 ) -> Float[Array, "horizon output"]:
     """Weights of squared deflections in each period; weights that are None are 1."""
-    period_weights = jnp.ones(horizon) if horizon_weight is None else horizon_weight
-    factors = jnp.ones(outputs) if output_weight is None else output_weight
-    return period_weights[:, None] * jnp.broadcast_to(factors, (outputs,))
+    period_weights = xp.ones(horizon) if horizon_weight is None else horizon_weight
+    factors = xp.ones(outputs) if output_weight is None else output_weight
+    return period_weights[:, None] * xp.broadcast_to(factors, (outputs,))
 
 
 def command_limits(actuators, maps: Float[Array, "period actuator variable"], period):
     """Limits and rate limits of actuators over the periods of some move maps, eq. (7.28)."""
     count, variables = len(actuators), maps.shape[2]
-    rows, limit_values = [jnp.zeros((0, variables))], [jnp.zeros(0)]
-    command_rows, cumulative_moves = [jnp.zeros((0, count))], jnp.cumsum(maps, axis=0)
+    rows, limit_values = [xp.zeros((0, variables))], [xp.zeros(0)]
+    command_rows, cumulative_moves = [xp.zeros((0, count))], xp.cumsum(maps, axis=0)
     for i, actuator in enumerate(actuators):
         limits, rate = actuator.command_limits(), actuator.command_rate_limit()
         bounds = []
@@ -170,7 +170,7 @@ def command_limits(actuators, maps: Float[Array, "period actuator variable"], pe
             bounds += [(sign * maps[:, i], rate * period, 0.0) for sign in (1.0, -1.0)]
         for row, top, sign in bounds:
             rows.append(row)
-            limit_values.append(jnp.full(row.shape[0], top))
-            command_rows.append(jnp.zeros((row.shape[0], count)).at[:, i].set(sign))
-    parts = (jnp.concatenate(part) for part in (rows, limit_values, command_rows))
+            limit_values.append(xp.full(row.shape[0], top))
+            command_rows.append(set_at(xp.zeros((row.shape[0], count)), np.s_[:, i], sign))
+    parts = (xp.concatenate(part) for part in (rows, limit_values, command_rows))
     return CommandLimits(*parts)

@@ -8,11 +8,11 @@ Moves are the changes of the commands, u(k+i) = u(k-1) + du(k) + ... + du(k+i).
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import c2d
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, add_at, scan, xp
 
 
 class SampledPlant(NamedTuple):
@@ -52,21 +52,21 @@ def sampled_plant(
     With a `delay` (s), at most the period, commands begin that much later.
     """
     actuators, loads = B.shape[1], B_f.shape[1]
-    transition, input_matrix = c2d(A, jnp.concatenate([B, B_f], axis=1), period)
+    transition, input_matrix = c2d(A, xp.concatenate([B, B_f], axis=1), period)
     input_matrix, load_matrix = input_matrix[0, :, :actuators], input_matrix[0, :, actuators:]
     if delay is None:
         return SampledPlant(transition, input_matrix, load_matrix)
     late_input_matrix = c2d(A, B, period - delay)[1][0]
-    no_state = jnp.zeros((actuators, transition.shape[0]))
+    no_state = xp.zeros((actuators, transition.shape[0]))
     return SampledPlant(
-        A=jnp.block(
+        A=xp.block(
             [
                 [transition, input_matrix - late_input_matrix],
-                [no_state, jnp.zeros((actuators, actuators))],
+                [no_state, xp.zeros((actuators, actuators))],
             ]
         ),
-        B=jnp.concatenate([late_input_matrix, jnp.eye(actuators)]),
-        E=jnp.concatenate([load_matrix, jnp.zeros((actuators, loads))]),
+        B=xp.concatenate([late_input_matrix, xp.eye(actuators)]),
+        E=xp.concatenate([load_matrix, xp.zeros((actuators, loads))]),
     )
 
 
@@ -81,9 +81,9 @@ def incremental_model(
 ]:
     """A, B and C of eq. (7.1): the plant in the states (x(k) - x(k-1), y(k)), driven by moves."""
     states, outputs = A.shape[0], C.shape[0]
-    transition = jnp.block([[A, jnp.zeros((states, outputs))], [C @ A, jnp.eye(outputs)]])
-    output_rows = jnp.concatenate([jnp.zeros((outputs, states)), jnp.eye(outputs)], axis=1)
-    return transition, jnp.concatenate([B, C @ B]), output_rows
+    transition = xp.block([[A, xp.zeros((states, outputs))], [C @ A, xp.eye(outputs)]])
+    output_rows = xp.concatenate([xp.zeros((outputs, states)), xp.eye(outputs)], axis=1)
+    return transition, xp.concatenate([B, C @ B]), output_rows
 
 
 def move_basis(
@@ -95,24 +95,25 @@ def move_basis(
     a few span a long horizon (Wang, J. Process Control 14, 2004); at a = 0 they are unit moves.
     """
     if pole is None:
-        return jnp.eye(horizon, terms)
+        return xp.eye(horizon, terms)
     pole_complement = 1 - pole**2
-    first = jnp.sqrt(pole_complement) * jnp.cumprod(
-        jnp.concatenate([jnp.ones(1), jnp.full(terms - 1, -pole)])
+    first = xp.sqrt(pole_complement) * xp.cumprod(
+        xp.concatenate([xp.ones(1), xp.full(terms - 1, -pole)])
     )
-    column = jnp.concatenate(
-        [pole[None], pole_complement * first[: terms - 1] / jnp.sqrt(pole_complement)]
+    column = xp.concatenate(
+        [pole[None], pole_complement * first[: terms - 1] / xp.sqrt(pole_complement)]
     )
-    step = jnp.array(
+    step = xp.array(
         [[column[i - j] if i >= j else 0.0 for j in range(terms)] for i in range(terms)]
     )
-    _, sequences = jax.lax.scan(lambda values, _: (step @ values, values), first, length=horizon)
+    _, sequences = scan(lambda values, _: (step @ values, values), first, length=horizon)
     return sequences
 
 
 def move_maps(basis: Float[Array, "horizon term"], actuators: int) -> Float[Array, "..."]:
     """Moves (horizon, actuator, variable) per variable, one for each basis term and actuator."""
-    return jax.vmap(lambda row: jnp.kron(row[None], jnp.eye(actuators)))(basis)
+    terms = basis[:, None, :, None] * np.eye(actuators)[:, None]
+    return terms.reshape(basis.shape[0], actuators, -1)
 
 
 def predict(
@@ -129,23 +130,23 @@ def predict(
     states, actuators = plants.B.shape[-2:]
     initial_count = 2 * states + actuators + 1
     columns = initial_count + move_maps.shape[2]
-    previous_command = jnp.eye(actuators, columns, k=2 * states)
-    commands = previous_command + jnp.pad(
-        jnp.cumsum(move_maps, axis=0), ((0, 0), (0, 0), (initial_count, 0))
+    previous_command = xp.eye(actuators, columns, k=2 * states)
+    commands = previous_command + xp.pad(
+        xp.cumsum(move_maps, axis=0), ((0, 0), (0, 0), (initial_count, 0))
     )
-    unexplained = jnp.eye(states, columns, k=states)
+    unexplained = xp.eye(states, columns, k=states)
 
     def advance(state, period):
         plant, command = period
         next_state = plant.A @ state + plant.B @ command + unexplained
-        next_state = next_state.at[:, initial_count - 1].add(plant.E @ load_weights)
+        next_state = add_at(next_state, np.s_[:, initial_count - 1], plant.E @ load_weights)
         return next_state, next_state
 
-    initial_state = jnp.eye(states, columns)
-    _, trajectory = jax.lax.scan(advance, initial_state, (plants, commands))
+    initial_state = xp.eye(states, columns)
+    _, trajectory = scan(advance, initial_state, (plants, commands))
     outputs = C @ trajectory
-    trajectory = jnp.concatenate([initial_state[None], trajectory])
-    terminal = jnp.concatenate([trajectory[-1] - trajectory[-2], outputs[-1]])
+    trajectory = xp.concatenate([initial_state[None], trajectory])
+    terminal = xp.concatenate([trajectory[-1] - trajectory[-2], outputs[-1]])
     return Prediction(
         outputs[..., :initial_count],
         outputs[..., initial_count:],
@@ -156,4 +157,4 @@ def predict(
 
 def repeat_plant(plant: SampledPlant, periods: int) -> SampledPlant:
     """The same plant over several periods."""
-    return jax.tree.map(lambda part: jnp.broadcast_to(part, (periods, *part.shape)), plant)
+    return jax.tree.map(lambda part: xp.broadcast_to(part, (periods, *part.shape)), plant)

@@ -11,15 +11,22 @@ s l = SMOOTHING instead of 0, in the form above. Where a limit is neither active
 the derivative jumps, it is the mean of both sides; elsewhere the smoothing is negligible.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import (
+    Array,
+    any_jax,
+    cholesky,
+    fori_loop,
+    set_at,
+    solve_triangular,
+    while_loop,
+    xp,
+)
 
 METHODS = ("interior", "hildreth")
 SOLVED, INFEASIBLE, UNFINISHED = range(3)
@@ -78,7 +85,8 @@ def solve_qp(
     """
     if method not in METHODS:
         raise ValueError(f"no method {method!r}; there are {', '.join(METHODS)}")
-    x, multipliers, status, steps = _solve(method, H, f, M, gamma)
+    solve = _solve if any_jax(H, f, M, gamma) else _solve_known
+    x, multipliers, status, steps = solve(method, H, f, M, gamma)
     return Solution(x, multipliers, status, steps)
 
 
@@ -95,30 +103,32 @@ class _LeastDistance(NamedTuple):
 
 
 def _least_distance(H, f, M, gamma) -> _LeastDistance:
-    factor = jnp.linalg.cholesky(H)
-    inverse_factor = jax.scipy.linalg.solve_triangular(factor, jnp.eye(H.shape[0]), lower=True)
+    factor = cholesky(H)
+    inverse_factor = solve_triangular(factor, xp.eye(H.shape[0]), lower=True)
     unconstrained = -inverse_factor @ f
     G = M @ inverse_factor.T
-    row_norms = jnp.sqrt(jnp.sum(G**2, axis=1))
-    row_norms = jnp.where(row_norms > 0, row_norms, 1.0)
+    row_norms = xp.sqrt(xp.sum(G**2, axis=1))
+    row_norms = xp.where(row_norms > 0, row_norms, 1.0)
     G = G / row_norms[:, None]
     h = gamma / row_norms - G @ unconstrained
-    violation = jnp.max(-h, initial=0.0)
-    magnitude = jnp.max(jnp.abs(gamma / row_norms), initial=0.0) + jnp.max(jnp.abs(unconstrained))
-    limits_matter = ~(violation <= LIMIT_ROUNDING * magnitude) | ~jnp.isfinite(magnitude)
-    scale = jnp.where(limits_matter, violation, 1.0)
+    violation = xp.max(-h, initial=0.0)
+    magnitude = xp.max(xp.abs(gamma / row_norms), initial=0.0) + xp.max(xp.abs(unconstrained))
+    limits_matter = ~(violation <= LIMIT_ROUNDING * magnitude) | ~xp.isfinite(magnitude)
+    scale = xp.where(limits_matter, violation, 1.0)
     return _LeastDistance(
         G, h / scale, scale, row_norms, inverse_factor, unconstrained, limits_matter
     )
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _solve(method, H, f, M, gamma):
+def _solve_known(method, H, f, M, gamma):
     problem = _least_distance(H, f, M, gamma)
     solver = {"interior": _interior_point, "hildreth": _hildreth}[method]
     z, multipliers, status, steps = solver(problem.G, problem.h, problem.limits_matter)
     x = problem.inverse_factor.T @ (problem.scale * z + problem.unconstrained)
     return x, problem.scale * multipliers / problem.row_norms, status, steps
+
+
+_solve = jax.custom_jvp(_solve_known, nondiff_argnums=(0,))
 
 
 @_solve.defjvp
@@ -137,10 +147,8 @@ def _solve_jvp(method, primals, tangents):
     gradient_change = inverse_factor @ (H_dot @ x + f_dot + M_dot.T @ multipliers)
     limit_change = (gamma_dot - M_dot @ x) / row_norms
     variables = G.shape[1]
-    matrix = jnp.block([[jnp.eye(variables), G.T], [multiplier[:, None] * G, -jnp.diag(slack)]])
-    change = jnp.linalg.solve(
-        matrix, jnp.concatenate([-gradient_change, multiplier * limit_change])
-    )
+    matrix = xp.block([[xp.eye(variables), G.T], [multiplier[:, None] * G, -xp.diag(slack)]])
+    change = xp.linalg.solve(matrix, xp.concatenate([-gradient_change, multiplier * limit_change]))
     x_dot = inverse_factor.T @ change[:variables]
     changes = x_dot, change[variables:] / row_norms, _zero_tangent(status), _zero_tangent(steps)
     return (x, multipliers, status, steps), changes
@@ -149,16 +157,16 @@ def _solve_jvp(method, primals, tangents):
 def _smoothed_pair(multiplier, slack):
     """Pair with the same difference and the product SMOOTHING, scaled to the sum one."""
     half = (multiplier - slack) / 2
-    root = jnp.sqrt(half**2 + SMOOTHING)
+    root = xp.sqrt(half**2 + SMOOTHING)
     # The smaller of the two from the product, to avoid cancellation.
-    large = root + jnp.abs(half)
+    large = root + xp.abs(half)
     small = SMOOTHING / large
-    multiplier, slack = (jnp.where(half > 0, *pair) for pair in ((large, small), (small, large)))
+    multiplier, slack = (xp.where(half > 0, *pair) for pair in ((large, small), (small, large)))
     return multiplier / (large + small), slack / (large + small)
 
 
 def _zero_tangent(value):
-    return jnp.zeros(jnp.shape(value), jax.dtypes.float0)
+    return xp.zeros(xp.shape(value), jax.dtypes.float0)
 
 
 def _status(tolerance, error, z, previous_multipliers, multipliers, h, G):
@@ -168,12 +176,12 @@ def _status(tolerance, error, z, previous_multipliers, multipliers, h, G):
     feasible point is at least -h'r / |G'r| away from the origin.
     """
     # XLA's maxima may ignore NaN, so that the error alone is no proof.
-    finite = jnp.all(jnp.isfinite(z)) & jnp.all(jnp.isfinite(multipliers))
-    solved = finite & (error <= tolerance * (1 + jnp.max(jnp.abs(z))))
-    ray = jnp.maximum(multipliers - previous_multipliers, 0.0)
-    min_certificate = MAX_DISTANCE * jnp.max(jnp.abs(G.T @ ray)) + TOLERANCE * jnp.sum(ray)
+    finite = xp.all(xp.isfinite(z)) & xp.all(xp.isfinite(multipliers))
+    solved = finite & (error <= tolerance * (1 + xp.max(xp.abs(z))))
+    ray = xp.maximum(multipliers - previous_multipliers, 0.0)
+    min_certificate = MAX_DISTANCE * xp.max(xp.abs(G.T @ ray)) + TOLERANCE * xp.sum(ray)
     infeasible = -(h @ ray) > min_certificate
-    return jnp.where(solved, SOLVED, jnp.where(infeasible, INFEASIBLE, UNFINISHED))
+    return xp.where(solved, SOLVED, xp.where(infeasible, INFEASIBLE, UNFINISHED))
 
 
 def _interior_point(G, h, limits_matter):
@@ -182,8 +190,8 @@ def _interior_point(G, h, limits_matter):
 
     def optimality_errors(z, multipliers, slack):
         stationary, limits = z + G.T @ multipliers, G @ z + slack - h
-        worst = jnp.maximum(jnp.max(jnp.abs(stationary)), jnp.max(jnp.abs(limits)))
-        return jnp.maximum(worst, jnp.max(jnp.minimum(multipliers, slack))), stationary, limits
+        worst = xp.maximum(xp.max(xp.abs(stationary)), xp.max(xp.abs(limits)))
+        return xp.maximum(worst, xp.max(xp.minimum(multipliers, slack))), stationary, limits
 
     def unfinished(state):
         *_, status, steps = state
@@ -193,11 +201,12 @@ def _interior_point(G, h, limits_matter):
         z, multipliers, slack, _, steps = state
         _, stationary, limits = optimality_errors(z, multipliers, slack)
         scaling = 1 / (slack / multipliers + DUAL_REGULARISATION)
-        factor = jnp.linalg.cholesky(jnp.eye(variables) + (G.T * scaling) @ G)
+        factor = cholesky(xp.eye(variables) + (G.T * scaling) @ G)
 
         def newton(product):
             rest = scaling * (limits - product / multipliers)
-            z_change = jax.scipy.linalg.cho_solve((factor, True), -stationary - G.T @ rest)
+            half = solve_triangular(factor, -stationary - G.T @ rest, lower=True)
+            z_change = solve_triangular(factor, half, lower=True, transposed=True)
             multiplier_change = rest + scaling * (G @ z_change)
             return z_change, multiplier_change, -(product + slack * multiplier_change) / multipliers
 
@@ -206,11 +215,11 @@ def _interior_point(G, h, limits_matter):
         length = _step_length(multipliers, multiplier_change, slack, slack_change, 1.0)
         affine_gap = (multipliers + length * multiplier_change) @ (slack + length * slack_change)
         centring_step = (steps > STEPS_BEFORE_CENTRING) & (steps % 2 == 0)
-        centring_target = jnp.where(centring_step, 0.3, (affine_gap / gap) ** 3) * gap / rows
+        centring_target = xp.where(centring_step, 0.3, (affine_gap / gap) ** 3) * gap / rows
         # The second-order correction is scaled by the step length of the predictor: in full, it
         # makes the method cycle where limits nearly exclude each other. A centring step without it
         # ends the rare cycles that are left.
-        second_order = jnp.where(centring_step, 0.0, length) * multiplier_change * slack_change
+        second_order = xp.where(centring_step, 0.0, length) * multiplier_change * slack_change
         z_change, multiplier_change, slack_change = newton(
             multipliers * slack + second_order - centring_target
         )
@@ -226,18 +235,16 @@ def _interior_point(G, h, limits_matter):
             steps + 1,
         )
 
-    start = jnp.zeros(variables), jnp.ones(rows), jnp.maximum(h, 0.0) + 1.0
-    initial_status = jnp.where(limits_matter, UNFINISHED, SOLVED), jnp.zeros((), int)
-    z, multipliers, _, status, steps = jax.lax.while_loop(
-        unfinished, step, (*start, *initial_status)
-    )
-    return z, jnp.where(limits_matter, multipliers, 0.0), status, steps
+    start = xp.zeros(variables), xp.ones(rows), xp.maximum(h, 0.0) + 1.0
+    initial_status = xp.where(limits_matter, UNFINISHED, SOLVED), xp.zeros((), int)
+    z, multipliers, _, status, steps = while_loop(unfinished, step, (*start, *initial_status))
+    return z, xp.where(limits_matter, multipliers, 0.0), status, steps
 
 
 def _step_length(multipliers, multiplier_change, slack, slack_change, boundary_share):
     """Step length, at most 1, at which no multiplier or slack decreases by more than this share."""
-    worst = jnp.maximum(jnp.max(-multiplier_change / multipliers), jnp.max(-slack_change / slack))
-    return jnp.where(worst > boundary_share, boundary_share / worst, 1.0)
+    worst = xp.maximum(xp.max(-multiplier_change / multipliers), xp.max(-slack_change / slack))
+    return xp.where(worst > boundary_share, boundary_share / worst, 1.0)
 
 
 def _hildreth(G, h, limits_matter):
@@ -256,15 +263,15 @@ def _hildreth(G, h, limits_matter):
 
         def row(i, iterate):
             z, multipliers = iterate
-            updated = jnp.maximum(0.0, multipliers[i] + G[i] @ z - h[i])
-            return z - G[i] * (updated - multipliers[i]), multipliers.at[i].set(updated)
+            updated = xp.maximum(0.0, multipliers[i] + G[i] @ z - h[i])
+            return z - G[i] * (updated - multipliers[i]), set_at(multipliers, i, updated)
 
-        _, after = jax.lax.fori_loop(0, rows, row, (z, multipliers))
+        _, after = fori_loop(0, rows, row, (z, multipliers))
         z = -G.T @ after
         slack = h - G @ z
-        error = jnp.maximum(jnp.max(-slack), jnp.max(jnp.minimum(after, slack)))
+        error = xp.maximum(xp.max(-slack), xp.max(xp.minimum(after, slack)))
         return z, after, _status(HILDRETH_TOLERANCE, error, z, multipliers, after, h, G), sweeps + 1
 
-    initial_status = jnp.where(limits_matter, UNFINISHED, SOLVED), jnp.zeros((), int)
-    start = jnp.zeros(variables), jnp.zeros(rows)
-    return jax.lax.while_loop(unfinished, sweep, (*start, *initial_status))
+    initial_status = xp.where(limits_matter, UNFINISHED, SOLVED), xp.zeros((), int)
+    start = xp.zeros(variables), xp.zeros(rows)
+    return while_loop(unfinished, sweep, (*start, *initial_status))
