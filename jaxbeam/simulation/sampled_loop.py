@@ -110,13 +110,13 @@ class SampledLoop(AbstractInputPolicy):
             return law_state, queue, failures + ~solved
 
         law_state, queue, failures = cond(
-            schedule.control_sample[event] >= 0,
+            take(schedule.control_sample, event) >= 0,
             step,
             lambda inputs: inputs,
             (memory.law_state, memory.command_queue, memory.failures),
         )
-        age = schedule.command_age[event]
-        command = xp.where(age >= 0, queue[xp.maximum(age, 0)], memory.command)
+        age = take(schedule.command_age, event)
+        command = xp.where(age >= 0, take(queue, xp.maximum(age, 0)), memory.command)
         return LoopMemory(law_state, command, filter_states, readings, queue, failures)
 
     def _sample_sensors(self, memory, state, info):
@@ -124,7 +124,7 @@ class SampledLoop(AbstractInputPolicy):
         readings, filter_states, histories = memory.readings, [], []
         signals = self._sensor_inputs(state, memory.command, info.start)
         for i, sensor in enumerate(self.plant.case.sensors):
-            number = self.schedule.reading[info.event, i]
+            number = take(self.schedule.reading, (info.event, i))
             noise = None if self.noise is None else take(self.noise, (number, i))
             reading, filter_state = filtered_reading(
                 sensor, self.filter_sections[i], memory.filter_states[i], signals[i], noise
@@ -137,9 +137,8 @@ class SampledLoop(AbstractInputPolicy):
 
     def _available_readings(self, readings, event):
         """Latest readings (sensor, batch) that are available at an event."""
-        latest = [
-            readings[self.schedule.reading_age[event, i], i] for i in range(readings.shape[1])
-        ]
+        ages = [take(self.schedule.reading_age, (event, i)) for i in range(readings.shape[1])]
+        latest = [take(readings, (age, i)) for i, age in enumerate(ages)]
         return xp.stack(latest) if latest else readings[0]
 
     def _sensor_inputs(self, state, command, time):

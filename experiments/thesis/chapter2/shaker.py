@@ -74,8 +74,9 @@ def _mass_in_impedance_only(beam: jb.Beam) -> FrequencyResponse:
     Both contain the accelerance of the beam, and eq. (2.30) with the mass is written for one.
     """
     bare, with_mass = _response(beam).values, _response(beam, STATIONARY_MASS)
-    force = with_mass.values[:, 3] / with_mass.values[:, 2] * bare[:, 2]
-    return eqx.tree_at(lambda found: found.values, with_mass, with_mass.values.at[:, 3].set(force))
+    values = np.array(with_mass.values)
+    values[:, 3] = values[:, 3] / values[:, 2] * bare[:, 2]
+    return eqx.tree_at(lambda response: response.values, with_mass, values)
 
 
 def _peaks(response: FrequencyResponse, pair: int) -> list[tuple[float, float]]:

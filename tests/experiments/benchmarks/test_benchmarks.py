@@ -48,7 +48,8 @@ def test_old_names_of_benchmarks_are_accepted_with_a_warning(capsys, monkeypatch
 
 @pytest.mark.parametrize("name", [name for name, one in __main__.BENCHMARKS.items() if one.quick])
 def test_options_of_a_short_run_exist(name):
-    source = Path(benchmarks.__file__ or "").with_name(f"{name}.py").read_text()
+    path = Path(benchmarks.__file__ or "").with_name(f"{name}.py")
+    source = (path if path.is_file() else path.with_suffix("") / "__main__.py").read_text()
     options = [word for word in __main__.BENCHMARKS[name].quick.split() if word.startswith("--")]
     if "--modes" in options and "modes=[" in source:
         options.remove("--modes")
