@@ -6,6 +6,7 @@ states m of digital filters; and the noise v of the samples that these filters r
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -149,7 +150,7 @@ class SensorChain(Module):
         )
         return Transition(matrix, previous_inputs, inputs, xp.zeros_like(identity))
 
-    def _jacobians(self, C, D, which: int):
+    def _jacobians(self, C, D, which: int) -> Any:
         """Jacobians by states and commands of the readings (0) or the states after a sample (1).
 
         A sample is linear, so they are its results for unit vectors.
@@ -158,7 +159,7 @@ class SensorChain(Module):
         signals = xp.pad(C, ((0, 0), (0, self.state_count - self.plant_states)))
         return self._sample(states, signals)[which], self._sample(commands, D)[which]
 
-    def _sample(self, state, signals):
+    def _sample(self, state, signals) -> Any:
         """Readings, and the states just after a sample, from the states just before it.
 
         Of several samples, along a second axis of states and signals.

@@ -60,7 +60,9 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
         def design(mass, speed):
             return self.gain_schedule(plant, _with_crossing_load(design_plant, mass, speed))
 
-        schedules = jax.vmap(jax.vmap(design, (None, 0)), (0, None))(self.masses, speeds)
+        schedules = jax.vmap(jax.vmap(design, (None, 0)), (0, None))(
+            jnp.asarray(self.masses), jnp.asarray(speeds)
+        )
         source = given_load(load)
         if self.load_identification is not None:
             source = self.load_identification.identifier(plant, design_plant)
