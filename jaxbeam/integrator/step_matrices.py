@@ -108,7 +108,7 @@ def load_path(
     on_beam = take(grid.loads_on_beam, panel)  # step, load
     if max_loads < len(loads.trajectories):
         # Loads on the beam first; those beyond the largest number are off the beam.
-        load_index = xp.argsort(~on_beam, axis=1)[:, :max_loads]
+        load_index = xp.argsort(~on_beam, axis=1, stable=True)[:, :max_loads]
         selection = load_index[:, :, None]
         position, speed, acceleration = (
             xp.take_along_axis(part, selection, axis=1) for part in (position, speed, acceleration)

@@ -126,7 +126,7 @@ def grid_by_schedule(
         # A step of zero length after the end: the controller acts at the last event too.
         events = xp.append(events, times[-1])
     boundary_times = xp.concatenate([times, xp.clip(events, times[0], times[-1])])
-    order = xp.argsort(boundary_times)
+    order = xp.argsort(boundary_times, stable=True)
     boundaries = boundary_times[order]
     panel_lengths = xp.diff(boundaries)
     is_scheduled = order < times.shape[0]

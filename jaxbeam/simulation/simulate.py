@@ -208,7 +208,6 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
         discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy
     )
     states = states[sample_steps]
-    sample_steps = xp.minimum(sample_steps, steps - 1)  # the last sample may be the end of a step
     observed, failures = (
         (None, None) if observed is None else (part[sample_steps, ..., 0] for part in observed)
     )
