@@ -17,7 +17,8 @@ from .case.actuators.spring import SpringDamper as SpringDamper
 from .case.beam import Beam as Beam, Support as Support
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
 from .case.filters import Filter as Filter
-from .case.loads import MovingForce as MovingForce, MovingMass as MovingMass
+from .case.loads.force import MovingForce as MovingForce
+from .case.loads.mass import MovingMass as MovingMass
 from .case.sensors import Sensor as Sensor
 from .control.compensators import (
     PD as PD,

@@ -12,7 +12,8 @@ from jaxbeam.case.actuators.spring import SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.filters import Filter
-from jaxbeam.case.loads import MovingForce, MovingMass
+from jaxbeam.case.loads.force import MovingForce
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
 

@@ -17,7 +17,7 @@ from jaxbeam.case.aliases import current_address
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, number
-from jaxbeam.case.loads import AbstractLoad, trajectory
+from jaxbeam.case.loads.base import AbstractLoad, trajectory
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array, set_at, xp
 

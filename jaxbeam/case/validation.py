@@ -22,7 +22,7 @@ from jaxbeam.case.declared_checks import (
 )
 from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
-from jaxbeam.case.loads import AbstractLoad
+from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array
 

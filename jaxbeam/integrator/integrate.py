@@ -15,7 +15,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.loads import AbstractLoad, MovingMass
+from jaxbeam.case.loads.base import AbstractLoad
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm

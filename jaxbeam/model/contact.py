@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.loads import trajectory
+from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import solve_small

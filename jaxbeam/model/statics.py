@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import is_concrete
-from jaxbeam.case.loads import trajectory
+from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.flexibility import check_supported, flexibility

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import trajectory
+from jaxbeam.case.loads.base import trajectory
 from jaxbeam.plot.schematic import draw_schematic
 from jaxbeam.plot.style import (
     ALARM,

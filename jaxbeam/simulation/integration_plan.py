@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import trajectory
+from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule

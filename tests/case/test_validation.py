@@ -16,7 +16,8 @@ from jaxbeam.case.actuators.shaker import Shaker
 from jaxbeam.case.actuators.spring import SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run, replace
-from jaxbeam.case.loads import MovingForce, MovingMass
+from jaxbeam.case.loads.force import MovingForce
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from tests.strategies import cases

@@ -14,7 +14,9 @@ from jaxbeam.case.actuators.shaker import Shaker
 from jaxbeam.case.actuators.spring import SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.case.loads import MovingForce, MovingMass, trajectory
+from jaxbeam.case.loads.base import trajectory
+from jaxbeam.case.loads.force import MovingForce
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.statics import influence_line, static_deflection, static_peak
 from tests.as_oracle import as_oracle
