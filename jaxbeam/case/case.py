@@ -17,7 +17,7 @@ from jaxbeam.case.aliases import current_address
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, number
-from jaxbeam.case.loads.base import AbstractLoad, trajectory
+from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array, set_at, xp
 
@@ -231,11 +231,15 @@ def stack_cases(cases: Sequence[Case]) -> Case:
 
 
 def crossing_times(case: Case) -> Float[np.ndarray, "load 2"]:
-    """Times (s) at which each load enters and leaves the beam; it leaves at `NEVER` if it stays.
+    """Times (s) at which each load enters, with its first wheel, and leaves, with its last.
+
+    It leaves at `NEVER` if it stays.
 
     Raises `jax.errors.ConcretizationTypeError` if the case is traced.
     """
-    windows = [trajectory(load, case.beam.length).entry_exit_times() for load in case.loads]
-    return np.array([[float(concrete(time)) for time in window] for window in windows]).reshape(
-        -1, 2
-    )
+    windows = []
+    for load in case.loads:
+        behind = wheel_distances(load, case.run.gravity)
+        entry, leave = trajectory(load, case.beam.length).entry_exit_times(behind)
+        windows.append((np.min(concrete(entry)), np.max(concrete(leave))))
+    return np.array(windows).reshape(-1, 2)

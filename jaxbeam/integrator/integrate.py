@@ -15,8 +15,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
@@ -25,11 +23,19 @@ from jaxbeam.integrator.step import (
     CHECKPOINT_NAME,
     advance,
     advance_unforced,
-    contact_forces,
+    forces_and_vehicles,
     known_maps,
 )
 from jaxbeam.integrator.step_matrices import LoadPath, chunk_length, load_path, step_matrices
-from jaxbeam.model.contact import LoadSet
+from jaxbeam.integrator.vehicle_steps import (
+    StepInput,
+    Vehicles,
+    VehicleStep,
+    initial_vehicle_states,
+    vehicle_state_norm,
+    vehicles_of,
+)
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (
     Array,
@@ -50,37 +56,39 @@ from jaxbeam.runtime.arrays import (
 MAX_PHASE_PER_STEP = 1.9 * NODE_COUNT
 
 
-def max_stable_step(model: ModalModel, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
+def max_stable_step(model: ModalModel, loads: LoadSet) -> Float[Array, ""]:
     """Longest step (s) at which the integration of these loads on the model is stable."""
     limit = MAX_STEP_NORM / state_matrix_norm(model)
-    if any(isinstance(load, MovingMass) for load in loads):
+    limit = xp.minimum(limit, MAX_STEP_NORM / (vehicle_state_norm(loads) + 1e-30))
+    if not loads.massless:
         highest_frequency = xp.sqrt(xp.max(xp.linalg.eigvalsh(model.stiffness())))
         limit = xp.minimum(limit, MAX_PHASE_PER_STEP / highest_frequency)
     return stop_gradient(limit)
 
 
-def _step_with_inputs(policy: AbstractInputPolicy, carry, step):
+def _step_with_inputs(policy: AbstractInputPolicy, vehicles: Vehicles | None, carry, step):
     """One step of a batch under the commands of an input policy."""
     state, memory = carry
-    matrices, inertia, weight, info = step
+    step, info = step
+    count = step.matrices.state_count
 
     def node_states(commands):
         commands = collapse(commands, 0, 2)
-        forces = contact_forces(matrices, inertia, weight, state, commands)
-        node_matrices = matrices.nodes
+        forces, _ = forces_and_vehicles(state, step, commands, vehicles)
+        nodes, beam = step.matrices.nodes, state[:count]
         node_values = (
-            node_matrices.transition @ state
-            + node_matrices.force_response @ forces
-            + node_matrices.command_response @ commands
+            nodes.transition @ beam
+            + nodes.force_response @ forces
+            + nodes.command_response @ commands
         )
-        return node_values.reshape(len(GAUSS_NODES), *state.shape)
+        return node_values.reshape(len(GAUSS_NODES), *beam.shape)
 
     node_commands, memory = policy.inputs(memory, state, info, node_states)
     commands = collapse(node_commands, 0, 2)
-    next_state, (state, forces) = advance(state, (matrices, inertia, weight, commands))
+    next_state, (state, forces) = advance(state, step, commands, vehicles)
     # A run that diverges becomes NaN here, without affecting the others, before it overflows.
-    diverged = xp.any(~(xp.abs(next_state) <= policy.state_bound[:, None]), axis=0)
-    next_state = xp.where(diverged, xp.nan, next_state)
+    within = xp.abs(next_state[:count]) <= policy.state_bound[:, None]
+    next_state = xp.where(xp.all(within, axis=0), next_state, xp.nan)
     return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
 
 
@@ -122,11 +130,24 @@ def _advance_known_with_inputs(policy, matrices, inertia, weight, infos, state, 
 
 
 def _values_by_row(
-    values: Float[Array, "load batch"], path: LoadPath
+    values: Float[Array, "wheel batch"], path: LoadPath
 ) -> Float[Array, "step row batch"]:
-    """A property of the loads for each row of the contact equations; zero off the beam."""
+    """A property of the wheels for each row of the contact equations; zero off the beam."""
     selected = xp.where(path.on_beam[..., None], take(values, path.loads), 0.0)
     return xp.repeat(selected, len(GAUSS_NODES), axis=1)
+
+
+def _step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> StepInput:
+    """Matrices and wheels of the steps of a chunk."""
+    inertia, weight = (_values_by_row(part, path) for part in (loads.inertia, loads.weight))
+    if path.surface is not None:
+        by_wheel = xp.take_along_axis(path.surface[:, 2], path.loads[..., None], axis=1)
+        weight = weight + inertia * by_wheel.reshape(*by_wheel.shape[:1], -1, 1)
+    vehicle_step = None
+    if loads.wheels.vehicles:
+        vehicle_step = VehicleStep(path.length_index, path.loads, path.on_beam, path.surface)
+    matrices = step_matrices(discrete, path, loads.massless)
+    return StepInput(matrices, inertia, weight, vehicle_step)
 
 
 def _chunk_function(
@@ -139,46 +160,44 @@ def _chunk_function(
     """
 
     chunk_steps = chunk_length(discrete, loads, max_loads)
+    vehicles = vehicles_of(loads, discrete.grid.lengths)
 
     def chunk(state, memory, running_peaks: Any, first_step):
         index = first_step + xp.arange(chunk_steps)
-        chunk_path = load_path(discrete, loads, max_loads, index)
-        matrices = step_matrices(discrete, chunk_path, loads.massless)
-        inertia_and_weight = (
-            _values_by_row(loads.inertia, chunk_path),
-            _values_by_row(loads.weight, chunk_path),
-        )
+        path = load_path(discrete, loads, max_loads, index)
+        steps = _step_inputs(discrete, loads, path)
         commands = observed = None
         if policy is None:
-            state, states, forces = advance_unforced(matrices, *inertia_and_weight, state)
+            state, states, forces = advance_unforced(steps, state, vehicles)
         else:
-            step_infos = StepInfo(
-                chunk_path.start, chunk_path.length, discrete.grid.event_at(index)
-            )
-            is_known = not any_jax(matrices, inertia_and_weight, state, memory, policy)
+            infos = StepInfo(path.start, path.length, discrete.grid.event_at(index))
+            is_known = not any_jax(steps, state, memory, policy)
             result = None
-            if is_known and not policy.implicit:
-                result = _advance_known_with_inputs(
-                    policy, matrices, *inertia_and_weight, step_infos, state, memory
-                )
+            if is_known and not policy.implicit and vehicles is None:
+                parts = steps.matrices, steps.inertia, steps.weight
+                result = _advance_known_with_inputs(policy, *parts, infos, state, memory)
             (state, memory), (states, forces, commands, observed) = result or scan(
-                lambda carry, step: _step_with_inputs(policy, carry, step),
+                lambda carry, step: _step_with_inputs(policy, vehicles, carry, step),
                 (state, memory),
-                (matrices, *inertia_and_weight, step_infos),
+                (steps, infos),
             )
         if running_peaks is not None:
+            beam_states = states[:, : discrete.model.state_count]
             running_peaks = update_peaks(
-                running_peaks, matrices, chunk_path, states, forces, commands
+                running_peaks, steps.matrices, path, beam_states, forces, commands
             )
-        return (
-            state,
-            memory,
-            running_peaks,
-            chunk_path.start[-1] + chunk_path.length[-1],
-            (states, commands, observed),
-        )
+        end = path.start[-1] + path.length[-1]
+        return state, memory, running_peaks, end, (states, commands, observed)
 
     return chunk, chunk_steps
+
+
+def _initial_state(discrete: DiscreteModel, loads: LoadSet, policy) -> Float[Array, "state batch"]:
+    """States of model and vehicles at rest at t = 0."""
+    batch_size = loads.inertia.shape[1]
+    state = zeros((discrete.model.state_count, batch_size), (discrete, loads, policy))
+    states = initial_vehicle_states(loads)
+    return state if states is None else xp.concatenate([state, states])
 
 
 def integrate_history(
@@ -198,7 +217,7 @@ def integrate_history(
     and contact forces of every step; under a policy, one state for each chunk.
     """
     chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
-    batch_size, load_count = loads.inertia.shape[1], len(loads.trajectories)
+    load_count, batch_size = loads.inertia.shape
 
     def one_chunk(carry, first):
         state, memory, peaks = carry
@@ -211,7 +230,7 @@ def integrate_history(
         else initial_peaks(discrete.position_count, load_count, batch_size, discrete.magnitude)
     )
     memory = None if policy is None else policy.start(batch_size)
-    initial_state = zeros((discrete.model.state_count, batch_size), (discrete, loads, policy))
+    initial_state = _initial_state(discrete, loads, policy)
     first_steps = xp.arange(0, steps, chunk_steps)
     checkpointed_chunk = checkpoint(
         one_chunk, policy=jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
@@ -265,13 +284,13 @@ def integrate_peaks(
         )
         return state, memory, peaks, first_step, continues
 
-    batch_size, load_count = loads.inertia.shape[1], len(loads.trajectories)
+    load_count, batch_size = loads.inertia.shape
     running_peaks = initial_peaks(
         discrete.position_count, load_count, batch_size, discrete.magnitude
     )
     memory = None if policy is None else policy.start(batch_size)
     start = (
-        zeros((discrete.model.state_count, batch_size), (discrete, loads, policy)),
+        _initial_state(discrete, loads, policy),
         memory,
         running_peaks,
         xp.zeros((), int),
@@ -304,7 +323,7 @@ def integrate_at_events(
         return state, memory, kept, first_step + chunk_steps
 
     batch_size = loads.inertia.shape[1]
-    initial_state = zeros((discrete.model.state_count, batch_size), (discrete, loads, policy))
+    initial_state = _initial_state(discrete, loads, policy)
     memory = None if policy is None else policy.start(batch_size)
     event_states = xp.zeros((grid.event_panels.shape[0], *initial_state.shape))
     start = initial_state, memory, event_states, xp.zeros((), int)

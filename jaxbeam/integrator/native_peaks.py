@@ -27,7 +27,7 @@ from jaxbeam.integrator.propagators import (
 from jaxbeam.integrator.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
-from jaxbeam.model.contact import LoadSet
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
@@ -72,7 +72,8 @@ LIBRARY = Library(
 
 def supports(case: Case) -> bool:
     """Whether a sweep of peaks of this case uses the C integrator."""
-    return case.controller is None and available()
+    has_vehicles = any(load.vehicle(case.run.gravity).names for load in case.loads)
+    return case.controller is None and not has_vehicles and case.profile is None and available()
 
 
 def available() -> bool:

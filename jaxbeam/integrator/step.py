@@ -11,6 +11,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Float
 
 from jaxbeam.integrator.step_matrices import StepMatrices
+from jaxbeam.integrator.vehicle_steps import StepInput, Vehicles
 from jaxbeam.model.contact import ModalCompliance, solve_contact_forces
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_small
 from jaxbeam.runtime.arrays import Array, any_jax, cond, custom_jvp, scan, vmap, xp
@@ -41,14 +42,25 @@ def contact_forces(matrices: StepMatrices, inertia, weight, state, commands):
 
 
 @jax.named_scope("propagation")
-def advance(state, step):
+def advance(state, step: StepInput, commands=None, vehicles: Vehicles | None = None):
     """One step of a batch: the state at its end, and (state at its start, contact forces)."""
-    matrices, inertia, weight, commands = step
-    forces = contact_forces(matrices, inertia, weight, state, commands)
-    next_state = free_response(matrices.transition, state) + matvec(matrices.force_response, forces)
+    matrices = step.matrices
+    forces, vehicle_states = forces_and_vehicles(state, step, commands, vehicles)
+    beam = state[: matrices.state_count]
+    next_state = free_response(matrices.transition, beam) + matvec(matrices.force_response, forces)
     if commands is not None:
         next_state = next_state + matrices.commands.input_matrix @ commands
+    if vehicle_states is not None:
+        next_state = xp.concatenate([next_state, vehicle_states])
     return next_state, (state, forces)
+
+
+def forces_and_vehicles(state, step: StepInput, commands, vehicles: Vehicles | None):
+    """Contact forces (row, batch) of a step, and the states of the vehicles at its end, if any."""
+    if vehicles is None:
+        parts = step.matrices, step.inertia, step.weight
+        return contact_forces(*parts, state, commands), None
+    return vehicles.advance(step, state, commands)
 
 
 def free_response(transition: Float[Array, "block side side"], state: Float[Array, "state batch"]):
@@ -64,8 +76,14 @@ def free_response(transition: Float[Array, "block side side"], state: Float[Arra
     return next_state.reshape(state.shape)
 
 
-def advance_unforced(matrices: StepMatrices, inertia, weight, state):
+def advance_unforced(step: StepInput, state, vehicles: Vehicles | None):
     """Steps without commands: final state, state before each step, and contact forces."""
+    matrices, inertia, weight = step.matrices, step.inertia, step.weight
+    if vehicles is not None:
+        final_state, (states, forces) = scan(
+            lambda state, one: advance(state, one, None, vehicles), state, step
+        )
+        return final_state, states, forces
     if not any_jax(matrices, inertia, weight, state):
         return _advance_known(matrices, inertia, weight, state)
     has_matrix = isinstance(matrices.contact_compliance, Array)
@@ -74,7 +92,8 @@ def advance_unforced(matrices: StepMatrices, inertia, weight, state):
 
 
 def _advance_all(matrices, inertia, weight, state):
-    final_state, (states, forces) = scan(advance, state, (matrices, inertia, weight, None))
+    steps = StepInput(matrices, inertia, weight, None)
+    final_state, (states, forces) = scan(advance, state, steps)
     return final_state, states, forces
 
 

@@ -9,8 +9,8 @@ import equinox as eqx
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.loads.base import trajectory
 from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, put, searchsorted, stop_gradient, take, xp
 
@@ -73,14 +73,12 @@ class TimeGrid(eqx.Module):
 
 
 def _load_events(case: Case, model: ModalModel):
-    """Entry and exit of each load (load, 2), and all load events (event,), in s."""
-    inner_nodes = model.modes.nodes[1:-1]
-    trajectories = [trajectory(load, case.beam.length) for load in case.loads]
-    if not trajectories:
-        return xp.zeros((0, 2)), xp.zeros(0)
-    windows = xp.stack([xp.stack(path.entry_exit_times()) for path in trajectories])
-    nonsmooth_times = [path.passage_times(inner_nodes) for path in trajectories]
-    return windows, xp.concatenate([windows.ravel(), *nonsmooth_times])
+    """Entry and exit of each wheel (wheel, 2), and all load events (event,), in s."""
+    places, loads = model.modes.nodes[1:-1], load_set(case)
+    if loads.profile is not None:
+        places = xp.concatenate([places, loads.profile.kinks()])
+    windows = loads.entry_exit_times()
+    return windows, xp.concatenate([windows.reshape(-1), loads.passage_times(places)])
 
 
 def _loads_on_beam(windows, boundaries):

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.model.contact import LoadSet, contact_rows, load_set
+from jaxbeam.model.contact import surface_rows
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
@@ -131,12 +132,12 @@ class Plant(Module):
         loads = self.loads
         position, speed, acceleration = loads.kinematics(t)
         active = loads.on_beam(t)
-        shape, contact = contact_rows(self.modal_model, position, speed, acceleration, active)
-        count = len(loads.trajectories)
+        rows = surface_rows(self.modal_model, position, speed, acceleration, active, False)
+        count = loads.wheel_count
         mass = xp.where(active, loads.inertia[:, 0], 0.0)
         return (
-            shape.reshape(count, self.coordinate_scale.size),
-            contact.reshape(count, self.modal_model.state_count),
+            rows.shape.reshape(count, self.coordinate_scale.size),
+            rows.acceleration.reshape(count, self.modal_model.state_count),
             mass,
         )
 

@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxbeam.case.case import crossing_times
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads.base import trajectory
+from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.schematic import draw_schematic
 from jaxbeam.plot.style import (
     ALARM,
@@ -61,11 +62,7 @@ def plot_record(record: Record) -> Figure:
 def load_windows(record: Record) -> list[tuple[int, float, float]]:
     """Number, entry and exit (s) of each load on the beam during the record, clipped to it."""
     times = np.asarray(record.times)
-    trajectories = [trajectory(load, record.case.beam.length) for load in record.case.loads]
-    windows = np.array(
-        [[float(concrete(t)) for t in trajectory.entry_exit_times()] for trajectory in trajectories]
-    ).reshape(-1, 2)
-    cut = np.clip(windows, times[0], times[-1]).tolist()
+    cut = np.clip(crossing_times(record.case), times[0], times[-1]).tolist()
     return [(i, entry, leaves) for i, (entry, leaves) in enumerate(cut) if entry < leaves]
 
 
@@ -137,11 +134,11 @@ def _draw_forces(axes, record):
     factor, unit = unit_scale(force[on], "N")
     shade_crossings(axes, record)
     weights = {}
-    for i, load in enumerate(record.case.loads):
-        contact_force = np.where(on[:, i], force[:, i], np.nan) / factor
+    loads = load_set(record.case)
+    for wheel, i in enumerate(loads.load_of_wheel):
+        contact_force = np.where(on[:, wheel], force[:, wheel], np.nan) / factor
         axes.plot(times, contact_force, color=load_colour(i), linewidth=1.1)
-        weight = float(concrete(load.weight(record.case.run.gravity))) / factor
-        weights.setdefault(weight, load_colour(i))
+        weights.setdefault(float(loads.weight[wheel, 0]) / factor, load_colour(i))
     lost = np.asarray(record.contact_lost_time)
     lost = lost[np.isfinite(lost)]
     if lost.size:

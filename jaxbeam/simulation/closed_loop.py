@@ -12,7 +12,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw
 from jaxbeam.case.fields import concrete
 from jaxbeam.integrator.events import EventSchedule, controller_schedule
-from jaxbeam.model.contact import LoadSet
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensor_filters import with_sensor_filters

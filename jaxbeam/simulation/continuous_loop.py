@@ -66,6 +66,7 @@ class ContinuousLoop(AbstractInputPolicy):
 
     def _commands(self, state, time):
         """Commands and rates of the law's states, (command, batch), for states (state, batch)."""
+        state = state[: self.model.state_count]  # without those of vehicles
         case, outputs = self.plant.case, self.output_rows @ state
         sensors = len(case.sensors)
         pairs = zip(case.sensors, outputs[:sensors], strict=True)

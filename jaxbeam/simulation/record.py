@@ -13,6 +13,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.files.netcdf import write_netcdf
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.output_rows import quantity_history
@@ -27,8 +28,10 @@ class Record(eqx.Module):
     """Record of one simulated run.
 
     Deflection is positive upwards. Samples at an entry or exit of a load are those just after.
-    `load_position` (m) and `contact_force` (N, positive under compression) are NaN and zero while a
-    load is off the beam. Peaks are those in continuous time. `contact_lost_time` (s) and
+    Loads are counted by their wheels. `load_position` (m) is NaN while a wheel is off the beam,
+    `contact_force` (N, positive under compression) zero, unless it is the wheel of a vehicle, which
+    presses on the ground. The `bodies` of vehicles have displacements in m (or rad) from static
+    equilibrium, positive upwards. Peaks are those in continuous time. `contact_lost_time` (s) and
     `contact_lost_position` (m) are those of the first negative contact force, which the bilateral
     model allows; NaN without one. `command` is that of the actuators, within their limits; at a
     change, the one just after. `failures` counts the steps of the controller so far without a
@@ -52,11 +55,25 @@ class Record(eqx.Module):
     lowest_contact_force: Float[Array, " load"]
     contact_lost_time: Float[Array, " load"]
     contact_lost_position: Float[Array, " load"]
+    body_displacement: Float[Array, "time body"]
+    body_velocity: Float[Array, "time body"]
+    body_acceleration: Float[Array, "time body"]
     error_estimate: Float[Array, ""]
     steps: int = eqx.field(static=True)
     controller_readings: Float[Array, "time sensor"] | None = None
 
     shown = renamed_property("shown", "controller_readings")
+
+    @property
+    def bodies(self) -> list[str]:
+        """Names of the degrees of freedom of all vehicles, as in "loads.0 vehicle 2 body"."""
+        loads, names = load_set(self.case), []
+        for group in loads.wheels.vehicles:
+            load = f"loads.{loads.load_of_wheel[group.first_wheel]}"
+            for i in range(group.count):
+                vehicle = load if group.count == 1 else f"{load} vehicle {i}"
+                names += [f"{vehicle} {name}" for name in group.names]
+        return names
 
     def at(self, x, quantity: str = "deflection", fibre_distance=None) -> Float[Array, "time ..."]:
         """History of a quantity at positions x (m) of any shape: (time, *shape of x), in SI units.
@@ -227,7 +244,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
     # Without sensors or loads a file lacks their variables.
     sizes = {
         "sensor": len(case.sensors),
-        "load": len(case.loads),
+        "load": load_set(case).wheel_count,
         "actuator": len(case.actuators),
         **dataset.sizes,
     }

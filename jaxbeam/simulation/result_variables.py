@@ -8,7 +8,7 @@ VARIABLES = {
     "coordinates": (("time", "mode"), "m kg^0.5", "modal coordinate"),
     "rates": (("time", "mode"), "m kg^0.5/s", "rate of the modal coordinate"),
     "accelerations": (("time", "mode"), "m kg^0.5/s^2", "acceleration of the modal coordinate"),
-    "load_position": (("time", "load"), "m", "position of the load"),
+    "load_position": (("time", "load"), "m", "position of the wheel"),
     "contact_force": (("time", "load"), "N", "contact force, positive under compression"),
     "command": (("time", "actuator"), "unit of a command", "command to the actuator"),
     "failures": (("time",), "1", "steps of the controller without a solution so far"),
@@ -17,6 +17,9 @@ VARIABLES = {
     "lowest_contact_force": (("load",), "N", "smallest contact force"),
     "contact_lost_time": (("load",), "s", "time of the first negative contact force"),
     "contact_lost_position": (("load",), "m", "position of the first negative contact force"),
+    "body_displacement": (("time", "body"), "m or rad", "displacement from static equilibrium"),
+    "body_velocity": (("time", "body"), "m/s or rad/s", "velocity of the body"),
+    "body_acceleration": (("time", "body"), "m/s^2 or rad/s^2", "acceleration of the body"),
 }
 # Variables of a run in a sweep; the dimensions of the sweep come first.
 SWEEP_VARIABLES = VARIABLES | {

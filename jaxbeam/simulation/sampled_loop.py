@@ -14,7 +14,8 @@ from jaxbeam.case.controller import AbstractSampledLaw, Measurement
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import NODE_COUNT
-from jaxbeam.model.contact import LoadSet, contact_at
+from jaxbeam.model.contact import contact_at
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state
@@ -143,10 +144,12 @@ class SampledLoop(AbstractInputPolicy):
 
     def _sensor_inputs(self, state, command, time):
         """Inputs of the sensors (sensor, batch) at a time (s)."""
-        signals, sensors = self.output_rows @ state, self.plant.case.sensors
+        signals = self.output_rows @ state[: self.model.state_count]
+        sensors = self.plant.case.sensors
         if not any(sensor.has_feedthrough for sensor in sensors):
             return signals
-        _, accelerations = contact_at(self.model, self.loads, time, state, command)
+        contact = contact_at(self.model, self.loads, time, state, command)
+        accelerations = contact.modal_acceleration
         return sensor_rows(self.model, sensors).with_accelerations(signals, accelerations)
 
     def _step_law(self, law_state, readings, state, command, time):

@@ -16,7 +16,8 @@ from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
 from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.integrator.time_grid import grid_by_schedule
-from jaxbeam.model.contact import LoadSet, contact_at, load_set
+from jaxbeam.model.contact import contact_at, split_states
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.runtime.arrays import Array, xp
@@ -86,19 +87,16 @@ def _check_times(times) -> None:
 
 def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
     running_peaks, outputs, modal, steps = _integrate(case, plan, times, case.sensor_positions)
-    coordinates, rates, accelerations, position, force, commands, readings, failures = outputs
+    coordinates, rates, accelerations, position, force, commands, *more = outputs
+    vehicles, readings, failures = more
     if commands is None:
         commands = xp.zeros((times.shape[0], len(case.actuators)))
     if failures is None:
         failures = xp.zeros(times.shape)
     peaks = Peaks(*(part[0] for part in running_peaks.peaks()))
     loads, lost_times = load_set(case), peaks.contact_lost_time
-    lost_positions = xp.array(
-        [
-            path.kinematics(time)[0]
-            for path, time in zip(loads.trajectories, lost_times, strict=True)
-        ]
-    ).reshape(-1)
+    # Each wheel at its own time.
+    lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
     return Record(
         case=case,
         modes=modal,
@@ -111,6 +109,7 @@ def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
         command=commands,
         failures=failures,
         controller_readings=readings,
+        **vehicles._asdict(),
         **peaks._asdict(),
         contact_lost_position=lost_positions,
         error_estimate=error,
@@ -218,10 +217,12 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
             if policy.implicit
             else _commands_at_steps(case, commands, sample_steps)
         )
-    *coordinates, commands = _modal_and_contact_outputs(model, loads, times, states, commands)
+    parts = _modal_and_contact_outputs(model, loads, times, states, commands)
+    *coordinates, commands, vehicles = parts
     if commands is not None:
         commands = commands[:, : len(case.actuators)]
-    return running_peaks, (*coordinates, commands, observed, failures), model.modes, steps
+    outputs = *coordinates, commands, vehicles, observed, failures
+    return running_peaks, outputs, model.modes, steps
 
 
 def _commands_at_steps(case: Case, commands, steps):
@@ -232,15 +233,43 @@ def _commands_at_steps(case: Case, commands, steps):
     return xp.clip(commands_at_start, low, high)
 
 
-def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states, commands):
-    """Modal coordinates, rates and accelerations, load positions, contact forces, commands."""
+class VehicleMotion(NamedTuple):
+    """Heights (m) or pitch angles (rad) of the bodies of vehicles, their rates and accelerations.
 
+    Of all vehicles, one after the other (see `Record.bodies`), measured from static equilibrium.
+    """
+
+    body_displacement: Float[Array, "time body"]
+    body_velocity: Float[Array, "time body"]
+    body_acceleration: Float[Array, "time body"]
+
+
+def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:
+    """Motion of the bodies at instants, from the states and the accelerations at contact."""
+    _, vehicle_states = split_states(model.state_count, loads, states)
+    none = xp.zeros((states.shape[0], 0))
+    parts = []
+    for state, acceleration in zip(vehicle_states, accelerations, strict=True):
+        dofs = acceleration.shape[-2]
+        motion = state[..., :dofs, 0], state[..., dofs:, 0], acceleration[..., 0]
+        parts.append([part.reshape(part.shape[0], -1) for part in motion])
+    if not parts:
+        return VehicleMotion(none, none, none)
+    return VehicleMotion(*(xp.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
+
+
+def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states, commands):
+    """Modal coordinates, rates and accelerations, wheel positions, contact forces, commands.
+
+    And the motion of the vehicles.
+    """
     columns = None if commands is None else commands[..., None]
-    force, accelerations = contact_at(model, loads, times, states, columns)
-    force, accelerations = force[..., 0], accelerations[..., 0]
+    contact = contact_at(model, loads, times, states, columns)
+    vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
+    force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
     count = 2 * accelerations.shape[1]
     coordinates = states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations
     if model.mode_map is not None:
         coordinates = tuple(part @ model.mode_map.T for part in coordinates)
-    position = loads.kinematics(times)[0].T
-    return *coordinates, xp.where(loads.on_beam(times).T, position, xp.nan), -force, commands
+    position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
+    return *coordinates, position, -force, commands, vehicles

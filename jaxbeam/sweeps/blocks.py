@@ -13,6 +13,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, value_at
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.events import sample_schedule
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import (
@@ -67,7 +68,7 @@ class Runner:
         same_model = all(name.startswith(leaves_model_unchanged) for name in self.addresses[0])
         self.same_model = same_model and self.devices == 1
         # Compilation of the programs for one load need not wait for its entry and exit times.
-        max_loads = len(case.loads)
+        max_loads = load_set(case).wheel_count
         if max_loads > 1:
             max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times())
         native = native_peaks.supports(case) and not single

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 
 from jaxbeam.case.trajectory import BrakingTrajectory, TabulatedTrajectory
-from jaxbeam.model.contact import LoadSet
+from jaxbeam.model.load_set import LoadSet
 
 LENGTH = jnp.asarray(2.0)
 TIMES = np.array([0.0, 0.3, 0.7, 0.8, 1.5])

@@ -123,3 +123,8 @@ def trajectory(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewis
     return BrakingTrajectory(
         load.speed, load.entry_time, load.deceleration, length, load.start_position
     )
+
+
+def wheel_distances(load: AbstractLoad, gravity: Float[Array, ""]) -> Float[Array, " wheel"]:
+    """Distances (m) of all wheels of a load behind its first one."""
+    return (load.spacings()[:, None] + load.vehicle(gravity).offsets).reshape(-1)

@@ -16,7 +16,7 @@ from jaxbeam.control.load_identifiers import AbstractLoadSource, given_load
 from jaxbeam.control.optimal.crossing_lqr import AbstractFiniteHorizonRegulator, interval_error
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.model.contact import load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array
 
