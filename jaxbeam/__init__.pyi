@@ -19,6 +19,14 @@ from .case.case import Case as Case, Run as Run, addresses as addresses, replace
 from .case.filters import Filter as Filter
 from .case.loads.force import MovingForce as MovingForce
 from .case.loads.mass import MovingMass as MovingMass
+from .case.profiles.bump import BumpProfile as BumpProfile
+from .case.profiles.iso8608 import ISO8608Profile as ISO8608Profile
+from .case.profiles.rail import RailProfile as RailProfile
+from .case.profiles.ramp import RampProfile as RampProfile
+from .case.profiles.sine import SineProfile as SineProfile
+from .case.profiles.spectrum import SpectrumProfile as SpectrumProfile
+from .case.profiles.step import StepProfile as StepProfile
+from .case.profiles.table import TableProfile as TableProfile
 from .case.sensors import Sensor as Sensor
 from .control.compensators import (
     PD as PD,
@@ -49,6 +57,7 @@ from .estimation.inversion import Inversion as Inversion
 from .estimation.kalman import Kalman as Kalman
 from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
+from .files.profile_file import profile_from_file as profile_from_file
 from .model.frequency_response import (
     accelerance as accelerance,
     frequency_response as frequency_response,

@@ -18,6 +18,7 @@ from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, number
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array, set_at, xp
 
@@ -36,7 +37,7 @@ class Run(eqx.Module):
 
 
 class Case(eqx.Module):
-    """Beam, supports, actuators, sensors, loads, controller and run settings.
+    """Beam, supports, actuators, sensors, loads, profile, controller and run settings.
 
     An immutable tree: `replace(case, {"loads.0.mass": 0.3})` or `equinox.tree_at` return a changed
     copy. Every number has an address, its dotted path. Its fields are the keys of a case file.
@@ -47,6 +48,7 @@ class Case(eqx.Module):
     actuators: tuple[AbstractActuator, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     loads: tuple[AbstractLoad, ...] = ()
+    profile: AbstractProfile | None = None
     controller: AbstractController | None = None
     run: Run | None = None
     title: str = choice("title of the case", default="")
@@ -61,12 +63,14 @@ class Case(eqx.Module):
         controller=None,
         run: Run | None = None,
         title: str = "",
+        profile=None,
     ):
         self.beam = beam
         self.supports = tuple(supports)
         self.actuators = tuple(actuators)
         self.sensors = tuple(sensors)
         self.loads = tuple(loads)
+        self.profile = profile
         self.controller = controller
         self.run = Run(duration=1.0) if run is None else run
         self.title = title

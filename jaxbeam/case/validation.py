@@ -23,11 +23,12 @@ from jaxbeam.case.declared_checks import (
 from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
 from jaxbeam.case.loads.base import AbstractLoad
+from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array
 
 # Parts with a method `validate(address)`.
-SELF_VALIDATING = Beam | AbstractActuator | Sensor | AbstractLoad
+SELF_VALIDATING = Beam | AbstractActuator | Sensor | AbstractLoad | AbstractProfile
 
 
 def check_case(case: Case) -> None:
@@ -52,6 +53,7 @@ def check_case(case: Case) -> None:
         if error is not None:
             raise ValueError(error)
     _check_supports(case.supports, case.beam.length)
+    _check_profile(case)
     for i, sensor in enumerate(case.sensors):
         _check_sampling(f"sensors.{i}", sensor, case)
     if case.controller is not None:
@@ -84,6 +86,14 @@ def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> 
                 f"supports.{min(i, j)} and supports.{max(i, j)} both hold the beam rigidly at"
                 f" {left:g} m; remove one"
             )
+
+
+def _check_profile(case: Case) -> None:
+    """Validate that the profile is known wherever loads travel, on the beam at least."""
+    if case.profile is not None and case.loads:
+        error = case.profile.validate_travel("profile", 0.0, case.beam.length)
+        if error is not None:
+            raise ValueError(error)
 
 
 def _check_sampling(address: str, sensor: Sensor, case: Case) -> None:

@@ -18,6 +18,7 @@ from jaxbeam.case.declared_checks import check_field, describe_value, missing_er
 from jaxbeam.case.fields import concrete, describe_shape, fits_shape
 from jaxbeam.case.kinds import import_modules, kind_of, kinds
 from jaxbeam.case.validation import check_case
+from jaxbeam.files.profile_file import with_profile_file
 from jaxbeam.files.toml_file import read_toml
 
 for package in ("jaxbeam.case", "jaxbeam.control", "jaxbeam.estimation"):
@@ -27,12 +28,15 @@ for package in ("jaxbeam.case", "jaxbeam.control", "jaxbeam.estimation"):
 def load_case(path: str | os.PathLike) -> Case:
     """The validated case of a TOML file.
 
+    A profile of kind "table" may have its points in a file of their own, `file = "profile.csv"`,
+    relative to the folder of the case file (see `profile_from_file`).
+
     Raises ValueError, with the file and the address or line, for invalid TOML, unknown keys or
     kinds, wrong types and the errors of `check_case`; OSError if the file cannot be read.
     """
     content = read_toml(path)
     try:
-        case = case_from_dict(content)
+        case = case_from_dict(with_profile_file(content, path))
         check_case(case)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -50,7 +54,7 @@ def load_controller(path: str | os.PathLike) -> AbstractController:
         if "controller" not in content:
             raise ValueError("has no controller; write a table [controller]")
         if set(content) - {"title", "controller"}:
-            case_from_dict(content)  # to validate the other tables
+            case_from_dict(with_profile_file(content, path))  # to validate the other tables
         return _read_key("controller", content["controller"])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
