@@ -17,8 +17,13 @@ from .case.actuators.spring import SpringDamper as SpringDamper
 from .case.beam import Beam as Beam, Support as Support
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
 from .case.filters import Filter as Filter
+from .case.loads.axles import Axles as Axles
 from .case.loads.force import MovingForce as MovingForce
+from .case.loads.half_car import HalfCar as HalfCar
 from .case.loads.mass import MovingMass as MovingMass
+from .case.loads.oscillator import Oscillator as Oscillator
+from .case.loads.quarter_car import QuarterCar as QuarterCar
+from .case.loads.wagon import Wagon as Wagon
 from .case.profiles.bump import BumpProfile as BumpProfile
 from .case.profiles.iso8608 import ISO8608Profile as ISO8608Profile
 from .case.profiles.rail import RailProfile as RailProfile

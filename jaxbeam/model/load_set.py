@@ -212,7 +212,7 @@ def load_set(case: Case) -> LoadSet:
         trajectories,
         _wheels(case.loads, vehicles),
         tuple(wheel_distances(load, case.run.gravity) for load in case.loads),
-        getattr(case, "profile", None),
+        case.profile,
     )
 
 

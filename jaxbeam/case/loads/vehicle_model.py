@@ -15,7 +15,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, cholesky, solve, xp
 
 
 class VehicleModel(eqx.Module):
@@ -49,6 +49,18 @@ class VehicleModel(eqx.Module):
         """Damping (N s/m) of the vehicle on a rigid surface."""
         contact = self.contact_damping[:, None] * self.wheel_map
         return self.damping + self.wheel_map.T @ contact
+
+    def natural_frequencies(self) -> Float[Array, " dof"]:
+        """Undamped natural frequencies (Hz) on a rigid surface, ascending.
+
+        det(K - (2 pi f)^2 M) = 0 with the springs of the wheels in K.
+        """
+        if not self.names:
+            return np.zeros(0)
+        half_solved = solve(factor := cholesky(self.mass), self.full_stiffness)
+        scaled = solve(factor, half_solved.T)
+        values = xp.linalg.eigvalsh((scaled + scaled.T) / 2)
+        return xp.sqrt(xp.maximum(values, 0.0)) / (2 * np.pi)
 
 
 def plain_wheels(
