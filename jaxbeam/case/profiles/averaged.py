@@ -3,7 +3,6 @@
 import abc
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.profiles.base import AbstractProfile
@@ -27,11 +26,11 @@ class AbstractAveragedProfile(AbstractProfile):
 
     def slope_jumps(self) -> Float[Array, " kink"]:
         """Positions (m) at which s' jumps."""
-        return np.zeros(0)
+        return xp.zeros(0)
 
     def curvature_jumps(self) -> Float[Array, " kink"]:
         """Positions (m) at which s'' jumps, though s' does not."""
-        return np.zeros(0)
+        return xp.zeros(0)
 
     def heights(self, x):
         x = xp.asarray(x, float)

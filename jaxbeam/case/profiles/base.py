@@ -3,10 +3,9 @@
 import abc
 from typing import ClassVar
 
-import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
 
 Heights = tuple[Float[Array, "*x"], Float[Array, "*x"], Float[Array, "*x"]]
@@ -33,7 +32,7 @@ class AbstractProfile(Module):
 
     def kinks(self) -> Float[Array, " kink"]:
         """Positions (m) at which r' or r'' jumps; their number depends on no number of the case."""
-        return np.zeros(0)
+        return xp.zeros(0)
 
     @property
     def has_slope_jumps(self) -> bool:

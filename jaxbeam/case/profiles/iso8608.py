@@ -32,7 +32,7 @@ class ISO8608Profile(AbstractRandomProfile):
     highest_wavenumber: Float[Array, ""] = number(
         "1/m", "highest wavenumber, cycles per metre", POSITIVE, default=4.0
     )
-    waves: int = count("number of waves of the sum", default=200)
+    waves: int = count("number of waves of the sum", default=100)
     switch_on: Float[Array, "2"] = number(
         "m",
         "positions where the profile begins and where it is all there",

@@ -29,7 +29,7 @@ class RailProfile(AbstractRandomProfile):
     longest_wavelength: Float[Array, ""] | None = number(
         "m", "longest wavelength", POSITIVE, default=None
     )
-    waves: int = count("number of waves of the sum", default=200)
+    waves: int = count("number of waves of the sum", default=100)
     switch_on: Float[Array, "2"] = number(
         "m",
         "positions where the profile begins and where it is all there",
