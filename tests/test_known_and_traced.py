@@ -115,7 +115,7 @@ FUNCTIONS = {
     "propagators": lambda case, layout: propagators(
         _model(case, layout), np.array([0.0, 1e-4, 0.01]), with_commands=has_coupling(case)
     ),
-    "longest step": lambda case, layout: max_stable_step(_model(case, layout), case.loads),
+    "longest step": lambda case, layout: max_stable_step(_model(case, layout), load_set(case)),
     "discrete model": _discrete_model,
     "output rows": lambda case, layout: sensor_rows(_model(case, layout), case.sensors),
     "flexibility": lambda case, layout: flexibility(case, layout, X, 0)(X / 1.2, 0),

@@ -92,20 +92,21 @@ def _step_with_inputs(policy: AbstractInputPolicy, vehicles: Vehicles | None, ca
     return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
 
 
-def _advance_known_with_inputs(policy, matrices, inertia, weight, infos, state, memory):
+def _advance_known_with_inputs(policy, vehicles, steps: StepInput, infos, state, memory):
     """Steps of known numbers under commands that do not depend on the states within a step.
 
     Results as of a `scan` of `_step_with_inputs`; see `step.known_maps`. None if the policy
     computes with JAX in spite of known numbers, as a law of a user may.
     """
-    forces_map, maps = known_maps(matrices, inertia, weight)
-    steps, batch_size, state_count, columns = maps.shape
-    bound = policy.state_bound[:, None]
+    forces_map, maps = known_maps(steps, vehicles)
+    count, batch_size, state_count, columns = maps.shape
+    bound = np.full((state_count, 1), np.inf)  # of vehicles none
+    bound[: steps.matrices.state_count, 0] = policy.state_bound
     # State, commands, and one.
-    sources = np.ones((steps + 1, batch_size, columns, 1))
+    sources = np.ones((count + 1, batch_size, columns, 1))
     sources[0, :, :state_count, 0] = state.T
     events, observations, held = infos.event.tolist(), [], None
-    for i in range(steps):
+    for i in range(count):
         state = sources[i, :, :state_count]
         if events[i] >= 0 or i == 0 or not policy.holds_commands:
             info = StepInfo(infos.start[i], infos.length[i], infos.event[i])
@@ -173,9 +174,8 @@ def _chunk_function(
             infos = StepInfo(path.start, path.length, discrete.grid.event_at(index))
             is_known = not any_jax(steps, state, memory, policy)
             result = None
-            if is_known and not policy.implicit and vehicles is None:
-                parts = steps.matrices, steps.inertia, steps.weight
-                result = _advance_known_with_inputs(policy, *parts, infos, state, memory)
+            if is_known and not policy.implicit:
+                result = _advance_known_with_inputs(policy, vehicles, steps, infos, state, memory)
             (state, memory), (states, forces, commands, observed) = result or scan(
                 lambda carry, step: _step_with_inputs(policy, vehicles, carry, step),
                 (state, memory),

@@ -116,10 +116,10 @@ def integrate_peaks(
             grids.loads_on_beam,
             grids.on_beam_intervals,
         ),
-        *(*jax.vmap(LoadSet.cubics)(loads), loads.inertia, loads.weight, positions),
+        *(*jax.vmap(LoadSet.cubics)(loads), loads.wheels.inertia, loads.wheels.weight, positions),
         *(part[None] for part in constants),
     )
-    tasks, load_count, batch_size = loads.inertia.shape
+    tasks, load_count, batch_size = loads.wheels.inertia.shape
     position_count, modes = positions.shape[1], shapes.shape[-1]
     blocks, block_size = models.state_matrix.shape[1:3]
     beam = grids.counts.shape[1], blocks, block_size, modes // blocks, *shapes.shape[1:3]

@@ -20,12 +20,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS
 from jaxbeam.numerics.gauss import gauss_nodes, lagrange_coefficients
 from jaxbeam.runtime.arrays import Array, scan, set_at, stop_gradient, vmap, xp
 
 NODE_COUNT = 6  # Gauss nodes in a step; the integrator has order 12
 DOUBLINGS = 7
 TAYLOR_TERMS = 14
+MANY_MATRICES = 256  # whose products XLA computes faster element by element
 MAX_STEP_NORM = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is exact to rounding
 
 GAUSS_NODES = gauss_nodes(NODE_COUNT)
@@ -54,8 +56,8 @@ def end_weights() -> np.ndarray:
 
 
 def _multiply(a, b):
-    """Product of matrices (row, column, ...), spelt out for the small blocks of single modes."""
-    if a.shape[1] > 3:
+    """Product of matrices (row, column, ...), spelt out for small blocks, and smaller than many."""
+    if a.shape[1] > (3 if math.prod(a.shape[2:]) < MANY_MATRICES else MAX_UNROLLED_TERMS):
         return xp.einsum("ij...,jk...->ik...", a, b)
     return sum(a[:, i, None] * b[None, i] for i in range(a.shape[1]))
 

@@ -79,13 +79,13 @@ def free_response(transition: Float[Array, "block side side"], state: Float[Arra
 def advance_unforced(step: StepInput, state, vehicles: Vehicles | None):
     """Steps without commands: final state, state before each step, and contact forces."""
     matrices, inertia, weight = step.matrices, step.inertia, step.weight
+    if not any_jax(step, state, vehicles):
+        return _advance_known(step, state, vehicles)
     if vehicles is not None:
         final_state, (states, forces) = scan(
             lambda state, one: advance(state, one, None, vehicles), state, step
         )
         return final_state, states, forces
-    if not any_jax(matrices, inertia, weight, state):
-        return _advance_known(matrices, inertia, weight, state)
     has_matrix = isinstance(matrices.contact_compliance, Array)
     advance_all = _advance_with_rule if has_matrix else _advance_all
     return advance_all(matrices, inertia, weight, state)
@@ -97,12 +97,12 @@ def _advance_all(matrices, inertia, weight, state):
     return final_state, states, forces
 
 
-def _advance_known(matrices: StepMatrices, inertia, weight, state):
+def _advance_known(step: StepInput, state, vehicles: Vehicles | None):
     """`advance_unforced` of known numbers, as one map a step.
 
     The systems of all steps are solved at once; NumPy takes a tenth of the time of one by one.
     """
-    forces_of_state, maps = known_maps(matrices, inertia, weight)
+    forces_of_state, maps = known_maps(step, vehicles)
     states = np.empty((len(maps) + 1, *maps.shape[1:3], 1))
     states[0] = state.T[..., None]
     state_maps, offsets = maps[..., :-1], maps[..., -1:]
@@ -113,40 +113,47 @@ def _advance_known(matrices: StepMatrices, inertia, weight, state):
     return states[-1], states[:-1], forces
 
 
-def known_maps(matrices: StepMatrices, inertia, weight):
+def known_maps(step: StepInput, vehicles: Vehicles | None):
     """Maps of steps of known numbers to the contact forces and to the next state.
 
     z' = Phi z + B u - Gamma S (m (R z + D u) + w) with commands u, if there are any. Both maps are
-    (step, batch, row, column), with the columns of the state z, of u, and of one.
+    (step, batch, row, column), with the columns of the state, of u, and of one.
     """
-    rows = inertia.shape[1]
-    inertia, weight = (np.swapaxes(part, 1, 2)[..., None] for part in (inertia, weight))
-    compliance, response = matrices.contact_compliance, matrices.contact_response
-    commands = matrices.commands
-    blocks, side = matrices.transition.shape[1:3]
-    states = blocks * side
-    if response is None:
-        columns = states + (0 if commands is None else commands.input_matrix.shape[-1])
-        no_response = np.zeros((*weight.shape[:-1], columns))
-        right = np.concatenate([no_response, weight], axis=-1)
-        forces_of_state = -right
+    matrices, commands = step.matrices, step.matrices.commands
+    surface = None
+    if vehicles is None:
+        forces_of_state = _known_forces(step)
     else:
-        parts = [response, *([] if commands is None else [commands.contact_response])]
-        right = [inertia * part[:, None] for part in parts]
-        right = np.concatenate([*right, weight], axis=-1)
-        if isinstance(compliance, ModalCompliance):
-            compliance = jax.tree.map(lambda part: part[:, None], compliance)
-            forces_of_state = compliance.solve(inertia, right)
-        else:
-            system = np.eye(rows) + inertia * compliance[:, None]
-            forces_of_state = -np.linalg.solve(system, right)
+        forces_of_state, surface = vehicles.known_forces(step)
     maps = matrices.force_response[:, None] @ forces_of_state
-    state_index = np.arange(states).reshape(blocks, side)
-    index = np.s_[:, :, state_index[:, :, None], state_index[:, None, :]]
-    maps[index] += matrices.transition[:, None]
+    blocks, side = matrices.transition.shape[1:3]
+    state_index = np.arange(matrices.state_count).reshape(blocks, side)
+    maps[:, :, state_index[:, :, None], state_index[:, None, :]] += matrices.transition[:, None]
     if commands is not None:
-        maps[..., states:-1] += commands.input_matrix[:, None]
+        count = commands.input_matrix.shape[-1]
+        maps[..., -1 - count : -1] += commands.input_matrix[:, None]
+    if vehicles is not None:
+        maps = np.concatenate([maps, vehicles.known_state_maps(step, surface)], axis=2)
     return forces_of_state, maps
+
+
+def _known_forces(step: StepInput):
+    """Map to the contact forces of plain wheels; see `known_maps`."""
+    matrices, commands = step.matrices, step.matrices.commands
+    inertia, weight = (np.swapaxes(part, 1, 2)[..., None] for part in (step.inertia, step.weight))
+    compliance, response = matrices.contact_compliance, matrices.contact_response
+    if response is None:
+        count = 0 if commands is None else commands.input_matrix.shape[-1]
+        no_response = np.zeros((*weight.shape[:-1], matrices.state_count + count))
+        return -np.concatenate([no_response, weight], axis=-1)
+    parts = [response, *([] if commands is None else [commands.contact_response])]
+    right = [inertia * part[:, None] for part in parts]
+    right = np.concatenate([*right, weight], axis=-1)
+    if isinstance(compliance, ModalCompliance):
+        compliance = jax.tree.map(lambda part: part[:, None], compliance)
+        return compliance.solve(inertia, right)
+    system = np.eye(weight.shape[2]) + inertia * compliance[:, None]
+    return -np.linalg.solve(system, right)
 
 
 _advance_with_rule = custom_jvp(_advance_all)

@@ -107,7 +107,10 @@ def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int
     """
     if any_jax(discrete, loads):
         return CHUNK_STEPS
-    rows, states = max_loads * NODE_COUNT, discrete.model.state_count
+    rows = max_loads * NODE_COUNT
+    states = discrete.model.state_count + loads.vehicle_states
+    if loads.wheels.vehicles:
+        rows = loads.wheel_count * NODE_COUNT
     compliance = rows * min(rows, NODE_COUNT * discrete.model.mode_count)
     entries = loads.inertia.shape[1] * max(compliance, rows * states, states**2)
     return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // entries)))

@@ -23,7 +23,12 @@ from jaxbeam.integrator.propagators import (
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.model.contact import forces_of_wheels, split_states
 from jaxbeam.model.load_set import LoadSet, VehicleGroup
-from jaxbeam.numerics.batched_linalg import matvec, solve_small, solve_unpivoted
+from jaxbeam.numerics.batched_linalg import (
+    matmul_last,
+    matvec,
+    solve_small,
+    solve_unpivoted,
+)
 from jaxbeam.runtime.arrays import (
     Array,
     add_at,
@@ -42,13 +47,13 @@ class VehiclePropagators(eqx.Module):
     """Matrices of the vehicles of one load over steps of some lengths.
 
     `transition` and `input` map states and q at the nodes to the states at the end;
-    `spring_states` is O and `spring_surface` is S.
+    `spring_states` is O and `spring_surface` is S. Rows are (wheel, node).
     """
 
     transition: Float[Array, "*length state state batch"]
-    input: Float[Array, "*length node state wheel batch"]
-    spring_states: Float[Array, "*length wheel node state batch"]
-    spring_surface: Float[Array, "*length wheel node wheel node batch"]
+    input: Float[Array, "*length state row batch"]
+    spring_states: Float[Array, "*length row state batch"]
+    spring_surface: Float[Array, "*length row row batch"]
 
 
 def vehicle_state_norm(loads: LoadSet) -> Float[Array, ""]:
@@ -79,51 +84,58 @@ def vehicle_propagators(
     inputs = xp.einsum("cfp,pswblc->lcfswb", force_weights(), phi_functions)
     transition = xp.einsum("stblc->lcstb", transition)
     nodes = slice(0, NODE_COUNT)
-    spring_states = xp.einsum("wsb,lcstb->lwctb", H, transition[:, nodes])
+    spring_states = xp.einsum("wsb,lcstb->lwctb", H, transition[:, nodes]) * scale
     response = xp.einsum("wsb,lcfsvb->lwcvfb", H, inputs[:, nodes])
-    wheels = H.shape[0]
-    identity = np.eye(wheels * NODE_COUNT).reshape(wheels, NODE_COUNT, wheels, NODE_COUNT, 1)
+    to_end = xp.einsum("lfswb->lswfb", inputs[:, -1])
+    count, rows, states, batch_size = lengths.shape[0], H.shape[0] * NODE_COUNT, *scale.shape
     return VehiclePropagators(
         transition=transition[:, -1] / scale[:, None] * scale,
-        input=inputs[:, -1] / scale[:, None],
-        spring_states=spring_states * scale,
-        spring_surface=identity - response,
+        input=to_end.reshape(count, states, rows, batch_size) / scale[:, None],
+        spring_states=spring_states.reshape(count, rows, states, batch_size),
+        spring_surface=np.eye(rows)[..., None] - response.reshape(count, rows, rows, batch_size),
     )
 
 
-def free_spring_forces(
+def _by_vehicle(group: VehicleGroup, surface: Float[Array, "wheel node batch"]):
+    """Values at the wheels of a load as (row, vehicle, batch)."""
+    values = surface[group.wheels].reshape(group.count, -1, surface.shape[-1])
+    return xp.swapaxes(values, 0, 1)
+
+
+def spring_forces(
     propagators: VehiclePropagators, group: VehicleGroup, states, surface
-) -> Float[Array, "node wheel batch"]:
+) -> Float[Array, "wheel node batch"]:
     """Forces s of the springs of a load at the nodes of a step.
 
-    From the states (vehicle, state, batch) and q of the surface (node, wheel, batch).
+    From the states (vehicle, state, batch) and q of the surface (wheel, node, batch).
     """
-    by_vehicle = surface.reshape(surface.shape[0], group.count, -1, surface.shape[-1])
-    forces = xp.einsum("wcvfb,fnvb->cnwb", propagators.spring_surface, by_vehicle) - xp.einsum(
-        "wctb,ntb->cnwb", propagators.spring_states, states
-    )
-    return forces.reshape(surface.shape)
+    forces = matmul_last(propagators.spring_surface, _by_vehicle(group, surface))
+    forces = forces - matmul_last(propagators.spring_states, xp.swapaxes(states, 0, 1))
+    return xp.swapaxes(forces, 0, 1).reshape(-1, NODE_COUNT, forces.shape[-1])
 
 
 def next_vehicle_states(
     propagators: VehiclePropagators, group: VehicleGroup, states, surface
-) -> Float[Array, "vehicle state batch"]:
-    """States at the end of a step, from those at its start and q of the surface."""
-    by_vehicle = surface.reshape(surface.shape[0], group.count, -1, surface.shape[-1])
-    return xp.einsum("stb,ntb->nsb", propagators.transition, states) + xp.einsum(
-        "fswb,fnwb->nsb", propagators.input, by_vehicle
-    )
+) -> Float[Array, "all batch"]:
+    """States of all vehicles of a load at the end of a step; arguments as for `spring_forces`."""
+    after = matmul_last(propagators.transition, xp.swapaxes(states, 0, 1))
+    after = after + matmul_last(propagators.input, _by_vehicle(group, surface))
+    return xp.swapaxes(after, 0, 1).reshape(group.state_count, -1)
 
 
 def spring_coupling(loads: LoadSet, propagators, wheels) -> Float[Array, "row row batch"]:
     """Matrix S between the rows (wheel and node) of some wheels; zero between vehicles."""
     count, coupling = wheels.shape[0], None
+    if count == loads.wheel_count == 1:
+        return propagators[0].spring_surface
     for group, part in zip(loads.wheels.vehicles, propagators, strict=True):
         within = (wheels >= group.wheels.start) & (wheels < group.wheels.stop)
         index = xp.where(within, wheels - group.first_wheel, 0)
         vehicle, wheel = index // group.wheels_per_vehicle, index % group.wheels_per_vehicle
         same = within[:, None] & within & (vehicle[:, None] == vehicle)
-        rows = xp.take(xp.take(part.spring_surface, wheel, axis=0), wheel, axis=2)
+        all_wheels = (group.wheels_per_vehicle, NODE_COUNT) * 2
+        rows = part.spring_surface.reshape(*all_wheels, -1)
+        rows = xp.take(xp.take(rows, wheel, axis=0), wheel, axis=2)
         rows = xp.where(same[:, None, :, None, None], rows, 0.0)
         coupling = rows if coupling is None else coupling + rows
     assert coupling is not None
@@ -175,18 +187,16 @@ class Vehicles(eqx.Module):
             for part in self.propagators
         )
         state, vehicle_states = split_states(matrices.state_count, loads, state)
-        shape = (NODE_COUNT, loads.wheel_count, state.shape[-1])
+        shape = (loads.wheel_count, NODE_COUNT, state.shape[-1])
         surface = xp.zeros(shape)
         if step.surface is not None:
-            height, rate, _ = (xp.swapaxes(part, 0, 1)[..., None] for part in step.surface)
-            surface = wheels.stiffness * height + wheels.damping * rate
+            height, rate, _ = step.surface[..., None]
+            surface = wheels.stiffness[:, None] * height + wheels.damping[:, None] * rate
         triples = list(zip(parts, wheels.vehicles, vehicle_states, strict=True))
-        springs = [free_spring_forces(*three, surface[:, three[1].wheels]) for three in triples]
-        springs = forces_of_wheels(loads, springs, surface)
+        springs = forces_of_wheels(loads, [spring_forces(*t, surface) for t in triples], surface, 0)
         # Rows are wheel and node.
-        of_wheels = xp.moveaxis(xp.take(springs, step.wheels, axis=1), 0, 1)
-        of_wheels = xp.where(step.on_beam[:, None, None], of_wheels, 0.0)
-        spring_rows = of_wheels.reshape(-1, of_wheels.shape[-1])
+        of_wheels = xp.where(step.on_beam[:, None, None], take(springs, step.wheels), 0.0)
+        spring_rows = of_wheels.reshape(-1, shape[-1])
         stiffness, damping = (
             xp.repeat(take(part, step.wheels), NODE_COUNT, axis=0)
             for part in (wheels.stiffness, wheels.damping)
@@ -205,25 +215,133 @@ class Vehicles(eqx.Module):
             impedance = stiffness[:, None] * compliance[0][..., None]
             impedance = impedance + damping[:, None] * compliance[1][..., None]
             right = weight + inertia * acceleration + spring_rows
-            right = right + xp.einsum("ijb,jb->ib", coupling, on_springs)
+            right = right + matmul_last(coupling, on_springs[:, None])[:, 0]
             system = inertia[:, None] * matrices.contact_compliance[..., None]
-            system = system + xp.einsum("ijb,jkb->ikb", coupling, impedance)
+            system = system + matmul_last(coupling, impedance)
             system = system + np.eye(right.shape[0])[..., None]
             forces = solve_rows(system, -right)
-            return forces, on_springs + xp.einsum("ijb,jb->ib", impedance, forces)
+            return forces, on_springs + matmul_last(impedance, forces[:, None])[:, 0]
 
         def no_contact():
             return xp.zeros_like(spring_rows), xp.zeros_like(spring_rows)
 
         forces, on_springs = cond(matrices.loaded, contact, no_contact)
-        by_wheel = on_springs.reshape(-1, NODE_COUNT, on_springs.shape[-1])
-        by_wheel = add_at(xp.zeros((shape[1], shape[0], shape[2])), step.wheels, by_wheel)
-        surface = surface + xp.swapaxes(by_wheel, 0, 1)
-        next_states = [
-            next_vehicle_states(*three, surface[:, three[1].wheels]).reshape(-1, shape[-1])
-            for three in triples
-        ]
-        return forces, xp.concatenate(next_states)
+        by_wheel = on_springs.reshape(-1, NODE_COUNT, shape[-1])
+        surface = surface + add_at(xp.zeros(shape), step.wheels, by_wheel)
+        return forces, xp.concatenate([next_vehicle_states(*t, surface) for t in triples])
+
+    def known_forces(self, step: StepInput):
+        """Maps of known steps to contact forces, and to q = k y + c y' of the beam at the rows.
+
+        Both (step, batch, row, column) with columns as in `step.known_maps`; see `advance`.
+        """
+        matrices, loads, wheels = step.matrices, self.loads, self.loads.wheels
+        count, states = step.inertia.shape[0], matrices.state_count
+        inertia, weight = (
+            np.swapaxes(part, 1, 2)[..., None] for part in (step.inertia, step.weight)
+        )
+        at_rows = (take(part, step.vehicles.wheels) for part in (wheels.stiffness, wheels.damping))
+        stiffness, damping = (
+            np.swapaxes(np.repeat(part, NODE_COUNT, axis=1), 1, 2)[..., None] for part in at_rows
+        )
+
+        def on_springs(parts):
+            return stiffness * parts[:, 0, None] + damping * parts[:, 1, None]
+
+        springs, commands = matrices.springs, matrices.commands
+        acceleration, surface = [matrices.contact_response], [on_springs(springs.response)]
+        if commands is not None:
+            acceleration.append(commands.contact_response)
+            surface.append(on_springs(springs.commands))
+        inputs = sum(part.shape[-1] for part in acceleration[1:])
+        coupling, by_states, by_profile = self._known_springs(step)
+        right = np.zeros((*weight.shape[:-1], states + loads.vehicle_states + inputs + 1))
+        vehicle_columns = slice(states, states + loads.vehicle_states)
+        beam_columns = np.r_[:states, states + loads.vehicle_states : right.shape[-1] - 1]
+        surface_map = np.zeros(right.shape)
+        surface_map[..., beam_columns] = np.concatenate(surface, axis=-1)
+        right[..., beam_columns] = inertia * np.concatenate(acceleration, axis=-1)[:, None]
+        right[..., vehicle_columns] = -by_states
+        right[..., -1:] = weight + by_profile
+        right += coupling @ surface_map
+        impedance = on_springs(springs.compliance)
+        system = np.eye(weight.shape[2]) + inertia * matrices.contact_compliance[:, None]
+        forces = -np.linalg.solve(system + coupling @ impedance, right)
+        assert len(forces) == count
+        return forces, surface_map + impedance @ forces
+
+    def _known_springs(self, step: StepInput):
+        """S and O at the rows, and S q of the profile, of known steps (step, batch, row, ...)."""
+        loads, wheels, length = self.loads, step.vehicles.wheels, step.vehicles.length_index
+        on_beam = np.repeat(step.vehicles.on_beam, NODE_COUNT, axis=1)[:, None, :, None]
+        profile = self._known_profile(step)
+        rows = (wheels[..., None] * NODE_COUNT + np.arange(NODE_COUNT)).reshape(len(wheels), -1)
+        all_rows = loads.wheel_count * NODE_COUNT
+        shape = len(length), profile.shape[1], all_rows
+        coupling, by_states = np.zeros((*shape, all_rows)), np.zeros((*shape, loads.vehicle_states))
+        first = 0
+        for group, part in zip(loads.wheels.vehicles, self.propagators, strict=True):
+            S, O = (
+                np.moveaxis(matrix[length], -1, 1)
+                for matrix in (part.spring_surface, part.spring_states)
+            )
+            for i in range(group.count):
+                own = _rows_of(group, i)
+                coupling[..., own, own] = S
+                by_states[..., own, first : first + O.shape[-1]] = O
+                first += O.shape[-1]
+        by_profile = coupling @ profile
+        index = np.arange(len(length))[:, None, None], np.arange(shape[1])[:, None], rows[:, None]
+        pairs = index[0][..., None], index[1][..., None], rows[:, None, :, None], rows[:, None, None]
+        return (
+            coupling[pairs] * on_beam,
+            by_states[index] * on_beam,
+            by_profile[index] * on_beam,
+        )
+
+    def _known_profile(self, step: StepInput) -> Float[np.ndarray, "step batch row 1"]:
+        """q of the profile at all wheels and nodes of known steps."""
+        wheels = self.loads.wheels
+        count, batch_size = step.inertia.shape[0], step.inertia.shape[-1]
+        rows = self.loads.wheel_count * NODE_COUNT
+        if step.vehicles.surface is None:
+            return np.zeros((count, batch_size, rows, 1))
+        height, rate, _ = np.moveaxis(step.vehicles.surface, 1, 0)[:, :, None]
+        stiffness, damping = (part.T[..., None] for part in (wheels.stiffness, wheels.damping))
+        return (stiffness * height + damping * rate).reshape(count, batch_size, rows, 1)
+
+    def known_state_maps(self, step: StepInput, surface):
+        """Maps of known steps to the states of the vehicles at their ends.
+
+        `surface` is the map to q of the beam at the rows; see `known_forces`.
+        """
+        loads, wheels, length = self.loads, step.vehicles.wheels, step.vehicles.length_index
+        columns, states = surface.shape[-1], step.matrices.state_count
+        by_wheel = np.zeros((*surface.shape[:2], loads.wheel_count, NODE_COUNT, columns))
+        parts = surface.reshape(*surface.shape[:2], -1, NODE_COUNT, columns)
+        parts = parts * step.vehicles.on_beam[:, None, :, None, None]
+        step_index, batch_index = np.ogrid[: len(wheels), : surface.shape[1]]
+        np.add.at(by_wheel, (step_index[..., None], batch_index[..., None], wheels[:, None]), parts)
+        by_row = by_wheel.reshape(*surface.shape[:2], -1, columns)
+        by_row[..., -1:] += self._known_profile(step)
+        maps, first = [], states
+        for group, part in zip(loads.wheels.vehicles, self.propagators, strict=True):
+            transition, to_end = (
+                np.moveaxis(matrix[length], -1, 1) for matrix in (part.transition, part.input)
+            )
+            for i in range(group.count):
+                next_state = to_end @ by_row[..., _rows_of(group, i), :]
+                next_state[..., first : first + transition.shape[-1]] += transition
+                first += transition.shape[-1]
+                maps.append(next_state)
+        return np.concatenate(maps, axis=2)
+
+
+def _rows_of(group: VehicleGroup, vehicle: int) -> slice:
+    """Rows (wheel and node) of a vehicle of a load among those of all wheels."""
+    rows = group.wheels_per_vehicle * NODE_COUNT
+    start = group.first_wheel * NODE_COUNT + vehicle * rows
+    return slice(start, start + rows)
 
 
 def initial_vehicle_states(loads: LoadSet) -> Float[Array, "state batch"] | None:

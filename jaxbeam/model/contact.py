@@ -21,18 +21,19 @@ from jaxtyping import Float
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import solve_small
-from jaxbeam.runtime.arrays import Array, add_at, custom_jvp, xp
+from jaxbeam.runtime.arrays import Array, add_at, custom_jvp, slice_in_dim, xp
 
 
 class SurfaceRows(eqx.Module):
     """Rows from modal states to the motion of the beam under wheels; zero off the beam.
 
     `shape` is that of the modes; `acceleration`, `velocity` and `deflection` act on the states in
-    the blocks of the modal model. The last two are None where no wheel has springs.
+    the blocks of the modal model. The first is None where no wheel has inertia, the others where
+    none has springs.
     """
 
     shape: Float[Array, "*wheel block mode"]
-    acceleration: Float[Array, "*wheel block side"]
+    acceleration: Float[Array, "*wheel block side"] | None
     velocity: Float[Array, "*wheel block side"] | None
     deflection: Float[Array, "*wheel block side"] | None
 
@@ -158,13 +159,13 @@ def split_states(state_count: int, loads: LoadSet, states: Float[Array, "*time s
     return states[..., :state_count, :], vehicle_states
 
 
-def forces_of_wheels(loads: LoadSet, spring_forces, like):
-    """Forces (*time, wheel, batch) of the springs of all wheels; zero for those without springs."""
+def forces_of_wheels(loads: LoadSet, spring_forces, like, axis: int = -2):
+    """Forces of the springs of all wheels, along an axis; zero for those without springs."""
     parts, first = [], 0
     for group, force in zip(loads.wheels.vehicles, spring_forces, strict=True):
-        parts += [xp.zeros_like(like[..., first : group.first_wheel, :]), force]
+        parts += [xp.zeros_like(slice_in_dim(like, first, group.first_wheel, axis)), force]
         first = group.wheels.stop
-    return xp.concatenate([*parts, xp.zeros_like(like[..., first:, :])], axis=-2)
+    return xp.concatenate([*parts, xp.zeros_like(slice_in_dim(like, first, None, axis))], axis=axis)
 
 
 def _solve_at_instants(

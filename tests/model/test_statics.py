@@ -135,7 +135,7 @@ def sampled_peak(case: Case, x, until: float) -> np.ndarray:
         entry, leave = (float(t) for t in path.entry_exit_times())
         line = np.asarray(influence_line(case, x, position))
         on = ((times >= entry) & (times <= leave))[:, None]
-        total = total + float(load.weight(case.run.gravity)) * on * line
+        total = total + float(load.vehicle(case.run.gravity).static_loads[0]) * on * line
     return np.abs(total).max(axis=0)
 
 

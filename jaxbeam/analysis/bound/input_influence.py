@@ -11,6 +11,7 @@ Both parts come from the integrator of `simulate`, in batches of unit commands o
 import dataclasses
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -21,7 +22,7 @@ from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.time_grid import grid_by_schedule
-from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
