@@ -1,5 +1,7 @@
 """Kinds of vehicles: matrices, static loads and frequencies against the reference; gradients."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxbeam.case.loads.oscillator import Oscillator
+from jaxbeam.case.loads.planar.parts import VehicleSpring
 from jaxbeam.case.loads.quarter_car import QuarterCar
 from tests.case.loads.reference import COORDINATES, LOADS, REFERENCE, coordinate_map
 from tests.differences import central
@@ -68,9 +71,14 @@ def summary(load):
     return jnp.concatenate(parts)
 
 
-@pytest.mark.parametrize("name", LOADS)
+TRUCK = LOADS["truck of five axles"]
+COUPLER = VehicleSpring("tractor", "trailer", -3.0, 2e4, 3e2, 4e4, 5e2)
+COUPLED = {"a spring beside the hinge": dataclasses.replace(TRUCK, springs=[COUPLER])}
+
+
+@pytest.mark.parametrize("name", [*LOADS, *COUPLED])
 def test_gradients_by_every_number_match_differences(name):
-    paths, structure = jax.tree_util.tree_flatten_with_path(LOADS[name])
+    paths, structure = jax.tree_util.tree_flatten_with_path((LOADS | COUPLED)[name])
     own = [jax.tree_util.keystr(path[:1]) not in TRAJECTORY for path, _ in paths]
     start = np.concatenate(
         [np.ravel(x) for (_, x), is_own in zip(paths, own, strict=True) if is_own]
