@@ -22,7 +22,15 @@ from .case.loads.force import MovingForce as MovingForce
 from .case.loads.half_car import HalfCar as HalfCar
 from .case.loads.mass import MovingMass as MovingMass
 from .case.loads.oscillator import Oscillator as Oscillator
+from .case.loads.planar.files import load_vehicle as load_vehicle
+from .case.loads.planar.parts import (
+    VehicleAxle as VehicleAxle,
+    VehicleBody as VehicleBody,
+    VehicleHinge as VehicleHinge,
+    VehicleSpring as VehicleSpring,
+)
 from .case.loads.quarter_car import QuarterCar as QuarterCar
+from .case.loads.vehicle import VehicleLoad as VehicleLoad
 from .case.loads.wagon import Wagon as Wagon
 from .case.profiles.bump import BumpProfile as BumpProfile
 from .case.profiles.iso8608 import ISO8608Profile as ISO8608Profile

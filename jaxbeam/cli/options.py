@@ -15,9 +15,9 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 import jaxbeam as jb
+from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.cli.arguments import parse_assignment, parse_value
 from jaxbeam.files.report import text_table
-from jaxbeam.files.toml_file import read_toml
 
 Output = Annotated[Path | None, Parameter(("-o", "--output"))]
 Free = Annotated[

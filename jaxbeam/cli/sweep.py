@@ -1,4 +1,4 @@
-"""Command `sweep`: many runs of a case."""
+"""Commands about many runs of a case: `sweep`, and `native`, the optional C code for it."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix, parse_sweep_values, refuse_option
-from jaxbeam.cli.options import CaseOptions, Output, Over, table
+from jaxbeam.cli.options import CaseOptions, Output, Over, PrintOptions, table
 
 
 def sweep(
@@ -88,3 +88,24 @@ def _lines(peaks, values) -> list[str]:
         f"{failed.size} runs, {int(failed.sum())} failed; the largest peak at each sensor:",
         *table(("sensor", "peak deflection (m)", *(f"at {name}" for name in values)), rows),
     ]
+
+
+def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:
+    """Compile the C code for this machine, once; sweeps of peaks use it from then on.
+
+    Needs a C compiler.
+
+    Parameters
+    ----------
+    remove
+        Remove the compiled code; sweeps use XLA again.
+    """
+    from jaxbeam.integrator import native_peaks
+
+    if remove:
+        path = native_peaks.LIBRARY.remove()
+        line = f"removed {path}: sweeps use XLA"
+    else:
+        path = native_peaks.LIBRARY.build()
+        line = f"compiled {path}: sweeps on this machine use it from now on"
+    options.report({"path": str(path), "compiled": not remove}, [line])

@@ -64,4 +64,10 @@ def _wagon(content: dict[str, Any], table: dict[str, Any]) -> Train:
     )
 
 
-LAYOUTS = {"high-speed": _high_speed, "wagon": _wagon}
+def _axles(content: dict[str, Any], table: dict[str, Any]) -> Train:
+    """Axles of a load model, at their distances."""
+    offsets = np.concatenate([[0.0], np.cumsum(table["axle_spacings"])])
+    return Train(offsets, np.array(table["axle_forces"]), None, None, content["source"])
+
+
+LAYOUTS = {"high-speed": _high_speed, "wagon": _wagon, "axles": _axles}

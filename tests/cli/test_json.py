@@ -46,6 +46,22 @@ KEYS = {
         "saturated": None,
         "verdict": None,
     },
+    "describe case.toml": {
+        "vehicles": [
+            {
+                "title": None,
+                "source": None,
+                "wheelbase": None,
+                "weight": None,
+                "mass": None,
+                "offsets": None,
+                "static_loads": None,
+                "unsprung_masses": None,
+                "degrees_of_freedom": None,
+                "frequencies_hz": None,
+            }
+        ]
+    },
     "sweep case.toml --over loads.0.mass=0.3,0.5": {
         "values": {"loads.0.mass": None},
         "dimensions": None,

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, concrete, is_concrete, number
 from jaxbeam.case.loads.base import AbstractVehicleLoad
-from jaxbeam.case.loads.planar import Bodies, Links, Wheels, assemble
+from jaxbeam.case.loads.planar.assembly import Bodies, Links, Wheels, assemble
 from jaxbeam.case.loads.vehicle_checks import (
     known_numbers,
     length_error,
@@ -70,8 +70,8 @@ class HalfCar(AbstractVehicleLoad):
         i = int(wrong[0]) + 1
         return (
             f"{address}.axle_positions.{i} must be below the entry before it,"
-            f" {positions[i - 1]:g} m; it is {positions[i]:g} m: list the axles front first, forward"
-            " positive"
+            f" {positions[i - 1]:g} m; it is {positions[i]:g} m: list the axles front first,"
+            " forward positive"
         )
 
     def vehicle(self, gravity):

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 from jaxbeam.case.loads.base import AbstractVehicleLoad
-from jaxbeam.case.loads.planar import Bodies, Links, Wheels, assemble
+from jaxbeam.case.loads.planar.assembly import Bodies, Links, Wheels, assemble
 from jaxbeam.case.loads.vehicle_checks import positive_error
 from jaxbeam.runtime.arrays import Array, xp
 

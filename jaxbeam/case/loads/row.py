@@ -1,12 +1,11 @@
 """Several vehicles of one kind in a row, with one trajectory."""
 
-import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case import fields
 from jaxbeam.case.fields import NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.case.loads.base import AbstractVehicleLoad
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class AbstractRowLoad(AbstractVehicleLoad):
@@ -23,8 +22,8 @@ class AbstractRowLoad(AbstractVehicleLoad):
 
     def spacings(self) -> Float[Array, " vehicle"]:
         if self.count == 1:
-            return np.zeros(1)
-        return np.arange(self.count) * self.row_spacing()
+            return xp.zeros(1)
+        return xp.arange(self.count) * self.row_spacing()
 
     def validate(self, address):
         if self.count > 1 and self.row_spacing() is None:

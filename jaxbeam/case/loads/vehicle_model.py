@@ -56,7 +56,7 @@ class VehicleModel(eqx.Module):
         det(K - (2 pi f)^2 M) = 0 with the springs of the wheels in K.
         """
         if not self.names:
-            return np.zeros(0)
+            return xp.zeros(0)
         half_solved = solve(factor := cholesky(self.mass), self.full_stiffness)
         scaled = solve(factor, half_solved.T)
         values = xp.linalg.eigvalsh((scaled + scaled.T) / 2)
@@ -71,7 +71,7 @@ def plain_wheels(
     """Wheels without a vehicle above them: forces (N) and masses (kg) that follow the surface."""
     static_loads, masses = xp.reshape(static_loads, -1), xp.reshape(masses, -1)
     wheels = static_loads.shape[0]
-    none, nothing = np.zeros(wheels), np.zeros((0, 0))
+    none, nothing = xp.zeros(wheels), np.zeros((0, 0))
     offsets = none if offsets is None else offsets
     matrices = nothing, nothing, nothing, np.zeros((wheels, 0))
     return VehicleModel(offsets, static_loads, masses, none, none, *matrices, ())

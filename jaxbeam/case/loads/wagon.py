@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, concrete, is_concrete, number
-from jaxbeam.case.loads.planar import Bodies, Links, Wheels, assemble
+from jaxbeam.case.loads.planar.assembly import Bodies, Links, Wheels, assemble
 from jaxbeam.case.loads.row import AbstractRowLoad
 from jaxbeam.case.loads.vehicle_checks import positive_error
 from jaxbeam.runtime.arrays import Array, xp

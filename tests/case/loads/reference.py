@@ -7,6 +7,7 @@ import numpy as np
 from jaxbeam.case.loads.half_car import HalfCar
 from jaxbeam.case.loads.oscillator import Oscillator
 from jaxbeam.case.loads.quarter_car import QuarterCar
+from jaxbeam.case.loads.vehicle import VehicleLoad
 from jaxbeam.case.loads.wagon import Wagon
 from tests.modules import ROOT
 
@@ -70,6 +71,7 @@ BUILDERS = {
     "wagon": _wagon,
 }
 LOADS = {name: build(REFERENCE[name]["input"]) for name, build in BUILDERS.items()}
+LOADS["truck of five axles"] = VehicleLoad(model="truck-5-axle", speed=20.0)
 
 # Coordinates of the reference = a permutation of those of jaxbeam, with signs: pitch is positive
 # nose down in the reference's road vehicles, nose up in its wagon.
@@ -85,6 +87,9 @@ COORDINATES = {
         "front bogie pitch": 1,
         "rear bogie pitch": 1,
     },
+}
+COORDINATES["truck of five axles"] = {"tractor": 1, "tractor pitch": -1, "trailer pitch": -1} | {
+    f"axle {i}": 1 for i in range(1, 6)
 }
 COORDINATES["half-car of unequal axles"] = COORDINATES["half-car"]
 

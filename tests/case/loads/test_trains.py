@@ -62,10 +62,21 @@ def test_line_categories(name):
     np.testing.assert_allclose(row, offsets, atol=1e-12)
 
 
+# Weight (kN) and length (m): EN 1991-2, 6.3.2; AASHTO LRFD, 3.6.1.2.
+CODES = {"LM71-axles": (1000, 4.8), "HL93-truck": (325, 8.6), "HL93-tandem": (220, 1.2)}
+
+
+@pytest.mark.parametrize("name", CODES)
+def test_axles_of_codes(name):
+    vehicle = Axles(train=name, speed=20.0).vehicle(GRAVITY)
+    assert np.sum(vehicle.static_loads) / 1e3 == pytest.approx(CODES[name][0])
+    assert vehicle.offsets[-1] == pytest.approx(CODES[name][1])
+
+
 @pytest.mark.parametrize("name", trains())
 def test_every_train_has_a_source_and_increasing_axles(name):
     train = trains()[name]
-    assert "EN " in train.source and "commit" in train.source
+    assert "EN 1" in train.source and "commit" in train.source
     assert train.offsets[0] == 0 and np.all(np.diff(train.offsets) > 0)
     assert (train.forces is None) != (train.masses is None)
 

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from jaxbeam.case.loads.oscillator import Oscillator
+from jaxbeam.case.loads.planar.parts import VehicleSpring
 from jaxbeam.case.loads.quarter_car import QuarterCar
 from tests.case.loads.reference import COORDINATES, LOADS, REFERENCE, coordinate_map
 from tests.differences import central
 
 GRAVITY = np.float64(9.81)
+TRAJECTORY = (".speed", ".entry_time", ".deceleration")
 
 
 @pytest.mark.parametrize("name", LOADS)
@@ -69,22 +71,27 @@ def summary(load):
     return jnp.concatenate(parts)
 
 
-@pytest.mark.parametrize("name", LOADS)
+TRUCK = LOADS["truck of five axles"]
+COUPLER = VehicleSpring("tractor", "trailer", -3.0, 2e4, 3e2, 4e4, 5e2)
+COUPLED = {"a spring beside the hinge": dataclasses.replace(TRUCK, springs=[COUPLER])}
+
+
+@pytest.mark.parametrize("name", [*LOADS, *COUPLED])
 def test_gradients_by_every_number_match_differences(name):
-    load = LOADS[name]
-    own = [f.name for f in dataclasses.fields(load) if f.name not in ("speed", "entry_time")]
-    own = [n for n in own if n != "deceleration" and not isinstance(getattr(load, n), int | None)]
-    sizes = [np.size(getattr(load, n)) for n in own]
-    start = np.concatenate([np.ravel(getattr(load, n)) for n in own])
+    paths, structure = jax.tree_util.tree_flatten_with_path((LOADS | COUPLED)[name])
+    own = [jax.tree_util.keystr(path[:1]) not in TRAJECTORY for path, _ in paths]
+    start = np.concatenate(
+        [np.ravel(x) for (_, x), is_own in zip(paths, own, strict=True) if is_own]
+    )
     scale = np.where(start == 0, 1.0, start)
 
     def of_factors(factors):
-        values, parts = factors * scale, np.split(np.arange(len(start)), np.cumsum(sizes)[:-1])
-        changed = {
-            n: values[part].reshape(np.shape(getattr(load, n)))
-            for n, part in zip(own, parts, strict=True)
-        }
-        return summary(dataclasses.replace(load, **changed))
+        values, leaves, used = factors * scale, [], 0
+        for (_, leaf), is_own in zip(paths, own, strict=True):
+            size = np.size(leaf) if is_own else 0
+            leaves.append(values[used : used + size].reshape(np.shape(leaf)) if is_own else leaf)
+            used += size
+        return summary(jax.tree.unflatten(structure, leaves))
 
     point = start / scale
     exact = jax.jit(jax.jacfwd(of_factors))(jnp.asarray(point))
