@@ -22,8 +22,8 @@ from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.propagators import propagators
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
-from jaxbeam.model.load_set import load_set
 from jaxbeam.model.flexibility import flexibility
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.output_rows import sensor_rows

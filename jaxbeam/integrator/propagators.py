@@ -124,9 +124,7 @@ def phi_functions_of(
     (transition, phi_functions), _ = scan(_double_argument, functions, length=DOUBLINGS)
     phi_functions = phi_functions * durations.ravel()
     parts = (transition, phi_functions)
-    transition, phi_functions = (
-        part.reshape(*part.shape[:-1], *durations.shape) for part in parts
-    )
+    transition, phi_functions = (part.reshape(*part.shape[:-1], *durations.shape) for part in parts)
     return transition, phi_functions
 
 

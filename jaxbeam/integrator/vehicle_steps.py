@@ -68,7 +68,9 @@ def _scaled_systems(group: VehicleGroup):
     """State, input and output matrices with displacements scaled to the size of rates."""
     dofs = group.A.shape[0] // 2
     frequency = xp.sqrt(1.0 + xp.max(xp.sum(xp.abs(group.A[dofs:, :dofs]), axis=1), axis=0))
-    scale = xp.concatenate([xp.broadcast_to(frequency, (dofs, *frequency.shape)), np.ones((dofs, *frequency.shape))])
+    scale = xp.concatenate(
+        [xp.broadcast_to(frequency, (dofs, *frequency.shape)), np.ones((dofs, *frequency.shape))]
+    )
     scale = stop_gradient(scale)
     return group.A * scale[:, None] / scale, group.B * scale[:, None], group.H / scale, scale
 
@@ -292,7 +294,12 @@ class Vehicles(eqx.Module):
                 first += O.shape[-1]
         by_profile = coupling @ profile
         index = np.arange(len(length))[:, None, None], np.arange(shape[1])[:, None], rows[:, None]
-        pairs = index[0][..., None], index[1][..., None], rows[:, None, :, None], rows[:, None, None]
+        pairs = (
+            index[0][..., None],
+            index[1][..., None],
+            rows[:, None, :, None],
+            rows[:, None, None],
+        )
         return (
             coupling[pairs] * on_beam,
             by_states[index] * on_beam,

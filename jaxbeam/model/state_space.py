@@ -14,8 +14,8 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.model.contact import surface_rows
-from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.linear_system import Signal, StateSpace
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.output_rows import sensor_rows

@@ -20,7 +20,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
 from jaxbeam.sweeps import MAX_RUNS
-from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, make_batches
+from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, addresses_within_batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
 
 # Positions and list entries, whose values are valid only in combination.
@@ -72,10 +72,10 @@ class SweepSpecification:
 
     def batches(self) -> Batches:
         """Batches of the runs."""
-        one_run_each = (
-            self.case.controller is not None and self.case.controller.design_depends_on_loads
-        )
-        return make_batches(list(self.axes), self.runs(), one_run_each)
+        controller = self.case.controller
+        one_run_each = controller is not None and controller.design_depends_on_loads
+        within = [] if one_run_each else addresses_within_batches(self.case, self.axes)
+        return make_batches(list(self.axes), self.runs(), within)
 
     def runner(self) -> Runner:
         """Runner of the batches in blocks.

@@ -74,7 +74,6 @@ class AbstractLoad(eqx.Module):
                 )
         return None
 
-
     def _start_error(self, address: str) -> str | None:
         """Error message if the load starts on the beam or behind its entry, or None."""
         start, speed = self.start_position, self.speed
@@ -111,7 +110,9 @@ class AbstractVehicleLoad(AbstractLoad):
         "m", "table: positions of the first wheel", default=None, kw_only=True
     )
     start_position: Float[Array, ""] | None = number(
-        "m", "position of the first wheel at entry_time, before the beam", default=None,
+        "m",
+        "position of the first wheel at entry_time, before the beam",
+        default=None,
         kw_only=True,
     )
 
