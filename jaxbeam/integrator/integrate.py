@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
@@ -54,6 +55,9 @@ from jaxbeam.runtime.arrays import (
 # Largest phase (rad) of the highest mode in a step. Beyond twice the number of nodes, the contact
 # force of a mass, a polynomial in each step, cannot follow that mode's oscillation and excites it.
 MAX_PHASE_PER_STEP = 1.9 * NODE_COUNT
+# Largest phase (rad) of the highest mode shape that a force passes in a step. A polynomial through
+# six Gauss nodes follows a sine over this phase to 1e-7 of its amplitude.
+MAX_PASSAGE_PER_STEP = 0.64
 
 
 def max_stable_step(model: ModalModel, loads: LoadSet) -> Float[Array, ""]:
@@ -64,6 +68,22 @@ def max_stable_step(model: ModalModel, loads: LoadSet) -> Float[Array, ""]:
         highest_frequency = xp.sqrt(xp.max(xp.linalg.eigvalsh(model.stiffness())))
         limit = xp.minimum(limit, MAX_PHASE_PER_STEP / highest_frequency)
     return stop_gradient(limit)
+
+
+def longest_force_step(case: Case, loads: LoadSet) -> Float[Array, ""]:
+    """Longest step (s) that resolves the passage of forces over the highest mode shape.
+
+    Their generalised forces are known functions of time, so no error but that of their polynomials
+    arises. Infinite for loads with inertia or springs, whose steps an error estimate decides.
+    """
+    if not loads.massless or not loads.trajectories:
+        return np.asarray(np.inf)
+    windows = xp.clip(loads.entry_exit_times(), 0.0, case.run.duration)
+    first, last = xp.min(windows[:, 0]), xp.max(windows[:, 1])
+    times = first + (last - first) * np.linspace(0.0, 1.0, 33)
+    speed = xp.max(xp.abs(loads.kinematics(times)[1]))
+    wavenumber = (case.beam.modes + 1) * np.pi / case.beam.length
+    return stop_gradient(MAX_PASSAGE_PER_STEP / (wavenumber * speed + 1e-30))
 
 
 def _step_with_inputs(policy: AbstractInputPolicy, vehicles: Vehicles | None, carry, step):
@@ -147,7 +167,7 @@ def _step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> Ste
     vehicle_step = None
     if loads.wheels.vehicles:
         vehicle_step = VehicleStep(path.length_index, path.loads, path.on_beam, path.surface)
-    matrices = step_matrices(discrete, path, loads.massless)
+    matrices = step_matrices(discrete, path)
     return StepInput(matrices, inertia, weight, vehicle_step)
 
 

@@ -6,8 +6,6 @@ state at the start, to the acceleration under the loads at the nodes, the state 
 deflections at monitored positions.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import numpy as np
@@ -15,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
+from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import ModalCompliance, SurfaceRows, surface_rows
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.runtime.arrays import (
@@ -63,8 +62,8 @@ class StepMatrices(eqx.Module):
 
     `contact_response` maps the state at the start to the acceleration under the loads at the
     nodes, `contact_compliance` the contact forces; both are None where no load has inertia.
-    `springs` are None where no wheel has springs. `monitored` acts on state at the start, contact forces and commands, one after the other. A step
-    is `loaded` with a load on the beam.
+    `springs` are None where no wheel has springs. `monitored` acts on state at the start, contact
+    forces and commands, one after the other. A step is `loaded` with a load on the beam.
     """
 
     contact_response: Float[Array, "step row state"] | None
@@ -116,6 +115,14 @@ def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int
     return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // entries)))
 
 
+def wheels_on_beam(grid: TimeGrid, max_loads: int) -> Int[Array, "panel wheel"]:
+    """Indices of at most `max_loads` wheels in each panel, those on the beam first.
+
+    It depends on no step, so that compiled programs sort once.
+    """
+    return xp.argsort(~grid.loads_on_beam, axis=1, stable=True)[:, :max_loads]
+
+
 @jax.named_scope("load_path")
 def load_path(
     discrete: DiscreteModel, loads: LoadSet, max_loads: int, index: Int[Array, " step"]
@@ -127,11 +134,10 @@ def load_path(
     # As an array: JAX remembers a NumPy constant in the precision in which it met it first.
     times = start[:, None] + length[:, None] * xp.asarray(GAUSS_NODES, length.dtype)
     position, speed, acceleration = (xp.moveaxis(p, 0, 1) for p in loads.kinematics(times))
-    on_beam = take(grid.loads_on_beam, panel)  # step, load
     surface = loads.surface_motion(position, speed, acceleration)
+    on_beam = take(grid.loads_on_beam, panel)  # step, load
     if max_loads < loads.wheel_count:
-        # Loads on the beam first; those beyond the largest number are off the beam.
-        load_index = xp.argsort(~on_beam, axis=1, stable=True)[:, :max_loads]
+        load_index = take(wheels_on_beam(discrete.grid, max_loads), panel)
         selection = load_index[:, :, None]
         position, speed, acceleration = (
             xp.take_along_axis(part, selection, axis=1) for part in (position, speed, acceleration)
@@ -141,17 +147,15 @@ def load_path(
         load_index = xp.broadcast_to(xp.arange(max_loads), on_beam.shape)
     on_beam_at_nodes = xp.broadcast_to(on_beam[:, :, None], position.shape)
     springs = bool(loads.wheels.vehicles)
-    rows = surface_rows(model, position, speed, acceleration, on_beam_at_nodes, springs)
+    motion = position, speed, acceleration, on_beam_at_nodes
+    rows = surface_rows(model, *motion, springs, not loads.massless)
     surface = None if surface is None else xp.stack(surface, axis=1)
     return LoadPath(length_index, start, length, load_index, on_beam, rows, surface)
 
 
 @jax.named_scope("load_path")
-def step_matrices(discrete: DiscreteModel, path: LoadPath, massless: bool = False) -> StepMatrices:
-    """Matrices of the steps of a chunk; without accelerations under `massless` loads."""
-    if massless:
-        rows = dataclasses.replace(path.rows, acceleration=None)
-        path = dataclasses.replace(path, rows=rows)
+def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
+    """Matrices of the steps of a chunk."""
     if is_jax(path.length_index):
         matrices = _matrices_by_branch(discrete, path)
     else:

@@ -68,10 +68,8 @@ def _scaled_systems(group: VehicleGroup):
     """State, input and output matrices with displacements scaled to the size of rates."""
     dofs = group.A.shape[0] // 2
     frequency = xp.sqrt(1.0 + xp.max(xp.sum(xp.abs(group.A[dofs:, :dofs]), axis=1), axis=0))
-    scale = xp.concatenate(
-        [xp.broadcast_to(frequency, (dofs, *frequency.shape)), np.ones((dofs, *frequency.shape))]
-    )
-    scale = stop_gradient(scale)
+    shape = (dofs, *frequency.shape)
+    scale = stop_gradient(xp.concatenate([xp.broadcast_to(frequency, shape), np.ones(shape)]))
     return group.A * scale[:, None] / scale, group.B * scale[:, None], group.H / scale, scale
 
 
@@ -283,28 +281,25 @@ class Vehicles(eqx.Module):
         coupling, by_states = np.zeros((*shape, all_rows)), np.zeros((*shape, loads.vehicle_states))
         first = 0
         for group, part in zip(loads.wheels.vehicles, self.propagators, strict=True):
-            S, O = (
+            of_surface, of_states = (
                 np.moveaxis(matrix[length], -1, 1)
                 for matrix in (part.spring_surface, part.spring_states)
             )
+            states = of_states.shape[-1]
             for i in range(group.count):
                 own = _rows_of(group, i)
-                coupling[..., own, own] = S
-                by_states[..., own, first : first + O.shape[-1]] = O
-                first += O.shape[-1]
+                coupling[..., own, own] = of_surface
+                by_states[..., own, first : first + states] = of_states
+                first += states
         by_profile = coupling @ profile
-        index = np.arange(len(length))[:, None, None], np.arange(shape[1])[:, None], rows[:, None]
+        steps, batch = np.ogrid[: shape[0], : shape[1]]
+        index = steps[..., None], batch[..., None], rows[:, None]
         pairs = (
-            index[0][..., None],
-            index[1][..., None],
+            *(part[..., None] for part in index[:2]),
             rows[:, None, :, None],
             rows[:, None, None],
         )
-        return (
-            coupling[pairs] * on_beam,
-            by_states[index] * on_beam,
-            by_profile[index] * on_beam,
-        )
+        return coupling[pairs] * on_beam, by_states[index] * on_beam, by_profile[index] * on_beam
 
     def _known_profile(self, step: StepInput) -> Float[np.ndarray, "step batch row 1"]:
         """q of the profile at all wheels and nodes of known steps."""

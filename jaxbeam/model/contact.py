@@ -38,20 +38,25 @@ class SurfaceRows(eqx.Module):
     deflection: Float[Array, "*wheel block side"] | None
 
 
-def surface_rows(model: ModalModel, position, speed, acceleration, active, springs) -> SurfaceRows:
-    """Rows at wheels; with velocity and deflection for wheels with `springs`.
+def surface_rows(
+    model: ModalModel, position, speed, acceleration, active, springs=False, inertia=True
+) -> SurfaceRows:
+    """Rows at wheels; velocity and deflection with `springs`, acceleration with `inertia` only.
 
     Position (m), speed (m/s), acceleration (m/s^2) and `active` (on the beam) of the wheels all
     have the shape (*wheel,).
     """
     position_on_beam = xp.where(active, position, 0.0)
+    blocks, modes_per_block = model.state_matrix.shape[0], model.modes_per_block
+    block_shape = (*position.shape, blocks, modes_per_block)
+    if not (inertia or springs):
+        shape = xp.where(active[..., None], model.shapes(position_on_beam, (0,))[0], 0.0)
+        return SurfaceRows(shape.reshape(block_shape), None, None, None)
     shape, slope, curvature = xp.where(
         active[..., None], model.shapes(position_on_beam, (0, 1, 2)), 0.0
     )
     speed, acceleration = speed[..., None], acceleration[..., None]
-    blocks, modes_per_block = model.state_matrix.shape[0], model.modes_per_block
     side = model.state_matrix.shape[1]
-    block_shape = (*position.shape, blocks, modes_per_block)
 
     def state_rows(of_coordinates, of_rates):
         """Rows on coordinates and rates of the modes, in turn."""

@@ -118,7 +118,7 @@ class LoadSet(Module):
 
     @property
     def on_ground(self) -> Bool[np.ndarray, " wheel"]:
-        """Whether each wheel presses on the ground before and behind the beam: those of vehicles."""
+        """Whether each wheel presses on the ground off the beam too: those of vehicles."""
         on_ground = np.zeros(self.wheel_count, bool)
         for group in self.wheels.vehicles:
             on_ground[group.wheels] = True

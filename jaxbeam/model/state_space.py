@@ -132,7 +132,7 @@ class Plant(Module):
         loads = self.loads
         position, speed, acceleration = loads.kinematics(t)
         active = loads.on_beam(t)
-        rows = surface_rows(self.modal_model, position, speed, acceleration, active, False)
+        rows = surface_rows(self.modal_model, position, speed, acceleration, active)
         count = loads.wheel_count
         mass = xp.where(active, loads.inertia[:, 0], 0.0)
         return (

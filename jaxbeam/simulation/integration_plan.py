@@ -17,7 +17,12 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
-from jaxbeam.integrator.integrate import integrate_at_events, integrate_peaks, max_stable_step
+from jaxbeam.integrator.integrate import (
+    integrate_at_events,
+    integrate_peaks,
+    longest_force_step,
+    max_stable_step,
+)
 from jaxbeam.integrator.running_peaks import RunningPeaks
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set
@@ -63,7 +68,8 @@ def static_shapes(case: Case) -> StaticShapes:
 def _model_limits(case: Case, layout: Layout):
     """Longest stable step (s), whether frequencies repeat, entry and exit times (load, 2) in s."""
     model, loads = modal_model(case, layout), load_set(case)
-    return max_stable_step(model, loads), model.modes.has_repeated, loads.entry_exit_times()
+    limit = xp.minimum(max_stable_step(model, loads), longest_force_step(case, loads))
+    return limit, model.modes.has_repeated, loads.entry_exit_times()
 
 
 def max_concurrent_loads(entry_exit_times: Float[np.ndarray, "load 2"]) -> int:

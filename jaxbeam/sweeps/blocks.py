@@ -70,7 +70,7 @@ class Runner:
         # Compilation of the programs for one load need not wait for its entry and exit times.
         max_loads = load_set(case).wheel_count
         if max_loads > 1:
-            max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times())
+            max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times()[0])
         native = native_peaks.supports(case) and not single
         self.shapes = StaticShapes(layout, has_coupling(case), max_loads, native)
         # The C library makes its own step matrices.
@@ -92,11 +92,12 @@ class Runner:
         )
         self.block_count = -(-count // self.batches_per_block)
 
-    def _entry_exit_times(self) -> Float[np.ndarray, "path load 2"]:
-        """Entry and exit times (s) of the loads of all batches."""
-        return np.asarray(
-            programs.entry_exit_times(self.case, self.addresses[0], self.batches.shared_values)
+    def _entry_exit_times(self) -> tuple[np.ndarray, np.ndarray]:
+        """Entry and exit times (path, wheel, 2), and longest steps of forces (path,), in s."""
+        times, steps = programs.entry_exit_times(
+            self.case, self.addresses[0], self.batches.shared_values
         )
+        return np.asarray(times), np.asarray(steps)
 
     def _model_groups(self) -> list:
         """Indices of batches whose models are made in one call: one batch if all share a model."""
@@ -113,7 +114,8 @@ class Runner:
             self.pool.submit(compiled_program.precompile(*arguments))
             for compiled_program, arguments in self._programs_to_compile(program, first_values)
         ]
-        entries, exits = np.moveaxis(self._entry_exit_times(), 2, 0)
+        times, self.force_steps = self._entry_exit_times()
+        entries, exits = np.moveaxis(times, 2, 0)
         for compilation in compilations:
             compilation.result()  # raises its error, if any
         return entries, exits
@@ -141,6 +143,7 @@ class Runner:
         crossing_time = np.min(times_on_beam, axis=1, initial=np.inf)
         crossing_time = np.where(np.isfinite(crossing_time), crossing_time, duration)
         self.crossing_rates = 1 / crossing_time
+        limits = np.minimum(limits, self.force_steps)
         self.max_steps = np.minimum(limits, duration)
         if self.schedule is not None and self.case.controller is not None:  # steps end at events
             self.max_steps = np.minimum(self.max_steps, self.schedule.lengths.max())

@@ -18,7 +18,12 @@ from jaxbeam.case.case import Case, replace
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
-from jaxbeam.integrator.integrate import integrate_history, integrate_peaks, max_stable_step
+from jaxbeam.integrator.integrate import (
+    integrate_history,
+    integrate_peaks,
+    longest_force_step,
+    max_stable_step,
+)
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
@@ -89,11 +94,12 @@ def modal_models(program: Program, shared_values):
 
 @compiled
 def entry_exit_times(case, addresses, shared_values):
-    """Entry and exit times (path, load, 2) of the loads in s."""
+    """Entry and exit times (path, wheel, 2), and longest steps of forces (path,), in s."""
 
     def entry_exit_times_of(values):
         varied = replace(case, dict(zip(addresses, values, strict=True)))
-        return load_set(varied).entry_exit_times()
+        loads = load_set(varied)
+        return loads.entry_exit_times(), longest_force_step(varied, loads)
 
     return jax.vmap(entry_exit_times_of)(shared_values)
 

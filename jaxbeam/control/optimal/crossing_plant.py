@@ -31,7 +31,7 @@ def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, Cou
     def contact_coupling(times):
         position, speed, acceleration = plant.loads.kinematics(times)
         active = plant.loads.on_beam(times)
-        motion = surface_rows(modal_model, position, speed, acceleration, active, False)
+        motion = surface_rows(modal_model, position, speed, acceleration, active)
         shape, rows = (
             xp.moveaxis(part.reshape(*active.shape, -1), 0, -2)
             for part in (motion.shape, motion.acceleration)
