@@ -246,5 +246,5 @@ def _vehicle_group(vehicle: VehicleModel, first_wheel: int, count: int) -> Vehic
     B = xp.concatenate([np.zeros(wheel_map.T.shape), rates[:, 2 * dofs :]])
     springs = vehicle.contact_stiffness, vehicle.contact_damping
     H = xp.concatenate([part[:, None] * wheel_map for part in springs], axis=1)
-    columns = (part[..., None] for part in (A, B, H))
-    return VehicleGroup(*columns, vehicle.names, first_wheel, count)
+    A, B, H = (part[..., None] for part in (A, B, H))
+    return VehicleGroup(A, B, H, vehicle.names, first_wheel, count)

@@ -8,7 +8,6 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.declared_checks import validate_exactly_one
@@ -19,7 +18,7 @@ from jaxbeam.case.trajectory import (
     BrakingTrajectory,
     TabulatedTrajectory,
 )
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class AbstractLoad(eqx.Module):
@@ -40,7 +39,7 @@ class AbstractLoad(eqx.Module):
 
     def spacings(self) -> Float[Array, " vehicle"]:
         """Distances (m) of the first wheels of its vehicles, all alike, behind the first wheel."""
-        return np.zeros(1)
+        return xp.zeros(1)
 
     def validate(self, address: str) -> str | None:
         """First inconsistency between its fields as an error message, or None."""
