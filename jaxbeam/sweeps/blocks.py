@@ -36,6 +36,7 @@ MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and o
 MIN_BLOCKS = 8  # of a large sweep, to use all cores
 MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
 MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
+MAX_TRIAL_BATCHES = 16  # more of one run each cost more than the steps that they would save
 
 
 class Runner:
@@ -86,7 +87,8 @@ class Runner:
         max_batches, trial_batches = (
             max(1, runs * self.devices // batch_size) for runs in (MAX_BLOCK_RUNS, MAX_TRIAL_RUNS)
         )
-        self.trial_batches = _round_up(min(count, trial_batches), self.devices)
+        trial_batches = min(count, trial_batches, MAX_TRIAL_BATCHES)
+        self.trial_batches = _round_up(trial_batches, self.devices)
         self.batches_per_block = max(
             self.trial_batches, _round_up(min(count // MIN_BLOCKS, max_batches), self.devices)
         )

@@ -37,6 +37,11 @@ class AbstractLoad(eqx.Module):
     def vehicle(self, gravity: Float[Array, ""]) -> VehicleModel:
         """Vehicle of the load, one of `spacings`; `gravity` in m/s^2."""
 
+    def total_mass(self, gravity: Float[Array, ""]) -> Float[Array, ""] | None:
+        """Mass (kg) whose weight its wheels carry; None for a force that is no weight."""
+        wheels = self.vehicle(gravity).static_loads
+        return self.spacings().shape[0] * xp.sum(wheels) / gravity
+
     def spacings(self) -> Float[Array, " vehicle"]:
         """Distances (m) of the first wheels of its vehicles, all alike, behind the first wheel."""
         return xp.zeros(1)
