@@ -72,7 +72,12 @@ LIBRARY = Library(
 
 def supports(case: Case) -> bool:
     """Whether a sweep of peaks of this case uses the C integrator."""
-    return case.controller is None and available()
+    return case.controller is None and deflections_only(case) and available()
+
+
+def deflections_only(case: Case) -> bool:
+    """Whether all sensors of a case measure deflections, the only peaks that C searches."""
+    return all(sensor.quantity == "deflection" for sensor in case.sensors)
 
 
 def available() -> bool:

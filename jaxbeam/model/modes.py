@@ -121,7 +121,7 @@ class Modes(eqx.Module):
     `coupling` is the off-diagonal stiffness between repeated modes, zero in value but not in
     derivative (see `eigen`). Stiffness is of order one for the lowest mode in the
     `stiffness_unit` E I / (m L^4). Shapes are mass-normalised, in kg^-1/2, positive near the left
-    end; `series` are their Chebyshev series between the `nodes` (m).
+    end; `series` are their Chebyshev series between the `nodes` (m) of the `layout`.
     """
 
     stiffness: Float[Array, " mode"]
@@ -131,6 +131,7 @@ class Modes(eqx.Module):
     nodes: Float[Array, " node"]
     series: Float[Array, "segment degree mode"]
     stiffness_unit: Float[Array, ""]
+    layout: Layout = eqx.field(static=True)
 
     def lowest(self, count: int) -> "Modes":
         """The lowest modes, as many as `count`."""
@@ -143,6 +144,7 @@ class Modes(eqx.Module):
             nodes=self.nodes,
             series=self.series[..., selection],
             stiffness_unit=self.stiffness_unit,
+            layout=self.layout,
         )
 
     @property
@@ -210,10 +212,10 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     )
     series = xp.einsum("std,dm->stm", to_series, vectors[:, lowest])
     series = series / xp.sqrt(beam.linear_density * beam.length)
-    return normalised_modes(beam, values, coupling, nodes * beam.length, series)
+    return normalised_modes(beam, values, coupling, nodes * beam.length, series, layout)
 
 
-def normalised_modes(beam, values, coupling, nodes, series) -> Modes:
+def normalised_modes(beam, values, coupling, nodes, series, layout: Layout) -> Modes:
     """Modes of given stiffness (1/s^2) with the beam's damping, positive near the left end."""
     damping, damping_coupling = _damping(beam, values, coupling)
     left_values = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
@@ -227,6 +229,7 @@ def normalised_modes(beam, values, coupling, nodes, series) -> Modes:
         nodes,
         series * signs,
         _stiffness_unit(beam),
+        layout,
     )
 
 

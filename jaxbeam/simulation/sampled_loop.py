@@ -147,7 +147,9 @@ class SampledLoop(AbstractInputPolicy):
         if not any(sensor.has_feedthrough for sensor in sensors):
             return signals
         _, accelerations = contact_at(self.model, self.loads, time, state, command)
-        return sensor_rows(self.model, sensors).with_accelerations(signals, accelerations)
+        return sensor_rows(self.model, self.plant.case, sensors).with_accelerations(
+            signals, accelerations
+        )
 
     def _step_law(self, law_state, readings, state, command, time):
         """Step of the law for each run of the batch."""

@@ -79,6 +79,29 @@ def test_record_of_many_parts(record):
     assert "contact loss" in said
 
 
+def test_record_of_several_quantities():
+    """Each has axes with its unit; names of sensors are beside their larger extremes."""
+    sensors = [
+        jb.Sensor(0.3, name="midspan"),
+        jb.Sensor(0.2, "acceleration"),
+        jb.Sensor(0.2, "strain", fibre_distance=-2e-3, name="gauge"),
+        jb.Sensor(0.4, "curvature"),
+    ]
+    record = jb.simulate(dataclasses.replace(CASE, sensors=sensors))
+    figure = plot_record(record)
+    said = words(figure)
+    for text in ("deflection (mm)", "acceleration (m/s²)", "strain ($10^{-3}$)", "midspan",
+                 "gauge", "curvature"):  # fmt: skip
+        assert text in said
+    strain = figure.axes[3]
+    (curve,) = lines_of(strain, record.times.size)
+    assert_allclose(data(curve)[1], 1e3 * np.asarray(record.measured)[:, 2])
+    (dot,) = [line for line in lines_of(strain, 1) if line.get_marker() == "o"]
+    found = record.extremes
+    assert_allclose(data(dot)[:, 0], [found.largest_time[2], 1e3 * found.largest[2]])
+    assert figure.axes[2].get_ylabel() == "acceleration (m/s²)"
+
+
 def test_record_without_sensors_or_loads(record):
     loads_only = dataclasses.replace(record, case=dataclasses.replace(CASE, sensors=()))
     assert len(plot_record(loads_only).axes) == 2
@@ -190,7 +213,9 @@ def test_animation_of_a_controlled_beam(tmp_path):
             frames = [np.asarray(f.convert("L")) for f in ImageSequence.Iterator(picture)]
         assert len(frames) == 3 and not np.array_equal(frames[0], frames[1])
     assert heights[0] > heights[1]
-    diverged = dataclasses.replace(record, coordinates=record.coordinates.at[9:].set(jnp.nan))
+    diverged = dataclasses.replace(
+        record, coordinates=jnp.asarray(record.coordinates).at[9:].set(jnp.nan)
+    )
     with pytest.raises(ValueError, match="diverges"):
         animate(diverged, tmp_path / "diverged.gif")
     assert not (tmp_path / "diverged.gif").exists()
