@@ -26,6 +26,7 @@ from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshe
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
 
 NODE_TOLERANCE = 1e-9  # of the length: closer nodes are one node
+ROUNDING_SHARE = 4e-15  # of the largest coefficient of a shape: smaller ones are rounding errors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,13 +207,21 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     nodes, stiffness, mass, to_series = assemble_matrices(case, layout)
     values, vectors, coupling = eigen(stiffness, mass)
     lowest = slice(beam.modes)
-    values, coupling = (
-        values[lowest] * _stiffness_unit(beam),
-        coupling[lowest, lowest] * _stiffness_unit(beam),
-    )
+    values, coupling = values[lowest], coupling[lowest, lowest]
+    values, coupling = values * _stiffness_unit(beam), coupling * _stiffness_unit(beam)
     series = xp.einsum("std,dm->stm", to_series, vectors[:, lowest])
-    series = series / xp.sqrt(beam.linear_density * beam.length)
+    series = _without_rounding(series) / xp.sqrt(beam.linear_density * beam.length)
     return normalised_modes(beam, values, coupling, nodes * beam.length, series, layout)
+
+
+def _without_rounding(series):
+    """Series with the coefficients zero that are rounding errors; their derivatives stay.
+
+    A third derivative, hence a shear force, multiplies that of degree n by up to n^6 / 15.
+    """
+    largest = xp.max(xp.abs(series), axis=1, keepdims=True)
+    noise = xp.where(xp.abs(series) < ROUNDING_SHARE * largest, series, 0.0)
+    return series - stop_gradient(noise)
 
 
 def normalised_modes(beam, values, coupling, nodes, series, layout: Layout) -> Modes:
