@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.model.measurement import sensor_readings
@@ -21,7 +20,13 @@ from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.extremes import Extremes, sensor_extremes
-from jaxbeam.simulation.result_variables import MODE_FIELDS, MODE_VARIABLES, VARIABLES
+from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
+from jaxbeam.simulation.result_variables import (
+    MODE_FIELDS,
+    MODE_VARIABLES,
+    VARIABLES,
+    sensor_coordinates,
+)
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -109,6 +114,20 @@ class Record(eqx.Module):
     def support_positions(self) -> Float[Array, " support"]:
         """Positions (m) of held ends and supports, from left to right."""
         return section_forces.support_positions(self.case, self.modes)
+
+    def envelope(
+        self, quantity: str = "moment", positions=None, fibre_distance=None, section_modulus=None
+    ) -> RecordEnvelope:
+        """Smallest and largest values of a quantity at positions (m), with times and loads.
+
+        From the samples, free vibration included; by default at 101 equally spaced positions. The
+        quantities are those of `at`; a moment has its peak as a load passes, so that a load should
+        move by a small part of the length between samples. Raises ValueError as `at` does.
+        """
+        parameters = positions, fibre_distance, section_modulus
+        return record_envelope(
+            self.case, self.modes, self.motion, self.times, quantity, *parameters
+        )
 
     @property
     def sensor_values(self) -> Float[Array, "time sensor"]:
@@ -276,13 +295,3 @@ class Record(eqx.Module):
         if not overwrite and os.path.exists(path):
             raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
         write_netcdf(path, *self._dataset_parts())
-
-
-def sensor_coordinates(case: Case) -> dict[str, tuple]:
-    """Coordinates of datasets along their sensors: labels, quantities and their units."""
-    sensors = case.sensors
-    return {
-        "sensor": ("sensor", np.array(sensor_labels(sensors), str)),
-        "quantity": ("sensor", np.array([s.quantity for s in sensors], str)),
-        "unit": ("sensor", np.array([s.unit for s in sensors], str)),
-    }

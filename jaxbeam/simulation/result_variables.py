@@ -1,5 +1,10 @@
 """Variables of records and sweeps in datasets: dimensions, unit and meaning, by name."""
 
+import numpy as np
+
+from jaxbeam.case.case import Case
+from jaxbeam.case.sensors import sensor_labels
+
 VARIABLES = {
     "deflection": (("time", "sensor"), "m", "deflection at the sensor"),
     "velocity": (("time", "sensor"), "m/s", "velocity at the sensor"),
@@ -39,3 +44,13 @@ MODE_VARIABLES = {
 }
 # Fields of `Modes` by their names in files, where they differ.
 MODE_FIELDS = {"unit": "stiffness_unit"}
+
+
+def sensor_coordinates(case: Case) -> dict[str, tuple]:
+    """Coordinates of datasets along their sensors: labels, quantities and their units."""
+    sensors = case.sensors
+    return {
+        "sensor": ("sensor", np.array(sensor_labels(sensors), str)),
+        "quantity": ("sensor", np.array([s.quantity for s in sensors], str)),
+        "unit": ("sensor", np.array([s.unit for s in sensors], str)),
+    }

@@ -14,8 +14,7 @@ from tqdm import tqdm
 from jaxbeam.case.case import Case
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.simulation.integration_plan import TOLERANCE, sample_times
-from jaxbeam.simulation.record import sensor_coordinates
-from jaxbeam.simulation.result_variables import SWEEP_VARIABLES
+from jaxbeam.simulation.result_variables import SWEEP_VARIABLES, sensor_coordinates
 from jaxbeam.sweeps import cluster, store as sweep_store
 from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.block_store import BlockStore, MemoryStore

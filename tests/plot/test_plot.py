@@ -16,6 +16,7 @@ from jaxbeam.model.frequency_response import frequency_response
 from jaxbeam.plot import (
     FitPanel,
     animate,
+    plot_envelope,
     plot_fit,
     plot_frequency_response,
     plot_modes,
@@ -100,6 +101,18 @@ def test_record_of_several_quantities():
     found = record.extremes
     assert_allclose(data(dot)[:, 0], [found.largest_time[2], 1e3 * found.largest[2]])
     assert figure.axes[2].get_ylabel() == "acceleration (m/s²)"
+
+
+def test_envelope(record):
+    found = record.envelope("moment", np.linspace(0, 0.6, 31))
+    figure = plot_envelope(record, "moment", found.positions)
+    low, high = lines_of(figure.axes[1], 31)
+    assert_allclose(data(low)[1], found.smallest)
+    assert_allclose(data(high)[1], found.largest)
+    i = int(np.argmax(found.largest))
+    said = words(figure)
+    for text in ("moment (N m)", "position (m)", f"at {found.positions[i]:.4g} m", "one ball"):
+        assert text in said
 
 
 def test_record_without_sensors_or_loads(record):
