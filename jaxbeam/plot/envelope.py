@@ -43,8 +43,10 @@ def plot_envelope(record: Record, quantity: str = "moment", positions=None, **pa
         i = int(extreme(values))
         axes.plot(x[[i]], values[[i]] / factor, "o", color=tint, markeredgecolor="white", zorder=3)
         text = f"{format_number(values[i] / factor)} {unit} at {x[i]:.4g} m, {time[i]:.4g} s"
-        annotate(axes, text, (x[i], values[i] / factor), (4, offset), color=tint, fontsize=8)
-    axes.margins(x=0.0, y=0.12)
-    axes.set(xlabel="position (m)", ylabel=axis_label(quantity, unit))
+        side = "right" if x[i] > (x[0] + x[-1]) / 2 else "left"
+        shift = (4 if side == "left" else -4, offset)
+        annotate(axes, text, (x[i], values[i] / factor), shift, color=tint, fontsize=8, ha=side)
+    axes.margins(y=0.12)
+    axes.set(xlim=top.get_xlim(), xlabel="position (m)", ylabel=axis_label(quantity, unit))
     set_title(figure, record.case.title)
     return figure
