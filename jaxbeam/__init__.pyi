@@ -4,11 +4,6 @@ from .analysis.amplification import (
     envelope as envelope,
 )
 from .analysis.bound.bound import bound as bound
-from .analysis.static_correction import (
-    bending_moment as bending_moment,
-    corrected_deflection as corrected_deflection,
-    shear_force as shear_force,
-)
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.patch import Patch as Patch
 from .case.actuators.point import PointForce as PointForce
@@ -79,11 +74,14 @@ from .model.frequency_response import (
 )
 from .model.modes import modes as modes
 from .model.state_space import state_space as state_space
+from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force
 from .model.statics import (
     influence_line as influence_line,
     static_deflection as static_deflection,
     static_peak as static_peak,
 )
-from .simulation.record import Record as Record, read_record as read_record
+from .simulation.corrected_deflection import corrected_deflection as corrected_deflection
+from .simulation.record import Record as Record
 from .simulation.simulate import simulate as simulate
+from .simulation.stored_record import read_record as read_record
 from .sweeps.sweep import sweep as sweep

@@ -24,7 +24,8 @@ from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.profiles.base import AbstractProfile
-from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import Sensor, sensor_labels
 from jaxbeam.runtime.arrays import Array
 
 # Parts with a method `validate(address)`.
@@ -54,6 +55,7 @@ def check_case(case: Case) -> None:
             raise ValueError(error)
     _check_supports(case.supports, case.beam.length)
     _check_profile(case)
+    _check_labels(case.sensors)
     for i, sensor in enumerate(case.sensors):
         _check_sampling(f"sensors.{i}", sensor, case)
     if case.controller is not None:
@@ -96,6 +98,16 @@ def _check_profile(case: Case) -> None:
             raise ValueError(error)
 
 
+def _check_labels(sensors: tuple[Sensor, ...]) -> None:
+    labels = sensor_labels(sensors)
+    for i, label in enumerate(labels):
+        if label in labels[:i]:
+            raise ValueError(
+                f"sensors.{labels.index(label)} and sensors.{i} are both called {label!r} in"
+                f" results; give sensors.{i} another name"
+            )
+
+
 def _check_sampling(address: str, sensor: Sensor, case: Case) -> None:
     """Validate the sampling period of a sensor: within the run, and short enough for its filter."""
     period, run = sensor.sampling_period, case.run
@@ -134,6 +146,8 @@ def _check_controller(case: Case) -> None:
                 f"sensors.{i}.filter cannot be analogue on an {sensor.quantity} that a controller"
                 " uses: make it digital"
             )
+        if QUANTITIES[sensor.quantity].has_active_moment and not controller.open_loop:
+            _check_outside_patches(f"sensors.{i}", sensor, case)
     period, duration = controller.period, case.run.duration
     if period is not None:
         if is_concrete(period) and is_concrete(duration) and concrete(period) > concrete(duration):
@@ -144,6 +158,20 @@ def _check_controller(case: Case) -> None:
         return
     for feature in _sampled_features(case):
         raise ValueError(f"{feature} needs a controller that samples: give controller.period")
+
+
+def _check_outside_patches(address: str, sensor: Sensor, case: Case) -> None:
+    """No controller reads a moment or stress to which its own command adds at once."""
+    for i, actuator in enumerate(case.actuators):
+        ends = [place for place, order, _ in actuator.displacement_map() if order == 1]
+        if ends and all(is_concrete(x) for x in (sensor.position, *ends)):
+            left, right = (concrete(edge(*map(concrete, ends))) for edge in (min, max))
+            if left <= concrete(sensor.position) <= right:
+                raise ValueError(
+                    f"{address} reads the {sensor.quantity} of a section on which actuators.{i}"
+                    " acts, which no controller can use: measure its strain or curvature, or move"
+                    " the sensor"
+                )
 
 
 def _sampled_features(case: Case) -> Iterator[str]:

@@ -67,26 +67,30 @@ def sweep(
             precision=precision,
             client=client,
         )
-    peaks = results["peak_deflection"]
+    peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
+    del peaks["peak_time"]
+    numbers = {name: values.to_numpy() for name, values in peaks.items()}
+    dimensions = results["peak_time"].dims
     options.report(
-        {"values": values, "dimensions": peaks.dims, "peak_deflection": peaks.to_numpy()},
-        _lines(peaks, values),
+        {"values": values, "dimensions": dimensions, **numbers},
+        _lines(parsed_case, peaks, results["failed"], values),
         output,
     )
 
 
-def _lines(peaks, values) -> list[str]:
+def _lines(case: "jb.Case", peaks, failed, values) -> list[str]:
     """Number of runs, and the largest peak at each sensor with the parameters of its run."""
     rows = []
-    for i in range(peaks.sizes["sensor"]):
-        at_sensor = peaks.isel(sensor=i)
+    for i, sensor in enumerate(case.sensors):
+        at_sensor = peaks[f"peak_{sensor.quantity}"].isel(sensor=i)
         largest = at_sensor.isel(at_sensor.fillna(-1.0).argmax(...))
         parameters = [f"{float(largest[address]):.6g}" for address in values]
-        rows.append((i, f"{float(largest):.6g}", *parameters))
-    failed = peaks.isnull().any("sensor")
+        unit = f" ({sensor.unit})" if sensor.unit != "1" else ""
+        quantity = f"{sensor.quantity}{unit}"
+        rows.append((sensor.name or i, quantity, f"{float(largest):.6g}", *parameters))
     return [
         f"{failed.size} runs, {int(failed.sum())} failed; the largest peak at each sensor:",
-        *table(("sensor", "peak deflection (m)", *(f"at {name}" for name in values)), rows),
+        *table(("sensor", "quantity", "peak", *(f"at {name}" for name in values)), rows),
     ]
 
 

@@ -1,12 +1,14 @@
-"""Figure of one run: deflections at the sensors, contact forces and commands over time."""
+"""Figure of one run: what the sensors measure, contact forces and commands over time."""
 
 import dataclasses
+import functools
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from jaxbeam.case.case import crossing_times
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.schematic import draw_schematic
 from jaxbeam.plot.style import (
@@ -14,6 +16,7 @@ from jaxbeam.plot.style import (
     GREY,
     SHADE,
     annotate,
+    axis_label,
     colour,
     command_drawstyle,
     draw_limits,
@@ -29,17 +32,21 @@ from jaxbeam.simulation.record import Record
 
 @use_style
 def plot_record(record: Record) -> Figure:
-    """Schematic of the case, deflections at the sensors, contact forces, and commands if any.
+    """Schematic of the case, quantities of the sensors, contact forces, and commands if any.
 
-    Dots mark peaks, shading the times with loads on the beam. Raises ValueError if the case has
-    neither sensors nor loads.
+    Each quantity has axes of its own. Dots mark peaks, shading the times with loads on the beam.
+    Raises ValueError if the case has neither sensors nor loads.
     """
     case = record.case
+    quantities = list(dict.fromkeys(sensor.quantity for sensor in case.sensors))
     panels = [
         (height, draw)
         for height, draw, shown in (
             (0.7, lambda axes, record: draw_schematic(axes, record.case), True),
-            (3.2, _draw_deflection, case.sensors),
+            *(
+                (3.2 if i == 0 else 2.2, functools.partial(_draw_quantity, quantity=name), True)
+                for i, name in enumerate(quantities)
+            ),
             (1.7, _draw_forces, case.loads),
             (1.7, _draw_commands, case.controller is not None),
         )
@@ -110,22 +117,29 @@ def _load_label(load) -> str:
     )
 
 
-def _draw_deflection(axes, record):
-    times, deflection = np.asarray(record.times), np.asarray(record.deflection)
-    factor, unit = unit_scale(deflection, "m")
+def _draw_quantity(axes, record, quantity: str):
+    """Draw the histories of the sensors of a quantity, with a dot at the larger extreme of each."""
+    times, values = np.asarray(record.times), np.asarray(record.sensor_values)
+    sensors = record.case.sensors
+    own = [i for i, sensor in enumerate(sensors) if sensor.quantity == quantity]
+    factor, unit = unit_scale(values[:, own], QUANTITIES[quantity].unit)
+    extremes = [np.asarray(part) for part in record.extremes]
     shade_crossings(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.8)
-    peaks = []
-    for i, when in enumerate(np.asarray(record.peak_time)):
-        axes.plot(times, deflection[:, i] / factor, color=colour(i))
-        peaks.append(signed_peak(record, i) / factor)
+    peaks, names = [], []
+    for i in own:
+        axes.plot(times, values[:, i] / factor, color=colour(i))
+        low, low_time, high, high_time = (float(part[i]) for part in extremes)
+        peak, when = (low, low_time) if -low > high else (high, high_time)
+        peaks.append(peak / factor)
         axes.plot([when], peaks[-1:], "o", color=colour(i), markeredgecolor="white", zorder=3)
-    axes.set_ylabel(f"deflection ({unit})")
+        names.append(f"{sensors[i].name or 'peak'} {format_number(peaks[-1])} {unit}")
+    axes.set_ylabel(axis_label(quantity, unit))
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.07 * (high - low))  # room for the names
-    label_loads(axes, record)
-    names = [f"peak {format_number(peak)} {unit}" for peak in peaks]
-    margin_labels(axes, peaks, names, [colour(i) for i in range(len(peaks))])
+    if 0 in own:  # the first of the quantities
+        label_loads(axes, record)
+    margin_labels(axes, peaks, names, [colour(i) for i in own])
 
 
 def _draw_forces(axes, record):

@@ -20,6 +20,7 @@ from jaxbeam.model.contact import contact_at, split_states
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
@@ -130,10 +131,13 @@ def simulate_readings(
     differentiate than `simulate`, without its checks and warnings.
     """
     _, outputs, modal, _ = _integrate(case, plan, times, None, noisy=False)
-    coordinates, rates, accelerations, *_, controller_readings, _ = outputs
+    coordinates, rates, accelerations, position, force, commands, controller_readings, _ = outputs
     if controller_readings is not None:
         return controller_readings
-    return sensor_readings(case, modal, coordinates, rates, accelerations, times)
+    if commands is None:
+        commands = xp.zeros((times.shape[0], len(case.actuators)))
+    motion = Motion(coordinates, rates, accelerations, position, force, commands)
+    return sensor_readings(case, modal, motion, times)
 
 
 class Histories(NamedTuple):

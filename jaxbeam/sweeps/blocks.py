@@ -163,7 +163,8 @@ class Runner:
             calls = batch_indices.size // self.trial_batches
             parts = zip(np.split(batch_indices, calls), np.split(steps, calls), strict=True)
             results = [self._integrate(*part, None, single, extra_steps) for part in parts]
-            return np.concatenate([result["peak_deflection"] for result in results])
+            found = np.concatenate([result["peak_deflection"] for result in results])
+            return self._compared_by_quantity(found)
 
         search = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
         steps, error = choose_step_sizes(peaks, *search, self.pool.map)
@@ -173,6 +174,15 @@ class Runner:
                 *(peaks(sample, steps[sample], single=single) for single in (False, True))
             )
         return steps, error
+
+    def _compared_by_quantity(self, peaks):
+        """Peaks (path, batch, sensor), those of each quantity as further runs of the batch.
+
+        Small peaks of one quantity then are not judged by large ones of another unit.
+        """
+        quantities = np.array([sensor.quantity for sensor in self.case.sensors])
+        parts = [peaks * (quantities == quantity) for quantity in np.unique(quantities)]
+        return np.concatenate(parts, axis=1)
 
     def run_count(self, block: int) -> int:
         """Number of runs in a block, without padding."""

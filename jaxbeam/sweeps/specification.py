@@ -16,6 +16,7 @@ from jaxtyping import Float
 from jaxbeam.case.aliases import current_address
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.declared_checks import describe_value
+from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
@@ -146,6 +147,12 @@ def sweep_specification(
         raise ValueError("give at least one address to sweep over, with a list of values")
     if not case.sensors:
         raise ValueError("the case has no sensors, and peaks are taken there; add one to `sensors`")
+    for i, sensor in enumerate(case.sensors):
+        if QUANTITIES[sensor.quantity].x_derivative > 2:
+            raise ValueError(
+                f"sensors.{i} measures {sensor.quantity}, whose sum of modes converges too slowly"
+                " for the peaks of a sweep: leave it out, and simulate single runs"
+            )
     over = {current_address(address): given for address, given in over.items()}
     axes = {address: _checked_values(case, address, given) for address, given in over.items()}
     for address in axes:

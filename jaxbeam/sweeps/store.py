@@ -88,8 +88,11 @@ class ZarrStore(BlockStore):
                 if folder.is_dir() and folder.name != BLOCKS_GROUP:
                     shutil.rmtree(folder)
             # Zarr specifies strings of variable length, not of fixed length.
-            labels = dataset["sensor"].values.astype(object)
-            dataset.assign_coords(sensor=labels).to_zarr(
+            labels = {
+                name: ("sensor", dataset[name].values.astype(object))
+                for name in ("sensor", "quantity", "unit")
+            }
+            dataset.assign_coords(labels).to_zarr(
                 self._path,
                 mode="a",
                 consolidated=False,

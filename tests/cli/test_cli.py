@@ -86,6 +86,7 @@ def test_simulate_prints_and_writes_the_same(run, folder):
     found = run("simulate case.toml --json")
     np.testing.assert_array_equal(found["peak_deflection"], record.peak_deflection)
     assert set(found) == {
+        "sensors",
         "peak_deflection",
         "lowest_contact_force",
         "contact_lost_time",
@@ -99,6 +100,21 @@ def test_simulate_prints_and_writes_the_same(run, folder):
     assert (folder / "out.nc").stat().st_size > 0
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "out.gif").read_bytes().startswith(b"GIF89a")
+
+
+def test_an_accelerometer_is_not_reported_as_deflection(run):
+    line = "case.toml --set sensors.1.quantity=acceleration --set sensors.1.name=deck"
+    found = run(f"simulate {line} --json")
+    assert found["peak_deflection"][1] is None and found["peak_deflection"][0] > 0
+    deck = found["sensors"][1]
+    assert (deck["name"], deck["quantity"], deck["unit"]) == ("deck", "acceleration", "m/s^2")
+    printed = run(f"simulate {line}")
+    assert "acceleration (m/s^2)" in printed and f"{deck['largest']:.6g}" in printed
+    assert "peak deflection" not in printed
+    swept = run(f"sweep {line} --over loads.0.mass=0.1,0.5 --json")
+    assert np.isfinite(np.array(swept["peak_acceleration"], float)[:, 1]).all()
+    assert np.isnan(np.array(swept["peak_deflection"], float)[:, 1]).all()
+    assert "deck  acceleration (m/s^2)" in run(f"sweep {line} --over loads.0.mass=0.1,0.5")
 
 
 def test_simulate_overwrites_only_with_the_option(run, refused, folder):
