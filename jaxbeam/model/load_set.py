@@ -75,7 +75,7 @@ class VehicleGroup(Module):
         return surface - pulled.reshape(surface.shape)
 
 
-class Wheels(Module):
+class WheelSet(Module):
     """Numbers of the wheels, which may differ between the runs of a batch.
 
     Inertia (kg) and weight (N, the static load), contact stiffness (N/m) and damping (N s/m) of the
@@ -97,7 +97,7 @@ class LoadSet(Module):
     """
 
     trajectories: tuple[AbstractTrajectory, ...]
-    wheels: Wheels
+    wheels: WheelSet
     behind: tuple[Float[Array, " wheel"], ...] | None = None
     profile: Module | None = None
 
@@ -216,7 +216,7 @@ def load_set(case: Case) -> LoadSet:
     )
 
 
-def _wheels(loads: Sequence[AbstractLoad], vehicles: Sequence[VehicleModel]) -> Wheels:
+def _wheels(loads: Sequence[AbstractLoad], vehicles: Sequence[VehicleModel]) -> WheelSet:
     """Numbers of the wheels of loads, as a batch of one run."""
     counts = [load.spacings().shape[0] for load in loads]
 
@@ -231,9 +231,9 @@ def _wheels(loads: Sequence[AbstractLoad], vehicles: Sequence[VehicleModel]) -> 
         first_wheel += count * vehicle.offsets.shape[0]
     inertia, weight = of_all_wheels("wheel_masses"), of_all_wheels("static_loads")
     if not groups:
-        return Wheels(inertia, weight)
+        return WheelSet(inertia, weight)
     springs = of_all_wheels("contact_stiffness"), of_all_wheels("contact_damping")
-    return Wheels(inertia, weight, *springs, tuple(groups))
+    return WheelSet(inertia, weight, *springs, tuple(groups))
 
 
 def _vehicle_group(vehicle: VehicleModel, first_wheel: int, count: int) -> VehicleGroup:
