@@ -25,6 +25,7 @@ from .case.loads.planar.parts import (
     VehicleSpring as VehicleSpring,
 )
 from .case.loads.quarter_car import QuarterCar as QuarterCar
+from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad
 from .case.loads.wagon import Wagon as Wagon
 from .case.profiles.bump import BumpProfile as BumpProfile

@@ -94,6 +94,12 @@ def _values_by_row(
 def _step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> StepInput:
     """Matrices and wheels of the steps of a chunk."""
     inertia, weight = (_values_by_row(part, path) for part in (loads.inertia, loads.weight))
+    for wheel, history in loads.wheels.histories.items():
+        of_wheel = (path.loads == wheel) & path.on_beam
+        times = path.start[:, None] + path.length[:, None] * np.asarray(GAUSS_NODES)
+        force = history.at(times)[:, None]  # step, 1, node, batch
+        rows = xp.where(of_wheel[..., None, None], force, 0.0)
+        weight = weight + rows.reshape(*weight.shape[:2], -1)
     if path.surface is not None:
         by_wheel = xp.take_along_axis(path.surface[:, 2], path.loads[..., None], axis=1)
         weight = weight + inertia * by_wheel.reshape(*by_wheel.shape[:1], -1, 1)

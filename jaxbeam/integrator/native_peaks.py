@@ -72,8 +72,13 @@ LIBRARY = Library(
 
 def supports(case: Case) -> bool:
     """Whether a sweep of peaks of this case uses the C integrator."""
-    has_vehicles = any(load.vehicle(case.run.gravity).names for load in case.loads)
-    plain = case.controller is None and case.profile is None and not has_vehicles
+    plain = (
+        case.controller is None
+        and case.profile is None
+        and not any(
+            load.vehicle(case.run.gravity).names or load.force_history() for load in case.loads
+        )
+    )
     return plain and deflections_only(case) and available()
 
 
