@@ -95,9 +95,8 @@ def corrected_history(
     """Statically corrected history of the deflection at x (m), in m, or of its x-derivative.
 
     w = sum psi_j q_j + sum residual(x, y) F over the forces F at y on the beam (the
-    mode-acceleration method): contact forces, commands by their
-    static gains, and forces of dampers at supports and of dampers and masses of actuators. Then
-    E I w'''' is the exact sum of the forces, less inertia and damping of the modes. Beams that can
+    mode-acceleration method): contact forces, commands by their static gains, and forces of dampers
+    at supports and of dampers and masses of actuators. Then E I w'''' is the exact sum of the forces, less inertia and damping of the modes. Beams that can
     move as a rigid body are left uncorrected.
     """
     x, layout = xp.asarray(x, float), modes.layout
@@ -105,10 +104,12 @@ def corrected_history(
     if not is_supported(case, layout):
         return history
     if case.loads:
-        positions = motion.load_position
-        positions = xp.where(xp.isfinite(positions), positions, 0.0)
+        on_beam = xp.isfinite(motion.load_position)
+        positions = xp.where(on_beam, motion.load_position, 0.0)
         residual = residual_flexibility(case, x, positions, derivative, layout)
-        history = history + xp.einsum("tl,tl...->t...", motion.contact_force, residual)
+        # Wheels of vehicles press on the ground, too.
+        forces = xp.where(on_beam, motion.contact_force, 0.0)
+        history = history + xp.einsum("tl,tl...->t...", forces, residual)
     for support in case.supports:
         if support.damping is not None:
             velocity = motion.rates @ modes.shapes(support.position)

@@ -86,14 +86,13 @@ class Record(eqx.Module):
 
     @property
     def motion(self) -> Motion:
-        """Motion of the modes, contact forces on the beam, and commands."""
-        on_beam = xp.isfinite(self.load_position)
+        """Motion of the modes, contact forces and commands."""
         return Motion(
             self.coordinates,
             self.rates,
             self.accelerations,
             self.load_position,
-            xp.where(on_beam, self.contact_force, 0.0),
+            self.contact_force,
             self.command,
         )
 
