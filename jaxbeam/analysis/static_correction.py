@@ -73,9 +73,12 @@ def corrected_deflection(
     shapes = record.modes.shapes(x, derivative)
     history = xp.tensordot(record.coordinates, shapes, axes=[1, -1])
     if case.loads:
-        load_positions = xp.where(xp.isfinite(record.load_position), record.load_position, 0.0)
+        on_beam = xp.isfinite(record.load_position)
+        load_positions = xp.where(on_beam, record.load_position, 0.0)
         residual = residual_flexibility(case, x, load_positions, derivative, layout)
-        history = history + xp.einsum("tl,tl...->t...", record.contact_force, residual)
+        # Wheels of vehicles press on the ground, too.
+        forces = xp.where(on_beam, record.contact_force, 0.0)
+        history = history + xp.einsum("tl,tl...->t...", forces, residual)
     if case.controller is not None:
         residual = residual_actuator_gain(case, x, derivative, layout)
         history = history + xp.tensordot(record.command, residual, axes=1)
