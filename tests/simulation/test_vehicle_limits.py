@@ -11,8 +11,8 @@ from tests.oracles import quarter_car
 from tests.oracles.modal_equations import Span
 from tests.runs import assert_close
 
-SPAN = Span(20.0, 2e10, 1.2e4, modes=4, damping_ratio=0.02)
-BEAM = jb.Beam(20.0, 2e10, 1.2e4, 0.02, modes=4)
+SPAN = Span(20.0, 2e10, 1.2e4, modes=3, damping_ratio=0.02)
+BEAM = jb.Beam(20.0, 2e10, 1.2e4, 0.02, modes=3)
 CAR = {
     "body_mass": 14000.0,
     "axle_mass": 1100.0,
@@ -42,7 +42,6 @@ PROFILES = {
     "flat": None,
     "sine": jb.SineProfile(4e-3, 6.0, 0.7),
     "ramp": jb.RampProfile(4.0, 6.0, 0.01),
-    "bump": jb.BumpProfile(-3.0, 2.0, 0.02),
     "spectrum": jb.SpectrumProfile([0.1, 0.3], [2e-3, 1e-3], [0.4, 2.0]),
 }
 
@@ -65,10 +64,10 @@ def test_a_quarter_car_is_that_of_scipy(name):
     events = (19.0 - np.sqrt(19.0**2 - 2.6 * (places + 5.0))) / 1.3
     states, forces = quarter_car.cross(SPAN, car, motion, heights, events, TIMES)
     record = jb.simulate(case, TIMES, tolerance=1e-10)
-    deflection = states[:, :4] @ SPAN.shapes(np.array([7.0, 12.0])).T
+    deflection = states[:, :3] @ SPAN.shapes(np.array([7.0, 12.0])).T
     assert_close(record.deflection, deflection, 1e-8)
-    assert_close(record.body_displacement, states[:, 8:10], 1e-8)
-    assert_close(record.body_velocity, states[:, 10:12], 1e-8)
+    assert_close(record.body_displacement, states[:, 6:8], 1e-8)
+    assert_close(record.body_velocity, states[:, 8:10], 1e-8)
     assert_close(record.contact_force[1:-1, 0], forces[1:-1], 1e-8)
 
 
