@@ -78,6 +78,14 @@ CASES = {
     "forces": dataclasses.replace(
         MASSES, loads=(jb.MovingForce(force=3.0, speed=6.0), jb.MovingForce(mass=0.2, **TABLE))
     ),
+    "vehicles": dataclasses.replace(
+        MASSES,
+        loads=(
+            jb.QuarterCar(0.3, 0.02, 60.0, 0.6, 400.0, 0.1, speed=6.0, start_position=-0.2),
+            jb.Oscillator(0.1, 40.0, 0.2, 0.01, speed=-5.0, entry_time=0.05, deceleration=8.0),
+        ),
+        profile=jb.BumpProfile(-0.15, 0.4, 1e-3),
+    ),
     "no loads": dataclasses.replace(MASSES, loads=()),
     "coupled": dataclasses.replace(
         MASSES,
@@ -203,7 +211,7 @@ def test_records_of_known_and_traced_numbers_are_the_same(name):
     assert_equal(*both_ways(simulate, CASES[name]))
 
 
-@pytest.mark.parametrize("name", ["masses on two spans", "forces", "coupled"])
+@pytest.mark.parametrize("name", ["masses on two spans", "forces", "coupled", "vehicles"])
 def test_peaks_of_known_and_traced_numbers_are_the_same(name):
     case = CASES[name]
     shapes = static_shapes(case)

@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator
@@ -22,7 +23,8 @@ from jaxbeam.case.declared_checks import (
 )
 from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
-from jaxbeam.case.loads.base import AbstractLoad
+from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.loads.vehicle_checks import known_numbers
 from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor, sensor_labels
@@ -91,11 +93,43 @@ def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> 
 
 
 def _check_profile(case: Case) -> None:
-    """Validate that the profile is known wherever loads travel, on the beam at least."""
-    if case.profile is not None and case.loads:
-        error = case.profile.validate_travel("profile", 0.0, case.beam.length)
-        if error is not None:
-            raise ValueError(error)
+    """Validate that wheels can follow the profile, and that it is known wherever they travel."""
+    profile = case.profile
+    if profile is None or not case.loads:
+        return
+    ends = [(0.0, case.beam.length)]
+    for i, load in enumerate(case.loads):
+        if not all(map(known_numbers, (load, case.run, case.beam))):
+            continue
+        vehicle = load.vehicle(case.run.gravity)
+        if profile.has_slope_jumps and np.any(concrete(vehicle.wheel_masses)):
+            raise ValueError(
+                f"loads.{i} has a mass that is rigidly on the surface, and would need an infinite"
+                " force where the slope of the profile jumps: give profile.contact_length, or a"
+                " smooth kind of profile"
+            )
+        if vehicle.names:
+            ends.append(_travel(load, case))
+    if not all(map(is_concrete, itertools.chain(*ends))):
+        return
+    starts, ends = zip(*(map(concrete, pair) for pair in ends), strict=True)
+    error = profile.validate_travel("profile", min(starts), max(ends))
+    if error is not None:
+        raise ValueError(error)
+
+
+def _travel(load: AbstractLoad, case: Case) -> tuple[float, float]:
+    """Lowest and highest position (m) of any wheel, from the start until all have left the beam."""
+    length = float(concrete(case.beam.length))
+    behind = float(np.max(concrete(wheel_distances(load, case.run.gravity))))
+    path = trajectory(load, case.beam.length)
+    places = path.kinematics(concrete(case.run.duration) * np.array([0.0, 1.0]))[0]
+    if load.positions is not None:
+        places = np.append(places, concrete(load.positions))
+    low, high = float(np.min(concrete(places))), float(np.max(concrete(places)))
+    if concrete(path.direction()) > 0:
+        return low - behind, min(high, length + behind)
+    return max(low, -behind), high + behind
 
 
 def _check_labels(sensors: tuple[Sensor, ...]) -> None:

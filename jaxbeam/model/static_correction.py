@@ -96,8 +96,9 @@ def corrected_history(
 
     w = sum psi_j q_j + sum residual(x, y) F over the forces F at y on the beam (the
     mode-acceleration method): contact forces, commands by their static gains, and forces of dampers
-    at supports and of dampers and masses of actuators. Then E I w'''' is the exact sum of the forces, less inertia and damping of the modes. Beams that can
-    move as a rigid body are left uncorrected.
+    at supports and of dampers and masses of actuators. Then E I w'''' is the exact sum of the
+    forces, less inertia and damping of the modes. Beams that can move as a rigid body are left
+    uncorrected.
     """
     x, layout = xp.asarray(x, float), modes.layout
     history = xp.tensordot(motion.coordinates, modes.shapes(x, derivative), axes=[1, -1])
