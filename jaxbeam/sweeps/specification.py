@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.aliases import current_address
-from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.case.case import Case, list_sizes, own_addresses, replace, value_at
 from jaxbeam.case.declared_checks import describe_value
+from jaxbeam.case.joint_addresses import overlap
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
@@ -25,7 +26,7 @@ from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
 
 # Positions and list entries, whose values are valid only in combination.
 JOINTLY_CHECKED = re.compile(
-    r"beam\.length|(supports|actuators|sensors)\.\d+\.(position|start|end)|.*\.\d+"
+    r"beam\.length|(supports|actuators|sensors)\.(\d+|\*)\.(position|start|end)|.*\.\d+"
 )
 
 PRECISIONS = ("double", "single")
@@ -33,7 +34,7 @@ PRECISIONS = ("double", "single")
 # Numbers that determine the schedule of a closed loop.
 SCHEDULE_ADDRESS = re.compile(
     r"run\.(duration|sample_rate)|controller\.(period|delay|times\.\d+)"
-    r"|sensors\.\d+\.(sampling_period|delay)"
+    r"|sensors\.(\d+|\*)\.(sampling_period|delay)"
 )
 
 
@@ -147,6 +148,9 @@ def sweep_specification(
     if not case.sensors:
         raise ValueError("the case has no sensors, and peaks are taken there; add one to `sensors`")
     over = {current_address(address): given for address, given in over.items()}
+    twice = overlap(over, list_sizes(case))
+    if twice:
+        raise ValueError(f"{twice} is swept twice: leave one of {', '.join(over)} out")
     axes = {address: _checked_values(case, address, given) for address, given in over.items()}
     for address in axes:
         if histories and address in ("run.duration", "run.sample_rate"):
@@ -185,7 +189,7 @@ def sweep_specification(
 
 def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.ndarray, " value"]:
     """Values of one address as an array, with the checks that need no other address."""
-    if np.ndim(value_at(case, address)):
+    if any(np.ndim(value_at(case, one)) for one in own_addresses(case, address)):
         raise ValueError(f"{address} is a list; sweep over one of its entries, {address}.0")
     try:
         values = np.atleast_1d(np.asarray(values_given, float))
