@@ -81,7 +81,8 @@ def _lines(peaks, values) -> list[str]:
     for i in range(peaks.sizes["sensor"]):
         at_sensor = peaks.isel(sensor=i)
         largest = at_sensor.isel(at_sensor.fillna(-1.0).argmax(...))
-        parameters = [f"{float(largest[address]):.6g}" for address in values]
+        own = [largest[address].item() for address in values]
+        parameters = [value if isinstance(value, str) else f"{value:.6g}" for value in own]
         rows.append((i, f"{float(largest):.6g}", *parameters))
     failed = peaks.isnull().any("sensor")
     return [

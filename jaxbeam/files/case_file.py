@@ -145,8 +145,8 @@ def with_settings(case: Case, settings: dict[str, Any]) -> Case:
     """A validated copy of a case with other entries at some addresses, as in its case file.
 
     Unlike `case.replace` it also sets words, counts and optional numbers that were left out, those
-    of all loads at `loads.*.train`, say; values are concrete (SI units), not traced. Raises ValueError for an address that no case file could
-    have, and for the errors of `check_case`.
+    of all loads at `loads.*.train`, say; values are concrete (SI units), not traced. Raises
+    ValueError for an address that no case file could have, and for the errors of `check_case`.
     """
     content, whole = case_to_dict(case), case_to_dict(case, whole=True)
     each = [

@@ -61,6 +61,11 @@ class SweepSpecification:
         return sizes[:1] if self.paired else sizes
 
     @property
+    def count(self) -> int:
+        """Number of runs."""
+        return math.prod(self.shape)
+
+    @property
     def dims(self) -> tuple[str, ...]:
         """Names of the dimensions of the results."""
         return ("run",) if self.paired else tuple(self.axes)
@@ -161,9 +166,9 @@ def sweep_specification(
     if paired and len(set(sizes.values())) > 1:
         raise ValueError(f"paired values must be equally many, not {sizes}")
     specification = SweepSpecification(case, axes, paired, histories, tolerance, single)
-    if math.prod(specification.shape) > MAX_RUNS:
+    if specification.count > MAX_RUNS:
         raise ValueError(
-            f"{math.prod(specification.shape):.1e} combinations of values are more than the"
+            f"{specification.count:.1e} combinations of values are more than the"
             f" {MAX_RUNS:.0e} runs of a sweep: split it"
         )
     jointly_checked = [name for name in axes if JOINTLY_CHECKED.fullmatch(name)]
