@@ -56,7 +56,10 @@ class WordSweep:
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
     def join(self, datasets: "Sequence[xarray.Dataset]") -> "xarray.Dataset":
-        """Dataset with a dimension for each address, from those of all combinations of words."""
+        """Dataset with a dimension for each address, from those of all combinations of words.
+
+        `cases` along the words has their cases as text; the attribute `case` that of the sweep.
+        """
         import xarray
 
         wheels = max(part.sizes.get("load", 0) for part in datasets)
@@ -67,12 +70,15 @@ class WordSweep:
             values = np.stack([part[name].values for part in datasets])
             values = values.reshape(*sizes, *values.shape[1:])
             variables[name] = ((*self.words, *first.dims), values, first.attrs)
-        coordinates = {address: list(words) for address, words in self.words.items()}
+        coordinates: dict[str, Any] = {
+            address: list(words) for address, words in self.words.items()
+        }
+        texts = [json.dumps(case_to_dict(case)) for case in self.cases]
+        coordinates["cases"] = (tuple(self.words), np.reshape(texts, sizes))
         joined = xarray.Dataset(variables, coordinates | dict(datasets[0].coords))
         return joined.transpose(*self.dims, ...).assign_attrs(
             title=self.case.title,
             case=json.dumps(case_to_dict(self.case)),
-            cases=json.dumps([case_to_dict(case) for case in self.cases]),
             error_estimate=max(part.error_estimate for part in datasets),
         )
 

@@ -46,7 +46,7 @@ def test_words_are_labels_and_peaks_those_of_single_runs(dataset):
             found = dataset.peak_deflection.sel({"loads.0.train": train, "loads.0.speed": speed})
             assert_allclose(found, jb.simulate(case).peak_deflection, rtol=1e-5)
     assert not dataset.failed.any()
-    cases = json.loads(dataset.cases)
+    cases = [json.loads(text) for text in dataset.cases.values]
     assert [case["loads"][0]["train"] for case in cases] == TRAINS
 
 
