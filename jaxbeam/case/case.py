@@ -232,8 +232,9 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     paths, structure = jax.tree_util.tree_flatten_with_path(case)
     leaves = [leaf for _, leaf in paths]
     index = {".".join(_key_name(key) for key in path): i for i, (path, _) in enumerate(paths)}
+    known = dict(zip(index, leaves, strict=True))
     each = [
-        (one, value) for key, value in values.items() for one in _own_addresses(case, key, index)
+        (one, value) for key, value in values.items() for one in _own_addresses(case, key, known)
     ]
     for address, value in each:
         value = xp.asarray(value, float)

@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict
+from jaxbeam.plot.speed_sweep import is_speed_sweep, is_word_axis, plot_speed_sweep
 from jaxbeam.plot.style import (
     ALARM,
     FAINT,
@@ -31,8 +32,9 @@ MAX_MARKED_RUNS = 40  # largest number of runs of a curve that are marked with d
 def plot_sweep(dataset: xarray.Dataset) -> Figure:
     """Peak deflection over the swept addresses: curves for one, a map per sensor for two.
 
-    A dot marks the largest peak; failed runs are left out; paired runs are drawn over their number.
-    A sweep over more addresses is drawn in slices: `plot_sweep(dataset.isel({"loads.0.mass": 0}))`.
+    Trains over speed are drawn as in `plot_speed_sweep`, other words as bars. A dot marks the
+    largest peak; failed runs are left out; paired runs are drawn over their number. A sweep over
+    more addresses is drawn in slices: `plot_sweep(dataset.isel({"loads.0.mass": 0}))`.
     Raises ValueError for more than two addresses, for a single run, and for a dataset without
     `peak_deflection` and the attribute `case`.
     """
@@ -52,16 +54,34 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
             f"a sweep is drawn over one or two addresses, not {len(swept)} ({', '.join(swept)}); "
             f"select a value of the others, as in dataset.isel({{{swept[0]!r}: 0}})"
         )
+    if is_speed_sweep(peaks, case):
+        return plot_speed_sweep(peaks, case)
+    words = [address for address in swept if is_word_axis(peaks, address)]
+    if words and len(swept) > 1:
+        raise ValueError(
+            f"{words[0]} has words, which are drawn over speed only; select one, as in"
+            f" dataset.isel({{{words[0]!r}: 0}})"
+        )
     factor, unit = unit_scale(peaks, "m")
     peaks = peaks.transpose("sensor", *swept) / factor
-    figure = (_curves if len(swept) == 1 else _maps)(peaks, swept, unit, case)
+    if words:
+        figure = _bars(peaks, swept, unit, case)
+    else:
+        figure = (_curves if len(swept) == 1 else _maps)(peaks, swept, unit, case)
     fixed_values = [
-        f"{address} = {float(value):.4g} {_unit(case, str(address))}".rstrip()
+        _fixed_value(case, str(address), value.item())
         for address, value in peaks.coords.items()
-        if value.ndim == 0 and address != "sensor"
+        if value.ndim == 0 and address not in ("sensor", "cases")
     ]
     set_title(figure, "\n".join(filter(None, [case.title, ", ".join(fixed_values)])))
     return figure
+
+
+def _fixed_value(case: Case, address: str, value) -> str:
+    """Address and value of a dimension that was selected."""
+    if isinstance(value, str):
+        return f"{address} = {value}"
+    return f"{address} = {value:.4g} {_unit(case, address)}".rstrip()
 
 
 def _unit(case: Case, address: str) -> str:
@@ -106,6 +126,22 @@ def _curves(peaks, swept, unit, case):
     margin_labels(
         axes, last_values, _sensor_names(peaks, case), [colour(i) for i in range(len(last_values))]
     )
+    return figure
+
+
+def _bars(peaks, swept, unit, case):
+    """Peaks of words, a bar for each sensor beside each word."""
+    (address,) = swept
+    labels, count = [str(word) for word in peaks[address].values], peaks.sizes["sensor"]
+    figure = Figure(figsize=(6.4, 0.9 + 0.3 * len(labels) * count))
+    axes = figure.subplots()
+    for i, (values, name) in enumerate(zip(peaks.values, _sensor_names(peaks, case), strict=True)):
+        places = np.arange(len(labels)) + (i - (count - 1) / 2) * 0.8 / count
+        axes.barh(places, values, 0.7 / count, color=colour(i), label=name)
+    axes.set_yticks(np.arange(len(labels)), labels)
+    axes.invert_yaxis()
+    axes.set(xlabel=f"peak deflection ({unit})", ylabel=address)
+    axes.legend()
     return figure
 
 
