@@ -25,7 +25,7 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
 )
-from jaxbeam.case.joint_addresses import each_address
+from jaxbeam.case.joint_addresses import ALL, each_address
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
 from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.sensors import Sensor
@@ -212,7 +212,8 @@ def value_at(case: Case, address: str) -> Float[Array, "..."]:
 def unit_at(case: Case, address: str) -> str:
     """SI unit of the number at an address; "" or "1" if it has none."""
     unit, part = "", case
-    for name in own_addresses(case, address)[0].split("."):
+    each = own_addresses(case, address) if ALL in address else [current_address(address)]
+    for name in each[0].split("."):
         if isinstance(part, tuple):
             part = part[int(name)]
         elif dataclasses.is_dataclass(part):

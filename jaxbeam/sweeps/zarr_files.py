@@ -23,7 +23,8 @@ DAMAGE_ERRORS = (
 )  # of zarr, for damaged files
 
 
-def checksummed():
+def checksummed() -> list[Any]:
+    """Compressor of arrays, with a checksum by which damage is detected."""
     from zarr.codecs import ZstdCodec
 
     return [ZstdCodec(checksum=True)]
@@ -41,7 +42,7 @@ def is_complete(array: zarr.Array) -> bool:
 
 @contextlib.contextmanager
 def explaining_damage(path: Path):
-    """Replace errors of zarr about damaged files by a ValueError of one sentence."""
+    """Replace errors of zarr about damaged files; raises ValueError of one sentence instead."""
     try:
         yield
     except DAMAGE_ERRORS as error:
@@ -53,7 +54,7 @@ def explaining_damage(path: Path):
 
 @contextlib.contextmanager
 def explaining_write_errors(path: Path):
-    """Replace errors in writing by one sentence, which says that finished blocks are kept."""
+    """Replace errors in writing; raises OSError that says that finished blocks are kept."""
     try:
         yield
     except OSError as error:
