@@ -102,7 +102,7 @@ class LoadSet(Module):
 
     trajectories: tuple[AbstractTrajectory, ...]
     wheels: WheelSet
-    behind: tuple[Float[Array, " wheel"], ...] | None = None
+    behind: tuple[Float[Array, " _"], ...] | None = None
     profile: Module | None = None
 
     @property

@@ -15,6 +15,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_dict
+from jaxbeam.plot.speed_sweep import is_speed_sweep, is_word_axis, plot_speed_sweep
 from jaxbeam.plot.style import (
     ALARM,
     FAINT,
@@ -36,8 +37,9 @@ MAX_MARKED_RUNS = 40  # largest number of runs of a curve that are marked with d
 def plot_sweep(dataset: xarray.Dataset) -> Figure:
     """Peaks at the sensors over the swept addresses: curves for one, a map per sensor for two.
 
-    Each quantity has a scale of its own. A dot marks the largest peak; failed runs are left out;
-    paired runs are drawn over their number. A sweep over more addresses is drawn in slices:
+    Trains over speed are drawn as in `plot_speed_sweep`, other words as bars. Each quantity has a
+    scale of its own. A dot marks the largest peak; failed runs are left out; paired runs are drawn
+    over their number. A sweep over more addresses is drawn in slices:
     `plot_sweep(dataset.isel({"loads.0.mass": 0}))`. Raises ValueError for more than two addresses,
     for a single run, and for a dataset without peaks and the attribute `case`.
     """
@@ -59,6 +61,14 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
             f"a sweep is drawn over one or two addresses, not {len(swept)} ({', '.join(swept)}); "
             f"select a value of the others, as in dataset.isel({{{swept[0]!r}: 0}})"
         )
+    if is_speed_sweep(peaks, case):
+        return plot_speed_sweep(peaks, case)
+    words = [address for address in swept if is_word_axis(peaks, address)]
+    if words and len(swept) > 1:
+        raise ValueError(
+            f"{words[0]} has words, which are drawn over speed only; select one, as in"
+            f" dataset.isel({{{words[0]!r}: 0}})"
+        )
     peaks = peaks.transpose("sensor", *swept)
     numbers = _sensor_numbers(peaks, case)
     by_quantity = [
@@ -66,14 +76,22 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
         for quantity in dict.fromkeys(case.sensors[i].quantity for i in numbers)
     ]
     groups = [_quantity_peaks(peaks, numbers, rows, case) for rows in by_quantity]
-    figure = (_curves if len(swept) == 1 else _maps)(groups, swept, case)
+    draw = _bars if words else _curves if len(swept) == 1 else _maps
+    figure = draw(groups, swept, case)
     fixed_values = [
-        f"{address} = {float(value):.4g} {_unit(case, str(address))}".rstrip()
+        _fixed_value(case, str(address), value.item())
         for address, value in peaks.coords.items()
-        if value.ndim == 0 and address != "sensor"
+        if value.ndim == 0 and address not in ("sensor", "cases")
     ]
     set_title(figure, "\n".join(filter(None, [case.title, ", ".join(fixed_values)])))
     return figure
+
+
+def _fixed_value(case: Case, address: str, value) -> str:
+    """Address and value of a dimension that was selected."""
+    if isinstance(value, str):
+        return f"{address} = {value}"
+    return f"{address} = {value:.4g} {_unit(case, address)}".rstrip()
 
 
 def _unit(case: Case, address: str) -> str:
@@ -144,6 +162,26 @@ def _curves(groups: list[QuantityPeaks], swept, case):
         axes.margins(x=0.01)
         margin_labels(axes, last_values, group.names, tints)
     rows[-1].set_xlabel(_axis_label(case, address))
+    return figure
+
+
+def _bars(groups: list[QuantityPeaks], swept, case):
+    """Peaks of words, a bar for each sensor beside each word."""
+    (address,) = swept
+    labels = [str(word) for word in groups[0].peaks[address].values]
+    heights = [0.9 + 0.3 * len(labels) * len(group.names) for group in groups]
+    figure = Figure(figsize=(6.4, sum(heights)))
+    rows = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, group in zip(rows, groups, strict=True):
+        count = len(group.names)
+        bars = zip(group.peaks.values, group.names, group.numbers, strict=True)
+        for i, (values, name, number) in enumerate(bars):
+            places = np.arange(len(labels)) + (i - (count - 1) / 2) * 0.8 / count
+            axes.barh(places, values, 0.7 / count, color=colour(number), label=name)
+        axes.set_yticks(np.arange(len(labels)), labels)
+        axes.invert_yaxis()
+        axes.set(xlabel=group.label, ylabel=address)
+        axes.legend()
     return figure
 
 

@@ -6,6 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from tests.cli.example import CASE
+
 
 def frequency(n: int, rigidity: float = 11.68) -> float:
     """Natural frequency n (Hz) of the pinned beam, (n pi / L)^2 sqrt(E I / m) / 2 pi."""
@@ -37,6 +39,7 @@ REFUSED = [
         "sweep case.toml --over loads.0.speed=1,2 --over loads.0.speed=1,2",
         "--over names loads.0.speed twice",
     ),
+    ("sweep case.toml --over loads.0.train=HSLM-A1,2", "'HSLM-A1' is not a number"),
     ("sweep case.toml --over loads.0.speed=1,2 --resume", "--resume needs the store to continue"),
     ("frf case.toml --from 0", "--from and --to must increase from above 0 Hz; they are 0, 1000"),
     ("frf case.toml --from 10 --to 1", "--from and --to must increase from above 0 Hz"),
@@ -167,6 +170,27 @@ def test_paired_sweep(run):
     line = "sweep case.toml --over loads.0.mass=0.1,0.5 --over loads.0.speed=0.5,1 --paired"
     assert np.shape(run(f"{line} --json")["peak_deflection"]) == (2, 2)
     assert "2 runs" in run(line)
+
+
+def test_sweep_over_words(run, refused, folder):
+    """Trains are words; the picture has their peaks over speed."""
+    load = '[[loads]]\nkind = "axles"\ntrain = "HL93-tandem"\nspeed = 1.0\n'
+    text = CASE[: CASE.index("[[loads]]")] + load
+    for old, new in {"= 0.6": "= 9.0", "11.68": "1e8", "0.535": "535.0"}.items():
+        text = text.replace(old, new)
+    (folder / "train.toml").write_text(text)
+    line = "sweep train.toml --over loads.*.speed=20:40:3 --over loads.0.train="
+    found = run(f"{line}HL93-tandem,LM71-axles --plot --json")
+    assert found["dimensions"] == ["loads.*.speed", "loads.0.train", "sensor"]
+    assert found["values"]["loads.0.train"] == ["HL93-tandem", "LM71-axles"]
+    assert np.shape(found["peak_deflection"]) == (3, 2, 2)
+    assert (folder / "train_sweep.png").read_bytes().startswith(b"\x89PNG")
+    assert "train_sweep.png exists" in refused(f"{line}HL93-tandem,LM71-axles --plot")
+    printed = run(f"{line}HL93-tandem,LM71-axles")
+    assert "6 runs" in printed and "LM71-axles" in printed
+    assert "did you mean 'LM71-axles'" in refused(f"{line}LM71-axle")
+    message = refused("sweep train.toml --over loads.*.speed=20 --plot")
+    assert "one or two parameters with several values" in message
 
 
 def write_decay(path):
