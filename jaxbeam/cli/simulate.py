@@ -62,11 +62,11 @@ def _to_dict(record: "jb.Record") -> dict:
     content = {
         "peak_deflection": record.peak_deflection,
         "lowest_contact_force": record.lowest_contact_force,
+        "wheel_unloading": jb.wheel_unloading(record),
         "contact_lost_time": record.contact_lost_time,
         "error_estimate": record.error_estimate,
         "steps": record.steps,
     }
-    content["wheel_unloading"] = jb.wheel_unloading(record)
     ride = _ride(record)
     if ride is not None:
         content["ride"] = {
@@ -107,11 +107,13 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
             (name, f"{static[i]:.6g}", f"{lowest[i]:.6g}", _percent(unloading[i]))
             for name, i in zip(names, wheels, strict=True)
         ]
-    header = ("load", "static load (N)", "lowest on the beam (N)", "unloading, approach too")
+    header = ("load", "static load (N)", "lowest contact force (N)", "unloading")
     return table(header, rows)
 
 
 def _percent(share: float) -> str:
+    if share > 1:
+        return "would lift"
     return "-" if share != share else f"{max(share, 0.0):.1%}"
 
 

@@ -22,7 +22,7 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
-from jaxbeam.plot.traffic import draw_accelerations, draw_forces, has_bodies
+from jaxbeam.plot.traffic.rows import draw_accelerations, draw_forces, has_bodies
 from jaxbeam.simulation.record import Record
 
 
@@ -31,8 +31,8 @@ def plot_record(record: Record) -> Figure:
     """Schematic, deflections at the sensors, contact forces, bodies of vehicles, and commands.
 
     Dots mark peaks, shading the times with loads on the beam; vehicles have a row for the
-    accelerations of their bodies (see `jaxbeam.plot.traffic`), controllers one for the commands. Raises ValueError if the case has
-    neither sensors nor loads.
+    accelerations of their bodies (see `jaxbeam.plot.traffic.rows`), controllers one for the
+    commands. Raises ValueError if the case has neither sensors nor loads.
     """
     case = record.case
     crossed = shows_traffic(case)

@@ -9,7 +9,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, colour, separate_labels
-from jaxbeam.plot.vehicle_art import vehicle_art
+from jaxbeam.plot.traffic.drawing import vehicle_art
 
 # Markers in points, below the point of the beam they support.
 _HATCH_LINES = [p for y in (-0.9, -0.5, -0.1, 0.3, 0.7) for p in ((0.0, y + 0.2), (-0.4, y))]

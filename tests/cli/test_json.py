@@ -38,6 +38,7 @@ KEYS = {
     "simulate controlled.toml": {
         "peak_deflection": None,
         "lowest_contact_force": None,
+        "wheel_unloading": None,
         "contact_lost_time": None,
         "error_estimate": None,
         "steps": None,

@@ -28,6 +28,10 @@ class VehiclePart(NamedTuple):
     level: int
     ends: tuple[float, float]
 
+    def lift(self, s, u) -> np.ndarray:
+        """Height above points s (m) for degrees of freedom u, (..., dof)."""
+        return u @ self.height + (s - self.position) * (u @ self.pitch)
+
 
 class DrawnVehicle(NamedTuple):
     """Parts of a vehicle, positions of its wheels (m), and springs.
@@ -122,7 +126,7 @@ def _inferred(model: VehicleModel):
     """Names and positions of the parts, and springs, of matrices.
 
     The springs between the bodies of a vehicle do not feel a rotation of the whole, heights x and
-    pitches 1; nor do the levers above the wheels, where the heights are the positions of the wheels.
+    pitches 1; above the wheels the heights are then the positions of the wheels.
     """
     names = [name for name in model.names if not name.endswith(" pitch")]
     index = {name: i for i, name in enumerate(model.names)}

@@ -14,7 +14,7 @@ from jaxbeam.plot.style import (
     tinted,
     unit_scale,
 )
-from jaxbeam.plot.vehicle_parts import drawn_vehicle
+from jaxbeam.plot.traffic.parts import drawn_vehicle
 from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.record import Record
 
