@@ -116,7 +116,8 @@ def surface_height(case: Case, x) -> np.ndarray:
 def _draw_traffic(axes, case: Case) -> None:
     """Draw the profile and the vehicles above the beam."""
     length = float(concrete(case.beam.length))
-    x = np.linspace(*axes.get_xlim(), 401)
+    left, right = axes.get_xlim()
+    x = np.linspace(left, right, 401)
     profile = surface_height(case, x)
     highest = np.max(np.abs(profile)) or 1.0
     factor = highest / 0.12
