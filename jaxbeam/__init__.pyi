@@ -4,6 +4,15 @@ from .analysis.amplification import (
     envelope as envelope,
 )
 from .analysis.bound.bound import bound as bound
+from .analysis.ride import (
+    RideMeasures as RideMeasures,
+    ride_measures as ride_measures,
+    sperling_index as sperling_index,
+    vibration_dose as vibration_dose,
+    weighted_acceleration as weighted_acceleration,
+    weighted_rms as weighted_rms,
+    wheel_unloading as wheel_unloading,
+)
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.patch import Patch as Patch
 from .case.actuators.point import PointForce as PointForce

@@ -10,10 +10,10 @@ from PIL import Image
 
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.record import shade_crossings
 from jaxbeam.plot.schematic import (
     ACTUATOR_MARKER,
-    LOAD_MARKER,
     actuator_positions,
     draw_supports,
 )
@@ -30,6 +30,7 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
+from jaxbeam.plot.traffic.moving import Traffic
 from jaxbeam.simulation.record import Record
 
 PALETTE_SIZE = 96  # colours of the GIF; few keep the file small
@@ -46,11 +47,13 @@ def animate(
 ) -> None:
     """Write a GIF of the beam, its deflection enlarged, and the loads that cross it.
 
-    Actuators hang below the beam, patches are drawn on it, sensors are dots; the thin line is the
-    envelope of the downward deflection. Below is what the sensors measure so far, and the
-    commands if there is a controller. The whole run takes `frames` frames, `rate` of them a second;
-    a clock shows its time (s). Raises FileExistsError if the file exists and `overwrite` is not
-    set, ValueError for a run that diverges.
+    Vehicles are boxes on springs, as far above the surface as their bodies move, on the same scale
+    unless the profile is rough; it is the line on the beam and beside it. Actuators hang below the
+    beam, patches are drawn on it, sensors are dots; the thin line is the envelope of the downward
+    deflection. Below is what the sensors measure so far, and the commands if there is a controller.
+    The whole run takes `frames` frames, `rate` of them a second; a clock shows its time (s). Raises
+    FileExistsError if the file exists and `overwrite` is not set, ValueError for a run that
+    diverges.
     """
     if not overwrite and os.path.exists(path):
         raise FileExistsError(f"{path} exists; choose another name, or overwrite it")
@@ -58,7 +61,8 @@ def animate(
         raise ValueError(f"there is nothing to show: {record.verdict}")
     controlled = record.case.controller is not None
     quantities = list(dict.fromkeys(sensor.quantity for sensor in record.case.sensors))
-    heights = [2.2] + [1.3] * (len(quantities) + controlled)
+    stage = 3.0 if load_set(record.case).on_ground.any() else 2.2
+    heights = [stage] + [1.3] * (len(quantities) + controlled)
     figure = Figure(figsize=(6.4, 0.8 + sum(heights)), dpi=90)
     canvas = FigureCanvasAgg(figure)
     top, *below = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
@@ -107,10 +111,10 @@ def _beam_axes(axes, record):
     length = float(concrete(case.beam.length))
     x = np.linspace(0, length, 201)
     sensor_positions = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
-    load_positions = np.asarray(record.load_position)
     beam = np.asarray(record.at(jnp.asarray(x)))
     factor, unit = unit_scale(beam, "m")
     beam = beam / factor
+    traffic = Traffic(record, x, beam, factor)
     lowest_deflection = np.minimum.accumulate(beam)
     acting_at = [actuator_positions(actuator) for actuator in case.actuators]
     point_actuators = np.array([positions[0] for positions in acting_at if len(positions) == 1])
@@ -132,19 +136,9 @@ def _beam_axes(axes, record):
     sensor_markers = axes.scatter(
         sensor_positions, 0 * sensor_positions, color=sensor_colours, edgecolor="white", zorder=4
     )
-    (load_markers,) = axes.plot(
-        [], [], linestyle="", marker=LOAD_MARKER, markersize=20, color=COLOURS[5]
-    )
-    load_markers.set(markeredgecolor=INK, clip_on=False, zorder=3)
-    for moving in (actuator_markers, load_markers):
-        moving.set_in_layout(False)  # no points yet in the first frame
+    actuator_markers.set_in_layout(False)  # no points yet in the first frame
     clock = axes.text(1, 1, "", transform=axes.transAxes, ha="right", va="top", family="monospace")
-    low, high = min(beam.min(), 0.0), max(beam.max(), 0.0)
-    height_range = (high - low) or 1.0
-    axes.set(
-        xlim=(-0.02 * length, 1.02 * length),
-        ylim=(low - 0.15 * height_range, high + 0.4 * height_range),
-    )
+    update_traffic = traffic.draw(axes)
     axes.set(xlabel="position (m)", ylabel=f"deflection ({unit})")
 
     def update(frame):
@@ -157,8 +151,7 @@ def _beam_axes(axes, record):
         for patch, span in zip(patch_lines, patches, strict=True):
             patch.set_data(span, height(span))
         sensor_markers.set_offsets(np.column_stack([sensor_positions, height(sensor_positions)]))
-        on = load_positions[frame][np.isfinite(load_positions[frame])]
-        load_markers.set_data(on, height(on))
+        update_traffic(frame)
         clock.set_text(f"t = {float(record.times[frame]):.3f} s")
 
     return update

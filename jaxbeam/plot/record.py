@@ -9,10 +9,8 @@ from matplotlib.figure import Figure
 from jaxbeam.case.case import crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.model.load_set import load_set
-from jaxbeam.plot.schematic import draw_schematic
+from jaxbeam.plot.schematic import draw_schematic, shows_traffic
 from jaxbeam.plot.style import (
-    ALARM,
     GREY,
     SHADE,
     annotate,
@@ -27,27 +25,31 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
+from jaxbeam.plot.traffic.rows import draw_accelerations, draw_forces, has_bodies
 from jaxbeam.simulation.record import Record
 
 
 @use_style
 def plot_record(record: Record) -> Figure:
-    """Schematic of the case, quantities of the sensors, contact forces, and commands if any.
+    """Schematic, quantities of the sensors, contact forces, bodies of vehicles, and commands.
 
-    Each quantity has axes of its own. Dots mark peaks, shading the times with loads on the beam.
-    Raises ValueError if the case has neither sensors nor loads.
+    Each quantity has axes of its own. Dots mark peaks, shading the times with loads on the beam;
+    vehicles have a row for the accelerations of their bodies (see `jaxbeam.plot.traffic.rows`),
+    controllers one for the commands. Raises ValueError if the case has neither sensors nor loads.
     """
     case = record.case
+    crossed = shows_traffic(case)
     quantities = list(dict.fromkeys(sensor.quantity for sensor in case.sensors))
     panels = [
         (height, draw)
         for height, draw, shown in (
-            (0.7, lambda axes, record: draw_schematic(axes, record.case), True),
+            (1.2 if crossed else 0.7, lambda axes, record: draw_schematic(axes, record.case), True),
             *(
                 (3.2 if i == 0 else 2.2, functools.partial(_draw_quantity, quantity=name), True)
                 for i, name in enumerate(quantities)
             ),
-            (1.7, _draw_forces, case.loads),
+            (1.7, _with_crossings(draw_forces), case.loads),
+            (1.5, _with_crossings(draw_accelerations), has_bodies(record)),
             (1.7, _draw_commands, case.controller is not None),
         )
         if shown
@@ -64,6 +66,16 @@ def plot_record(record: Record) -> Figure:
         axes.tick_params(labelbottom=False)
     set_title(figure, case.title)
     return figure
+
+
+def _with_crossings(draw):
+    """Function that shades the times with loads on the beam before it draws."""
+
+    def shade_and_draw(axes, record):
+        shade_crossings(axes, record)
+        draw(axes, record)
+
+    return shade_and_draw
 
 
 def load_windows(record: Record) -> list[tuple[int, float, float]]:
@@ -108,13 +120,16 @@ def label_loads(axes, record: Record) -> None:
 
 
 def _load_label(load) -> str:
-    """Mass or force, and speed of a load, with units: "0.5 kg, 1.2 m/s"."""
+    """Mass or force, or name, and speed of a load, with units: "0.5 kg, 1.2 m/s"."""
     numbers = [(field, getattr(load, field.name)) for field in dataclasses.fields(load)]
-    return ", ".join(
+    parts = [
         f"{float(concrete(value)):.4g} {field.metadata['unit']}"
         for field, value in numbers
         if field.name in ("mass", "force", "speed") and value is not None
-    )
+    ]
+    if load.kind not in ("mass", "force"):
+        parts.insert(0, getattr(load, "train", "") or getattr(load, "model", "") or load.kind)
+    return ", ".join(parts)
 
 
 def _draw_quantity(axes, record, quantity: str):
@@ -140,38 +155,6 @@ def _draw_quantity(axes, record, quantity: str):
     if 0 in own:  # the first of the quantities
         label_loads(axes, record)
     margin_labels(axes, peaks, names, [colour(i) for i in own])
-
-
-def _draw_forces(axes, record):
-    times, force = np.asarray(record.times), np.asarray(record.contact_force)
-    on = np.isfinite(np.asarray(record.load_position))
-    factor, unit = unit_scale(force[on], "N")
-    shade_crossings(axes, record)
-    weights = {}
-    loads = load_set(record.case)
-    for wheel, i in enumerate(loads.load_of_wheel):
-        contact_force = np.where(on[:, wheel], force[:, wheel], np.nan) / factor
-        axes.plot(times, contact_force, color=load_colour(i), linewidth=1.1)
-        weights.setdefault(float(loads.weight[wheel, 0]) / factor, load_colour(i))
-    lost = np.asarray(record.contact_lost_time)
-    lost = lost[np.isfinite(lost)]
-    if lost.size:
-        axes.axhline(0, color=GREY, linewidth=0.8)
-        axes.plot(lost, 0 * lost, "X", color=ALARM, markersize=7, zorder=3)
-        annotate(
-            axes,
-            "contact loss",
-            (lost.min(), 0),
-            (-6, -6),
-            ha="right",
-            va="top",
-            color=ALARM,
-        )
-    axes.set_ylabel(f"contact force ({unit})")
-    for weight, tint in weights.items():
-        axes.axhline(weight, color=tint, linewidth=0.9, linestyle=":")
-    names = [f"weight {format_number(weight)} {unit}" for weight in weights]
-    margin_labels(axes, list(weights), names, list(weights.values()))
 
 
 def _draw_commands(axes, record):

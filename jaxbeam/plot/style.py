@@ -6,6 +6,7 @@ import numpy as np
 from cycler import cycler
 from jaxtyping import Float
 from matplotlib import rc_context
+from matplotlib.colors import to_rgb
 
 INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, distinct with any kind of colour vision.
@@ -85,6 +86,11 @@ def colour(index: int) -> str:
 def load_colour(index: int) -> str:
     """Colour of a load or actuator by its number; colours repeat after four."""
     return LOAD_COLOURS[index % len(LOAD_COLOURS)]
+
+
+def tinted(tint, strength: float) -> tuple[float, float, float]:
+    """Mixture of a colour and white: 1 is the colour, 0 is white."""
+    return tuple(1 - strength * (1 - channel) for channel in to_rgb(tint))  # type: ignore[return]
 
 
 def format_number(value: float, count: int = 3) -> str:

@@ -68,7 +68,7 @@ class _Namespace:
     def __getattr__(self, name):
         known, traced = getattr(self._known, name), getattr(self._traced, name)
         known = _einsum if name == "einsum" else known
-        if name == "linalg":
+        if name in ("linalg", "fft"):
             attribute: Any = _Namespace(known, traced)
         elif isinstance(known, type) or not callable(known):
             attribute = known

@@ -21,6 +21,7 @@ from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.extremes import Extremes, sensor_extremes
+from jaxbeam.simulation.labels import contact_sentence, wheel_labels
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
 from jaxbeam.simulation.result_variables import (
     MODE_FIELDS,
@@ -245,19 +246,8 @@ class Record(eqx.Module):
                 f"the control loop diverges: the deflection has grown beyond all bounds by"
                 f" t = {diverged:.4g} s; lower the gains, or shorten period and delay"
             )
-        lost = np.asarray(concrete(self.contact_lost_time))
-        where = np.asarray(concrete(self.contact_lost_position))
-        lowest_force = np.asarray(concrete(self.lowest_contact_force))
-        contact_losses = [
-            f"load {i} loses contact, first at t = {lost[i]:.4g} s, x = {where[i]:.4g} m "
-            f"(smallest contact force {lowest_force[i]:.4g} N)"
-            for i in np.flatnonzero(np.isfinite(lost))
-        ]
-        parts = [
-            "; ".join(contact_losses)
-            if contact_losses
-            else "every load presses on the beam throughout"
-        ]
+        contact = self.contact_lost_time, self.contact_lost_position, self.lowest_contact_force
+        parts = [contact_sentence(self.case, *(np.asarray(concrete(part)) for part in contact))]
         failures = int(concrete(self.failures)[-1])
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")
@@ -287,6 +277,8 @@ class Record(eqx.Module):
         coordinates = {
             "time": ("time", np.asarray(self.times), {"units": "s"}),
             **sensor_coordinates(self.case),
+            "load": ("load", wheel_labels(self.case)),
+            "body": ("body", np.array(self.bodies, dtype=str)),
             "frequency": ("mode", np.asarray(self.modes.frequencies), {"units": "Hz"}),
         }
         attributes = {

@@ -92,6 +92,7 @@ def test_simulate_prints_and_writes_the_same(run, folder):
         "sensors",
         "peak_deflection",
         "lowest_contact_force",
+        "wheel_unloading",
         "contact_lost_time",
         "error_estimate",
         "steps",

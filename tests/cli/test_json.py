@@ -50,6 +50,7 @@ KEYS = {
         ],
         "peak_deflection": None,
         "lowest_contact_force": None,
+        "wheel_unloading": None,
         "contact_lost_time": None,
         "error_estimate": None,
         "steps": None,

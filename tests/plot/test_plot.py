@@ -226,9 +226,8 @@ def test_animation_of_a_controlled_beam(tmp_path):
             frames = [np.asarray(f.convert("L")) for f in ImageSequence.Iterator(picture)]
         assert len(frames) == 3 and not np.array_equal(frames[0], frames[1])
     assert heights[0] > heights[1]
-    diverged = dataclasses.replace(
-        record, coordinates=jnp.asarray(record.coordinates).at[9:].set(jnp.nan)
-    )
+    nothing = jnp.asarray(record.coordinates).at[9:].set(jnp.nan)
+    diverged = dataclasses.replace(record, coordinates=nothing)
     with pytest.raises(ValueError, match="diverges"):
         animate(diverged, tmp_path / "diverged.gif")
     assert not (tmp_path / "diverged.gif").exists()
