@@ -1,4 +1,4 @@
-"""Draw docs/figures/vehicle.png: `python -m docs.draw_vehicle`. A coach crosses an uneven bridge."""
+"""Draw docs/figures/vehicle.png, a wagon that crosses a bridge: `python -m docs.draw_vehicle`."""
 
 from pathlib import Path
 
