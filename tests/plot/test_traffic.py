@@ -63,7 +63,7 @@ def test_hinged_bodies_share_the_height_of_their_hinge():
     load = jb.VehicleLoad(model="truck-5-axle", speed=20.0)
     tractor, trailer, *axles = drawn_vehicle(load).parts
     hinge = float(load.hinges[0].position - load.axles[0].position)
-    u = np.random.default_rng(1).normal(size=len(load.vehicle(9.81).names))
+    u = np.random.default_rng(1).normal(size=len(load.vehicle(np.float64(9.81)).names))
     assert tractor.lift(hinge, u) == pytest.approx(trailer.lift(hinge, u))
     assert tractor.level == trailer.level == 2 and len(axles) == 5
 
