@@ -26,7 +26,7 @@ from jaxbeam.model.flexibility import flexibility
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.statics import static_deflection_per_command
 from jaxbeam.runtime.arrays import any_jax
 from jaxbeam.simulation.integration_plan import (

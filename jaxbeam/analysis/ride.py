@@ -28,7 +28,7 @@ SPERLING_BAND, SPERLING_EXPONENT = (0.5, 30.0), 1 / 6.67
 CENTIMETRES = 100.0  # of a metre: the index is defined for cm/s^2
 
 
-def vertical_weighting(frequency: Float[Array, "*shape"]) -> Complex[Array, "*shape"]:
+def vertical_weighting(frequency: Float[Array, "*shape"] | float) -> Complex[Array, "*shape"]:
     """Transfer function W_k of ISO 2631-1 for vertical vibration, at frequencies f (Hz).
 
     Product of a high and a low pass, a transition from acceleration to velocity, and an upward
@@ -56,7 +56,7 @@ def vertical_weighting(frequency: Float[Array, "*shape"]) -> Complex[Array, "*sh
     )
 
 
-def sperling_weighting(frequency: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def sperling_weighting(frequency: Float[Array, "*shape"] | float) -> Float[Array, "*shape"]:
     """Weighting B of vertical acceleration in Sperling's index of comfort, at f (Hz).
 
         B = 0.588 sqrt((1.911 f^2 + (0.25 f^2)^2) / ((1 - 0.277 f^2)^2 + (1.563 f - 0.0368 f^3)^2))

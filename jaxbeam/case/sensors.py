@@ -28,7 +28,7 @@ class Sensor(Module):
     axis, `moment` the bending moment, positive where the beam sags, `shear` its x-derivative, and
     `stress` the moment over the `section_modulus`. `name` is the label in results. `offset` and
     noise are added to the quantity; the reading is limited to the range and rounded to the
-    resolution (see `jaxbeam.model.sensor_signals`). What is left out is ideal.
+    resolution (see `jaxbeam.model.sensing.sensor_signals`). What is left out is ideal.
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)

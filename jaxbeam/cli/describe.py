@@ -1,19 +1,23 @@
 """Command about vehicles: `describe`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxbeam.case.reading.toml_file import read_toml
-from jaxbeam.cli.options import PrintOptions, table
+from jaxbeam.cli.arguments import check_suffix
+from jaxbeam.cli.options import OutputOptions, PrintOptions, table
 
 if TYPE_CHECKING:
+    from jaxbeam.case.loads.base import AbstractLoad
     from jaxbeam.case.loads.vehicle_model import VehicleModel
 
 GRAVITY = 9.81  # m/s^2, of vehicles without a case
 
 
-def describe(source: str = "", /, *, options: PrintOptions = PrintOptions()) -> None:
+def describe(
+    source: str = "", /, *, plot: Path | None = None, options: OutputOptions = OutputOptions()
+) -> None:
     """Describe vehicles: static wheel loads, masses, and natural frequencies on a rigid road.
 
     Parameters
@@ -21,7 +25,11 @@ def describe(source: str = "", /, *, options: PrintOptions = PrintOptions()) -> 
     source
         Vehicle file or case file, TOML, or a vehicle or train of the library by name; its names are
         listed if left out.
+    plot
+        Draw the vehicles to this file, OUT.png.
     """
+    check_suffix(plot, ".png", "a picture")
+    options.check_outputs(plot)
     if not source:
         _list_library(options)
         return
@@ -40,7 +48,27 @@ def describe(source: str = "", /, *, options: PrintOptions = PrintOptions()) -> 
     lines: list[str] = []
     for result in results:
         lines += [*([""] if lines else []), *_lines(result)]
-    options.report({"vehicles": results}, lines or ["the case has no loads"])
+    drawn = plot if results else None
+    if drawn:
+        from jaxbeam.plot import plot_vehicles
+
+        titles = [result["title"] for result in results]
+        plot_vehicles(_loads(source, content), titles).savefig(drawn)
+    options.report({"vehicles": results}, lines or ["the case has no loads"], drawn)
+
+
+def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
+    """Loads of a case, or one of a vehicle file, a vehicle or a train."""
+    from jaxbeam.case.loads.axles import Axles
+    from jaxbeam.case.loads.vehicle import VehicleLoad
+    from jaxbeam.files.case_file import load_case
+    from jaxbeam.vehicles.trains import trains
+
+    if "beam" in content or "loads" in content:
+        return load_case(source).loads
+    if source in trains():
+        return [Axles(train=source, speed=1.0)]
+    return [VehicleLoad(model=source, speed=1.0)]
 
 
 def _of_library(name: str) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from jaxbeam.control.state_law import (
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.output_rows import modal_row
+from jaxbeam.model.sensing.output_rows import modal_row
 from jaxbeam.model.state_space import Plant, build_plant, state_space
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled_if_traced

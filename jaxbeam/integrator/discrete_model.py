@@ -12,7 +12,7 @@ from jaxbeam.integrator.monitored_rows import largest_per_energy, monitored_rows
 from jaxbeam.integrator.propagators import PEAK_NODES, Propagators, propagators
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.output_rows import OutputRows
+from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.runtime.arrays import Array, xp
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.integrator.step import advance, forces_and_vehicles, known_maps
-from jaxbeam.integrator.vehicle_steps import StepInput, Vehicles
+from jaxbeam.integrator.vehicles.steps import StepInput, Vehicles
 from jaxbeam.runtime.arrays import any_jax, collapse, xp
 
 

@@ -26,8 +26,8 @@ from jaxbeam.integrator.step import (
     advance_unforced,
 )
 from jaxbeam.integrator.step_matrices import LoadPath, chunk_length, load_path, step_matrices
-from jaxbeam.integrator.vehicle_propagators import vehicle_state_norm
-from jaxbeam.integrator.vehicle_steps import (
+from jaxbeam.integrator.vehicles.propagators import vehicle_state_norm
+from jaxbeam.integrator.vehicles.steps import (
     StepInput,
     VehicleStep,
     initial_vehicle_states,

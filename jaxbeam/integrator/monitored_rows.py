@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, Propagators
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.output_rows import OutputRows
+from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.runtime.arrays import Array, add_at, solve_triangular, xp
 

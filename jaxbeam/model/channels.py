@@ -26,7 +26,7 @@ from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.output_rows import row_on_states, sensor_rows
+from jaxbeam.model.sensing.output_rows import row_on_states, sensor_rows
 from jaxbeam.runtime.arrays import set_at, xp
 
 POINT_QUANTITIES = tuple(

@@ -9,3 +9,4 @@ from .poles import plot_poles as plot_poles
 from .record import plot_record as plot_record
 from .sweep import plot_sweep as plot_sweep
 from .tuning import TuningPanel as TuningPanel, plot_tuning as plot_tuning
+from .vehicles import plot_vehicles as plot_vehicles

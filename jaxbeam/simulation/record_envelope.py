@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.output_rows import quantity_history
+from jaxbeam.model.sensing.output_rows import quantity_history
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.simulation.section_forces import SIDES, shear_force

@@ -17,8 +17,8 @@ from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.output_rows import sensor_rows
-from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state
+from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, cond, is_jax, take, vmap, xp
 from jaxbeam.simulation.command_limits import limit_commands

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.output_rows import SIDE_SHARE, beside, quantity_history
+from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_history
 from jaxbeam.model.static_correction import (
     Motion,
     corrected_history,

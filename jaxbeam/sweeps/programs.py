@@ -27,7 +27,7 @@ from jaxbeam.integrator.integrate import (
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.model.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,

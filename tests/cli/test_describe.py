@@ -44,3 +44,10 @@ def test_library(run):
 def test_unknown_names_are_refused(refused):
     assert "did you mean 'truck-5-axle'?" in refused("describe truck-5-axel")
     assert "cannot read the file none.toml" in refused("describe none.toml")
+
+
+def test_picture(folder, run):
+    (folder / "cart.toml").write_text(CART)
+    for source, picture in (("cart.toml", "cart.png"), ("case.toml", "case.png")):
+        assert f"written: {picture}" in run(f"describe {source} --plot {picture}")
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")

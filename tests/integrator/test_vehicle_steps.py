@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
-from jaxbeam.integrator.vehicle_steps import (
+from jaxbeam.integrator.vehicles.steps import (
     next_vehicle_states,
     solve_rows,
     spring_coupling,

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.quantities import QUANTITIES, Quantity, quantity_of
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.output_rows import modal_row, quantity_history, sensor_rows
+from jaxbeam.model.sensing.output_rows import modal_row, quantity_history, sensor_rows
 from jaxbeam.model.static_correction import Motion
 
 FIBRE, MODULUS = 0.003, 2e-6

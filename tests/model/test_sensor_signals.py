@@ -15,8 +15,8 @@ from jaxbeam.case.filters import Filter
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.model.measurement import sensor_readings
-from jaxbeam.model.sensor_signals import (
+from jaxbeam.model.sensing.measurement import sensor_readings
+from jaxbeam.model.sensing.sensor_signals import (
     filtered_reading,
     initial_filter_state,
     noise_samples,

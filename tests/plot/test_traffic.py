@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageSequence
 
 import jaxbeam as jb
-from jaxbeam.plot import animate, plot_record
+from jaxbeam.plot import animate, plot_record, plot_vehicles
 from jaxbeam.plot.traffic.drawing import vehicle_art
 from jaxbeam.plot.traffic.parts import drawn_vehicle
 from tests.plot.figures import CASE as BALL, data, lines_of, words
@@ -63,7 +63,7 @@ def test_hinged_bodies_share_the_height_of_their_hinge():
     load = jb.VehicleLoad(model="truck-5-axle", speed=20.0)
     tractor, trailer, *axles = drawn_vehicle(load).parts
     hinge = float(load.hinges[0].position - load.axles[0].position)
-    u = np.random.default_rng(1).normal(size=len(load.vehicle(9.81).names))
+    u = np.random.default_rng(1).normal(size=len(load.vehicle(np.float64(9.81)).names))
     assert tractor.lift(hinge, u) == pytest.approx(trailer.lift(hinge, u))
     assert tractor.level == trailer.level == 2 and len(axles) == 5
 
@@ -142,3 +142,16 @@ def test_animation_of_vehicles(tmp_path):
         assert len(frames) == 4
         assert not np.array_equal(frames[1], frames[2])
     animate(jb.simulate(BALL), tmp_path / "ball.gif", frames=4)
+
+
+def test_vehicles_on_the_ground_with_their_static_loads():
+    train = jb.Axles(train="HSLM-A1", speed=1.0)
+    figure = plot_vehicles([CAR, dataclasses.replace(WAGON, speed=-1.0), train], ["car", "wagons"])
+    said = words(figure)
+    for text in ("car", "wagons", "axles", "168.7", "109.1", "static loads in kN", "position (m)"):
+        assert text in said
+    assert "170" not in said  # of fifty axles
+    wheels = [data(line)[0] for line in figure.axes[1].lines if line.get_marker() != "None"]
+    assert_allclose(np.sort(wheels[0])[[0, -1]], [0.0, 46.56])
+    with pytest.raises(ValueError, match="at least one load"):
+        plot_vehicles([])

@@ -10,7 +10,7 @@ import jaxbeam as jb
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator.monitored_rows import largest_per_energy
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.output_rows import modal_row, sensor_rows
+from jaxbeam.model.sensing.output_rows import modal_row, sensor_rows
 from jaxbeam.sweeps.truncation import TruncationWarning
 
 BEAM = jb.Beam(1.2, 11.68, 0.535, 0.02, modes=3)

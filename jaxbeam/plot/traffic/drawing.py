@@ -74,13 +74,15 @@ class VehicleArt:
         self._gaps = [max(gap, room) for gap, room in zip(self._gaps, needed, strict=True)]
         return sum(needed)
 
-    def update(self, positions, surface, displacements, follow=np.zeros_like) -> None:
+    def update(self, positions, surface, displacements, follow=np.zeros_like, facing=None) -> None:
         """Draw at positions (m) of all wheels, heights of the surface under them, and bodies.
 
         Heights of the surface and displacements (by degree of freedom) are in units of the axis;
-        `follow` are heights at positions on the beam that are added to those of the bodies.
+        `follow` are heights at positions on the beam that are added to those of the bodies;
+        `facing` is 1 for a front on the right, else that of its trajectory.
         """
         self._follow = follow
+        self._direction = self._direction if facing is None else facing
         self._wheels.set_data(positions, surface)
         count = self._vehicle.wheels.size
         boxes, lines = [], []

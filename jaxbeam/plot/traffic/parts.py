@@ -28,7 +28,7 @@ class VehiclePart(NamedTuple):
     level: int
     ends: tuple[float, float]
 
-    def lift(self, s, u) -> np.ndarray:
+    def lift(self, s, u):
         """Height above points s (m) for degrees of freedom u, (..., dof)."""
         return u @ self.height + (s - self.position) * (u @ self.pitch)
 

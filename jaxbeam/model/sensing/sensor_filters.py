@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxbeam.case.controller import ControllerFilter
 from jaxbeam.case.filters import analogue_state_space
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, add_at, block_diag, set_at, xp
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.integrator.propagators import NODE_COUNT
-from jaxbeam.integrator.vehicle_steps import StepInput, Vehicles
+from jaxbeam.integrator.vehicles.steps import StepInput, Vehicles
 from jaxbeam.model.load_set import VehicleGroup
 from jaxbeam.runtime.arrays import take
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.step_matrices import StepMatrices
-from jaxbeam.integrator.vehicle_propagators import (
+from jaxbeam.integrator.vehicles.propagators import (
     VehiclePropagators,
     next_vehicle_states,
     spring_coupling,
