@@ -98,7 +98,7 @@ class LoadSet(Module):
 
     trajectories: tuple[AbstractTrajectory, ...]
     wheels: Wheels
-    behind: tuple[Float[Array, " wheel"], ...] | None = None
+    behind: tuple[Float[Array, " _"], ...] | None = None
     profile: Module | None = None
 
     @property
