@@ -23,9 +23,7 @@ BEAM = jb.Beam(20.0, 2e10, 1.2e4, modes=2)
 VEHICLES = {
     "quarter-car": reference.quarter_car(reference.REFERENCE["quarter-car"]["input"]),
     "half-car": reference.half_car(reference.REFERENCE["half-car"]["input"]),
-    "two wagons": reference.wagon(
-        reference.REFERENCE["wagon"]["input"], count=2, spacing=25.0
-    ),
+    "two wagons": reference.wagon(reference.REFERENCE["wagon"]["input"], count=2, spacing=25.0),
 }
 LENGTHS = np.array([0.02, 3e-3])
 
@@ -52,7 +50,9 @@ def test_a_step_is_that_of_scipy(name):
         after = next_vehicle_states(part, group, states, at_nodes)
         after = after.reshape(group.count, -1)
         for vehicle in range(group.count):
-            own = slice(vehicle * group.wheels_per_vehicle, (vehicle + 1) * group.wheels_per_vehicle)
+            own = slice(
+                vehicle * group.wheels_per_vehicle, (vehicle + 1) * group.wheels_per_vehicle
+            )
             solution = solve_ivp(
                 lambda t, z, own=own, length=length: A @ z + B @ surface(t / length)[own],
                 (0.0, length),

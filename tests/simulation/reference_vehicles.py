@@ -109,5 +109,7 @@ def largest(values) -> float:
     """Largest value of samples (time,) and of the parabolas through three of them."""
     left, middle, right = values[:-2], values[1:-1], values[2:]
     bend = np.minimum(left - 2 * middle + right, -1e-300)
-    tops = np.where(middle >= np.maximum(left, right), middle - (right - left) ** 2 / (8 * bend), -np.inf)
+    tops = np.where(
+        middle >= np.maximum(left, right), middle - (right - left) ** 2 / (8 * bend), -np.inf
+    )
     return float(max(np.max(tops), values[0], values[-1]))

@@ -79,7 +79,9 @@ def test_stiff_springs_become_a_moving_mass():
     """The difference falls as 1 / stiffness: the mass on the spring lags by m a / k."""
     mass = deflections(jb.MovingMass(MASS, speed=20.0))
     errors = [
-        np.max(np.abs(deflections(jb.Oscillator(MASS, k, 2 * np.sqrt(k * MASS), speed=20.0)) - mass))
+        np.max(
+            np.abs(deflections(jb.Oscillator(MASS, k, 2 * np.sqrt(k * MASS), speed=20.0)) - mass)
+        )
         for k in (4e9, 1.6e10)
     ]
     assert errors[1] < 0.02 * np.max(np.abs(mass))

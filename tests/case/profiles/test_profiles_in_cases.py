@@ -237,7 +237,9 @@ RIGID = {
 def test_masses_on_the_surface_need_a_slope_without_jumps(name):
     ramp = jb.RampProfile(5.0, 7.0, 0.01)
     with pytest.raises(ValueError, match="loads.1 has a mass that is rigidly on the surface"):
-        check_case(jb.Case(BEAM, loads=[jb.QuarterCar(**CAR, speed=1.0), RIGID[name]], profile=ramp))
+        check_case(
+            jb.Case(BEAM, loads=[jb.QuarterCar(**CAR, speed=1.0), RIGID[name]], profile=ramp)
+        )
     for smooth in (jb.RampProfile(5.0, 7.0, 0.01, 0.2), jb.StepProfile(5.0, 7.0, 0.01)):
         check_case(jb.Case(BEAM, loads=[RIGID[name]], profile=smooth))
 
