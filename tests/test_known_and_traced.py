@@ -106,9 +106,10 @@ def _model(case, layout):
 
 def _forces_on_the_beam(case, layout):
     """Contact forces and accelerations at some instants, for arbitrary states."""
-    model, times = _model(case, layout), np.linspace(0.01, 0.2, 7)
-    states = 1e-3 * np.sin(np.arange(times.size * model.state_count)).reshape(times.size, -1, 1)
-    return contact_at(model, load_set(case), times, states)
+    model, loads, times = _model(case, layout), load_set(case), np.linspace(0.01, 0.2, 7)
+    count = model.state_count + loads.vehicle_states
+    states = 1e-3 * np.sin(np.arange(times.size * count)).reshape(times.size, -1, 1)
+    return contact_at(model, loads, times, states)
 
 
 def _discrete_model(case, layout):

@@ -19,7 +19,11 @@ from jaxbeam.case.trajectory import NEVER, AbstractTrajectory
 from jaxbeam.model.modal_model import compiled_modal_model
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
-from jaxbeam.model.sensing.sensor_signals import filtered_reading, initial_filter_state, sensor_sections
+from jaxbeam.model.sensing.sensor_signals import (
+    filtered_reading,
+    initial_filter_state,
+    sensor_sections,
+)
 from jaxbeam.model.state_space import Plant, build_plant
 from jaxbeam.runtime.arrays import Array, expm, known, scan, xp
 from jaxbeam.runtime.compiling import compiled

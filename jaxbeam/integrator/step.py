@@ -10,8 +10,8 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Float
 
-from jaxbeam.integrator.vehicles.known_maps import known_forces, known_state_maps
 from jaxbeam.integrator.step_matrices import StepMatrices
+from jaxbeam.integrator.vehicles.known_maps import known_forces, known_state_maps
 from jaxbeam.integrator.vehicles.steps import StepInput, Vehicles
 from jaxbeam.model.contact import ModalCompliance, solve_contact_forces
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_small

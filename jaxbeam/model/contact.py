@@ -89,7 +89,7 @@ class ContactState(eqx.Module):
 
     force: Float[Array, "*time wheel batch"]
     modal_acceleration: Float[Array, "*time mode batch"]
-    vehicle_acceleration: tuple[Float[Array, "*time vehicle dof batch"], ...]
+    vehicle_acceleration: tuple[Float[Array, "*time _ _ batch"], ...]  # vehicle, dof
 
 
 def contact_at(

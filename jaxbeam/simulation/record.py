@@ -14,8 +14,8 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.model.load_set import load_set
-from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.modes import Modes
+from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import quantity_history
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp

@@ -18,8 +18,8 @@ from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.contact import contact_at, split_states
 from jaxbeam.model.load_set import LoadSet, load_set
-from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced

@@ -58,7 +58,9 @@ def test_motion_of_the_surface_is_that_of_its_height():
     loads = load_set(jb.Case(CASE.beam, loads=[load], profile=PROFILE))
     step, time = 1e-4, 0.31
     times = time + step * np.array([-1.0, 0.0, 1.0])
-    heights, rates, accelerations = loads.surface_motion(*loads.kinematics(times))
+    motion = loads.surface_motion(*loads.kinematics(times))
+    assert motion is not None
+    heights, rates, accelerations = motion
     low, middle, high = heights[0]
     assert rates[0, 1] == pytest.approx((high - low) / (2 * step), rel=1e-5)
     assert accelerations[0, 1] == pytest.approx((high - 2 * middle + low) / step**2, rel=1e-4)

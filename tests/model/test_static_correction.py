@@ -223,3 +223,13 @@ def test_moment_under_a_slow_load_and_a_patch():
     residual = residual_actuator_gain(case, x, 2)[0] * 100.0
     difference = corrected_deflection(steady, x, 2) - corrected_deflection(record, x, 2)
     assert_allclose(difference, np.tile(residual, (121, 1)), atol=1e-15)
+
+
+def test_wheels_on_the_ground_do_not_bend_the_beam():
+    """A vehicle before the free end of a beam presses on the road."""
+    case = jb.Case(
+        jb.Beam(10.0, 1e8, 1e3, 0.02, ends="free-clamped", modes=3),
+        loads=[jb.Oscillator(100.0, 1e5, 1e3, speed=10.0, start_position=-5.0)],
+        run=jb.Run(0.4, 50.0),
+    )
+    assert_allclose(corrected_deflection(jb.simulate(case), np.array([0.0, 3.0])), 0.0, atol=1e-15)

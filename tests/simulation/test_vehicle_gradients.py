@@ -113,7 +113,7 @@ FORCE = jb.PointForce(9.0)
 LOOPS = {
     "sampled feedback": ([jb.Sensor(7.0, "velocity")], jb.Feedback([2e5], period=0.01)),
     "continuous feedback": ([jb.Sensor(7.0, "velocity")], jb.Feedback([2e5])),
-    "regulator": ([jb.Sensor(7.0)], jb.LQR([1e3] * 4, [1e-9], period=5e-3)),
+    "regulator": ([jb.Sensor(7.0)], jb.LQR([0.1] * 4, [1e-9], period=5e-3)),
 }
 
 

@@ -2,8 +2,8 @@
 
 Deflections with the static correction to 1e-5 of the peak, contact forces to 1e-5 of the static
 load; rigid wheelsets on a rough rail to 3e-5, as the reference states. Heights of bodies follow the
-beam without the correction: to 5e-5 of the largest with 24 modes (1e-6 with 40), accelerations to
-2e-3 between samples.
+beam without the correction: to 2e-4 of the largest with 16 modes (1e-6 with 40), accelerations to
+3e-3 between samples.
 """
 
 import numpy as np
@@ -18,8 +18,8 @@ from tests.simulation.reference_vehicles import (
     simulated,
 )
 
-MODES = {"1d-oscillator-two-span": 40}  # others have 24
-SAMPLES = {"2h-isoA-quarter-ss": 1301}  # axles on a rough road
+MODES = {"1d-oscillator-two-span": 24, "2k-fra6-wagon-ss25": 24}  # others have 16
+SAMPLES = {"2h-isoA-quarter-ss": 801}  # axles on a rough road
 SLOW = ("1l-artic-5-axle-ss-vbi2d-default", "1p-train-4-manchester-ss50", "2k-fra6-wagon-ss25")
 NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in RUNS]
 
@@ -27,7 +27,7 @@ NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name fo
 @pytest.mark.parametrize("name", NAMES)
 def test_runs_are_those_of_the_reference(name):
     run = RUNS[name]
-    record, at = simulated(run, MODES.get(name, 24), SAMPLES.get(name, 301))
+    record, at = simulated(run, MODES.get(name, 16), SAMPLES.get(name, 301))
     deflection = jb.corrected_deflection(record, record.case.sensor_positions)
     for i, expected in enumerate(run["deflection"].values()):
         found = deflection[[at(share * run["duration"]) for share in run["fractions"]], i]
@@ -44,18 +44,18 @@ def test_runs_are_those_of_the_reference(name):
         column, sign = body_index(record, run, body)
         motion = sign * record.body_displacement[:, column]
         scale = max(body["u_max"], -body["u_min"])
-        assert motion[-1] == pytest.approx(body["u_end"], abs=5e-5 * scale)
+        assert motion[-1] == pytest.approx(body["u_end"], abs=2e-4 * scale)
         extremes = -largest(-motion), largest(motion)
-        np.testing.assert_allclose(extremes, [body["u_min"], body["u_max"]], atol=5e-5 * scale)
+        np.testing.assert_allclose(extremes, [body["u_min"], body["u_max"]], atol=2e-4 * scale)
         motion = sign * record.body_acceleration[:, column]
         expected = np.array([body["acc_min"], body["acc_max"]])
         extremes = -largest(-motion), largest(motion)
-        np.testing.assert_allclose(extremes, expected, atol=2e-3 * np.max(np.abs(expected)))
+        np.testing.assert_allclose(extremes, expected, atol=3e-3 * np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize("entry", DATA["trains"], ids=lambda entry: entry["train"])
 def test_high_speed_trains_at_two_speeds(entry):
-    """Lowest deflection at midspan, with that of 20 modes and the static correction: 1e-5."""
+    """Lowest deflection at midspan; five modes miss up to 4e-5 of it, says the reference."""
     for speed, expected in zip(np.array(entry["speeds_kmh"]) / 3.6, entry["w_min"], strict=True):
         load = jb.Axles(train=entry["train"], speed=speed)
         length = load.vehicle(np.float64(9.81)).offsets[-1] + 25.0

@@ -5,7 +5,12 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import quantity_history
-from jaxbeam.model.sensing.sensor_signals import needs_times, noise_samples, sampled_readings, to_reading
+from jaxbeam.model.sensing.sensor_signals import (
+    needs_times,
+    noise_samples,
+    sampled_readings,
+    to_reading,
+)
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 
