@@ -1,7 +1,7 @@
 """Quantities that a point sensor measures, in terms of the deflection w(x, t).
 
 This is their only list: names and units of sensors, outputs of state spaces and of frequency
-responses, and histories of records derive from it (rows of the outputs: `model.sensing.output_rows`).
+responses, and histories of records derive from it (rows: `model.sensing.output_rows`).
 """
 
 from typing import NamedTuple
