@@ -22,9 +22,11 @@ PEAKS = {
 }
 
 
-@pytest.mark.slow
-def test_peaks_agree_with_an_independent_implementation():
-    case = with_settings(CASE, {"beam.modes": 9, "run.duration": 10.0})
-    over = {"loads.0.train": list(PEAKS), "loads.0.speed": SPEEDS / 3.6}
-    found = jb.sweep(case, over, progress=False, tolerance=1e-5)
-    assert_allclose(1e3 * found.peak_deflection[..., 0], list(PEAKS.values()), rtol=1.4e-4)
+@pytest.mark.parametrize("train", PEAKS)
+def test_peaks_agree_with_an_independent_implementation(train):
+    numbers = {"beam.modes": 9, "run.duration": 10.0, "run.sample_rate": 20.0}
+    case = with_settings(CASE, numbers | {"loads.0.train": train})
+    speeds = SPEEDS / 3.6
+    runs = [jb.simulate(jb.replace(case, {"loads.0.speed": v}), tolerance=1e-5) for v in speeds]
+    found = [1e3 * float(run.peak_deflection[0]) for run in runs]
+    assert_allclose(found, PEAKS[train], rtol=1.4e-4)
