@@ -158,7 +158,9 @@ def _draw_panel(axes, speeds, curves, labels, cases, load, unit):
     annotate(axes, text, (x[at], curves[worst, at]), (-8 if right else 8, 0), va="center",
              ha="right" if right else "left", path_effects=HALO, zorder=7)  # fmt: skip
     if len(labels) > 1:
-        margin_labels(axes, curves[:, -1], labels, tints)
+        ranks = np.argsort(np.argsort(curves[:, -1]))
+        lowest = 0.05 * axes.get_ylim()[1] * (ranks + 0.5)  # where labels stay above the axis
+        margin_labels(axes, np.maximum(curves[:, -1], lowest), labels, tints)
     _draw_legend(axes, cases[worst], load, limits, len(labels) > 1)
 
 

@@ -51,7 +51,8 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
     peaks = functools.reduce(lambda one, other: one.fillna(other), (dataset[n] for n in names))
     peaks = peaks.squeeze([d for d in peaks.dims if d != "sensor" and peaks.sizes[d] == 1])
     swept = [str(dimension) for dimension in peaks.dims if dimension != "sensor"]
-    peaks = peaks.sortby([address for address in swept if address in peaks.coords])
+    with_values = [address for address in swept if address in peaks.coords]
+    peaks = peaks.sortby([a for a in with_values if not is_word_axis(peaks, a)])
     if "sensor" not in peaks.dims:
         peaks = peaks.expand_dims("sensor")
     if not swept:
