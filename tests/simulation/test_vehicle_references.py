@@ -18,9 +18,16 @@ from tests.simulation.reference_vehicles import (
     simulated,
 )
 
-MODES = {"1d-oscillator-two-span": 24, "2k-fra6-wagon-ss25": 24}  # others have 16
-SAMPLES = {"2h-isoA-quarter-ss": 801}  # axles on a rough road
-SLOW = ("1l-artic-5-axle-ss-vbi2d-default", "1p-train-4-manchester-ss50", "2k-fra6-wagon-ss25")
+# Others have 16. The two spans have the 40 of the reference, without the correction: it misses 2.5e-5
+# of those beyond, as it states.
+MODES = {"1d-oscillator-two-span": 40, "2k-fra6-wagon-ss25": 24}
+SAMPLES = {"2h-isoA-quarter-ss": 801, "1p-train-4-manchester-ss50": 601}  # axles on a rough road
+SLOW = (
+    "1d-oscillator-two-span",
+    "1l-artic-5-axle-ss-vbi2d-default",
+    "1p-train-4-manchester-ss50",
+    "2k-fra6-wagon-ss25",
+)
 NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in RUNS]
 
 
@@ -28,7 +35,9 @@ NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name fo
 def test_runs_are_those_of_the_reference(name):
     run = RUNS[name]
     record, at = simulated(run, MODES.get(name, 16), SAMPLES.get(name, 301))
-    deflection = jb.corrected_deflection(record, record.case.sensor_positions)
+    deflection = record.deflection
+    if MODES.get(name) != 40:
+        deflection = jb.corrected_deflection(record, record.case.sensor_positions)
     for i, expected in enumerate(run["deflection"].values()):
         found = deflection[[at(share * run["duration"]) for share in run["fractions"]], i]
         scale = abs(expected["w_min"])
