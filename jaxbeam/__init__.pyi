@@ -13,11 +13,6 @@ from .analysis.ride import (
     weighted_rms as weighted_rms,
     wheel_unloading as wheel_unloading,
 )
-from .analysis.static_correction import (
-    bending_moment as bending_moment,
-    corrected_deflection as corrected_deflection,
-    shear_force as shear_force,
-)
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.patch import Patch as Patch
 from .case.actuators.point import PointForce as PointForce
@@ -39,6 +34,7 @@ from .case.loads.planar.parts import (
     VehicleSpring as VehicleSpring,
 )
 from .case.loads.quarter_car import QuarterCar as QuarterCar
+from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad
 from .case.loads.wagon import Wagon as Wagon
 from .case.profiles.bump import BumpProfile as BumpProfile
@@ -88,11 +84,14 @@ from .model.frequency_response import (
 )
 from .model.modes import modes as modes
 from .model.state_space import state_space as state_space
+from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force
 from .model.statics import (
     influence_line as influence_line,
     static_deflection as static_deflection,
     static_peak as static_peak,
 )
-from .simulation.record import Record as Record, read_record as read_record
+from .simulation.corrected_deflection import corrected_deflection as corrected_deflection
+from .simulation.record import Record as Record
 from .simulation.simulate import simulate as simulate
+from .simulation.stored_record import read_record as read_record
 from .sweeps.sweep import sweep as sweep

@@ -135,6 +135,32 @@ class BrakingTrajectory(AbstractPiecewiseTrajectory):
         return xp.concatenate([arrivals.reshape(-1), jumps])
 
 
+class StandingTrajectory(AbstractPiecewiseTrajectory):
+    """A place on the beam at which a load acts from `entry_time` (s) on."""
+
+    position: Float[Array, ""]
+    entry_time: Float[Array, ""]
+    length: Float[Array, ""]
+
+    def direction(self):
+        return xp.ones(())
+
+    def kinematics(self, t):
+        position = xp.broadcast_to(self.position, xp.shape(t))
+        return position, xp.zeros_like(position), xp.zeros_like(position)
+
+    def cubics(self):
+        zero = xp.zeros(())
+        return self.entry_time[None], xp.stack([self.position, zero, zero, zero])[None]
+
+    def entry_exit_times(self, behind=0.0):
+        entry = self.entry_time + xp.zeros(xp.shape(behind))
+        return entry, xp.full(entry.shape, NEVER)
+
+    def passage_times(self, positions, behind=0.0):
+        return xp.full(xp.size(positions) * xp.size(behind), NEVER)
+
+
 class TabulatedTrajectory(AbstractPiecewiseTrajectory):
     """Not-a-knot cubic spline through positions at times.
 

@@ -27,8 +27,8 @@ Free = Annotated[
 Over = Annotated[
     tuple[str, ...],
     Parameter(
-        help="ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: values of a parameter; all"
-        " combinations are computed if it is repeated for more."
+        help="ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: values of a parameter, or words, as"
+        " loads.0.train=HSLM-A1,HSLM-A2; all combinations are computed if it is repeated for more."
     ),
 ]
 Starts = Annotated[

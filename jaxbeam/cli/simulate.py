@@ -20,7 +20,7 @@ def simulate(
     animate: Path | None = None,
     options: CaseOptions = CaseOptions(),
 ) -> None:
-    """Simulate a case: peak deflections, contact forces, commands; the whole record on request.
+    """Simulate a case: peaks at sensors, contact forces, commands; the whole record on request.
 
     Parameters
     ----------
@@ -59,8 +59,20 @@ def simulate(
 
 def _to_dict(record: "jb.Record") -> dict:
     """Numbers of a record by their names in JSON (SI units)."""
+    from jaxbeam.case.sensors import sensor_labels
+
+    sensors = record.case.sensors
+    peaks = zip(sensors, record.peak_deflection, strict=True)
     content = {
-        "peak_deflection": record.peak_deflection,
+        "sensors": [
+            {"name": label, "quantity": s.quantity, "unit": s.unit, "position": s.position}
+            | extremes
+            for label, s, extremes in zip(
+                sensor_labels(sensors), sensors, _extremes_of_sensors(record), strict=True
+            )
+        ],
+        # None at sensors of other quantities.
+        "peak_deflection": [peak if s.quantity == "deflection" else None for s, peak in peaks],
         "lowest_contact_force": record.lowest_contact_force,
         "wheel_unloading": jb.wheel_unloading(record),
         "contact_lost_time": record.contact_lost_time,
@@ -82,6 +94,12 @@ def _to_dict(record: "jb.Record") -> dict:
             "saturated": record.saturated.mean(axis=0),
         }
     return content | {"verdict": record.verdict}
+
+
+def _extremes_of_sensors(record: "jb.Record") -> list[dict[str, float]]:
+    """Smallest and largest value of each sensor and their times, by name."""
+    names, columns = zip(*record.extremes._asdict().items(), strict=True)
+    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
 def _wheel_lines(record: "jb.Record") -> list[str]:
@@ -154,12 +172,23 @@ def _ride(record: "jb.Record") -> "jb.RideMeasures | None":
 
 
 def _lines(record: "jb.Record") -> list[str]:
-    peaks = zip(record.case.sensors, record.peak_deflection, strict=True)
+    sensors = record.case.sensors
+    rows = [
+        (
+            sensor.name or str(i),
+            f"{sensor.position:.4g}",
+            f"{sensor.quantity} ({sensor.unit})" if sensor.unit != "1" else sensor.quantity,
+            *(f"{extremes[name]:.6g}" for name in ("smallest", "smallest_time")),
+            *(f"{extremes[name]:.6g}" for name in ("largest", "largest_time")),
+        )
+        for i, (sensor, extremes) in enumerate(
+            zip(sensors, _extremes_of_sensors(record), strict=True)
+        )
+    ]
     lines = [
         record.verdict,
         *table(
-            ("sensor", "position (m)", "peak deflection (m)"),
-            [(i, f"{s.position:.4g}", f"{peak:.6g}") for i, (s, peak) in enumerate(peaks)],
+            ("sensor", "position (m)", "quantity", "smallest", "at (s)", "largest", "at (s)"), rows
         ),
         *_wheel_lines(record),
         *_body_lines(record),

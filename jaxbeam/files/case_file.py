@@ -13,10 +13,11 @@ from typing import Any
 import tomli_w
 
 from jaxbeam.case.aliases import current_address
-from jaxbeam.case.case import Case, part_classes, unknown_address_error
+from jaxbeam.case.case import Case, list_sizes, part_classes, unknown_address_error
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.declared_checks import describe_value, suggestion
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.joint_addresses import each_address
 from jaxbeam.case.kinds import import_modules, kind_of
 from jaxbeam.case.loads.planar.files import is_path
 from jaxbeam.case.loads.vehicle import IMPLIED
@@ -143,13 +144,18 @@ def case_to_dict(case: Case, whole: bool = False) -> dict[str, Any]:
 def with_settings(case: Case, settings: dict[str, Any]) -> Case:
     """A validated copy of a case with other entries at some addresses, as in its case file.
 
-    Unlike `case.replace` it also sets words, counts and optional numbers that were left out; values
-    are concrete (SI units), not traced. Raises ValueError for an address that no case file could
-    have, and for the errors of `check_case`.
+    Unlike `case.replace` it also sets words, counts and optional numbers that were left out, those
+    of all loads at `loads.*.train`, say; values are concrete (SI units), not traced. Raises
+    ValueError for an address that no case file could have, and for the errors of `check_case`.
     """
     content, whole = case_to_dict(case), case_to_dict(case, whole=True)
-    for address, value in settings.items():
-        *path, last = current_address(address).split(".")
+    each = [
+        (one, value)
+        for address, value in settings.items()
+        for one in each_address(current_address(address), list_sizes(case))
+    ]
+    for address, value in each:
+        *path, last = address.split(".")
         node: Any = content
         implied: Any = whole
         for key in path:

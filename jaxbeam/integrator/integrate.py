@@ -18,22 +18,19 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
+from jaxbeam.integrator.input_steps import advance_known_with_inputs, step_with_inputs
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.running_peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.step import (
     CHECKPOINT_NAME,
-    advance,
     advance_unforced,
-    forces_and_vehicles,
-    known_maps,
 )
 from jaxbeam.integrator.step_matrices import LoadPath, chunk_length, load_path, step_matrices
+from jaxbeam.integrator.vehicle_propagators import vehicle_state_norm
 from jaxbeam.integrator.vehicle_steps import (
     StepInput,
-    Vehicles,
     VehicleStep,
     initial_vehicle_states,
-    vehicle_state_norm,
     vehicles_of,
 )
 from jaxbeam.model.load_set import LoadSet
@@ -77,77 +74,13 @@ def longest_force_step(case: Case, loads: LoadSet) -> Float[Array, ""]:
     arises. Infinite for loads with inertia or springs, whose steps an error estimate decides.
     """
     if not loads.massless or not loads.trajectories:
-        return np.asarray(np.inf)
+        return xp.asarray(np.inf)
     windows = xp.clip(loads.entry_exit_times(), 0.0, case.run.duration)
     first, last = xp.min(windows[:, 0]), xp.max(windows[:, 1])
     times = first + (last - first) * np.linspace(0.0, 1.0, 33)
     speed = xp.max(xp.abs(loads.kinematics(times)[1]))
     wavenumber = (case.beam.modes + 1) * np.pi / case.beam.length
     return stop_gradient(MAX_PASSAGE_PER_STEP / (wavenumber * speed + 1e-30))
-
-
-def _step_with_inputs(policy: AbstractInputPolicy, vehicles: Vehicles | None, carry, step):
-    """One step of a batch under the commands of an input policy."""
-    state, memory = carry
-    step, info = step
-    count = step.matrices.state_count
-
-    def node_states(commands):
-        commands = collapse(commands, 0, 2)
-        forces, _ = forces_and_vehicles(state, step, commands, vehicles)
-        nodes, beam = step.matrices.nodes, state[:count]
-        node_values = (
-            nodes.transition @ beam
-            + nodes.force_response @ forces
-            + nodes.command_response @ commands
-        )
-        return node_values.reshape(len(GAUSS_NODES), *beam.shape)
-
-    node_commands, memory = policy.inputs(memory, state, info, node_states)
-    commands = collapse(node_commands, 0, 2)
-    next_state, (state, forces) = advance(state, step, commands, vehicles)
-    # A run that diverges becomes NaN here, without affecting the others, before it overflows.
-    within = xp.abs(next_state[:count]) <= policy.state_bound[:, None]
-    next_state = xp.where(xp.all(within, axis=0), next_state, xp.nan)
-    return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
-
-
-def _advance_known_with_inputs(policy, vehicles, steps: StepInput, infos, state, memory):
-    """Steps of known numbers under commands that do not depend on the states within a step.
-
-    Results as of a `scan` of `_step_with_inputs`; see `step.known_maps`. None if the policy
-    computes with JAX in spite of known numbers, as a law of a user may.
-    """
-    forces_map, maps = known_maps(steps, vehicles)
-    count, batch_size, state_count, columns = maps.shape
-    bound = np.full((state_count, 1), np.inf)  # of vehicles none
-    bound[: steps.matrices.state_count, 0] = policy.state_bound
-    # State, commands, and one.
-    sources = np.ones((count + 1, batch_size, columns, 1))
-    sources[0, :, :state_count, 0] = state.T
-    events, observations, held = infos.event.tolist(), [], None
-    for i in range(count):
-        state = sources[i, :, :state_count]
-        if events[i] >= 0 or i == 0 or not policy.holds_commands:
-            info = StepInfo(infos.start[i], infos.length[i], infos.event[i])
-            node_commands, memory = policy.inputs(memory, state[..., 0].T, info, None)
-            if i == 0 and any_jax(node_commands, memory):
-                return None
-            held = collapse(node_commands, 0, 2).T[..., None]
-            observed = policy.observe(memory, info)
-        sources[i, :, state_count:-1] = held
-        observations.append(observed)
-        next_state = maps[i] @ sources[i]
-        within = np.abs(next_state) <= bound
-        if not within.all():
-            next_state = np.where(within.all(axis=1, keepdims=True), next_state, np.nan)
-        sources[i + 1, :, :state_count] = next_state
-    forces = forces_map @ sources[:-1]
-    forces, states = (np.swapaxes(part[..., 0], 1, 2) for part in (forces, sources))
-    commands = states[:-1, state_count:-1]
-    observed = jax.tree.map(lambda *parts: np.stack(parts), *observations)
-    states = states[:, :state_count]
-    return (states[-1], memory), (states[:-1], forces, commands, observed)
 
 
 def _values_by_row(
@@ -161,6 +94,12 @@ def _values_by_row(
 def _step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> StepInput:
     """Matrices and wheels of the steps of a chunk."""
     inertia, weight = (_values_by_row(part, path) for part in (loads.inertia, loads.weight))
+    for wheel, history in loads.wheels.histories.items():
+        of_wheel = (path.loads == wheel) & path.on_beam
+        times = path.start[:, None] + path.length[:, None] * np.asarray(GAUSS_NODES)
+        force = history.at(times)[:, None]  # step, 1, node, batch
+        rows = xp.where(of_wheel[..., None, None], force, 0.0)
+        weight = weight + rows.reshape(*weight.shape[:2], -1)
     if path.surface is not None:
         by_wheel = xp.take_along_axis(path.surface[:, 2], path.loads[..., None], axis=1)
         weight = weight + inertia * by_wheel.reshape(*by_wheel.shape[:1], -1, 1)
@@ -195,9 +134,9 @@ def _chunk_function(
             is_known = not any_jax(steps, state, memory, policy)
             result = None
             if is_known and not policy.implicit:
-                result = _advance_known_with_inputs(policy, vehicles, steps, infos, state, memory)
+                result = advance_known_with_inputs(policy, vehicles, steps, infos, state, memory)
             (state, memory), (states, forces, commands, observed) = result or scan(
-                lambda carry, step: _step_with_inputs(policy, vehicles, carry, step),
+                lambda carry, step: step_with_inputs(policy, vehicles, carry, step),
                 (state, memory),
                 (steps, infos),
             )

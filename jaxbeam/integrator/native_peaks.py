@@ -72,8 +72,19 @@ LIBRARY = Library(
 
 def supports(case: Case) -> bool:
     """Whether a sweep of peaks of this case uses the C integrator."""
-    has_vehicles = any(load.vehicle(case.run.gravity).names for load in case.loads)
-    return case.controller is None and not has_vehicles and case.profile is None and available()
+    plain = (
+        case.controller is None
+        and case.profile is None
+        and not any(
+            load.vehicle(case.run.gravity).names or load.force_history() for load in case.loads
+        )
+    )
+    return plain and deflections_only(case) and available()
+
+
+def deflections_only(case: Case) -> bool:
+    """Whether all sensors of a case measure deflections, the only peaks that C searches."""
+    return all(sensor.quantity == "deflection" for sensor in case.sensors)
 
 
 def available() -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Float
 
+from jaxbeam.integrator.known_vehicle_maps import known_forces, known_state_maps
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.integrator.vehicle_steps import StepInput, Vehicles
 from jaxbeam.model.contact import ModalCompliance, solve_contact_forces
@@ -124,7 +125,7 @@ def known_maps(step: StepInput, vehicles: Vehicles | None):
     if vehicles is None:
         forces_of_state = _known_forces(step)
     else:
-        forces_of_state, surface = vehicles.known_forces(step)
+        forces_of_state, surface = known_forces(vehicles, step)
     maps = matrices.force_response[:, None] @ forces_of_state
     blocks, side = matrices.transition.shape[1:3]
     state_index = np.arange(matrices.state_count).reshape(blocks, side)
@@ -133,7 +134,7 @@ def known_maps(step: StepInput, vehicles: Vehicles | None):
         count = commands.input_matrix.shape[-1]
         maps[..., -1 - count : -1] += commands.input_matrix[:, None]
     if vehicles is not None:
-        maps = np.concatenate([maps, vehicles.known_state_maps(step, surface)], axis=2)
+        maps = np.concatenate([maps, known_state_maps(vehicles, step, surface)], axis=2)
     return forces_of_state, maps
 
 

@@ -47,14 +47,15 @@ class NodeMatrices(eqx.Module):
 
 
 class SpringMatrices(eqx.Module):
-    """To deflections and velocities under the wheels at the nodes, (step, 2, row, ...).
+    """To deflections and velocities under the wheels at the nodes.
 
-    From the state at the start, the contact forces, and the commands.
+    From the state at the start, the contact forces, and the commands; one of the motions, or both
+    along an axis `motion`.
     """
 
-    response: Float[Array, "step 2 row state"]
-    compliance: Float[Array, "step 2 row row"]
-    commands: Float[Array, "step 2 row command"] | None
+    response: Float[Array, "step *motion row state"]
+    compliance: Float[Array, "step *motion row row"]
+    commands: Float[Array, "step *motion row command"] | None
 
 
 class StepMatrices(eqx.Module):

@@ -125,7 +125,7 @@ def contact_at(
         command_acceleration = model.command_matrix[model.rate_index] @ commands
         modal_acceleration = modal_acceleration + command_acceleration
         surface_acceleration = surface_acceleration + shape @ command_acceleration
-    weight, vehicle_acceleration = loads.weight, ()
+    weight, vehicle_acceleration = loads.varying_weight(times), ()
     if springs:
         wheels = loads.wheels
         surface = wheels.stiffness * motion(rows.deflection, height)

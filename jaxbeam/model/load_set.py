@@ -3,14 +3,16 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.loads.force_history import ForceHistory
 from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.case.trajectory import AbstractTrajectory
-from jaxbeam.runtime.arrays import Array, is_jax, xp
+from jaxbeam.runtime.arrays import Array, add_at, is_jax, xp
 from jaxbeam.runtime.module import Module
 
 
@@ -75,11 +77,12 @@ class VehicleGroup(Module):
         return surface - pulled.reshape(surface.shape)
 
 
-class Wheels(Module):
+class WheelSet(Module):
     """Numbers of the wheels, which may differ between the runs of a batch.
 
     Inertia (kg) and weight (N, the static load), contact stiffness (N/m) and damping (N s/m) of the
     springs between surface and vehicle, and the vehicles. Without vehicles there are no springs.
+    `histories` are forces over time in addition to the weight, by the index of their wheel.
     """
 
     inertia: Float[Array, "wheel batch"]
@@ -87,6 +90,7 @@ class Wheels(Module):
     stiffness: Float[Array, "wheel batch"] | None = None
     damping: Float[Array, "wheel batch"] | None = None
     vehicles: tuple[VehicleGroup, ...] = ()
+    histories: dict[int, ForceHistory] = eqx.field(default_factory=dict)
 
 
 class LoadSet(Module):
@@ -97,8 +101,8 @@ class LoadSet(Module):
     """
 
     trajectories: tuple[AbstractTrajectory, ...]
-    wheels: Wheels
-    behind: tuple[Float[Array, " wheel"], ...] | None = None
+    wheels: WheelSet
+    behind: tuple[Float[Array, " _"], ...] | None = None
     profile: Module | None = None
 
     @property
@@ -182,6 +186,13 @@ class LoadSet(Module):
             all_cubics.append(xp.pad(cubics, [more, (0, 0)]) + shift)
         return xp.concatenate(all_times), xp.concatenate(all_cubics)
 
+    def varying_weight(self, times: Float[Array, "*time"]) -> Float[Array, "*time wheel batch"]:
+        """Weights (N) at times (s), with the forces of wheels that vary in time."""
+        weight = xp.broadcast_to(self.weight, (*xp.shape(times), *self.weight.shape))
+        for wheel, history in self.wheels.histories.items():
+            weight = add_at(weight, np.s_[..., wheel, :], history.at(times))
+        return weight
+
     @property
     def massless(self) -> bool:
         """Whether all wheels are known to have no inertia or springs: their forces are weights."""
@@ -194,8 +205,12 @@ class LoadSet(Module):
         return xp.concatenate(windows) if windows else xp.zeros((0, 2))
 
     def passage_times(self, positions: Float[Array, " position"]) -> Float[Array, " time"]:
-        """Times (s) at which wheels pass positions (m), and of jumps in speed or acceleration."""
+        """Times (s) at which wheels pass positions (m), and of jumps in speed or acceleration.
+
+        And those of the tables of forces, at which these have kinks.
+        """
         times = [path.passage_times(positions, behind) for path, behind in self._paths()]
+        times += [history.times[:, 0] for history in self.wheels.histories.values()]
         return xp.concatenate(times) if times else xp.zeros(0)
 
     def on_beam(self, times: Float[Array, "*time"]) -> Bool[Array, "wheel *time"]:
@@ -216,7 +231,7 @@ def load_set(case: Case) -> LoadSet:
     )
 
 
-def _wheels(loads: Sequence[AbstractLoad], vehicles: Sequence[VehicleModel]) -> Wheels:
+def _wheels(loads: Sequence[AbstractLoad], vehicles: Sequence[VehicleModel]) -> WheelSet:
     """Numbers of the wheels of loads, as a batch of one run."""
     counts = [load.spacings().shape[0] for load in loads]
 
@@ -224,16 +239,19 @@ def _wheels(loads: Sequence[AbstractLoad], vehicles: Sequence[VehicleModel]) -> 
         parts = [xp.tile(getattr(v, name), n) for v, n in zip(vehicles, counts, strict=True)]
         return (xp.concatenate(parts) if parts else xp.zeros(0))[:, None]
 
-    groups, first_wheel = [], 0
-    for vehicle, count in zip(vehicles, counts, strict=True):
+    groups, histories, first_wheel = [], {}, 0
+    for load, vehicle, count in zip(loads, vehicles, counts, strict=True):
+        history = load.force_history()
+        if history is not None:
+            histories[first_wheel] = jax.tree.map(lambda part: part[..., None], history)
         if vehicle.names:
             groups.append(_vehicle_group(vehicle, first_wheel, count))
         first_wheel += count * vehicle.offsets.shape[0]
     inertia, weight = of_all_wheels("wheel_masses"), of_all_wheels("static_loads")
     if not groups:
-        return Wheels(inertia, weight)
+        return WheelSet(inertia, weight, histories=histories)
     springs = of_all_wheels("contact_stiffness"), of_all_wheels("contact_damping")
-    return Wheels(inertia, weight, *springs, tuple(groups))
+    return WheelSet(inertia, weight, *springs, tuple(groups), histories)
 
 
 def _vehicle_group(vehicle: VehicleModel, first_wheel: int, count: int) -> VehicleGroup:
@@ -246,5 +264,5 @@ def _vehicle_group(vehicle: VehicleModel, first_wheel: int, count: int) -> Vehic
     B = xp.concatenate([np.zeros(wheel_map.T.shape), rates[:, 2 * dofs :]])
     springs = vehicle.contact_stiffness, vehicle.contact_damping
     H = xp.concatenate([part[:, None] * wheel_map for part in springs], axis=1)
-    columns = (part[..., None] for part in (A, B, H))
-    return VehicleGroup(*columns, vehicle.names, first_wheel, count)
+    A, B, H = (part[..., None] for part in (A, B, H))
+    return VehicleGroup(A, B, H, vehicle.names, first_wheel, count)

@@ -24,7 +24,7 @@ def with_sensor_filters(
     """
     case, model = plant.case, plant.modal_model
     state_matrices, filter_inputs, rows = [model.A], [], []
-    on_states, _ = sensor_rows(model, case.sensors).on_states(model)
+    on_states, _ = sensor_rows(model, case, case.sensors).on_states(model)
     for sensor, row in zip(case.sensors, on_states, strict=True):
         if sensor.filter is None or sensor.filter.realisation != "analogue":
             rows.append({0: row})

@@ -154,7 +154,7 @@ class Plant(Module):
         matrix = matrix - force_input @ (mass[:, None] * contact_rows)
         command = command - force_input @ (mass[:, None] * (shape_rows @ command[rates]))
         inputs = xp.concatenate([command, -force_input], axis=1)
-        C, D = sensor_rows(model, self.case.sensors).of_system(model, matrix, inputs)
+        C, D = sensor_rows(model, self.case, self.case.sensors).of_system(model, matrix, inputs)
         order, scales = self._state_order, self._state_scales
         loads = tuple(Signal(f"load_{i}", "N") for i in range(len(mass)))
         return StateSpace(

@@ -102,20 +102,32 @@ def static_deflection_per_command(
     a discontinuity, such as that of the curvature at the end of a patch, its value to the right.
     Inside `jit`, pass the `layout`. Raises ValueError as `influence_line` does.
     """
+    per_force = static_deflection_per_port_force(case, x, derivative, layout)
+    gains = xp.array([a.attachment().static_gain for a in case.actuators]).reshape(-1)
+    return gains.reshape(-1, *(1,) * (per_force.ndim - 1)) * per_force
+
+
+def static_deflection_per_port_force(
+    case: Case, x, derivative: int = 0, layout: Layout | None = None
+) -> Float[Array, "actuator *position"]:
+    """Static deflection at x (m) per unit of each actuator's generalised force on the beam.
+
+    In m/N for a force, 1/N for a couple; otherwise as `static_deflection_per_command`.
+    """
     x = xp.asarray(x, float)
     layout = _validated_layout(case, layout, x=x)
-    return _deflection_per_command(case, layout, x, derivative)
+    return _deflection_per_port_force(case, layout, x, derivative)
 
 
 @compiled_if_traced
-def _deflection_per_command(case: Case, layout: Layout, x, derivative: int):
+def _deflection_per_port_force(case: Case, layout: Layout, x, derivative: int):
     length = case.beam.length
     greens = flexibility(case, layout, x.reshape(-1), derivative)  # by reciprocity: forces at x
     gains = xp.zeros((len(case.actuators), x.size))
     for i, actuator in enumerate(case.actuators):
         terms = actuator.displacement_map()
         displacement = sum(f / length**d * greens(position / length, d) for position, d, f in terms)
-        gains = set_at(gains, i, actuator.attachment().static_gain * displacement)
+        gains = set_at(gains, i, displacement)
     return (gains * length ** (3 - derivative) / case.beam.bending_stiffness).reshape(-1, *x.shape)
 
 

@@ -1,17 +1,20 @@
-"""Figure of one run: deflections at the sensors, contact forces and commands over time."""
+"""Figure of one run: what the sensors measure, contact forces and commands over time."""
 
 import dataclasses
+import functools
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from jaxbeam.case.case import crossing_times
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.plot.schematic import draw_schematic, shows_traffic
 from jaxbeam.plot.style import (
     GREY,
     SHADE,
     annotate,
+    axis_label,
     colour,
     command_drawstyle,
     draw_limits,
@@ -28,19 +31,23 @@ from jaxbeam.simulation.record import Record
 
 @use_style
 def plot_record(record: Record) -> Figure:
-    """Schematic, deflections at the sensors, contact forces, bodies of vehicles, and commands.
+    """Schematic, quantities of the sensors, contact forces, bodies of vehicles, and commands.
 
-    Dots mark peaks, shading the times with loads on the beam; vehicles have a row for the
-    accelerations of their bodies (see `jaxbeam.plot.traffic.rows`), controllers one for the
-    commands. Raises ValueError if the case has neither sensors nor loads.
+    Each quantity has axes of its own. Dots mark peaks, shading the times with loads on the beam;
+    vehicles have a row for the accelerations of their bodies (see `jaxbeam.plot.traffic.rows`),
+    controllers one for the commands. Raises ValueError if the case has neither sensors nor loads.
     """
     case = record.case
     crossed = shows_traffic(case)
+    quantities = list(dict.fromkeys(sensor.quantity for sensor in case.sensors))
     panels = [
         (height, draw)
         for height, draw, shown in (
             (1.2 if crossed else 0.7, lambda axes, record: draw_schematic(axes, record.case), True),
-            (3.2, _draw_deflection, case.sensors),
+            *(
+                (3.2 if i == 0 else 2.2, functools.partial(_draw_quantity, quantity=name), True)
+                for i, name in enumerate(quantities)
+            ),
             (1.7, _with_crossings(draw_forces), case.loads),
             (1.5, _with_crossings(draw_accelerations), has_bodies(record)),
             (1.7, _draw_commands, case.controller is not None),
@@ -125,22 +132,29 @@ def _load_label(load) -> str:
     return ", ".join(parts)
 
 
-def _draw_deflection(axes, record):
-    times, deflection = np.asarray(record.times), np.asarray(record.deflection)
-    factor, unit = unit_scale(deflection, "m")
+def _draw_quantity(axes, record, quantity: str):
+    """Draw the histories of the sensors of a quantity, with a dot at the larger extreme of each."""
+    times, values = np.asarray(record.times), np.asarray(record.sensor_values)
+    sensors = record.case.sensors
+    own = [i for i, sensor in enumerate(sensors) if sensor.quantity == quantity]
+    factor, unit = unit_scale(values[:, own], QUANTITIES[quantity].unit)
+    extremes = [np.asarray(part) for part in record.extremes]
     shade_crossings(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.8)
-    peaks = []
-    for i, when in enumerate(np.asarray(record.peak_time)):
-        axes.plot(times, deflection[:, i] / factor, color=colour(i))
-        peaks.append(signed_peak(record, i) / factor)
+    peaks, names = [], []
+    for i in own:
+        axes.plot(times, values[:, i] / factor, color=colour(i))
+        low, low_time, high, high_time = (float(part[i]) for part in extremes)
+        peak, when = (low, low_time) if -low > high else (high, high_time)
+        peaks.append(peak / factor)
         axes.plot([when], peaks[-1:], "o", color=colour(i), markeredgecolor="white", zorder=3)
-    axes.set_ylabel(f"deflection ({unit})")
+        names.append(f"{sensors[i].name or 'peak'} {format_number(peaks[-1])} {unit}")
+    axes.set_ylabel(axis_label(quantity, unit))
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.07 * (high - low))  # room for the names
-    label_loads(axes, record)
-    names = [f"peak {format_number(peak)} {unit}" for peak in peaks]
-    margin_labels(axes, peaks, names, [colour(i) for i in range(len(peaks))])
+    if 0 in own:  # the first of the quantities
+        label_loads(axes, record)
+    margin_labels(axes, peaks, names, [colour(i) for i in own])
 
 
 def _draw_commands(axes, record):

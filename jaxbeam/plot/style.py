@@ -61,15 +61,21 @@ _PREFIXES = ((1e6, 1e6, "M"), (1e3, 1e3, "k"), (0.1, 1.0, ""), (1e-4, 1e-3, "m")
 def unit_scale(values, unit: str) -> UnitScale:
     """Prefixed unit for the largest of some values in an SI unit: mm for 0.0014 m.
 
-    Values without unit ("1") get a power of ten instead.
+    Values without unit ("1"), or in 1/m, get a power of ten instead.
     """
     sizes = np.abs(np.asarray(values, float))
     largest = np.max(sizes[np.isfinite(sizes)], initial=0.0)
     fitting = ((factor, prefix) for least, factor, prefix in _PREFIXES if largest >= least)
     factor, prefix = next(fitting, (1e-9, "n")) if largest else (1.0, "")
-    if unit in ("", "1"):
-        return UnitScale(factor, "" if factor == 1 else f"$10^{{{np.log10(factor):.0f}}}$")
+    if unit == "" or unit.startswith("1"):
+        power = "" if factor == 1 else f"$10^{{{np.log10(factor):.0f}}}$"
+        return UnitScale(factor, f"{power or '1'}{unit[1:]}" if unit[1:] else power)
     return UnitScale(factor, prefix + unit.replace("^2", "²"))
+
+
+def axis_label(words: str, unit: str) -> str:
+    """Label of an axis: words, and the unit in brackets if there is one."""
+    return f"{words} ({unit})" if unit else words
 
 
 def colour(index: int) -> str:

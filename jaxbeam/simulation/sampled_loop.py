@@ -149,8 +149,9 @@ class SampledLoop(AbstractInputPolicy):
         if not any(sensor.has_feedthrough for sensor in sensors):
             return signals
         contact = contact_at(self.model, self.loads, time, state, command)
-        accelerations = contact.modal_acceleration
-        return sensor_rows(self.model, sensors).with_accelerations(signals, accelerations)
+        return sensor_rows(self.model, self.plant.case, sensors).with_accelerations(
+            signals, contact.modal_acceleration
+        )
 
     def _step_law(self, law_state, readings, state, command, time):
         """Step of the law for each run of the batch."""

@@ -20,6 +20,7 @@ from jaxbeam.model.contact import contact_at, split_states
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.measurement import sensor_readings
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
@@ -87,12 +88,6 @@ def _check_times(times) -> None:
 
 def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
     running_peaks, outputs, modal, steps = _integrate(case, plan, times, case.sensor_positions)
-    coordinates, rates, accelerations, position, force, commands, *more = outputs
-    vehicles, readings, failures = more
-    if commands is None:
-        commands = xp.zeros((times.shape[0], len(case.actuators)))
-    if failures is None:
-        failures = xp.zeros(times.shape)
     peaks = Peaks(*(part[0] for part in running_peaks.peaks()))
     loads, lost_times = load_set(case), peaks.contact_lost_time
     # Each wheel at its own time.
@@ -101,15 +96,10 @@ def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
         case=case,
         modes=modal,
         times=times,
-        coordinates=coordinates,
-        rates=rates,
-        accelerations=accelerations,
-        load_position=position,
-        contact_force=force,
-        command=commands,
-        failures=failures,
-        controller_readings=readings,
-        **vehicles._asdict(),
+        **outputs.motion._asdict(),
+        **outputs.vehicles._asdict(),
+        failures=xp.zeros(times.shape) if outputs.failures is None else outputs.failures,
+        controller_readings=outputs.readings,
         **peaks._asdict(),
         contact_lost_position=lost_positions,
         error_estimate=error,
@@ -130,10 +120,9 @@ def simulate_readings(
     differentiate than `simulate`, without its checks and warnings.
     """
     _, outputs, modal, _ = _integrate(case, plan, times, None, noisy=False)
-    coordinates, rates, accelerations, *_, controller_readings, _ = outputs
-    if controller_readings is not None:
-        return controller_readings
-    return sensor_readings(case, modal, coordinates, rates, accelerations, times)
+    if outputs.readings is not None:
+        return outputs.readings
+    return sensor_readings(case, modal, outputs.motion, times)
 
 
 class Histories(NamedTuple):
@@ -152,10 +141,9 @@ def simulate_histories(
 ) -> Histories:
     """Histories at ascending times (s) and positions (m); see `simulate_readings`."""
     _, outputs, modal, _ = _integrate(case, plan, times, None)
-    coordinates, _, _, _, forces, commands, *_ = outputs
-    if commands is None:
-        commands = xp.zeros((times.shape[0], len(case.actuators)))
-    return Histories(coordinates @ modal.shapes(positions).T, commands, forces)
+    motion = outputs.motion
+    deflection = motion.coordinates @ modal.shapes(positions).T
+    return Histories(deflection, motion.command, motion.contact_force)
 
 
 class IntegrationSetup(NamedTuple):
@@ -217,12 +205,8 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
             if policy.implicit
             else _commands_at_steps(case, commands, sample_steps)
         )
-    parts = _modal_and_contact_outputs(model, loads, times, states, commands)
-    *coordinates, commands, vehicles = parts
-    if commands is not None:
-        commands = commands[:, : len(case.actuators)]
-    outputs = *coordinates, commands, vehicles, observed, failures
-    return running_peaks, outputs, model.modes, steps
+    motion, vehicles = _motion(case, model, loads, times, states, commands)
+    return running_peaks, Outputs(motion, vehicles, observed, failures), model.modes, steps
 
 
 def _commands_at_steps(case: Case, commands, steps):
@@ -258,11 +242,17 @@ def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) ->
     return VehicleMotion(*(xp.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
 
 
-def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states, commands):
-    """Modal coordinates, rates and accelerations, wheel positions, contact forces, commands.
+class Outputs(NamedTuple):
+    """Motion of beam and vehicles at the samples; readings and failures of a controller, if any."""
 
-    And the motion of the vehicles.
-    """
+    motion: Motion
+    vehicles: VehicleMotion
+    readings: Float[Array, "time sensor"] | None
+    failures: Float[Array, " time"] | None
+
+
+def _motion(case: Case, model: ModalModel, loads: LoadSet, times, states, commands):
+    """Motion of the modes with the forces on the beam, and motion of the vehicles."""
     columns = None if commands is None else commands[..., None]
     contact = contact_at(model, loads, times, states, columns)
     vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
@@ -272,4 +262,6 @@ def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states,
     if model.mode_map is not None:
         coordinates = tuple(part @ model.mode_map.T for part in coordinates)
     position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
-    return *coordinates, position, -force, commands, vehicles
+    actuators = len(case.actuators)
+    command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]
+    return Motion(*coordinates, position, -force, command), vehicles

@@ -36,6 +36,7 @@ MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and o
 MIN_BLOCKS = 8  # of a large sweep, to use all cores
 MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
 MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
+MAX_TRIAL_BATCHES = 16  # more of one run each cost more than the steps that they would save
 
 
 class Runner:
@@ -86,7 +87,8 @@ class Runner:
         max_batches, trial_batches = (
             max(1, runs * self.devices // batch_size) for runs in (MAX_BLOCK_RUNS, MAX_TRIAL_RUNS)
         )
-        self.trial_batches = _round_up(min(count, trial_batches), self.devices)
+        trial_batches = min(count, trial_batches, MAX_TRIAL_BATCHES)
+        self.trial_batches = _round_up(trial_batches, self.devices)
         self.batches_per_block = max(
             self.trial_batches, _round_up(min(count // MIN_BLOCKS, max_batches), self.devices)
         )
@@ -161,7 +163,8 @@ class Runner:
             calls = batch_indices.size // self.trial_batches
             parts = zip(np.split(batch_indices, calls), np.split(steps, calls), strict=True)
             results = [self._integrate(*part, None, single, extra_steps) for part in parts]
-            return np.concatenate([result["peak_deflection"] for result in results])
+            found = np.concatenate([result["peak_deflection"] for result in results])
+            return self._compared_by_quantity(found)
 
         search = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
         steps, error = choose_step_sizes(peaks, *search, self.pool.map)
@@ -171,6 +174,15 @@ class Runner:
                 *(peaks(sample, steps[sample], single=single) for single in (False, True))
             )
         return steps, error
+
+    def _compared_by_quantity(self, peaks):
+        """Peaks (path, batch, sensor), those of each quantity as further runs of the batch.
+
+        Small peaks of one quantity then are not judged by large ones of another unit.
+        """
+        quantities = np.array([sensor.quantity for sensor in self.case.sensors])
+        parts = [peaks * (quantities == quantity) for quantity in np.unique(quantities)]
+        return np.concatenate(parts, axis=1)
 
     def run_count(self, block: int) -> int:
         """Number of runs in a block, without padding."""

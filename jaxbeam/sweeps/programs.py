@@ -27,6 +27,7 @@ from jaxbeam.integrator.integrate import (
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
@@ -75,9 +76,10 @@ class Program(NamedTuple):
         return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps)
 
     def discretise(self, model, shared_values, step_size, policy=None):
-        """Discrete model of a batch, with peaks at the sensors."""
-        positions = self.case_with(shared_values).sensor_positions
-        return discrete_model(model, self.grid(model, shared_values, step_size), positions, policy)
+        """Discrete model of a batch, with peaks of what the sensors measure."""
+        varied, grid = self.case_with(shared_values), self.grid(model, shared_values, step_size)
+        outputs = sensor_rows(model, varied, varied.sensors)
+        return discrete_model(model, grid, None, policy, outputs)
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)

@@ -36,6 +36,18 @@ KEYS = {
         ],
     },
     "simulate controlled.toml": {
+        "sensors": [
+            {
+                "name": None,
+                "quantity": None,
+                "unit": None,
+                "position": None,
+                "smallest": None,
+                "smallest_time": None,
+                "largest": None,
+                "largest_time": None,
+            }
+        ],
         "peak_deflection": None,
         "lowest_contact_force": None,
         "wheel_unloading": None,

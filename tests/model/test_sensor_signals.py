@@ -207,15 +207,13 @@ def test_noise_is_in_the_record_but_not_in_predictions(record):
     difference = np.asarray(noisy.measured - record.measured)
     assert_allclose(difference, 1e-3 * noise_samples(11, 4, 801), rtol=0, atol=1e-12)
     assert_array_equal(noisy.measured, noisy.measured)
-    motion = noisy.coordinates, noisy.rates, noisy.accelerations
-    assert_array_equal(sensor_readings(noisy.case, noisy.modes, *motion), record.measured)
+    assert_array_equal(sensor_readings(noisy.case, noisy.modes, noisy.motion), record.measured)
 
 
 def test_delayed_readings_without_times_are_refused(record):
     delayed = with_sensors(record, delay=0.1)
-    motion = delayed.coordinates, delayed.rates, delayed.accelerations
     with pytest.raises(ValueError, match=r"sensors.0 .* its readings need times"):
-        sensor_readings(delayed.case, delayed.modes, *motion)
+        sensor_readings(delayed.case, delayed.modes, delayed.motion)
     fast = with_sensors(record, filter=Filter(100.0), sampling_period=1e-4)
     with pytest.raises(ValueError, match=r"sensors.0: its filter takes a reading every 0.0001 s"):
         _ = fast.measured

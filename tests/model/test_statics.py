@@ -223,7 +223,10 @@ def test_gradients_of_lines_and_peaks():
         (lambda: influence_line(GENERAL, 1.4, 0.1), "x must lie on the beam, between 0 and 1.3 m"),
         (lambda: influence_line(GENERAL, 0.1, [0.1, -0.2]), "positions must lie on the beam"),
         (lambda: influence_line(GENERAL, 0.1, jnp.nan), "positions must lie on the beam"),
-        (lambda: static_deflection(GENERAL, 0.1, [0.1]), "one for each of the 2 loads of the case"),
+        (
+            lambda: static_deflection(GENERAL, 0.1, [0.1]),
+            "each of the 2 wheels of the case",
+        ),
         (lambda: static_deflection(GENERAL, 0.1, [0.1, 0.2], 1.0), "one for each of the 1 forces"),
         (lambda: static_peak(GENERAL, -1.0), "x must lie on the beam"),
         (

@@ -1,5 +1,6 @@
 """Axles in a row: forces or masses that travel together."""
 
+import dataclasses
 from typing import ClassVar
 
 import numpy as np
@@ -54,6 +55,14 @@ class Axles(AbstractRowLoad):
         if self.spacing is None and self.train:
             return self._library().spacing
         return self.spacing
+
+    def by_numbers(self):
+        train = self._library() if self.train else None
+        if train is None or train.forces is None:  # weights of masses depend on gravity
+            return self
+        return dataclasses.replace(
+            self, train="", offsets=train.offsets, forces=train.forces, spacing=self.row_spacing()
+        )
 
     def validate(self, address):
         error = self._train_error(address) if self.train else self._list_error(address)

@@ -8,18 +8,18 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.declared_checks import validate_exactly_one
 from jaxbeam.case.fields import INCREASING, concrete, is_concrete, number
+from jaxbeam.case.loads.force_history import ForceHistory
 from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.case.trajectory import (
     AbstractPiecewiseTrajectory,
     BrakingTrajectory,
     TabulatedTrajectory,
 )
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class AbstractLoad(eqx.Module):
@@ -38,9 +38,32 @@ class AbstractLoad(eqx.Module):
     def vehicle(self, gravity: Float[Array, ""]) -> VehicleModel:
         """Vehicle of the load, one of `spacings`; `gravity` in m/s^2."""
 
+    def trajectory(self, length: Float[Array, ""]) -> AbstractPiecewiseTrajectory:
+        """Trajectory of its first wheel along a beam of a length (m)."""
+        if self.times is not None:
+            return TabulatedTrajectory(self.times, self.positions, length)
+        start = self.speed, self.entry_time, self.deceleration, length, self.start_position
+        return BrakingTrajectory(*start)
+
+    def force_history(self) -> ForceHistory | None:
+        """Force of its one wheel over time in addition to the static load, or None."""
+        return None
+
+    def total_mass(self, gravity: Float[Array, ""]) -> Float[Array, ""] | None:
+        """Mass (kg) whose weight its wheels carry; None for a force that is no weight."""
+        wheels = self.vehicle(gravity).static_loads
+        return self.spacings().shape[0] * xp.sum(wheels) / gravity
+
     def spacings(self) -> Float[Array, " vehicle"]:
         """Distances (m) of the first wheels of its vehicles, all alike, behind the first wheel."""
-        return np.zeros(1)
+        return xp.zeros(1)
+
+    def by_numbers(self) -> "AbstractLoad":
+        """The same load with numbers in place of the names of a library, where they mean the same.
+
+        Loads of equal structure share compiled programs.
+        """
+        return self
 
     def validate(self, address: str) -> str | None:
         """First inconsistency between its fields as an error message, or None."""
@@ -119,11 +142,7 @@ class AbstractVehicleLoad(AbstractLoad):
 
 def trajectory(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewiseTrajectory:
     """Trajectory of a load along a beam of a length (m)."""
-    if load.times is not None:
-        return TabulatedTrajectory(load.times, load.positions, length)
-    return BrakingTrajectory(
-        load.speed, load.entry_time, load.deceleration, length, load.start_position
-    )
+    return load.trajectory(length)
 
 
 def wheel_distances(load: AbstractLoad, gravity: Float[Array, ""]) -> Float[Array, " wheel"]:

@@ -36,6 +36,9 @@ class MovingForce(AbstractLoad):
     def validate(self, address):
         return validate_exactly_one(address, self, "force", "mass") or super().validate(address)
 
+    def total_mass(self, gravity):
+        return self.mass
+
     def vehicle(self, gravity):
         force = self.force if self.force is not None else self.mass * gravity
         return plain_wheels(force, xp.zeros(()))

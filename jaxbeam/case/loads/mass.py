@@ -30,5 +30,8 @@ class MovingMass(AbstractLoad):
         "m", "position at entry_time, before the beam", default=None
     )
 
+    def total_mass(self, gravity):
+        return self.mass
+
     def vehicle(self, gravity):
         return plain_wheels(self.mass * gravity, self.mass)

@@ -1,5 +1,6 @@
 """Any planar vehicle, from a file or from the library, that travels along the beam."""
 
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
@@ -58,6 +59,9 @@ class VehicleLoad(AbstractRowLoad):
             for name in DESCRIPTION
             if eqx.tree_equal(getattr(self, name), getattr(vehicle, name)) is True
         )
+
+    def by_numbers(self):
+        return dataclasses.replace(self, model="")
 
     def planar_vehicle(self) -> PlanarVehicle:
         """Description of one of its vehicles."""

@@ -14,7 +14,7 @@ from tests.modules import ROOT
 REFERENCE = json.loads((ROOT / "tests" / "data" / "vehicles.json").read_text(encoding="utf-8"))
 
 
-def _half_car(d):
+def half_car(d, speed=20.0, **options):
     return HalfCar(
         body_mass=d["mB"],
         body_inertia=d["IB"],
@@ -24,11 +24,12 @@ def _half_car(d):
         suspension_damping=d["cs"],
         tyre_stiffness=d["kt"],
         tyre_damping=d["ct"],
-        speed=20.0,
+        speed=speed,
+        **options,
     )
 
 
-def _wagon(d):
+def wagon(d, speed=20.0, **options):
     return Wagon(
         body_mass=d["mc"],
         body_inertia=d["Ic"],
@@ -41,11 +42,12 @@ def _wagon(d):
         secondary_damping=d["cs"],
         bogie_distance=d["lc"],
         wheelset_distance=d["lb"],
-        speed=20.0,
+        speed=speed,
+        **options,
     )
 
 
-def _quarter_car(d):
+def quarter_car(d, speed=20.0, **options):
     return QuarterCar(
         body_mass=d["ms"],
         axle_mass=d["mu"],
@@ -53,22 +55,28 @@ def _quarter_car(d):
         suspension_damping=d["cs"],
         tyre_stiffness=d["kt"],
         tyre_damping=d["ct"],
-        speed=20.0,
+        speed=speed,
+        **options,
     )
 
 
-def _oscillator(d):
+def oscillator(d, speed=20.0, **options):
     return Oscillator(
-        mass=d["m_v"], stiffness=d["k"], damping=d["c"], wheel_mass=d["m_w"], speed=20.0
+        mass=d["m_v"],
+        stiffness=d["k"],
+        damping=d["c"],
+        wheel_mass=d["m_w"],
+        speed=speed,
+        **options,
     )
 
 
 BUILDERS = {
-    "oscillator": _oscillator,
-    "quarter-car": _quarter_car,
-    "half-car": _half_car,
-    "half-car of unequal axles": _half_car,
-    "wagon": _wagon,
+    "oscillator": oscillator,
+    "quarter-car": quarter_car,
+    "half-car": half_car,
+    "half-car of unequal axles": half_car,
+    "wagon": wagon,
 }
 LOADS = {name: build(REFERENCE[name]["input"]) for name, build in BUILDERS.items()}
 LOADS["truck of five axles"] = VehicleLoad(model="truck-5-axle", speed=20.0)

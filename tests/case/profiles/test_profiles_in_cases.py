@@ -210,8 +210,61 @@ def test_wrong_part_in_python():
 
 def test_traced_numbers_are_not_validated():
     def valid(height):
-        case = jb.Case(BEAM, loads=LOADS, profile=jb.RampProfile(height, height, height))
+        loads = [jb.MovingForce(force=1e4, speed=20.0)]
+        case = jb.Case(BEAM, loads=loads, profile=jb.RampProfile(height, height, height))
         check_case(case)
         return case.profile.height
 
     assert jax.jit(valid)(0.5) == 0.5
+
+
+CAR = {
+    "body_mass": 14000.0,
+    "axle_mass": 1100.0,
+    "suspension_stiffness": 9e5,
+    "suspension_damping": 3e4,
+    "tyre_stiffness": 3e6,
+}
+RIGID = {
+    "mass": jb.MovingMass(1000.0, speed=20.0),
+    "wheel": jb.Oscillator(1e4, 1e6, wheel_mass=10.0, speed=20.0),
+    "wagon": jb.VehicleLoad(model="manchester-wagon", speed=20.0),
+    "masses": jb.Axles(offsets=[0.0, 2.0], masses=1e3, speed=20.0),
+}
+
+
+@pytest.mark.parametrize("name", RIGID)
+def test_masses_on_the_surface_need_a_slope_without_jumps(name):
+    ramp = jb.RampProfile(5.0, 7.0, 0.01)
+    with pytest.raises(ValueError, match="loads.1 has a mass that is rigidly on the surface"):
+        check_case(
+            jb.Case(BEAM, loads=[jb.QuarterCar(**CAR, speed=1.0), RIGID[name]], profile=ramp)
+        )
+    for smooth in (jb.RampProfile(5.0, 7.0, 0.01, 0.2), jb.StepProfile(5.0, 7.0, 0.01)):
+        check_case(jb.Case(BEAM, loads=[RIGID[name]], profile=smooth))
+
+
+@pytest.mark.parametrize(
+    ("path", "travel"),
+    [
+        ({"speed": 20.0, "start_position": -12.0}, "from -12 to 25 m"),
+        ({"speed": 20.0, "entry_time": 0.5}, "from -10 to 25 m"),
+        ({"speed": -20.0, "start_position": 40.0}, "from 0 to 40 m"),
+        ({"times": [0.0, 1.0, 2.0], "positions": [-3.0, 4.0, 30.0]}, "from -3 to 25 m"),
+    ],
+)
+def test_tables_are_known_where_vehicles_come_from(path, travel):
+    load = jb.QuarterCar(**CAR, **path)
+    short = jb.TableProfile([-1.0, 10.0, 26.0], [0.01, 0.0, 0.01])
+    run = jb.Run(2.0)
+    with pytest.raises(ValueError, match=f"loads travel {travel}"):
+        check_case(jb.Case(BEAM, loads=[load], profile=short, run=run))
+    long = jb.TableProfile([-20.0, 10.0, 50.0], [0.01, 0.0, 0.01])
+    check_case(jb.Case(BEAM, loads=[load], profile=long, run=run))
+
+
+def test_all_wheels_travel():
+    load = jb.VehicleLoad(model="truck-5-axle", speed=20.0)
+    profile = jb.TableProfile([-5.0, 10.0, 50.0], [0.01, 0.0, 0.01])
+    with pytest.raises(ValueError, match=r"loads travel from -12\.8 to 37\.8 m"):
+        check_case(jb.Case(BEAM, loads=[load], profile=profile, run=jb.Run(3.0)))
