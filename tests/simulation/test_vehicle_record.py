@@ -8,7 +8,7 @@ from numpy.testing import assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.simulation.labels import contact_sentence, wheel_labels
-from jaxbeam.simulation.record import record_from_xarray
+from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.simulation.test_record import assert_same
 
 WAGON = jb.Wagon(
