@@ -1,9 +1,9 @@
 """Vehicles and trains against runs of an independent implementation (`tests/data`).
 
 Deflections with the static correction to 1e-5 of the peak, contact forces to 1e-5 of the static
-load; of rigid wheelsets on a rough rail, where all modes matter, to 2e-4, as its report states. Heights of bodies follow the
-beam without the correction: to 2e-4 of the largest with 16 modes (1e-6 with 40), accelerations to
-3e-3 between samples.
+load; of rigid wheelsets on a rough rail, where all modes matter, to 2e-4, as its report states.
+Heights of bodies follow the beam without the correction: to 2e-4 of the largest with 16 modes
+(1e-6 with 40), accelerations to 3e-3 between samples.
 """
 
 import numpy as np
