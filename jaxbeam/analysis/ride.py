@@ -1,8 +1,8 @@
 """Ride measures: weighted accelerations of ISO 2631-1, Sperling's index, unloading of wheels.
 
 All are vertical. Accelerations are histories at equally spaced times from rest, of a body of a
-vehicle, a point of it, or the deck under a pedestrian. Limits to compare with are not here: those
-of ISO 2631-1, EN 12299 and UIC 513 differ by vehicle, posture and purpose.
+vehicle, a point of it, or the deck under a pedestrian. Limits to compare with are not here, for
+want of an open source.
 """
 
 from typing import NamedTuple
