@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from tests.simulation.reference_vehicles import (
+from tests.simulation.vehicles.reference_vehicles import (
     DATA,
     RUNS,
     body_index,
