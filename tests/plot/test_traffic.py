@@ -15,7 +15,7 @@ from jaxbeam.plot import animate, plot_record, plot_vehicles
 from jaxbeam.plot.traffic.drawing import vehicle_art
 from jaxbeam.plot.traffic.parts import drawn_vehicle
 from tests.plot.figures import CASE as BALL, data, lines_of, words
-from tests.simulation.test_vehicle_record import WAGON
+from tests.simulation.vehicles.test_vehicle_record import WAGON
 
 CAR = jb.QuarterCar(16e3, 1.2e3, 8e5, 2e4, 3.5e6, 1e4, speed=25.0, start_position=-5.0)
 ROAD = jb.Case(
