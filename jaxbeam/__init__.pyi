@@ -4,10 +4,14 @@ from .analysis.amplification import (
     envelope as envelope,
 )
 from .analysis.bound.bound import bound as bound
-from .analysis.static_correction import (
-    bending_moment as bending_moment,
-    corrected_deflection as corrected_deflection,
-    shear_force as shear_force,
+from .analysis.ride import (
+    RideMeasures as RideMeasures,
+    ride_measures as ride_measures,
+    sperling_index as sperling_index,
+    vibration_dose as vibration_dose,
+    weighted_acceleration as weighted_acceleration,
+    weighted_rms as weighted_rms,
+    wheel_unloading as wheel_unloading,
 )
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.patch import Patch as Patch
@@ -17,7 +21,30 @@ from .case.actuators.spring import SpringDamper as SpringDamper
 from .case.beam import Beam as Beam, Support as Support
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
 from .case.filters import Filter as Filter
-from .case.loads import MovingForce as MovingForce, MovingMass as MovingMass
+from .case.loads.axles import Axles as Axles
+from .case.loads.force import MovingForce as MovingForce
+from .case.loads.half_car import HalfCar as HalfCar
+from .case.loads.mass import MovingMass as MovingMass
+from .case.loads.oscillator import Oscillator as Oscillator
+from .case.loads.planar.files import load_vehicle as load_vehicle
+from .case.loads.planar.parts import (
+    VehicleAxle as VehicleAxle,
+    VehicleBody as VehicleBody,
+    VehicleHinge as VehicleHinge,
+    VehicleSpring as VehicleSpring,
+)
+from .case.loads.quarter_car import QuarterCar as QuarterCar
+from .case.loads.varying_force import VaryingForce as VaryingForce
+from .case.loads.vehicle import VehicleLoad as VehicleLoad
+from .case.loads.wagon import Wagon as Wagon
+from .case.profiles.bump import BumpProfile as BumpProfile
+from .case.profiles.iso8608 import ISO8608Profile as ISO8608Profile
+from .case.profiles.rail import RailProfile as RailProfile
+from .case.profiles.ramp import RampProfile as RampProfile
+from .case.profiles.sine import SineProfile as SineProfile
+from .case.profiles.spectrum import SpectrumProfile as SpectrumProfile
+from .case.profiles.step import StepProfile as StepProfile
+from .case.profiles.table import TableProfile as TableProfile
 from .case.sensors import Sensor as Sensor
 from .control.compensators import (
     PD as PD,
@@ -48,6 +75,7 @@ from .estimation.inversion import Inversion as Inversion
 from .estimation.kalman import Kalman as Kalman
 from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
+from .files.profile_file import profile_from_file as profile_from_file
 from .model.frequency_response import (
     accelerance as accelerance,
     frequency_response as frequency_response,
@@ -56,11 +84,14 @@ from .model.frequency_response import (
 )
 from .model.modes import modes as modes
 from .model.state_space import state_space as state_space
+from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force
 from .model.statics import (
     influence_line as influence_line,
     static_deflection as static_deflection,
     static_peak as static_peak,
 )
-from .simulation.record import Record as Record, read_record as read_record
+from .simulation.corrected_deflection import corrected_deflection as corrected_deflection
+from .simulation.record import Record as Record
 from .simulation.simulate import simulate as simulate
+from .simulation.stored_record import read_record as read_record
 from .sweeps.sweep import sweep as sweep

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxbeam.case.actuators.shaker import Shaker
 from jaxbeam.case.case import Case
-from jaxbeam.case.loads import MovingMass
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.state_feedback import StateFeedback
 from tests.oracles import closed_loop

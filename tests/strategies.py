@@ -12,7 +12,8 @@ from jaxbeam.case.actuators.spring import SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.filters import Filter
-from jaxbeam.case.loads import MovingForce, MovingMass
+from jaxbeam.case.loads.force import MovingForce
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
 
@@ -112,6 +113,7 @@ def sensors(draw, length: float) -> Sensor:
     """A sensor of any quantity."""
     quantity = draw(st.sampled_from(list(QUANTITIES)))
     fibre = draw(numbers(-0.1, 0.1)) if QUANTITIES[quantity].at_fibre else None
+    modulus = draw(numbers(1e-6, 0.1)) if QUANTITIES[quantity].over_modulus else None
     offset = draw(numbers(-1.0, 1.0))
     return Sensor(
         draw(numbers(0.0, length)),
@@ -124,6 +126,7 @@ def sensors(draw, length: float) -> Sensor:
         filter=draw(maybe(filters())),
         sampling_period=draw(maybe(numbers(1e-4, 0.01))),
         delay=draw(maybe(numbers(0.0, 0.1))),
+        section_modulus=modulus,
     )
 
 

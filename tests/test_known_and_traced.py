@@ -21,11 +21,12 @@ from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.propagators import propagators
 from jaxbeam.integrator.time_grid import grid_by_step_length
-from jaxbeam.model.contact import contact_at, load_set
+from jaxbeam.model.contact import contact_at
 from jaxbeam.model.flexibility import flexibility
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.statics import static_deflection_per_command
 from jaxbeam.runtime.arrays import any_jax
 from jaxbeam.simulation.integration_plan import (
@@ -48,7 +49,12 @@ BEAM = jb.Beam(
     modes=4,
 )
 SENSORS = tuple(
-    jb.Sensor(0.2 + 0.2 * i, quantity, fibre_distance=1e-3 if entry.at_fibre else None)
+    jb.Sensor(
+        0.17 + 0.1 * i,
+        quantity,
+        fibre_distance=1e-3 if entry.at_fibre else None,
+        section_modulus=1e-6 if entry.over_modulus else None,
+    )
     for i, (quantity, entry) in enumerate(QUANTITIES.items())
 )
 TABLE = {"times": [0.0, 0.05, 0.2, 0.3], "positions": [0.9, 0.6, 0.7, 0.2]}
@@ -72,6 +78,14 @@ CASES = {
     "forces": dataclasses.replace(
         MASSES, loads=(jb.MovingForce(force=3.0, speed=6.0), jb.MovingForce(mass=0.2, **TABLE))
     ),
+    "vehicles": dataclasses.replace(
+        MASSES,
+        loads=(
+            jb.QuarterCar(0.3, 0.02, 60.0, 0.6, 400.0, 0.1, speed=6.0, start_position=-0.2),
+            jb.Oscillator(0.1, 40.0, 0.2, 0.01, speed=-5.0, entry_time=0.05, deceleration=8.0),
+        ),
+        profile=jb.BumpProfile(-0.15, 0.4, 1e-3),
+    ),
     "no loads": dataclasses.replace(MASSES, loads=()),
     "coupled": dataclasses.replace(
         MASSES,
@@ -92,9 +106,10 @@ def _model(case, layout):
 
 def _forces_on_the_beam(case, layout):
     """Contact forces and accelerations at some instants, for arbitrary states."""
-    model, times = _model(case, layout), np.linspace(0.01, 0.2, 7)
-    states = 1e-3 * np.sin(np.arange(times.size * model.state_count)).reshape(times.size, -1, 1)
-    return contact_at(model, load_set(case), times, states)
+    model, loads, times = _model(case, layout), load_set(case), np.linspace(0.01, 0.2, 7)
+    count = model.state_count + loads.vehicle_states
+    states = 1e-3 * np.sin(np.arange(times.size * count)).reshape(times.size, -1, 1)
+    return contact_at(model, loads, times, states)
 
 
 def _discrete_model(case, layout):
@@ -114,9 +129,9 @@ FUNCTIONS = {
     "propagators": lambda case, layout: propagators(
         _model(case, layout), np.array([0.0, 1e-4, 0.01]), with_commands=has_coupling(case)
     ),
-    "longest step": lambda case, layout: max_stable_step(_model(case, layout), case.loads),
+    "longest step": lambda case, layout: max_stable_step(_model(case, layout), load_set(case)),
     "discrete model": _discrete_model,
-    "output rows": lambda case, layout: sensor_rows(_model(case, layout), case.sensors),
+    "output rows": lambda case, layout: sensor_rows(_model(case, layout), case, case.sensors),
     "flexibility": lambda case, layout: flexibility(case, layout, X, 0)(X / 1.2, 0),
     "influence line": lambda case, layout: [
         jb.influence_line(case, X, X[:2, None], derivative, layout) for derivative in (0, 2, 3)
@@ -190,13 +205,14 @@ def test_records_of_known_and_traced_numbers_are_the_same(name):
 
     def simulate(case):
         record = jb.simulate(case, times, plan)
-        histories = [record.at(0.33, quantity, 1e-3) for quantity in QUANTITIES]
-        return record, histories, record.measured, record.strain
+        histories = [record.at(0.33, quantity, 1e-3, 1e-6) for quantity in QUANTITIES]
+        left = record.shear_force(0.33, "left")
+        return record, histories, record.measured, record.strain, left, record.reactions
 
     assert_equal(*both_ways(simulate, CASES[name]))
 
 
-@pytest.mark.parametrize("name", ["masses on two spans", "forces", "coupled"])
+@pytest.mark.parametrize("name", ["masses on two spans", "forces", "coupled", "vehicles"])
 def test_peaks_of_known_and_traced_numbers_are_the_same(name):
     case = CASES[name]
     shapes = static_shapes(case)

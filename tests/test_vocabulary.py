@@ -12,7 +12,8 @@ from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Run
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator
-from jaxbeam.case.loads import AbstractLoad
+from jaxbeam.case.loads.base import AbstractLoad
+from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.sensors import Sensor
 from tests.modules import ROOT
 
@@ -22,6 +23,7 @@ PARTS = {
     "actuators": AbstractActuator,
     "sensors": Sensor,
     "loads": AbstractLoad,
+    "profile": AbstractProfile,
     "controller": AbstractController,
     "controller.estimator": AbstractEstimator,
     "run": Run,

@@ -18,8 +18,12 @@ from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, M
 from jaxbeam.case.trajectory import NEVER, AbstractTrajectory
 from jaxbeam.model.modal_model import compiled_modal_model
 from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensor_filters import with_sensor_filters
-from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state, sensor_sections
+from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
+from jaxbeam.model.sensing.sensor_signals import (
+    filtered_reading,
+    initial_filter_state,
+    sensor_sections,
+)
 from jaxbeam.model.state_space import Plant, build_plant
 from jaxbeam.runtime.arrays import Array, expm, known, scan, xp
 from jaxbeam.runtime.compiling import compiled
@@ -41,18 +45,23 @@ class FrozenTrajectory(AbstractTrajectory):
     position: Float[Array, ""]
     speed: Float[Array, ""]
     acceleration: Float[Array, ""]
+    heading: Float[Array, ""]
     on_beam: Any
     length: Float[Array, ""]
+
+    def direction(self):
+        return self.heading
 
     def kinematics(self, t):
         shape = xp.shape(t)
         parts = self.position, self.speed, self.acceleration
         return tuple(xp.broadcast_to(part, shape) for part in parts)
 
-    def entry_exit_times(self):
-        return xp.where(self.on_beam, -NEVER, NEVER), xp.asarray(NEVER)
+    def entry_exit_times(self, behind=0.0):
+        entry = xp.where(self.on_beam, -NEVER, NEVER)
+        return entry, xp.full(entry.shape, NEVER)
 
-    def passage_times(self, positions):
+    def passage_times(self, positions, behind=0.0):
         return xp.zeros(0)
 
 
@@ -71,10 +80,11 @@ class LoopDynamics(eqx.Module):
     def freeze_loads(self, t) -> "LoopDynamics":
         """The same dynamics with loads frozen at t (s)."""
         loads, length = self.augmented_plant.loads, self.plant.case.beam.length
-        on = loads.on_beam(t)
+        counts = [behind.shape[0] for behind in loads.behind]
+        on = xp.split(loads.on_beam(t), np.cumsum(counts)[:-1]) if counts else []
         trajectories = tuple(
-            FrozenTrajectory(*path.kinematics(t), on[i], length)
-            for i, path in enumerate(loads.trajectories)
+            FrozenTrajectory(*path.kinematics(t), path.direction(), on_beam, length)
+            for path, on_beam in zip(loads.trajectories, on, strict=True)
         )
         return eqx.tree_at(lambda loop: loop.augmented_plant.loads.trajectories, self, trajectories)
 

@@ -199,9 +199,9 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
         rest_state, rebuild = loop.rest_state(timing)
         # Deviations from rest: weights left out.
         unweighted = eqx.tree_at(
-            lambda loop: loop.augmented_plant.loads.weight,
+            lambda loop: loop.augmented_plant.loads.wheels.weight,
             loop,
-            0 * loop.augmented_plant.loads.weight,
+            0 * loop.augmented_plant.loads.wheels.weight,
         )
 
         def advance_sample(transition, t):

@@ -21,6 +21,8 @@ KEYS = {
     "place_weight": "position_weight",
     "reach": "max_delay_periods",
 }
+# Words of case files that attributes in Python cannot have, and those that they have; both stay.
+FILE_KEYS = {"class": "road_class", "heights": "point_heights"}
 
 
 def warn_renamed(
@@ -52,18 +54,20 @@ def current_kind(address: str, kind: str) -> str:
 def current_keys(
     address: str, table: Mapping[str, Any], allowed: Collection[str]
 ) -> dict[str, Any]:
-    """A table of a case file with its keys in their present words.
+    """A table of a case file with its keys in their present words, which are those in Python.
 
     A word that is among the allowed keys is left alone. Raises ValueError if the old and the new
     word are both there.
     """
     values = {}
     for key, value in table.items():
-        new = KEYS.get(key, key) if key not in allowed else key
+        new = (KEYS | FILE_KEYS).get(key, key) if key not in allowed else key
         if new != key and new in allowed:
             if new in table:
-                raise ValueError(f"{address}.{key} is called {new} now; leave one of them out")
-            warn_renamed(f"{address}.{key}", new, FutureWarning)
+                where = "now" if key in KEYS else "in Python"
+                raise ValueError(f"{address}.{key} is called {new} {where}; leave one of them out")
+            if key in KEYS:
+                warn_renamed(f"{address}.{key}", new, FutureWarning)
             key = new
         values[key] = value
     return values
@@ -71,7 +75,8 @@ def current_keys(
 
 def current_address(address: str) -> str:
     """An address in a case, such as "controller.recognition.until", in the present words."""
-    current = ".".join(KEYS.get(name, name) for name in address.split("."))
-    if current != address:
-        warn_renamed(address, current, FutureWarning)
-    return current
+    names = [FILE_KEYS.get(name, name) for name in address.split(".")]
+    current = [KEYS.get(name, name) for name in names]
+    if current != names:
+        warn_renamed(address, ".".join(current), FutureWarning)
+    return ".".join(current)

@@ -16,8 +16,18 @@ from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.aliases import current_address
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, number
-from jaxbeam.case.loads import AbstractLoad, trajectory
+from jaxbeam.case.fields import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    choice,
+    concrete,
+    count,
+    is_concrete,
+    number,
+)
+from jaxbeam.case.joint_addresses import ALL, each_address
+from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array, set_at, xp
 
@@ -36,7 +46,7 @@ class Run(eqx.Module):
 
 
 class Case(eqx.Module):
-    """Beam, supports, actuators, sensors, loads, controller and run settings.
+    """Beam, supports, actuators, sensors, loads, profile, controller and run settings.
 
     An immutable tree: `replace(case, {"loads.0.mass": 0.3})` or `equinox.tree_at` return a changed
     copy. Every number has an address, its dotted path. Its fields are the keys of a case file.
@@ -47,6 +57,7 @@ class Case(eqx.Module):
     actuators: tuple[AbstractActuator, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     loads: tuple[AbstractLoad, ...] = ()
+    profile: AbstractProfile | None = None
     controller: AbstractController | None = None
     run: Run | None = None
     title: str = choice("title of the case", default="")
@@ -61,12 +72,14 @@ class Case(eqx.Module):
         controller=None,
         run: Run | None = None,
         title: str = "",
+        profile=None,
     ):
         self.beam = beam
         self.supports = tuple(supports)
         self.actuators = tuple(actuators)
         self.sensors = tuple(sensors)
         self.loads = tuple(loads)
+        self.profile = profile
         self.controller = controller
         self.run = Run(duration=1.0) if run is None else run
         self.title = title
@@ -125,7 +138,8 @@ def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
     """All numbers of a case by address, in SI units.
 
     A list has an address as a whole, `beam.damping_ratio`, and one for each entry,
-    `beam.damping_ratio.0`; an entry of a matrix has row and column, `controller.gain.0.2`.
+    `beam.damping_ratio.0`; an entry of a matrix has row and column, `controller.gain.0.2`. Where an
+    address is taken, `loads.*.speed` stands for the speed of all loads, and so for other lists.
     """
     numbers = {}
     for address, leaf in _leaves_by_address(case).items():
@@ -144,22 +158,62 @@ def unknown_address_error(case: Case, address: str) -> ValueError:
     return ValueError(f"the case has no number at address {address!r}{hint}")
 
 
-def value_at(case: Case, address: str) -> Float[Array, "..."]:
-    """The number at an address, in SI units.
+def list_sizes(case: Case) -> dict[str, int]:
+    """Numbers of parts at the keys of a case that hold lists of parts."""
+    return {key: len(getattr(case, key)) for key, found in part_classes().items() if found.listed}
 
-    Raises ValueError, with the nearest address of the case, if there is none.
+
+def own_addresses(case: Case, address: str) -> list[str]:
+    """Addresses of the numbers of a case for which one stands, in present words.
+
+    It is one number, or that of every load for `loads.*.speed`, say.
+
+    Raises ValueError, with the nearest address of the case, if one of them has no number.
     """
-    leaves, address = _leaves_by_address(case), current_address(address)
-    parent, entry = _parent_and_entry(address, leaves)
-    if parent is None or (entry and not _has_entry(leaves[parent], entry)):
-        raise unknown_address_error(case, address)
-    return leaves[parent][entry] if entry else leaves[parent]
+    return _own_addresses(case, address, _leaves_by_address(case))
+
+
+def _own_addresses(case: Case, address: str, leaves: dict[str, Any]) -> list[str]:
+    current = current_address(address)
+    found = each_address(current, list_sizes(case))
+    for one in found:
+        parent, entry = _parent_and_entry(one, leaves)
+        if parent is None or (entry and not _has_entry(leaves[parent], entry)):
+            if one == current:
+                raise unknown_address_error(case, address)
+            key, index, name = one.split(".", 2)
+            raise ValueError(
+                f"{address} stands for a number of all {key}, and {key}.{index} has no {name}:"
+                " name those that have it, one by one"
+            )
+    return found
+
+
+def value_at(case: Case, address: str) -> Float[Array, "..."]:
+    """The number at an address, in SI units; at `loads.*.speed` the one that all loads have.
+
+    Raises ValueError, with the nearest address of the case, if there is none, and if the numbers
+    for which the address stands differ.
+    """
+    leaves, values = _leaves_by_address(case), []
+    for one in _own_addresses(case, address, leaves):
+        parent, entry = _parent_and_entry(one, leaves)
+        values.append(leaves[parent][entry] if entry else leaves[parent])
+    if len(values) > 1 and all(map(is_concrete, values)):
+        known = [concrete(value) for value in values]
+        if not all(np.array_equal(value, known[0]) for value in known):
+            raise ValueError(
+                f"{address} stands for numbers that differ, {', '.join(map(str, known))}: set"
+                " them to one value first, or name one of them"
+            )
+    return values[0]
 
 
 def unit_at(case: Case, address: str) -> str:
     """SI unit of the number at an address; "" or "1" if it has none."""
     unit, part = "", case
-    for name in current_address(address).split("."):
+    each = own_addresses(case, address) if ALL in address else [current_address(address)]
+    for name in each[0].split("."):
         if isinstance(part, tuple):
             part = part[int(name)]
         elif dataclasses.is_dataclass(part):
@@ -173,13 +227,18 @@ def unit_at(case: Case, address: str) -> str:
 def replace(case: Case, values: dict[str, Any]) -> Case:
     """A copy of a case with other numbers at some addresses (SI units).
 
-    It is differentiable by the values. Raises ValueError for an unknown address or a wrong shape.
+    `loads.*.speed` sets the speed of all loads. It is differentiable by the values. Raises
+    ValueError for an unknown address, one that some load lacks, or a wrong shape.
     """
     paths, structure = jax.tree_util.tree_flatten_with_path(case)
     leaves = [leaf for _, leaf in paths]
     index = {".".join(_key_name(key) for key in path): i for i, (path, _) in enumerate(paths)}
-    for address, value in values.items():
-        value, address = xp.asarray(value, float), current_address(address)
+    known = dict(zip(index, leaves, strict=True))
+    each = [
+        (one, value) for key, value in values.items() for one in _own_addresses(case, key, known)
+    ]
+    for address, value in each:
+        value = xp.asarray(value, float)
         parent, entry = _parent_and_entry(address, index)
         if address in index:
             current = leaves[index[address]]
@@ -188,12 +247,10 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
                     f"{address} takes a value of shape {xp.shape(current)}, not {xp.shape(value)}"
                 )
             leaves[index[address]] = value
-        elif parent is not None and _has_entry(leaves[index[parent]], entry):
+        else:
             if value.shape:
                 raise ValueError(f"{address} takes one number, not {value.shape}")
             leaves[index[parent]] = set_at(leaves[index[parent]], entry, value)
-        else:
-            raise unknown_address_error(case, address)
     return jax.tree_util.tree_unflatten(structure, leaves)
 
 
@@ -231,11 +288,15 @@ def stack_cases(cases: Sequence[Case]) -> Case:
 
 
 def crossing_times(case: Case) -> Float[np.ndarray, "load 2"]:
-    """Times (s) at which each load enters and leaves the beam; it leaves at `NEVER` if it stays.
+    """Times (s) at which each load enters, with its first wheel, and leaves, with its last.
+
+    It leaves at `NEVER` if it stays.
 
     Raises `jax.errors.ConcretizationTypeError` if the case is traced.
     """
-    windows = [trajectory(load, case.beam.length).entry_exit_times() for load in case.loads]
-    return np.array([[float(concrete(time)) for time in window] for window in windows]).reshape(
-        -1, 2
-    )
+    windows = []
+    for load in case.loads:
+        behind = wheel_distances(load, case.run.gravity)
+        entry, leave = trajectory(load, case.beam.length).entry_exit_times(behind)
+        windows.append((np.min(concrete(entry)), np.max(concrete(leave))))
+    return np.array(windows).reshape(-1, 2)

@@ -96,6 +96,15 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
             )
         if value is not None:
             check_fields(address, value)
+    elif "parts" in field.metadata:
+        for i, one in enumerate(value):
+            if not isinstance(one, field.metadata["parts"]):
+                name = field.metadata["parts"].__name__
+                raise ValueError(
+                    f"{address}.{i} holds {describe_value(one)}; it takes a table of its own, in"
+                    f" Python a {name}"
+                )
+            check_fields(f"{address}.{i}", one)
     elif "meaning" in field.metadata:
         if not isinstance(value, str):
             raise ValueError(f"{address} must be a word in quotes, not {describe_value(value)}")

@@ -65,6 +65,12 @@ def part(meaning: str, part_class: type, **options):
     return eqx.field(metadata={"meaning": meaning, "part": part_class}, default=None, **options)
 
 
+def parts(meaning: str, part_class: type, **options):
+    """Field for any number of parts of one class, each a table of a list; () if left out."""
+    metadata = {"meaning": meaning, "parts": part_class}
+    return eqx.field(converter=tuple, metadata=metadata, default=(), **options)
+
+
 def axis_names(field) -> str:
     """Axes in the annotation of a number: "" for one number, "2", "point", "*modes"."""
     return next(iter(typing.get_args(field.type)), field.type).dim_str

@@ -1,7 +1,7 @@
 """Quantities that a point sensor measures, in terms of the deflection w(x, t).
 
 This is their only list: names and units of sensors, outputs of state spaces and of frequency
-responses, and histories of records derive from it (rows of the outputs: `model.output_rows`).
+responses, and histories of records derive from it (rows: `model.sensing.output_rows`).
 """
 
 from typing import NamedTuple
@@ -10,14 +10,27 @@ from typing import NamedTuple
 class Quantity(NamedTuple):
     """Unit of a quantity, and its orders of derivation of w by position and by time.
 
-    With `at_fibre` the derivative is multiplied by -z, z (m) being the height of a fibre above
-    the neutral axis.
+    The derivative is multiplied by -z `at_fibre`, z (m) being the height of a fibre above the
+    neutral axis; by the bending stiffness E I if it is a `section_force`, to which active moments
+    of patches belong; and divided by the section modulus (m^3) if it is `over_modulus`.
     """
 
     unit: str
     x_derivative: int = 0
     time_derivative: int = 0
     at_fibre: bool = False
+    section_force: bool = False
+    over_modulus: bool = False
+
+    @property
+    def bends(self) -> bool:
+        """Whether it is a curvature or a derivative of it, whose modal sums need a correction."""
+        return self.x_derivative >= 2 and self.time_derivative == 0
+
+    @property
+    def has_active_moment(self) -> bool:
+        """Whether the active moment of a patch over the section is part of it."""
+        return self.section_force and self.x_derivative == 2
 
 
 QUANTITIES = {
@@ -25,19 +38,28 @@ QUANTITIES = {
     "velocity": Quantity("m/s", time_derivative=1),
     "acceleration": Quantity("m/s^2", time_derivative=2),
     "slope": Quantity("rad", x_derivative=1),
+    "rotation": Quantity("rad", x_derivative=1),
+    "curvature": Quantity("1/m", x_derivative=2),
     "strain": Quantity("1", x_derivative=2, at_fibre=True),
+    "moment": Quantity("N m", x_derivative=2, section_force=True),
+    "shear": Quantity("N", x_derivative=3, section_force=True),
+    "stress": Quantity("Pa", x_derivative=2, section_force=True, over_modulus=True),
 }
 
 
-def quantity_of(name: str, fibre_distance: object = None) -> Quantity:
+def quantity_of(
+    name: str, fibre_distance: object = None, section_modulus: object = None
+) -> Quantity:
     """The quantity of a name.
 
-    Raises ValueError for an unknown name, and for a quantity at a fibre without the distance (m)
-    of the fibre.
+    Raises ValueError for an unknown name, for a quantity at a fibre without the distance (m) of the
+    fibre, and for a stress without the section modulus (m^3).
     """
     if name not in QUANTITIES:
         raise ValueError(f"no quantity {name!r}; there are {', '.join(QUANTITIES)}")
     quantity = QUANTITIES[name]
     if quantity.at_fibre and fibre_distance is None:
         raise ValueError(f"{name} needs fibre_distance, the height above the neutral axis in m")
+    if quantity.over_modulus and section_modulus is None:
+        raise ValueError(f"{name} needs section_modulus, bending moment over stress in m^3")
     return quantity

@@ -1,10 +1,20 @@
 """Point sensors on the beam."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from jaxtyping import Float
 
-from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, choice, number, part
+from jaxbeam.case.fields import (
+    INCREASING,
+    NOT_NEGATIVE,
+    ON_BEAM,
+    POSITIVE,
+    choice,
+    concrete,
+    is_concrete,
+    number,
+    part,
+)
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.runtime.arrays import Array, xp
@@ -15,8 +25,10 @@ class Sensor(Module):
     """Point sensor of a quantity at a position on the beam; deflections are positive upwards.
 
     `strain` is the bending strain -z d2w/dx2 of the fibre at z = `fibre_distance` above the neutral
-    axis. `offset` and noise are added to the quantity; the reading is limited to the range and
-    rounded to the resolution (see `jaxbeam.model.sensor_signals`). What is left out is ideal.
+    axis, `moment` the bending moment, positive where the beam sags, `shear` its x-derivative, and
+    `stress` the moment over the `section_modulus`. `name` is the label in results. `offset` and
+    noise are added to the quantity; the reading is limited to the range and rounded to the
+    resolution (see `jaxbeam.model.sensing.sensor_signals`). What is left out is ideal.
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
@@ -41,6 +53,10 @@ class Sensor(Module):
     delay: Float[Array, ""] | None = number(
         "s", "from deflection to reading", NOT_NEGATIVE, default=None
     )
+    section_modulus: Float[Array, ""] | None = number(
+        "m^3", "bending moment over stress; negative for a fibre above the axis", default=None
+    )
+    name: str = choice("label in results; its number and quantity if left out", default="")
 
     @property
     def unit(self) -> str:
@@ -51,6 +67,11 @@ class Sensor(Module):
     def has_feedthrough(self) -> bool:
         """Whether forces and commands change the reading at once, as they change accelerations."""
         return QUANTITIES[self.quantity].time_derivative == 2
+
+    @property
+    def bends(self) -> bool:
+        """Whether it measures curvature, or what follows from it by the section."""
+        return QUANTITIES[self.quantity].bends
 
     @property
     def has_digital_filter(self) -> bool:
@@ -74,15 +95,33 @@ class Sensor(Module):
 
     def validate(self, address: str) -> str | None:
         """First inconsistency between its fields as an error message, or None."""
-        at_fibre = QUANTITIES[self.quantity].at_fibre
-        if at_fibre and self.fibre_distance is None:
+        quantity, words = QUANTITIES[self.quantity], f"a sensor of {self.quantity}"
+        if quantity.at_fibre and self.fibre_distance is None:
             return (
                 f"{address}.fibre_distance is missing: {self.quantity} needs the height of the"
                 " gauge above the neutral axis in m"
             )
-        if not at_fibre and self.fibre_distance is not None:
+        if not quantity.at_fibre and self.fibre_distance is not None:
             return (
-                f"{address}.fibre_distance would have no effect on a sensor of {self.quantity};"
+                f"{address}.fibre_distance would have no effect on {words};"
                 " leave it out, or set quantity to 'strain'"
             )
+        modulus = self.section_modulus
+        if quantity.over_modulus and modulus is None:
+            return (
+                f"{address}.section_modulus is missing: {self.quantity} needs bending moment over"
+                " stress in m^3, negative for a fibre above the neutral axis"
+            )
+        if not quantity.over_modulus and modulus is not None:
+            return (
+                f"{address}.section_modulus would have no effect on {words};"
+                " leave it out, or set quantity to 'stress'"
+            )
+        if modulus is not None and is_concrete(modulus) and concrete(modulus) == 0:
+            return f"{address}.section_modulus must not be zero"
         return None
+
+
+def sensor_labels(sensors: Sequence[Sensor]) -> list[str]:
+    """Labels of sensors in results: their names, or number and quantity, as in "0: deflection"."""
+    return [sensor.name or f"{i}: {sensor.quantity}" for i, sensor in enumerate(sensors)]

@@ -13,21 +13,32 @@ NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that der
 
 
 class AbstractTrajectory(Module):
-    """Trajectory x(t) of a load, on the beam from one entry to at most one exit."""
+    """Trajectory x(t) of the first wheel of a load, from before its entry to at most one exit.
+
+    Wheels that are `behind` the first one (m) follow at that distance.
+    """
 
     length: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def direction(self) -> Float[Array, ""]:
+        """1 for a load that enters at the left end, -1 for one that enters at the right end."""
 
     @abc.abstractmethod
     def kinematics(self, t) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
         """Position (m), speed (m/s) and acceleration (m/s^2) at times t (s), of any shape."""
 
     @abc.abstractmethod
-    def entry_exit_times(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Times of entry and exit (s); the exit is `NEVER` if the load stays on the beam."""
+    def entry_exit_times(
+        self, behind: Float[Array, " wheel"] | float = 0.0
+    ) -> tuple[Float[Array, "*wheel"], Float[Array, "*wheel"]]:
+        """Times of entry and exit of wheels (s); `NEVER` for an exit of one that stays."""
 
     @abc.abstractmethod
-    def passage_times(self, positions: Float[Array, " position"]) -> Float[Array, " time"]:
-        """Times (s) of passing the positions (m), and of a discontinuous speed or acceleration.
+    def passage_times(
+        self, positions: Float[Array, " position"], behind: Float[Array, " wheel"] | float = 0.0
+    ) -> Float[Array, " time"]:
+        """Times (s) at which wheels pass the positions (m), and of a jump in speed or acceleration.
 
         `NEVER` stands for what does not happen.
         """
@@ -48,44 +59,59 @@ class BrakingTrajectory(AbstractPiecewiseTrajectory):
     """Constant deceleration from the speed at entry: x = v t - a t^2 / 2 until it stops.
 
     A load of negative speed enters at the right end and travels left. A negative deceleration
-    accelerates the load.
+    accelerates the load. At `entry_time` (s) its first wheel is at `start` (m), by default the end
+    of the beam; before, it travels with the constant speed.
     """
 
     speed: Float[Array, ""]
     entry_time: Float[Array, ""]
     deceleration: Float[Array, ""]
     length: Float[Array, ""]
+    start: Float[Array, ""] | None = None
+
+    def direction(self):
+        return xp.sign(self.speed)
+
+    def _start(self):
+        """Position (m) at entry_time."""
+        if self.start is not None:
+            return self.start
+        return xp.where(self.speed < 0, self.length, 0.0)
 
     def _stopping_time(self):
-        """Time from entry to standstill (s)."""
+        """Time from entry_time to standstill (s)."""
         braking = self.deceleration > 0
         deceleration = xp.where(braking, self.deceleration, 1.0)
         return xp.where(braking, xp.abs(self.speed) / deceleration, NEVER)
 
-    def _time_to_cover(self, distance):
-        """Time from entry (s) to cover a distance (m): the smaller root of the parabola."""
+    def _time_of_arrival(self, position, behind):
+        """Time (s) at which a wheel arrives at a position (m): the smaller root of the parabola."""
+        distance = self.direction() * (position - self._start()) + behind
         speed = xp.abs(self.speed)
         squared_speed = speed**2 - 2 * self.deceleration * distance
         final_speed = xp.where(
             squared_speed > 0, xp.sqrt(xp.where(squared_speed > 0, squared_speed, 1.0)), 0.0
         )
-        reached = (squared_speed >= 0) & (speed + final_speed > 0)
-        return xp.where(reached, 2 * distance / xp.where(reached, speed + final_speed, 1.0), NEVER)
+        before = distance < 0
+        final_speed = xp.where(before, speed, final_speed)
+        reached = ((squared_speed >= 0) | before) & (speed + final_speed > 0)
+        duration = 2 * distance / xp.where(reached, speed + final_speed, 1.0)
+        return xp.where(reached, self.entry_time + duration, NEVER)
 
     def kinematics(self, t):
         elapsed = t - self.entry_time
         stop = self._stopping_time()
-        moving = elapsed < stop
+        moving, braking = elapsed < stop, elapsed >= 0
         moving_time = xp.minimum(elapsed, stop)
-        direction = xp.sign(self.speed)
-        distance = xp.abs(self.speed) * moving_time - self.deceleration * moving_time**2 / 2
-        speed = xp.where(moving, xp.abs(self.speed) - self.deceleration * moving_time, 0.0)
-        start = xp.where(self.speed < 0, self.length, 0.0)
-        braking = xp.where(moving, -self.deceleration, 0.0)
-        return start + direction * distance, direction * speed, direction * braking
+        braking_time = xp.maximum(moving_time, 0.0)
+        direction, speed = self.direction(), xp.abs(self.speed)
+        distance = speed * moving_time - self.deceleration * braking_time**2 / 2
+        speed = xp.where(moving, speed - self.deceleration * braking_time, 0.0)
+        acceleration = xp.where(moving & braking, -self.deceleration, 0.0)
+        return self._start() + direction * distance, direction * speed, direction * acceleration
 
     def cubics(self):
-        start = xp.where(self.speed < 0, self.length, 0.0)
+        start = self._start()
         half_acceleration = -xp.sign(self.speed) * self.deceleration / 2
         stop = self._stopping_time()
         stop_position = start + xp.where(stop < NEVER, self.speed * stop / 2, 0.0)
@@ -95,16 +121,44 @@ class BrakingTrajectory(AbstractPiecewiseTrajectory):
         times = xp.stack([self.entry_time, self.entry_time + stop])
         return times, xp.stack([moving, standing])
 
-    def entry_exit_times(self):
-        crossing_time = self._time_to_cover(self.length)
-        return self.entry_time, xp.where(
-            crossing_time < NEVER, self.entry_time + crossing_time, NEVER
-        )
+    def entry_exit_times(self, behind=0.0):
+        entry_end = xp.where(self.speed < 0, self.length, 0.0)
+        ends = entry_end, self.length - entry_end
+        entry, leave = (self._time_of_arrival(end, behind) for end in ends)
+        return entry, leave
 
-    def passage_times(self, positions):
-        distance = xp.where(self.speed < 0, self.length - positions, positions)
-        times = xp.append(self._time_to_cover(distance), self._stopping_time())
-        return xp.where(times < NEVER, self.entry_time + times, NEVER)
+    def passage_times(self, positions, behind=0.0):
+        arrivals = self._time_of_arrival(positions, xp.expand_dims(behind, -1))
+        stop = self._stopping_time()
+        stop = xp.where(stop < NEVER, self.entry_time + stop, NEVER)
+        jumps = xp.stack([self.entry_time, stop])
+        return xp.concatenate([arrivals.reshape(-1), jumps])
+
+
+class StandingTrajectory(AbstractPiecewiseTrajectory):
+    """A place on the beam at which a load acts from `entry_time` (s) on."""
+
+    position: Float[Array, ""]
+    entry_time: Float[Array, ""]
+    length: Float[Array, ""]
+
+    def direction(self):
+        return xp.ones(())
+
+    def kinematics(self, t):
+        position = xp.broadcast_to(self.position, xp.shape(t))
+        return position, xp.zeros_like(position), xp.zeros_like(position)
+
+    def cubics(self):
+        zero = xp.zeros(())
+        return self.entry_time[None], xp.stack([self.position, zero, zero, zero])[None]
+
+    def entry_exit_times(self, behind=0.0):
+        entry = self.entry_time + xp.zeros(xp.shape(behind))
+        return entry, xp.full(entry.shape, NEVER)
+
+    def passage_times(self, positions, behind=0.0):
+        return xp.full(xp.size(positions) * xp.size(behind), NEVER)
 
 
 class TabulatedTrajectory(AbstractPiecewiseTrajectory):
@@ -165,6 +219,9 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
         acceleration = 2 * half_acceleration + elapsed * 6 * sixth_jerk
         return position, xp.where(inside, velocity, 0.0), xp.where(inside, acceleration, 0.0)
 
+    def direction(self):
+        return xp.where(self.positions[0] <= self.positions[-1], 1.0, -1.0)
+
     def _passage_time(self, target):
         """First time (s) of passing a position (m), by bisection.
 
@@ -188,15 +245,25 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
         step = xp.where(moving, (position - target) / xp.where(moving, speed, 1.0), 0.0)
         return xp.where(xp.any(passed), time - (step - stop_gradient(step)), NEVER)
 
-    def entry_exit_times(self):
-        first, last = self.positions[0], self.positions[-1]
-        entry_end = xp.where(first < last, 0.0, self.length)
+    def _entry_exit_times_of(self, behind):
+        """Times of entry and exit (s) of one wheel."""
+        direction = self.direction()
+        first, last = (self.positions[i] - direction * behind for i in (0, -1))
+        entry_end = xp.where(direction > 0, 0.0, self.length)
+        exit_end = self.length - entry_end
         outside = (first < 0) | (first > self.length)
-        entry = xp.where(outside, self._passage_time(entry_end), self.times[0])
-        exits = (last < 0) | (last > self.length)
-        exit_time = xp.where(exits, self._passage_time(self.length - entry_end), NEVER)
-        return entry, xp.where(last == self.length - entry_end, self.times[-1], exit_time)
+        passages = (self._passage_time(end + direction * behind) for end in (entry_end, exit_end))
+        entry, leave = passages
+        entry = xp.where(outside, entry, self.times[0])
+        leave = xp.where((last < 0) | (last > self.length), leave, NEVER)
+        return entry, xp.where(last == exit_end, self.times[-1], leave)
 
-    def passage_times(self, positions):
-        times = vmap(self._passage_time)(positions)
+    def entry_exit_times(self, behind=0.0):
+        if xp.ndim(behind) == 0:
+            return self._entry_exit_times_of(behind)
+        return vmap(self._entry_exit_times_of)(behind)
+
+    def passage_times(self, positions, behind=0.0):
+        targets = positions + self.direction() * xp.expand_dims(xp.asarray(behind), -1)
+        times = vmap(self._passage_time)(targets.reshape(-1))
         return xp.append(times, self.times[-1])

@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator
@@ -22,12 +23,15 @@ from jaxbeam.case.declared_checks import (
 )
 from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
-from jaxbeam.case.loads import AbstractLoad
-from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.loads.vehicle_checks import known_numbers
+from jaxbeam.case.profiles.base import AbstractProfile
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import Sensor, sensor_labels
 from jaxbeam.runtime.arrays import Array
 
 # Parts with a method `validate(address)`.
-SELF_VALIDATING = Beam | AbstractActuator | Sensor | AbstractLoad
+SELF_VALIDATING = Beam | AbstractActuator | Sensor | AbstractLoad | AbstractProfile
 
 
 def check_case(case: Case) -> None:
@@ -52,6 +56,8 @@ def check_case(case: Case) -> None:
         if error is not None:
             raise ValueError(error)
     _check_supports(case.supports, case.beam.length)
+    _check_profile(case)
+    _check_labels(case.sensors)
     for i, sensor in enumerate(case.sensors):
         _check_sampling(f"sensors.{i}", sensor, case)
     if case.controller is not None:
@@ -83,6 +89,56 @@ def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> 
             raise ValueError(
                 f"supports.{min(i, j)} and supports.{max(i, j)} both hold the beam rigidly at"
                 f" {left:g} m; remove one"
+            )
+
+
+def _check_profile(case: Case) -> None:
+    """Validate that wheels can follow the profile, and that it is known wherever they travel."""
+    profile = case.profile
+    if profile is None or not case.loads:
+        return
+    ends = [(0.0, case.beam.length)]
+    for i, load in enumerate(case.loads):
+        if not all(map(known_numbers, (load, case.run, case.beam))):
+            continue
+        vehicle = load.vehicle(case.run.gravity)
+        if profile.has_slope_jumps and np.any(concrete(vehicle.wheel_masses)):
+            raise ValueError(
+                f"loads.{i} has a mass that is rigidly on the surface, and would need an infinite"
+                " force where the slope of the profile jumps: give profile.contact_length, or a"
+                " smooth kind of profile"
+            )
+        if vehicle.names:
+            ends.append(_travel(load, case))
+    if not all(map(is_concrete, itertools.chain(*ends))):
+        return
+    starts, ends = zip(*(map(concrete, pair) for pair in ends), strict=True)
+    error = profile.validate_travel("profile", min(starts), max(ends))
+    if error is not None:
+        raise ValueError(error)
+
+
+def _travel(load: AbstractLoad, case: Case) -> tuple[float, float]:
+    """Lowest and highest position (m) of any wheel, from the start until all have left the beam."""
+    length = float(concrete(case.beam.length))
+    behind = float(np.max(concrete(wheel_distances(load, case.run.gravity))))
+    path = trajectory(load, case.beam.length)
+    places = path.kinematics(concrete(case.run.duration) * np.array([0.0, 1.0]))[0]
+    if load.positions is not None:
+        places = np.append(places, concrete(load.positions))
+    low, high = float(np.min(concrete(places))), float(np.max(concrete(places)))
+    if concrete(path.direction()) > 0:
+        return low - behind, min(high, length + behind)
+    return max(low, -behind), high + behind
+
+
+def _check_labels(sensors: tuple[Sensor, ...]) -> None:
+    labels = sensor_labels(sensors)
+    for i, label in enumerate(labels):
+        if label in labels[:i]:
+            raise ValueError(
+                f"sensors.{labels.index(label)} and sensors.{i} are both called {label!r} in"
+                f" results; give sensors.{i} another name"
             )
 
 
@@ -124,6 +180,8 @@ def _check_controller(case: Case) -> None:
                 f"sensors.{i}.filter cannot be analogue on an {sensor.quantity} that a controller"
                 " uses: make it digital"
             )
+        if QUANTITIES[sensor.quantity].has_active_moment and not controller.open_loop:
+            _check_outside_patches(f"sensors.{i}", sensor, case)
     period, duration = controller.period, case.run.duration
     if period is not None:
         if is_concrete(period) and is_concrete(duration) and concrete(period) > concrete(duration):
@@ -134,6 +192,20 @@ def _check_controller(case: Case) -> None:
         return
     for feature in _sampled_features(case):
         raise ValueError(f"{feature} needs a controller that samples: give controller.period")
+
+
+def _check_outside_patches(address: str, sensor: Sensor, case: Case) -> None:
+    """No controller reads a moment or stress to which its own command adds at once."""
+    for i, actuator in enumerate(case.actuators):
+        ends = [place for place, order, _ in actuator.displacement_map() if order == 1]
+        if ends and all(is_concrete(x) for x in (sensor.position, *ends)):
+            left, right = (concrete(edge(*map(concrete, ends))) for edge in (min, max))
+            if left <= concrete(sensor.position) <= right:
+                raise ValueError(
+                    f"{address} reads the {sensor.quantity} of a section on which actuators.{i}"
+                    " acts, which no controller can use: measure its strain or curvature, or move"
+                    " the sensor"
+                )
 
 
 def _sampled_features(case: Case) -> Iterator[str]:

@@ -10,21 +10,21 @@ from typing import NoReturn
 from cyclopts import App, CycloptsError, Group, Parameter
 
 from jaxbeam.cli.compare import compare
+from jaxbeam.cli.describe import describe
 from jaxbeam.cli.export import export
 from jaxbeam.cli.frequency import frf, modes
 from jaxbeam.cli.identify import identify
 from jaxbeam.cli.models import compare_models, design_experiment
-from jaxbeam.cli.native import native
 from jaxbeam.cli.options import print_message
 from jaxbeam.cli.simulate import simulate
 from jaxbeam.cli.stability import stability
-from jaxbeam.cli.sweep import sweep
+from jaxbeam.cli.sweep import native, sweep
 from jaxbeam.cli.thesis import demo, reproduce
 from jaxbeam.cli.tune import tune
 from jaxbeam.cli.weigh import identify_responses, weigh
 
 COMMANDS = {
-    "Simulation": (modes, frf, simulate, sweep),
+    "Simulation": (modes, frf, simulate, sweep, describe),
     "Control": (compare, stability, tune, export),
     "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
     "Other": (demo, reproduce, native),

@@ -51,11 +51,11 @@ def named_numbers(
         raise ValueError(f"{option} takes {form}, such as {example}, not {text!r}") from None
 
 
-def parse_sweep_values(texts: Iterable[str]) -> dict[str, list[float]]:
-    """Values by address of ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...
+def parse_sweep_values(texts: Iterable[str]) -> dict[str, list[float] | list[str]]:
+    """Values by address of ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,..., numbers or all words.
 
-    Raises ValueError if they are no numbers, if a range has too many, or if an address is named
-    twice.
+    Raises ValueError for numbers among words, if a range has too many numbers, or if an address is
+    named twice.
     """
     values = {}
     for text in texts:
@@ -65,7 +65,11 @@ def parse_sweep_values(texts: Iterable[str]) -> dict[str, list[float]]:
         if ":" in value:
             values[address] = _range_values(text, value)
         else:
-            values[address] = _parse_numbers("--over", text, value.split(","))
+            entries = value.split(",")
+            is_word = [bool(entry) and isinstance(parse_value(entry), str) for entry in entries]
+            values[address] = entries
+            if not all(is_word):
+                values[address] = _parse_numbers("--over", text, entries)
     return values
 
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import jaxbeam as jb
+from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.cli.arguments import check_suffix, parse_sweep_values, refuse_option
 from jaxbeam.cli.options import CaseOptions, Output, Over, table
-from jaxbeam.files.toml_file import read_toml
 
 if TYPE_CHECKING:
     from jaxbeam.analysis.compare import Comparison, MetricsOverCases, PerformanceMetrics

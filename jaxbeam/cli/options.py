@@ -15,9 +15,9 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 import jaxbeam as jb
+from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.cli.arguments import parse_assignment, parse_value
 from jaxbeam.files.report import text_table
-from jaxbeam.files.toml_file import read_toml
 
 Output = Annotated[Path | None, Parameter(("-o", "--output"))]
 Free = Annotated[
@@ -27,8 +27,8 @@ Free = Annotated[
 Over = Annotated[
     tuple[str, ...],
     Parameter(
-        help="ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: values of a parameter; all"
-        " combinations are computed if it is repeated for more."
+        help="ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: values of a parameter, or words, as"
+        " loads.0.train=HSLM-A1,HSLM-A2; all combinations are computed if it is repeated for more."
     ),
 ]
 Starts = Annotated[

@@ -1,11 +1,14 @@
 """Command `simulate`: one run of a case."""
 
+import re
 import warnings
 from pathlib import Path
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix, figure_path
 from jaxbeam.cli.options import CaseOptions, Output, table
+
+MAX_WHEELS = 8  # of a load, or bodies, with a row each
 
 
 def simulate(
@@ -17,7 +20,7 @@ def simulate(
     animate: Path | None = None,
     options: CaseOptions = CaseOptions(),
 ) -> None:
-    """Simulate a case: peak deflections, contact forces, commands; the whole record on request.
+    """Simulate a case: peaks at sensors, contact forces, commands; the whole record on request.
 
     Parameters
     ----------
@@ -56,13 +59,34 @@ def simulate(
 
 def _to_dict(record: "jb.Record") -> dict:
     """Numbers of a record by their names in JSON (SI units)."""
+    from jaxbeam.case.sensors import sensor_labels
+
+    sensors = record.case.sensors
+    peaks = zip(sensors, record.peak_deflection, strict=True)
     content = {
-        "peak_deflection": record.peak_deflection,
+        "sensors": [
+            {"name": label, "quantity": s.quantity, "unit": s.unit, "position": s.position}
+            | extremes
+            for label, s, extremes in zip(
+                sensor_labels(sensors), sensors, _extremes_of_sensors(record), strict=True
+            )
+        ],
+        # None at sensors of other quantities.
+        "peak_deflection": [peak if s.quantity == "deflection" else None for s, peak in peaks],
         "lowest_contact_force": record.lowest_contact_force,
+        "wheel_unloading": jb.wheel_unloading(record),
         "contact_lost_time": record.contact_lost_time,
         "error_estimate": record.error_estimate,
         "steps": record.steps,
     }
+    ride = _ride(record)
+    if ride is not None:
+        content["ride"] = {
+            "body": ride.bodies,
+            "weighted_rms": ride.weighted_rms,
+            "vibration_dose": ride.vibration_dose,
+            "sperling_index": ride.sperling_index,
+        }
     if record.case.controller is not None:
         content |= {
             "peak_command": record.peak_command,
@@ -72,18 +96,102 @@ def _to_dict(record: "jb.Record") -> dict:
     return content | {"verdict": record.verdict}
 
 
+def _extremes_of_sensors(record: "jb.Record") -> list[dict[str, float]]:
+    """Smallest and largest value of each sensor and their times, by name."""
+    names, columns = zip(*record.extremes._asdict().items(), strict=True)
+    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def _wheel_lines(record: "jb.Record") -> list[str]:
+    """Table of contact forces by wheel; of loads of many wheels the one unloaded most."""
+    import numpy as np
+
+    from jaxbeam.model.load_set import load_set
+    from jaxbeam.simulation.labels import wheel_labels
+
+    loads, labels = load_set(record.case), wheel_labels(record.case)
+    static, lowest = np.asarray(loads.weight)[:, 0], np.asarray(record.lowest_contact_force)
+    unloading = np.asarray(jb.wheel_unloading(record))
+    load_of_wheel, rows = np.array(loads.load_of_wheel), []
+    for load in np.unique(load_of_wheel):
+        wheels = np.flatnonzero(load_of_wheel == load)
+        if wheels.size > MAX_WHEELS:
+            worst = wheels[np.argmax(np.nan_to_num(unloading[wheels], nan=-np.inf))]
+            names = [f"{labels[worst]}, lowest of {wheels.size}"]
+            wheels = np.array([worst])
+        else:
+            names = [str(labels[i]) for i in wheels]
+        rows += [
+            (name, f"{static[i]:.6g}", f"{lowest[i]:.6g}", _percent(unloading[i]))
+            for name, i in zip(names, wheels, strict=True)
+        ]
+    header = ("load", "static load (N)", "lowest contact force (N)", "unloading")
+    return table(header, rows)
+
+
+def _percent(share: float) -> str:
+    if share > 1:
+        return "would lift"
+    return "-" if share != share else f"{max(share, 0.0):.1%}"
+
+
+def _body_lines(record: "jb.Record") -> list[str]:
+    """Table of motions and ride measures by body; of many vehicles the largest of each."""
+    import numpy as np
+
+    names = record.bodies
+    if not names:
+        return []
+    motion = np.max(np.abs(record.body_displacement), axis=0)
+    shaking = np.max(np.abs(record.body_acceleration), axis=0)
+    columns = {name: [motion[i], shaking[i]] for i, name in enumerate(names)}
+    ride = _ride(record)
+    if ride is not None:
+        measures = ride.weighted_rms, ride.vibration_dose, ride.sperling_index
+        for name, *values in zip(ride.bodies, *measures, strict=True):
+            columns[name] += values
+    heights = {name: row for name, row in columns.items() if not name.endswith(" pitch")}
+    if len(heights) > MAX_WHEELS:
+        largest: dict[str, list] = {}
+        for name, row in heights.items():
+            key = re.sub(r" vehicle \d+", "", name)
+            largest[key] = np.maximum(largest.get(key, row), row).tolist()
+        heights = {f"{name}, largest": row for name, row in largest.items()}
+    header = ("body", "displacement (m)", "acceleration (m/s^2)")
+    if ride is not None:
+        header += ("W_k rms (m/s^2)", "VDV (m/s^1.75)", "Sperling W_z")
+    rows = [(name, *(f"{v:.4g}" for v in row)) for name, row in heights.items()]
+    return table(header, rows)
+
+
+def _ride(record: "jb.Record") -> "jb.RideMeasures | None":
+    """Ride measures of the bodies, None without any or with too few samples a second for them."""
+    if not record.bodies or float(record.case.run.sample_rate) < 160:
+        return None
+    return jb.ride_measures(record)
+
+
 def _lines(record: "jb.Record") -> list[str]:
-    peaks = zip(record.case.sensors, record.peak_deflection, strict=True)
+    sensors = record.case.sensors
+    rows = [
+        (
+            sensor.name or str(i),
+            f"{sensor.position:.4g}",
+            f"{sensor.quantity} ({sensor.unit})" if sensor.unit != "1" else sensor.quantity,
+            *(f"{extremes[name]:.6g}" for name in ("smallest", "smallest_time")),
+            *(f"{extremes[name]:.6g}" for name in ("largest", "largest_time")),
+        )
+        for i, (sensor, extremes) in enumerate(
+            zip(sensors, _extremes_of_sensors(record), strict=True)
+        )
+    ]
     lines = [
         record.verdict,
         *table(
-            ("sensor", "position (m)", "peak deflection (m)"),
-            [(i, f"{s.position:.4g}", f"{peak:.6g}") for i, (s, peak) in enumerate(peaks)],
+            ("sensor", "position (m)", "quantity", "smallest", "at (s)", "largest", "at (s)"), rows
         ),
-        *table(
-            ("load", "lowest contact force (N)"),
-            [(i, f"{force:.6g}") for i, force in enumerate(record.lowest_contact_force)],
-        ),
+        *_wheel_lines(record),
+        *_body_lines(record),
     ]
     if record.case.controller is not None:
         rows = zip(record.peak_command, record.effort, record.saturated.mean(axis=0), strict=True)

@@ -1,4 +1,4 @@
-"""Command `sweep`: many runs of a case."""
+"""Commands about many runs of a case: `sweep`, and `native`, the optional C code for it."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -7,8 +7,13 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import check_suffix, parse_sweep_values, refuse_option
-from jaxbeam.cli.options import CaseOptions, Output, Over, table
+from jaxbeam.cli.arguments import (
+    check_suffix,
+    figure_path,
+    parse_sweep_values,
+    refuse_option,
+)
+from jaxbeam.cli.options import CaseOptions, Output, Over, PrintOptions, table
 
 
 def sweep(
@@ -21,6 +26,7 @@ def sweep(
     resume: bool = False,
     scheduler: str | None = None,
     precision: str = "double",
+    plot: bool = False,
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case for many values of some of its parameters.
@@ -40,6 +46,9 @@ def sweep(
         store must be in a folder that all workers see.
     precision
         double, or single: half the bits, errors of a few parts in a million.
+    plot
+        Draw the peaks to a PNG beside the store, or to CASE_sweep.png in this folder: trains over
+        speed with resonance speeds, other parameters as curves or maps.
     """
     values = parse_sweep_values(over)
     refuse_option(
@@ -49,8 +58,13 @@ def sweep(
         bool(scheduler) and not output, "--scheduler needs a store for the results: -o OUT.zarr"
     )
     check_suffix(output, ".zarr", "a sweep")
+    picture = figure_path(output, case.with_stem(f"{case.stem}_sweep")) if plot else None
+    refuse_option(
+        plot and not 0 < sum(len(given) > 1 for given in values.values()) < 3,
+        "--plot draws peaks over one or two parameters with several values; leave it out",
+    )
     if not resume:
-        options.check_outputs(output)
+        options.check_outputs(output, picture)
     parsed_case = options.read(case)
 
     from jaxbeam.sweeps.cluster import connect
@@ -67,24 +81,55 @@ def sweep(
             precision=precision,
             client=client,
         )
-    peaks = results["peak_deflection"]
+    if picture:
+        from jaxbeam.plot import plot_sweep
+
+        plot_sweep(results).savefig(picture)
+    peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
+    del peaks["peak_time"]
+    numbers = {name: found.to_numpy() for name, found in peaks.items()}
+    dimensions = results["peak_time"].dims
     options.report(
-        {"values": values, "dimensions": peaks.dims, "peak_deflection": peaks.to_numpy()},
-        _lines(peaks, values),
+        {"values": values, "dimensions": dimensions, **numbers},
+        _lines(parsed_case, peaks, results["failed"], values),
         output,
+        picture,
     )
 
 
-def _lines(peaks, values) -> list[str]:
+def _lines(case: "jb.Case", peaks, failed, values) -> list[str]:
     """Number of runs, and the largest peak at each sensor with the parameters of its run."""
     rows = []
-    for i in range(peaks.sizes["sensor"]):
-        at_sensor = peaks.isel(sensor=i)
+    for i, sensor in enumerate(case.sensors):
+        at_sensor = peaks[f"peak_{sensor.quantity}"].isel(sensor=i)
         largest = at_sensor.isel(at_sensor.fillna(-1.0).argmax(...))
-        parameters = [f"{float(largest[address]):.6g}" for address in values]
-        rows.append((i, f"{float(largest):.6g}", *parameters))
-    failed = peaks.isnull().any("sensor")
+        own = [largest[address].item() for address in values]
+        parameters = [value if isinstance(value, str) else f"{value:.6g}" for value in own]
+        unit = f" ({sensor.unit})" if sensor.unit != "1" else ""
+        quantity = f"{sensor.quantity}{unit}"
+        rows.append((sensor.name or i, quantity, f"{float(largest):.6g}", *parameters))
     return [
         f"{failed.size} runs, {int(failed.sum())} failed; the largest peak at each sensor:",
-        *table(("sensor", "peak deflection (m)", *(f"at {name}" for name in values)), rows),
+        *table(("sensor", "quantity", "peak", *(f"at {name}" for name in values)), rows),
     ]
+
+
+def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:
+    """Compile the C code for this machine, once; sweeps of peaks use it from then on.
+
+    Needs a C compiler.
+
+    Parameters
+    ----------
+    remove
+        Remove the compiled code; sweeps use XLA again.
+    """
+    from jaxbeam.integrator import native_peaks
+
+    if remove:
+        path = native_peaks.LIBRARY.remove()
+        line = f"removed {path}: sweeps use XLA"
+    else:
+        path = native_peaks.LIBRARY.build()
+        line = f"compiled {path}: sweeps on this machine use it from now on"
+    options.report({"path": str(path), "compiled": not remove}, [line])

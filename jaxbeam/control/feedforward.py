@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
-from jaxbeam.case.loads import trajectory
+from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.runtime.arrays import Array, xp
 

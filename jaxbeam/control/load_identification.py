@@ -131,7 +131,8 @@ def identified_load(record: Any, settings: LoadIdentification) -> IdentifiedLoad
     if error is not None:
         raise ValueError(f"load_identification.{error}")
     mass, speed = (float(value) for value in _replay(settings, case, mesh_layout(case), record))
-    true_mass, true_speed = float(case.loads[0].mass), float(case.loads[0].speed)
+    load = case.loads[0]
+    true_mass, true_speed = float(load.total_mass(case.run.gravity)), float(load.speed)
     return IdentifiedLoad(mass, speed, mass / true_mass - 1, speed / true_speed - 1)
 
 

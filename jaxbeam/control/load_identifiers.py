@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import Measurement, Time
+from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.module import Module
 
@@ -60,9 +61,12 @@ class GivenLoad(AbstractLoadSource):
         return LoadEstimate(self.mass, self.speed, self.entry_time, true, true), state
 
 
-def given_load(load: Any) -> GivenLoad:
-    """Load of a case as given; speed and entry time are NaN for a table of positions."""
-    numbers = load.mass, load.speed, load.entry_time
+def given_load(load: AbstractLoad, gravity: Float[Array, ""]) -> GivenLoad:
+    """Load of a case as given; speed and entry time are NaN for a table of positions.
+
+    That of a vehicle is its total mass, entering with its first wheel.
+    """
+    numbers = load.total_mass(gravity), load.speed, load.entry_time
     return GivenLoad(*(xp.asarray(xp.nan if x is None else x) for x in numbers))
 
 

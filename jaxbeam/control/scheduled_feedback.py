@@ -48,7 +48,7 @@ class ScheduledFeedback(AbstractController):
     )
 
     def validate(self, case):
-        if len(case.loads) != 1 or case.loads[0].mass is None:
+        if len(case.loads) != 1 or case.loads[0].total_mass(case.run.gravity) is None:
             return "kind needs a single load, with a mass; or take kind 'feedback'"
         if self.masses.size == 0 or (
             is_concrete(self.masses) and np.any(concrete(self.masses) <= 0)
@@ -63,7 +63,7 @@ class ScheduledFeedback(AbstractController):
 
     def design_law(self, plant):
         if self.load_identification is None:
-            source = given_load(plant.case.loads[0])
+            source = given_load(plant.case.loads[0], plant.case.run.gravity)
         else:
             source = self.load_identification.identifier(plant, plant)
         return ScheduledFeedbackLaw(

@@ -22,7 +22,7 @@ from jaxbeam.control.state_law import (
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.output_rows import modal_row
+from jaxbeam.model.sensing.output_rows import modal_row
 from jaxbeam.model.state_space import Plant, build_plant, state_space
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
@@ -152,5 +152,6 @@ def deflection_rows(
     plant: Plant, positions: Float[Array, " position"]
 ) -> Float[Array, "position state"]:
     """Rows that map the states of a plant to the deflections at positions (m)."""
-    rows = modal_row(plant.modal_model.shapes, positions, "deflection") / plant.coordinate_scale
+    rows = modal_row(plant.modal_model.shapes, plant.case, positions, "deflection")
+    rows = rows / plant.coordinate_scale
     return xp.pad(rows, ((0, 0), (0, plant.modal_model.state_count - rows.shape[1])))

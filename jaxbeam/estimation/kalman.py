@@ -76,7 +76,7 @@ class Kalman(AbstractEstimator):
     def sampled_filter(self, plant, timing):
         filtered = filtered_plant(plant)
         filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
-        states, loads = intensity.shape[0], len(plant.case.loads)
+        states, loads = intensity.shape[0], plant.weights.shape[0]
         variance, scale = self.reading_variance(plant), balance(filtered_model.unloaded.A)
         plant_states = plant.modal_model.state_count
         if self.loads == "ignored":
@@ -105,7 +105,7 @@ class Kalman(AbstractEstimator):
         filtered, count = filtered_plant(plant), len(plant.case.sensors)
         filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
         noise = xp.diag(xp.broadcast_to(self.measurement_intensity, (count,)))
-        states, loads = intensity.shape[0], len(plant.case.loads)
+        states, loads = intensity.shape[0], plant.weights.shape[0]
         offset, plant_states = sensor_offsets(plant), plant.modal_model.state_count
         zero_state = xp.zeros(states)
         if self.loads == "ignored":
@@ -119,9 +119,7 @@ class Kalman(AbstractEstimator):
             plant = filtered.with_filtered_outputs(filtered_model.augmented(end - time_to_end))
             return plant.A.T, plant.C.T
 
-        crossing_times = xp.array(
-            [path.entry_exit_times() for path in filtered_model.loads.trajectories]
-        ).reshape(-1)
+        crossing_times = filtered_model.loads.entry_exit_times().reshape(-1)
         events = xp.concatenate([xp.zeros(1), xp.clip(crossing_times, 0.0, end), end[None]])
         initial_covariance = xp.diag(xp.append(zero_state, self.weight_variance(plant)))
         Q = xp.pad(intensity, (0, loads))
@@ -140,7 +138,7 @@ class Kalman(AbstractEstimator):
 
     def weight_variance(self, plant: Plant) -> Float[Array, " load"]:
         """Variance of the weights of the loads (N^2) at the start; zero where they are known."""
-        loads = len(plant.case.loads)
+        loads = plant.weights.shape[0]
         if self.weight_deviation is None:
             return xp.zeros(loads)
         return xp.broadcast_to(self.weight_deviation**2, (loads,))

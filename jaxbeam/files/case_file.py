@@ -7,18 +7,24 @@ Keys follow from the fields of the classes, kinds from the classes that declare 
 import dataclasses
 import inspect
 import os
+from pathlib import Path
 from typing import Any
 
 import tomli_w
 
-from jaxbeam.case.aliases import current_address, current_keys, current_kind
-from jaxbeam.case.case import Case, part_classes, unknown_address_error
+from jaxbeam.case.aliases import current_address
+from jaxbeam.case.case import Case, list_sizes, part_classes, unknown_address_error
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.declared_checks import check_field, describe_value, missing_error, suggestion
-from jaxbeam.case.fields import concrete, describe_shape, fits_shape
-from jaxbeam.case.kinds import import_modules, kind_of, kinds
+from jaxbeam.case.declared_checks import describe_value, suggestion
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.joint_addresses import each_address
+from jaxbeam.case.kinds import import_modules, kind_of
+from jaxbeam.case.loads.planar.files import is_path
+from jaxbeam.case.loads.vehicle import IMPLIED
+from jaxbeam.case.reading.parts import read_part, read_parts
+from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.case.validation import check_case
-from jaxbeam.files.toml_file import read_toml
+from jaxbeam.files.profile_file import with_profile_file
 
 for package in ("jaxbeam.case", "jaxbeam.control", "jaxbeam.estimation"):
     import_modules(package)
@@ -27,16 +33,29 @@ for package in ("jaxbeam.case", "jaxbeam.control", "jaxbeam.estimation"):
 def load_case(path: str | os.PathLike) -> Case:
     """The validated case of a TOML file.
 
+    A profile of kind "table" may have its points in a file of their own, `file = "profile.csv"`,
+    relative to the folder of the case file (see `profile_from_file`).
+
     Raises ValueError, with the file and the address or line, for invalid TOML, unknown keys or
     kinds, wrong types and the errors of `check_case`; OSError if the file cannot be read.
     """
     content = read_toml(path)
+    _find_vehicle_files(content, Path(path).parent)
     try:
-        case = case_from_dict(content)
+        case = case_from_dict(with_profile_file(content, path))
         check_case(case)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return case
+
+
+def _find_vehicle_files(content: dict[str, Any], folder: Path) -> None:
+    """Paths of vehicle files, which are relative to the case file, as they are from here."""
+    loads = content.get("loads")
+    for table in loads if isinstance(loads, list) else ():
+        model = table.get("model") if isinstance(table, dict) else None
+        if isinstance(model, str) and is_path(model):
+            table["model"] = str(folder / model)
 
 
 def load_controller(path: str | os.PathLike) -> AbstractController:
@@ -50,7 +69,7 @@ def load_controller(path: str | os.PathLike) -> AbstractController:
         if "controller" not in content:
             raise ValueError("has no controller; write a table [controller]")
         if set(content) - {"title", "controller"}:
-            case_from_dict(content)  # to validate the other tables
+            case_from_dict(with_profile_file(content, path))  # to validate the other tables
         return _read_key("controller", content["controller"])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -101,43 +120,53 @@ def _read_key(key: str, value: Any) -> Any:
         if not isinstance(value, dict):
             raise ValueError(f"{key} must be one table; write [{key}]")
         return read_part(key, value, part_class)
-    if not isinstance(value, list) or not all(isinstance(table, dict) for table in value):
-        raise ValueError(f"{key} must be a list of tables; write [[{key}]]")
-    return tuple(read_part(f"{key}.{i}", table, part_class) for i, table in enumerate(value))
+    return read_parts(key, value, part_class)
 
 
-def case_to_dict(case: Case) -> dict[str, Any]:
+def case_to_dict(case: Case, whole: bool = False) -> dict[str, Any]:
     """Tables of a case file for a case; optional numbers that are None are left out.
 
-    Raises ValueError if a part has no kind, though its table needs one.
+    So is what a word implies, as the numbers of a vehicle of the library, unless the `whole` case
+    is asked for. Raises ValueError if a part has no kind, though its table needs one.
     """
     content: dict[str, Any] = {"title": case.title} if case.title else {}
     for key, (part_class, listed) in part_classes().items():
         value = getattr(case, key)
         if listed and value:
             content[key] = [
-                _write_part(f"{key}.{i}", part, part_class) for i, part in enumerate(value)
+                _write_part(f"{key}.{i}", part, part_class, whole) for i, part in enumerate(value)
             ]
         elif not listed and value is not None:
-            content[key] = _write_part(key, value, part_class)
+            content[key] = _write_part(key, value, part_class, whole)
     return content
 
 
 def with_settings(case: Case, settings: dict[str, Any]) -> Case:
     """A validated copy of a case with other entries at some addresses, as in its case file.
 
-    Unlike `case.replace` it also sets words, counts and optional numbers that were left out; values
-    are concrete (SI units), not traced. Raises ValueError for an address that no case file could
-    have, and for the errors of `check_case`.
+    Unlike `case.replace` it also sets words, counts and optional numbers that were left out, those
+    of all loads at `loads.*.train`, say; values are concrete (SI units), not traced. Raises
+    ValueError for an address that no case file could have, and for the errors of `check_case`.
     """
-    content = case_to_dict(case)
-    for address, value in settings.items():
-        *path, last = current_address(address).split(".")
+    content, whole = case_to_dict(case), case_to_dict(case, whole=True)
+    each = [
+        (one, value)
+        for address, value in settings.items()
+        for one in each_address(current_address(address), list_sizes(case))
+    ]
+    for address, value in each:
+        *path, last = address.split(".")
         node: Any = content
+        implied: Any = whole
         for key in path:
+            implied = _child(implied, key)
+            if isinstance(node, dict) and key not in node and implied is not None:
+                node[key] = implied  # an entry of what a word implies
             node = _child(node, key)
         if isinstance(node, dict):
             node[last] = value
+            for name in IMPLIED.get(last, ()) if path[:1] == ["loads"] else ():
+                node.pop(name, None)
         elif _child(node, last) is not None:
             node[int(last)] = value
         else:
@@ -156,70 +185,10 @@ def _child(node: Any, key: str) -> Any:
     return None
 
 
-def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
-    """The part of a case that a table describes.
-
-    `part_class` is its class, or an abstract class of which the table's `kind` names a subclass.
-    Raises ValueError, with the address, as `case_from_dict` does.
-    """
-    values = dict(table)
-    if inspect.isabstract(part_class):
-        part_class = _class_of_kind(address, values.pop("kind", None), part_class)
-    fields = {field.name: field for field in dataclasses.fields(part_class) if field.metadata}
-    values = current_keys(address, values, fields)
-    for key, value in values.items():
-        if key not in fields:
-            raise ValueError(
-                f"{address} has no key {describe_value(key)}; {suggestion(key, fields)}"
-            )
-        inner_class = fields[key].metadata.get("part")
-        if inner_class is not None and isinstance(value, dict):
-            values[key] = read_part(f"{address}.{key}", value, inner_class)
-        else:
-            _check_type(f"{address}.{key}", value, fields[key])
-    for name, field in fields.items():
-        if field.default is dataclasses.MISSING and name not in values:
-            raise missing_error(f"{address}.{name}", field)
-    return part_class(**values)
-
-
-def _class_of_kind(address: str, kind: Any, family: type) -> type:
-    classes = kinds(family)
-    if kind is None:
-        raise ValueError(f"{address}.kind is missing; it may be {', '.join(classes)}")
-    if isinstance(kind, str) and kind not in classes:
-        kind = current_kind(address, kind)
-    if not isinstance(kind, str) or kind not in classes:
-        hint = suggestion(str(kind), classes)
-        raise ValueError(f"{address}.kind cannot be {describe_value(kind)}; {hint}")
-    return classes[kind]
-
-
-def _check_type(address: str, value: Any, field: dataclasses.Field) -> None:
-    """Validate the entry of a field in a file, before it becomes an array."""
-    if "unit" not in field.metadata:
-        check_field(address, value, field)
-        return
-    shape = _shape(value)
-    if shape is None or not fits_shape(field, shape):
-        raise ValueError(f"{address} must be {describe_shape(field)}, not {describe_value(value)}")
-
-
-def _shape(value: Any) -> tuple[int, ...] | None:
-    """Shape of a number or of nested lists of numbers; None for anything else.
-
-    A whole number that is too large for a float is not a number here.
-    """
-    if not isinstance(value, list):
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        return () if is_number and (isinstance(value, float) or abs(value) < 2**1023) else None
-    shapes = {_shape(entry) for entry in value} or {()}
-    entry_shape = shapes.pop()
-    return None if shapes or entry_shape is None else (len(value), *entry_shape)
-
-
-def _write_part(address: str, part: Any, part_class: type) -> dict[str, Any]:
+def _write_part(address: str, part: Any, part_class: type, whole: bool = False) -> dict[str, Any]:
+    """Table of a part; `whole`: with what follows from other entries of it, too."""
     table = {}
+    implied = () if whole else getattr(part, "implied_fields", tuple)()
     if inspect.isabstract(part_class):
         kind = kind_of(type(part))
         if kind is None:
@@ -230,7 +199,7 @@ def _write_part(address: str, part: Any, part_class: type) -> dict[str, Any]:
         table["kind"] = kind
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
-        if value is None:
+        if value is None or field.name in implied or (isinstance(value, str | tuple) and not value):
             continue
         if not field.metadata:
             raise ValueError(f"{address}.{field.name} is no key of a case file; leave it out")
@@ -238,6 +207,12 @@ def _write_part(address: str, part: Any, part_class: type) -> dict[str, Any]:
             value = concrete(value).tolist()
         elif "part" in field.metadata:
             value = _write_part(f"{address}.{field.name}", value, field.metadata["part"])
+        elif "parts" in field.metadata:
+            inner_class = field.metadata["parts"]
+            value = [
+                _write_part(f"{address}.{field.name}.{i}", one, inner_class)
+                for i, one in enumerate(value)
+            ]
         table[field.name] = value
     return table
 
@@ -248,15 +223,24 @@ def _as_toml(case: Case) -> str:
     for key, value in content.items():
         if isinstance(value, list):
             for part, table in zip(getattr(case, key), value, strict=True):
-                blocks.append(_toml_block(f"[[{key}]]", part, table))
+                blocks.append(_toml_block(key, part, table, listed=True))
         else:
-            blocks.append(_toml_block(f"[{key}]", getattr(case, key), value))
+            blocks.append(_toml_block(key, getattr(case, key), value))
     return "\n".join(blocks)
 
 
-def _toml_block(header: str, part: Any, table: dict[str, Any]) -> str:
-    units = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(part)}
-    return header + "\n" + "".join(_toml_line(key, table[key], units.get(key, "")) for key in table)
+def _toml_block(key: str, part: Any, table: dict[str, Any], listed: bool = False) -> str:
+    """Table of a part, followed by those of the parts in it."""
+    fields = {field.name: field.metadata for field in dataclasses.fields(part)}
+    inner = [name for name in table if "parts" in fields.get(name, {})]
+    text = f"[[{key}]]\n" if listed else f"[{key}]\n"
+    for name in table:
+        if name not in inner:
+            text += _toml_line(name, table[name], fields.get(name, {}).get("unit", ""))
+    for name in inner:
+        for one, inner_table in zip(getattr(part, name), table[name], strict=True):
+            text += _toml_block(f"{key}.{name}", one, inner_table, listed=True)
+    return text
 
 
 def _toml_line(key: str, value: Any, unit: str = "") -> str:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.validation import check_case
-from jaxbeam.model.contact import LoadSet, load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled
@@ -81,11 +81,8 @@ def simulate_adaptive(
 
 def _event_times(model: ModalModel, loads: LoadSet, end: float) -> tuple[np.ndarray, np.ndarray]:
     """Entry and exit of each load (load, 2), and the boundaries of legs without events, in s."""
-    windows = np.array([path.entry_exit_times() for path in loads.trajectories]).reshape(-1, 2)
-    nonsmooth_times = [
-        np.asarray(path.passage_times(model.modes.nodes)) for path in loads.trajectories
-    ]
-    event_times = np.concatenate([windows.ravel(), *nonsmooth_times])
+    windows = np.asarray(loads.entry_exit_times())
+    event_times = np.append(windows, loads.passage_times(model.modes.nodes))
     boundaries = np.unique(
         np.concatenate([[0.0, end], event_times[(event_times > 0) & (event_times < end)]])
     )

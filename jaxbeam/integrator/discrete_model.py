@@ -1,26 +1,28 @@
-"""Discrete model: modal model on a time grid, with rows of monitored deflections."""
+"""Discrete model: modal model on a time grid, with rows of monitored outputs."""
 
 import dataclasses
 import operator
 from collections.abc import Callable
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
+from jaxbeam.integrator.monitored_rows import largest_per_energy, monitored_rows
 from jaxbeam.integrator.propagators import PEAK_NODES, Propagators, propagators
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.runtime.arrays import Array, solve_triangular, xp
+from jaxbeam.model.sensing.output_rows import OutputRows
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class DiscreteModel(eqx.Module):
-    """Modal model on a time grid: propagators of each step length, rows of monitored deflections.
+    """Modal model on a time grid: propagators of each step length, rows of monitored outputs.
 
-    `flexibility` is the static deflection (m/N) at each monitored position under a unit force
-    there; it bounds the deflection by the energy. With `with_node_states`, step matrices include
-    the states at the nodes. Peaks are those of the `magnitude` of a deflection, by default its
+    Outputs are deflections, or other quantities of sensors. `flexibility` bounds each of them by
+    the energy: output^2 <= flexibility (q'^2 + q K q), for a deflection the static deflection (m/N)
+    under a unit force there. With `with_node_states`, step matrices include
+    the states at the nodes. Peaks are those of the `magnitude` of an output, by default its
     absolute value.
     """
 
@@ -45,69 +47,36 @@ def discrete_model(
     grid: TimeGrid,
     positions: Float[Array, " position"] | None,
     policy: AbstractInputPolicy | None = None,
+    outputs: OutputRows | None = None,
 ) -> DiscreteModel:
     """Modal model on a time grid, with deflections monitored at `positions` (m), if any.
 
-    An input policy adds the commands, and the states at the nodes if it is implicit.
+    An input policy adds the commands, and the states at the nodes if it is implicit. `outputs` are
+    monitored in place of the deflections: sums of the modes, accelerations with the forces.
     """
     with_commands = policy is not None
     with_node_states = policy is not None and policy.implicit
     step_propagators = propagators(model, grid.lengths, with_commands)
     modes_per_block = model.modes_per_block
     commands = model.command_matrix[1 : 2 * modes_per_block : 2] if with_commands else None
-    if positions is None:
+    if positions is None and outputs is None:
         return DiscreteModel(
             model, grid, step_propagators, None, None, None, commands, with_node_states
         )
-    blocks = model.state_matrix.shape[0]
-    shapes = model.shapes(positions, (0,))[0]
-    rows = shapes.reshape(-1, blocks, modes_per_block)
-    transitions, force_responses = _peak_node_rows(
-        step_propagators, np.arange(0, 2 * modes_per_block, 2)
-    )
-    deflection_transition = xp.einsum("wbm,lpbmj->lpwbj", rows, transitions)
-    deflection_force_response = xp.einsum("wbm,lpfbmk->lpwfbk", rows, force_responses)
-    flat_shape = (grid.lengths.shape[0], -1)
+    if outputs is None:
+        shapes = model.shapes(positions, (0,))[0]
+        outputs = OutputRows(shapes, xp.zeros((shapes.shape[0], 0)), (0,) * shapes.shape[0])
+    transition, force_response = monitored_rows(model, step_propagators, outputs, commands)
     return DiscreteModel(
         model,
         grid,
         step_propagators,
-        deflection_transition.reshape(*flat_shape, *deflection_transition.shape[3:]),
-        deflection_force_response.reshape(*flat_shape, *deflection_force_response.shape[3:]),
-        _static_flexibility(model, shapes),
+        transition,
+        force_response,
+        largest_per_energy(model, outputs),
         commands,
         with_node_states,
     )
-
-
-def _peak_node_rows(propagators: Propagators, rows):
-    """Rows of the propagators (length, sample, ...) at the peak nodes of a step."""
-    identity = xp.broadcast_to(
-        xp.eye(propagators.transition_end.shape[-1]), propagators.transition_end.shape
-    )
-    transitions = xp.concatenate(
-        [identity[:, None], propagators.transition_nodes, propagators.transition_end[:, None]],
-        axis=1,
-    )
-    force_responses = (
-        xp.zeros_like(propagators.input_end)[:, None],
-        propagators.input_nodes,
-        propagators.input_end[:, None],
-    )
-    return transitions[..., rows, :], xp.concatenate(force_responses, axis=1)[..., rows, :]
-
-
-def _static_flexibility(
-    model: ModalModel, shapes: Float[Array, "position mode"]
-) -> Float[Array, " position"]:
-    """Static deflection (m/N) at positions under a unit force; infinite with rigid-body modes.
-
-    Uncoupled modes need no factorisation, which would dominate the time.
-    """
-    if model.modes_per_block == 1:
-        return xp.sum(shapes**2 / -model.state_matrix[:, 1, 0], axis=1)
-    half_solved = solve_triangular(xp.linalg.cholesky(model.stiffness()), shapes.T, lower=True)
-    return xp.sum(half_solved**2, axis=0)
 
 
 def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:

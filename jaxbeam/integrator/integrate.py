@@ -15,20 +15,25 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.loads import AbstractLoad, MovingMass
+from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
+from jaxbeam.integrator.input_steps import advance_known_with_inputs, step_with_inputs
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.running_peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.step import (
     CHECKPOINT_NAME,
-    advance,
     advance_unforced,
-    contact_forces,
-    known_maps,
 )
 from jaxbeam.integrator.step_matrices import LoadPath, chunk_length, load_path, step_matrices
-from jaxbeam.model.contact import LoadSet
+from jaxbeam.integrator.vehicles.propagators import vehicle_state_norm
+from jaxbeam.integrator.vehicles.steps import (
+    StepInput,
+    VehicleStep,
+    initial_vehicle_states,
+    vehicles_of,
+)
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (
     Array,
@@ -47,85 +52,62 @@ from jaxbeam.runtime.arrays import (
 # Largest phase (rad) of the highest mode in a step. Beyond twice the number of nodes, the contact
 # force of a mass, a polynomial in each step, cannot follow that mode's oscillation and excites it.
 MAX_PHASE_PER_STEP = 1.9 * NODE_COUNT
+# Largest phase (rad) of the highest mode shape that a force passes in a step. A polynomial through
+# six Gauss nodes follows a sine over this phase to 1e-7 of its amplitude.
+MAX_PASSAGE_PER_STEP = 0.64
 
 
-def max_stable_step(model: ModalModel, loads: tuple[AbstractLoad, ...]) -> Float[Array, ""]:
+def max_stable_step(model: ModalModel, loads: LoadSet) -> Float[Array, ""]:
     """Longest step (s) at which the integration of these loads on the model is stable."""
     limit = MAX_STEP_NORM / state_matrix_norm(model)
-    if any(isinstance(load, MovingMass) for load in loads):
+    limit = xp.minimum(limit, MAX_STEP_NORM / (vehicle_state_norm(loads) + 1e-30))
+    if not loads.massless:
         highest_frequency = xp.sqrt(xp.max(xp.linalg.eigvalsh(model.stiffness())))
         limit = xp.minimum(limit, MAX_PHASE_PER_STEP / highest_frequency)
     return stop_gradient(limit)
 
 
-def _step_with_inputs(policy: AbstractInputPolicy, carry, step):
-    """One step of a batch under the commands of an input policy."""
-    state, memory = carry
-    matrices, inertia, weight, info = step
+def longest_force_step(case: Case, loads: LoadSet) -> Float[Array, ""]:
+    """Longest step (s) that resolves the passage of forces over the highest mode shape.
 
-    def node_states(commands):
-        commands = collapse(commands, 0, 2)
-        forces = contact_forces(matrices, inertia, weight, state, commands)
-        node_matrices = matrices.nodes
-        node_values = (
-            node_matrices.transition @ state
-            + node_matrices.force_response @ forces
-            + node_matrices.command_response @ commands
-        )
-        return node_values.reshape(len(GAUSS_NODES), *state.shape)
-
-    node_commands, memory = policy.inputs(memory, state, info, node_states)
-    commands = collapse(node_commands, 0, 2)
-    next_state, (state, forces) = advance(state, (matrices, inertia, weight, commands))
-    # A run that diverges becomes NaN here, without affecting the others, before it overflows.
-    diverged = xp.any(~(xp.abs(next_state) <= policy.state_bound[:, None]), axis=0)
-    next_state = xp.where(diverged, xp.nan, next_state)
-    return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
-
-
-def _advance_known_with_inputs(policy, matrices, inertia, weight, infos, state, memory):
-    """Steps of known numbers under commands that do not depend on the states within a step.
-
-    Results as of a `scan` of `_step_with_inputs`; see `step.known_maps`. None if the policy
-    computes with JAX in spite of known numbers, as a law of a user may.
+    Their generalised forces are known functions of time, so no error but that of their polynomials
+    arises. Infinite for loads with inertia or springs, whose steps an error estimate decides.
     """
-    forces_map, maps = known_maps(matrices, inertia, weight)
-    steps, batch_size, state_count, columns = maps.shape
-    bound = policy.state_bound[:, None]
-    # State, commands, and one.
-    sources = np.ones((steps + 1, batch_size, columns, 1))
-    sources[0, :, :state_count, 0] = state.T
-    events, observations, held = infos.event.tolist(), [], None
-    for i in range(steps):
-        state = sources[i, :, :state_count]
-        if events[i] >= 0 or i == 0 or not policy.holds_commands:
-            info = StepInfo(infos.start[i], infos.length[i], infos.event[i])
-            node_commands, memory = policy.inputs(memory, state[..., 0].T, info, None)
-            if i == 0 and any_jax(node_commands, memory):
-                return None
-            held = collapse(node_commands, 0, 2).T[..., None]
-            observed = policy.observe(memory, info)
-        sources[i, :, state_count:-1] = held
-        observations.append(observed)
-        next_state = maps[i] @ sources[i]
-        within = np.abs(next_state) <= bound
-        if not within.all():
-            next_state = np.where(within.all(axis=1, keepdims=True), next_state, np.nan)
-        sources[i + 1, :, :state_count] = next_state
-    forces = forces_map @ sources[:-1]
-    forces, states = (np.swapaxes(part[..., 0], 1, 2) for part in (forces, sources))
-    commands = states[:-1, state_count:-1]
-    observed = jax.tree.map(lambda *parts: np.stack(parts), *observations)
-    states = states[:, :state_count]
-    return (states[-1], memory), (states[:-1], forces, commands, observed)
+    if not loads.massless or not loads.trajectories:
+        return xp.asarray(np.inf)
+    windows = xp.clip(loads.entry_exit_times(), 0.0, case.run.duration)
+    first, last = xp.min(windows[:, 0]), xp.max(windows[:, 1])
+    times = first + (last - first) * np.linspace(0.0, 1.0, 33)
+    speed = xp.max(xp.abs(loads.kinematics(times)[1]))
+    wavenumber = (case.beam.modes + 1) * np.pi / case.beam.length
+    return stop_gradient(MAX_PASSAGE_PER_STEP / (wavenumber * speed + 1e-30))
 
 
 def _values_by_row(
-    values: Float[Array, "load batch"], path: LoadPath
+    values: Float[Array, "wheel batch"], path: LoadPath
 ) -> Float[Array, "step row batch"]:
-    """A property of the loads for each row of the contact equations; zero off the beam."""
+    """A property of the wheels for each row of the contact equations; zero off the beam."""
     selected = xp.where(path.on_beam[..., None], take(values, path.loads), 0.0)
     return xp.repeat(selected, len(GAUSS_NODES), axis=1)
+
+
+def _step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> StepInput:
+    """Matrices and wheels of the steps of a chunk."""
+    inertia, weight = (_values_by_row(part, path) for part in (loads.inertia, loads.weight))
+    for wheel, history in loads.wheels.histories.items():
+        of_wheel = (path.loads == wheel) & path.on_beam
+        times = path.start[:, None] + path.length[:, None] * np.asarray(GAUSS_NODES)
+        force = history.at(times)[:, None]  # step, 1, node, batch
+        rows = xp.where(of_wheel[..., None, None], force, 0.0)
+        weight = weight + rows.reshape(*weight.shape[:2], -1)
+    if path.surface is not None:
+        by_wheel = xp.take_along_axis(path.surface[:, 2], path.loads[..., None], axis=1)
+        weight = weight + inertia * by_wheel.reshape(*by_wheel.shape[:1], -1, 1)
+    vehicle_step = None
+    if loads.wheels.vehicles:
+        vehicle_step = VehicleStep(path.length_index, path.loads, path.on_beam, path.surface)
+    matrices = step_matrices(discrete, path)
+    return StepInput(matrices, inertia, weight, vehicle_step)
 
 
 def _chunk_function(
@@ -138,46 +120,43 @@ def _chunk_function(
     """
 
     chunk_steps = chunk_length(discrete, loads, max_loads)
+    vehicles = vehicles_of(loads, discrete.grid.lengths)
 
     def chunk(state, memory, running_peaks: Any, first_step):
         index = first_step + xp.arange(chunk_steps)
-        chunk_path = load_path(discrete, loads, max_loads, index)
-        matrices = step_matrices(discrete, chunk_path, loads.massless)
-        inertia_and_weight = (
-            _values_by_row(loads.inertia, chunk_path),
-            _values_by_row(loads.weight, chunk_path),
-        )
+        path = load_path(discrete, loads, max_loads, index)
+        steps = _step_inputs(discrete, loads, path)
         commands = observed = None
         if policy is None:
-            state, states, forces = advance_unforced(matrices, *inertia_and_weight, state)
+            state, states, forces = advance_unforced(steps, state, vehicles)
         else:
-            step_infos = StepInfo(
-                chunk_path.start, chunk_path.length, discrete.grid.event_at(index)
-            )
-            is_known = not any_jax(matrices, inertia_and_weight, state, memory, policy)
+            infos = StepInfo(path.start, path.length, discrete.grid.event_at(index))
+            is_known = not any_jax(steps, state, memory, policy)
             result = None
             if is_known and not policy.implicit:
-                result = _advance_known_with_inputs(
-                    policy, matrices, *inertia_and_weight, step_infos, state, memory
-                )
+                result = advance_known_with_inputs(policy, vehicles, steps, infos, state, memory)
             (state, memory), (states, forces, commands, observed) = result or scan(
-                lambda carry, step: _step_with_inputs(policy, carry, step),
+                lambda carry, step: step_with_inputs(policy, vehicles, carry, step),
                 (state, memory),
-                (matrices, *inertia_and_weight, step_infos),
+                (steps, infos),
             )
         if running_peaks is not None:
+            beam_states = states[:, : discrete.model.state_count]
             running_peaks = update_peaks(
-                running_peaks, matrices, chunk_path, states, forces, commands
+                running_peaks, steps.matrices, path, beam_states, forces, commands
             )
-        return (
-            state,
-            memory,
-            running_peaks,
-            chunk_path.start[-1] + chunk_path.length[-1],
-            (states, commands, observed),
-        )
+        end = path.start[-1] + path.length[-1]
+        return state, memory, running_peaks, end, (states, commands, observed)
 
     return chunk, chunk_steps
+
+
+def _initial_state(discrete: DiscreteModel, loads: LoadSet, policy) -> Float[Array, "state batch"]:
+    """States of model and vehicles at rest at t = 0."""
+    batch_size = loads.inertia.shape[1]
+    state = zeros((discrete.model.state_count, batch_size), (discrete, loads, policy))
+    states = initial_vehicle_states(loads)
+    return state if states is None else xp.concatenate([state, states])
 
 
 def integrate_history(
@@ -197,7 +176,7 @@ def integrate_history(
     and contact forces of every step; under a policy, one state for each chunk.
     """
     chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
-    batch_size, load_count = loads.inertia.shape[1], len(loads.trajectories)
+    load_count, batch_size = loads.inertia.shape
 
     def one_chunk(carry, first):
         state, memory, peaks = carry
@@ -210,7 +189,7 @@ def integrate_history(
         else initial_peaks(discrete.position_count, load_count, batch_size, discrete.magnitude)
     )
     memory = None if policy is None else policy.start(batch_size)
-    initial_state = zeros((discrete.model.state_count, batch_size), (discrete, loads, policy))
+    initial_state = _initial_state(discrete, loads, policy)
     first_steps = xp.arange(0, steps, chunk_steps)
     checkpointed_chunk = checkpoint(
         one_chunk, policy=jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
@@ -264,13 +243,13 @@ def integrate_peaks(
         )
         return state, memory, peaks, first_step, continues
 
-    batch_size, load_count = loads.inertia.shape[1], len(loads.trajectories)
+    load_count, batch_size = loads.inertia.shape
     running_peaks = initial_peaks(
         discrete.position_count, load_count, batch_size, discrete.magnitude
     )
     memory = None if policy is None else policy.start(batch_size)
     start = (
-        zeros((discrete.model.state_count, batch_size), (discrete, loads, policy)),
+        _initial_state(discrete, loads, policy),
         memory,
         running_peaks,
         xp.zeros((), int),
@@ -303,7 +282,7 @@ def integrate_at_events(
         return state, memory, kept, first_step + chunk_steps
 
     batch_size = loads.inertia.shape[1]
-    initial_state = zeros((discrete.model.state_count, batch_size), (discrete, loads, policy))
+    initial_state = _initial_state(discrete, loads, policy)
     memory = None if policy is None else policy.start(batch_size)
     event_states = xp.zeros((grid.event_panels.shape[0], *initial_state.shape))
     start = initial_state, memory, event_states, xp.zeros((), int)

@@ -27,7 +27,7 @@ from jaxbeam.integrator.propagators import (
 from jaxbeam.integrator.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
-from jaxbeam.model.contact import LoadSet
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
@@ -72,7 +72,19 @@ LIBRARY = Library(
 
 def supports(case: Case) -> bool:
     """Whether a sweep of peaks of this case uses the C integrator."""
-    return case.controller is None and available()
+    plain = (
+        case.controller is None
+        and case.profile is None
+        and not any(
+            load.vehicle(case.run.gravity).names or load.force_history() for load in case.loads
+        )
+    )
+    return plain and deflections_only(case) and available()
+
+
+def deflections_only(case: Case) -> bool:
+    """Whether all sensors of a case measure deflections, the only peaks that C searches."""
+    return all(sensor.quantity == "deflection" for sensor in case.sensors)
 
 
 def available() -> bool:
@@ -115,10 +127,10 @@ def integrate_peaks(
             grids.loads_on_beam,
             grids.on_beam_intervals,
         ),
-        *(*jax.vmap(LoadSet.cubics)(loads), loads.inertia, loads.weight, positions),
+        *(*jax.vmap(LoadSet.cubics)(loads), loads.wheels.inertia, loads.wheels.weight, positions),
         *(part[None] for part in constants),
     )
-    tasks, load_count, batch_size = loads.inertia.shape
+    tasks, load_count, batch_size = loads.wheels.inertia.shape
     position_count, modes = positions.shape[1], shapes.shape[-1]
     blocks, block_size = models.state_matrix.shape[1:3]
     beam = grids.counts.shape[1], blocks, block_size, modes // blocks, *shapes.shape[1:3]

@@ -20,12 +20,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS
 from jaxbeam.numerics.gauss import gauss_nodes, lagrange_coefficients
 from jaxbeam.runtime.arrays import Array, scan, set_at, stop_gradient, vmap, xp
 
 NODE_COUNT = 6  # Gauss nodes in a step; the integrator has order 12
 DOUBLINGS = 7
 TAYLOR_TERMS = 14
+MANY_MATRICES = 256  # whose products XLA computes faster element by element
 MAX_STEP_NORM = 0.5 * 2**DOUBLINGS  # largest norm of A h for which the series is exact to rounding
 
 GAUSS_NODES = gauss_nodes(NODE_COUNT)
@@ -54,8 +56,8 @@ def end_weights() -> np.ndarray:
 
 
 def _multiply(a, b):
-    """Product of matrices (row, column, ...), spelt out for the small blocks of single modes."""
-    if a.shape[1] > 3:
+    """Product of matrices (row, column, ...), spelt out for small blocks, and smaller than many."""
+    if a.shape[1] > (3 if math.prod(a.shape[2:]) < MANY_MATRICES else MAX_UNROLLED_TERMS):
         return xp.einsum("ij...,jk...->ik...", a, b)
     return sum(a[:, i, None] * b[None, i] for i in range(a.shape[1]))
 
@@ -94,22 +96,11 @@ def propagators(
         input_matrix = xp.concatenate([input_matrix, model.command_matrix], axis=1)
     fractions = np.append(GAUSS_NODES, 1.0)
     durations = lengths[..., None] * fractions
-    # Blocks and durations are the last axes, along which operations vectorise.
-    x = xp.moveaxis(matrix, 0, -1)[..., None] * durations.ravel() / 2**DOUBLINGS
-    transition, phi_functions = _taylor_series(x, input_matrix)
-    (transition, phi_functions), _ = scan(
-        _double_argument, (transition, phi_functions), length=DOUBLINGS
+    # Blocks are the last axis but that of durations, along which operations vectorise.
+    transition, phi_functions = phi_functions_of(
+        xp.moveaxis(matrix, 0, -1), input_matrix[..., None], durations
     )
-    phi_functions = phi_functions * durations.ravel()
-    transition, phi_functions = (
-        part.reshape(*part.shape[:-1], *durations.shape) for part in (transition, phi_functions)
-    )
-    powers = np.arange(NODE_COUNT)
-    weights = lagrange_coefficients(NODE_COUNT) * np.array(
-        [math.factorial(p) for p in powers]
-    )  # force, power
-    weights = weights * fractions[:, None, None] ** powers  # fraction, force, power
-    inputs = xp.einsum("cfp,psmb...c->...cfbsm", weights, phi_functions)
+    inputs = xp.einsum("cfp,psmb...c->...cfbsm", force_weights(), phi_functions)
     transition = xp.einsum("stb...c->...cbst", transition)
     # Inputs act on rates and actuators' own states, which the scaling leaves unchanged.
     inputs = inputs / state_scale[:, :, None]
@@ -122,15 +113,40 @@ def propagators(
     )
 
 
+def phi_functions_of(
+    matrix: Float[Array, "side side *system"],
+    input_matrix: Float[Array, "side input *#system"],
+    durations: Float[Array, "*duration"],
+) -> tuple[Float[Array, "side side *all"], Float[Array, "phi side input *all"]]:
+    """exp(A t), and t phi_p(A t) B for p = 1 to 6, of systems over durations t (s)."""
+    x = matrix[..., None] * durations.ravel() / 2**DOUBLINGS
+    functions = _taylor_series(x, input_matrix[..., None])
+    (transition, phi_functions), _ = scan(_double_argument, functions, length=DOUBLINGS)
+    phi_functions = phi_functions * durations.ravel()
+    parts = (transition, phi_functions)
+    transition, phi_functions = (part.reshape(*part.shape[:-1], *durations.shape) for part in parts)
+    return transition, phi_functions
+
+
+def force_weights() -> Float[np.ndarray, "fraction force power"]:
+    """Weights of the phi functions in the response to forces at the Gauss nodes.
+
+    At the fractions of a step that are its Gauss nodes, then at its end.
+    """
+    fractions, powers = np.append(GAUSS_NODES, 1.0), np.arange(NODE_COUNT)
+    factorials = np.array([math.factorial(p) for p in powers])
+    return lagrange_coefficients(NODE_COUNT) * factorials * fractions[:, None, None] ** powers
+
+
 def _taylor_series(x, input_matrix):
     """exp(x), and phi_1(x) ... phi_6(x) times the input matrix (phi, ...), for small x."""
-    side, inputs = input_matrix.shape
+    side, inputs = input_matrix.shape[:2]
     rest = x.shape[2:]
     # Both series at once: they differ only in the divisors of their terms.
-    starting_terms = xp.concatenate([xp.eye(side), input_matrix], axis=1).reshape(
-        side, -1, *(1,) * len(rest)
+    identity = xp.broadcast_to(xp.eye(side).reshape(side, side, *(1,) * len(rest)), x.shape)
+    starting_terms = xp.concatenate(
+        [identity, xp.broadcast_to(input_matrix, (side, inputs, *rest))], axis=1
     )
-    starting_terms = xp.broadcast_to(starting_terms, (side, side + inputs, *rest))
     divisor_offset = np.repeat([0, NODE_COUNT], [side, inputs]).reshape(-1, *(1,) * len(rest))
 
     def horner(sums, term):

@@ -11,6 +11,8 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Float
 
 from jaxbeam.integrator.step_matrices import StepMatrices
+from jaxbeam.integrator.vehicles.known_maps import known_forces, known_state_maps
+from jaxbeam.integrator.vehicles.steps import StepInput, Vehicles
 from jaxbeam.model.contact import ModalCompliance, solve_contact_forces
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_small
 from jaxbeam.runtime.arrays import Array, any_jax, cond, custom_jvp, scan, vmap, xp
@@ -41,14 +43,25 @@ def contact_forces(matrices: StepMatrices, inertia, weight, state, commands):
 
 
 @jax.named_scope("propagation")
-def advance(state, step):
+def advance(state, step: StepInput, commands=None, vehicles: Vehicles | None = None):
     """One step of a batch: the state at its end, and (state at its start, contact forces)."""
-    matrices, inertia, weight, commands = step
-    forces = contact_forces(matrices, inertia, weight, state, commands)
-    next_state = free_response(matrices.transition, state) + matvec(matrices.force_response, forces)
+    matrices = step.matrices
+    forces, vehicle_states = forces_and_vehicles(state, step, commands, vehicles)
+    beam = state[: matrices.state_count]
+    next_state = free_response(matrices.transition, beam) + matvec(matrices.force_response, forces)
     if commands is not None:
         next_state = next_state + matrices.commands.input_matrix @ commands
+    if vehicle_states is not None:
+        next_state = xp.concatenate([next_state, vehicle_states])
     return next_state, (state, forces)
+
+
+def forces_and_vehicles(state, step: StepInput, commands, vehicles: Vehicles | None):
+    """Contact forces (row, batch) of a step, and the states of the vehicles at its end, if any."""
+    if vehicles is None:
+        parts = step.matrices, step.inertia, step.weight
+        return contact_forces(*parts, state, commands), None
+    return vehicles.advance(step, state, commands)
 
 
 def free_response(transition: Float[Array, "block side side"], state: Float[Array, "state batch"]):
@@ -64,26 +77,33 @@ def free_response(transition: Float[Array, "block side side"], state: Float[Arra
     return next_state.reshape(state.shape)
 
 
-def advance_unforced(matrices: StepMatrices, inertia, weight, state):
+def advance_unforced(step: StepInput, state, vehicles: Vehicles | None):
     """Steps without commands: final state, state before each step, and contact forces."""
-    if not any_jax(matrices, inertia, weight, state):
-        return _advance_known(matrices, inertia, weight, state)
+    matrices, inertia, weight = step.matrices, step.inertia, step.weight
+    if not any_jax(step, state, vehicles):
+        return _advance_known(step, state, vehicles)
+    if vehicles is not None:
+        final_state, (states, forces) = scan(
+            lambda state, one: advance(state, one, None, vehicles), state, step
+        )
+        return final_state, states, forces
     has_matrix = isinstance(matrices.contact_compliance, Array)
     advance_all = _advance_with_rule if has_matrix else _advance_all
     return advance_all(matrices, inertia, weight, state)
 
 
 def _advance_all(matrices, inertia, weight, state):
-    final_state, (states, forces) = scan(advance, state, (matrices, inertia, weight, None))
+    steps = StepInput(matrices, inertia, weight, None)
+    final_state, (states, forces) = scan(advance, state, steps)
     return final_state, states, forces
 
 
-def _advance_known(matrices: StepMatrices, inertia, weight, state):
+def _advance_known(step: StepInput, state, vehicles: Vehicles | None):
     """`advance_unforced` of known numbers, as one map a step.
 
     The systems of all steps are solved at once; NumPy takes a tenth of the time of one by one.
     """
-    forces_of_state, maps = known_maps(matrices, inertia, weight)
+    forces_of_state, maps = known_maps(step, vehicles)
     states = np.empty((len(maps) + 1, *maps.shape[1:3], 1))
     states[0] = state.T[..., None]
     state_maps, offsets = maps[..., :-1], maps[..., -1:]
@@ -94,40 +114,47 @@ def _advance_known(matrices: StepMatrices, inertia, weight, state):
     return states[-1], states[:-1], forces
 
 
-def known_maps(matrices: StepMatrices, inertia, weight):
+def known_maps(step: StepInput, vehicles: Vehicles | None):
     """Maps of steps of known numbers to the contact forces and to the next state.
 
     z' = Phi z + B u - Gamma S (m (R z + D u) + w) with commands u, if there are any. Both maps are
-    (step, batch, row, column), with the columns of the state z, of u, and of one.
+    (step, batch, row, column), with the columns of the state, of u, and of one.
     """
-    rows = inertia.shape[1]
-    inertia, weight = (np.swapaxes(part, 1, 2)[..., None] for part in (inertia, weight))
-    compliance, response = matrices.contact_compliance, matrices.contact_response
-    commands = matrices.commands
-    blocks, side = matrices.transition.shape[1:3]
-    states = blocks * side
-    if response is None:
-        columns = states + (0 if commands is None else commands.input_matrix.shape[-1])
-        no_response = np.zeros((*weight.shape[:-1], columns))
-        right = np.concatenate([no_response, weight], axis=-1)
-        forces_of_state = -right
+    matrices, commands = step.matrices, step.matrices.commands
+    surface = None
+    if vehicles is None:
+        forces_of_state = _known_forces(step)
     else:
-        parts = [response, *([] if commands is None else [commands.contact_response])]
-        right = [inertia * part[:, None] for part in parts]
-        right = np.concatenate([*right, weight], axis=-1)
-        if isinstance(compliance, ModalCompliance):
-            compliance = jax.tree.map(lambda part: part[:, None], compliance)
-            forces_of_state = compliance.solve(inertia, right)
-        else:
-            system = np.eye(rows) + inertia * compliance[:, None]
-            forces_of_state = -np.linalg.solve(system, right)
+        forces_of_state, surface = known_forces(vehicles, step)
     maps = matrices.force_response[:, None] @ forces_of_state
-    state_index = np.arange(states).reshape(blocks, side)
-    index = np.s_[:, :, state_index[:, :, None], state_index[:, None, :]]
-    maps[index] += matrices.transition[:, None]
+    blocks, side = matrices.transition.shape[1:3]
+    state_index = np.arange(matrices.state_count).reshape(blocks, side)
+    maps[:, :, state_index[:, :, None], state_index[:, None, :]] += matrices.transition[:, None]
     if commands is not None:
-        maps[..., states:-1] += commands.input_matrix[:, None]
+        count = commands.input_matrix.shape[-1]
+        maps[..., -1 - count : -1] += commands.input_matrix[:, None]
+    if vehicles is not None:
+        maps = np.concatenate([maps, known_state_maps(vehicles, step, surface)], axis=2)
     return forces_of_state, maps
+
+
+def _known_forces(step: StepInput):
+    """Map to the contact forces of plain wheels; see `known_maps`."""
+    matrices, commands = step.matrices, step.matrices.commands
+    inertia, weight = (np.swapaxes(part, 1, 2)[..., None] for part in (step.inertia, step.weight))
+    compliance, response = matrices.contact_compliance, matrices.contact_response
+    if response is None:
+        count = 0 if commands is None else commands.input_matrix.shape[-1]
+        no_response = np.zeros((*weight.shape[:-1], matrices.state_count + count))
+        return -np.concatenate([no_response, weight], axis=-1)
+    parts = [response, *([] if commands is None else [commands.contact_response])]
+    right = [inertia * part[:, None] for part in parts]
+    right = np.concatenate([*right, weight], axis=-1)
+    if isinstance(compliance, ModalCompliance):
+        compliance = jax.tree.map(lambda part: part[:, None], compliance)
+        return compliance.solve(inertia, right)
+    system = np.eye(weight.shape[2]) + inertia * compliance[:, None]
+    return -np.linalg.solve(system, right)
 
 
 _advance_with_rule = custom_jvp(_advance_all)

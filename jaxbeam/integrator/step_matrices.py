@@ -6,8 +6,6 @@ state at the start, to the acceleration under the loads at the nodes, the state 
 deflections at monitored positions.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import numpy as np
@@ -15,7 +13,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
-from jaxbeam.model.contact import LoadSet, ModalCompliance, contact_rows
+from jaxbeam.integrator.time_grid import TimeGrid
+from jaxbeam.model.contact import ModalCompliance, SurfaceRows, surface_rows
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.runtime.arrays import (
     Array,
     any_jax,
@@ -46,13 +46,25 @@ class NodeMatrices(eqx.Module):
     command_response: Float[Array, "step node_state command"]
 
 
+class SpringMatrices(eqx.Module):
+    """To deflections and velocities under the wheels at the nodes.
+
+    From the state at the start, the contact forces, and the commands; one of the motions, or both
+    along an axis `motion`.
+    """
+
+    response: Float[Array, "step *motion row state"]
+    compliance: Float[Array, "step *motion row row"]
+    commands: Float[Array, "step *motion row command"] | None
+
+
 class StepMatrices(eqx.Module):
     """Matrices of the steps of a chunk; rows are (load, node), commands (node, actuator).
 
     `contact_response` maps the state at the start to the acceleration under the loads at the
     nodes, `contact_compliance` the contact forces; both are None where no load has inertia.
-    `monitored` acts on state at the start, contact forces and commands, one after the other. A step
-    is `loaded` with a load on the beam.
+    `springs` are None where no wheel has springs. `monitored` acts on state at the start, contact
+    forces and commands, one after the other. A step is `loaded` with a load on the beam.
     """
 
     contact_response: Float[Array, "step row state"] | None
@@ -62,14 +74,21 @@ class StepMatrices(eqx.Module):
     monitored: Float[Array, "step sample input"] | None
     commands: CommandMatrices | None
     nodes: NodeMatrices | None
+    springs: SpringMatrices | None
     loaded: Bool[Array, " step"]
+
+    @property
+    def state_count(self) -> int:
+        """Number of states of the model."""
+        return self.transition.shape[-3] * self.transition.shape[-2]
 
 
 class LoadPath(eqx.Module):
-    """Load path in the steps of a chunk: shape and contact rows at the loads, zero off the beam.
+    """Load path in the steps of a chunk: rows at the wheels on the beam, and the surface.
 
     `length_index` is the index of a step's length among those of the grid; start and length are in
-    s. `loads` are the indices of the loads in the rows.
+    s. `loads` are the indices of the wheels in the rows. `surface` is the height of the profile (m)
+    under all wheels, and its first and second rate, where there is a profile.
     """
 
     length_index: Int[Array, " step"]
@@ -77,8 +96,8 @@ class LoadPath(eqx.Module):
     length: Float[Array, " step"]
     loads: Int[Array, "step load"]
     on_beam: Bool[Array, "step load"]
-    shape_rows: Float[Array, "step load node block mode"]
-    contact_rows: Float[Array, "step load node block side"] | None
+    rows: SurfaceRows
+    surface: Float[Array, "step 3 wheel node"] | None
 
 
 def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int:
@@ -88,10 +107,21 @@ def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int
     """
     if any_jax(discrete, loads):
         return CHUNK_STEPS
-    rows, states = max_loads * NODE_COUNT, discrete.model.state_count
+    rows = max_loads * NODE_COUNT
+    states = discrete.model.state_count + loads.vehicle_states
+    if loads.wheels.vehicles:
+        rows = loads.wheel_count * NODE_COUNT
     compliance = rows * min(rows, NODE_COUNT * discrete.model.mode_count)
     entries = loads.inertia.shape[1] * max(compliance, rows * states, states**2)
     return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // entries)))
+
+
+def wheels_on_beam(grid: TimeGrid, max_loads: int) -> Int[Array, "panel wheel"]:
+    """Indices of at most `max_loads` wheels in each panel, those on the beam first.
+
+    It depends on no step, so that compiled programs sort once.
+    """
+    return xp.argsort(~grid.loads_on_beam, axis=1, stable=True)[:, :max_loads]
 
 
 @jax.named_scope("load_path")
@@ -105,10 +135,10 @@ def load_path(
     # As an array: JAX remembers a NumPy constant in the precision in which it met it first.
     times = start[:, None] + length[:, None] * xp.asarray(GAUSS_NODES, length.dtype)
     position, speed, acceleration = (xp.moveaxis(p, 0, 1) for p in loads.kinematics(times))
+    surface = loads.surface_motion(position, speed, acceleration)
     on_beam = take(grid.loads_on_beam, panel)  # step, load
-    if max_loads < len(loads.trajectories):
-        # Loads on the beam first; those beyond the largest number are off the beam.
-        load_index = xp.argsort(~on_beam, axis=1, stable=True)[:, :max_loads]
+    if max_loads < loads.wheel_count:
+        load_index = take(wheels_on_beam(discrete.grid, max_loads), panel)
         selection = load_index[:, :, None]
         position, speed, acceleration = (
             xp.take_along_axis(part, selection, axis=1) for part in (position, speed, acceleration)
@@ -117,15 +147,16 @@ def load_path(
     else:
         load_index = xp.broadcast_to(xp.arange(max_loads), on_beam.shape)
     on_beam_at_nodes = xp.broadcast_to(on_beam[:, :, None], position.shape)
-    shape, rows = contact_rows(model, position, speed, acceleration, on_beam_at_nodes)
-    return LoadPath(length_index, start, length, load_index, on_beam, shape, rows)
+    springs = bool(loads.wheels.vehicles)
+    motion = position, speed, acceleration, on_beam_at_nodes
+    rows = surface_rows(model, *motion, springs, not loads.massless)
+    surface = None if surface is None else xp.stack(surface, axis=1)
+    return LoadPath(length_index, start, length, load_index, on_beam, rows, surface)
 
 
 @jax.named_scope("load_path")
-def step_matrices(discrete: DiscreteModel, path: LoadPath, massless: bool = False) -> StepMatrices:
-    """Matrices of the steps of a chunk; without accelerations under `massless` loads."""
-    if massless:
-        path = dataclasses.replace(path, contact_rows=None)
+def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
+    """Matrices of the steps of a chunk."""
     if is_jax(path.length_index):
         matrices = _matrices_by_branch(discrete, path)
     else:
@@ -140,8 +171,7 @@ def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):
         _matrices_of_one_length(
             discrete,
             _propagators_of(discrete, path.length_index[index[0]]),
-            path.shape_rows[index],
-            None if path.contact_rows is None else path.contact_rows[index],
+            jax.tree.map(lambda part, index=index: part[index], path.rows),
         )
         for index in indices
     ]
@@ -157,22 +187,16 @@ def _matrices_by_branch(discrete: DiscreteModel, path: LoadPath):
     first_propagators = _propagators_of(discrete, path.length_index[0])
 
     def equal_lengths(_):
-        return _matrices_of_one_length(
-            discrete, first_propagators, path.shape_rows, path.contact_rows
-        )
+        return _matrices_of_one_length(discrete, first_propagators, path.rows)
 
     def mixed_lengths(_):
         def single_step(step):
-            kind, shape, rows = step
-            matrices = _matrices_of_one_length(
-                discrete,
-                _propagators_of(discrete, kind),
-                shape[None],
-                None if rows is None else rows[None],
-            )
+            kind, rows = step
+            rows = jax.tree.map(lambda part: part[None], rows)
+            matrices = _matrices_of_one_length(discrete, _propagators_of(discrete, kind), rows)
             return jax.tree.map(lambda matrix: matrix[0], matrices)
 
-        return map_elements(single_step, (path.length_index, path.shape_rows, path.contact_rows))
+        return map_elements(single_step, (path.length_index, path.rows))
 
     # In most chunks all steps are equally long and share their propagators.
     return cond(
@@ -188,8 +212,9 @@ def _propagators_of(discrete: DiscreteModel, length_index):
     )
 
 
-def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
-    """Matrices of steps of one length, from the shape and contact rows (step, load, node, ...)."""
+def _matrices_of_one_length(discrete: DiscreteModel, propagators, motion: SurfaceRows):
+    """Matrices of steps of one length, from rows (step, load, node, ...)."""
+    shape, rows = motion.shape, motion.acceleration
     of_states, deflection_transition, deflection_force_response = propagators
     steps, load_count, nodes, _, modes = shape.shape
     size = load_count * nodes
@@ -198,7 +223,9 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
     if rows is not None:
         contact_response = xp.einsum("tpcbi,cbij->tpcbj", rows, of_states.transition_nodes)
         contact_response = contact_response.reshape(steps, size, states)
-        contact_compliance = _contact_compliance(of_states.input_nodes[..., :modes], shape, rows)
+        contact_compliance = _contact_compliance(
+            of_states.input_nodes[..., :modes], shape, rows, motion.deflection is None
+        )
     force_response = xp.einsum("tqfbm,fbim->tbiqf", shape, of_states.input_end[..., :modes])
 
     def for_all_steps(matrix, *shape):
@@ -250,18 +277,42 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, shape, rows):
             force_to_node_states.reshape(steps, nodes * states, size),
             for_all_steps(xp.moveaxis(command_responses, 1, 2), nodes * states, command_count),
         )
-    return *matrices, commands, node_states
+    springs = None
+    if motion.deflection is not None:
+        spring_rows = motion.deflection, motion.velocity
+        parts = [_spring_matrices(discrete, of_states, shape, rows) for rows in spring_rows]
+        springs = jax.tree.map(lambda *both: xp.stack(both, axis=1), *parts)
+    return *matrices, commands, node_states, springs
 
 
-def _contact_compliance(input_nodes, shape, rows):
+def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows) -> SpringMatrices:
+    """Matrices to one motion of the surface under the wheels, deflection or velocity."""
+    steps, load_count, nodes, _, modes = shape.shape
+    size = load_count * nodes
+    response = xp.einsum("tpcbi,cbij->tpcbj", rows, of_states.transition_nodes)
+    by_force = xp.einsum("tpcbi,cfbim->tpcfbm", rows, of_states.input_nodes[..., :modes])
+    compliance = xp.einsum("tpcfbm,tqfbm->tpcqf", by_force, shape)
+    commands = None
+    if discrete.modal_command_matrix is not None:
+        by_command = of_states.input_nodes[:, :, 0, :, modes:]
+        commands = xp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], by_command)
+        commands = commands.reshape(steps, size, -1)
+    states = discrete.model.state_count
+    return SpringMatrices(
+        response.reshape(steps, size, states), compliance.reshape(steps, size, size), commands
+    )
+
+
+def _contact_compliance(input_nodes, shape, rows, by_factors):
     """Acceleration under the loads at the nodes due to contact forces of one newton.
 
-    As a product of two factors where the generalised forces are fewer than the contact forces.
+    As a product of two factors where the generalised forces are fewer than the contact forces, if
+    `by_factors`.
     """
     steps, load_count, nodes, blocks, modes = shape.shape
     size = load_count * nodes
     response = xp.einsum("tpcbi,cfbim->tpcfbm", rows, input_nodes)
-    if load_count > blocks * modes:
+    if by_factors and load_count > blocks * modes:
         own_node = np.eye(nodes)[:, :, None, None]
         response = response + shape[:, :, :, None] * own_node
         shape_rows = shape.reshape(steps, load_count, nodes, -1)

@@ -6,11 +6,12 @@ number of panels, so the grid can be compiled; a panel of zero length has no eff
 """
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.loads import trajectory
 from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, put, searchsorted, stop_gradient, take, xp
 
@@ -73,20 +74,23 @@ class TimeGrid(eqx.Module):
 
 
 def _load_events(case: Case, model: ModalModel):
-    """Entry and exit of each load (load, 2), and all load events (event,), in s."""
-    inner_nodes = model.modes.nodes[1:-1]
-    trajectories = [trajectory(load, case.beam.length) for load in case.loads]
-    if not trajectories:
-        return xp.zeros((0, 2)), xp.zeros(0)
-    windows = xp.stack([xp.stack(path.entry_exit_times()) for path in trajectories])
-    nonsmooth_times = [path.passage_times(inner_nodes) for path in trajectories]
-    return windows, xp.concatenate([windows.ravel(), *nonsmooth_times])
+    """Entry and exit of each wheel (wheel, 2), and all load events (event,), in s."""
+    places, loads = model.modes.nodes[1:-1], load_set(case)
+    if loads.profile is not None:
+        places = xp.concatenate([places, loads.profile.kinks()])
+    windows = loads.entry_exit_times()
+    return windows, xp.concatenate([windows.reshape(-1), loads.passage_times(places)])
 
 
-def _loads_on_beam(windows, boundaries):
-    """Whether each load is on the beam in each panel, (panel, load)."""
-    middle = (boundaries[1:] + boundaries[:-1]) / 2
-    return (windows[:, 0] < middle[:, None]) & (middle[:, None] < windows[:, 1])
+def _loads_on_beam(positions, panels: int):
+    """Whether each wheel is on the beam in each panel, (panel, wheel).
+
+    From the positions of its entry and exit, one after the other, among the boundaries: so a panel
+    of no length between a sample and an exit at the same time has its derivative.
+    """
+    entry, leave = positions.reshape(-1, 2).T
+    index = np.arange(panels)[:, None]
+    return (entry <= index) & (index < leave)
 
 
 def grid_by_step_length(
@@ -99,7 +103,9 @@ def grid_by_step_length(
     """
     windows, events = _load_events(case, model)
     end = case.run.duration
-    boundaries = xp.concatenate([xp.zeros(1), xp.clip(xp.sort(events), 0.0, end), end[None]])
+    times = xp.concatenate([xp.zeros(1), xp.clip(events, 0.0, end), end[None]])
+    order = xp.argsort(times, stable=True)
+    boundaries = times[order]
     panel_lengths = xp.diff(boundaries)
     counts = xp.ceil(stop_gradient(panel_lengths / max_step)).astype(int) + extra_steps * (
         panel_lengths > 0
@@ -107,7 +113,8 @@ def grid_by_step_length(
     lengths = panel_lengths / xp.maximum(counts, 1)
     length_index = xp.arange(panel_lengths.shape[0])
     lengths = xp.append(lengths, 0.0)
-    loads_on_beam = _loads_on_beam(windows, boundaries)
+    positions = xp.argsort(order)[1 : 1 + windows.size]
+    loads_on_beam = _loads_on_beam(positions, counts.shape[0])
     return TimeGrid(
         boundaries, counts, xp.cumsum(counts), length_index, lengths, loads_on_beam, windows
     )
@@ -146,10 +153,11 @@ def grid_by_schedule(
         lengths, xp.where(between_scheduled, lengths.shape[0], length_index), panel_lengths
     )
     counts = xp.full(panel_lengths.shape, substeps)
-    loads_on_beam = _loads_on_beam(windows, boundaries)
+    positions = xp.argsort(order)
+    event_positions = positions[times.shape[0] : times.shape[0] + windows.size]
+    loads_on_beam = _loads_on_beam(event_positions, panel_lengths.shape[0])
     scheduled_event = xp.where(is_scheduled[:-1], order[:-1], -1)
     cumulative_counts, lengths = xp.cumsum(counts), lengths / substeps
-    event_boundary = xp.argsort(order)
     return TimeGrid(
         boundaries,
         counts,
@@ -159,5 +167,5 @@ def grid_by_schedule(
         loads_on_beam,
         windows,
         scheduled_event,
-        event_boundary,
+        positions,
     )

@@ -26,10 +26,12 @@ from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.output_rows import row_on_states, sensor_rows
+from jaxbeam.model.sensing.output_rows import row_on_states, sensor_rows
 from jaxbeam.runtime.arrays import set_at, xp
 
-POINT_QUANTITIES = tuple(name for name, quantity in QUANTITIES.items() if not quantity.at_fibre)
+POINT_QUANTITIES = tuple(
+    name for name, entry in QUANTITIES.items() if not (entry.at_fibre or entry.over_modulus)
+)
 ACTUATOR_QUANTITIES = ("current", "active_force", "transmitted_force")
 
 
@@ -120,8 +122,9 @@ def output_row(case: Case, model: ModalModel, output: str):
         sensor = (
             Sensor(float(position), name) if at_point else case.sensors[int(name.split(".")[1])]
         )
-        on_states, on_rates = sensor_rows(model, [sensor]).on_states(model)
-        return on_states[0], on_rates[0], feedthrough
+        rows = sensor_rows(model, case, [sensor])
+        on_states, on_rates = rows.on_states(model)
+        return on_states[0], on_rates[0], rows.on_commands[0]
     _, index, actuator_output = name.split(".")
     index = int(index)
     attachments = [actuator.attachment() for actuator in case.actuators]

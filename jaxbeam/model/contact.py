@@ -1,111 +1,95 @@
-"""Contact law of travelling loads on a vibrating beam.
+"""Contact law of wheels on a vibrating beam.
 
-A load of mass m at x(t) stays on the beam, so its acceleration is that of the deflection under it,
+A wheel at x(t) follows the surface, whose height is the deflection plus that of the profile r(x):
 
-    D2w/Dt2 = w_tt + 2 x' w_xt + x'^2 w_xx + x'' w_x,
+    y = w + r,    y' = w_t + x' w_x + x' r',
+    y'' = w_tt + 2 x' w_xt + x'^2 (w_xx + r'') + x'' (w_x + r'),
 
-and the force on the beam, positive upwards, is r = -W - m D2w/Dt2 with W its weight (corrected
-eqs 2.3 to 2.13 of the thesis; a force has m = 0). With the states z of the modal model and forces
-f on the modes, D2w/Dt2 = (contact row) . z + (shape row) . f.
+and the force on the beam, positive upwards, is f = -W - m y'' - s with W the static load, m the
+unsprung mass and s = k y + c y' - H z the force of the springs between wheel and vehicle, with the
+states z of the vehicle (corrected eqs 2.3 to 2.13 of the thesis for a mass, which has no springs; a
+force has m = 0). With the states of the modal model and forces f on the modes, y, y' and y'' are
+rows times states, and y'' is also (shape row) . f.
 """
 
 import math
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from jaxbeam.case.case import Case
-from jaxbeam.case.loads import trajectory
-from jaxbeam.case.trajectory import AbstractTrajectory
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import solve_small
-from jaxbeam.runtime.arrays import Array, add_at, custom_jvp, is_jax, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, add_at, custom_jvp, slice_in_dim, xp
 
 
-class LoadSet(Module):
-    """All loads of a run: trajectories, inertia (kg) and weight (N).
+class SurfaceRows(eqx.Module):
+    """Rows from modal states to the motion of the beam under wheels; zero off the beam.
 
-    Inertia and weight may differ between the runs of a batch, which share everything else.
+    `shape` is that of the modes; `acceleration`, `velocity` and `deflection` act on the states in
+    the blocks of the modal model. The first is None where no wheel has inertia, the others where
+    none has springs.
     """
 
-    trajectories: tuple[AbstractTrajectory, ...]
-    inertia: Float[Array, "load batch"]
-    weight: Float[Array, "load batch"]
-
-    def kinematics(self, times: Float[Array, "*time"]) -> tuple[Float[Array, "load *time"], ...]:
-        """Positions (m), speeds (m/s) and accelerations (m/s^2) at given times (s)."""
-        if not self.trajectories:
-            return (xp.zeros((0, *times.shape)),) * 3
-        paths = zip(*(path.kinematics(times) for path in self.trajectories), strict=True)
-        position, speed, acceleration = (xp.stack(parts) for parts in paths)
-        return position, speed, acceleration
-
-    def cubics(self) -> tuple[Float[Array, "load piece"], Float[Array, "load piece 4"]]:
-        """Start times (s) and coefficients of the cubic pieces of the trajectories.
-
-        Padded to the same number of pieces; for trajectories of the kind
-        `AbstractPiecewiseTrajectory`, which those of cases are.
-        """
-        if not self.trajectories:
-            return xp.zeros((0, 1)), xp.zeros((0, 1, 4))
-        cubics_by_load = [path.cubics() for path in self.trajectories]
-        max_pieces = max(times.shape[0] for times, _ in cubics_by_load)
-        padding = [(0, max_pieces - times.shape[0]) for times, _ in cubics_by_load]
-        pairs = list(zip(cubics_by_load, padding, strict=True))
-        times = [xp.pad(times, more, constant_values=np.inf) for (times, _), more in pairs]
-        cubics = [xp.pad(cubics, [more, (0, 0)]) for (_, cubics), more in pairs]
-        return xp.stack(times), xp.stack(cubics)
-
-    @property
-    def massless(self) -> bool:
-        """Whether all loads are known to have no inertia, so that contact forces are weights."""
-        return not is_jax(self.inertia) and not np.any(self.inertia)
-
-    def on_beam(self, times: Float[Array, "*time"]) -> Bool[Array, "load *time"]:
-        """Whether each load is on the beam at given times (s), from entry until before exit."""
-        windows = [path.entry_exit_times() for path in self.trajectories]
-        on = [(entry <= times) & (times < leave) for entry, leave in windows]
-        return xp.array(on, bool).reshape(len(on), *xp.shape(times))
+    shape: Float[Array, "*wheel block mode"]
+    acceleration: Float[Array, "*wheel block side"] | None
+    velocity: Float[Array, "*wheel block side"] | None
+    deflection: Float[Array, "*wheel block side"] | None
 
 
-def load_set(case: Case) -> LoadSet:
-    """Loads of a case, as a batch of one run."""
-    trajectories = tuple(trajectory(load, case.beam.length) for load in case.loads)
-    gravity = case.run.gravity
-    inertia = [load.inertia() for load in case.loads]
-    weight = [load.weight(gravity) for load in case.loads]
-    column = (len(trajectories), 1)
-    return LoadSet(
-        trajectories, xp.array(inertia).reshape(column), xp.array(weight).reshape(column)
-    )
+def surface_rows(
+    model: ModalModel, position, speed, acceleration, active, springs=False, inertia=True
+) -> SurfaceRows:
+    """Rows at wheels; velocity and deflection with `springs`, acceleration with `inertia` only.
 
-
-def contact_rows(model: ModalModel, position, speed, acceleration, active):
-    """Shape rows (*position, block, mode) and contact rows (*position, block, side) at the loads.
-
-    Position (m), speed (m/s), acceleration (m/s^2) and `active` (on the beam) of the loads all have
-    the shape (*position,); rows of loads off the beam are zero.
+    Position (m), speed (m/s), acceleration (m/s^2) and `active` (on the beam) of the wheels all
+    have the shape (*wheel,).
     """
     position_on_beam = xp.where(active, position, 0.0)
+    blocks, modes_per_block = model.state_matrix.shape[0], model.modes_per_block
+    block_shape = (*position.shape, blocks, modes_per_block)
+    if not (inertia or springs):
+        shape = xp.where(active[..., None], model.shapes(position_on_beam, (0,))[0], 0.0)
+        return SurfaceRows(shape.reshape(block_shape), None, None, None)
     shape, slope, curvature = xp.where(
         active[..., None], model.shapes(position_on_beam, (0, 1, 2)), 0.0
     )
     speed, acceleration = speed[..., None], acceleration[..., None]
-    convective = speed**2 * curvature + acceleration * slope
-    coriolis = 2 * speed * slope
-    blocks, modes_per_block = model.state_matrix.shape[0], model.modes_per_block
-    block_shape = (*position.shape, blocks, modes_per_block)
-    shape = shape.reshape(block_shape)
+    side = model.state_matrix.shape[1]
+
+    def state_rows(of_coordinates, of_rates):
+        """Rows on coordinates and rates of the modes, in turn."""
+        pairs = xp.stack([part.reshape(block_shape) for part in (of_coordinates, of_rates)], -1)
+        return pairs.reshape(*block_shape[:-1], 2 * modes_per_block)
+
+    def all_states(rows):
+        return xp.pad(rows, [(0, 0)] * (rows.ndim - 1) + [(0, side - rows.shape[-1])])
+
+    convective = state_rows(speed**2 * curvature + acceleration * slope, 2 * speed * slope)
+    blocks_of_shape = shape.reshape(block_shape)
     rates = model.state_matrix[:, 1 : 2 * modes_per_block : 2, :]
-    state_rows = (
-        xp.sum(shape[..., None] * rates, axis=-2) if modes_per_block == 1 else shape @ rates
+    rows = (
+        xp.sum(blocks_of_shape[..., None] * rates, axis=-2)
+        if modes_per_block == 1
+        else blocks_of_shape @ rates
     )
-    convective = xp.stack([convective.reshape(block_shape), coriolis.reshape(block_shape)], axis=-1)
-    convective = convective.reshape(*block_shape[:-1], 2 * modes_per_block)
-    rows = add_at(state_rows, np.s_[..., : 2 * modes_per_block], convective)
-    return shape, rows
+    rows = add_at(rows, np.s_[..., : 2 * modes_per_block], convective)
+    if not springs:
+        return SurfaceRows(blocks_of_shape, rows, None, None)
+    velocity, deflection = state_rows(speed * slope, shape), state_rows(shape, xp.zeros_like(shape))
+    return SurfaceRows(blocks_of_shape, rows, all_states(velocity), all_states(deflection))
+
+
+class ContactState(eqx.Module):
+    """Contact forces f (N, upwards on the beam) and accelerations at instants.
+
+    Of the coordinates q, and of the degrees of freedom of the vehicles of each load (m/s^2).
+    """
+
+    force: Float[Array, "*time wheel batch"]
+    modal_acceleration: Float[Array, "*time mode batch"]
+    vehicle_acceleration: tuple[Float[Array, "*time _ _ batch"], ...]  # vehicle, dof
 
 
 def contact_at(
@@ -114,36 +98,79 @@ def contact_at(
     times: Float[Array, "*time"],
     states: Float[Array, "*time state batch"],
     commands: Float[Array, "*time actuator batch"] | None = None,
-) -> tuple[Float[Array, "*time load batch"], Float[Array, "*time mode batch"]]:
-    """Contact forces r (N, upwards on the beam) and accelerations of q at instants (s).
+) -> ContactState:
+    """Contact forces and accelerations at instants (s), with the states of model and vehicles.
 
-    At the instant at which a load enters or leaves, those just after it.
+    At the instant at which a wheel enters or leaves, those just after it.
     """
     kinematics = (*loads.kinematics(times), loads.on_beam(times))
     position, speed, acceleration, active = (xp.moveaxis(part, 0, -1) for part in kinematics)
-    shape, rows = contact_rows(model, position, speed, acceleration, active)
-    shape = shape.reshape(*position.shape, model.mode_count)
+    springs = bool(loads.wheels.vehicles)
+    rows = surface_rows(model, position, speed, acceleration, active, springs)
+    profile = loads.surface_motion(position, speed, acceleration)
+    states, vehicle_states = split_states(model.state_count, loads, states)
+    shape = rows.shape.reshape(*position.shape, model.mode_count)
     blocks, side, _ = model.state_matrix.shape
     state_blocks = states.reshape(*times.shape, blocks, side, -1)
     rates = (model.state_matrix @ state_blocks).reshape(states.shape)
     modal_acceleration = rates[..., model.rate_index, :]
-    acceleration_under_load = rows.reshape(*position.shape, model.state_count) @ states
+
+    def motion(row, height):
+        beam = row.reshape(*position.shape, model.state_count) @ states
+        return beam if height is None else beam + height[..., None]
+
+    height, height_rate, height_acceleration = (None,) * 3 if profile is None else profile
+    surface_acceleration = motion(rows.acceleration, height_acceleration)
     if commands is not None:
         command_acceleration = model.command_matrix[model.rate_index] @ commands
-        modal_acceleration, acceleration_under_load = (
-            modal_acceleration + command_acceleration,
-            acceleration_under_load + shape @ command_acceleration,
+        modal_acceleration = modal_acceleration + command_acceleration
+        surface_acceleration = surface_acceleration + shape @ command_acceleration
+    weight, vehicle_acceleration = loads.varying_weight(times), ()
+    if springs:
+        wheels = loads.wheels
+        surface = wheels.stiffness * motion(rows.deflection, height)
+        surface = surface + wheels.damping * motion(rows.velocity, height_rate)
+        pairs = list(zip(wheels.vehicles, vehicle_states, strict=True))
+        weight = weight + forces_of_wheels(
+            loads, [g.spring_forces(z, surface[..., g.wheels, :]) for g, z in pairs], surface
         )
-    weight = xp.where(active[..., None], loads.weight, 0.0)
+        vehicle_acceleration = tuple(
+            group.accelerations(state, surface[..., group.wheels, :]) for group, state in pairs
+        )
+    mass = loads.inertia
+    on_beam = active[..., None]
+    pressing = on_beam | loads.on_ground[:, None]
+    free_force = xp.where(pressing, -(weight + mass * surface_acceleration), 0.0)
     if loads.massless:
-        return -weight, modal_acceleration - shape.mT @ weight
-    mass = xp.where(active[..., None], loads.inertia, 0.0)
-    # The contact law: (1 + m S S') r = -W - m (contact row) . z.
+        return ContactState(free_force, modal_acceleration + shape.mT @ free_force, ())
+    # The contact law: (1 + m S S') f = -W - s - m (acceleration row) . z.
+    mass_on_beam = xp.where(on_beam, mass, 0.0)
     identity = np.eye(position.shape[-1])[..., None]
-    matrix = identity + mass[..., None, :] * (shape @ shape.mT)[..., None]
-    right = weight + mass * acceleration_under_load
-    force = -_solve_at_instants(matrix, right)
-    return force, modal_acceleration + shape.mT @ force
+    matrix = identity + mass_on_beam[..., None, :] * (shape @ shape.mT)[..., None]
+    force = _solve_at_instants(matrix, free_force)
+    return ContactState(force, modal_acceleration + shape.mT @ force, vehicle_acceleration)
+
+
+def split_states(state_count: int, loads: LoadSet, states: Float[Array, "*time state batch"]):
+    """States of the model, `state_count`, and of the vehicles of each load after them.
+
+    Those are (*time, vehicle, state, batch).
+    """
+    first, vehicle_states = state_count, []
+    for group in loads.wheels.vehicles:
+        part = states[..., first : first + group.state_count, :]
+        vehicle_states.append(part.reshape(*part.shape[:-2], group.count, -1, part.shape[-1]))
+        first += group.state_count
+    return states[..., :state_count, :], vehicle_states
+
+
+def forces_of_wheels(loads: LoadSet, spring_forces, like, axis: int = -2):
+    """Forces of the springs of all wheels, along an axis; zero for those without springs."""
+    parts, first = [], 0
+    for group, force in zip(loads.wheels.vehicles, spring_forces, strict=True):
+        parts += [xp.zeros_like(slice_in_dim(like, first, group.first_wheel, axis)), force]
+        first = group.wheels.stop
+    return xp.concatenate([*parts, xp.zeros_like(slice_in_dim(like, first, None, axis))], axis=axis)
 
 
 def _solve_at_instants(

@@ -26,6 +26,7 @@ from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshe
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
 
 NODE_TOLERANCE = 1e-9  # of the length: closer nodes are one node
+ROUNDING_SHARE = 4e-15  # of the largest coefficient of a shape: smaller ones are rounding errors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +122,7 @@ class Modes(eqx.Module):
     `coupling` is the off-diagonal stiffness between repeated modes, zero in value but not in
     derivative (see `eigen`). Stiffness is of order one for the lowest mode in the
     `stiffness_unit` E I / (m L^4). Shapes are mass-normalised, in kg^-1/2, positive near the left
-    end; `series` are their Chebyshev series between the `nodes` (m).
+    end; `series` are their Chebyshev series between the `nodes` (m) of the `layout`.
     """
 
     stiffness: Float[Array, " mode"]
@@ -131,6 +132,7 @@ class Modes(eqx.Module):
     nodes: Float[Array, " node"]
     series: Float[Array, "segment degree mode"]
     stiffness_unit: Float[Array, ""]
+    layout: Layout = eqx.field(static=True)
 
     def lowest(self, count: int) -> "Modes":
         """The lowest modes, as many as `count`."""
@@ -143,6 +145,7 @@ class Modes(eqx.Module):
             nodes=self.nodes,
             series=self.series[..., selection],
             stiffness_unit=self.stiffness_unit,
+            layout=self.layout,
         )
 
     @property
@@ -204,16 +207,24 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     nodes, stiffness, mass, to_series = assemble_matrices(case, layout)
     values, vectors, coupling = eigen(stiffness, mass)
     lowest = slice(beam.modes)
-    values, coupling = (
-        values[lowest] * _stiffness_unit(beam),
-        coupling[lowest, lowest] * _stiffness_unit(beam),
-    )
+    values, coupling = values[lowest], coupling[lowest, lowest]
+    values, coupling = values * _stiffness_unit(beam), coupling * _stiffness_unit(beam)
     series = xp.einsum("std,dm->stm", to_series, vectors[:, lowest])
-    series = series / xp.sqrt(beam.linear_density * beam.length)
-    return normalised_modes(beam, values, coupling, nodes * beam.length, series)
+    series = _without_rounding(series) / xp.sqrt(beam.linear_density * beam.length)
+    return normalised_modes(beam, values, coupling, nodes * beam.length, series, layout)
 
 
-def normalised_modes(beam, values, coupling, nodes, series) -> Modes:
+def _without_rounding(series):
+    """Series with the coefficients zero that are rounding errors; their derivatives stay.
+
+    A third derivative, hence a shear force, multiplies that of degree n by up to n^6 / 15.
+    """
+    largest = xp.max(xp.abs(series), axis=1, keepdims=True)
+    noise = xp.where(xp.abs(series) < ROUNDING_SHARE * largest, series, 0.0)
+    return series - stop_gradient(noise)
+
+
+def normalised_modes(beam, values, coupling, nodes, series, layout: Layout) -> Modes:
     """Modes of given stiffness (1/s^2) with the beam's damping, positive near the left end."""
     damping, damping_coupling = _damping(beam, values, coupling)
     left_values = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
@@ -227,6 +238,7 @@ def normalised_modes(beam, values, coupling, nodes, series) -> Modes:
         nodes,
         series * signs,
         _stiffness_unit(beam),
+        layout,
     )
 
 

@@ -13,11 +13,12 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.model.contact import LoadSet, contact_rows, load_set
+from jaxbeam.model.contact import surface_rows
 from jaxbeam.model.linear_system import Signal, StateSpace
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
-from jaxbeam.model.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
@@ -131,12 +132,12 @@ class Plant(Module):
         loads = self.loads
         position, speed, acceleration = loads.kinematics(t)
         active = loads.on_beam(t)
-        shape, contact = contact_rows(self.modal_model, position, speed, acceleration, active)
-        count = len(loads.trajectories)
+        rows = surface_rows(self.modal_model, position, speed, acceleration, active)
+        count = loads.wheel_count
         mass = xp.where(active, loads.inertia[:, 0], 0.0)
         return (
-            shape.reshape(count, self.coordinate_scale.size),
-            contact.reshape(count, self.modal_model.state_count),
+            rows.shape.reshape(count, self.coordinate_scale.size),
+            rows.acceleration.reshape(count, self.modal_model.state_count),
             mass,
         )
 
@@ -153,7 +154,7 @@ class Plant(Module):
         matrix = matrix - force_input @ (mass[:, None] * contact_rows)
         command = command - force_input @ (mass[:, None] * (shape_rows @ command[rates]))
         inputs = xp.concatenate([command, -force_input], axis=1)
-        C, D = sensor_rows(model, self.case.sensors).of_system(model, matrix, inputs)
+        C, D = sensor_rows(model, self.case, self.case.sensors).of_system(model, matrix, inputs)
         order, scales = self._state_order, self._state_scales
         loads = tuple(Signal(f"load_{i}", "N") for i in range(len(mass)))
         return StateSpace(

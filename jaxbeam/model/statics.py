@@ -9,10 +9,10 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import is_concrete
-from jaxbeam.case.loads import trajectory
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.flexibility import check_supported, flexibility
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.numerics.peak_search import refine_peak
 from jaxbeam.runtime.arrays import Array, set_at, xp
@@ -69,7 +69,7 @@ def static_deflection(
     """Static deflection at x (m) under stationary forces, in m, positive upwards.
 
     `forces` (load,) are in N, positive downwards, at `load_positions` (load,) in m; by default the
-    weights of the loads of the case. `derivative` and `layout` are those of `influence_line`.
+    static loads of the wheels of the case. `derivative` and `layout` are those of `influence_line`.
 
     Raises ValueError as `influence_line` does, and where forces and positions differ in number.
 
@@ -80,8 +80,8 @@ def static_deflection(
     """
     positions = xp.atleast_1d(xp.asarray(load_positions, float))
     if forces is None:
-        forces = xp.array([load.weight(case.run.gravity) for load in case.loads]).reshape(-1)
-        described = "loads of the case"
+        forces = load_set(case).weight[:, 0]
+        described = "wheels of the case"
     else:
         forces = xp.atleast_1d(xp.asarray(forces, float))
         described = "forces"
@@ -102,20 +102,32 @@ def static_deflection_per_command(
     a discontinuity, such as that of the curvature at the end of a patch, its value to the right.
     Inside `jit`, pass the `layout`. Raises ValueError as `influence_line` does.
     """
+    per_force = static_deflection_per_port_force(case, x, derivative, layout)
+    gains = xp.array([a.attachment().static_gain for a in case.actuators]).reshape(-1)
+    return gains.reshape(-1, *(1,) * (per_force.ndim - 1)) * per_force
+
+
+def static_deflection_per_port_force(
+    case: Case, x, derivative: int = 0, layout: Layout | None = None
+) -> Float[Array, "actuator *position"]:
+    """Static deflection at x (m) per unit of each actuator's generalised force on the beam.
+
+    In m/N for a force, 1/N for a couple; otherwise as `static_deflection_per_command`.
+    """
     x = xp.asarray(x, float)
     layout = _validated_layout(case, layout, x=x)
-    return _deflection_per_command(case, layout, x, derivative)
+    return _deflection_per_port_force(case, layout, x, derivative)
 
 
 @compiled_if_traced
-def _deflection_per_command(case: Case, layout: Layout, x, derivative: int):
+def _deflection_per_port_force(case: Case, layout: Layout, x, derivative: int):
     length = case.beam.length
     greens = flexibility(case, layout, x.reshape(-1), derivative)  # by reciprocity: forces at x
     gains = xp.zeros((len(case.actuators), x.size))
     for i, actuator in enumerate(case.actuators):
         terms = actuator.displacement_map()
         displacement = sum(f / length**d * greens(position / length, d) for position, d, f in terms)
-        gains = set_at(gains, i, actuator.attachment().static_gain * displacement)
+        gains = set_at(gains, i, displacement)
     return (gains * length ** (3 - derivative) / case.beam.bending_stiffness).reshape(-1, *x.shape)
 
 
@@ -142,28 +154,21 @@ def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*p
 def _static_peak(case: Case, layout: Layout, x):
     length = case.beam.length
     greens = flexibility(case, layout, x.reshape(-1), 0)
-    trajectories = [trajectory(load, length) for load in case.loads]
-    windows = xp.stack([xp.stack(path.entry_exit_times()) for path in trajectories])
+    loads = load_set(case)
+    windows = loads.entry_exit_times()
     nodes = xp.concatenate([greens.nodes, greens.sources.positions])
     table_times = [load.times for load in case.loads if load.times is not None]
-    events = [
-        windows.ravel(),
-        *(path.passage_times(nodes * length) for path in trajectories),
-        *table_times,
-    ]
-    events = xp.concatenate(events)
+    passages = loads.passage_times(nodes * length)
+    events = xp.concatenate([windows.reshape(-1), passages, *table_times])
     event_times = xp.sort(xp.where(events < NEVER, events, windows[0, 0]))
     starts, ends = event_times[:-1], event_times[1:]
     middle = (starts + ends) / 2
     times = starts + (ends - starts) * np.array(PEAK_POSITIONS)[:, None]
     total = xp.zeros((*times.shape, x.size))
-    for load, path, window in zip(case.loads, trajectories, windows, strict=True):
-        active = (window[0] < middle) & (middle < window[1])
-        relative_position = xp.clip(path.kinematics(times)[0] / length, 0.0, 1.0)
-        load_deflection = (
-            load.weight(case.run.gravity) * active[:, None] * greens(relative_position)
-        )
-        total = total + load_deflection
+    positions = xp.clip(loads.kinematics(times)[0] / length, 0.0, 1.0)
+    for wheel in range(loads.wheel_count):
+        active = (windows[wheel, 0] < middle) & (middle < windows[wheel, 1])
+        total = total + loads.weight[wheel] * active[:, None] * greens(positions[wheel])
     highest = xp.max(refine_peak(total, PEAK_POSITIONS)[0], axis=0)
     return (highest * length**3 / case.beam.bending_stiffness).reshape(x.shape)
 

@@ -1,4 +1,4 @@
-"""Figures of records, comparisons, modes, sweeps, fits, tunings and frequency responses.
+"""Figures of records, envelopes, comparisons, modes, sweeps, fits, tunings and frequency responses.
 
 Each function returns a matplotlib figure, which the caller saves. Figures are not registered with
 pyplot: none is shown, and none needs to be closed. The public names are listed in `__init__.pyi`;

@@ -1,5 +1,6 @@
 from .animation import animate as animate
 from .compare import plot_comparison as plot_comparison
+from .envelope import plot_envelope as plot_envelope
 from .fit import FitPanel as FitPanel, plot_fit as plot_fit
 from .frequency import plot_frequency_response as plot_frequency_response
 from .front import plot_pareto_front as plot_pareto_front
@@ -8,3 +9,4 @@ from .poles import plot_poles as plot_poles
 from .record import plot_record as plot_record
 from .sweep import plot_sweep as plot_sweep
 from .tuning import TuningPanel as TuningPanel, plot_tuning as plot_tuning
+from .vehicles import plot_vehicles as plot_vehicles

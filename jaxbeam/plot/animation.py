@@ -1,4 +1,4 @@
-"""Animation of a run: beam with loads and actuators, deflections and commands so far."""
+"""Animation of a run: beam with loads and actuators, readings and commands so far."""
 
 import os
 
@@ -9,10 +9,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.record import shade_crossings
 from jaxbeam.plot.schematic import (
     ACTUATOR_MARKER,
-    LOAD_MARKER,
     actuator_positions,
     draw_supports,
 )
@@ -20,6 +21,8 @@ from jaxbeam.plot.style import (
     COLOURS,
     GREY,
     INK,
+    UnitScale,
+    axis_label,
     colour,
     command_drawstyle,
     load_colour,
@@ -27,6 +30,7 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
+from jaxbeam.plot.traffic.moving import Traffic
 from jaxbeam.simulation.record import Record
 
 PALETTE_SIZE = 96  # colours of the GIF; few keep the file small
@@ -43,26 +47,37 @@ def animate(
 ) -> None:
     """Write a GIF of the beam, its deflection enlarged, and the loads that cross it.
 
-    Actuators hang below the beam, patches are drawn on it, sensors are dots; the thin line is the
-    envelope of the downward deflection. Below are the deflections at the sensors so far, and the
-    commands if there is a controller. The whole run takes `frames` frames, `rate` of them a second;
-    a clock shows its time (s). Raises FileExistsError if the file exists and `overwrite` is not
-    set, ValueError for a run that diverges.
+    Vehicles are boxes on springs, as far above the surface as their bodies move, on the same scale
+    unless the profile is rough; it is the line on the beam and beside it. Actuators hang below the
+    beam, patches are drawn on it, sensors are dots; the thin line is the envelope of the downward
+    deflection. Below is what the sensors measure so far, and the commands if there is a controller.
+    The whole run takes `frames` frames, `rate` of them a second; a clock shows its time (s). Raises
+    FileExistsError if the file exists and `overwrite` is not set, ValueError for a run that
+    diverges.
     """
     if not overwrite and os.path.exists(path):
         raise FileExistsError(f"{path} exists; choose another name, or overwrite it")
     if np.isfinite(float(concrete(record.diverged_time))):
         raise ValueError(f"there is nothing to show: {record.verdict}")
     controlled = record.case.controller is not None
-    heights = [2.2] + [1.3] * (bool(record.case.sensors) + controlled)
+    quantities = list(dict.fromkeys(sensor.quantity for sensor in record.case.sensors))
+    stage = 3.0 if load_set(record.case).on_ground.any() else 2.2
+    heights = [stage] + [1.3] * (len(quantities) + controlled)
     figure = Figure(figsize=(6.4, 0.8 + sum(heights)), dpi=90)
     canvas = FigureCanvasAgg(figure)
     top, *below = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     updates = [_beam_axes(top, record)]
-    if record.case.sensors:
-        updates.append(_history_axes(below[0], record, np.asarray(record.deflection), "deflection"))
+    values = np.asarray(record.sensor_values)
+    for axes, quantity in zip(below, quantities, strict=False):
+        own = [i for i, sensor in enumerate(record.case.sensors) if sensor.quantity == quantity]
+        scale = unit_scale(values[:, own], QUANTITIES[quantity].unit)
+        tints = [colour(i) for i in own]
+        updates.append(_history_axes(axes, record, values[:, own], quantity, scale, tints))
     if controlled:
-        updates.append(_history_axes(below[-1], record, np.asarray(record.command), "command"))
+        commands, unit = np.asarray(record.command), record.case.actuators[0].command_unit
+        tints = [load_colour(i) for i in range(commands.shape[1])]
+        style, scale = command_drawstyle(record.case.controller), UnitScale(1.0, unit)
+        updates.append(_history_axes(below[-1], record, commands, "command", scale, tints, style))
     for axes in below[:-1]:
         axes.tick_params(labelbottom=False)
     if below:
@@ -96,10 +111,10 @@ def _beam_axes(axes, record):
     length = float(concrete(case.beam.length))
     x = np.linspace(0, length, 201)
     sensor_positions = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
-    load_positions = np.asarray(record.load_position)
     beam = np.asarray(record.at(jnp.asarray(x)))
     factor, unit = unit_scale(beam, "m")
     beam = beam / factor
+    traffic = Traffic(record, x, beam, factor)
     lowest_deflection = np.minimum.accumulate(beam)
     acting_at = [actuator_positions(actuator) for actuator in case.actuators]
     point_actuators = np.array([positions[0] for positions in acting_at if len(positions) == 1])
@@ -121,19 +136,9 @@ def _beam_axes(axes, record):
     sensor_markers = axes.scatter(
         sensor_positions, 0 * sensor_positions, color=sensor_colours, edgecolor="white", zorder=4
     )
-    (load_markers,) = axes.plot(
-        [], [], linestyle="", marker=LOAD_MARKER, markersize=20, color=COLOURS[5]
-    )
-    load_markers.set(markeredgecolor=INK, clip_on=False, zorder=3)
-    for moving in (actuator_markers, load_markers):
-        moving.set_in_layout(False)  # no points yet in the first frame
+    actuator_markers.set_in_layout(False)  # no points yet in the first frame
     clock = axes.text(1, 1, "", transform=axes.transAxes, ha="right", va="top", family="monospace")
-    low, high = min(beam.min(), 0.0), max(beam.max(), 0.0)
-    height_range = (high - low) or 1.0
-    axes.set(
-        xlim=(-0.02 * length, 1.02 * length),
-        ylim=(low - 0.15 * height_range, high + 0.4 * height_range),
-    )
+    update_traffic = traffic.draw(axes)
     axes.set(xlabel="position (m)", ylabel=f"deflection ({unit})")
 
     def update(frame):
@@ -146,31 +151,23 @@ def _beam_axes(axes, record):
         for patch, span in zip(patch_lines, patches, strict=True):
             patch.set_data(span, height(span))
         sensor_markers.set_offsets(np.column_stack([sensor_positions, height(sensor_positions)]))
-        on = load_positions[frame][np.isfinite(load_positions[frame])]
-        load_markers.set_data(on, height(on))
+        update_traffic(frame)
         clock.set_text(f"t = {float(record.times[frame]):.3f} s")
 
     return update
 
 
-def _history_axes(axes, record, values, quantity):
+def _history_axes(
+    axes, record, values, words: str, scale: UnitScale, tints: list[str], style: str = "default"
+):
     """Axes of values over time, a line a column; returns a function that draws them to a sample."""
-    times = np.asarray(record.times)
-    unit, factor, line_colour, style = "", 1.0, load_colour, "default"
-    if quantity == "deflection":
-        (factor, unit), line_colour = unit_scale(values, "m"), colour
-    else:
-        unit = record.case.actuators[0].command_unit
-        style = command_drawstyle(record.case.controller)
-    values = values / factor
+    times, values = np.asarray(record.times), values / scale.factor
     shade_crossings(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.7)
-    lines = [
-        axes.plot([], [], color=line_colour(i), drawstyle=style)[0] for i in range(values.shape[1])
-    ]
+    lines = [axes.plot([], [], color=tint, drawstyle=style)[0] for tint in tints]
     low, high = np.min(values), np.max(values)
     margin = 0.08 * ((high - low) or 1.0)
-    axes.set(ylim=(low - margin, high + margin), ylabel=f"{quantity} ({unit})")
+    axes.set(ylim=(low - margin, high + margin), ylabel=axis_label(words, scale.unit))
 
     def draw(frame):
         for line, column in zip(lines, values.T, strict=True):

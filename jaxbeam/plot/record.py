@@ -1,18 +1,20 @@
-"""Figure of one run: deflections at the sensors, contact forces and commands over time."""
+"""Figure of one run: what the sensors measure, contact forces and commands over time."""
 
 import dataclasses
+import functools
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxbeam.case.case import crossing_times
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import trajectory
-from jaxbeam.plot.schematic import draw_schematic
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.plot.schematic import draw_schematic, shows_traffic
 from jaxbeam.plot.style import (
-    ALARM,
     GREY,
     SHADE,
     annotate,
+    axis_label,
     colour,
     command_drawstyle,
     draw_limits,
@@ -23,23 +25,31 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
+from jaxbeam.plot.traffic.rows import draw_accelerations, draw_forces, has_bodies
 from jaxbeam.simulation.record import Record
 
 
 @use_style
 def plot_record(record: Record) -> Figure:
-    """Schematic of the case, deflections at the sensors, contact forces, and commands if any.
+    """Schematic, quantities of the sensors, contact forces, bodies of vehicles, and commands.
 
-    Dots mark peaks, shading the times with loads on the beam. Raises ValueError if the case has
-    neither sensors nor loads.
+    Each quantity has axes of its own. Dots mark peaks, shading the times with loads on the beam;
+    vehicles have a row for the accelerations of their bodies (see `jaxbeam.plot.traffic.rows`),
+    controllers one for the commands. Raises ValueError if the case has neither sensors nor loads.
     """
     case = record.case
+    crossed = shows_traffic(case)
+    quantities = list(dict.fromkeys(sensor.quantity for sensor in case.sensors))
     panels = [
         (height, draw)
         for height, draw, shown in (
-            (0.7, lambda axes, record: draw_schematic(axes, record.case), True),
-            (3.2, _draw_deflection, case.sensors),
-            (1.7, _draw_forces, case.loads),
+            (1.2 if crossed else 0.7, lambda axes, record: draw_schematic(axes, record.case), True),
+            *(
+                (3.2 if i == 0 else 2.2, functools.partial(_draw_quantity, quantity=name), True)
+                for i, name in enumerate(quantities)
+            ),
+            (1.7, _with_crossings(draw_forces), case.loads),
+            (1.5, _with_crossings(draw_accelerations), has_bodies(record)),
             (1.7, _draw_commands, case.controller is not None),
         )
         if shown
@@ -58,14 +68,20 @@ def plot_record(record: Record) -> Figure:
     return figure
 
 
+def _with_crossings(draw):
+    """Function that shades the times with loads on the beam before it draws."""
+
+    def shade_and_draw(axes, record):
+        shade_crossings(axes, record)
+        draw(axes, record)
+
+    return shade_and_draw
+
+
 def load_windows(record: Record) -> list[tuple[int, float, float]]:
     """Number, entry and exit (s) of each load on the beam during the record, clipped to it."""
     times = np.asarray(record.times)
-    trajectories = [trajectory(load, record.case.beam.length) for load in record.case.loads]
-    windows = np.array(
-        [[float(concrete(t)) for t in trajectory.entry_exit_times()] for trajectory in trajectories]
-    ).reshape(-1, 2)
-    cut = np.clip(windows, times[0], times[-1]).tolist()
+    cut = np.clip(crossing_times(record.case), times[0], times[-1]).tolist()
     return [(i, entry, leaves) for i, (entry, leaves) in enumerate(cut) if entry < leaves]
 
 
@@ -104,63 +120,41 @@ def label_loads(axes, record: Record) -> None:
 
 
 def _load_label(load) -> str:
-    """Mass or force, and speed of a load, with units: "0.5 kg, 1.2 m/s"."""
+    """Mass or force, or name, and speed of a load, with units: "0.5 kg, 1.2 m/s"."""
     numbers = [(field, getattr(load, field.name)) for field in dataclasses.fields(load)]
-    return ", ".join(
+    parts = [
         f"{float(concrete(value)):.4g} {field.metadata['unit']}"
         for field, value in numbers
         if field.name in ("mass", "force", "speed") and value is not None
-    )
+    ]
+    if load.kind not in ("mass", "force"):
+        parts.insert(0, getattr(load, "train", "") or getattr(load, "model", "") or load.kind)
+    return ", ".join(parts)
 
 
-def _draw_deflection(axes, record):
-    times, deflection = np.asarray(record.times), np.asarray(record.deflection)
-    factor, unit = unit_scale(deflection, "m")
+def _draw_quantity(axes, record, quantity: str):
+    """Draw the histories of the sensors of a quantity, with a dot at the larger extreme of each."""
+    times, values = np.asarray(record.times), np.asarray(record.sensor_values)
+    sensors = record.case.sensors
+    own = [i for i, sensor in enumerate(sensors) if sensor.quantity == quantity]
+    factor, unit = unit_scale(values[:, own], QUANTITIES[quantity].unit)
+    extremes = [np.asarray(part) for part in record.extremes]
     shade_crossings(axes, record)
     axes.axhline(0, color=GREY, linewidth=0.8)
-    peaks = []
-    for i, when in enumerate(np.asarray(record.peak_time)):
-        axes.plot(times, deflection[:, i] / factor, color=colour(i))
-        peaks.append(signed_peak(record, i) / factor)
+    peaks, names = [], []
+    for i in own:
+        axes.plot(times, values[:, i] / factor, color=colour(i))
+        low, low_time, high, high_time = (float(part[i]) for part in extremes)
+        peak, when = (low, low_time) if -low > high else (high, high_time)
+        peaks.append(peak / factor)
         axes.plot([when], peaks[-1:], "o", color=colour(i), markeredgecolor="white", zorder=3)
-    axes.set_ylabel(f"deflection ({unit})")
+        names.append(f"{sensors[i].name or 'peak'} {format_number(peaks[-1])} {unit}")
+    axes.set_ylabel(axis_label(quantity, unit))
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.07 * (high - low))  # room for the names
-    label_loads(axes, record)
-    names = [f"peak {format_number(peak)} {unit}" for peak in peaks]
-    margin_labels(axes, peaks, names, [colour(i) for i in range(len(peaks))])
-
-
-def _draw_forces(axes, record):
-    times, force = np.asarray(record.times), np.asarray(record.contact_force)
-    on = np.isfinite(np.asarray(record.load_position))
-    factor, unit = unit_scale(force[on], "N")
-    shade_crossings(axes, record)
-    weights = {}
-    for i, load in enumerate(record.case.loads):
-        contact_force = np.where(on[:, i], force[:, i], np.nan) / factor
-        axes.plot(times, contact_force, color=load_colour(i), linewidth=1.1)
-        weight = float(concrete(load.weight(record.case.run.gravity))) / factor
-        weights.setdefault(weight, load_colour(i))
-    lost = np.asarray(record.contact_lost_time)
-    lost = lost[np.isfinite(lost)]
-    if lost.size:
-        axes.axhline(0, color=GREY, linewidth=0.8)
-        axes.plot(lost, 0 * lost, "X", color=ALARM, markersize=7, zorder=3)
-        annotate(
-            axes,
-            "contact loss",
-            (lost.min(), 0),
-            (-6, -6),
-            ha="right",
-            va="top",
-            color=ALARM,
-        )
-    axes.set_ylabel(f"contact force ({unit})")
-    for weight, tint in weights.items():
-        axes.axhline(weight, color=tint, linewidth=0.9, linestyle=":")
-    names = [f"weight {format_number(weight)} {unit}" for weight in weights]
-    margin_labels(axes, list(weights), names, list(weights.values()))
+    if 0 in own:  # the first of the quantities
+        label_loads(axes, record)
+    margin_labels(axes, peaks, names, [colour(i) for i in own])
 
 
 def _draw_commands(axes, record):

@@ -7,7 +7,9 @@ from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
+from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, colour, separate_labels
+from jaxbeam.plot.traffic.drawing import vehicle_art
 
 # Markers in points, below the point of the beam they support.
 _HATCH_LINES = [p for y in (-0.9, -0.5, -0.1, 0.3, 0.7) for p in ((0.0, y + 0.2), (-0.4, y))]
@@ -39,8 +41,12 @@ END_MARKERS = {
 
 
 def _draw_marker(axes, x, y, marker, size, **style):
+    _draw_markers(axes, [x], [y], marker, markersize=size, **style)
+
+
+def _draw_markers(axes, x, y, marker, **style):
     style = {"markerfacecolor": "white", "markeredgecolor": INK, "markeredgewidth": 1.0} | style
-    axes.plot([x], [y], marker=marker, markersize=size, clip_on=False, zorder=3, **style)
+    axes.plot(x, y, marker=marker, clip_on=False, zorder=3, **style)
 
 
 def draw_supports(axes, case: Case, y: int | float = 0, size: int | float = 22) -> None:
@@ -63,8 +69,17 @@ def actuator_positions(actuator: AbstractActuator) -> list[float]:
     return [float(concrete(position)) for position, _, _ in actuator.displacement_map()]
 
 
+def shows_traffic(case: Case) -> bool:
+    """Whether the schematic shows loads or a profile: vehicles, and several wheels in a row."""
+    loads = load_set(case)
+    return case.profile is not None or loads.wheel_count > len(case.loads) or any(loads.on_ground)
+
+
 def draw_schematic(axes, case: Case) -> None:
-    """Draw beam, supports, actuators, and sensors in their colours with their positions (m)."""
+    """Draw beam, supports, actuators, and sensors in their colours with their positions (m).
+
+    Vehicles, where the first of them is in the middle, and the profile, its height to no scale.
+    """
     length = float(concrete(case.beam.length))
     axes.plot([0, length], [0, 0], color=INK, linewidth=3, zorder=2)
     draw_supports(axes, case)
@@ -74,11 +89,55 @@ def draw_schematic(axes, case: Case) -> None:
             _draw_marker(axes, positions[0], 0, ACTUATOR_MARKER, 22, markeredgecolor=GREY)
         else:
             axes.plot(positions, [0, 0], color=COLOURS[4], linewidth=6, zorder=2.5)
+    crossed = shows_traffic(case)
+    xlim = (-0.02 * length, 1.02 * length)
+    ylim = (-1.0, 1.7 if crossed else 1.0)
+    axes.set(xlim=xlim, ylim=ylim)
+    axes.axis("off")
+    if crossed:
+        _draw_traffic(axes, case)
     sensor_positions = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
+    side = {"va": "top"} if crossed else {}  # of the beam, where no vehicle is
     for i, (x, label_position) in enumerate(
         zip(sensor_positions, separate_labels(sensor_positions, 0.08 * length), strict=True)
     ):
         axes.plot([x], [0], "o", color=colour(i), markersize=8, markeredgecolor="white", zorder=4)
-        annotate(axes, f"{x:.4g} m", (label_position, 0), (0, 9), ha="center", color=colour(i))
-    axes.set(xlim=(-0.02 * length, 1.02 * length), ylim=(-1, 1))
-    axes.axis("off")
+        offset, tint = (0, -9 if crossed else 9), colour(i)
+        annotate(axes, f"{x:.4g} m", (label_position, 0), offset, ha="center", color=tint, **side)
+
+
+def surface_height(case: Case, x) -> np.ndarray:
+    """Height (m) of the profile at positions x (m), zero without one."""
+    if case.profile is None:
+        return np.zeros(np.shape(x))
+    return np.asarray(concrete(case.profile.heights(np.asarray(x, float))[0]))
+
+
+def _draw_traffic(axes, case: Case) -> None:
+    """Draw the profile and the vehicles above the beam."""
+    length = float(concrete(case.beam.length))
+    left, right = axes.get_xlim()
+    x = np.linspace(left, right, 401)
+    profile = surface_height(case, x)
+    highest = np.max(np.abs(profile)) or 1.0
+    factor = highest / 0.12
+    if case.profile is not None:
+        axes.plot(x, profile / factor, color=GREY, linewidth=0.9, zorder=2.2)
+    loads = load_set(case)
+    if loads.wheel_count == 0:
+        return
+    art = vehicle_art(axes, case, 7.0, 0.3)
+    times = np.linspace(0, float(concrete(case.run.duration)), 2001)
+    positions = np.asarray(concrete(loads.kinematics(times)[0]))
+    first = art[0].wheels if art else slice(0, None)
+    count = art[0].wheels_per_vehicle if art else loads.wheel_count
+    middle = np.mean(positions[first][:count], axis=0)
+    now = positions[:, np.argmin(np.abs(middle - length / 2))]
+    for one in art:
+        here = now[one.wheels]
+        one.update(here, surface_height(case, here) / factor, np.zeros(one.dofs))
+    plain = now[~loads.on_ground]
+    plain = plain[(plain >= 0) & (plain <= length)]
+    if plain.size:
+        style = {"markerfacecolor": COLOURS[5], "markersize": 14, "linestyle": ""}
+        _draw_markers(axes, plain, surface_height(case, plain) / factor, LOAD_MARKER, **style)

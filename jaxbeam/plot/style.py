@@ -6,6 +6,7 @@ import numpy as np
 from cycler import cycler
 from jaxtyping import Float
 from matplotlib import rc_context
+from matplotlib.colors import to_rgb
 
 INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, distinct with any kind of colour vision.
@@ -60,15 +61,21 @@ _PREFIXES = ((1e6, 1e6, "M"), (1e3, 1e3, "k"), (0.1, 1.0, ""), (1e-4, 1e-3, "m")
 def unit_scale(values, unit: str) -> UnitScale:
     """Prefixed unit for the largest of some values in an SI unit: mm for 0.0014 m.
 
-    Values without unit ("1") get a power of ten instead.
+    Values without unit ("1"), or in 1/m, get a power of ten instead.
     """
     sizes = np.abs(np.asarray(values, float))
     largest = np.max(sizes[np.isfinite(sizes)], initial=0.0)
     fitting = ((factor, prefix) for least, factor, prefix in _PREFIXES if largest >= least)
     factor, prefix = next(fitting, (1e-9, "n")) if largest else (1.0, "")
-    if unit in ("", "1"):
-        return UnitScale(factor, "" if factor == 1 else f"$10^{{{np.log10(factor):.0f}}}$")
+    if unit == "" or unit.startswith("1"):
+        power = "" if factor == 1 else f"$10^{{{np.log10(factor):.0f}}}$"
+        return UnitScale(factor, f"{power or '1'}{unit[1:]}" if unit[1:] else power)
     return UnitScale(factor, prefix + unit.replace("^2", "²"))
+
+
+def axis_label(words: str, unit: str) -> str:
+    """Label of an axis: words, and the unit in brackets if there is one."""
+    return f"{words} ({unit})" if unit else words
 
 
 def colour(index: int) -> str:
@@ -79,6 +86,11 @@ def colour(index: int) -> str:
 def load_colour(index: int) -> str:
     """Colour of a load or actuator by its number; colours repeat after four."""
     return LOAD_COLOURS[index % len(LOAD_COLOURS)]
+
+
+def tinted(tint, strength: float) -> tuple[float, float, float]:
+    """Mixture of a colour and white: 1 is the colour, 0 is white."""
+    return tuple(1 - strength * (1 - channel) for channel in to_rgb(tint))  # type: ignore[return]
 
 
 def format_number(value: float, count: int = 3) -> str:

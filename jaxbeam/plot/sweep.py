@@ -1,6 +1,8 @@
-"""Figure of a sweep: peak deflection at each sensor over one or two addresses."""
+"""Figure of a sweep: peaks of what each sensor measures over one or two addresses."""
 
+import functools
 import json
+from typing import NamedTuple
 
 import numpy as np
 import xarray
@@ -10,11 +12,15 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_dict
+from jaxbeam.plot.speed_sweep import is_speed_sweep, is_word_axis, plot_speed_sweep
 from jaxbeam.plot.style import (
     ALARM,
     FAINT,
     INK,
+    axis_label,
     colour,
     format_number,
     margin_labels,
@@ -29,20 +35,24 @@ MAX_MARKED_RUNS = 40  # largest number of runs of a curve that are marked with d
 
 @use_style
 def plot_sweep(dataset: xarray.Dataset) -> Figure:
-    """Peak deflection over the swept addresses: curves for one, a map per sensor for two.
+    """Peaks at the sensors over the swept addresses: curves for one, a map per sensor for two.
 
-    A dot marks the largest peak; failed runs are left out; paired runs are drawn over their number.
-    A sweep over more addresses is drawn in slices: `plot_sweep(dataset.isel({"loads.0.mass": 0}))`.
-    Raises ValueError for more than two addresses, for a single run, and for a dataset without
-    `peak_deflection` and the attribute `case`.
+    Trains over speed are drawn as in `plot_speed_sweep`, other words as bars. Each quantity has a
+    scale of its own. A dot marks the largest peak; failed runs are left out; paired runs are drawn
+    over their number. A sweep over more addresses is drawn in slices:
+    `plot_sweep(dataset.isel({"loads.0.mass": 0}))`. Raises ValueError for more than two addresses,
+    for a single run, and for a dataset without peaks and the attribute `case`.
     """
-    if "peak_deflection" not in dataset or "case" not in dataset.attrs:
-        raise ValueError("not a sweep of jaxbeam: the dataset lacks peak_deflection or its case")
+    names = [f"peak_{name}" for name in QUANTITIES if f"peak_{name}" in dataset]
+    if not names or "case" not in dataset.attrs:
+        raise ValueError("not a sweep of jaxbeam: the dataset lacks its peaks or its case")
     case = case_from_dict(json.loads(dataset.attrs["case"]))
-    peaks = dataset["peak_deflection"]
+    # Each sensor has its peaks in the variable of its quantity, and NaN in the others.
+    peaks = functools.reduce(lambda one, other: one.fillna(other), (dataset[n] for n in names))
     peaks = peaks.squeeze([d for d in peaks.dims if d != "sensor" and peaks.sizes[d] == 1])
     swept = [str(dimension) for dimension in peaks.dims if dimension != "sensor"]
-    peaks = peaks.sortby([address for address in swept if address in peaks.coords])
+    with_values = [address for address in swept if address in peaks.coords]
+    peaks = peaks.sortby([a for a in with_values if not is_word_axis(peaks, a)])
     if "sensor" not in peaks.dims:
         peaks = peaks.expand_dims("sensor")
     if not swept:
@@ -52,16 +62,37 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
             f"a sweep is drawn over one or two addresses, not {len(swept)} ({', '.join(swept)}); "
             f"select a value of the others, as in dataset.isel({{{swept[0]!r}: 0}})"
         )
-    factor, unit = unit_scale(peaks, "m")
-    peaks = peaks.transpose("sensor", *swept) / factor
-    figure = (_curves if len(swept) == 1 else _maps)(peaks, swept, unit, case)
+    if is_speed_sweep(peaks, case):
+        return plot_speed_sweep(peaks, case)
+    words = [address for address in swept if is_word_axis(peaks, address)]
+    if words and len(swept) > 1:
+        raise ValueError(
+            f"{words[0]} has words, which are drawn over speed only; select one, as in"
+            f" dataset.isel({{{words[0]!r}: 0}})"
+        )
+    peaks = peaks.transpose("sensor", *swept)
+    numbers = _sensor_numbers(peaks, case)
+    by_quantity = [
+        [row for row, i in enumerate(numbers) if case.sensors[i].quantity == quantity]
+        for quantity in dict.fromkeys(case.sensors[i].quantity for i in numbers)
+    ]
+    groups = [_quantity_peaks(peaks, numbers, rows, case) for rows in by_quantity]
+    draw = _bars if words else _curves if len(swept) == 1 else _maps
+    figure = draw(groups, swept, case)
     fixed_values = [
-        f"{address} = {float(value):.4g} {_unit(case, str(address))}".rstrip()
+        _fixed_value(case, str(address), value.item())
         for address, value in peaks.coords.items()
-        if value.ndim == 0 and address != "sensor"
+        if value.ndim == 0 and address not in ("sensor", "cases")
     ]
     set_title(figure, "\n".join(filter(None, [case.title, ", ".join(fixed_values)])))
     return figure
+
+
+def _fixed_value(case: Case, address: str, value) -> str:
+    """Address and value of a dimension that was selected."""
+    if isinstance(value, str):
+        return f"{address} = {value}"
+    return f"{address} = {value:.4g} {_unit(case, address)}".rstrip()
 
 
 def _unit(case: Case, address: str) -> str:
@@ -75,56 +106,113 @@ def _axis_label(case: Case, address: str) -> str:
     return f"{address} ({unit})" if unit else address
 
 
-def _sensor_names(peaks, case):
-    """Names of the sensors: their positions (m), or their numbers if positions are swept."""
+class QuantityPeaks(NamedTuple):
+    """Peaks (sensor, ...) of a quantity in the unit of its label, names and numbers of sensors."""
+
+    label: str
+    unit: str
+    peaks: xarray.DataArray
+    names: list[str]
+    numbers: list[int]
+
+
+def _sensor_numbers(peaks, case: Case) -> list[int]:
+    """Numbers of the sensors of a dataset, by their labels."""
     if "sensor" not in peaks.coords:
-        return [f"sensor {i}" for i in range(peaks.sizes["sensor"])]
-    numbers = [int(str(label).split(":")[0]) for label in peaks["sensor"].values]
+        return list(range(peaks.sizes["sensor"]))
+    labels = sensor_labels(case.sensors)
+    return [labels.index(str(label)) for label in peaks["sensor"].values]
+
+
+def _quantity_peaks(peaks, numbers, rows, case: Case) -> QuantityPeaks:
+    """Peaks of the sensors of a quantity, which are some rows of all peaks."""
+    own = [numbers[row] for row in rows]
+    quantity = case.sensors[own[0]].quantity
+    factor, unit = unit_scale(peaks[rows], QUANTITIES[quantity].unit)
+    label = axis_label(f"peak {quantity}", unit)
+    return QuantityPeaks(label, unit, peaks[rows] / factor, _sensor_names(peaks, own, case), own)
+
+
+def _sensor_names(peaks, numbers, case: Case) -> list[str]:
+    """Names of sensors; without one, positions (m), or numbers if positions are swept."""
     swept = any(str(address).startswith("sensors.") for address in peaks.coords)
+    positions = [f"at {float(concrete(case.sensors[i].position)):.4g} m" for i in numbers]
     return [
-        f"sensor {i}" if swept else f"at {float(concrete(case.sensors[i].position)):.4g} m"
-        for i in numbers
+        case.sensors[i].name or (f"sensor {i}" if swept else position)
+        for i, position in zip(numbers, positions, strict=True)
     ]
 
 
-def _curves(peaks, swept, unit, case):
+def _curves(groups: list[QuantityPeaks], swept, case):
     (address,) = swept
-    figure = Figure(figsize=(6.4, 4))
-    axes = figure.subplots()
-    x = peaks[address].values if address in peaks.coords else np.arange(peaks.sizes[address])
-    line_style = "o-" if x.size <= MAX_MARKED_RUNS else "-"
-    last_values = []
-    for i, values in enumerate(peaks.values):
-        axes.plot(x, values, line_style, markersize=3, color=colour(i))
-        finite = np.flatnonzero(np.isfinite(values))
-        last_values.append(values[finite[-1]] if finite.size else 0.0)
-        top = finite[np.argmax(values[finite])] if finite.size else []
-        axes.plot(x[top], values[top], "o", markersize=7, markeredgecolor="white", color=colour(i))
-    axes.set(xlabel=_axis_label(case, address), ylabel=f"peak deflection ({unit})")
-    axes.set_ylim(bottom=0)
-    axes.margins(x=0.01)
-    margin_labels(
-        axes, last_values, _sensor_names(peaks, case), [colour(i) for i in range(len(last_values))]
-    )
+    figure = Figure(figsize=(6.4, 1.2 + 2.8 * len(groups)))
+    rows = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, group in zip(rows, groups, strict=True):
+        peaks = group.peaks
+        x = peaks[address].values if address in peaks.coords else np.arange(peaks.sizes[address])
+        line_style = "o-" if x.size <= MAX_MARKED_RUNS else "-"
+        tints, last_values = [colour(i) for i in group.numbers], []
+        for tint, values in zip(tints, peaks.values, strict=True):
+            axes.plot(x, values, line_style, markersize=3, color=tint)
+            finite = np.flatnonzero(np.isfinite(values))
+            last_values.append(values[finite[-1]] if finite.size else 0.0)
+            top = finite[np.argmax(values[finite])] if finite.size else []
+            axes.plot(x[top], values[top], "o", markersize=7, markeredgecolor="white", color=tint)
+        axes.set_ylabel(group.label)
+        axes.set_ylim(bottom=0)
+        axes.margins(x=0.01)
+        margin_labels(axes, last_values, group.names, tints)
+    rows[-1].set_xlabel(_axis_label(case, address))
     return figure
 
 
-def _maps(peaks, swept, unit, case):
-    count = peaks.sizes["sensor"]
-    columns = min(count, 3)
-    rows = -(-count // columns)
-    figure = Figure(figsize=(1.5 + 2.9 * columns, 0.7 + 2.8 * rows))
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for axes in grid.flat[count:]:
+def _bars(groups: list[QuantityPeaks], swept, case):
+    """Peaks of words, a bar for each sensor beside each word."""
+    (address,) = swept
+    labels = [str(word) for word in groups[0].peaks[address].values]
+    heights = [0.9 + 0.3 * len(labels) * len(group.names) for group in groups]
+    figure = Figure(figsize=(6.4, sum(heights)))
+    rows = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, group in zip(rows, groups, strict=True):
+        count = len(group.names)
+        bars = zip(group.peaks.values, group.names, group.numbers, strict=True)
+        for i, (values, name, number) in enumerate(bars):
+            places = np.arange(len(labels)) + (i - (count - 1) / 2) * 0.8 / count
+            axes.barh(places, values, 0.7 / count, color=colour(number), label=name)
+        axes.set_yticks(np.arange(len(labels)), labels)
+        axes.invert_yaxis()
+        axes.set(xlabel=group.label, ylabel=address)
+        axes.legend()
+    return figure
+
+
+def _maps(groups: list[QuantityPeaks], swept, case):
+    columns = min(max(len(group.names) for group in groups), 3)
+    heights = [-(-len(group.names) // columns) for group in groups]
+    figure = Figure(figsize=(1.5 + 2.9 * columns, 0.7 + 2.8 * sum(heights)))
+    grid = figure.subplots(sum(heights), columns, sharex=True, sharey=True, squeeze=False)
+    first = 0
+    for group, height in zip(groups, heights, strict=True):
+        _draw_maps(figure, grid[first : first + height], group, swept)
+        first += height
+    for axes in grid[-1]:
+        axes.set_xlabel(_axis_label(case, swept[1]))
+    for axes in grid[:, 0]:
+        axes.set_ylabel(_axis_label(case, swept[0]))
+    return figure
+
+
+def _draw_maps(figure, grid, group: QuantityPeaks, swept):
+    """Maps of a quantity in the rows of a grid; equal colours are equal peaks."""
+    peaks = group.peaks
+    for axes in grid.flat[len(group.names) :]:
         axes.set_visible(False)
     y, x = (peaks[address].values for address in swept)
-    # One scale for all sensors: equal colours and lines mean equal deflections.
     highest = np.max(peaks.values, initial=0.0, where=np.isfinite(peaks.values)) or 1.0
     contour_levels = MaxNLocator(8).tick_values(0, highest)
     fill_levels = np.linspace(0, contour_levels[-1], 8 * (contour_levels.size - 1) + 1)
-    names = _sensor_names(peaks, case)
     filled = None
-    for axes, values, title in zip(grid.flat, peaks.values, names, strict=False):
+    for axes, values, title in zip(grid.flat, peaks.values, group.names, strict=False):
         axes.set_facecolor(FAINT)  # visible where runs failed
         filled = axes.contourf(x, y, values, levels=fill_levels, cmap="YlGnBu")
         drawn = axes.contour(x, y, values, levels=contour_levels[1:-1], colors=INK, linewidths=0.5)
@@ -138,15 +226,8 @@ def _maps(peaks, swept, unit, case):
         if np.any(np.isfinite(values)):
             row, column = np.unravel_index(np.nanargmax(values), values.shape)
             axes.plot(x[column], y[row], "o", color=ALARM, markeredgecolor="white", clip_on=False)
-            title = f"{title}, largest {format_number(values[row, column])} {unit}"
+            title = f"{title}, largest {format_number(values[row, column])} {group.unit}".rstrip()
         axes.set_title(title)
         axes.grid(False)
-    for axes in grid[-1]:
-        axes.set_xlabel(_axis_label(case, swept[1]))
-    for axes in grid[:, 0]:
-        axes.set_ylabel(_axis_label(case, swept[0]))
-    bar = figure.colorbar(
-        filled, ax=grid, ticks=contour_levels, label=f"peak deflection ({unit})", pad=0.02
-    )
+    bar = figure.colorbar(filled, ax=grid, ticks=contour_levels, label=group.label, pad=0.02)
     bar.outline.set_visible(False)
-    return figure

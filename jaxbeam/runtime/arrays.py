@@ -68,7 +68,7 @@ class _Namespace:
     def __getattr__(self, name):
         known, traced = getattr(self._known, name), getattr(self._traced, name)
         known = _einsum if name == "einsum" else known
-        if name == "linalg":
+        if name in ("linalg", "fft"):
             attribute: Any = _Namespace(known, traced)
         elif isinstance(known, type) or not callable(known):
             attribute = known
@@ -271,6 +271,18 @@ def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> An
     import scipy.linalg  # 0.1 s, which compiled programs need not wait for
 
     return scipy.linalg.solve_triangular(matrix, right, transposed, lower=lower, check_finite=False)
+
+
+def solve_tridiagonal(lower, diagonal, upper, right) -> Any:
+    """Solution of a tridiagonal system (n,), with n - 1 entries below and above the diagonal."""
+    if is_jax((lower, diagonal, upper, right)):
+        lower, upper = jnp.append(0.0, lower), jnp.append(upper, 0.0)
+        columns = jnp.asarray(right)[:, None]
+        return jax.lax.linalg.tridiagonal_solve(lower, diagonal, upper, columns)[:, 0]
+    import scipy.linalg
+
+    bands = np.stack([np.append(0.0, upper), diagonal, np.append(lower, 0.0)])
+    return scipy.linalg.solve_banded((1, 1), bands, right)
 
 
 def cholesky(matrix) -> Any:

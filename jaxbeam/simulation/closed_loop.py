@@ -12,11 +12,11 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw
 from jaxbeam.case.fields import concrete
 from jaxbeam.integrator.events import EventSchedule, controller_schedule
-from jaxbeam.model.contact import LoadSet
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensor_filters import with_sensor_filters
-from jaxbeam.model.sensor_signals import noise_samples, sensor_sections
+from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
+from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array, block_diag, set_at, xp
 from jaxbeam.simulation.continuous_loop import ContinuousLoop

@@ -11,7 +11,7 @@ from jaxbeam.case.controller import AbstractContinuousLaw, Measurement
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensor_signals import filtered_reading
+from jaxbeam.model.sensing.sensor_signals import filtered_reading
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, scan, vmap, xp
 from jaxbeam.simulation.command_limits import limit_commands
@@ -66,6 +66,7 @@ class ContinuousLoop(AbstractInputPolicy):
 
     def _commands(self, state, time):
         """Commands and rates of the law's states, (command, batch), for states (state, batch)."""
+        state = state[: self.model.state_count]  # without those of vehicles
         case, outputs = self.plant.case, self.output_rows @ state
         sensors = len(case.sensors)
         pairs = zip(case.sensors, outputs[:sensors], strict=True)

@@ -14,14 +14,18 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import trajectory
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
-from jaxbeam.integrator.integrate import integrate_at_events, integrate_peaks, max_stable_step
+from jaxbeam.integrator.integrate import (
+    integrate_at_events,
+    integrate_peaks,
+    longest_force_step,
+    max_stable_step,
+)
 from jaxbeam.integrator.running_peaks import RunningPeaks
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
-from jaxbeam.model.contact import LoadSet, load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.runtime.arrays import Array, xp
@@ -63,10 +67,9 @@ def static_shapes(case: Case) -> StaticShapes:
 @compiled_if_traced
 def _model_limits(case: Case, layout: Layout):
     """Longest stable step (s), whether frequencies repeat, entry and exit times (load, 2) in s."""
-    model = modal_model(case, layout)
-    trajectories = [trajectory(load, case.beam.length) for load in case.loads]
-    entry_exit = xp.array([path.entry_exit_times() for path in trajectories]).reshape(-1, 2)
-    return max_stable_step(model, case.loads), model.modes.has_repeated, entry_exit
+    model, loads = modal_model(case, layout), load_set(case)
+    limit = xp.minimum(max_stable_step(model, loads), longest_force_step(case, loads))
+    return limit, model.modes.has_repeated, loads.entry_exit_times()
 
 
 def max_concurrent_loads(entry_exit_times: Float[np.ndarray, "load 2"]) -> int:

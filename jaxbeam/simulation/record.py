@@ -1,4 +1,4 @@
-"""Record of one simulated run: histories, peaks, error estimate; stored as xarray and netCDF."""
+"""Record of one simulated run: histories, section forces, peaks, error; as xarray and netCDF."""
 
 import json
 import os
@@ -11,13 +11,24 @@ from jaxtyping import Bool, Float
 from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.netcdf import write_netcdf
-from jaxbeam.model.measurement import sensor_readings
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.output_rows import quantity_history
+from jaxbeam.model.sensing.measurement import sensor_readings
+from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
-from jaxbeam.simulation.result_variables import MODE_FIELDS, MODE_VARIABLES, VARIABLES
+from jaxbeam.simulation import section_forces
+from jaxbeam.simulation.extremes import Extremes, sensor_extremes
+from jaxbeam.simulation.labels import contact_sentence, wheel_labels
+from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
+from jaxbeam.simulation.result_variables import (
+    MODE_FIELDS,
+    MODE_VARIABLES,
+    VARIABLES,
+    sensor_coordinates,
+)
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -27,8 +38,10 @@ class Record(eqx.Module):
     """Record of one simulated run.
 
     Deflection is positive upwards. Samples at an entry or exit of a load are those just after.
-    `load_position` (m) and `contact_force` (N, positive under compression) are NaN and zero while a
-    load is off the beam. Peaks are those in continuous time. `contact_lost_time` (s) and
+    Loads are counted by their wheels. `load_position` (m) is NaN while a wheel is off the beam,
+    `contact_force` (N, positive under compression) zero, unless it is the wheel of a vehicle, which
+    presses on the ground. The `bodies` of vehicles have displacements in m (or rad) from static
+    equilibrium, positive upwards. Peaks are those in continuous time. `contact_lost_time` (s) and
     `contact_lost_position` (m) are those of the first negative contact force, which the bilateral
     model allows; NaN without one. `command` is that of the actuators, within their limits; at a
     change, the one just after. `failures` counts the steps of the controller so far without a
@@ -52,20 +65,105 @@ class Record(eqx.Module):
     lowest_contact_force: Float[Array, " load"]
     contact_lost_time: Float[Array, " load"]
     contact_lost_position: Float[Array, " load"]
+    body_displacement: Float[Array, "time body"]
+    body_velocity: Float[Array, "time body"]
+    body_acceleration: Float[Array, "time body"]
     error_estimate: Float[Array, ""]
     steps: int = eqx.field(static=True)
     controller_readings: Float[Array, "time sensor"] | None = None
 
     shown = renamed_property("shown", "controller_readings")
 
-    def at(self, x, quantity: str = "deflection", fibre_distance=None) -> Float[Array, "time ..."]:
+    @property
+    def bodies(self) -> list[str]:
+        """Names of the degrees of freedom of all vehicles, as in "loads.0 vehicle 2 body"."""
+        loads, names = load_set(self.case), []
+        for group in loads.wheels.vehicles:
+            load = f"loads.{loads.load_of_wheel[group.first_wheel]}"
+            for i in range(group.count):
+                vehicle = load if group.count == 1 else f"{load} vehicle {i}"
+                names += [f"{vehicle} {name}" for name in group.names]
+        return names
+
+    @property
+    def motion(self) -> Motion:
+        """Motion of the modes, contact forces and commands."""
+        return Motion(
+            self.coordinates,
+            self.rates,
+            self.accelerations,
+            self.load_position,
+            self.contact_force,
+            self.command,
+        )
+
+    def at(
+        self, x, quantity: str = "deflection", fibre_distance=None, section_modulus=None
+    ) -> Float[Array, "time ..."]:
         """History of a quantity at positions x (m) of any shape: (time, *shape of x), in SI units.
 
-        Strain is that of the fibre at `fibre_distance` z (m) above the neutral axis, -z w_xx.
-        Raises ValueError for an unknown quantity, or strain without a fibre distance.
+        Strain is that of the fibre at `fibre_distance` z (m) above the neutral axis, -z w_xx;
+        stress the moment over the `section_modulus` (m^3). Curvature, strain and section forces are
+        statically corrected, hence right with few modes (see `corrected_history`). Raises
+        ValueError for an unknown quantity, strain without a fibre distance, or stress without a
+        section modulus.
         """
-        coordinates = self.coordinates, self.rates, self.accelerations
-        return quantity_history(self.modes, coordinates, x, quantity, fibre_distance)
+        parameters = fibre_distance, section_modulus
+        return quantity_history(self.case, self.modes, self.motion, x, quantity, *parameters)
+
+    def bending_moment(self, x) -> Float[Array, "time ..."]:
+        """Bending moment at positions x (m) in N m, positive where the beam sags: E I w_xx."""
+        return self.at(x, "moment")
+
+    def shear_force(self, x, side: str = "right") -> Float[Array, "time ..."]:
+        """Shear force dM/dx at positions x (m) in N, just "right" or "left" of each.
+
+        It jumps at loads and supports: by a contact force down, by a reaction up. At the ends of
+        the beam it is that within. Raises ValueError for another side.
+        """
+        return section_forces.shear_force(self.case, self.modes, self.motion, x, side)
+
+    @property
+    def reactions(self) -> Float[Array, "time support"]:
+        """Reactions of ends and supports in N, positive upwards, at `support_positions`."""
+        return section_forces.reactions(self.case, self.modes, self.motion)
+
+    @property
+    def support_positions(self) -> Float[Array, " support"]:
+        """Positions (m) of held ends and supports, from left to right."""
+        return section_forces.support_positions(self.case, self.modes)
+
+    def envelope(
+        self, quantity: str = "moment", positions=None, fibre_distance=None, section_modulus=None
+    ) -> RecordEnvelope:
+        """Smallest and largest values of a quantity at positions (m), with times and loads.
+
+        From the samples, free vibration included; by default at 101 equally spaced positions. The
+        quantities are those of `at`; a moment has its peak as a load passes, so that a load should
+        move by a small part of the length between samples. Raises ValueError as `at` does.
+        """
+        parameters = positions, fibre_distance, section_modulus
+        return record_envelope(
+            self.case, self.modes, self.motion, self.times, quantity, *parameters
+        )
+
+    @property
+    def sensor_values(self) -> Float[Array, "time sensor"]:
+        """True quantity of each sensor in its SI unit: without offset, filters and noise."""
+        columns = [
+            self.at(s.position, s.quantity, s.fibre_distance, s.section_modulus)
+            for s in self.case.sensors
+        ]
+        return xp.array(columns).reshape(-1, self.times.shape[0]).T
+
+    @property
+    def extremes(self) -> Extremes:
+        """Smallest and largest value of the quantity of each sensor, with their times (s).
+
+        From the samples; peaks of deflections between samples too.
+        """
+        peaks = self.peak_deflection, self.peak_time
+        return sensor_extremes(self.case.sensors, self.times, self.sensor_values, *peaks)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
         return self.at(self.case.sensor_positions, quantity)
@@ -110,8 +208,7 @@ class Record(eqx.Module):
         """
         if self.controller_readings is not None:
             return self.controller_readings
-        coordinates = self.coordinates, self.rates, self.accelerations
-        return sensor_readings(self.case, self.modes, *coordinates, self.times, noisy=True)
+        return sensor_readings(self.case, self.modes, self.motion, self.times, noisy=True)
 
     @property
     def saturated(self) -> Bool[Array, "time actuator"]:
@@ -149,19 +246,8 @@ class Record(eqx.Module):
                 f"the control loop diverges: the deflection has grown beyond all bounds by"
                 f" t = {diverged:.4g} s; lower the gains, or shorten period and delay"
             )
-        lost = np.asarray(concrete(self.contact_lost_time))
-        where = np.asarray(concrete(self.contact_lost_position))
-        lowest_force = np.asarray(concrete(self.lowest_contact_force))
-        contact_losses = [
-            f"load {i} loses contact, first at t = {lost[i]:.4g} s, x = {where[i]:.4g} m "
-            f"(smallest contact force {lowest_force[i]:.4g} N)"
-            for i in np.flatnonzero(np.isfinite(lost))
-        ]
-        parts = [
-            "; ".join(contact_losses)
-            if contact_losses
-            else "every load presses on the beam throughout"
-        ]
+        contact = self.contact_lost_time, self.contact_lost_position, self.lowest_contact_force
+        parts = [contact_sentence(self.case, *(np.asarray(concrete(part)) for part in contact))]
         failures = int(concrete(self.failures)[-1])
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")
@@ -170,8 +256,13 @@ class Record(eqx.Module):
 
     def _dataset_parts(self) -> tuple[dict, dict, dict]:
         """Variables, coordinates and attributes of the labelled dataset."""
+        extremes = self.extremes._asdict()
         variables = {
-            name: (dims, np.asarray(getattr(self, name)), {"units": unit, "long_name": words})
+            name: (
+                dims,
+                np.asarray(extremes[name] if name in extremes else getattr(self, name)),
+                {"units": unit, "long_name": words},
+            )
             for name, (dims, unit, words) in VARIABLES.items()
         }
         # Modes of repeated frequencies are not unique, so they are stored.
@@ -185,7 +276,9 @@ class Record(eqx.Module):
         }
         coordinates = {
             "time": ("time", np.asarray(self.times), {"units": "s"}),
-            "sensor": ("sensor", sensor_labels(self.case)),
+            **sensor_coordinates(self.case),
+            "load": ("load", wheel_labels(self.case)),
+            "body": ("body", np.array(self.bodies, dtype=str)),
             "frequency": ("mode", np.asarray(self.modes.frequencies), {"units": "Hz"}),
         }
         attributes = {
@@ -211,71 +304,3 @@ class Record(eqx.Module):
         if not overwrite and os.path.exists(path):
             raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
         write_netcdf(path, *self._dataset_parts())
-
-
-_STORED_VARIABLES = [name for name in VARIABLES if name in Record.__annotations__]
-
-
-def record_from_xarray(dataset: "xarray.Dataset") -> Record:
-    """Record from a dataset of `Record.to_xarray`, or read from its file.
-
-    Raises ValueError if the dataset is not that of a record.
-    """
-    if "case" not in dataset.attrs:
-        raise ValueError("not a record of jaxbeam: it lacks its case")
-    case = case_from_dict(json.loads(dataset.attrs["case"]))
-    # Without sensors or loads a file lacks their variables.
-    sizes = {
-        "sensor": len(case.sensors),
-        "load": len(case.loads),
-        "actuator": len(case.actuators),
-        **dataset.sizes,
-    }
-    may_be_empty = *_STORED_VARIABLES, "measured"
-    shapes = {name: [sizes.get(d, 0) for d in VARIABLES[name][0]] for name in may_be_empty}
-    empty = {
-        name: (VARIABLES[name][0], np.zeros(shape))
-        for name, shape in shapes.items()
-        if 0 in shape and name not in dataset.variables
-    }
-    dataset = dataset.assign(empty)
-    mode_variables = {name: f"mode_{name}" for name in MODE_VARIABLES}
-    required = (*_STORED_VARIABLES, *mode_variables.values(), "time")
-    missing = [name for name in required if name not in dataset.variables]
-    if missing:
-        raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(missing)}")
-    values = {name: xp.asarray(dataset[name].values) for name in _STORED_VARIABLES}
-    return Record(
-        case=case,
-        modes=Modes(
-            **{
-                MODE_FIELDS.get(name, name): xp.asarray(dataset[label].values)
-                for name, label in mode_variables.items()
-            }
-        ),
-        times=xp.asarray(dataset["time"].values),
-        error_estimate=xp.asarray(float(dataset.attrs["error_estimate"])),
-        steps=int(dataset.attrs["steps"]),
-        controller_readings=xp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
-        **values,
-    )
-
-
-def _is_sampled(case: Case) -> bool:
-    return case.controller is not None and case.controller.period is not None
-
-
-def read_record(path: str | os.PathLike) -> Record:
-    """Record from a netCDF file written by `Record.to_netcdf`.
-
-    Raises OSError if the file cannot be read, ValueError if it is not that of a record.
-    """
-    import xarray
-
-    with xarray.open_dataset(path, engine="scipy") as dataset:
-        return record_from_xarray(dataset.load())
-
-
-def sensor_labels(case: Case) -> np.ndarray:
-    """Labels of the sensors: number and quantity, as in "0: deflection"."""
-    return np.array([f"{i}: {s.quantity}" for i, s in enumerate(case.sensors)], dtype=str)

@@ -1,5 +1,10 @@
 """Variables of records and sweeps in datasets: dimensions, unit and meaning, by name."""
 
+import numpy as np
+
+from jaxbeam.case.case import Case
+from jaxbeam.case.sensors import sensor_labels
+
 VARIABLES = {
     "deflection": (("time", "sensor"), "m", "deflection at the sensor"),
     "velocity": (("time", "sensor"), "m/s", "velocity at the sensor"),
@@ -8,15 +13,22 @@ VARIABLES = {
     "coordinates": (("time", "mode"), "m kg^0.5", "modal coordinate"),
     "rates": (("time", "mode"), "m kg^0.5/s", "rate of the modal coordinate"),
     "accelerations": (("time", "mode"), "m kg^0.5/s^2", "acceleration of the modal coordinate"),
-    "load_position": (("time", "load"), "m", "position of the load"),
+    "load_position": (("time", "load"), "m", "position of the wheel"),
     "contact_force": (("time", "load"), "N", "contact force, positive under compression"),
     "command": (("time", "actuator"), "unit of a command", "command to the actuator"),
     "failures": (("time",), "1", "steps of the controller without a solution so far"),
-    "peak_deflection": (("sensor",), "m", "largest absolute deflection"),
-    "peak_time": (("sensor",), "s", "time of the largest absolute deflection"),
+    "smallest": (("sensor",), "SI unit of its quantity", "smallest value of its quantity"),
+    "smallest_time": (("sensor",), "s", "time of the smallest value"),
+    "largest": (("sensor",), "SI unit of its quantity", "largest value of its quantity"),
+    "largest_time": (("sensor",), "s", "time of the largest value"),
+    "peak_deflection": (("sensor",), "m", "largest absolute deflection at the sensor"),
+    "peak_time": (("sensor",), "s", "time of the largest absolute deflection at the sensor"),
     "lowest_contact_force": (("load",), "N", "smallest contact force"),
     "contact_lost_time": (("load",), "s", "time of the first negative contact force"),
     "contact_lost_position": (("load",), "m", "position of the first negative contact force"),
+    "body_displacement": (("time", "body"), "m or rad", "displacement from static equilibrium"),
+    "body_velocity": (("time", "body"), "m/s or rad/s", "velocity of the body"),
+    "body_acceleration": (("time", "body"), "m/s^2 or rad/s^2", "acceleration of the body"),
 }
 # Variables of a run in a sweep; the dimensions of the sweep come first.
 SWEEP_VARIABLES = VARIABLES | {
@@ -35,3 +47,13 @@ MODE_VARIABLES = {
 }
 # Fields of `Modes` by their names in files, where they differ.
 MODE_FIELDS = {"unit": "stiffness_unit"}
+
+
+def sensor_coordinates(case: Case) -> dict[str, tuple]:
+    """Coordinates of datasets along their sensors: labels, quantities and their units."""
+    sensors = case.sensors
+    return {
+        "sensor": ("sensor", np.array(sensor_labels(sensors), str)),
+        "quantity": ("sensor", np.array([s.quantity for s in sensors], str)),
+        "unit": ("sensor", np.array([s.unit for s in sensors], str)),
+    }

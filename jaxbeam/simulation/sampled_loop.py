@@ -14,10 +14,11 @@ from jaxbeam.case.controller import AbstractSampledLaw, Measurement
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import NODE_COUNT
-from jaxbeam.model.contact import LoadSet, contact_at
+from jaxbeam.model.contact import contact_at
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.output_rows import sensor_rows
-from jaxbeam.model.sensor_signals import filtered_reading, initial_filter_state
+from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, cond, is_jax, take, vmap, xp
 from jaxbeam.simulation.command_limits import limit_commands
@@ -143,11 +144,14 @@ class SampledLoop(AbstractInputPolicy):
 
     def _sensor_inputs(self, state, command, time):
         """Inputs of the sensors (sensor, batch) at a time (s)."""
-        signals, sensors = self.output_rows @ state, self.plant.case.sensors
+        signals = self.output_rows @ state[: self.model.state_count]
+        sensors = self.plant.case.sensors
         if not any(sensor.has_feedthrough for sensor in sensors):
             return signals
-        _, accelerations = contact_at(self.model, self.loads, time, state, command)
-        return sensor_rows(self.model, sensors).with_accelerations(signals, accelerations)
+        contact = contact_at(self.model, self.loads, time, state, command)
+        return sensor_rows(self.model, self.plant.case, sensors).with_accelerations(
+            signals, contact.modal_acceleration
+        )
 
     def _step_law(self, law_state, readings, state, command, time):
         """Step of the law for each run of the batch."""

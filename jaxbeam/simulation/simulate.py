@@ -16,9 +16,11 @@ from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
 from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.integrator.time_grid import grid_by_schedule
-from jaxbeam.model.contact import LoadSet, contact_at, load_set
-from jaxbeam.model.measurement import sensor_readings
+from jaxbeam.model.contact import contact_at, split_states
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.sensing.measurement import sensor_readings
+from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
@@ -86,31 +88,18 @@ def _check_times(times) -> None:
 
 def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
     running_peaks, outputs, modal, steps = _integrate(case, plan, times, case.sensor_positions)
-    coordinates, rates, accelerations, position, force, commands, readings, failures = outputs
-    if commands is None:
-        commands = xp.zeros((times.shape[0], len(case.actuators)))
-    if failures is None:
-        failures = xp.zeros(times.shape)
     peaks = Peaks(*(part[0] for part in running_peaks.peaks()))
     loads, lost_times = load_set(case), peaks.contact_lost_time
-    lost_positions = xp.array(
-        [
-            path.kinematics(time)[0]
-            for path, time in zip(loads.trajectories, lost_times, strict=True)
-        ]
-    ).reshape(-1)
+    # Each wheel at its own time.
+    lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
     return Record(
         case=case,
         modes=modal,
         times=times,
-        coordinates=coordinates,
-        rates=rates,
-        accelerations=accelerations,
-        load_position=position,
-        contact_force=force,
-        command=commands,
-        failures=failures,
-        controller_readings=readings,
+        **outputs.motion._asdict(),
+        **outputs.vehicles._asdict(),
+        failures=xp.zeros(times.shape) if outputs.failures is None else outputs.failures,
+        controller_readings=outputs.readings,
         **peaks._asdict(),
         contact_lost_position=lost_positions,
         error_estimate=error,
@@ -131,10 +120,9 @@ def simulate_readings(
     differentiate than `simulate`, without its checks and warnings.
     """
     _, outputs, modal, _ = _integrate(case, plan, times, None, noisy=False)
-    coordinates, rates, accelerations, *_, controller_readings, _ = outputs
-    if controller_readings is not None:
-        return controller_readings
-    return sensor_readings(case, modal, coordinates, rates, accelerations, times)
+    if outputs.readings is not None:
+        return outputs.readings
+    return sensor_readings(case, modal, outputs.motion, times)
 
 
 class Histories(NamedTuple):
@@ -153,10 +141,9 @@ def simulate_histories(
 ) -> Histories:
     """Histories at ascending times (s) and positions (m); see `simulate_readings`."""
     _, outputs, modal, _ = _integrate(case, plan, times, None)
-    coordinates, _, _, _, forces, commands, *_ = outputs
-    if commands is None:
-        commands = xp.zeros((times.shape[0], len(case.actuators)))
-    return Histories(coordinates @ modal.shapes(positions).T, commands, forces)
+    motion = outputs.motion
+    deflection = motion.coordinates @ modal.shapes(positions).T
+    return Histories(deflection, motion.command, motion.contact_force)
 
 
 class IntegrationSetup(NamedTuple):
@@ -218,10 +205,8 @@ def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
             if policy.implicit
             else _commands_at_steps(case, commands, sample_steps)
         )
-    *coordinates, commands = _modal_and_contact_outputs(model, loads, times, states, commands)
-    if commands is not None:
-        commands = commands[:, : len(case.actuators)]
-    return running_peaks, (*coordinates, commands, observed, failures), model.modes, steps
+    motion, vehicles = _motion(case, model, loads, times, states, commands)
+    return running_peaks, Outputs(motion, vehicles, observed, failures), model.modes, steps
 
 
 def _commands_at_steps(case: Case, commands, steps):
@@ -232,15 +217,51 @@ def _commands_at_steps(case: Case, commands, steps):
     return xp.clip(commands_at_start, low, high)
 
 
-def _modal_and_contact_outputs(model: ModalModel, loads: LoadSet, times, states, commands):
-    """Modal coordinates, rates and accelerations, load positions, contact forces, commands."""
+class VehicleMotion(NamedTuple):
+    """Heights (m) or pitch angles (rad) of the bodies of vehicles, their rates and accelerations.
 
+    Of all vehicles, one after the other (see `Record.bodies`), measured from static equilibrium.
+    """
+
+    body_displacement: Float[Array, "time body"]
+    body_velocity: Float[Array, "time body"]
+    body_acceleration: Float[Array, "time body"]
+
+
+def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:
+    """Motion of the bodies at instants, from the states and the accelerations at contact."""
+    _, vehicle_states = split_states(model.state_count, loads, states)
+    none = xp.zeros((states.shape[0], 0))
+    parts = []
+    for state, acceleration in zip(vehicle_states, accelerations, strict=True):
+        dofs = acceleration.shape[-2]
+        motion = state[..., :dofs, 0], state[..., dofs:, 0], acceleration[..., 0]
+        parts.append([part.reshape(part.shape[0], -1) for part in motion])
+    if not parts:
+        return VehicleMotion(none, none, none)
+    return VehicleMotion(*(xp.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
+
+
+class Outputs(NamedTuple):
+    """Motion of beam and vehicles at the samples; readings and failures of a controller, if any."""
+
+    motion: Motion
+    vehicles: VehicleMotion
+    readings: Float[Array, "time sensor"] | None
+    failures: Float[Array, " time"] | None
+
+
+def _motion(case: Case, model: ModalModel, loads: LoadSet, times, states, commands):
+    """Motion of the modes with the forces on the beam, and motion of the vehicles."""
     columns = None if commands is None else commands[..., None]
-    force, accelerations = contact_at(model, loads, times, states, columns)
-    force, accelerations = force[..., 0], accelerations[..., 0]
+    contact = contact_at(model, loads, times, states, columns)
+    vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
+    force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
     count = 2 * accelerations.shape[1]
     coordinates = states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations
     if model.mode_map is not None:
         coordinates = tuple(part @ model.mode_map.T for part in coordinates)
-    position = loads.kinematics(times)[0].T
-    return *coordinates, xp.where(loads.on_beam(times).T, position, xp.nan), -force, commands
+    position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
+    actuators = len(case.actuators)
+    command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]
+    return Motion(*coordinates, position, -force, command), vehicles

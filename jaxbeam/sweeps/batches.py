@@ -1,16 +1,18 @@
 """Batches of a sweep: runs on one load path.
 
-Loads that differ in mass or force only have the same path; step matrices that depend on the path
-are computed once for all runs of a batch.
+Loads that differ in masses, forces, springs or dampers only have the same path; step matrices that
+depend on the path are computed once for all runs of a batch.
 """
 
 import dataclasses
-import re
+from collections.abc import Collection
 
 import numpy as np
 from jaxtyping import Float, Int
 
-BATCHED_ADDRESS = re.compile(r"loads\.\d+\.(mass|force)|run\.gravity")
+from jaxbeam.case.case import Case, unit_at
+
+PATH_UNITS = {"m", "m/s", "s", "m/s^2"}  # of numbers of a load on which its path may depend
 MAX_BATCH_SIZE = 256  # runs; more exceed the cache of the processor
 
 
@@ -29,17 +31,24 @@ class Batches:
     run_index: Int[np.ndarray, "path batch"]
 
 
+def addresses_within_batches(case: Case, addresses: Collection[str]) -> list[str]:
+    """Those of some addresses on which no path depends: masses, forces and springs of loads."""
+    return [
+        address
+        for address in addresses
+        if address == "run.gravity"
+        or (address.startswith("loads.") and unit_at(case, address) not in PATH_UNITS)
+    ]
+
+
 def make_batches(
-    addresses: list[str], runs: Float[np.ndarray, "run address"], one_run_each: bool = False
+    addresses: list[str], runs: Float[np.ndarray, "run address"], within: Collection[str]
 ) -> Batches:
     """Batches of runs, which are given by their values at the addresses (SI units).
 
-    Runs on one path share a batch, unless there is to be `one_run_each`, for controllers whose
-    design depends on the loads.
+    Runs that differ in the values at the addresses `within` batches only share one.
     """
-    is_batched = np.array(
-        [bool(BATCHED_ADDRESS.fullmatch(address)) and not one_run_each for address in addresses]
-    )
+    is_batched = np.array([address in within for address in addresses], bool)
     shared_values, batched_values = runs[:, ~is_batched], runs[:, is_batched]
     order = np.lexsort((np.zeros(len(runs)), *shared_values.T[::-1]))
     new_path = np.any(np.diff(shared_values[order], axis=0) != 0, axis=1)

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, value_at
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.events import sample_schedule
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import (
@@ -35,6 +36,7 @@ MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and o
 MIN_BLOCKS = 8  # of a large sweep, to use all cores
 MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
 MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
+MAX_TRIAL_BATCHES = 16  # more of one run each cost more than the steps that they would save
 
 
 class Runner:
@@ -67,9 +69,9 @@ class Runner:
         same_model = all(name.startswith(leaves_model_unchanged) for name in self.addresses[0])
         self.same_model = same_model and self.devices == 1
         # Compilation of the programs for one load need not wait for its entry and exit times.
-        max_loads = len(case.loads)
+        max_loads = load_set(case).wheel_count
         if max_loads > 1:
-            max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times())
+            max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times()[0])
         native = native_peaks.supports(case) and not single
         self.shapes = StaticShapes(layout, has_coupling(case), max_loads, native)
         # The C library makes its own step matrices.
@@ -85,17 +87,19 @@ class Runner:
         max_batches, trial_batches = (
             max(1, runs * self.devices // batch_size) for runs in (MAX_BLOCK_RUNS, MAX_TRIAL_RUNS)
         )
-        self.trial_batches = _round_up(min(count, trial_batches), self.devices)
+        trial_batches = min(count, trial_batches, MAX_TRIAL_BATCHES)
+        self.trial_batches = _round_up(trial_batches, self.devices)
         self.batches_per_block = max(
             self.trial_batches, _round_up(min(count // MIN_BLOCKS, max_batches), self.devices)
         )
         self.block_count = -(-count // self.batches_per_block)
 
-    def _entry_exit_times(self) -> Float[np.ndarray, "path load 2"]:
-        """Entry and exit times (s) of the loads of all batches."""
-        return np.asarray(
-            programs.entry_exit_times(self.case, self.addresses[0], self.batches.shared_values)
+    def _entry_exit_times(self) -> tuple[np.ndarray, np.ndarray]:
+        """Entry and exit times (path, wheel, 2), and longest steps of forces (path,), in s."""
+        times, steps = programs.entry_exit_times(
+            self.case, self.addresses[0], self.batches.shared_values
         )
+        return np.asarray(times), np.asarray(steps)
 
     def _model_groups(self) -> list:
         """Indices of batches whose models are made in one call: one batch if all share a model."""
@@ -112,7 +116,8 @@ class Runner:
             self.pool.submit(compiled_program.precompile(*arguments))
             for compiled_program, arguments in self._programs_to_compile(program, first_values)
         ]
-        entries, exits = np.moveaxis(self._entry_exit_times(), 2, 0)
+        times, self.force_steps = self._entry_exit_times()
+        entries, exits = np.moveaxis(times, 2, 0)
         for compilation in compilations:
             compilation.result()  # raises its error, if any
         return entries, exits
@@ -140,6 +145,7 @@ class Runner:
         crossing_time = np.min(times_on_beam, axis=1, initial=np.inf)
         crossing_time = np.where(np.isfinite(crossing_time), crossing_time, duration)
         self.crossing_rates = 1 / crossing_time
+        limits = np.minimum(limits, self.force_steps)
         self.max_steps = np.minimum(limits, duration)
         if self.schedule is not None and self.case.controller is not None:  # steps end at events
             self.max_steps = np.minimum(self.max_steps, self.schedule.lengths.max())
@@ -157,7 +163,8 @@ class Runner:
             calls = batch_indices.size // self.trial_batches
             parts = zip(np.split(batch_indices, calls), np.split(steps, calls), strict=True)
             results = [self._integrate(*part, None, single, extra_steps) for part in parts]
-            return np.concatenate([result["peak_deflection"] for result in results])
+            found = np.concatenate([result["peak_deflection"] for result in results])
+            return self._compared_by_quantity(found)
 
         search = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
         steps, error = choose_step_sizes(peaks, *search, self.pool.map)
@@ -167,6 +174,15 @@ class Runner:
                 *(peaks(sample, steps[sample], single=single) for single in (False, True))
             )
         return steps, error
+
+    def _compared_by_quantity(self, peaks):
+        """Peaks (path, batch, sensor), those of each quantity as further runs of the batch.
+
+        Small peaks of one quantity then are not judged by large ones of another unit.
+        """
+        quantities = np.array([sensor.quantity for sensor in self.case.sensors])
+        parts = [peaks * (quantities == quantity) for quantity in np.unique(quantities)]
+        return np.concatenate(parts, axis=1)
 
     def run_count(self, block: int) -> int:
         """Number of runs in a block, without padding."""

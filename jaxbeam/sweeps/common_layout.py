@@ -9,7 +9,7 @@ from jaxbeam.case.case import Case, replace
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.sweeps.batches import Batches
 
-POSITION_ADDRESS = re.compile(r"beam\.length|(supports|actuators)\.\d+\.(position|start|end)")
+POSITION_ADDRESS = re.compile(r"beam\.length|(supports|actuators)\.(\d+|\*)\.(position|start|end)")
 
 
 def common_layout(case: Case, batches: Batches) -> Layout:

@@ -4,6 +4,7 @@ Batches differ in shared values, which determine path and model, and the runs of
 values. All batches of a block have equal shapes; `mask` marks those whose results count.
 """
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -14,14 +15,19 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.case.loads import trajectory
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
-from jaxbeam.integrator.integrate import integrate_history, integrate_peaks, max_stable_step
+from jaxbeam.integrator.integrate import (
+    integrate_history,
+    integrate_peaks,
+    longest_force_step,
+    max_stable_step,
+)
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
-from jaxbeam.model.contact import LoadSet, load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
@@ -53,13 +59,13 @@ class Program(NamedTuple):
         """Loads of a batch, in all its runs."""
         varied = self.case_with(shared_values)
 
-        def load_parameters(values):
+        def wheels(values):
             pairs = zip(self.batched_addresses, values, strict=True)
             loads = load_set(replace(varied, dict(pairs)))
-            return loads.inertia[:, 0], loads.weight[:, 0]
+            return jax.tree.map(lambda part: part[..., 0], loads.wheels)
 
-        inertia, weight = jax.vmap(load_parameters, out_axes=1)(batched_values)
-        return LoadSet(load_set(varied).trajectories, inertia, weight)
+        wheels_of_runs = jax.vmap(wheels, out_axes=-1)(batched_values)
+        return dataclasses.replace(load_set(varied), wheels=wheels_of_runs)
 
     def grid(self, model, shared_values, step_size):
         """Time grid of a batch for a longest step (s) and a number of extra steps per event."""
@@ -70,9 +76,10 @@ class Program(NamedTuple):
         return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps)
 
     def discretise(self, model, shared_values, step_size, policy=None):
-        """Discrete model of a batch, with peaks at the sensors."""
-        positions = self.case_with(shared_values).sensor_positions
-        return discrete_model(model, self.grid(model, shared_values, step_size), positions, policy)
+        """Discrete model of a batch, with peaks of what the sensors measure."""
+        varied, grid = self.case_with(shared_values), self.grid(model, shared_values, step_size)
+        outputs = sensor_rows(model, varied, varied.sensors)
+        return discrete_model(model, grid, None, policy, outputs)
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
@@ -82,19 +89,19 @@ def modal_models(program: Program, shared_values):
     def model_and_limit(values):
         varied = program.case_with(values)
         model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
-        return model, max_stable_step(model, varied.loads)
+        return model, max_stable_step(model, load_set(varied))
 
     return jax.lax.map(model_and_limit, shared_values)  # less to trace than vmap
 
 
 @compiled
 def entry_exit_times(case, addresses, shared_values):
-    """Entry and exit times (path, load, 2) of the loads in s."""
+    """Entry and exit times (path, wheel, 2), and longest steps of forces (path,), in s."""
 
     def entry_exit_times_of(values):
         varied = replace(case, dict(zip(addresses, values, strict=True)))
-        trajectories = [trajectory(load, varied.beam.length) for load in varied.loads]
-        return jnp.array([path.entry_exit_times() for path in trajectories]).reshape(-1, 2)
+        loads = load_set(varied)
+        return loads.entry_exit_times(), longest_force_step(varied, loads)
 
     return jax.vmap(entry_exit_times_of)(shared_values)
 

@@ -14,18 +14,20 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.aliases import current_address
-from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.case.case import Case, list_sizes, own_addresses, replace, value_at
 from jaxbeam.case.declared_checks import describe_value
+from jaxbeam.case.joint_addresses import overlap
+from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
 from jaxbeam.sweeps import MAX_RUNS
-from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, make_batches
+from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, addresses_within_batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
 
 # Positions and list entries, whose values are valid only in combination.
 JOINTLY_CHECKED = re.compile(
-    r"beam\.length|(supports|actuators|sensors)\.\d+\.(position|start|end)|.*\.\d+"
+    r"beam\.length|(supports|actuators|sensors)\.(\d+|\*)\.(position|start|end)|.*\.\d+"
 )
 
 PRECISIONS = ("double", "single")
@@ -33,7 +35,7 @@ PRECISIONS = ("double", "single")
 # Numbers that determine the schedule of a closed loop.
 SCHEDULE_ADDRESS = re.compile(
     r"run\.(duration|sample_rate)|controller\.(period|delay|times\.\d+)"
-    r"|sensors\.\d+\.(sampling_period|delay)"
+    r"|sensors\.(\d+|\*)\.(sampling_period|delay)"
 )
 
 
@@ -60,6 +62,11 @@ class SweepSpecification:
         return sizes[:1] if self.paired else sizes
 
     @property
+    def count(self) -> int:
+        """Number of runs."""
+        return math.prod(self.shape)
+
+    @property
     def dims(self) -> tuple[str, ...]:
         """Names of the dimensions of the results."""
         return ("run",) if self.paired else tuple(self.axes)
@@ -72,10 +79,10 @@ class SweepSpecification:
 
     def batches(self) -> Batches:
         """Batches of the runs."""
-        one_run_each = (
-            self.case.controller is not None and self.case.controller.design_depends_on_loads
-        )
-        return make_batches(list(self.axes), self.runs(), one_run_each)
+        controller = self.case.controller
+        one_run_each = controller is not None and controller.design_depends_on_loads
+        within = [] if one_run_each else addresses_within_batches(self.case, self.axes)
+        return make_batches(list(self.axes), self.runs(), within)
 
     def runner(self) -> Runner:
         """Runner of the batches in blocks.
@@ -146,7 +153,16 @@ def sweep_specification(
         raise ValueError("give at least one address to sweep over, with a list of values")
     if not case.sensors:
         raise ValueError("the case has no sensors, and peaks are taken there; add one to `sensors`")
+    for i, sensor in enumerate(case.sensors):
+        if QUANTITIES[sensor.quantity].x_derivative > 2:
+            raise ValueError(
+                f"sensors.{i} measures {sensor.quantity}, whose sum of modes converges too slowly"
+                " for the peaks of a sweep: leave it out, and simulate single runs"
+            )
     over = {current_address(address): given for address, given in over.items()}
+    twice = overlap(over, list_sizes(case))
+    if twice:
+        raise ValueError(f"{twice} is swept twice: leave one of {', '.join(over)} out")
     axes = {address: _checked_values(case, address, given) for address, given in over.items()}
     for address in axes:
         if histories and address in ("run.duration", "run.sample_rate"):
@@ -157,9 +173,9 @@ def sweep_specification(
     if paired and len(set(sizes.values())) > 1:
         raise ValueError(f"paired values must be equally many, not {sizes}")
     specification = SweepSpecification(case, axes, paired, histories, tolerance, single)
-    if math.prod(specification.shape) > MAX_RUNS:
+    if specification.count > MAX_RUNS:
         raise ValueError(
-            f"{math.prod(specification.shape):.1e} combinations of values are more than the"
+            f"{specification.count:.1e} combinations of values are more than the"
             f" {MAX_RUNS:.0e} runs of a sweep: split it"
         )
     jointly_checked = [name for name in axes if JOINTLY_CHECKED.fullmatch(name)]
@@ -185,7 +201,7 @@ def sweep_specification(
 
 def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.ndarray, " value"]:
     """Values of one address as an array, with the checks that need no other address."""
-    if np.ndim(value_at(case, address)):
+    if any(np.ndim(value_at(case, one)) for one in own_addresses(case, address)):
         raise ValueError(f"{address} is a list; sweep over one of its entries, {address}.0")
     try:
         values = np.atleast_1d(np.asarray(values_given, float))

@@ -7,7 +7,6 @@ group is gone. A fingerprint of all that determines the results protects against
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
 import tempfile
@@ -18,20 +17,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbeam.sweeps.block_store import BlockStore
+from jaxbeam.sweeps.zarr_files import (
+    BLOCKS_GROUP,
+    DAMAGE_ERRORS,
+    FINGERPRINT_ATTRIBUTE,
+    array_options,
+    checksummed,
+    explaining_damage,
+    explaining_write_errors,
+    is_complete,
+    new_store,
+    replace_blocks,
+)
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
-    import zarr  # takes long to import; only stored sweeps need it
-
-FINGERPRINT_ATTRIBUTE = "jaxbeam_sweep"
-BLOCKS_GROUP = "blocks"
-DAMAGE_ERRORS = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    RuntimeError,
-)  # of zarr, for damaged files
 
 
 class ZarrStore(BlockStore):
@@ -44,7 +44,7 @@ class ZarrStore(BlockStore):
         import zarr
 
         self._path = path
-        with _explaining_damage(path):
+        with explaining_damage(path):
             self._blocks: Any = zarr.open_group(path, mode="r+")[BLOCKS_GROUP]
             self.steps = np.asarray(self._blocks["steps"][:])
             self._flags = self._blocks["done"]
@@ -53,7 +53,7 @@ class ZarrStore(BlockStore):
 
     def specification(self) -> dict[str, Any]:
         """Specification of the sweep, as given to `create_store`."""
-        with _explaining_damage(self._path):
+        with explaining_damage(self._path):
             return json.loads(np.asarray(self._blocks["order"][:]).tobytes())
 
     def missing(self) -> list[int]:
@@ -71,34 +71,18 @@ class ZarrStore(BlockStore):
         return self._is_flagged(block) and self._is_intact(block)
 
     def write(self, block: int, results: dict[str, np.ndarray]) -> None:
-        with _explaining_write_errors(self._path):
+        with explaining_write_errors(self._path):
             for name, values in results.items():
                 size = values.shape[0]
                 self._result_array(name, values)[block * size : (block + 1) * size] = values
             self._flags[block] = True
 
     def collect(self) -> dict[str, np.ndarray]:
-        with _explaining_damage(self._path):
+        with explaining_damage(self._path):
             return {name: np.asarray(self._blocks[name][:]) for name in self._names()}
 
     def finish(self, dataset: xarray.Dataset) -> None:
-        with _explaining_write_errors(self._path):
-            # Arrays of an interrupted attempt may be incomplete.
-            for folder in self._path.iterdir():
-                if folder.is_dir() and folder.name != BLOCKS_GROUP:
-                    shutil.rmtree(folder)
-            # Zarr specifies strings of variable length, not of fixed length.
-            labels = dataset["sensor"].values.astype(object)
-            dataset.assign_coords(sensor=labels).to_zarr(
-                self._path,
-                mode="a",
-                consolidated=False,
-                write_empty_chunks=True,
-                encoding={name: {"compressors": _checksummed()} for name in dataset.variables},
-            )
-            # Without its metadata the group is gone and the store complete.
-            (self._path / BLOCKS_GROUP / "zarr.json").unlink()
-            shutil.rmtree(self._path / BLOCKS_GROUP)
+        replace_blocks(self._path, dataset)
 
     def _names(self) -> list[str]:
         return sorted(set(self._blocks.array_keys()) - {"done", "steps", "order"})
@@ -112,7 +96,7 @@ class ZarrStore(BlockStore):
                     shape=(self._count * values.shape[0], *values.shape[1:]),
                     chunks=values.shape,
                     dtype=values.dtype,
-                    **_array_options(),
+                    **array_options(),
                 )
             self._arrays[name] = self._blocks[name]
         return self._arrays[name]
@@ -128,7 +112,7 @@ class ZarrStore(BlockStore):
     def _all_readable(self) -> bool:
         """Whether all blocks can be read: a fast check before `_is_intact`."""
         try:
-            complete = all(_is_complete(self._blocks[name]) for name in self._names())
+            complete = all(is_complete(self._blocks[name]) for name in self._names())
             return complete and bool(self.collect())
         except ValueError:
             return False
@@ -154,55 +138,15 @@ def read_dataset(path: Path) -> xarray.Dataset:
     import zarr
 
     shutil.rmtree(path / BLOCKS_GROUP, ignore_errors=True)  # chunks may remain after a kill
-    with _explaining_damage(path):
+    with explaining_damage(path):
         group = zarr.open_group(path, mode="r")
         arrays: dict[str, Any] = {
             part.name: group[part.name] for part in path.iterdir() if part.is_dir()
         }
-        incomplete = [name for name, array in arrays.items() if not _is_complete(array)]
+        incomplete = [name for name, array in arrays.items() if not is_complete(array)]
         if incomplete:
             raise ValueError(f"parts of {', '.join(sorted(incomplete))} are missing")
         return xarray.open_zarr(path, consolidated=False).load()
-
-
-def _checksummed():
-    from zarr.codecs import ZstdCodec
-
-    return [ZstdCodec(checksum=True)]
-
-
-def _array_options() -> dict[str, Any]:
-    """Options of arrays with which damaged and missing chunks are detected."""
-    return {"compressors": _checksummed(), "config": {"write_empty_chunks": True}}
-
-
-def _is_complete(array: zarr.Array) -> bool:
-    """Whether all chunks of an array exist; zarr reads missing ones as zeros."""
-    return array.nchunks_initialized == array.nchunks
-
-
-@contextlib.contextmanager
-def _explaining_damage(path: Path):
-    """Replace errors of zarr about damaged files by a ValueError of one sentence."""
-    try:
-        yield
-    except DAMAGE_ERRORS as error:
-        raise ValueError(
-            f"{path} is damaged ({' '.join(str(error).split())}): make the sweep anew, under"
-            " another name or with overwrite"
-        ) from None
-
-
-@contextlib.contextmanager
-def _explaining_write_errors(path: Path):
-    """Replace errors in writing by one sentence, which says that finished blocks are kept."""
-    try:
-        yield
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise type(error)(
-            f"cannot write to {path}: {reason}; finished blocks are kept: mend this, then resume"
-        ) from None
 
 
 def status(path: Path) -> tuple[str, str] | None:
@@ -274,24 +218,12 @@ def create_store(
     `steps` are the step sizes (s) of the batches and the error estimate. With `overwrite` a sweep
     at the path is deleted. Raises OSError if the store cannot be written.
     """
-    import zarr
-
-    # Written beside the path and renamed, so that a store is complete or does not exist.
-    temporary_path = path.with_name(f".{path.name}.new")
-    shutil.rmtree(temporary_path, ignore_errors=True)
-    with _explaining_write_errors(path):
-        group = zarr.create_group(temporary_path)
-        blocks_group = group.create_group(BLOCKS_GROUP)
+    with new_store(path, fingerprint, overwrite) as group:
+        blocks_group = group[BLOCKS_GROUP]
         blocks_group.create_array(
             "done", shape=(blocks,), chunks=(1,), dtype=bool, fill_value=False
         )
-        blocks_group.create_array(
-            "steps", data=np.asarray(steps, float), compressors=_checksummed()
-        )
+        blocks_group.create_array("steps", data=np.asarray(steps, float), compressors=checksummed())
         specification_bytes = np.frombuffer(json.dumps(specification).encode(), np.uint8)
-        blocks_group.create_array("order", data=specification_bytes, compressors=_checksummed())
-        group.attrs[FINGERPRINT_ATTRIBUTE] = fingerprint
-        if overwrite:
-            shutil.rmtree(path, ignore_errors=True)
-        temporary_path.rename(path)
+        blocks_group.create_array("order", data=specification_bytes, compressors=checksummed())
     return ZarrStore(path)

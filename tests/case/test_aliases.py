@@ -19,7 +19,7 @@ from jaxbeam.files.case_file import (
     load_controller,
     with_settings,
 )
-from jaxbeam.simulation.record import record_from_xarray
+from jaxbeam.simulation.stored_record import record_from_xarray
 from jaxbeam.sweeps.specification import specification_from_dict, sweep_specification
 
 BEAM = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535, "modes": 1}

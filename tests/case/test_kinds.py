@@ -86,6 +86,7 @@ def test_parts_of_a_case_follow_from_its_fields():
         "actuators": "AbstractActuator",
         "sensors": "Sensor",
         "loads": "AbstractLoad",
+        "profile": "AbstractProfile",
         "controller": "AbstractController",
         "run": "Run",
     }
@@ -95,7 +96,7 @@ def test_parts_of_a_case_follow_from_its_fields():
     ]
 
 
-@pytest.mark.parametrize("key", ["actuators", "loads", "controller"])
+@pytest.mark.parametrize("key", ["actuators", "loads", "profile", "controller"])
 def test_every_class_of_a_case_has_a_kind(key):
     family = part_classes()[key].part_class
     found = {each for each in kinds(family).values() if each.__module__.startswith("jaxbeam.")}

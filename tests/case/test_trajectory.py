@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 
 from jaxbeam.case.trajectory import BrakingTrajectory, TabulatedTrajectory
-from jaxbeam.model.contact import LoadSet
+from jaxbeam.model.load_set import LoadSet, WheelSet
 
 LENGTH = jnp.asarray(2.0)
 TIMES = np.array([0.0, 0.3, 0.7, 0.8, 1.5])
@@ -64,8 +64,8 @@ def test_cubics_of_a_load_set_are_padded_to_the_same_number():
         TabulatedTrajectory(jnp.asarray(TIMES), jnp.asarray(POSITIONS), LENGTH),
     )
     zeros = jnp.zeros((2, 1))
-    breakpoints, cubics = LoadSet(trajectories, zeros, zeros).cubics()
+    breakpoints, cubics = LoadSet(trajectories, WheelSet(zeros, zeros)).cubics()
     assert breakpoints.shape == (2, 5) and cubics.shape == (2, 5, 4)
     assert_allclose(breakpoints[0], [0.2, 2.2, np.inf, np.inf, np.inf])
     assert_allclose(cubics[1], trajectories[1].cubics()[1])
-    assert LoadSet((), zeros[:0], zeros[:0]).cubics()[1].shape == (0, 1, 4)
+    assert LoadSet((), WheelSet(zeros[:0], zeros[:0])).cubics()[1].shape == (0, 1, 4)

@@ -16,9 +16,11 @@ from jaxbeam.case.actuators.shaker import Shaker
 from jaxbeam.case.actuators.spring import SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run, replace
-from jaxbeam.case.loads import MovingForce, MovingMass
+from jaxbeam.case.loads.force import MovingForce
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
+from jaxbeam.control.feedback import Feedback
 from tests.strategies import cases
 
 SECTION = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}
@@ -152,7 +154,29 @@ CASES = [
         Case(BEAM, sensors=[Sensor(0.2, fibre_distance=0.1)]),
         "sensors.0.fibre_distance would have no effect on a sensor of deflection",
     ),
-    (Case(BEAM, sensors=[Sensor(0.2, "stress")]), "sensors.0.quantity cannot be 'stress'; it may"),
+    (Case(BEAM, sensors=[Sensor(0.2, "torsion")]), "sensors.0.quantity cannot be 'torsion'; it ma"),
+    (Case(BEAM, sensors=[Sensor(0.2, "stress")]), "sensors.0.section_modulus is missing: stress"),
+    (
+        Case(BEAM, sensors=[Sensor(0.2, "stress", section_modulus=0.0)]),
+        "sensors.0.section_modulus must not be zero",
+    ),
+    (
+        Case(BEAM, sensors=[Sensor(0.2, section_modulus=1e-3)]),
+        "sensors.0.section_modulus would have no effect on a sensor of deflection",
+    ),
+    (
+        Case(BEAM, sensors=[Sensor(0.2, name="a"), Sensor(0.3), Sensor(0.1, name="a")]),
+        "sensors.0 and sensors.2 are both called 'a' in results; give sensors.2 another name",
+    ),
+    (
+        Case(
+            BEAM,
+            actuators=[Patch(0.1, 0.3, 1e-3)],
+            sensors=[Sensor(0.2, "moment")],
+            controller=Feedback(gains=[1.0]),
+        ),
+        "sensors.0 reads the moment of a section on which actuators.0 acts, which no controller",
+    ),
     (Case(BEAM, loads=[MovingMass(1.0)]), "loads.0 has neither speed nor times; give one of them"),
     (Case(BEAM, loads=[MovingMass(1.0, 1.0, **TABLE)]), "loads.0 has both speed and times"),
     (Case(BEAM, loads=[MovingMass(1.0, times=[0.0, 1.0])]), "loads.0.positions is missing"),

@@ -6,6 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from tests.cli.example import CASE
+
 
 def frequency(n: int, rigidity: float = 11.68) -> float:
     """Natural frequency n (Hz) of the pinned beam, (n pi / L)^2 sqrt(E I / m) / 2 pi."""
@@ -37,6 +39,7 @@ REFUSED = [
         "sweep case.toml --over loads.0.speed=1,2 --over loads.0.speed=1,2",
         "--over names loads.0.speed twice",
     ),
+    ("sweep case.toml --over loads.0.train=HSLM-A1,2", "'HSLM-A1' is not a number"),
     ("sweep case.toml --over loads.0.speed=1,2 --resume", "--resume needs the store to continue"),
     ("frf case.toml --from 0", "--from and --to must increase from above 0 Hz; they are 0, 1000"),
     ("frf case.toml --from 10 --to 1", "--from and --to must increase from above 0 Hz"),
@@ -86,8 +89,10 @@ def test_simulate_prints_and_writes_the_same(run, folder):
     found = run("simulate case.toml --json")
     np.testing.assert_array_equal(found["peak_deflection"], record.peak_deflection)
     assert set(found) == {
+        "sensors",
         "peak_deflection",
         "lowest_contact_force",
+        "wheel_unloading",
         "contact_lost_time",
         "error_estimate",
         "steps",
@@ -99,6 +104,21 @@ def test_simulate_prints_and_writes_the_same(run, folder):
     assert (folder / "out.nc").stat().st_size > 0
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "out.gif").read_bytes().startswith(b"GIF89a")
+
+
+def test_an_accelerometer_is_not_reported_as_deflection(run):
+    line = "case.toml --set sensors.1.quantity=acceleration --set sensors.1.name=deck"
+    found = run(f"simulate {line} --json")
+    assert found["peak_deflection"][1] is None and found["peak_deflection"][0] > 0
+    deck = found["sensors"][1]
+    assert (deck["name"], deck["quantity"], deck["unit"]) == ("deck", "acceleration", "m/s^2")
+    printed = run(f"simulate {line}")
+    assert "acceleration (m/s^2)" in printed and f"{deck['largest']:.6g}" in printed
+    assert "peak deflection" not in printed
+    swept = run(f"sweep {line} --over loads.0.mass=0.1,0.5 --json")
+    assert np.isfinite(np.array(swept["peak_acceleration"], float)[:, 1]).all()
+    assert np.isnan(np.array(swept["peak_deflection"], float)[:, 1]).all()
+    assert "deck  acceleration (m/s^2)" in run(f"sweep {line} --over loads.0.mass=0.1,0.5")
 
 
 def test_simulate_overwrites_only_with_the_option(run, refused, folder):
@@ -151,6 +171,27 @@ def test_paired_sweep(run):
     line = "sweep case.toml --over loads.0.mass=0.1,0.5 --over loads.0.speed=0.5,1 --paired"
     assert np.shape(run(f"{line} --json")["peak_deflection"]) == (2, 2)
     assert "2 runs" in run(line)
+
+
+def test_sweep_over_words(run, refused, folder):
+    """Trains are words; the picture has their peaks over speed."""
+    load = '[[loads]]\nkind = "axles"\ntrain = "HL93-tandem"\nspeed = 1.0\n'
+    text = CASE[: CASE.index("[[loads]]")] + load
+    for old, new in {"= 0.6": "= 9.0", "11.68": "1e8", "0.535": "535.0"}.items():
+        text = text.replace(old, new)
+    (folder / "train.toml").write_text(text)
+    line = "sweep train.toml --over loads.*.speed=20:40:3 --over loads.0.train="
+    found = run(f"{line}HL93-tandem,LM71-axles --plot --json")
+    assert found["dimensions"] == ["loads.*.speed", "loads.0.train", "sensor"]
+    assert found["values"]["loads.0.train"] == ["HL93-tandem", "LM71-axles"]
+    assert np.shape(found["peak_deflection"]) == (3, 2, 2)
+    assert (folder / "train_sweep.png").read_bytes().startswith(b"\x89PNG")
+    assert "train_sweep.png exists" in refused(f"{line}HL93-tandem,LM71-axles --plot")
+    printed = run(f"{line}HL93-tandem,LM71-axles")
+    assert "6 runs" in printed and "LM71-axles" in printed
+    assert "did you mean 'LM71-axles'" in refused(f"{line}LM71-axle")
+    message = refused("sweep train.toml --over loads.*.speed=20 --plot")
+    assert "one or two parameters with several values" in message
 
 
 def write_decay(path):

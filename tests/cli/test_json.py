@@ -36,8 +36,21 @@ KEYS = {
         ],
     },
     "simulate controlled.toml": {
+        "sensors": [
+            {
+                "name": None,
+                "quantity": None,
+                "unit": None,
+                "position": None,
+                "smallest": None,
+                "smallest_time": None,
+                "largest": None,
+                "largest_time": None,
+            }
+        ],
         "peak_deflection": None,
         "lowest_contact_force": None,
+        "wheel_unloading": None,
         "contact_lost_time": None,
         "error_estimate": None,
         "steps": None,
@@ -45,6 +58,22 @@ KEYS = {
         "effort": None,
         "saturated": None,
         "verdict": None,
+    },
+    "describe case.toml": {
+        "vehicles": [
+            {
+                "title": None,
+                "source": None,
+                "wheelbase": None,
+                "weight": None,
+                "mass": None,
+                "offsets": None,
+                "static_loads": None,
+                "unsprung_masses": None,
+                "degrees_of_freedom": None,
+                "frequencies_hz": None,
+            }
+        ]
     },
     "sweep case.toml --over loads.0.mass=0.3,0.5": {
         "values": {"loads.0.mass": None},

@@ -32,6 +32,8 @@ LINES = {
     "weigh case.toml log.csv --speeds fast": "--speeds takes LOW:HIGH",
     "compare-models fit.npz": "one fit alone",
     "reproduce": "name an experiment",
+    "describe --help": "static wheel loads",
+    "describe none.toml": "cannot read the file none.toml",
 }
 
 

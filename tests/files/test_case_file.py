@@ -13,7 +13,8 @@ from jaxbeam.case.actuators.point import PointForce
 from jaxbeam.case.actuators.shaker import Shaker
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, Run
-from jaxbeam.case.loads import MovingForce, MovingMass
+from jaxbeam.case.loads.force import MovingForce
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.files.case_file import (
     case_from_dict,
@@ -178,8 +179,8 @@ REFUSED = [
         "actuators.0.kind is missing; it may be electrodynamic, patch, point, shaker, spring",
     ),
     ('"shaker"', '"shakr"', "actuators.0.kind cannot be 'shakr'; did you mean 'shaker'?"),
-    ('"mass"', '"car"', "loads.0.kind cannot be 'car'; it may be force, mass"),
-    ('"mass"', "1", "loads.0.kind cannot be 1; it may be force, mass"),
+    ('"mass"', '"car"', "loads.0.kind cannot be 'car'; it may be axles, force, "),
+    ('"mass"', "1", "loads.0.kind cannot be 1; it may be axles, force, "),
     ("speed = 0.55", "sped = 0.55", "loads.0 has no key 'sped'; did you mean 'speed'?"),
     ("[-2.5, 7.5]", "7.5", "actuators.1.limits must be a list of 2 numbers, not 7.5"),
     ("[-2.5, 7.5]", "[1, 2, 3]", "actuators.1.limits must be a list of 2 numbers, not [1, 2, 3]"),

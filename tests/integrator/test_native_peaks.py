@@ -23,7 +23,7 @@ from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.time_grid import grid_by_step_length
-from jaxbeam.model.contact import load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.numerics.peak_search import interpolation_matrix, refine_peak
 from jaxbeam.runtime import native_library

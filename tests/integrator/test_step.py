@@ -8,6 +8,7 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.integrator.step import advance, advance_unforced
 from jaxbeam.integrator.step_matrices import StepMatrices
+from jaxbeam.integrator.vehicles.steps import StepInput
 from jaxbeam.simulation.simulate import simulate_readings
 from tests.runs import plan_of
 
@@ -34,6 +35,7 @@ def random_steps(blocks: int, side: int, rows: int):
         monitored=None,
         commands=None,
         nodes=None,
+        springs=None,
         loaded=jnp.asarray(active),
     )
     on = active[:, None, None]
@@ -51,9 +53,14 @@ def random_steps(blocks: int, side: int, rows: int):
     return arguments, jax.tree.map(tangent, arguments)
 
 
+def advance_plain_wheels(matrices, inertia, weight, state):
+    return advance_unforced(StepInput(matrices, inertia, weight, None), state, None)
+
+
 def advance_by_operations(matrices, inertia, weight, state):
     """The same steps, differentiated operation by operation."""
-    after, (states, forces) = jax.lax.scan(advance, state, (matrices, inertia, weight, None))
+    steps = StepInput(matrices, inertia, weight, None)
+    after, (states, forces) = jax.lax.scan(advance, state, steps)
     return after, states, forces
 
 
@@ -64,7 +71,7 @@ SHAPES = [(3, 2, 6), (8, 2, 12), (1, 7, 6)]
 @pytest.mark.parametrize("shape", SHAPES)
 def test_tangents_of_steps_are_those_of_every_operation(shape):
     arguments, tangents = random_steps(*shape)
-    found = jax.jvp(advance_unforced, arguments, tangents)
+    found = jax.jvp(advance_plain_wheels, arguments, tangents)
     expected = jax.jvp(advance_by_operations, arguments, tangents)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(b).max())
@@ -79,9 +86,9 @@ def test_tangents_of_steps_are_differences(shape):
         def shifted(a, b):
             return a if a.dtype == bool else a + by * b
 
-        return advance_unforced(*jax.tree.map(shifted, arguments, tangents))
+        return advance_plain_wheels(*jax.tree.map(shifted, arguments, tangents))
 
-    found = jax.jvp(advance_unforced, arguments, tangents)[1]
+    found = jax.jvp(advance_plain_wheels, arguments, tangents)[1]
     for a, up, down in zip(found, result_after(size), result_after(-size), strict=True):
         change = (up - down) / (2 * size)
         np.testing.assert_allclose(a, change, rtol=1e-6, atol=1e-7 * np.abs(change).max())
@@ -91,15 +98,15 @@ def test_tangents_of_steps_are_differences(shape):
 def test_reverse_mode_is_the_transpose_of_forward_mode(shape):
     """First and second derivatives along a direction are the same in both modes."""
     (matrices, *rest), (matrix_tangents, *rest_tangents) = random_steps(*shape)
-    found = advance_unforced(matrices, *rest)
+    found = advance_plain_wheels(matrices, *rest)
     targets = [np.random.default_rng(7).normal(size=part.shape) for part in found]
 
     names = "contact_response", "contact_compliance", "transition", "force_response"
 
     def misfit(*parts):
         parts, rest = parts[: len(names)], parts[len(names) :]
-        varied = StepMatrices(*parts, None, None, None, matrices.loaded)
-        found = advance_unforced(varied, *rest)
+        varied = StepMatrices(*parts, None, None, None, None, matrices.loaded)
+        found = advance_plain_wheels(varied, *rest)
         return sum(jnp.sum((a - b) ** 2) for a, b in zip(found, targets, strict=True))
 
     arguments = (*(getattr(matrices, name) for name in names), *rest)

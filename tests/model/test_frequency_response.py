@@ -10,7 +10,6 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.static_correction import residual_actuator_gain
 from jaxbeam.case.case import replace
 from jaxbeam.model.channels import common_pairs, shaker_channels
 from jaxbeam.model.frequency_response import (
@@ -23,6 +22,7 @@ from jaxbeam.model.frequency_response import (
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.poles_zeros import poles, zeros
+from jaxbeam.model.static_correction import residual_actuator_gain
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import finite_elements

@@ -14,7 +14,9 @@ from jaxbeam.case.actuators.shaker import Shaker
 from jaxbeam.case.actuators.spring import SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
-from jaxbeam.case.loads import MovingForce, MovingMass, trajectory
+from jaxbeam.case.loads.base import trajectory
+from jaxbeam.case.loads.force import MovingForce
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.statics import influence_line, static_deflection, static_peak
 from tests.as_oracle import as_oracle
@@ -133,7 +135,7 @@ def sampled_peak(case: Case, x, until: float) -> np.ndarray:
         entry, leave = (float(t) for t in path.entry_exit_times())
         line = np.asarray(influence_line(case, x, position))
         on = ((times >= entry) & (times <= leave))[:, None]
-        total = total + float(load.weight(case.run.gravity)) * on * line
+        total = total + float(load.vehicle(case.run.gravity).static_loads[0]) * on * line
     return np.abs(total).max(axis=0)
 
 
@@ -221,7 +223,10 @@ def test_gradients_of_lines_and_peaks():
         (lambda: influence_line(GENERAL, 1.4, 0.1), "x must lie on the beam, between 0 and 1.3 m"),
         (lambda: influence_line(GENERAL, 0.1, [0.1, -0.2]), "positions must lie on the beam"),
         (lambda: influence_line(GENERAL, 0.1, jnp.nan), "positions must lie on the beam"),
-        (lambda: static_deflection(GENERAL, 0.1, [0.1]), "one for each of the 2 loads of the case"),
+        (
+            lambda: static_deflection(GENERAL, 0.1, [0.1]),
+            "each of the 2 wheels of the case",
+        ),
         (lambda: static_deflection(GENERAL, 0.1, [0.1, 0.2], 1.0), "one for each of the 1 forces"),
         (lambda: static_peak(GENERAL, -1.0), "x must lie on the beam"),
         (

@@ -16,6 +16,7 @@ from jaxbeam.model.frequency_response import frequency_response
 from jaxbeam.plot import (
     FitPanel,
     animate,
+    plot_envelope,
     plot_fit,
     plot_frequency_response,
     plot_modes,
@@ -77,6 +78,41 @@ def test_record_of_many_parts(record):
     said = words(figure)
     assert "load 0" in said and "load 1" in said and "load 2" not in said
     assert "contact loss" in said
+
+
+def test_record_of_several_quantities():
+    """Each has axes with its unit; names of sensors are beside their larger extremes."""
+    sensors = [
+        jb.Sensor(0.3, name="midspan"),
+        jb.Sensor(0.2, "acceleration"),
+        jb.Sensor(0.2, "strain", fibre_distance=-2e-3, name="gauge"),
+        jb.Sensor(0.4, "curvature"),
+    ]
+    record = jb.simulate(dataclasses.replace(CASE, sensors=sensors))
+    figure = plot_record(record)
+    said = words(figure)
+    for text in ("deflection (mm)", "acceleration (m/s²)", "strain ($10^{-3}$)", "midspan",
+                 "gauge", "curvature"):  # fmt: skip
+        assert text in said
+    strain = figure.axes[3]
+    (curve,) = lines_of(strain, record.times.size)
+    assert_allclose(data(curve)[1], 1e3 * np.asarray(record.measured)[:, 2])
+    (dot,) = [line for line in lines_of(strain, 1) if line.get_marker() == "o"]
+    found = record.extremes
+    assert_allclose(data(dot)[:, 0], [found.largest_time[2], 1e3 * found.largest[2]])
+    assert figure.axes[2].get_ylabel() == "acceleration (m/s²)"
+
+
+def test_envelope(record):
+    found = record.envelope("moment", np.linspace(0, 0.6, 31))
+    figure = plot_envelope(record, "moment", found.positions)
+    low, high = lines_of(figure.axes[1], 31)
+    assert_allclose(data(low)[1], found.smallest)
+    assert_allclose(data(high)[1], found.largest)
+    i = int(np.argmax(found.largest))
+    said = words(figure)
+    for text in ("moment (N m)", "position (m)", f"at {found.positions[i]:.4g} m", "one ball"):
+        assert text in said
 
 
 def test_record_without_sensors_or_loads(record):
@@ -190,9 +226,8 @@ def test_animation_of_a_controlled_beam(tmp_path):
             frames = [np.asarray(f.convert("L")) for f in ImageSequence.Iterator(picture)]
         assert len(frames) == 3 and not np.array_equal(frames[0], frames[1])
     assert heights[0] > heights[1]
-    coordinates = np.array(record.coordinates)
-    coordinates[9:] = np.nan
-    diverged = dataclasses.replace(record, coordinates=coordinates)
+    nothing = jnp.asarray(record.coordinates).at[9:].set(jnp.nan)
+    diverged = dataclasses.replace(record, coordinates=nothing)
     with pytest.raises(ValueError, match="diverges"):
         animate(diverged, tmp_path / "diverged.gif")
     assert not (tmp_path / "diverged.gif").exists()

@@ -1,5 +1,6 @@
 """Figures of sweeps."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -8,6 +9,7 @@ import xarray
 from matplotlib.text import Text
 from numpy.testing import assert_allclose
 
+import jaxbeam as jb
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.plot import plot_sweep
 from tests.plot.figures import CASE, data, lines_of, words
@@ -53,6 +55,22 @@ def test_sweep_over_two_addresses():
     for text in ("loads.0.speed (m/s)", "loads.0.mass (kg)", "at 0.3 m, largest 10.6 mm"):
         assert text in said
     assert bar.get_ylabel() == "peak deflection (mm)"
+
+
+@pytest.mark.parametrize("addresses", [1, 2])
+def test_sweep_of_several_quantities(addresses):
+    """Accelerations are not drawn as deflections: axes and scales of their own, and names."""
+    sensors = [jb.Sensor(0.15, name="quarter"), jb.Sensor(0.3, "acceleration")]
+    case = dataclasses.replace(CASE, sensors=sensors)
+    over = {"loads.0.mass": [0.1, 0.3], "loads.0.speed": [1.0, 2.0]}
+    dataset = jb.sweep(case, dict(list(over.items())[:addresses]), progress=False)
+    figure = plot_sweep(dataset)
+    said = words(figure)
+    for text in ("peak deflection (mm)", "peak acceleration (m/s²)", "quarter", "at 0.3 m"):
+        assert text in said
+    if addresses == 1:
+        (curve,) = lines_of(figure.axes[1], 2)
+        assert_allclose(data(curve)[1], dataset["peak_acceleration"].values[:, 1])
 
 
 def test_contour_labels_are_not_cut_off():

@@ -55,6 +55,18 @@ FUNCTIONS = {
         MATRIX,
         VECTOR,
     ),
+    "solve_tridiagonal": (
+        arrays.solve_tridiagonal,
+        np.array([0.5, -1.0, 0.3]),
+        np.array([2.0, 3.0, -4.0, 1.5]),
+        np.array([1.0, 0.7, -0.2]),
+        VECTOR,
+    ),
+    "solve_tridiagonal of one": (
+        lambda d, r: arrays.solve_tridiagonal(d[:0], d, d[:0], r),
+        VECTOR[:1],
+        VECTOR[2:3],
+    ),
     "solve_triangular, lower": (lambda a, b: arrays.solve_triangular(a, b, True), FACTOR, MATRIX),
     "solve_triangular, upper": (
         lambda a, b: arrays.solve_triangular(a, b, False),

@@ -15,7 +15,7 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.model.sensor_signals import noise_samples
+from jaxbeam.model.sensing.sensor_signals import noise_samples
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from jaxbeam.simulation.simulate import simulate_readings

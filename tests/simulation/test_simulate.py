@@ -13,7 +13,7 @@ import jaxbeam as jb
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.time_grid import grid_by_step_length
-from jaxbeam.model.contact import load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.simulation.integration_plan import static_shapes
 from jaxbeam.simulation.simulate import ContactLossWarning

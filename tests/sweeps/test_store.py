@@ -10,7 +10,7 @@ import pytest
 import xarray
 
 import jaxbeam as jb
-from jaxbeam.simulation.record import read_record
+from jaxbeam.simulation.stored_record import read_record
 from jaxbeam.sweeps.specification import SweepSpecification
 from jaxbeam.sweeps.store import ZarrStore
 from tests.modules import module_files, parse

@@ -207,7 +207,8 @@ def test_every_run_is_in_one_batch(count, paths, seed):
     random = np.random.default_rng(seed)
     speeds = random.integers(0, paths, count).astype(float)
     masses = random.random(count)
-    batches = make_batches(["loads.0.speed", "loads.0.mass"], np.stack([speeds, masses], axis=1))
+    values = np.stack([speeds, masses], axis=1)
+    batches = make_batches(["loads.0.speed", "loads.0.mass"], values, ["loads.0.mass"])
     mask = batches.run_index >= 0
     assert sorted(batches.run_index[mask]) == list(range(count))
     rows = np.broadcast_to(batches.shared_values[:, None, 0], batches.run_index.shape)
@@ -240,7 +241,8 @@ def test_longest_steps_are_stable(modes, damping):
         run=jb.Run(duration=6.5),
     )
     runs = np.array([(mass, speed) for speed in speeds for mass in masses])
-    runner = Runner(case, make_batches(["loads.0.mass", "loads.0.speed"], runs), False, 1e-3)
+    batches = make_batches(["loads.0.mass", "loads.0.speed"], runs, ["loads.0.mass"])
+    runner = Runner(case, batches, False, 1e-3)
     peaks = runner.compute_block(0, runner.max_steps)["peak_deflection"]  # speed, mass, sensor
     ratio = peaks / (masses[:, None] * np.asarray(static_peak(case, np.array([0.15, 0.3]))))
     assert ratio.min() > 0.99 and ratio.max() < 1.15

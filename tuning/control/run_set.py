@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, least_achievable_peak
 from jaxbeam.case.case import Case, crossing_times, replace, stack_cases, value_at
-from jaxbeam.model.contact import load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import (

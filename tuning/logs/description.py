@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from jaxbeam.case.loads import AbstractLoad
+from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.files.case_file import read_part
 
 _KEYS = ("loads", "columns", "time", "runs")

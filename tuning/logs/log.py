@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.case.loads import AbstractLoad
+from jaxbeam.case.loads.base import AbstractLoad
 
 MAX_GRID_DEVIATION_STEPS = 0.25  # steps between times and an even grid, for rounded times
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case, crossing_times, replace
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import AbstractLoad
+from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.control.prescribed import Prescribed

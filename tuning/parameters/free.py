@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, replace, unit_at, value_at
+from jaxbeam.case.case import Case, list_sizes, replace, unit_at, value_at
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.joint_addresses import ALL, overlap
 from jaxbeam.runtime.arrays import Array
 from tuning.parameters.prior import Prior, as_prior
 
@@ -124,7 +125,7 @@ def free_parameters(
     if not bounds:
         raise ValueError("name at least one address as free")
     bounds = _expand_log_addresses(bounds, len(cases))
-    _check_unique(list(bounds))
+    _check_unique(list(bounds), cases)
     return [
         _free_parameter(cases, address, pair, largest_reading) for address, pair in bounds.items()
     ]
@@ -142,8 +143,8 @@ def _expand_log_addresses(bounds: dict[str, Any], logs: int) -> dict[str, Any]:
     return expanded
 
 
-def _check_unique(addresses: list[str]) -> None:
-    """Refuse an address that is free for all logs and for one log as well."""
+def _check_unique(addresses: list[str], cases: list[Case]) -> None:
+    """Refuse an address that is free twice: for all logs and for one, or for all loads and one."""
     for address in addresses:
         own = LOG_ADDRESS.fullmatch(address)
         if own and own[2] in addresses:
@@ -151,12 +152,20 @@ def _check_unique(addresses: list[str]) -> None:
                 f"{address} is free twice, as {own[2]} is free for all logs together; "
                 "leave one of them out"
             )
+    shared = [address for address in addresses if not LOG_ADDRESS.fullmatch(address)]
+    twice = overlap(shared, list_sizes(cases[0]))
+    if twice:
+        raise ValueError(f"{twice} is free twice; name it once")
 
 
 def _free_parameter(
     cases: list[Case], address: str, bounds, largest_reading: float
 ) -> FreeParameter:
     case, local_address = _locate(cases, address)
+    if ALL in local_address and local_address.endswith(".offset"):
+        raise ValueError(
+            f"{address}: sensors have offsets of their own; free sensors.0.offset and so on"
+        )
     value = concrete(value_at(case, local_address))
     if value.ndim:
         raise ValueError(f"{address} is a list; free its entries, {address}.0 and so on")

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import MovingMass
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.model.statics import influence_line
 from tuning.logs.log import Log
 

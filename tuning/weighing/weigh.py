@@ -9,7 +9,8 @@ import dataclasses
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads import AbstractLoad, MovingMass
+from jaxbeam.case.loads.base import AbstractLoad
+from jaxbeam.case.loads.mass import MovingMass
 from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.fit.identify import identify
 from tuning.fit.model_validation import ModelCriteria, compare_fits

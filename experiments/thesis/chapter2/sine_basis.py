@@ -41,4 +41,5 @@ def sine_basis_modes(case: Case, rigid_stiffness: float = RIGID_SUPPORT_STIFFNES
         coupling * unsupported.stiffness_unit,
         unsupported.nodes,
         series,
+        unsupported.layout,
     )

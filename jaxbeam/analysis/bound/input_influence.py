@@ -11,6 +11,7 @@ Both parts come from the integrator of `simulate`, in batches of unit commands o
 import dataclasses
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -21,7 +22,7 @@ from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.time_grid import grid_by_schedule
-from jaxbeam.model.contact import LoadSet, load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
@@ -158,12 +159,12 @@ def _unit_responses(
 ):
     """Modal coordinates (time, mode, batch): under weights for hold -1, else a unit command."""
     model, case_loads = modal_model(case, shapes.layout), load_set(case)
-    size = (len(case_loads.trajectories), hold_index.shape[0])
-    loads = LoadSet(
-        case_loads.trajectories,
-        xp.broadcast_to(case_loads.inertia, size),
-        xp.where(hold_index == -1, xp.broadcast_to(case_loads.weight, size), 0.0),
+    size = (case_loads.wheel_count, hold_index.shape[0])
+    wheels = jax.tree.map(
+        lambda part: xp.broadcast_to(part, (*part.shape[:-1], size[1])), case_loads.wheels
     )
+    weight = xp.where(hold_index == -1, wheels.weight, 0.0)
+    loads = dataclasses.replace(case_loads, wheels=dataclasses.replace(wheels, weight=weight))
     state_bound = xp.full(model.state_count, xp.inf)
     policy = _UnitCommands(
         schedule=schedule,

@@ -194,7 +194,7 @@ def finite_horizon_gains(
     """Table of optimal gains for a plant, and P at its breakpoints, load states included."""
     Q, R = regulator.weights(plant)
     F = Q if regulator.terminal_weight is None else xp.diag(regulator.terminal_weight)
-    load_count = len(plant.case.loads) if regulator.load_feedforward else 0
+    load_count = plant.weights.shape[0] if regulator.load_feedforward else 0
     Q, F = (xp.pad(weight, (0, load_count)) for weight in (Q, F))
     problem = crossing_events(plant), regulator.points, Q, R, F
     if plant.modal_model.state_count == 2 * plant.coordinate_scale.shape[0]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxbeam.model.contact import contact_rows
+from jaxbeam.model.contact import surface_rows
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.coupled_stages import ConstantPlant, Coupling
 from jaxbeam.numerics.finite_horizon import CouplingFunction
@@ -31,9 +31,10 @@ def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, Cou
     def contact_coupling(times):
         position, speed, acceleration = plant.loads.kinematics(times)
         active = plant.loads.on_beam(times)
+        motion = surface_rows(modal_model, position, speed, acceleration, active)
         shape, rows = (
             xp.moveaxis(part.reshape(*active.shape, -1), 0, -2)
-            for part in contact_rows(modal_model, position, speed, acceleration, active)
+            for part in (motion.shape, motion.acceleration)
         )
         weight_columns = xp.broadcast_to(
             xp.eye(load_count)[:, :weight_states], (*times.shape, load_count, weight_states)

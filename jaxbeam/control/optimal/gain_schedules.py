@@ -46,7 +46,6 @@ class GainSchedule(AbstractStateLaw):
 
 def crossing_events(plant: Plant) -> Float[Array, " event"]:
     """Entry and exit times (s) of all loads, ascending; the end of the run for loads that stay."""
-    windows = [path.entry_exit_times() for path in plant.loads.trajectories]
-    events = xp.sort(xp.array(windows).reshape(-1))
+    events = xp.sort(plant.loads.entry_exit_times().reshape(-1))
     last_event = xp.max(xp.where(events < NEVER, events, plant.case.run.duration))
     return xp.minimum(events, last_event)

@@ -11,12 +11,14 @@ from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.fields import INCREASING, choice, concrete, is_concrete, number, part
+from jaxbeam.case.loads.base import AbstractVehicleLoad
+from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.control.load_identification import LoadIdentification, identification_error
 from jaxbeam.control.load_identifiers import AbstractLoadSource, given_load
 from jaxbeam.control.optimal.crossing_lqr import AbstractFiniteHorizonRegulator, interval_error
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.model.contact import load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array
 
@@ -63,7 +65,7 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
         schedules = jax.vmap(jax.vmap(design, (None, 0)), (0, None))(
             jnp.asarray(self.masses), jnp.asarray(speeds)
         )
-        source = given_load(load)
+        source = given_load(load, design_plant.case.run.gravity)
         if self.load_identification is not None:
             source = self.load_identification.identifier(plant, design_plant)
         return ScheduledGainLaw(
@@ -78,8 +80,9 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
         )
 
     def validate(self, case):
+        gravity = case.run.gravity
         if len(case.loads) != 1 or any(
-            getattr(load, name) is None for load in case.loads for name in ("mass", "speed")
+            load.speed is None or load.total_mass(gravity) is None for load in case.loads
         ):
             return "kind needs a single load, with a mass and a speed; or take another kind"
         if self.entries == "predicted":
@@ -147,8 +150,13 @@ def _any_not_positive(values) -> bool:
 
 
 def _with_crossing_load(plant: Plant, mass, speed) -> Plant:
-    """Plant with another mass (kg) at another constant speed (m/s), in the same direction."""
+    """Plant with another mass (kg) at another constant speed (m/s), in the same direction.
+
+    Instead of a vehicle, it is a mass.
+    """
     load = plant.case.loads[0]
+    if isinstance(load, AbstractVehicleLoad):
+        load = MovingMass(mass, load.speed, load.entry_time)
     changed = eqx.tree_at(
         lambda x: (x.mass, x.speed, x.deceleration),
         load,

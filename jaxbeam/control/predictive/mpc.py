@@ -177,7 +177,7 @@ class MPC(AbstractStateController):
             return design_plant
         if self.loads == "ignored":
             return None
-        return eqx.tree_at(lambda m: m.loads.inertia, design_plant, replace_fn=xp.zeros_like)
+        return eqx.tree_at(lambda m: m.loads.wheels.inertia, design_plant, replace_fn=xp.zeros_like)
 
     def _terminal_cost(self, sampled, C, weights):
         """P of the terminal cost, of the incremental model under its regulator, or None."""

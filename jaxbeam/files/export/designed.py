@@ -25,7 +25,7 @@ from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.files.export.gains import Gains
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensor_signals import sensor_sections
+from jaxbeam.model.sensing.sensor_signals import sensor_sections
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled

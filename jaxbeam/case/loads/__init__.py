@@ -1,0 +1,1 @@
+"""Loads, one kind a file, with the interface of `base`."""

@@ -1,0 +1,71 @@
+"""Force that varies in time as it travels along the beam, or stays at a place."""
+
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number
+from jaxbeam.case.loads.base import AbstractVehicleLoad
+from jaxbeam.case.loads.force_history import ForceHistory
+from jaxbeam.case.loads.vehicle_checks import length_error
+from jaxbeam.case.loads.vehicle_model import plain_wheels
+from jaxbeam.case.trajectory import StandingTrajectory
+from jaxbeam.runtime.arrays import Array, xp
+
+
+class VaryingForce(AbstractVehicleLoad):
+    """Force F(t) = `force` + sum of A sin(2 pi f t + phase) + a table, positive downwards.
+
+    t is in s from the start of the run. The table has `forces` at `force_times`, straight lines
+    between them and constant before and after. The force travels as other loads do, or stays at
+    `position`, as a machine does.
+    """
+
+    kind: ClassVar[str] = "varying-force"
+
+    force: Float[Array, ""] = number("N", "constant part", default=0.0)
+    frequencies: Float[Array, " wave"] = number(
+        "Hz", "frequencies of the waves", NOT_NEGATIVE, default=()
+    )
+    amplitudes: Float[Array, " wave"] = number("N", "amplitudes of the waves", default=())
+    phases: Float[Array, " wave"] | None = number(
+        "rad", "phases of the waves at the start of the run; 0 if left out", default=None
+    )
+    force_times: Float[Array, " entry"] | None = number(
+        "s", "times of the table of forces", INCREASING, default=None
+    )
+    forces: Float[Array, " entry"] | None = number("N", "forces of the table", default=None)
+    position: Float[Array, ""] | None = number(
+        "m", "place of a force that does not travel", ON_BEAM, default=None
+    )
+
+    def validate(self, address):
+        error = length_error(address, self, "frequencies", ("amplitudes", "phases"))
+        if error is not None:
+            return error
+        if (self.force_times is None) != (self.forces is None):
+            absent = "force_times" if self.force_times is None else "forces"
+            return f"{address}.{absent} is missing; a table has both force_times and forces"
+        if self.force_times is not None:
+            error = length_error(address, self, "force_times", ("forces",))
+        if error is not None or self.position is None:
+            return error or super().validate(address)
+        for name in ("speed", "times", "start_position"):
+            if getattr(self, name) is not None:
+                return f"{address} has both position and {name}; leave one out"
+        return None
+
+    def trajectory(self, length):
+        if self.position is None:
+            return super().trajectory(length)
+        return StandingTrajectory(self.position, self.entry_time, length)
+
+    def vehicle(self, gravity):
+        return plain_wheels(self.force, xp.zeros(()))
+
+    def force_history(self):
+        phases = xp.zeros_like(self.frequencies) if self.phases is None else self.phases
+        none = np.zeros(0)
+        table = (none, none) if self.forces is None else (self.force_times, self.forces)
+        return ForceHistory(self.frequencies, self.amplitudes, phases, *table)

@@ -1,0 +1,1 @@
+"""TOML files, and parts of a case from their tables."""

@@ -1,0 +1,87 @@
+"""Parts of a case from the tables of a file, by the declarations of their fields."""
+
+import dataclasses
+import inspect
+import re
+from typing import Any
+
+from jaxbeam.case.aliases import current_keys, current_kind
+from jaxbeam.case.declared_checks import check_field, describe_value, missing_error, suggestion
+from jaxbeam.case.fields import describe_shape, fits_shape
+from jaxbeam.case.kinds import kinds
+
+
+def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
+    """The part of a case that a table describes.
+
+    `part_class` is its class, or an abstract class of which the table's `kind` names a subclass.
+    Raises ValueError, with the address, for keys and kinds that are unknown or missing and for
+    values of the wrong type or shape.
+    """
+    values = dict(table)
+    if inspect.isabstract(part_class):
+        part_class = _class_of_kind(address, values.pop("kind", None), part_class)
+    fields = {field.name: field for field in dataclasses.fields(part_class) if field.metadata}
+    values = current_keys(address, values, fields)
+    for key, value in values.items():
+        if key not in fields:
+            raise ValueError(
+                f"{address} has no key {describe_value(key)}; {suggestion(key, fields)}"
+            )
+        inner_class = fields[key].metadata.get("part")
+        if inner_class is not None and isinstance(value, dict):
+            values[key] = read_part(f"{address}.{key}", value, inner_class)
+        elif "parts" in fields[key].metadata:
+            values[key] = read_parts(f"{address}.{key}", value, fields[key].metadata["parts"])
+        else:
+            _check_type(f"{address}.{key}", value, fields[key])
+    for name, field in fields.items():
+        if field.default is dataclasses.MISSING and name not in values:
+            raise missing_error(f"{address}.{name}", field)
+    return part_class(**values)
+
+
+def read_parts(address: str, tables: Any, part_class: type) -> tuple[Any, ...]:
+    """The parts that a list of tables describes.
+
+    Raises ValueError, with the address, if it is no such list, and as `read_part` does.
+    """
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        listed = re.sub(r"\.\d+", "", address).removeprefix(".")
+        raise ValueError(f"{address} must be a list of tables; write [[{listed}]]")
+    return tuple(read_part(f"{address}.{i}", one, part_class) for i, one in enumerate(tables))
+
+
+def _class_of_kind(address: str, kind: Any, family: type) -> type:
+    classes = kinds(family)
+    if kind is None:
+        raise ValueError(f"{address}.kind is missing; it may be {', '.join(classes)}")
+    if isinstance(kind, str) and kind not in classes:
+        kind = current_kind(address, kind)
+    if not isinstance(kind, str) or kind not in classes:
+        hint = suggestion(str(kind), classes)
+        raise ValueError(f"{address}.kind cannot be {describe_value(kind)}; {hint}")
+    return classes[kind]
+
+
+def _check_type(address: str, value: Any, field: dataclasses.Field) -> None:
+    """Validate the entry of a field in a file, before it becomes an array."""
+    if "unit" not in field.metadata:
+        check_field(address, value, field)
+        return
+    shape = _shape(value)
+    if shape is None or not fits_shape(field, shape):
+        raise ValueError(f"{address} must be {describe_shape(field)}, not {describe_value(value)}")
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    """Shape of a number or of nested lists of numbers; None for anything else.
+
+    A whole number that is too large for a float is not a number here.
+    """
+    if not isinstance(value, list):
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        return () if is_number and (isinstance(value, float) or abs(value) < 2**1023) else None
+    shapes = {_shape(entry) for entry in value} or {()}
+    entry_shape = shapes.pop()
+    return None if shapes or entry_shape is None else (len(value), *entry_shape)

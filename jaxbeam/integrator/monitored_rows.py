@@ -1,0 +1,129 @@
+"""Rows of monitored outputs at the peak nodes of a step, on its initial state and its forces."""
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, Propagators
+from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.sensing.output_rows import OutputRows
+from jaxbeam.numerics.gauss import lagrange_coefficients
+from jaxbeam.runtime.arrays import Array, add_at, solve_triangular, xp
+
+
+def monitored_rows(
+    model: ModalModel,
+    propagators: Propagators,
+    outputs: OutputRows,
+    command_rates: Float[Array, "mode actuator"] | None,
+) -> tuple[
+    Float[Array, "length sample block side"],
+    Float[Array, "length sample force block input"],
+]:
+    """Rows of outputs on the state at the start of a step and on the forces at its Gauss nodes.
+
+    Samples are the outputs at each peak node, one node after the other; inputs are the generalised
+    forces, then the commands, whose `command_rates` are accelerations of the modes. Accelerations
+    are q'' = (rows of A) z + forces, with the forces as polynomials through the Gauss nodes.
+    """
+    blocks, count = model.state_matrix.shape[0], model.modes_per_block
+    rows = outputs.rows.reshape(-1, blocks, count)
+    transition, response = _at_peak_nodes(propagators)
+    accelerations = model.state_matrix[:, 1 : 2 * count : 2]
+    orders = np.array(outputs.time_derivatives, int)
+    on_state, on_forces, grouped = [], [], []
+    for order in np.unique(orders) if orders.size else (0,):
+        index = np.flatnonzero(orders == order)
+        on_side, sides = rows[index], np.s_[order : 2 * count : 2]
+        if order == 2:
+            on_side, sides = xp.einsum("wbm,bmj->wbj", on_side, accelerations), np.s_[:]
+        on_state.append(xp.einsum("wbm,lpbmj->lpwbj", on_side, transition[..., sides, :]))
+        on_forces.append(xp.einsum("wbm,lpfbmk->lpwfbk", on_side, response[..., sides, :]))
+        grouped.append(index)
+    on_state, on_forces = xp.concatenate(on_state, axis=2), xp.concatenate(on_forces, axis=2)
+    if len(grouped) > 1:
+        as_given = np.argsort(np.concatenate(grouped))
+        on_state, on_forces = on_state[:, :, as_given], on_forces[:, :, as_given]
+    forces_at_once = _feedthrough(outputs, rows, command_rates, response.shape[-1])
+    if forces_at_once is not None:
+        weights = _force_weights()[:, None, :, None, None]
+        on_forces = on_forces + weights * forces_at_once[:, None]
+    lengths = on_state.shape[0]
+    return (
+        on_state.reshape(lengths, -1, *on_state.shape[3:]),
+        on_forces.reshape(lengths, -1, *on_forces.shape[3:]),
+    )
+
+
+def _at_peak_nodes(propagators: Propagators):
+    """Propagators (length, sample, ...) to the start, the Gauss nodes and the end of a step."""
+    identity = xp.broadcast_to(
+        xp.eye(propagators.transition_end.shape[-1]), propagators.transition_end.shape
+    )
+    transitions = (
+        identity[:, None],
+        propagators.transition_nodes,
+        propagators.transition_end[:, None],
+    )
+    responses = (
+        xp.zeros_like(propagators.input_end)[:, None],
+        propagators.input_nodes,
+        propagators.input_end[:, None],
+    )
+    return xp.concatenate(transitions, axis=1), xp.concatenate(responses, axis=1)
+
+
+def _force_weights() -> np.ndarray:
+    """Weights (sample, force) from forces at the Gauss nodes to those at the peak nodes."""
+    powers = np.array(PEAK_NODES)[:, None] ** np.arange(NODE_COUNT)
+    return powers @ lagrange_coefficients(NODE_COUNT).T
+
+
+def _feedthrough(outputs: OutputRows, rows, command_rates, input_count: int):
+    """Outputs per input at the same instant (output, block, input); None if they are all zero."""
+    count = rows.shape[-1]
+    has_commands = command_rates is not None and outputs.on_commands.shape[1] > 0
+    if not (outputs.has_feedthrough.any() or has_commands):
+        return None
+    direct = xp.zeros((*rows.shape[:2], input_count))
+    for i in np.flatnonzero(outputs.has_feedthrough):
+        direct = add_at(direct, np.s_[i, :, :count], rows[i])
+        if command_rates is not None:
+            direct = add_at(direct, np.s_[i, :, count:], rows[i] @ command_rates)
+    if has_commands:
+        actuators = outputs.on_commands.shape[1]
+        direct = add_at(direct, np.s_[:, 0, count : count + actuators], outputs.on_commands)
+    return direct
+
+
+def largest_per_energy(model: ModalModel, outputs: OutputRows) -> Float[Array, " output"]:
+    """Bound of the square of each free output per q'^2 + q K q; infinite with rigid-body modes.
+
+    For a row s on q it is s K^-1 s; on q', s s; on q'' = -K q - D q', (sqrt(s K s) + |D s|)^2.
+    """
+    orders = np.array(outputs.time_derivatives, int)
+    bounds = xp.zeros(orders.shape)
+    deflections, rates, accelerations = (np.flatnonzero(orders == order) for order in range(3))
+    if deflections.size:
+        bounds = add_at(bounds, deflections, _static_flexibility(model, outputs.rows[deflections]))
+    if rates.size:
+        bounds = add_at(bounds, rates, xp.sum(outputs.rows[rates] ** 2, axis=1))
+    if accelerations.size:
+        rows, stiffness = outputs.rows[accelerations], model.stiffness()
+        damping = -model.A[model.rate_index, model.rate_index]
+        elastic = xp.sum(rows * (rows @ stiffness), axis=1)
+        damped = xp.sum((rows @ damping) ** 2, axis=1)
+        bounds = add_at(bounds, accelerations, (xp.sqrt(elastic) + xp.sqrt(damped)) ** 2)
+    return bounds
+
+
+def _static_flexibility(
+    model: ModalModel, shapes: Float[Array, "position mode"]
+) -> Float[Array, " position"]:
+    """Static deflection (m/N) at positions under a unit force; infinite with rigid-body modes.
+
+    Uncoupled modes need no factorisation, which would dominate the time.
+    """
+    if model.modes_per_block == 1:
+        return xp.sum(shapes**2 / -model.state_matrix[:, 1, 0], axis=1)
+    half_solved = solve_triangular(xp.linalg.cholesky(model.stiffness()), shapes.T, lower=True)
+    return xp.sum(half_solved**2, axis=0)

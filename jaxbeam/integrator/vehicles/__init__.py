@@ -1,0 +1,1 @@
+"""Vehicles on the beam: their propagators, and their steps."""

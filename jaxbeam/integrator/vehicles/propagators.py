@@ -1,0 +1,124 @@
+"""Propagators of vehicles: exact response of their states to the motion of the surface.
+
+Within a step, the forces q = k y + c y' that the surface exerts on the springs of the wheels are
+polynomials through their values at the Gauss nodes, as the contact forces are. The states of a
+vehicle follow exactly (`propagators`), and the springs press on the surface at the nodes with
+
+    s = S q - O z
+
+where z are its states at the start of the step.
+"""
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.integrator.propagators import (
+    GAUSS_NODES,
+    NODE_COUNT,
+    force_weights,
+    phi_functions_of,
+)
+from jaxbeam.model.load_set import LoadSet, VehicleGroup
+from jaxbeam.numerics.batched_linalg import matmul_last
+from jaxbeam.runtime.arrays import Array, stop_gradient, xp
+
+
+class VehiclePropagators(eqx.Module):
+    """Matrices of the vehicles of one load over steps of some lengths.
+
+    `transition` and `input` map states and q at the nodes to the states at the end;
+    `spring_states` is O and `spring_surface` is S. Rows are (wheel, node).
+    """
+
+    transition: Float[Array, "*length state state batch"]
+    input: Float[Array, "*length state row batch"]
+    spring_states: Float[Array, "*length row state batch"]
+    spring_surface: Float[Array, "*length row row batch"]
+
+
+def vehicle_state_norm(loads: LoadSet) -> Float[Array, ""]:
+    """Largest norm of the scaled state matrices of the vehicles, in 1/s; zero without any."""
+    norms = [
+        xp.max(xp.sum(xp.abs(_scaled_systems(group)[0]), axis=1)) for group in loads.wheels.vehicles
+    ]
+    return stop_gradient(xp.max(xp.stack(norms))) if norms else xp.zeros(())
+
+
+def _scaled_systems(group: VehicleGroup):
+    """State, input and output matrices with displacements scaled to the size of rates."""
+    dofs = group.A.shape[0] // 2
+    frequency = xp.sqrt(1.0 + xp.max(xp.sum(xp.abs(group.A[dofs:, :dofs]), axis=1), axis=0))
+    shape = (dofs, *frequency.shape)
+    scale = stop_gradient(xp.concatenate([xp.broadcast_to(frequency, shape), np.ones(shape)]))
+    return group.A * scale[:, None] / scale, group.B * scale[:, None], group.H / scale, scale
+
+
+@jax.named_scope("vehicles")
+def vehicle_propagators(
+    group: VehicleGroup, lengths: Float[Array, " length"]
+) -> VehiclePropagators:
+    """Propagators of the vehicles of a load over steps of the given lengths (s)."""
+    A, B, H, scale = _scaled_systems(group)
+    durations = lengths[:, None] * np.append(GAUSS_NODES, 1.0)
+    transition, phi_functions = phi_functions_of(A, B, durations)
+    inputs = xp.einsum("cfp,pswblc->lcfswb", force_weights(), phi_functions)
+    transition = xp.einsum("stblc->lcstb", transition)
+    nodes = slice(0, NODE_COUNT)
+    spring_states = xp.einsum("wsb,lcstb->lwctb", H, transition[:, nodes]) * scale
+    response = xp.einsum("wsb,lcfsvb->lwcvfb", H, inputs[:, nodes])
+    to_end = xp.einsum("lfswb->lswfb", inputs[:, -1])
+    count, rows, states, batch_size = lengths.shape[0], H.shape[0] * NODE_COUNT, *scale.shape
+    return VehiclePropagators(
+        transition=transition[:, -1] / scale[:, None] * scale,
+        input=to_end.reshape(count, states, rows, batch_size) / scale[:, None],
+        spring_states=spring_states.reshape(count, rows, states, batch_size),
+        spring_surface=np.eye(rows)[..., None] - response.reshape(count, rows, rows, batch_size),
+    )
+
+
+def _by_vehicle(group: VehicleGroup, surface: Float[Array, "wheel node batch"]):
+    """Values at the wheels of a load as (row, vehicle, batch)."""
+    values = surface[group.wheels].reshape(group.count, -1, surface.shape[-1])
+    return xp.swapaxes(values, 0, 1)
+
+
+def spring_forces(
+    propagators: VehiclePropagators, group: VehicleGroup, states, surface
+) -> Float[Array, "wheel node batch"]:
+    """Forces s of the springs of a load at the nodes of a step.
+
+    From the states (vehicle, state, batch) and q of the surface (wheel, node, batch).
+    """
+    forces = matmul_last(propagators.spring_surface, _by_vehicle(group, surface))
+    forces = forces - matmul_last(propagators.spring_states, xp.swapaxes(states, 0, 1))
+    return xp.swapaxes(forces, 0, 1).reshape(-1, NODE_COUNT, forces.shape[-1])
+
+
+def next_vehicle_states(
+    propagators: VehiclePropagators, group: VehicleGroup, states, surface
+) -> Float[Array, "all batch"]:
+    """States of all vehicles of a load at the end of a step; arguments as for `spring_forces`."""
+    after = matmul_last(propagators.transition, xp.swapaxes(states, 0, 1))
+    after = after + matmul_last(propagators.input, _by_vehicle(group, surface))
+    return xp.swapaxes(after, 0, 1).reshape(group.state_count, -1)
+
+
+def spring_coupling(loads: LoadSet, propagators, wheels) -> Float[Array, "row row batch"]:
+    """Matrix S between the rows (wheel and node) of some wheels; zero between vehicles."""
+    count, coupling = wheels.shape[0], None
+    if count == loads.wheel_count == 1:
+        return propagators[0].spring_surface
+    for group, part in zip(loads.wheels.vehicles, propagators, strict=True):
+        within = (wheels >= group.wheels.start) & (wheels < group.wheels.stop)
+        index = xp.where(within, wheels - group.first_wheel, 0)
+        vehicle, wheel = index // group.wheels_per_vehicle, index % group.wheels_per_vehicle
+        same = within[:, None] & within & (vehicle[:, None] == vehicle)
+        all_wheels = (group.wheels_per_vehicle, NODE_COUNT) * 2
+        rows = part.spring_surface.reshape(*all_wheels, -1)
+        rows = xp.take(xp.take(rows, wheel, axis=0), wheel, axis=2)
+        rows = xp.where(same[:, None, :, None, None], rows, 0.0)
+        coupling = rows if coupling is None else coupling + rows
+    assert coupling is not None
+    return coupling.reshape(count * NODE_COUNT, count * NODE_COUNT, -1)

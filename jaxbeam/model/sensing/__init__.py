@@ -1,0 +1,1 @@
+"""What sensors measure: rows of quantities, signals, filters and readings."""

@@ -1,0 +1,201 @@
+"""Figure of a sweep over speed: peaks of trains, their envelope, and speeds of resonance."""
+
+import json
+
+import numpy as np
+import xarray
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+
+from jaxbeam.analysis.critical_speeds import (
+    CriticalSpeed,
+    cancellation_speeds,
+    regular_spacing,
+    resonance_speeds,
+)
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.files.case_file import case_from_dict
+from jaxbeam.model.load_set import load_set
+from jaxbeam.plot.style import (
+    COLOURS,
+    FAINT,
+    GREY,
+    INK,
+    annotate,
+    axis_label,
+    format_number,
+    margin_labels,
+    set_title,
+    unit_scale,
+    use_style,
+)
+
+FAST = 20.0  # m/s: from here on speeds are in km/h
+MAX_ORDER = 4  # of marked resonances and cancellations; higher ones are weak
+HALO = [withStroke(linewidth=3, foreground="white")]
+ENVELOPE_STYLE = {"color": FAINT, "linewidth": 6.0, "zorder": 1}
+
+
+def is_speed_sweep(peaks: xarray.DataArray, case: Case) -> bool:
+    """Whether peaks (speed, ...) are those of trains or of several wheels, over one speed.
+
+    One more dimension may have words, as names of trains.
+    """
+    swept = [str(dim) for dim in peaks.dims if dim != "sensor"]
+    speeds = [dim for dim in swept if is_speed(dim)]
+    others = [dim for dim in swept if dim not in speeds]
+    if len(speeds) != 1 or len(others) > 1 or not all(is_word_axis(peaks, dim) for dim in others):
+        return False
+    return bool(others) or load_set(case).wheel_count > len(case.loads)
+
+
+def is_speed(address: str) -> bool:
+    """Whether an address is the speed of one load, or of all."""
+    return address.startswith("loads.") and address.endswith(".speed")
+
+
+def is_word_axis(peaks: xarray.DataArray, address: str) -> bool:
+    """Whether a dimension is labelled by words."""
+    return address in peaks.coords and peaks[address].dtype.kind not in "fiub"
+
+
+@use_style
+def plot_speed_sweep(peaks: xarray.DataArray, case: Case) -> Figure:
+    """Peaks (speed, word, sensor) over speed, in the units of the sensors, a curve for each word.
+
+    A panel for each sensor, with speeds in km/h from 72 km/h on. Behind the curves of several
+    words is their envelope; a black dot marks the largest peak of all. Triangles mark resonance
+    speeds d f_1 / i of a curve, dashed lines those of the curve with the largest peak; dotted lines
+    are cancellation speeds, where there is a closed form (see `analysis.critical_speeds`).
+    """
+    (address,) = (str(dim) for dim in peaks.dims if is_speed(str(dim)))
+    others = [str(dim) for dim in peaks.dims if dim not in (address, "sensor")]
+    labels = [str(word) for word in peaks[others[0]].values] if others else [""]
+    cases = _cases(peaks, case, len(labels))
+    if not others:
+        labels = [getattr(cases[0].loads[_load_index(address)], "train", "")]
+    values = peaks.transpose("sensor", *others, address).values
+    values = values.reshape(peaks.sizes["sensor"], len(labels), -1)
+    speeds = np.abs(peaks[address].values)
+    count = len(values)
+    figure = Figure(figsize=(7.6, 0.6 + 3.9 * count))
+    panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    for i, (axes, curves) in enumerate(zip(panels, values, strict=True)):
+        quantity = case.sensors[i].quantity
+        factor, unit = unit_scale(curves, QUANTITIES[quantity].unit)
+        axes.set_ylabel(axis_label(f"peak {quantity}", unit))
+        _draw_panel(axes, speeds, curves / factor, labels, cases, _load_index(address), unit)
+        if count > 1:
+            axes.set_title(f"sensor {i}, at {float(concrete(case.sensors[i].position)):.4g} m")
+    panels[-1].set_xlabel(_speed_label(address, case, _scale(speeds)[1]))
+    set_title(figure, case.title)
+    return figure
+
+
+def _scale(speeds) -> tuple[float, str]:
+    """Factor from m/s, and unit, in which speeds are drawn."""
+    return (3.6, "km/h") if np.max(speeds) >= FAST else (1.0, "m/s")
+
+
+def _load_index(address: str) -> int:
+    """Index of the load that an address names; 0 for all."""
+    index = address.split(".")[1]
+    return int(index) if index.isdigit() else 0
+
+
+def _speed_label(address: str, case: Case, unit: str) -> str:
+    if "*" in address and len(case.loads) > 1:
+        return f"speed of all loads ({unit})"
+    is_row = load_set(case).wheel_count > len(case.loads)
+    name = "train" if case.loads[_load_index(address)].kind == "axles" and is_row else "load"
+    number = f" {_load_index(address)}" if len(case.loads) > 1 else ""
+    return f"speed of {name}{number} ({unit})"
+
+
+def _cases(peaks, case: Case, count: int) -> list[Case]:
+    """Cases of the curves."""
+    if "cases" not in peaks.coords:
+        return [case] * count
+    return [case_from_dict(json.loads(str(text))) for text in np.atleast_1d(peaks["cases"].values)]
+
+
+def _colours(count: int) -> list:
+    """Distinct colours of some curves; of many in the order of a map, dark to light."""
+    if count <= len(COLOURS):
+        return list(COLOURS[:count])
+    from matplotlib import colormaps
+
+    return list(colormaps["viridis"](np.linspace(0.0, 0.9, count)))
+
+
+def _draw_panel(axes, speeds, curves, labels, cases, load, unit):
+    """Curves (word, speed) of one sensor, their envelope and the marks on them."""
+    factor, speed_unit = _scale(speeds)
+    order = np.argsort(speeds)
+    x, curves = factor * speeds[order], curves[:, order]
+    finite = np.where(np.isfinite(curves), curves, -np.inf)
+    worst, at = np.unravel_index(np.argmax(finite), curves.shape)
+    if len(labels) > 1:
+        axes.plot(x, np.max(finite, axis=0), **ENVELOPE_STYLE)
+    tints = _colours(len(labels))
+    limits = float(np.min(speeds)), float(np.max(speeds))
+    for i, (case, y, tint) in enumerate(zip(cases, curves, tints, strict=True)):
+        axes.plot(x, y, color=tint, zorder=3 if i == worst else 2)
+        marks = [factor * one.speed for one in _resonances(case, load, *limits)]
+        axes.plot(marks, np.interp(marks, x, y), "v", markersize=5, color=tint, linestyle="none",
+                  markeredgecolor="white", markeredgewidth=0.6, zorder=4)  # fmt: skip
+    axes.set_ylim(0.0, 1.25 * float(np.max(finite)))
+    axes.set_xlim(x[0], x[-1])
+    _draw_critical_speeds(axes, cases[worst], load, limits, factor)
+    peak = f"{format_number(curves[worst, at])} {unit} at {format_number(x[at])} {speed_unit}"
+    axes.plot(x[at], curves[worst, at], "o", markersize=6, markeredgecolor="white", color=INK,
+              clip_on=False, zorder=6)  # fmt: skip
+    right = x[at] > (x[0] + x[-1]) / 2
+    text = f"{labels[worst]}: {peak}" if labels[worst] else peak
+    annotate(axes, text, (x[at], curves[worst, at]), (-8 if right else 8, 0), va="center",
+             ha="right" if right else "left", path_effects=HALO, zorder=7)  # fmt: skip
+    if len(labels) > 1:
+        ranks = np.argsort(np.argsort(curves[:, -1]))
+        lowest = 0.05 * axes.get_ylim()[1] * (ranks + 0.5)  # where labels stay above the axis
+        margin_labels(axes, np.maximum(curves[:, -1], lowest), labels, tints)
+    _draw_legend(axes, cases[worst], load, limits, len(labels) > 1)
+
+
+def _draw_legend(axes, case: Case, load: int, limits, has_envelope: bool) -> None:
+    """Meaning of envelope, triangles and lines, above the axes."""
+    entries = [Line2D([], [], label="envelope", **ENVELOPE_STYLE)] if has_envelope else []
+    if _resonances(case, load, *limits):
+        mark = {"marker": "v", "markersize": 5, "color": INK, "linestyle": "--", "linewidth": 0.8}
+        entries.append(Line2D([], [], label="resonance d f₁ / i", **mark))
+        if cancellation_speeds(case, *limits):
+            line = {"color": GREY, "linestyle": ":", "linewidth": 0.8}
+            label = "cancellation 2 L f₁ / (2 i + 1)"
+            entries.append(Line2D([], [], label=label, **line))
+    if entries:
+        axes.legend(handles=entries, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
+
+
+def _resonances(case: Case, load: int, lowest: float, highest: float) -> list[CriticalSpeed]:
+    """Resonance speeds of the first mode that are marked; none for loads without spacing."""
+    spacing = regular_spacing(case, load)
+    if spacing is None:
+        return []
+    found = resonance_speeds(case, spacing, lowest, highest)
+    return [one for one in found if one.order <= MAX_ORDER]
+
+
+def _draw_critical_speeds(axes, case: Case, load: int, limits, factor: float) -> None:
+    """Lines at resonance speeds of a case, named above, and at those of cancellation."""
+    resonances = _resonances(case, load, *limits)
+    cancellations = [c for c in cancellation_speeds(case, *limits) if c.order <= 2 * MAX_ORDER + 1]
+    named = [(one, "d f₁", "--", INK, 0.99) for one in resonances]
+    if resonances:
+        named += [(one, "2 L f₁", ":", GREY, 0.93) for one in cancellations]
+    for one, words, style, tint, height in named:
+        words = words if one.order == 1 else f"{words} / {one.order}"
+        axes.axvline(factor * one.speed, color=tint, linestyle=style, linewidth=0.8, zorder=1)
+        annotate(axes, words, (factor * one.speed, height), (3, 0), va="top", fontsize=8,
+                 color=tint, path_effects=HALO, xycoords=axes.get_xaxis_transform())  # fmt: skip

@@ -1,0 +1,1 @@
+"""Loads in figures: parts of vehicles, their drawing and motion, rows of the figure of a run."""

@@ -1,0 +1,73 @@
+"""Smallest and largest values of a quantity along the beam, with place of the loads and time."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.case import Case
+from jaxbeam.model.modes import Modes
+from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.static_correction import Motion
+from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.simulation.section_forces import SIDES, shear_force
+
+MAX_ENTRIES = 4_000_000  # of the influence of all loads at all times on one part of the positions
+DEFAULT_POSITIONS = 101
+
+
+class RecordEnvelope(NamedTuple):
+    """Smallest and largest values of a quantity at positions (m), from the samples of a record.
+
+    Values are in the unit of the quantity; with each are its time (s) and the positions of the
+    loads then (m, NaN off the beam).
+    """
+
+    positions: Float[Array, " position"]
+    smallest: Float[Array, " position"]
+    smallest_time: Float[Array, " position"]
+    smallest_load_position: Float[Array, "position load"]
+    largest: Float[Array, " position"]
+    largest_time: Float[Array, " position"]
+    largest_load_position: Float[Array, "position load"]
+
+
+def record_envelope(
+    case: Case,
+    modes: Modes,
+    motion: Motion,
+    times: Float[Array, " time"],
+    quantity: str,
+    positions: Float[Array, " position"] | None = None,
+    fibre_distance=None,
+    section_modulus=None,
+) -> RecordEnvelope:
+    """Envelope of a quantity at positions (m), by default equally spaced; see `Record.envelope`.
+
+    Of shear forces on both sides of each position. Raises ValueError as `quantity_history` does.
+    """
+    if positions is None:
+        positions = case.beam.length * np.linspace(0.0, 1.0, DEFAULT_POSITIONS)
+    positions = xp.asarray(positions, float)
+    size = max(1, times.shape[0] * len(case.loads))
+    parts = -(-positions.shape[0] * size // MAX_ENTRIES)
+    extremes = []
+    for part in np.array_split(np.arange(positions.shape[0]), parts):
+        x = positions[part]
+        if quantity == "shear":
+            sides = xp.stack([shear_force(case, modes, motion, x, side) for side in SIDES])
+        else:
+            parameters = fibre_distance, section_modulus
+            sides = quantity_history(case, modes, motion, x, quantity, *parameters)[None]
+        extremes.append(
+            [*_extremes(-sides, times, motion, -1.0), *_extremes(sides, times, motion, 1.0)]
+        )
+    return RecordEnvelope(positions, *map(xp.concatenate, zip(*extremes, strict=True)))
+
+
+def _extremes(values, times, motion: Motion, sign: float):
+    """Largest of values (side, time, position) with a sign, its time, and the loads then."""
+    highest = xp.max(values, axis=0)
+    index = xp.argmax(highest, axis=0)
+    value = xp.take_along_axis(highest, index[None], axis=0)[0]
+    return sign * value, take(times, index), take(motion.load_position, index)

@@ -1,0 +1,81 @@
+"""Records from labelled datasets and from their netCDF files."""
+
+import json
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxbeam.case.case import Case
+from jaxbeam.files.case_file import case_from_dict
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modes import Modes, mesh_layout
+from jaxbeam.runtime.arrays import xp
+from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.result_variables import MODE_FIELDS, MODE_VARIABLES, VARIABLES
+
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
+
+_STORED_VARIABLES = [name for name in VARIABLES if name in Record.__annotations__]
+
+
+def record_from_xarray(dataset: "xarray.Dataset") -> Record:
+    """Record from a dataset of `Record.to_xarray`, or read from its file.
+
+    Raises ValueError if the dataset is not that of a record.
+    """
+    if "case" not in dataset.attrs:
+        raise ValueError("not a record of jaxbeam: it lacks its case")
+    case = case_from_dict(json.loads(dataset.attrs["case"]))
+    # Without sensors or loads a file lacks their variables.
+    sizes = {
+        "sensor": len(case.sensors),
+        "load": load_set(case).wheel_count,
+        "actuator": len(case.actuators),
+        **dataset.sizes,
+    }
+    may_be_empty = *_STORED_VARIABLES, "measured"
+    shapes = {name: [sizes.get(d, 0) for d in VARIABLES[name][0]] for name in may_be_empty}
+    empty = {
+        name: (VARIABLES[name][0], np.zeros(shape))
+        for name, shape in shapes.items()
+        if 0 in shape and name not in dataset.variables
+    }
+    dataset = dataset.assign(empty)
+    mode_variables = {name: f"mode_{name}" for name in MODE_VARIABLES}
+    required = (*_STORED_VARIABLES, *mode_variables.values(), "time")
+    missing = [name for name in required if name not in dataset.variables]
+    if missing:
+        raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(missing)}")
+    values = {name: xp.asarray(dataset[name].values) for name in _STORED_VARIABLES}
+    return Record(
+        case=case,
+        modes=Modes(
+            **{
+                MODE_FIELDS.get(name, name): xp.asarray(dataset[label].values)
+                for name, label in mode_variables.items()
+            },
+            layout=mesh_layout(case),
+        ),
+        times=xp.asarray(dataset["time"].values),
+        error_estimate=xp.asarray(float(dataset.attrs["error_estimate"])),
+        steps=int(dataset.attrs["steps"]),
+        controller_readings=xp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
+        **values,
+    )
+
+
+def _is_sampled(case: Case) -> bool:
+    return case.controller is not None and case.controller.period is not None
+
+
+def read_record(path: str | os.PathLike) -> Record:
+    """Record from a netCDF file written by `Record.to_netcdf`.
+
+    Raises OSError if the file cannot be read, ValueError if it is not that of a record.
+    """
+    import xarray
+
+    with xarray.open_dataset(path, engine="scipy") as dataset:
+        return record_from_xarray(dataset.load())

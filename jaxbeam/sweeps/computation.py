@@ -1,0 +1,144 @@
+"""Computation of a sweep of numbers, block by block, into a store and a labelled dataset."""
+
+import json
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from jaxbeam.case.case import Case
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.simulation.integration_plan import sample_times
+from jaxbeam.simulation.result_variables import SWEEP_VARIABLES, sensor_coordinates
+from jaxbeam.sweeps import cluster, store as sweep_store
+from jaxbeam.sweeps.batches import Batches
+from jaxbeam.sweeps.block_store import BlockStore, MemoryStore
+from jaxbeam.sweeps.blocks import Runner
+from jaxbeam.sweeps.specification import SweepSpecification
+
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
+
+
+def compute_sweep(
+    specification: SweepSpecification,
+    path: Path | None,
+    state: str,
+    overwrite: bool,
+    client: Any,
+    progress_bar: tqdm,
+) -> "xarray.Dataset":
+    """Dataset of a sweep; blocks are written to the store at a path, unless it is None.
+
+    `state` of the store is "new" or "resume" (see `resolve_action`); then the blocks in it are not
+    computed again, and count in the progress bar as done before. With a `client` of Dask its
+    workers compute all blocks but the first.
+    """
+    fingerprint, runner = specification.fingerprint(), specification.runner()
+    if path is not None and state == "resume":
+        block_store = sweep_store.ZarrStore(path)
+        steps, error = block_store.steps[:-1], float(block_store.steps[-1])
+    else:
+        steps, error = runner.choose_step_sizes()
+        if path is None:
+            block_store = MemoryStore(runner.block_count)
+        else:
+            step_sizes_and_error = np.append(steps, error)
+            content = specification.to_dict()
+            block_store = sweep_store.create_store(
+                path, fingerprint, content, runner.block_count, step_sizes_and_error, overwrite
+            )
+    missing = block_store.missing()
+    remaining = sum(runner.run_count(block) for block in missing)
+    count_as_done(progress_bar, specification.count - remaining)
+    # The first block is always computed here, and creates the arrays of the store.
+    computed_locally = missing if client is None else missing[:1]
+    for block in _compute(runner, computed_locally, steps, block_store):
+        progress_bar.update(runner.run_count(block))
+    if client is not None:
+        for block in cluster.compute_blocks(client, fingerprint, path, missing[1:]):
+            progress_bar.update(runner.run_count(block))
+    dataset = _to_dataset(specification, runner.batches, block_store.collect())
+    dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT_ATTRIBUTE: fingerprint}
+    block_store.finish(dataset)
+    return dataset
+
+
+def count_as_done(progress_bar: tqdm, runs: int) -> None:
+    """Count runs of an earlier attempt as done; they do not add to the rate."""
+    if progress_bar.disable:
+        return
+    progress_bar.initial += runs
+    progress_bar.n += runs
+    progress_bar.refresh()
+
+
+def _compute(runner: Runner, blocks: list[int], steps, block_store: BlockStore) -> Iterator[int]:
+    """Numbers of blocks as they are computed, on all cores, and stored."""
+    results = runner.pool.map(lambda block: (block, runner.compute_block(block, steps)), blocks)
+    # An error or an interrupt closes the iterator, which cancels blocks not yet started.
+    with closing(results):  # type: ignore[type-var]
+        for block, result in results:
+            block_store.write(block, result)
+            yield block
+
+
+def _to_dataset(
+    specification: SweepSpecification, batches: Batches, results: dict[str, np.ndarray]
+) -> "xarray.Dataset":
+    """Results of all batches as a dataset with a dimension per address, or `run`."""
+    import xarray
+
+    case, dims, shape = specification.case, specification.dims, specification.shape
+    mask = batches.run_index >= 0
+    flat = {}
+    for name, values in results.items():
+        values = values[: batches.run_index.shape[0]][mask]
+        flat[name] = np.empty_like(values)
+        flat[name][batches.run_index[mask]] = values
+    peaks = flat["peak_deflection"]
+    failed = ~np.all(np.isfinite(peaks), axis=1)
+    variables: dict[str, Any] = {
+        "failed": (dims, failed.reshape(shape), {"long_name": "whether the run failed"})
+    }
+    for name, values in flat.items():
+        own_dims, unit, words = SWEEP_VARIABLES[name]
+        values = np.where(failed.reshape(-1, *(1,) * (values.ndim - 1)), np.nan, values)
+        attributes = {"units": unit, "long_name": words}
+        if name == "peak_deflection":
+            variables |= _peak_variables(case, dims, values.reshape(*shape, values.shape[1]))
+            continue
+        variables[name] = (
+            (*dims, *own_dims),
+            values.reshape(*shape, *values.shape[1:]),
+            attributes,
+        )
+    coordinates: dict[str, Any] = {
+        address: ("run" if specification.paired else address, values)
+        for address, values in specification.axes.items()
+    }
+    coordinates |= sensor_coordinates(case)
+    if "deflection" in flat:
+        coordinates["time"] = ("time", np.asarray(sample_times(case)), {"units": "s"})
+    attributes = {
+        "title": case.title,
+        "case": json.dumps(specification.case_dict),
+    }
+    return xarray.Dataset(variables, coordinates, attributes)
+
+
+def _peak_variables(case: Case, dims: tuple[str, ...], peaks) -> dict[str, tuple]:
+    """Peaks (..., sensor) as a variable for each quantity, NaN at sensors of others."""
+    quantities = np.array([sensor.quantity for sensor in case.sensors])
+    variables = {}
+    for sensor in case.sensors:
+        entry, own = QUANTITIES[sensor.quantity], quantities == sensor.quantity
+        words = f"largest absolute {sensor.quantity}"
+        words += f", sum of {case.beam.modes} modes" if entry.bends else ""
+        values = np.where(own, peaks, np.nan).astype(peaks.dtype)
+        attributes = {"units": entry.unit, "long_name": words}
+        variables[f"peak_{sensor.quantity}"] = ((*dims, "sensor"), values, attributes)
+    return variables

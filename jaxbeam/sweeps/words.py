@@ -1,0 +1,193 @@
+"""Sweeps over words, as names of trains: a sweep of numbers for each, joined in one dataset.
+
+A word changes the structure of a case, so that each combination of words is a case of its own, with
+its own sweep of numbers and, in a store, a store of its own within `blocks`. Cases that have equal
+structures once the words are written out as numbers share compiled programs: trains with as many
+axles.
+"""
+
+import dataclasses
+import hashlib
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+from tqdm import tqdm
+
+from jaxbeam.case.aliases import current_address
+from jaxbeam.case.case import Case, addresses
+from jaxbeam.case.joint_addresses import ALL
+from jaxbeam.files.case_file import case_to_dict, with_settings
+from jaxbeam.sweeps import MAX_RUNS, store as sweep_store
+from jaxbeam.sweeps.computation import compute_sweep, count_as_done
+from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
+from jaxbeam.sweeps.zarr_files import BLOCKS_GROUP, FINGERPRINT_ATTRIBUTE, new_store, replace_blocks
+
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WordSweep:
+    """Words at addresses of a case, and the sweep of numbers for each combination of them.
+
+    `cases` have the words, `sweeps` the same cases with numbers in their place, both in the order
+    of all combinations, the last word first. `dims` are the dimensions of the results.
+    """
+
+    case: Case
+    words: dict[str, tuple[str, ...]]
+    dims: tuple[str, ...]
+    cases: list[Case]
+    sweeps: list[SweepSpecification]
+
+    @property
+    def count(self) -> int:
+        """Number of runs."""
+        return sum(part.count for part in self.sweeps)
+
+    def fingerprint(self) -> str:
+        """SHA-256 of all that determines the results: words, and the sweep of numbers of each."""
+        content = [self.words, self.dims, [part.fingerprint() for part in self.sweeps]]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+    def join(self, datasets: "Sequence[xarray.Dataset]") -> "xarray.Dataset":
+        """Dataset with a dimension for each address, from those of all combinations of words.
+
+        `cases` along the words has their cases as text; the attribute `case` that of the sweep.
+        """
+        import xarray
+
+        wheels = max(part.sizes.get("load", 0) for part in datasets)
+        datasets = [part.pad(load=(0, wheels - part.sizes.get("load", 0))) for part in datasets]
+        sizes = tuple(len(words) for words in self.words.values())
+        variables = {}
+        for name, first in datasets[0].data_vars.items():
+            values = np.stack([part[name].values for part in datasets])
+            values = values.reshape(*sizes, *values.shape[1:])
+            variables[name] = ((*self.words, *first.dims), values, first.attrs)
+        coordinates: dict[str, Any] = {
+            address: list(words) for address, words in self.words.items()
+        }
+        texts = [json.dumps(case_to_dict(case)) for case in self.cases]
+        coordinates["cases"] = (tuple(self.words), np.reshape(texts, sizes))
+        joined = xarray.Dataset(variables, coordinates | dict(datasets[0].coords))
+        return joined.transpose(*self.dims, ...).assign_attrs(
+            title=self.case.title,
+            case=json.dumps(case_to_dict(self.case)),
+            error_estimate=max(part.error_estimate for part in datasets),
+        )
+
+
+def split_words(
+    case: Case, over: dict[str, Any]
+) -> tuple[dict[str, tuple[str, ...]], dict[str, Any]]:
+    """Words by address, in present words, and values by address of the others.
+
+    Words are values that are text, at an address that has no number. Raises ValueError for numbers
+    among them.
+    """
+    numbers_of_case, words, others = addresses(case), {}, {}
+    for address, given in over.items():
+        values, current = np.atleast_1d(np.asarray(given, object)).ravel(), current_address(address)
+        is_word = [isinstance(value, str) for value in values]
+        if not any(is_word) or current.replace(ALL, "0") in numbers_of_case:
+            others[address] = given
+        elif all(is_word):
+            words[current] = tuple(map(str, values))
+        else:
+            raise ValueError(f"{address} takes a list of words or of numbers, not both in one")
+    return words, others
+
+
+def word_sweep(
+    case: Case,
+    words: dict[str, tuple[str, ...]],
+    over: dict[str, Any],
+    order: Sequence[str],
+    paired: bool,
+    histories: bool,
+    tolerance: float,
+    precision: str,
+) -> WordSweep:
+    """Sweep over all combinations of words and numbers, `order` that of the addresses.
+
+    Raises ValueError for words that the case cannot have, paired values, words that change the
+    sensors, and as `sweep_specification`, with the words.
+    """
+    if paired:
+        raise ValueError(
+            f"words at {', '.join(words)} are combined with all numbers; they cannot be paired"
+        )
+    cases, sweeps = [], []
+    for combination in itertools.product(*words.values()):
+        settings = dict(zip(words, combination, strict=True))
+        named = ", ".join(f"{address} = {word}" for address, word in settings.items())
+        changed = with_settings(case, settings)
+        numbers = over or {"run.gravity": [float(case.run.gravity)]}
+        try:
+            sweeps.append(
+                sweep_specification(
+                    with_numbers(changed), numbers, False, histories, tolerance, precision
+                )
+            )
+        except ValueError as error:
+            raise ValueError(f"with {named}: {error}") from None
+        if [str(s.quantity) for s in changed.sensors] != [str(s.quantity) for s in case.sensors]:
+            raise ValueError(f"{named} changes the sensors, which all runs share: make two sweeps")
+        cases.append(changed)
+    dims = tuple(current_address(address) for address in order)
+    plan = WordSweep(case, words, dims, cases, sweeps)
+    if plan.count > MAX_RUNS:
+        raise ValueError(
+            f"{plan.count:.1e} combinations of values are more than the {MAX_RUNS:.0e} runs of a"
+            " sweep: split it"
+        )
+    return plan
+
+
+def with_numbers(case: Case) -> Case:
+    """The case with numbers in place of names of the library, where they mean the same."""
+    loads = tuple(load.by_numbers() for load in case.loads)
+    return eqx.tree_at(lambda c: c.loads, case, loads) if loads else case
+
+
+def compute_word_sweep(
+    plan: WordSweep,
+    path: Path | None,
+    state: str,
+    overwrite: bool,
+    client: Any,
+    progress_bar: tqdm,
+) -> "xarray.Dataset":
+    """Dataset of a sweep over words, one word after the other (see `compute_sweep`)."""
+    fingerprint = plan.fingerprint()
+    if path is not None and state == "new":
+        with new_store(path, fingerprint, overwrite):
+            pass
+    datasets = []
+    for i, part in enumerate(plan.sweeps):
+        part_path = None if path is None else path / BLOCKS_GROUP / str(i)
+        datasets.append(_compute_part(part, part_path, client, progress_bar))
+    joined = plan.join(datasets)
+    if set(plan.sweeps[0].dims) - set(plan.dims):  # words alone
+        joined = joined.isel({dim: 0 for dim in plan.sweeps[0].dims}, drop=True)
+    joined.attrs[FINGERPRINT_ATTRIBUTE] = fingerprint
+    if path is not None:
+        replace_blocks(path, joined)
+    return joined
+
+
+def _compute_part(part, path, client, progress_bar) -> "xarray.Dataset":
+    """Dataset of the sweep of numbers for one combination of words."""
+    state = "new"
+    if path is not None:
+        state = sweep_store.resolve_action(path, part.fingerprint(), path.exists(), False)
+    if path is not None and state == "complete":
+        count_as_done(progress_bar, part.count)
+        return sweep_store.read_dataset(path)
+    return compute_sweep(part, path, state, False, client, progress_bar)

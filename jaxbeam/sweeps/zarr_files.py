@@ -1,0 +1,110 @@
+"""Files of a store in zarr format: options, damage, and the dataset that replaces the blocks."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
+    import zarr  # takes long to import; only stored sweeps need it
+
+FINGERPRINT_ATTRIBUTE = "jaxbeam_sweep"
+BLOCKS_GROUP = "blocks"
+DAMAGE_ERRORS = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    RuntimeError,
+)  # of zarr, for damaged files
+
+
+def checksummed() -> list[Any]:
+    """Compressor of arrays, with a checksum by which damage is detected."""
+    from zarr.codecs import ZstdCodec
+
+    return [ZstdCodec(checksum=True)]
+
+
+def array_options() -> dict[str, Any]:
+    """Options of arrays with which damaged and missing chunks are detected."""
+    return {"compressors": checksummed(), "config": {"write_empty_chunks": True}}
+
+
+def is_complete(array: zarr.Array) -> bool:
+    """Whether all chunks of an array exist; zarr reads missing ones as zeros."""
+    return array.nchunks_initialized == array.nchunks
+
+
+@contextlib.contextmanager
+def explaining_damage(path: Path):
+    """Replace errors of zarr about damaged files; raises ValueError of one sentence instead."""
+    try:
+        yield
+    except DAMAGE_ERRORS as error:
+        raise ValueError(
+            f"{path} is damaged ({' '.join(str(error).split())}): make the sweep anew, under"
+            " another name or with overwrite"
+        ) from None
+
+
+@contextlib.contextmanager
+def explaining_write_errors(path: Path):
+    """Replace errors in writing; raises OSError that says that finished blocks are kept."""
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise type(error)(
+            f"cannot write to {path}: {reason}; finished blocks are kept: mend this, then resume"
+        ) from None
+
+
+@contextlib.contextmanager
+def new_store(path: Path, fingerprint: str, overwrite: bool) -> Iterator[Any]:
+    """Group of a new, unfinished store at a path, to be filled; with `overwrite` in place of one.
+
+    Raises OSError if the store cannot be written.
+    """
+    import zarr
+
+    # Written beside the path and renamed, so that a store is complete or does not exist.
+    temporary_path = path.with_name(f".{path.name}.new")
+    shutil.rmtree(temporary_path, ignore_errors=True)
+    with explaining_write_errors(path):
+        group = zarr.create_group(temporary_path)
+        group.create_group(BLOCKS_GROUP)
+        yield group
+        group.attrs[FINGERPRINT_ATTRIBUTE] = fingerprint
+        if overwrite:
+            shutil.rmtree(path, ignore_errors=True)
+        temporary_path.rename(path)
+
+
+def replace_blocks(path: Path, dataset: xarray.Dataset) -> None:
+    """Replace the blocks of a store by the labelled dataset of the sweep."""
+    with explaining_write_errors(path):
+        # Arrays of an interrupted attempt may be incomplete.
+        for folder in path.iterdir():
+            if folder.is_dir() and folder.name != BLOCKS_GROUP:
+                shutil.rmtree(folder)
+        # Zarr specifies strings of variable length, not of fixed length.
+        labels = {
+            name: (values.dims, values.values.astype(object), values.attrs)
+            for name, values in dataset.coords.items()
+            if values.dtype.kind == "U"
+        }
+        dataset.assign_coords(labels).to_zarr(
+            path,
+            mode="a",
+            consolidated=False,
+            write_empty_chunks=True,
+            encoding={name: {"compressors": checksummed()} for name in dataset.variables},
+        )
+        # Without its metadata the group is gone and the store complete.
+        (path / BLOCKS_GROUP / "zarr.json").unlink()
+        shutil.rmtree(path / BLOCKS_GROUP)

@@ -1,0 +1,95 @@
+"""Trains of the library against published sums and lengths, and an independent implementation."""
+
+import re
+
+import numpy as np
+import pytest
+
+from jaxbeam.case.loads.axles import Axles
+from jaxbeam.vehicles.trains import trains
+
+GRAVITY = np.float64(9.81)
+
+# Number of axles, sum of the loads (kN), distance of the outer axles less 0.025 m: README of KTH
+# BeamDyn has the extremes 375.5 to 398.5 m and 7140 to 9600 kN.
+HIGH_SPEED = {
+    "HSLM-A1": (50, 8500, 397.5),
+    "HSLM-A2": (48, 9600, 398.5),
+    "HSLM-A3": (46, 8280, 397.5),
+    "HSLM-A4": (44, 8360, 394.5),
+    "HSLM-A5": (42, 7140, 389.5),
+    "HSLM-A6": (40, 7200, 382.5),
+    "HSLM-A7": (40, 7600, 397.5),
+    "HSLM-A8": (38, 7220, 387.5),
+    "HSLM-A9": (36, 7560, 375.5),
+    "HSLM-A10": (36, 7560, 388.5),
+}
+# Axle load (kN) and axles behind the first of two coupled wagons (m), computed by an independent
+# implementation from table A.1 of EN 15528.
+WAGONS = {
+    "EN15528-A": (156.96, [0.0, 1.8, 8.0, 9.8, 12.8, 14.6, 20.8, 22.6]),
+    "EN15528-B2": (176.58, [0.0, 1.8, 6.45, 8.25, 11.25, 13.05, 17.7, 19.5]),
+    "EN15528-C3": (196.2, [0.0, 1.8, 6.3, 8.1, 11.1, 12.9, 17.4, 19.2]),
+    "EN15528-D2": (220.725, [0.0, 1.8, 9.25, 11.05, 14.05, 15.85, 23.3, 25.1]),
+    "EN15528-D4": (220.725, [0.0, 1.8, 6.45, 8.25, 11.25, 13.05, 17.7, 19.5]),
+    "EN15528-E4": (245.25, [0.0, 1.8, 7.7, 9.5, 12.5, 14.3, 20.2, 22.0]),
+}
+
+
+@pytest.mark.parametrize("name", HIGH_SPEED)
+def test_high_speed_trains(name):
+    axles, total, length = HIGH_SPEED[name]
+    vehicle = Axles(train=name, speed=50.0).vehicle(GRAVITY)
+    assert len(vehicle.offsets) == axles
+    assert np.sum(vehicle.static_loads) == pytest.approx(1e3 * total)
+    assert vehicle.offsets[-1] == pytest.approx(length + 0.025, abs=1e-9)
+    np.testing.assert_allclose(np.diff(vehicle.offsets), np.diff(vehicle.offsets)[::-1], atol=1e-9)
+
+
+def test_axles_of_the_first_universal_train():
+    """As listed by an independent implementation; one bogie stands on each coupling of coaches."""
+    expected = [0, 3, 14, 17, 20.525, 22.525, 35.7625, 37.7625, 53.7625, 55.7625, 71.7625, 73.7625]
+    np.testing.assert_allclose(trains()["HSLM-A1"].offsets[:12], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", WAGONS)
+def test_line_categories(name):
+    force, offsets = WAGONS[name]
+    load = Axles(train=name, count=2, speed=20.0)
+    vehicle = load.vehicle(GRAVITY)
+    np.testing.assert_allclose(vehicle.static_loads, 1e3 * force, rtol=1e-12)
+    row = (load.spacings()[:, None] + vehicle.offsets).ravel()
+    np.testing.assert_allclose(row, offsets, atol=1e-12)
+
+
+# Weight (kN) and length (m): EN 1991-2, 6.3.2; AASHTO LRFD, 3.6.1.2.
+CODES = {"LM71-axles": (1000, 4.8), "HL93-truck": (325, 8.6), "HL93-tandem": (220, 1.2)}
+
+
+@pytest.mark.parametrize("name", CODES)
+def test_axles_of_codes(name):
+    vehicle = Axles(train=name, speed=20.0).vehicle(GRAVITY)
+    assert np.sum(vehicle.static_loads) / 1e3 == pytest.approx(CODES[name][0])
+    assert vehicle.offsets[-1] == pytest.approx(CODES[name][1])
+
+
+@pytest.mark.parametrize("name", trains())
+def test_every_train_has_a_source_and_increasing_axles(name):
+    train = trains()[name]
+    assert "EN 1" in train.source and "commit" in train.source
+    assert train.offsets[0] == 0 and np.all(np.diff(train.offsets) > 0)
+    assert (train.forces is None) != (train.masses is None)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"train": "HSLM-A11"}, "loads.0.train cannot be 'HSLM-A11'; did you mean 'HSLM-A1'"),
+        ({"train": "HSLM-A1", "count": 2}, "loads.0.count must be 1 for HSLM-A1.*whole train"),
+        ({"train": "EN15528-A", "count": 2, "spacing": 9.0}, "exceed the wheelbase of the axles"),
+        ({"train": "EN15528-A", "masses": 3.0}, "has both train and masses"),
+    ],
+)
+def test_bad_input(settings, message):
+    error = Axles(speed=20.0, **settings).validate("loads.0")
+    assert error is not None and re.search(message, error), error

@@ -1,0 +1,53 @@
+"""`jaxbeam describe`: vehicles of files, of cases, of the library."""
+
+import numpy as np
+import pytest
+
+CART = """
+[[bodies]]
+name = "cart"
+mass = 800.0
+inertia = 500.0
+[[axles]]
+body = "cart"
+position = 1.5
+tyre_stiffness = 2.0e5
+[[axles]]
+body = "cart"
+position = -1.5
+tyre_stiffness = 2.0e5
+"""
+
+
+def test_vehicle_file(folder, run):
+    (folder / "cart.toml").write_text(CART)
+    printed = run("describe cart.toml")
+    assert "weight 7.848 kN, mass 800 kg, wheelbase 3 m" in printed
+    assert "degrees of freedom: cart, cart pitch" in printed
+    (vehicle,) = run("describe cart.toml --json")["vehicles"]
+    assert vehicle["static_loads"] == pytest.approx([3924.0, 3924.0])
+    expected = np.sqrt([4e5 / 800, 4e5 * 1.5**2 / 500]) / (2 * np.pi)
+    assert vehicle["frequencies_hz"] == pytest.approx(expected)
+
+
+def test_case_file(run):
+    printed = run("describe case.toml")
+    assert "loads.0: mass" in printed and "weight 0.004905 kN, mass 0.5 kg" in printed
+
+
+def test_library(run):
+    assert "truck-5-axle" in run("describe") and "HSLM-A10" in run("describe")
+    assert "55.1622" in run("describe truck-5-axle")
+    assert "weight 8500 kN" in run("describe HSLM-A1")
+
+
+def test_unknown_names_are_refused(refused):
+    assert "did you mean 'truck-5-axle'?" in refused("describe truck-5-axel")
+    assert "cannot read the file none.toml" in refused("describe none.toml")
+
+
+def test_picture(folder, run):
+    (folder / "cart.toml").write_text(CART)
+    for source, picture in (("cart.toml", "cart.png"), ("case.toml", "case.png")):
+        assert f"written: {picture}" in run(f"describe {source} --plot {picture}")
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,97 @@
+"""Rows of every quantity: against the deflection's own derivatives, and on states and histories."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case.quantities import QUANTITIES, Quantity, quantity_of
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.sensing.output_rows import modal_row, quantity_history, sensor_rows
+from jaxbeam.model.static_correction import Motion
+
+FIBRE, MODULUS = 0.003, 2e-6
+CASE = jb.Case(
+    jb.Beam(1.2, 11.68, 0.535, modes=4),
+    supports=[jb.Support(0.7, stiffness=3e3, damping=2.0)],
+    actuators=[jb.Shaker(0.3, stiffness=100.0, damping=1.0)],
+)
+
+
+def sensor(name: str) -> jb.Sensor:
+    """A sensor of a quantity, with a fibre distance where it needs one."""
+    quantity = QUANTITIES[name]
+    return jb.Sensor(
+        0.45,
+        name,
+        fibre_distance=FIBRE if quantity.at_fibre else None,
+        section_modulus=MODULUS if quantity.over_modulus else None,
+    )
+
+
+@pytest.mark.parametrize("name", QUANTITIES)
+def test_rows_are_x_derivatives_of_the_deflection(name):
+    """By central differences of one order less."""
+    quantity, model, h = QUANTITIES[name], modal_model(CASE), 1e-5
+    lower = max(quantity.x_derivative - 1, 0)
+    shapes = model.shapes(jnp.array([0.45 - h, 0.45, 0.45 + h]), (lower,))[0]
+    expected = (shapes[2] - shapes[0]) / (2 * h) if quantity.x_derivative else shapes[1]
+    expected = -FIBRE * expected if quantity.at_fibre else expected
+    expected = 11.68 * expected if quantity.section_force else expected
+    expected = expected / MODULUS if quantity.over_modulus else expected
+    found = modal_row(model.shapes, CASE, 0.45, name, FIBRE, MODULUS)
+    assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", QUANTITIES)
+def test_outputs_on_states_are_those_of_histories(name):
+    """y = C z + D u and y = C z + C' z' against the history of the modal coordinates."""
+    model, rows = modal_model(CASE), sensor_rows(modal_model(CASE), CASE, [sensor(name)])
+    rng = np.random.default_rng(3)
+    state, command = rng.normal(size=model.state_count), rng.normal(size=1)
+    rate = model.A @ state + model.command_matrix @ command
+    motion = state[model.coordinate_index], state[model.rate_index], rate[model.rate_index]
+    expected = (rows.rows @ motion[QUANTITIES[name].time_derivative])[:1]
+    if not QUANTITIES[name].bends:
+        histories = Motion(*(part[None] for part in motion), *np.zeros((2, 1, 0)), np.zeros((1, 1)))
+        history = quantity_history(CASE, model.modes, histories, 0.45, name)
+        assert_allclose(history, expected, rtol=1e-12)
+    C, D = rows.of_system(model, model.A, model.command_matrix)
+    assert_allclose(C @ state + D @ command, expected, rtol=1e-12)
+    on_states, on_rates = rows.on_states(model)
+    assert_allclose(on_states @ state + on_rates @ rate, expected, rtol=1e-12)
+    outputs = rows.with_accelerations(on_states @ state, jnp.asarray(motion[2]))
+    assert_allclose(outputs, expected, rtol=1e-12)
+    assert rows.has_feedthrough.tolist() == [sensor(name).has_feedthrough]
+
+
+def test_a_quantity_is_declared_by_one_entry(monkeypatch):
+    """Sensors of a rate of rotation, with unit and rows, by the entry alone."""
+    monkeypatch.setitem(QUANTITIES, "rotation_rate", Quantity("rad/s", 1, 1))
+    model = modal_model(CASE)
+    rows = sensor_rows(model, CASE, [jb.Sensor(0.45, "rotation_rate")])
+    slope = sensor_rows(model, CASE, [jb.Sensor(0.45, "slope")])
+    assert_allclose(rows.rows, slope.rows, rtol=1e-15)
+    assert rows.time_derivatives == (1,) and jb.Sensor(0.45, "rotation_rate").unit == "rad/s"
+
+
+def test_unknown_quantities_and_missing_fibres_are_refused():
+    with pytest.raises(ValueError, match="no quantity 'torsion'; there are deflection, velocity"):
+        quantity_of("torsion")
+    with pytest.raises(ValueError, match="strain needs fibre_distance, the height above"):
+        quantity_of("strain")
+    with pytest.raises(ValueError, match="stress needs section_modulus, bending moment over"):
+        quantity_of("stress", 0.1)
+
+
+def test_active_moments_of_commands_belong_to_moment_and_stress():
+    """A patch alone on a pinned beam: the section over it carries no moment, by commands alone."""
+    case = dataclasses.replace(CASE, supports=(), actuators=(jb.Patch(0.4, 0.5, 2e-3),))
+    sensors = [sensor("moment"), sensor("stress"), sensor("curvature"), jb.Sensor(0.6, "moment")]
+    rows = sensor_rows(modal_model(case), case, sensors)
+    assert_allclose(rows.on_commands[:, 0], [2e-3, 2e-3 / MODULUS, 0.0, 0.0])
+    _, D = rows.of_system(modal_model(case), np.eye(8), np.ones((8, 1)))
+    assert_allclose(D, rows.on_commands)

@@ -1,0 +1,286 @@
+"""Sensors: readings from histories of deflection, velocity and acceleration."""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxbeam as jb
+from jaxbeam.case.filters import Filter
+from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.validation import check_case
+from jaxbeam.files.case_file import case_from_dict
+from jaxbeam.model.sensing.measurement import sensor_readings
+from jaxbeam.model.sensing.sensor_signals import (
+    filtered_reading,
+    initial_filter_state,
+    noise_samples,
+    sampled_readings,
+    sensor_sections,
+    to_reading,
+)
+from tests.differences import central
+
+TIMES = jnp.arange(201) / 1000.0
+OMEGA = 2 * np.pi * np.array([3.0, 8.0])
+
+
+def signal(t, derivative=0):
+    """A smooth signal that starts from rest, and its derivatives by time."""
+    t = np.asarray(t)
+    if derivative:
+        return sum(w * np.sin(w * t) for w in OMEGA)
+    return sum(1 - np.cos(w * t) for w in OMEGA)
+
+
+VALUES, RATES = jnp.asarray(signal(TIMES)), jnp.asarray(signal(TIMES, 1))
+
+
+def test_offset_noise_range_and_resolution_in_this_order():
+    sensor = Sensor(0.3, offset=0.5, noise=0.1, range=[-2.0, 2.0], resolution=0.25)
+    found = to_reading(sensor, jnp.array([0.0, 0.0, 1.4, -9.0]), jnp.array([0.0, 2.0, 1.0, 1.0]))
+    assert_allclose(found, [0.5, 0.75, 2.0, -2.0], rtol=0, atol=0)
+    assert_allclose(to_reading(sensor, 0.3), 0.75)  # without noise
+
+
+def test_derivatives_pass_through_rounding_and_stop_at_the_range():
+    sensor = Sensor(0.3, range=[-2.0, 2.0], resolution=0.25)
+    slope = jax.vmap(jax.grad(lambda v: to_reading(sensor, v)))(jnp.array([0.3, 1.9, 2.1, -5.0]))
+    assert_allclose(slope, [1.0, 1.0, 0.0, 0.0], rtol=0, atol=0)
+
+
+def test_noise_depends_on_the_seed_and_has_the_stated_deviation():
+    samples = noise_samples(3, 2, 20000)
+    assert_array_equal(samples, noise_samples(3, 2, 20000))
+    assert_array_equal(samples[:, 0], noise_samples(3, 1, 20000)[:, 0])
+    assert np.max(np.abs(samples - noise_samples(4, 2, 20000))) > 1
+    assert Sensor(0.3, noise=0.1).noise_variance == 0.1**2 and Sensor(0.3).noise_variance == 0
+    assert_allclose(np.std(samples, axis=0), 1.0, atol=0.02)
+    assert_allclose(np.corrcoef(samples.T)[0, 1], 0.0, atol=0.03)
+
+
+def test_readings_sample_by_sample_are_those_of_the_whole_history():
+    sensor = Sensor(0.3, offset=0.2, noise=0.01, resolution=1e-3, filter=Filter(20.0, 3))
+    noise = noise_samples(0, 1, 201)[:, 0]
+    sections = sensor_sections(sensor, 1e-3)
+    filter_state = initial_filter_state(sensor, sections, jnp.zeros(()))
+    step = jax.jit(filtered_reading)
+    found = []
+    for value, drawn in zip(VALUES, noise, strict=True):
+        reading, filter_state = step(sensor, sections, filter_state, value, drawn)
+        found.append(reading)
+    assert_allclose(
+        found, sampled_readings(sensor, TIMES, VALUES, RATES, noise), rtol=0, atol=1e-13
+    )
+    batch = initial_filter_state(sensor, sections, jnp.zeros(4))
+    together, _ = filtered_reading(sensor, sections, batch, jnp.linspace(0, 1, 4), None)
+    alone, _ = filtered_reading(sensor, sections, batch[..., 2], jnp.array(2 / 3), None)
+    assert_allclose(together[2], alone, rtol=1e-14)
+
+
+def test_a_digital_filter_is_that_of_scipy_from_rest():
+    sensor = Sensor(0.3, offset=0.7, filter=Filter(15.0, 6))
+    sos = scipy.signal.butter(6, 15.0, fs=1000.0, output="sos")
+    rest = scipy.signal.sosfilt_zi(sos) * 0.7
+    expected = scipy.signal.sosfilt(sos, np.asarray(VALUES) + 0.7, zi=rest)[0]
+    assert_allclose(sampled_readings(sensor, TIMES, VALUES, RATES), expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("order", [1, 4])
+def test_an_analogue_filter_is_that_of_scipy(order):
+    sensor = Sensor(0.3, filter=Filter(15.0, order, realisation="analogue"))
+    fine = np.linspace(0.0, 0.2, 20001)  # lsim takes the signal to be straight in between
+    system = scipy.signal.butter(order, 2 * np.pi * 15.0, analog=True)
+    expected = scipy.signal.lsim(system, signal(fine), fine)[1][::100]
+    found = sampled_readings(sensor, TIMES, VALUES, RATES)
+    assert_allclose(found, expected, rtol=0, atol=1e-7)
+
+
+def test_delayed_readings_are_those_of_an_earlier_signal():
+    whole = sampled_readings(Sensor(0.3, delay=0.01), TIMES, VALUES, RATES)
+    assert_allclose(whole[10:], VALUES[:-10], rtol=0, atol=1e-13)
+    assert_allclose(whole[:10], 0.0, atol=1e-15)
+    between = sampled_readings(Sensor(0.3, delay=0.00437), TIMES, VALUES, RATES)
+    # Cubics are right to (omega h)^4 / 384.
+    assert_allclose(between[5:], signal(TIMES - 0.00437)[5:], rtol=0, atol=5e-8)
+
+
+def test_readings_are_held_between_sampling_instants():
+    sensor = Sensor(0.3, sampling_period=0.004, noise=0.1)
+    noise = noise_samples(0, 1, 201)[:, 0]
+    found = sampled_readings(sensor, TIMES, VALUES, RATES, noise)
+    expected = np.repeat(VALUES[::4] + 0.1 * noise[: len(VALUES[::4])], 4)[:201]
+    assert_allclose(found, expected, rtol=0, atol=1e-13)
+    # Not a multiple of the time between samples: the readings are those at its own times.
+    odd = sampled_readings(Sensor(0.3, sampling_period=0.0033), TIMES, VALUES, RATES)
+    instants = 0.0033 * np.floor(np.asarray(TIMES) / 0.0033 + 1e-9)
+    assert_allclose(odd, signal(instants), rtol=0, atol=5e-8)
+
+
+def test_a_digital_filter_runs_at_the_sampling_period_of_its_sensor():
+    sensor = Sensor(0.3, sampling_period=0.004, filter=Filter(20.0, 3))
+    sos = scipy.signal.butter(3, 20.0, fs=250.0, output="sos")
+    expected = np.repeat(scipy.signal.sosfilt(sos, VALUES[::4]), 4)[:201]
+    assert_allclose(sampled_readings(sensor, TIMES, VALUES, RATES), expected, rtol=0, atol=1e-12)
+
+
+def test_unsuitable_times_are_refused():
+    uneven = TIMES.at[7].add(3e-4)
+    for realisation in ("digital", "analogue"):
+        sensor = Sensor(0.3, filter=Filter(20.0, 3, realisation=realisation))
+        with pytest.raises(ValueError, match="equal spacing"):
+            sampled_readings(sensor, uneven, VALUES, RATES)
+    fast = Sensor(0.3, sampling_period=1e-4, filter=Filter(20.0, 3))
+    with pytest.raises(ValueError, match="a reading every 0.0001 s, but .* 0.001 s apart"):
+        sampled_readings(fast, TIMES, VALUES, RATES)
+
+
+@pytest.mark.parametrize("realisation", ["digital", "analogue"])
+def test_derivatives_of_readings(realisation):
+    """By offset, cutoff and delay, through sampling and filter, against differences."""
+
+    def readings(parameters):
+        offset, cutoff, delay = parameters
+        sensor = Sensor(
+            0.3,
+            offset=offset,
+            filter=Filter(20 * cutoff, 4, realisation=realisation),
+            sampling_period=2e-3,
+            delay=0.01 * delay,
+        )
+        return sampled_readings(sensor, TIMES, VALUES, RATES)
+
+    point = jnp.array([0.1, 1.0, 0.53])
+    readings = jax.jit(readings)
+    expected = central(readings, point, step=1e-3, order=4)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found = derivative(readings)(point)
+        assert_allclose(found, expected, rtol=0, atol=1e-6 * np.max(np.abs(expected)))
+
+
+QUANTITIES = [("deflection", None), ("velocity", None), ("acceleration", None), ("strain", 0.002)]
+CASE = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
+    sensors=[Sensor(0.25, quantity, fibre_distance=z) for quantity, z in QUANTITIES],
+    loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    run=jb.Run(0.4, sample_rate=2000.0, seed=11),
+)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return jb.simulate(CASE)
+
+
+def with_sensors(record, **changes):
+    """The same run with other properties of the sensors."""
+    sensors = tuple(dataclasses.replace(s, **changes) for s in CASE.sensors)
+    return dataclasses.replace(record, case=dataclasses.replace(CASE, sensors=sensors))
+
+
+def test_ideal_sensors_read_the_true_values(record):
+    truth = [record.at(0.25, quantity, z) for quantity, z in QUANTITIES]
+    assert_array_equal(record.measured, np.array(truth).T)
+
+
+def test_a_record_reads_every_quantity_through_filter_and_delay(record):
+    filter = Filter(40.0, 4)
+    found = with_sensors(record, filter=filter, delay=0.004).measured
+    sos = scipy.signal.butter(4, 40.0, fs=2000.0, output="sos")
+    delayed = np.asarray(record.measured)[np.maximum(np.arange(801) - 8, 0)]
+    rest = scipy.signal.sosfilt_zi(sos)[:, :, None] * delayed[0]
+    expected = scipy.signal.sosfilt(sos, delayed, axis=0, zi=rest)[0]
+    assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected), axis=0).max())
+    analogue = Filter(40.0, 4, realisation="analogue")
+    smooth = with_sensors(record, filter=analogue, delay=0.004).measured
+    size = np.max(np.abs(expected), axis=0)
+    assert np.all(np.max(np.abs(smooth - expected), axis=0) < 0.02 * size)
+
+
+def test_noise_is_in_the_record_but_not_in_predictions(record):
+    noisy = with_sensors(record, noise=1e-3)
+    difference = np.asarray(noisy.measured - record.measured)
+    assert_allclose(difference, 1e-3 * noise_samples(11, 4, 801), rtol=0, atol=1e-12)
+    assert_array_equal(noisy.measured, noisy.measured)
+    assert_array_equal(sensor_readings(noisy.case, noisy.modes, noisy.motion), record.measured)
+
+
+def test_delayed_readings_without_times_are_refused(record):
+    delayed = with_sensors(record, delay=0.1)
+    with pytest.raises(ValueError, match=r"sensors.0 .* its readings need times"):
+        sensor_readings(delayed.case, delayed.modes, delayed.motion)
+    fast = with_sensors(record, filter=Filter(100.0), sampling_period=1e-4)
+    with pytest.raises(ValueError, match=r"sensors.0: its filter takes a reading every 0.0001 s"):
+        _ = fast.measured
+
+
+def test_case_files_hold_every_property_of_a_sensor(tmp_path):
+    filter = Filter(10.0, 10)
+    sensor = Sensor(
+        0.25, offset=1e-5, noise=1e-5, range=[-0.01, 0.01], resolution=1e-6, filter=filter,
+        sampling_period=1e-3, delay=2e-4,
+    )  # fmt: skip
+    case = dataclasses.replace(CASE, sensors=(sensor, CASE.sensors[1]))
+    jb.save_case(case, tmp_path / "case.toml")
+    loaded = jb.load_case(tmp_path / "case.toml")
+    assert jax.tree.structure(loaded) == jax.tree.structure(case)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), loaded, case))
+    assert jb.replace(case, {"sensors.0.filter.cutoff": 12.0}).sensors[0].filter.cutoff == 12.0
+    path = tmp_path / "table.toml"
+    path.write_text(
+        "[beam]\nlength = 0.6\nflexural_rigidity = 11.68\nmass_per_length = 0.535\n"
+        "[[sensors]]\nposition = 0.3\n[sensors.filter]\ncutoff = 10\norder = 10\n"
+    )
+    assert jb.load_case(path).sensors[0].filter == filter
+
+
+INVALID_SENSORS = [
+    ({"resolution": 0.0}, "sensors.0.resolution must be positive; it is 0"),
+    ({"noise": -1.0}, "sensors.0.noise must not be negative; it is -1"),
+    ({"range": [1.0, -1.0]}, "sensors.0.range.1 must be above the entry before it; -1 follows 1"),
+    ({"delay": -0.1}, "sensors.0.delay must not be negative; it is -0.1 s"),
+    ({"sampling_period": 0.0}, "sensors.0.sampling_period must be positive; it is 0 s"),
+    ({"sampling_period": 0.5}, "must not exceed the run's duration, 0.4 s; it is 0.5 s"),
+    ({"filter": Filter(1000.0)}, "sensors.0.filter.cutoff must be below half the sampling freq"),
+    ({"filter": Filter(60.0), "sampling_period": 0.01}, "frequency, 50 Hz; it is 60 Hz: lower it"),
+    ({"filter": Filter(0.0)}, "sensors.0.filter.cutoff must be positive; it is 0 Hz"),
+    ({"filter": Filter(9.0, 0)}, "sensors.0.filter.order must be a whole number, 1 or more"),
+    ({"filter": Filter(9.0, kind="bessel")}, "sensors.0.filter.kind cannot be 'bessel'"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), INVALID_SENSORS)
+def test_invalid_sensors_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        check_case(dataclasses.replace(CASE, sensors=(Sensor(0.25, **changes),)))
+
+
+@pytest.mark.parametrize(
+    ("filter", "message"),
+    [
+        (10.0, "sensors.0.filter holds 10.0; it takes a table of its own"),
+        ({"cutof": 10.0}, "sensors.0.filter has no key 'cutof'; did you mean 'cutoff'?"),
+        ({"order": 3}, "sensors.0.filter.cutoff is missing"),
+        ({"cutoff": "low"}, "sensors.0.filter.cutoff must be one number, not 'low'"),
+    ],
+)
+def test_invalid_filter_tables_are_refused(filter, message):
+    beam = {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535}
+    with pytest.raises(ValueError, match=re.escape(message)):
+        case_from_dict({"beam": beam, "sensors": [{"position": 0.3, "filter": filter}]})
+
+
+def test_the_bound_on_the_cutoff_needs_a_known_sampling_period():
+    """None for an analogue filter, nor for one whose controller decides the sampling."""
+    analogue = Filter(5000.0, realisation="analogue")
+    check_case(dataclasses.replace(CASE, sensors=(Sensor(0.25, filter=analogue),)))
+
+
+def test_seeds_are_whole_numbers():
+    with pytest.raises(ValueError, match="run.seed must be a whole number, 0 or more; it is -1"):
+        check_case(dataclasses.replace(CASE, run=jb.Run(0.4, seed=-1)))

@@ -1,0 +1,106 @@
+"""Loads of a run: wheels of all vehicles in order, their paths, systems and states at rest."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxbeam as jb
+from jaxbeam.model.contact import forces_of_wheels, split_states
+from jaxbeam.model.load_set import load_set
+from tests.case.loads import reference
+
+CAR = jb.QuarterCar(14e3, 1100.0, 9e5, 3e4, 3e6, 8e3, speed=-15.0, entry_time=0.1)
+WAGONS = reference.wagon(reference.REFERENCE["wagon"]["input"], 30.0, count=2, spacing=25.0)
+MASS = jb.MovingMass(5e3, speed=10.0, start_position=-4.0)
+PROFILE = jb.SineProfile(5e-3, 7.0, 0.4)
+CASE = jb.Case(
+    jb.Beam(20.0, 2e10, 1.2e4, modes=2), loads=[MASS, WAGONS, CAR], profile=PROFILE, run=jb.Run(1.0)
+)
+LOADS = load_set(CASE)
+OFFSETS = np.array([0.0, 2.56, 19.0, 21.56])
+
+
+def test_wheels_are_those_of_the_loads_in_turn():
+    assert LOADS.wheel_count == 1 + 2 * 4 + 1
+    assert LOADS.load_of_wheel == [0, *[1] * 8, 2]
+    assert_array_equal(LOADS.on_ground, [False, *[True] * 9])
+    assert LOADS.vehicle_states == 2 * (2 * 6 + 2)
+    wheelset = reference.REFERENCE["wagon"]["input"]["mw"]
+    assert_array_equal(LOADS.inertia[:, 0], [5e3, *[wheelset] * 8, 0.0])
+    total = 9.81 * (5e3 + 15.1e3) + 2 * sum(reference.REFERENCE["wagon"]["P_static"])
+    assert np.sum(LOADS.weight) == pytest.approx(total, rel=1e-7)
+
+
+def test_wheels_follow_behind_the_first():
+    times = np.array([0.0, 0.7, 1.3])
+    position, speed, acceleration = LOADS.kinematics(times)
+    assert_allclose(position[0], -4.0 + 10.0 * times)
+    behind = np.concatenate([OFFSETS, OFFSETS + 25.0])
+    assert_allclose(position[1:9], 30.0 * times - behind[:, None])
+    assert_allclose(position[9], 20.0 - 15.0 * (times - 0.1))
+    assert_array_equal(speed[:, 0], [10.0, *[30.0] * 8, -15.0])
+    assert_array_equal(acceleration, 0.0)
+    entry, leave = LOADS.entry_exit_times().T
+    assert_allclose(entry, [0.4, *behind / 30.0, 0.1])
+    assert_allclose(leave - entry, [2.0, *[2 / 3] * 8, 4 / 3])
+
+
+def test_cubics_are_the_positions():
+    starts, cubics = LOADS.cubics()
+    elapsed = 0.6 - starts[:, 0]
+    found = np.sum(cubics[:, 0] * elapsed[:, None] ** np.arange(4), axis=1)
+    assert_allclose(found, LOADS.kinematics(np.float64(0.6))[0])
+
+
+def test_motion_of_the_surface_is_that_of_its_height():
+    """By differences along the path, of a load that brakes."""
+    load = jb.MovingMass(1.0, speed=20.0, deceleration=6.0)
+    loads = load_set(jb.Case(CASE.beam, loads=[load], profile=PROFILE))
+    step, time = 1e-4, 0.31
+    times = time + step * np.array([-1.0, 0.0, 1.0])
+    motion = loads.surface_motion(*loads.kinematics(times))
+    assert motion is not None
+    heights, rates, accelerations = motion
+    low, middle, high = heights[0]
+    assert rates[0, 1] == pytest.approx((high - low) / (2 * step), rel=1e-5)
+    assert accelerations[0, 1] == pytest.approx((high - 2 * middle + low) / step**2, rel=1e-4)
+
+
+def test_vehicles_at_rest_stay_so():
+    """On surfaces of any heights: no rates, no accelerations, forces in equilibrium."""
+    group = LOADS.wheels.vehicles[0]
+    heights = np.cos(np.arange(8.0))[:, None]
+    surface = LOADS.wheels.stiffness[group.wheels] * heights
+    states = group.initial_state(surface)
+    assert_allclose(states[:, 6:], 0.0, atol=1e-12)
+    scale = np.max(np.abs(surface)) / 2615.0
+    assert_allclose(group.accelerations(states, surface), 0.0, atol=1e-10 * scale)
+    forces = group.spring_forces(states, surface)[:, 0].reshape(2, 4)
+    # Springs give neither a force nor a moment together.
+    assert_allclose(np.sum(forces, axis=1), 0.0, atol=1e-9 * np.max(np.abs(surface)))
+    assert_allclose(forces @ OFFSETS, 0.0, atol=1e-8 * np.max(np.abs(surface)))
+
+
+def test_level_raised_surfaces_lift_vehicles():
+    group = LOADS.wheels.vehicles[1]
+    states = group.initial_state(0.03 * LOADS.wheels.stiffness[group.wheels])
+    assert_allclose(states[0, :, 0], [0.03, 0.03, 0.0, 0.0], atol=1e-14)
+
+
+def test_states_and_forces_are_in_the_order_of_the_loads():
+    states = np.arange(4.0 + LOADS.vehicle_states)[:, None]
+    beam, (wagons, car) = split_states(4, LOADS, states)
+    assert_array_equal(beam[:, 0], np.arange(4.0))
+    assert wagons.shape == (2, 12, 1)
+    assert wagons[1, 0, 0] == 16
+    assert_array_equal(car[0, :, 0], np.arange(28.0, 32.0))
+    forces = [np.full((8, 1), 2.0), np.full((1, 1), 3.0)]
+    found = forces_of_wheels(LOADS, forces, np.zeros((10, 1)))
+    assert_array_equal(found[:, 0], [0.0, *[2.0] * 8, 3.0])
+
+
+def test_loads_without_inertia_or_springs_are_massless():
+    force = jb.MovingForce(force=1.0, speed=2.0)
+    assert load_set(jb.Case(CASE.beam, loads=[force])).massless
+    for load in (MASS, CAR, jb.Oscillator(1e4, 1e6, speed=1.0)):
+        assert not load_set(jb.Case(CASE.beam, loads=[force, load])).massless

@@ -1,0 +1,235 @@
+"""Modes plus residuals against the exact static response; section forces."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case.case import replace
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.static_correction import (
+    bending_moment,
+    residual_actuator_gain,
+    residual_flexibility,
+    shear_force,
+)
+from jaxbeam.model.statics import influence_line, static_deflection_per_command
+from jaxbeam.simulation.corrected_deflection import corrected_deflection
+from tests.as_oracle import as_oracle
+from tests.differences import central
+from tests.oracles import finite_elements
+
+PLAIN = jb.Case(jb.Beam(0.6, 13.211, 0.812), actuators=[jb.Patch(0.2, 0.35, 1e-3)])
+GENERAL = jb.Case(
+    jb.Beam(1.3, 2.0, 0.7, ends="clamped-free", modes=4),
+    supports=[jb.Support(0.3, 500.0, 0.4, 3.0), jb.Support(0.91)],
+    actuators=[
+        jb.Patch(0.2, 0.45, 1e-3, 0.5, 200.0, added_mass=0.4, added_rigidity=1.0),
+        jb.Shaker(0.7, 300.0, force_per_volt=2.0),
+        jb.Patch(0.4, 0.7, 2e-3),
+        jb.Electrodynamic(0.55, 0.8, 5e-5, 4.2, mass=0.02, stiffness=900.0, damping=0.5),
+        jb.PointForce(1.2),
+        jb.SpringDamper(0.11, 800.0),
+    ],
+)
+STEADY = np.array([1e-3 * 0.5 * 200.0, 2.0, 2e-3, 4.2 / 0.8, 1.0, 0.0])
+X = np.array([0.0, 0.05, 0.25, 0.33, 0.42, 0.6, 1.0, 1.3])
+
+
+def oracle_deflections(case: jb.Case, x, derivative: int = 0) -> np.ndarray:
+    """Deflections per unit command (actuator, position) by finite elements."""
+    beam, deflections = as_oracle(case, elements=1), []
+    for actuator, steady in zip(case.actuators, STEADY, strict=True):
+        if isinstance(actuator, jb.Patch):
+            moments = [(float(actuator.start), float(actuator.end), steady)]
+            found = finite_elements.static_deflection(beam, x, patch_moments=moments)
+        else:
+            force = float(actuator.position), steady
+            found = finite_elements.static_deflection(beam, x, [force])
+        deflections.append(found)
+    return np.array(deflections)
+
+
+# Exact static deflection per command
+
+
+def test_patch_on_a_pinned_beam_against_closed_form():
+    """w'' = -M / E I over the patch, zero elsewhere: w = (M / E I) (two Macaulay terms)."""
+    a, b, length = 0.2, 0.35, 0.6
+    x = np.linspace(0.0, length, 13)
+    ramp = ((length - a) ** 2 - (length - b) ** 2) / 2
+    bent = np.maximum(x - a, 0) ** 2 / 2 - np.maximum(x - b, 0) ** 2 / 2
+    expected = 1e-3 / 13.211 * (ramp * x / length - bent)
+    found = static_deflection_per_command(PLAIN, x)[0]
+    assert_allclose(found, expected, rtol=1e-12, atol=1e-20)
+    assert found[6] > 0
+
+
+def test_slope_curvature_and_third_derivative_of_a_pinned_beam():
+    x = np.array([0.1, 0.2, 0.3, 0.35, 0.5])
+    over = np.array([0, 1, 1, 0, 0])  # at the ends of the patch, the section to the right
+    assert_allclose(
+        static_deflection_per_command(PLAIN, x, 2)[0], -1e-3 / 13.211 * over, rtol=1e-12, atol=1e-18
+    )
+    assert_allclose(static_deflection_per_command(PLAIN, x, 3)[0], 0.0, atol=1e-15)
+    slopes = central(lambda y: static_deflection_per_command(PLAIN, y[0])[0], [0.3], 1e-3)
+    assert_allclose(static_deflection_per_command(PLAIN, 0.3, 1)[0], slopes[0], rtol=1e-9)
+
+
+def test_all_actuators_agree_with_finite_elements():
+    expected = oracle_deflections(GENERAL, X)
+    found = static_deflection_per_command(GENERAL, X)
+    assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+    assert_allclose(found[-1], 0.0, atol=0)
+
+
+@pytest.mark.parametrize("ends", ["clamped-clamped", "guided-pinned", "free-clamped"])
+@pytest.mark.parametrize("supports", [[], [jb.Support(0.4)], [jb.Support(0.5, 2e4, 0.0, 30.0)]])
+def test_patch_with_other_ends_and_supports(ends, supports):
+    patch = jb.Patch(0.25, 0.55, 1.0, added_mass=0.2, added_rigidity=4.0)
+    case = jb.Case(jb.Beam(1.0, 12.0, 0.8, ends=ends), supports, [patch])
+    x, beam = np.linspace(0, 1, 9), as_oracle(case, elements=1)
+    expected = finite_elements.static_deflection(beam, x, patch_moments=[(0.25, 0.55, 1.0)])
+    found = static_deflection_per_command(case, x)[0]
+    assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
+def test_residual_decreases_with_the_number_of_modes():
+    errors = []
+    for count in (4, 12, 36):
+        case = jb.Case(dataclasses.replace(PLAIN.beam, modes=count), actuators=PLAIN.actuators)
+        errors.append(float(jnp.abs(residual_actuator_gain(case, X[2:4])).max()))
+    largest = float(static_deflection_per_command(PLAIN, 0.3)[0])
+    assert errors[0] < 0.05 * largest
+    assert errors[1] < errors[0] / 5
+    assert errors[2] < errors[1] / 5
+
+
+# Modes plus residual
+
+
+@pytest.fixture(scope="module")
+def model():
+    return eqx.filter_jit(modal_model)(GENERAL, mesh_layout(GENERAL))
+
+
+@pytest.mark.parametrize("derivative", [0, 3])  # section forces, below, use the second
+def test_modes_plus_residual_are_exact(model, derivative):
+    """The modal part is the equilibrium of the state equations of the model."""
+    y = np.array([0.07, 0.5])
+    matrix, modes = np.asarray(model.state_matrix[0]), GENERAL.beam.modes
+    shapes = np.asarray(model.shapes(X, (derivative,))[0])
+    states = -np.linalg.solve(matrix, np.asarray(model.command_matrix))
+    modal = (shapes @ states[: 2 * modes : 2]).T
+    exact = np.asarray(static_deflection_per_command(GENERAL, X, derivative))
+    found = modal + residual_actuator_gain(GENERAL, X, derivative)
+    assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
+    load_input = np.zeros((len(matrix), y.size))
+    load_input[1 : 2 * modes : 2] = -np.asarray(model.shapes(y, (0,))[0]).T
+    modal = (shapes @ -np.linalg.solve(matrix, load_input)[: 2 * modes : 2]).T
+    exact = influence_line(GENERAL, X, y, derivative)
+    found = modal + residual_flexibility(GENERAL, X, y, derivative)
+    assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
+
+
+def test_derivatives_of_residuals():
+    layout, scale = mesh_layout(PLAIN), np.array([1.0, 100.0])
+
+    def residual(values):
+        names = ("actuators.0.start", "beam.flexural_rigidity")
+        changed = replace(PLAIN, dict(zip(names, values * scale, strict=True)))
+        return residual_actuator_gain(changed, X[3:5], 2, layout)[0]
+
+    point = np.array([0.2, 0.13])
+    found = jax.jacobian(residual)(jnp.asarray(point))
+    expected = central(residual, point, 1e-3)
+    assert_allclose(found, expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
+
+
+# Section forces
+
+
+def test_patch_causes_no_moment_in_a_determinate_beam():
+    """The active moment balances the bending of the stiffened section."""
+    patch = dataclasses.replace(PLAIN.actuators[0], added_rigidity=5.0, added_mass=0.1)
+    for ends in ("pinned-pinned", "clamped-free"):
+        beam = dataclasses.replace(PLAIN.beam, ends=ends)
+        case, x = jb.Case(beam, actuators=[patch]), np.linspace(0.0, 0.6, 13)
+        curvature, third = (
+            static_deflection_per_command(case, x, 2)[0],
+            static_deflection_per_command(case, x, 3)[0],
+        )
+        assert_allclose(bending_moment(case, x, curvature, [1.0]), 0.0, atol=1e-14)
+        assert_allclose(shear_force(case, x, third), 0.0, atol=1e-12)
+
+
+def test_moment_of_a_patch_on_a_clamped_beam():
+    """M = p + q x, with zero deflection and slope at both ends."""
+    patch, x = PLAIN.actuators[0], np.linspace(0.0, 0.6, 13)
+    case = jb.Case(dataclasses.replace(PLAIN.beam, ends="clamped-clamped"), actuators=[patch])
+    length, a, b, active = 0.6, 0.2, 0.35, 1e-3
+    # The integrals over the beam of w'', with E I w'' = M - active moment, and of x w'' are zero.
+    system = np.array([[length, length**2 / 2], [length**2 / 2, length**3 / 3]])
+    p, q = np.linalg.solve(system, active * np.array([b - a, (b**2 - a**2) / 2]))
+    found = bending_moment(case, x, static_deflection_per_command(case, x, 2)[0], [1.0])
+    assert_allclose(found, p + q * x, rtol=1e-11)
+    assert_allclose(
+        shear_force(case, x, static_deflection_per_command(case, x, 3)[0]), q, rtol=1e-10
+    )
+
+
+@pytest.mark.parametrize("x", [0.0, 0.12, 0.6])
+def test_moments_and_shear_of_a_clamped_beam(x):
+    """P at a quarter: -P a b^2 / L^2 and -P a^2 b / L^2 at the ends, V = P b^2 (3 a + b) / L^3."""
+    case = jb.Case(dataclasses.replace(PLAIN.beam, ends="clamped-clamped"))
+    left, right = -0.15 * 0.45**2 / 0.36, -(0.15**2) * 0.45 / 0.36
+    shear = 0.45**2 * (3 * 0.15 + 0.45) / 0.216
+    moments = {0.0: left, 0.12: left + shear * 0.12, 0.6: right}
+    found = bending_moment(case, x, influence_line(case, x, 0.15, 2))
+    assert_allclose(found, moments[x], rtol=1e-11)
+    forces = {0.0: shear, 0.12: shear, 0.6: shear - 1}
+    assert_allclose(shear_force(case, x, influence_line(case, x, 0.15, 3)), forces[x], rtol=1e-11)
+
+
+@pytest.mark.slow
+def test_moment_under_a_slow_load_and_a_patch():
+    """Three modes and the correction: P a b / L, within the dynamics of a slow crossing."""
+    case = jb.Case(
+        jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.1),
+        actuators=[jb.Patch(0.25, 0.35, 1e-3)],
+        loads=[jb.MovingForce(force=5.0, speed=0.05)],
+        run=jb.Run(duration=12.0, sample_rate=10.0),
+    )
+    record = jb.simulate(case)
+    x = np.array([0.15, 0.3, 0.41])
+    found = bending_moment(case, x, corrected_deflection(record, x, 2))
+    at = 0.05 * np.asarray(record.times)[1:-1, None]
+    expected = 5.0 * np.minimum(at, x) * (0.6 - np.maximum(at, x)) / 0.6
+    assert_allclose(found[1:-1], expected, atol=2e-3)
+    curvature = np.tensordot(record.coordinates, record.modes.shapes(x, 2), axes=[1, -1])
+    modal = bending_moment(case, x, curvature)
+    assert np.abs(modal[1:-1] - expected).max() > 0.05
+    # The correction includes the commands of a record.
+    controlled = dataclasses.replace(case, controller=jb.Prescribed(offsets=[1.0]))
+    steady = dataclasses.replace(
+        record, case=controlled, command=jnp.full((record.times.size, 1), 100.0)
+    )
+    residual = residual_actuator_gain(case, x, 2)[0] * 100.0
+    difference = corrected_deflection(steady, x, 2) - corrected_deflection(record, x, 2)
+    assert_allclose(difference, np.tile(residual, (121, 1)), atol=1e-15)
+
+
+def test_wheels_on_the_ground_do_not_bend_the_beam():
+    """A vehicle before the free end of a beam presses on the road."""
+    case = jb.Case(
+        jb.Beam(10.0, 1e8, 1e3, 0.02, ends="free-clamped", modes=3),
+        loads=[jb.Oscillator(100.0, 1e5, 1e3, speed=10.0, start_position=-5.0)],
+        run=jb.Run(0.4, 50.0),
+    )
+    assert_allclose(corrected_deflection(jb.simulate(case), np.array([0.0, 3.0])), 0.0, atol=1e-15)

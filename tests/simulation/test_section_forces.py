@@ -1,0 +1,335 @@
+"""Section forces and reactions of records: references, closed forms, equilibrium, gradients."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case.case import replace
+from jaxbeam.simulation.integration_plan import integration_plan
+from tests.differences import central
+from tests.modules import ROOT
+
+REFERENCES = json.loads((ROOT / "tests" / "data" / "sections.json").read_text())["cases"]
+UNIT = {"flexural_rigidity": 1.0, "mass_per_length": 1.0}
+
+
+def reference_run(reference) -> tuple[jb.Record, np.ndarray]:
+    """Record of a mass of a reference case with 20 modes, and the indices of its instants."""
+    given = reference["parameters"]
+    spans = 2 if given["beam"]["type"] == "two equal spans" else 1
+    duration = spans / given["speed"]
+    case = jb.Case(
+        jb.Beam(length=float(spans), damping_ratio=given["beam"]["zeta"], modes=20, **UNIT),
+        supports=[jb.Support(1.0)] if spans == 2 else [],
+        loads=[jb.MovingMass(mass=given["mass"], speed=given["speed"])],
+        run=jb.Run(duration, gravity=given["weight"] / given["mass"]),
+    )
+    shares = np.linspace(0, 1, 101)
+    record = jb.simulate(case, times=shares * duration)
+    return record, np.searchsorted(shares, np.array(given["t_over_T"]) - 1e-9)
+
+
+@pytest.fixture(scope="module", params=REFERENCES, ids=lambda reference: reference["case"])
+def crossing(request):
+    return request.param, *reference_run(request.param)
+
+
+def accuracy(reference, name: str) -> float:
+    """Larger difference of the two independent methods behind a reference, of the largest."""
+    stated = reference["accuracy"]
+    family = {"M": "M", "F": "F"}.get(name[0], "RA")
+    other = {"M": "M_load"}.get(family, name)
+    return max(stated["FE_rel"][family], stated["richardson_change_rel_to_max"][other])
+
+
+def assert_like(reference, name: str, found, instants=slice(None)):
+    """Agreement at the instants, relative to the largest force or moment of the reference."""
+    outputs = reference["outputs"]
+    expected = np.array(outputs[name]["at"])
+    size = outputs["M_load" if name[0] == "M" else "F"]["max"]
+    tolerance = accuracy(reference, name) * size
+    assert_allclose(found[instants], expected[instants], rtol=0, atol=tolerance, err_msg=name)
+
+
+def test_contact_force_and_moments_of_a_moving_mass(crossing):
+    reference, record, at = crossing
+    assert_like(reference, "F", np.asarray(record.contact_force)[at, 0])
+    for x in reference["parameters"]["xs"]:
+        assert_like(reference, f"M_{x:g}", np.asarray(record.bending_moment(x))[at])
+    under_load = np.asarray(record.load_position)[at, 0]
+    moments = np.asarray(record.bending_moment(under_load))[at]
+    assert_like(reference, "M_load", np.diag(moments))
+    if "MB" in reference["outputs"]:
+        assert_like(reference, "MB", np.asarray(record.bending_moment(1.0))[at])
+
+
+def test_shear_before_and_after_a_moving_mass(crossing):
+    reference, record, at = crossing
+    x = np.asarray(record.load_position)[at, 0]
+    before = np.diag(np.asarray(record.shear_force(x, "left"))[at])
+    after = np.diag(np.asarray(record.shear_force(x, "right"))[at])
+    assert_like(reference, "V_before", before)
+    # At the inner support the reference is left of it, ours right of load and support.
+    elsewhere = np.abs(x - 1.0) > 1e-9
+    assert_like(reference, "V_after", after, elsewhere)
+    force = np.asarray(record.contact_force)[at, 0]
+    assert_allclose((before - after)[elsewhere], force[elsewhere], rtol=1e-9)
+
+
+def test_reactions_under_a_moving_mass(crossing):
+    """Inner reactions of the reference (RB) contradict its own equilibrium by 3 %: not compared."""
+    reference, record, at = crossing
+    found = np.asarray(record.reactions)[at]
+    assert_allclose(record.support_positions, np.arange(found.shape[1]), atol=1e-12)
+    assert_like(reference, "RA", found[:, 0])
+    assert_like(reference, "RC", found[:, -1])
+
+
+# Equilibrium
+
+
+def imbalances(record: jb.Record, x, weights) -> np.ndarray:
+    """Sums of forces on the beam, and of their moments about x = 0, (2, time).
+
+    Reactions, contact forces, support dampers within the reactions, inertia and damping of the
+    modes by quadrature along the beam, patches without commands. Patches add mass.
+    """
+    case, modes = record.case, record.modes
+    density = np.full(x.shape, float(case.beam.linear_density))
+    for actuator in case.actuators:
+        patch = actuator.section_stiffening()
+        if patch is not None:
+            density += float(patch.mass_per_length) * ((patch.start < x) & (x < patch.end))
+    damping = np.asarray(record.rates) * np.asarray(modes.damping) @ np.asarray(modes.shapes(x)).T
+    inertia = (np.asarray(record.at(x, "acceleration")) + damping) * density * weights
+    position = np.nan_to_num(np.asarray(record.load_position))
+    force, reactions = np.asarray(record.contact_force), np.asarray(record.reactions)
+    held_at = np.asarray(record.support_positions)
+    sums = reactions.sum(axis=1) - force.sum(axis=1) - inertia.sum(axis=1)
+    moments = reactions @ held_at - np.sum(force * position, axis=1) - inertia @ x
+    return np.array([sums, moments])
+
+
+LOADS = (
+    jb.MovingMass(mass=0.2, speed=0.8),
+    jb.MovingMass(mass=0.1, speed=-0.6, entry_time=0.3),
+    jb.MovingForce(force=0.7, speed=1.1, entry_time=0.5),
+)
+BEAM = jb.Beam(length=2.0, damping_ratio=0.02, modes=6, **UNIT)
+CASES = {
+    "two spans": jb.Case(BEAM, supports=[jb.Support(0.9)]),
+    "overhang": jb.Case(dataclasses.replace(BEAM, ends="pinned-free"), supports=[jb.Support(1.3)]),
+    "elastic, damped": jb.Case(
+        dataclasses.replace(BEAM, ends="free-free"),
+        supports=[
+            jb.Support(0.0, stiffness=300.0),
+            jb.Support(0.8, stiffness=80.0, damping=2.0),
+            jb.Support(2.0, stiffness=1e11),
+        ],
+    ),
+    "patch": jb.Case(
+        BEAM, actuators=[jb.Patch(0.5, 0.9, 1e-3, added_mass=0.1, added_rigidity=0.5)]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_equilibrium_at_every_instant(name):
+    """Vertical forces, and moments about the left end where nothing clamps, to 1e-8 of a weight."""
+    case = dataclasses.replace(
+        CASES[name], loads=LOADS, run=jb.Run(3.0, sample_rate=100.0, gravity=5.0)
+    )
+    record = jb.simulate(case)
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    edges = np.unique([0.0, 0.5, 0.8, 0.9, 1.3, 2.0])
+    half = np.diff(edges)[:, None] / 2
+    x = (edges[:-1, None] + half * (1 + nodes)).ravel()
+    found = imbalances(record, x, (half * weights).ravel())
+    assert np.abs(found).max() < 1e-8
+    assert np.abs(record.reactions).max() > 0.5
+
+
+def test_reaction_of_an_elastic_support_is_its_own_force():
+    """k w + c w' of the corrected deflection; a stiff spring carries what a rigid support does."""
+    case = dataclasses.replace(
+        CASES["elastic, damped"], loads=LOADS, run=jb.Run(2.0, sample_rate=100.0, gravity=5.0)
+    )
+    record = jb.simulate(case)
+    pushed = jb.corrected_deflection(record, np.array([0.0, 0.8]))
+    expected = -np.array([300.0, 80.0]) * pushed - np.array([0.0, 2.0]) * record.at(
+        np.array([0.0, 0.8]), "velocity"
+    )
+    assert_allclose(record.reactions[:, :2], expected, rtol=0, atol=1e-8)
+    stiff = dataclasses.replace(CASES["two spans"], supports=[jb.Support(0.9, stiffness=1e11)])
+    rigid, elastic = (
+        jb.simulate(dataclasses.replace(one, loads=LOADS, run=case.run)).reactions
+        for one in (CASES["two spans"], stiff)
+    )
+    assert_allclose(elastic, rigid, rtol=0, atol=1e-6 * np.abs(rigid).max())
+
+
+# A force that stands still
+
+
+def standing(x: float, beam: jb.Beam, **parts) -> jb.Record:
+    """Record of a downward force of 2 N that has stood at x until all vibration is damped away."""
+    load = jb.MovingForce(force=2.0, times=[0.0, 9.0], positions=[x, x])
+    beam = dataclasses.replace(beam, damping_ratio=0.7, modes=3)
+    return jb.simulate(jb.Case(beam, loads=[load], run=jb.Run(8.0), **parts), np.array([7.0, 8.0]))
+
+
+@pytest.mark.parametrize("a", [0.25, 0.5, 0.7])
+def test_a_force_standing_on_one_span(a):
+    """M = P b x / L up to the load, V = P b / L and -P a / L: exact with three modes."""
+    record = standing(a, jb.Beam(length=1.0, **UNIT))
+    x = np.array([0.0, 0.1, 0.25, 0.5, 0.7, 0.9, 1.0])
+    moments = 2 * np.where(x < a, (1 - a) * x, a * (1 - x))
+    assert_allclose(record.bending_moment(x)[-1], moments, rtol=0, atol=1e-9)
+    left, right = record.shear_force(x, "left")[-1], record.shear_force(x)[-1]
+    assert_allclose(left, np.where(x <= a, 2 * (1 - a), -2 * a), rtol=0, atol=1e-8)
+    assert_allclose(right, np.where(x < a, 2 * (1 - a), -2 * a), rtol=0, atol=1e-8)
+    assert_allclose(record.reactions[-1], [2 * (1 - a), 2 * a], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("a", [0.3, 1.0, 1.6])
+def test_a_force_standing_on_two_spans(a):
+    """Clapeyron's three moments: M_B = -P a (L^2 - a^2) / (4 L^2) for a force on the first span."""
+    beam = jb.Beam(length=2.0, **UNIT)
+    record = standing(a, beam, supports=[jb.Support(1.0)])
+    near = min(a, 2.0 - a)
+    at_support = -2 * near * (1 - near**2) / 4
+    loaded, other = 2 * (1 - near) + at_support, at_support
+    ends = [loaded, other] if a <= 1 else [other, loaded]
+    reactions = [ends[0], 2 - sum(ends), ends[1]]
+    assert_allclose(record.reactions[-1], reactions, rtol=0, atol=1e-9)
+    assert_allclose(record.bending_moment(1.0)[-1], at_support, rtol=0, atol=1e-9)
+    inner = record.shear_force(1.0, "right") - record.shear_force(1.0, "left")
+    weight_there = 2.0 if a == 1.0 else 0.0
+    assert_allclose(inner[-1], reactions[1] - weight_there, rtol=0, atol=1e-8)
+
+
+def test_sides_other_than_left_and_right_are_refused():
+    record = standing(0.5, jb.Beam(length=1.0, **UNIT))
+    with pytest.raises(ValueError, match="side must be 'left' or 'right' of x, not 'top'"):
+        record.shear_force(0.5, "top")
+
+
+# Truncation
+
+
+def moving_force_moment(x, y, ratio: float, modes: int, derivative: int) -> np.ndarray:
+    """d^k w / dx^k under a unit force moving on an undamped pinned span with E I = m = L = 1.
+
+    Closed form with all modes up to `modes`, the last ones of which respond as in statics: mode n
+    of frequency (n pi)^2 is driven at n pi v; `ratio` is v / pi (Fryba, Vibration of solids and
+    structures under moving loads, 1999, section 1.3).
+    """
+    n = np.arange(1, modes + 1)
+    y = np.asarray(y)
+    drive, omega = n * np.pi * ratio * np.pi, (n * np.pi) ** 2
+    time = y[:, None] / (ratio * np.pi)
+    q = (np.sin(drive * time) - drive / omega * np.sin(omega * time)) / (omega**2 - drive**2)
+    quasi = np.sin(n * np.pi * y[:, None]) / omega**2
+    shape = {2: -np.sin(n * np.pi * x), 3: -np.cos(n * np.pi * x)}[derivative]
+    dynamic = -2 * (q - quasi) @ (shape * (n * np.pi) ** derivative)
+    static = np.where(x < y, (1 - y) * x, (1 - x) * y) if derivative == 2 else (x < y) - y
+    return dynamic + static
+
+
+@pytest.mark.slow
+def test_order_of_truncation():
+    """Away from the load sums of n modes have errors like n^-2 (M) and n^-1 (V).
+
+    Under the load M has n^-1. Corrected, n^-2.5 and n^-1.5 remain: the entry of the force sets off
+    free vibration of the truncated modes, n^-3 (M) and n^-2 (V) each and of unlike phases.
+    """
+    ratio, x = 0.2, 0.31
+    times = np.linspace(0, 1, 81)[1:-1] / (ratio * np.pi)
+    y = times * ratio * np.pi
+    away = np.abs(y - x) > 0.12
+    errors = {}
+    for count in (4, 8, 16, 32):
+        case = jb.Case(
+            jb.Beam(length=1.0, modes=count, **UNIT),
+            loads=[jb.MovingForce(force=1.0, speed=ratio * np.pi)],
+            run=jb.Run(1 / (ratio * np.pi)),
+        )
+        record = jb.simulate(case, times)
+        for derivative, corrected in ((2, record.bending_moment(x)), (3, record.shear_force(x))):
+            exact = moving_force_moment(x, y, ratio, 3000, derivative)
+            modal = np.tensordot(record.coordinates, record.modes.shapes(x, derivative), 1)
+            for name, found in (("modal", modal), ("corrected", corrected)):
+                error = np.abs(np.asarray(found) - exact)
+                errors.setdefault((name, derivative), []).append(np.sqrt(np.mean(error[away] ** 2)))
+        record = jb.simulate(case, np.array([0.2, 0.5]) / (ratio * np.pi))
+        modal = np.tensordot(record.coordinates, record.modes.shapes(0.5, 2), 1)[1]
+        exact = moving_force_moment(0.5, [0.5], ratio, 3000, 2)[0]
+        errors.setdefault("under", []).append(abs(modal - exact))
+    orders = {k: -np.polyfit(np.log([4, 8, 16, 32]), np.log(v), 1)[0] for k, v in errors.items()}
+    assert_allclose(orders["modal", 2], 2.0, atol=0.4)
+    assert_allclose(orders["modal", 3], 1.0, atol=0.4)
+    assert_allclose(orders["under"], 1.0, atol=0.3)
+    assert_allclose(orders["corrected", 2], 2.5, atol=0.4)
+    assert_allclose(orders["corrected", 3], 1.5, atol=0.5)
+    assert np.all(np.array(errors["corrected", 2]) < 0.06 * np.array(errors["modal", 2]))
+
+
+@pytest.mark.parametrize("modes", [3, 6])
+def test_strain_under_a_slow_axle_is_right_with_three_modes(modes):
+    """P L / 4 at midspan to 1e-3, where the sum of three modes is 10 % low."""
+    beam = jb.Beam(30.0, 3e10, 1e4, 0.02, modes=modes)
+    sensors = [
+        jb.Sensor(15.0, "strain", fibre_distance=-0.8),
+        jb.Sensor(15.0, "moment"),
+        jb.Sensor(15.0, "stress", section_modulus=0.5),
+        jb.Sensor(15.0, "curvature"),
+        jb.Sensor(10.0, "shear"),
+        jb.Sensor(0.0, "rotation"),
+    ]
+    loads = [jb.MovingForce(force=1e5, speed=0.25)]
+    case = jb.Case(beam, sensors=sensors, loads=loads, run=jb.Run(121.0, sample_rate=50.0))
+    record = jb.simulate(case)
+    middle = 60 * 50  # the sample at which the load is at midspan
+    moment, rotation = 1e5 * 30 / 4, -1e5 * 30**2 / (16 * 3e10)
+    strain = 0.8 * moment / 3e10
+    expected = [strain, moment, moment / 0.5, moment / 3e10, 0.5e5, rotation]
+    assert_allclose(record.measured[middle, :5], expected[:5], rtol=1e-3)
+    assert_allclose(record.measured[middle, 5], expected[5], rtol=1e-2)  # not corrected: n^-3
+    modal = np.asarray(record.coordinates)[middle] @ np.asarray(record.modes.shapes(15.0, 2))
+    assert modal * 3e10 < (0.91 if modes == 3 else 0.94) * moment
+    assert_allclose(record.extremes.largest[1], moment, rtol=1e-3)
+
+
+# Derivatives
+
+
+def test_gradients_of_the_largest_moment():
+    """By mass and speed, of the largest sample, against differences."""
+    case = jb.Case(
+        jb.Beam(length=1.0, damping_ratio=0.03, modes=3, **UNIT),
+        loads=[jb.MovingMass(mass=0.25, speed=0.8)],
+        run=jb.Run(1.25, gravity=4.0),
+    )
+    times = np.linspace(0.0, 1.2, 37)
+    plan = integration_plan(case, times, tolerance=1e-9)
+
+    def largest(values):
+        changed = replace(case, dict(zip(("loads.0.mass", "loads.0.speed"), values, strict=True)))
+        record = jb.simulate(changed, times, plan)
+        reaction = record.reactions[20, 1]
+        return jnp.array(
+            [jnp.max(record.bending_moment(0.47)), record.shear_force(0.3)[5], reaction]
+        )
+
+    point = jnp.array([0.25, 0.8])
+    expected = central(jax.jit(largest), point, 1e-3)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found = jax.jit(derivative(largest))(point)
+        assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    assert np.all(np.abs(expected[0]) > 1e-2)
