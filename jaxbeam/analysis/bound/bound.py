@@ -165,6 +165,8 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
         raise ValueError(f"period {period:g} s is longer than the run, {case.run.duration:g} s")
     if not case.loads:
         raise ValueError("a bound needs loads, and the case has none; add one")
+    if case.profile is not None:
+        raise ValueError("a bound is that on a level surface: leave the profile out")
     influence = input_influence(case, positions, period, spacing)
     if not np.any(influence.unforced @ influence.deflection_rows.T):
         raise ValueError("no load deflects the beam at these positions during the run")

@@ -163,8 +163,18 @@ def _unit_responses(
     wheels = jax.tree.map(
         lambda part: xp.broadcast_to(part, (*part.shape[:-1], size[1])), case_loads.wheels
     )
-    weight = xp.where(hold_index == -1, wheels.weight, 0.0)
-    loads = dataclasses.replace(case_loads, wheels=dataclasses.replace(wheels, weight=weight))
+    is_loaded = hold_index == -1
+    histories = {
+        wheel: dataclasses.replace(
+            history,
+            amplitudes=xp.where(is_loaded, history.amplitudes, 0.0),
+            forces=xp.where(is_loaded, history.forces, 0.0),
+        )
+        for wheel, history in wheels.histories.items()
+    }
+    weight = xp.where(is_loaded, wheels.weight, 0.0)
+    wheels = dataclasses.replace(wheels, weight=weight, histories=histories)
+    loads = dataclasses.replace(case_loads, wheels=wheels)
     state_bound = xp.full(model.state_count, xp.inf)
     policy = _UnitCommands(
         schedule=schedule,

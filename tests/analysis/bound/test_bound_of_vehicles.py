@@ -1,0 +1,37 @@
+"""The least peak under vehicles and varying forces: without commands that of the simulation."""
+
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+
+BEAM = jb.Beam(length=2.0, flexural_rigidity=6.0, mass_per_length=1.0, damping_ratio=0.01, modes=3)
+LOADS = {
+    "vehicle": jb.Oscillator(mass=0.2, stiffness=4e2, damping=2.0, wheel_mass=0.1, speed=2.0),
+    "varying force": jb.VaryingForce(force=3.0, frequencies=[2.0], amplitudes=[0.5], speed=2.0),
+}
+
+
+def case_of(load, **parts) -> jb.Case:
+    return jb.Case(
+        BEAM,
+        loads=[load],
+        sensors=[jb.Sensor(1.0)],
+        actuators=[jb.PointForce(1.0, limits=[-0.5, 0.5])],
+        run=jb.Run(1.5, 200.0),
+        **parts,
+    )
+
+
+@pytest.mark.parametrize("name", LOADS)
+def test_the_uncontrolled_peak_is_that_of_the_simulation(name):
+    case = case_of(LOADS[name])
+    found = jb.bound(case, period=0.05, spacing=0.005)
+    assert_allclose(found.uncontrolled, jb.simulate(case).peak_deflection[0], rtol=1e-6)
+    assert 0.0 < found.peak < 0.9 * found.uncontrolled
+
+
+def test_a_rough_surface_is_refused():
+    case = case_of(LOADS["vehicle"], profile=jb.SineProfile(1e-3, 0.5))
+    with pytest.raises(ValueError, match="a bound is that on a level surface"):
+        jb.bound(case)
