@@ -67,13 +67,13 @@ def sweep(
     """
     if client is not None and store is None:
         raise ValueError("workers write their blocks to a store; name one")
-    warn_of_truncation(case)
     words, numbers = split_words(case, over)
     settings = paired, histories, tolerance, precision
     if words:
         plan = word_sweep(case, words, numbers, list(over), *settings)
     else:
         plan = sweep_specification(case, over, *settings)
+    warn_of_truncation(case)
     path = None if store is None else Path(store).absolute()
     fingerprint = plan.fingerprint()
     state = (
