@@ -8,14 +8,14 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
-from jaxbeam.integrator.vehicles.steps import (
+from jaxbeam.integrator.vehicles.propagators import (
     next_vehicle_states,
-    solve_rows,
     spring_coupling,
     spring_forces,
     vehicle_propagators,
     vehicle_state_norm,
 )
+from jaxbeam.integrator.vehicles.steps import solve_rows
 from jaxbeam.model.load_set import load_set
 from tests.case.loads import reference
 
