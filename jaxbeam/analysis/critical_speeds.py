@@ -27,8 +27,9 @@ def regular_spacing(case: Case, load: int = 0) -> float | None:
     The distance that the largest static loads have in common, sum P_i P_j over all pairs of wheels
     at that distance; the smallest of equal ones. None if fewer than three pairs repeat.
     """
-    row, gravity = case.loads[load], case.run.gravity
-    distances, vehicle = concrete(wheel_distances(row, gravity)), row.vehicle(gravity)
+    row = case.loads[load]
+    vehicle = row.vehicle(case.run.gravity)
+    distances = concrete(wheel_distances(row, vehicle))
     weights = np.tile(concrete(vehicle.static_loads), len(distances) // len(vehicle.offsets))
     first, second = np.triu_indices(len(distances), 1)
     apart, product = distances[second] - distances[first], weights[first] * weights[second]

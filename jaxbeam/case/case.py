@@ -296,7 +296,7 @@ def crossing_times(case: Case) -> Float[np.ndarray, "load 2"]:
     """
     windows = []
     for load in case.loads:
-        behind = wheel_distances(load, case.run.gravity)
+        behind = wheel_distances(load, load.vehicle(case.run.gravity))
         entry, leave = trajectory(load, case.beam.length).entry_exit_times(behind)
         windows.append((np.min(concrete(entry)), np.max(concrete(leave))))
     return np.array(windows).reshape(-1, 2)

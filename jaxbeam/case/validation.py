@@ -25,6 +25,7 @@ from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
 from jaxbeam.case.loads.vehicle_checks import known_numbers
+from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor, sensor_labels
@@ -109,7 +110,7 @@ def _check_profile(case: Case) -> None:
                 " smooth kind of profile"
             )
         if vehicle.names:
-            ends.append(_travel(load, case))
+            ends.append(_travel(load, vehicle, case))
     if not all(map(is_concrete, itertools.chain(*ends))):
         return
     starts, ends = zip(*(map(concrete, pair) for pair in ends), strict=True)
@@ -118,10 +119,10 @@ def _check_profile(case: Case) -> None:
         raise ValueError(error)
 
 
-def _travel(load: AbstractLoad, case: Case) -> tuple[float, float]:
+def _travel(load: AbstractLoad, vehicle: VehicleModel, case: Case) -> tuple[float, float]:
     """Lowest and highest position (m) of any wheel, from the start until all have left the beam."""
     length = float(concrete(case.beam.length))
-    behind = float(np.max(concrete(wheel_distances(load, case.run.gravity))))
+    behind = float(np.max(concrete(wheel_distances(load, vehicle))))
     path = trajectory(load, case.beam.length)
     places = path.kinematics(concrete(case.run.duration) * np.array([0.0, 1.0]))[0]
     if load.positions is not None:

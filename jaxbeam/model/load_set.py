@@ -226,7 +226,7 @@ def load_set(case: Case) -> LoadSet:
     return LoadSet(
         trajectories,
         _wheels(case.loads, vehicles),
-        tuple(wheel_distances(load, case.run.gravity) for load in case.loads),
+        tuple(map(wheel_distances, case.loads, vehicles)),
         case.profile,
     )
 

@@ -37,7 +37,7 @@ def plot_vehicles(loads: Sequence[AbstractLoad], titles: Sequence[str] = ()) -> 
 
 
 def _draw(axes, load: AbstractLoad) -> None:
-    behind = np.asarray(concrete(wheel_distances(load, np.float64(9.81))))
+    behind = np.asarray(concrete(wheel_distances(load, load.vehicle(np.float64(9.81)))))
     span = float(np.max(behind))
     length = span or 3.0
     positions = span - behind

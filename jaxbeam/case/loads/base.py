@@ -145,6 +145,6 @@ def trajectory(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewis
     return load.trajectory(length)
 
 
-def wheel_distances(load: AbstractLoad, gravity: Float[Array, ""]) -> Float[Array, " wheel"]:
-    """Distances (m) of all wheels of a load behind its first one."""
-    return (load.spacings()[:, None] + load.vehicle(gravity).offsets).reshape(-1)
+def wheel_distances(load: AbstractLoad, vehicle: VehicleModel) -> Float[Array, " wheel"]:
+    """Distances (m) of all wheels of a load, whose vehicles are given, behind its first one."""
+    return (load.spacings()[:, None] + vehicle.offsets).reshape(-1)
