@@ -19,6 +19,8 @@ from .case.actuators.point import PointForce as PointForce
 from .case.actuators.shaker import Shaker as Shaker
 from .case.actuators.spring import SpringDamper as SpringDamper
 from .case.beam import Beam as Beam, Support as Support
+from .case.beam_parts.hinge import Hinge as Hinge
+from .case.beam_parts.segment import Segment as Segment
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
 from .case.filters import Filter as Filter
 from .case.loads.axles import Axles as Axles

@@ -21,7 +21,7 @@ NODE_TOLERANCE = 1e-9  # of the length: closer nodes are one node
 # convergence; static solutions are series of a fixed degree on parts of the elements, in which
 # exponentials grow by less than e^MAX_GROWTH and depths fall to no less than a third.
 VARIATION_DEGREE, MAX_VARIATION_DEGREE = 12, 60
-MAX_GROWTH, MAX_TAPER, MAX_PARTS = 3.0, 2.2, 400
+MAX_GROWTH, MAX_TAPER, MAX_PARTS = 1.0, 2.2, 400
 SAMPLES = np.linspace(0, 1, 33)  # of a segment, for estimates of how its properties vary
 
 

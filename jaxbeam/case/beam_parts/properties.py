@@ -103,10 +103,6 @@ def mean(beam, of) -> Float[Array, ""]:
 
 def validate_segments(address: str, beam) -> str | None:
     """First inconsistency of the segments of a beam as an error message, or None."""
-    for i, segment in enumerate(beam.segments):
-        error = _validate_segment(f"{address}.segments.{i}", beam, segment, i)
-        if error is not None:
-            return error
     name = "shear_stiffness"
     lacking = [i for i, segment in enumerate(beam.segments) if getattr(segment, name) is None]
     if lacking and has(beam, name) and getattr(beam, name) is None:
@@ -114,6 +110,10 @@ def validate_segments(address: str, beam) -> str | None:
             f"{address}.segments.{lacking[0]}.{name} is missing: give it to every segment, or"
             f" {address}.{name} for those without"
         )
+    for i, segment in enumerate(beam.segments):
+        error = _validate_segment(f"{address}.segments.{i}", beam, segment, i)
+        if error is not None:
+            return error
     lengths = [segment.length for segment in beam.segments if segment.length is not None]
     if lengths and all(map(is_concrete, (*lengths, beam.length))):
         total, whole = sum(float(concrete(length)) for length in lengths), concrete(beam.length)

@@ -1,5 +1,6 @@
 """Buckling of a beam in compression."""
 
+import equinox as eqx
 import numpy as np
 
 from jaxbeam.case.case import Case, concrete_case
@@ -9,6 +10,7 @@ from jaxbeam.model.theory.elements import assemble_sections
 from jaxbeam.model.theory.sections import sections
 from jaxbeam.runtime.arrays import xp
 
+NO_FORCE = 1e-6  # of E I / L^2: a critical force below this is that of a rigid body
 RIGID_BODY_SHIFT = 1e-10  # of the mass matrix: makes the stiffness of a free beam invertible
 
 
@@ -18,6 +20,12 @@ def check_buckling(case: Case, layout: Layout) -> None:
     if force is None or not float(concrete(force)) < 0:
         return
     critical = critical_axial_force(concrete_case(case), layout)
+    if critical > -NO_FORCE * float(concrete(case.beam.bending_stiffness / case.beam.length**2)):
+        raise ValueError(
+            f"beam.axial_force is {float(concrete(force)):g} N, but the beam ({case.beam.ends}) can"
+            " turn as a rigid body, so that any compression makes it buckle: hold it, or leave the"
+            " compression out"
+        )
     if float(concrete(force)) <= critical:
         raise ValueError(
             f"beam.axial_force is {float(concrete(force)):g} N, but the beam buckles at"
@@ -33,9 +41,7 @@ def critical_axial_force(case: Case, layout: Layout) -> float:
     found = sections(case, layout)
     matrices = []
     for axial_force in (0.0, 1.0):
-        changed = type(found)(
-            found.nodes, found.series, xp.asarray(axial_force), found.shear_flexible
-        )
+        changed = eqx.tree_at(lambda s: s.axial_force, found, xp.asarray(axial_force))
         stiffness, mass, *_ = assemble_sections(case, layout, changed)
         matrices.append(np.asarray(stiffness))
     stiffness = matrices[0] + RIGID_BODY_SHIFT * np.asarray(mass)
