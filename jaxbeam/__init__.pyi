@@ -19,6 +19,7 @@ from .case.actuators.point import PointForce as PointForce
 from .case.actuators.shaker import Shaker as Shaker
 from .case.actuators.spring import SpringDamper as SpringDamper
 from .case.beam import Beam as Beam, Support as Support
+from .case.beam_parts.damping import rayleigh_coefficients as rayleigh_coefficients
 from .case.beam_parts.hinge import Hinge as Hinge
 from .case.beam_parts.segment import Segment as Segment
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace

@@ -4,6 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.beam_parts.damping import MATERIALS
 from jaxbeam.case.beam_parts.hinge import Hinge
 from jaxbeam.case.beam_parts.properties import (
     OPTIONAL,
@@ -71,7 +72,9 @@ class Beam(eqx.Module):
     constant, tension positive, compression negative.
 
     Damping is modal: one `damping_ratio` for all modes or one for each; or, when
-    `rayleigh_damping` is given, proportional to mass and stiffness, D = a M + b K.
+    `rayleigh_damping` is given, proportional to mass and stiffness, D = a M + b K. A `loss_factor`
+    eta of hysteretic damping is taken as the equivalent ratio eta / 2 of every mode. A `material`
+    has the ratio of EN 1991-2, table 6.6, for the longest span of the beam.
     """
 
     length: Float[Array, ""] = number("m", "total length", POSITIVE)
@@ -104,6 +107,10 @@ class Beam(eqx.Module):
     foundation_stiffness: Float[Array, ""] | None = number(
         "N/m^2", "elastic foundation, force per length and deflection", NOT_NEGATIVE, default=None
     )
+    loss_factor: Float[Array, ""] | None = number(
+        "1", "loss factor of hysteretic damping", NOT_NEGATIVE, default=None
+    )
+    material: str = choice("material of a bridge, for its damping", "", *MATERIALS, default="")
     axial_force: Float[Array, ""] | None = number(
         "N", "axial force, tension positive", default=None
     )
@@ -212,7 +219,13 @@ class Beam(eqx.Module):
                 f"{address}.damping_ratio lists {ratio_shape[0]} values for {self.modes} modes;"
                 " give one for each mode, or a single number for all"
             )
-        both_given = self.rayleigh_damping is not None and is_concrete(self.damping_ratio)
-        if both_given and concrete(self.damping_ratio).any():
-            return f"{address} has both damping_ratio and rayleigh_damping; leave one out"
+        given = []
+        if is_concrete(self.damping_ratio) and concrete(self.damping_ratio).any():
+            given.append("damping_ratio")
+        for name in ("rayleigh_damping", "loss_factor", "material"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, str) and not value):
+                given.append(name)
+        if len(given) > 1:
+            return f"{address} has both {given[0]} and {given[1]}; leave one out"
         return None

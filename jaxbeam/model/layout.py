@@ -14,6 +14,7 @@ from jaxbeam.case.beam_parts.properties import (
 from jaxbeam.case.beam_parts.segment import Segment
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
+from jaxbeam.runtime.arrays import xp
 
 NODE_TOLERANCE = 1e-9  # of the length: closer nodes are one node
 
@@ -95,6 +96,22 @@ def actuator_nodes(case: Case, layout: Layout) -> list[int]:
     first = 2 + sum(_counts(case)) + len(case.beam.hinges)
     nodes = {index: node for node, indices in enumerate(layout.nodes) for index in indices}
     return [nodes[first + i] for i in range(len(actuator_terms(case)))]
+
+
+def longest_span(case: Case, layout: Layout, nodes):
+    """Longest distance between neighbouring nodes with supports, rigid or elastic, of some `nodes`.
+
+    In the unit of the nodes; the whole length if fewer than two are supported.
+    """
+    supports = range(2, 2 + len(case.supports))
+    held = [
+        i
+        for i, (indices, (fixed, _)) in enumerate(
+            zip(layout.nodes, layout.constrained, strict=True)
+        )
+        if fixed or any(index in supports for index in indices)
+    ]
+    return nodes[-1] - nodes[0] if len(held) < 2 else xp.max(xp.diff(nodes[np.array(held)]))
 
 
 def _stiffened_sections(case: Case) -> list:

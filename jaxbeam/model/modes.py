@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
+from jaxbeam.case.beam_parts.damping import MATERIALS
 from jaxbeam.case.case import Case
-from jaxbeam.model.layout import Layout, find_layout, is_uniform, node_positions
+from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
 from jaxbeam.model.theory.buckling import check_buckling
 from jaxbeam.model.theory.elements import assemble_sections, bending_basis
 from jaxbeam.model.theory.fields import SLOPE, FieldParts, section_fields
@@ -181,8 +182,10 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
         return _without_rounding(series) / unit
 
     rotation = None if to_rotation is None else shapes(to_rotation) / beam.length
+    nodes = nodes * beam.length
+    span = longest_span(case, layout, nodes)
     return normalised_modes(
-        beam, values, coupling, nodes * beam.length, shapes(to_series), layout, found, rotation
+        beam, values, coupling, nodes, shapes(to_series), layout, found, rotation, span
     )
 
 
@@ -197,10 +200,10 @@ def _without_rounding(series):
 
 
 def normalised_modes(
-    beam, values, coupling, nodes, series, layout: Layout, sections=None, rotation=None
+    beam, values, coupling, nodes, series, layout: Layout, sections=None, rotation=None, span=None
 ) -> Modes:
     """Modes of given stiffness (1/s^2) with the beam's damping, positive near the left end."""
-    damping, damping_coupling = _damping(beam, values, coupling)
+    damping, damping_coupling = _damping(beam, values, coupling, span)
     left_values = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
     signs = stop_gradient(xp.where(left_values < 0, -1.0, 1.0))
     sign_products = signs[:, None] * signs[None, :]
@@ -294,7 +297,7 @@ def supported_matrices(case: Case, layout: Layout):
                 yield case.supports[index - 2], i
 
 
-def _damping(beam, values, coupling):
+def _damping(beam, values, coupling, span):
     """Modal damping (1/s), and damping between repeated modes (mode, mode).
 
     Rayleigh damping, a + b K; or modal ratios, D = 2 zeta sqrt(K), whose derivative between
@@ -303,7 +306,12 @@ def _damping(beam, values, coupling):
     if beam.rayleigh_damping is not None:
         mass_factor, stiffness_factor = beam.rayleigh_damping
         return mass_factor + stiffness_factor * values, stiffness_factor * coupling
-    ratios = xp.broadcast_to(beam.damping_ratio, values.shape)
+    ratio = beam.damping_ratio
+    if beam.loss_factor is not None:
+        ratio = beam.loss_factor / 2
+    if beam.material:
+        ratio = MATERIALS[beam.material].at(beam.length if span is None else span)
+    ratios = xp.broadcast_to(ratio, values.shape)
     omega = _safe_sqrt(values)
     sums = omega[:, None] + omega[None, :]
     coupling_factor = xp.where(
