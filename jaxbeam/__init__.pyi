@@ -86,6 +86,7 @@ from .model.frequency_response import (
     receptance as receptance,
 )
 from .model.modes import modes as modes
+from .model.settlement import settlement_response as settlement_response
 from .model.state_space import state_space as state_space
 from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force
 from .model.statics import (

@@ -21,8 +21,7 @@ class MaterialDamping(NamedTuple):
         return self.ratio + self.increase * xp.maximum(LIMIT_SPAN - span, 0.0)
 
 
-# EN 1991-2, table 6.6, as in the function `ec1damping` of the open train-bridge solver in Julia
-# that the search of public code finds under "EC1 damping".
+# EN 1991-2, table 6.6; numbers as in the function `ec1damping` of a public solver in Julia.
 MATERIALS = {
     "steel": MaterialDamping(0.005, 0.00125),
     "composite": MaterialDamping(0.005, 0.00125),

@@ -15,7 +15,10 @@ RIGID_BODY_SHIFT = 1e-10  # of the mass matrix: makes the stiffness of a free be
 
 
 def check_buckling(case: Case, layout: Layout) -> None:
-    """Raise ValueError, with the critical force, for a beam whose compression makes it buckle."""
+    """Check that the axial force does not make the beam buckle.
+
+    Raises ValueError, with the critical force.
+    """
     force = case.beam.axial_force
     if force is None or not float(concrete(force)) < 0:
         return
