@@ -50,7 +50,7 @@ def of_modes(record: jb.Record, sensor: jb.Sensor) -> np.ndarray:
     """History of a sensor's quantity as the sum of the modes."""
     modes, motion = record.modes, record.motion
     parameters = sensor.position, sensor.quantity, sensor.fibre_distance
-    row = modal_row(modes.shape_derivatives, record.case, *parameters)
+    row = modal_row(modes.fields, record.case, *parameters)
     return np.asarray(motion[QUANTITIES[sensor.quantity].time_derivative]) @ np.asarray(row)
 
 

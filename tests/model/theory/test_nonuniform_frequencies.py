@@ -10,7 +10,9 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace, value_at
+from jaxbeam.model.layout import find_layout
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.theory.buckling import critical_axial_force
 from tests.differences import central
 from tests.modules import ROOT
 from tests.oracles.shooting import ShootingBeam
@@ -279,3 +281,22 @@ def test_bad_loads_and_bearings():
         jb.simulate(jb.Case(jb.Beam(**UNIT, hinges=[jb.Hinge(0.5)]), loads=[mass]))
     with pytest.raises(ValueError, match="supports.0.mass would have no effect"):
         jb.simulate(jb.Case(jb.Beam(**UNIT), supports=[jb.Support(0.5, mass=1.0)]))
+
+
+def test_both_branches_of_timoshenko():
+    """Two pins: a omega^4 - (1 + k^2 (r + 1 / kGA)) omega^2 + k^4 = 0, and pure shear at k = 0."""
+    shear, rotary = 384.615384615, 0.01 / 12
+    k = np.arange(1, 30) * np.pi
+    a, b = rotary / shear, 1 + k**2 * (rotary + 1 / shear)
+    root = np.sqrt(b**2 - 4 * a * k**4)
+    squares = np.concatenate([(b - root) / (2 * a), (b + root) / (2 * a), [shear / rotary]])
+    found = frequencies(**UNIT, modes=24, shear_stiffness=shear, rotary_inertia=rotary)
+    assert_allclose(found, np.sqrt(np.sort(squares))[:24], rtol=1e-10)
+
+
+@pytest.mark.parametrize("shear", [5.0, 50.0])
+def test_buckling_with_shear(shear):
+    """Engesser's load: P_E / (1 + P_E / kGA)."""
+    critical = np.pi**2 / (1 + np.pi**2 / shear)
+    case = jb.Case(jb.Beam(**UNIT, shear_stiffness=shear, axial_force=-1.0))
+    assert_allclose(critical_axial_force(case, find_layout(case)), -critical, rtol=1e-10)
