@@ -9,6 +9,7 @@ from typing import NoReturn
 
 from cyclopts import App, CycloptsError, Group, Parameter
 
+from jaxbeam.cli.commands.check import check
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
 from jaxbeam.cli.commands.export import export
@@ -24,7 +25,7 @@ from jaxbeam.cli.commands.weigh import identify_responses, weigh
 from jaxbeam.cli.options import print_message
 
 COMMANDS = {
-    "Simulation": (modes, frf, simulate, sweep, describe),
+    "Simulation": (check, describe, modes, frf, simulate, sweep),
     "Control": (compare, stability, tune, export),
     "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
     "Other": (demo, reproduce, native),

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from jaxbeam.cli import main
 from tests.cli.example import CASE
 
 
@@ -97,6 +98,7 @@ def test_simulate_prints_and_writes_the_same(run, folder):
         "error_estimate",
         "steps",
         "verdict",
+        "plausibility",
     }
     printed = run("simulate case.toml -o out.nc --plot --animate out.gif")
     assert f"{float(record.peak_deflection[0]):.6g}" in printed
@@ -104,6 +106,23 @@ def test_simulate_prints_and_writes_the_same(run, folder):
     assert (folder / "out.nc").stat().st_size > 0
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "out.gif").read_bytes().startswith(b"GIF89a")
+
+
+def test_what_looks_wrong_is_said_before_a_run(run, folder, capsys):
+    found = run("check case.toml --json")
+    assert found["first_frequency"] == pytest.approx(frequency(1))
+    assert found["warnings"] == []
+    assert "nothing looks wrong" in run("check case.toml")
+    for command in ("simulate case.toml", "sweep case.toml --over loads.0.mass=0.1,0.5"):
+        lines = run(command).splitlines()
+        assert lines[0].startswith("plausibility: first frequency 20.39 Hz")
+    for command in ("check", "simulate", "sweep --over loads.0.speed=0.5,1"):
+        name, *more = command.split()
+        with pytest.raises(SystemExit):
+            main([name, "case.toml", *more, "--set", "run.duration=1.5", "--set", "loads.0.mass=9"])
+        printed = capsys.readouterr()
+        assert printed.err.count("jaxbeam: warning: the beam sags by") == 1
+        assert "written" not in printed.out
 
 
 def test_an_accelerometer_is_not_reported_as_deflection(run):

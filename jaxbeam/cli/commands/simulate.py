@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix, figure_path
-from jaxbeam.cli.options import CaseOptions, Output, table
+from jaxbeam.cli.options import CaseOptions, Output, print_plausibility, table
 
 MAX_WHEELS = 8  # of a load, or bodies, with a row each
 
@@ -38,6 +38,7 @@ def simulate(
     picture = figure_path(output, case) if plot else None
     options.check_outputs(output, picture, animate)
     parsed_case = options.read(case)
+    plausibility = print_plausibility(parsed_case, options)
 
     from jaxbeam.simulation.simulate import ContactLossWarning
 
@@ -54,7 +55,8 @@ def simulate(
         from jaxbeam.plot import animate as write_animation
 
         write_animation(record, animate, overwrite=options.overwrite)
-    options.report(_to_dict(record), _lines(record), output, picture, animate)
+    content = _to_dict(record) | {"plausibility": plausibility}
+    options.report(content, _lines(record), output, picture, animate)
 
 
 def _to_dict(record: "jb.Record") -> dict:
