@@ -52,9 +52,10 @@ def check(case: Case) -> Plausibility:
     """
     check_case(case)
     case = concrete_case(case)
-    found = modes(case)
-    numbers = plausible_numbers(case, found)
-    return dataclasses.replace(numbers, warnings=tuple(_warnings(case, found, numbers)))
+    with np.errstate(all="ignore"):  # of numbers that no beam has
+        found = modes(case)
+        numbers = plausible_numbers(case, found)
+        return dataclasses.replace(numbers, warnings=tuple(_warnings(case, found, numbers)))
 
 
 def _warnings(case: Case, found: Modes, numbers: Plausibility) -> Iterator[str]:
@@ -151,7 +152,9 @@ def _travel_warnings(case: Case, numbers: Plausibility) -> Iterator[str]:
     )
     limit, traffic = (ROAD_SPEED, "road vehicle") if on_road else (RAIL_SPEED, "train in service")
     if length >= LEAST_BRIDGE and numbers.speed > limit:
-        yield f"{kmh}, faster than any {traffic}: give speeds in m/s, not in km/h"
+        yield (
+            f"{kmh}, faster than any {traffic}: give speeds in m/s, not in km/h, or with their unit"
+        )
     elif numbers.speed_ratio is not None and numbers.speed_ratio > 1:
         yield (
             f"the loads are faster than the critical speed of {numbers.critical_speed:.4g} m/s"
@@ -172,7 +175,7 @@ def _support_warnings(case: Case) -> Iterator[str]:
     for (left, k, first), (right, other_k, second) in itertools.pairwise(sorted(held)):
         apart = right - left
         flexibility = sum(1 / each if each else math.inf for each in (k, other_k))
-        stiff = apart**2 > CLAMPING_STIFFNESS * unit * flexibility
+        stiff = apart * apart > CLAMPING_STIFFNESS * unit * flexibility
         if 0 < apart < CLAMPING_DISTANCE * length and stiff:
             yield (
                 f"{first} and {second} are only {apart:.3g} m apart, and clamp the beam: are"

@@ -29,8 +29,9 @@ Free = Annotated[
 Over = Annotated[
     tuple[str, ...],
     Parameter(
-        help="ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: values of a parameter, or words, as"
-        " loads.0.train=HSLM-A1,HSLM-A2; all combinations are computed if it is repeated for more."
+        help="ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: values of a parameter, with units, as"
+        " 60 km/h:200 km/h:15, or words, as loads.0.train=HSLM-A1,HSLM-A2; all combinations are"
+        " computed if it is repeated for more."
     ),
 ]
 Starts = Annotated[
@@ -85,7 +86,11 @@ class CaseOptions(OutputOptions):
 
     set_: Annotated[
         tuple[str, ...],
-        Parameter("--set", help="ADDRESS=VALUE: change an entry of the case; repeat it for more."),
+        Parameter(
+            "--set",
+            help="ADDRESS=VALUE: change an entry of the case, also with a unit, as"
+            " beam.length='25 m'; repeat it for more.",
+        ),
     ] = ()
 
     def check_case(self, path: Path) -> None:

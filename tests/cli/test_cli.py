@@ -1,6 +1,7 @@
 """Commands: results printed and files written; one sentence for a command line that is wrong."""
 
 import itertools
+import json
 import math
 
 import numpy as np
@@ -123,6 +124,26 @@ def test_what_looks_wrong_is_said_before_a_run(run, folder, capsys):
         printed = capsys.readouterr()
         assert printed.err.count("jaxbeam: warning: the beam sags by") == 1
         assert "written" not in printed.out
+
+
+def test_units_on_the_command_line(run, capsys):
+    options = ["--set", "beam.length=600 mm", "--set", "beam.damping_ratio=1 %,2 %,3 %", "--json"]
+    with pytest.raises(SystemExit):
+        main(["modes", "case.toml", *options])
+    found = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(found["damping_ratios"], [0.01, 0.02, 0.03], rtol=1e-9)
+    assert found["frequencies_hz"][0] == pytest.approx(frequency(1))
+    for over in ("3.6 km/h:7.2 km/h:3", "3.6 km/h,1.5 m/s,200 cm/s"):
+        with pytest.raises(SystemExit):
+            main(["sweep", "case.toml", "--over", f"loads.0.speed={over}", "--json"])
+        values = json.loads(capsys.readouterr().out)["values"]["loads.0.speed"]
+        np.testing.assert_allclose(values, [1.0, 1.5, 2.0], rtol=1e-12)
+    with pytest.raises(SystemExit):
+        main(["sweep", "case.toml", "--over", "loads.0.speed=3 km/h:7 m/s:3"])
+    assert "both ends of a range have the same unit" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["simulate", "case.toml", "--set", "loads.0.mass=5 N"])
+    assert "loads.0.mass must be in kg, or a unit of the same kind" in capsys.readouterr().err
 
 
 def test_an_accelerometer_is_not_reported_as_deflection(run):

@@ -93,6 +93,7 @@ def sweep(
         from jaxbeam.plot import plot_sweep
 
         plot_sweep(results).savefig(picture)
+    values = {address: results[address].to_numpy().tolist() for address in values}  # in SI units
     peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
     del peaks["peak_time"]
     numbers = {name: found.to_numpy() for name, found in peaks.items()}
