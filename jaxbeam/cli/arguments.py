@@ -208,11 +208,15 @@ def check_exists(kind: str, *paths: Path) -> None:
             raise FileNotFoundError(f"{path}: there is no such {kind}")
 
 
-def check_suffix(path: Path | None, suffix: str, content: str) -> None:
-    """Raises ValueError if a file has not the suffix of its content."""
-    if path and path.suffix != suffix:
+TABLE_SUFFIXES = (".csv", ".xlsx", ".mat", ".parquet")
+
+
+def check_suffix(path: Path | None, suffix: str, content: str, others: Sequence[str] = ()) -> None:
+    """Raises ValueError if a file has not the suffix of its content, nor one of the others."""
+    if path and path.suffix not in (suffix, *others):
+        more = f", or {', '.join(others)}" if others else ""
         raise ValueError(
-            f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}"
+            f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}{more}"
         )
 
 

@@ -146,6 +146,21 @@ def test_units_on_the_command_line(run, capsys):
     assert "loads.0.mass must be in kg, or a unit of the same kind" in capsys.readouterr().err
 
 
+def test_a_record_as_a_table(run, folder):
+    assert "written: out.csv" in run("simulate case.toml -o out.csv")
+    heads, *rows = (folder / "out.csv").read_text().splitlines()
+    assert heads.split(",")[:2] == ["time (s)", "sensor 0 deflection (m)"]
+    assert len(rows) == 201
+
+
+def test_modes_as_a_table(run, folder):
+    assert "written: modes.csv" in run("modes case.toml -o modes.csv")
+    table = np.loadtxt(folder / "modes.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(table[:, 0], [1, 2, 3])
+    np.testing.assert_allclose(table[:, 1], [frequency(n) for n in (1, 2, 3)], rtol=1e-9)
+    np.testing.assert_allclose(table[:, 2], 0.03, rtol=1e-9)
+
+
 def test_an_accelerometer_is_not_reported_as_deflection(run):
     line = "case.toml --set sensors.1.quantity=acceleration --set sensors.1.name=deck"
     found = run(f"simulate {line} --json")
