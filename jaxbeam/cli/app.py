@@ -16,6 +16,7 @@ from jaxbeam.cli.commands.export import export
 from jaxbeam.cli.commands.frequency import frf, modes
 from jaxbeam.cli.commands.identify import identify
 from jaxbeam.cli.commands.models import compare_models, design_experiment
+from jaxbeam.cli.commands.new import new
 from jaxbeam.cli.commands.simulate import simulate
 from jaxbeam.cli.commands.stability import stability
 from jaxbeam.cli.commands.sweep import native, sweep
@@ -25,7 +26,7 @@ from jaxbeam.cli.commands.weigh import identify_responses, weigh
 from jaxbeam.cli.options import print_message
 
 COMMANDS = {
-    "Simulation": (check, describe, modes, frf, simulate, sweep),
+    "Simulation": (new, check, describe, modes, frf, simulate, sweep),
     "Control": (compare, stability, tune, export),
     "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
     "Other": (demo, reproduce, native),
