@@ -78,6 +78,7 @@ KEYS = {
         "plausibility": PLAUSIBILITY,
     },
     "describe case.toml": {
+        "case": PLAUSIBILITY | {"frequencies_hz": None},
         "vehicles": [
             {
                 "title": None,
@@ -91,7 +92,7 @@ KEYS = {
                 "degrees_of_freedom": None,
                 "frequencies_hz": None,
             }
-        ]
+        ],
     },
     "sweep case.toml --over loads.0.mass=0.3,0.5": {
         "values": {"loads.0.mass": None},
