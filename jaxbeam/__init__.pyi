@@ -4,6 +4,8 @@ from .analysis.amplification import (
     envelope as envelope,
 )
 from .analysis.bound.bound import bound as bound
+from .analysis.plausibility import check as check
+from .analysis.plausible_numbers import Plausibility as Plausibility
 from .analysis.ride import (
     RideMeasures as RideMeasures,
     ride_measures as ride_measures,

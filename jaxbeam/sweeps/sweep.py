@@ -35,7 +35,8 @@ def sweep(
 ) -> "xarray.Dataset":
     """Simulate a case for many values of the numbers, and for words, at given addresses.
 
-    `over` maps each address to a list of values (SI units): all combinations, with a dimension per
+    `over` maps each address to a list of values (SI units, or text with units, as
+    "60 km/h"): all combinations, with a dimension per
     address, or with `paired` the first of each, the second, and so on along `run`. An address such
     as `loads.*.speed` is the speed of all loads. A list of words, as trains of the library at
     `loads.0.train` or models of vehicles at `loads.0.model`, makes a case of each, and a dimension
