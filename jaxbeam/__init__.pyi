@@ -21,6 +21,9 @@ from .case.actuators.point import PointForce as PointForce
 from .case.actuators.shaker import Shaker as Shaker
 from .case.actuators.spring import SpringDamper as SpringDamper
 from .case.beam import Beam as Beam, Support as Support
+from .case.beam_parts.damping import rayleigh_coefficients as rayleigh_coefficients
+from .case.beam_parts.hinge import Hinge as Hinge
+from .case.beam_parts.segment import Segment as Segment
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
 from .case.filters import Filter as Filter
 from .case.loads.axles import Axles as Axles
@@ -85,6 +88,7 @@ from .model.frequency_response import (
     receptance as receptance,
 )
 from .model.modes import modes as modes
+from .model.settlement import settlement_response as settlement_response
 from .model.state_space import state_space as state_space
 from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force
 from .model.statics import (

@@ -152,6 +152,6 @@ def deflection_rows(
     plant: Plant, positions: Float[Array, " position"]
 ) -> Float[Array, "position state"]:
     """Rows that map the states of a plant to the deflections at positions (m)."""
-    rows = modal_row(plant.modal_model.shapes, plant.case, positions, "deflection")
+    rows = modal_row(plant.modal_model.fields, plant.case, positions, "deflection")
     rows = rows / plant.coordinate_scale
     return xp.pad(rows, ((0, 0), (0, plant.modal_model.state_count - rows.shape[1])))
