@@ -51,7 +51,7 @@ def jogging_factors(
 
     `contact` is the contact time (s).
     """
-    u = np.arange(1, harmonics + 1) * (pace * contact)[..., None]
+    u = xp.asarray((pace * contact)[..., None] * np.arange(1, harmonics + 1))
     # cos(pi u) / (1 - 4 u^2), which is finite at u = 1/2 too.
     factors = np.pi / 2 * (xp.sinc(u - 0.5) + xp.sinc(u + 0.5))
-    return factors, np.pi / 2 - np.pi * u
+    return factors, xp.asarray(np.pi / 2 - np.pi * u)
