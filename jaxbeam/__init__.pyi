@@ -42,6 +42,8 @@ from .case.loads.quarter_car import QuarterCar as QuarterCar
 from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad
 from .case.loads.wagon import Wagon as Wagon
+from .case.loads.walking.crowd import Crowd as Crowd
+from .case.loads.walking.pedestrian import Pedestrian as Pedestrian
 from .case.profiles.bump import BumpProfile as BumpProfile
 from .case.profiles.iso8608 import ISO8608Profile as ISO8608Profile
 from .case.profiles.rail import RailProfile as RailProfile
