@@ -16,19 +16,19 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.model.contact_rows import (
+from jaxbeam.model.linear_system import Signal, StateSpace
+from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
+from jaxbeam.model.modes import Layout
+from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.vehicles.contact_rows import (
     ContactRows,
     contact_rows,
     has_known_disturbance,
     known_disturbance,
     vehicle_system,
 )
-from jaxbeam.model.linear_system import Signal, StateSpace
-from jaxbeam.model.load_set import LoadSet, load_set
-from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
-from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensing.output_rows import sensor_rows
-from jaxbeam.model.vehicle_states import initial_vehicle_states, vehicle_signals
+from jaxbeam.model.vehicles.vehicle_states import initial_vehicle_states, vehicle_signals
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled_if_traced

@@ -124,8 +124,9 @@ def integration_plan(
 ) -> IntegrationPlan:
     """Integration plan of a case with concrete numbers, for samples at `times` (s).
 
-    Default times are those of the run, which ends at its duration. `tolerance` is relative to the largest deflection. Raises
-    ValueError for an invalid case, RuntimeError if no time step meets the tolerance.
+    Default times are those of the run, which ends at its duration. `tolerance` is relative to the
+    largest deflection. Raises ValueError for an invalid case, RuntimeError if no time step meets
+    the tolerance.
     """
     check_case(case)
     case = concrete_case(case)
@@ -184,7 +185,8 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
 def sample_times(case: Case) -> Float[Array, " time"]:
     """Times (s) of the samples of a run: from 0 to its duration at its sample rate.
 
-    A run too short for a second sample has one at its end. Raises ValueError if there are more than MAX_STEPS.
+    A run too short for a second sample has one at its end. Raises ValueError if there are more than
+    MAX_STEPS.
     """
     duration, rate = float(concrete(case.run.duration)), float(concrete(case.run.sample_rate))
     if duration * rate > MAX_STEPS:

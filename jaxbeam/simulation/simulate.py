@@ -50,8 +50,8 @@ def simulate(
     `jaxbeam.model.contact`), to `tolerance` (relative to the largest deflection) by exponential
     collocation. Samples are at the sample rate of the run, which ends at its duration, or at
     ascending `times` (s), with the last of which it then ends. Samples do not depend on the time
-    step, peaks not on the sample rate. Differentiable in every number of the case, forward and in reverse.
-    Inside `jit` or `vmap`, give a `plan` made outside by
+    step, peaks not on the sample rate. Differentiable in every number of the case, forward and in
+    reverse. Inside `jit` or `vmap`, give a `plan` made outside by
     `jaxbeam.simulation.integration_plan.integration_plan`.
 
     Raises ValueError for an invalid case or times, RuntimeError if no time step meets the

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from jaxbeam.model.contact_rows import (
+from jaxbeam.model.load_set import LoadSet
+from jaxbeam.model.state_space import Plant
+from jaxbeam.model.vehicles.contact_rows import (
     contact_rows,
     has_known_disturbance,
     known_disturbance,
     vehicle_system,
 )
-from jaxbeam.model.load_set import LoadSet
-from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.coupled_stages import ConstantPlant, Coupling
 from jaxbeam.numerics.finite_horizon import CouplingFunction
 from jaxbeam.runtime.arrays import block_diag, set_at, xp

@@ -28,7 +28,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.sensor_signals import sensor_sections
 from jaxbeam.model.state_space import state_space
-from jaxbeam.model.vehicle_states import vehicle_signals
+from jaxbeam.model.vehicles.vehicle_states import vehicle_signals
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 
