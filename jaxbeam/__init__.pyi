@@ -4,6 +4,8 @@ from .analysis.amplification import (
     envelope as envelope,
 )
 from .analysis.bound.bound import bound as bound
+from .analysis.plausibility import check as check
+from .analysis.plausible_numbers import Plausibility as Plausibility
 from .analysis.ride import (
     RideMeasures as RideMeasures,
     ride_measures as ride_measures,
@@ -40,6 +42,8 @@ from .case.loads.quarter_car import QuarterCar as QuarterCar
 from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad
 from .case.loads.wagon import Wagon as Wagon
+from .case.loads.walking.crowd import Crowd as Crowd
+from .case.loads.walking.pedestrian import Pedestrian as Pedestrian
 from .case.profiles.bump import BumpProfile as BumpProfile
 from .case.profiles.iso8608 import ISO8608Profile as ISO8608Profile
 from .case.profiles.rail import RailProfile as RailProfile

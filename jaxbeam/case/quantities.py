@@ -6,6 +6,8 @@ responses, and histories of records derive from it (rows: `model.sensing.output_
 
 from typing import NamedTuple
 
+OF_QUANTITY = "unit of quantity"  # unit of the entries of a sensor that are in that of its quantity
+
 
 class Quantity(NamedTuple):
     """Unit of a quantity, and its orders of derivation of w by position and by time.

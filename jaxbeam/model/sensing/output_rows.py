@@ -88,11 +88,12 @@ class OutputRows(Module):
     def of_system(
         self, model: ModalModel, A: Float[Array, "state state"], B: Float[Array, "state input"]
     ) -> tuple[Float[Array, "output state"], Float[Array, "output input"]]:
-        """C and D of y = C z + D u where z' = A z + B u; the states are those of the model.
+        """C and D of y = C z + D u where z' = A z + B u; the first states are those of the model.
 
         Commands are the first of the inputs.
         """
         C, _ = self.on_states(model)
+        C = xp.pad(C, ((0, 0), (0, A.shape[1] - C.shape[1])))
         D = xp.zeros((C.shape[0], B.shape[1]))
         D = set_at(D, np.s_[:, : self.on_commands.shape[1]], self.on_commands)
         rates = model.rate_index
