@@ -74,8 +74,17 @@ from .control.optimal.lqr import LQR as LQR
 from .control.optimal.sampled_lqr import DiscreteLQR as DiscreteLQR
 from .control.optimal.sampling_loss import sampling_limit as sampling_limit
 from .control.optimal.scheduled_lqr import ScheduledLQR as ScheduledLQR
+from .control.output_feedback import OutputFeedback as OutputFeedback
 from .control.predictive.mpc import MPC as MPC
 from .control.prescribed import Prescribed as Prescribed
+from .control.receptance import (
+    ReceptanceFeedback as ReceptanceFeedback,
+    closed_loop_poles as closed_loop_poles,
+    fit_receptances as fit_receptances,
+    receptance_feedback as receptance_feedback,
+    receptance_gains as receptance_gains,
+    receptances as receptances,
+)
 from .control.scheduled_feedback import ScheduledFeedback as ScheduledFeedback
 from .control.state_feedback import StateFeedback as StateFeedback
 from .estimation.inversion import Inversion as Inversion

@@ -1,0 +1,289 @@
+"""Receptance method of pole placement: gains of displacement and velocity feedback.
+
+An actuator is driven by the deflections at the sensors, u = g . w(t - tau) + f . w'(t - tau). With
+the receptances r(s), the deflections per command, a pole s of the loop satisfies
+
+    exp(-s tau) (g + s f) . r(s) = 1,
+
+which is linear in g and f: poles are assigned from receptances alone, without mass, stiffness or
+damping matrices (Ram and Mottershead, AIAA Journal 45, 2007; with delays Ram, Singh and
+Mottershead, Mechanical Systems and Signal Processing 23, 2009). An open-loop pole s whose mode has
+the deflections v at the sensors stays where (g + s f) . v = 0. Actuators with dynamics are part of
+the receptances.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+from numpy.typing import ArrayLike
+
+from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.validation import check_case
+from jaxbeam.control.output_feedback import OutputFeedback
+from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.runtime.arrays import Array, is_jax, solve, xp
+
+COLLOCATION_NODES = 24  # over a delay; the rightmost poles are refined afterwards
+REFINEMENTS = 20  # at most, of each pole
+MAX_TURN = 300.0  # |s| times the delay
+
+
+class ReceptanceFeedback(eqx.Module):
+    """Law u = g . w(t - delay) + f . w'(t - delay) of an actuator; w are deflections at sensors.
+
+    `displacement` are the gains g (command per m), `velocity` the gains f (command per m/s),
+    `delay` is in s. `actuator` is the index of the actuator.
+    """
+
+    displacement: Float[Array, " sensor"]
+    velocity: Float[Array, " sensor"]
+    delay: Float[Array, ""]
+    actuator: int = eqx.field(static=True, default=0)
+
+    def controller(self, case: Case, period: float | None = None) -> OutputFeedback:
+        """Controller of a case whose sensors measure the deflections, then their velocities.
+
+        With a sampling `period` (s), by which a delay is implemented. Raises ValueError if the case
+        has other sensors, or for a delay without a period.
+        """
+        count = self.displacement.shape[0]
+        quantities = [sensor.quantity for sensor in case.sensors]
+        if quantities != ["deflection"] * count + ["velocity"] * count:
+            raise ValueError(
+                f"the law needs {count} sensors of deflection, then {count} of velocity at the same"
+                f" positions; the case has {', '.join(quantities) or 'none'}"
+            )
+        delay = float(concrete(self.delay))
+        if delay and period is None:
+            raise ValueError("a delay needs a sampling period: give period in s")
+        gains = np.zeros((len(case.actuators), 2 * count))
+        gains[self.actuator] = np.concatenate([self.displacement, self.velocity])
+        return OutputFeedback(gains=gains, period=period, delay=delay or None)
+
+
+def receptances(case: Case, s, actuator: int = 0) -> Complex[Array, "pole sensor"]:
+    """Deflections at the sensors per command of an actuator, at complex s (1/s), in m per command.
+
+    Of the beam with supports and actuators, without loads and filters of sensors. Raises ValueError
+    for an invalid case, or an actuator that it does not have.
+    """
+    model = _checked_model(case, actuator)
+    s = xp.asarray(s) + 0j
+    matrix = s[:, None, None] * xp.eye(model.state_count) - model.A
+    drive = xp.broadcast_to(model.command_matrix[:, actuator], (s.shape[0], model.state_count))
+    states = solve(matrix, drive[..., None] + 0j)[..., 0]
+    return states[:, model.coordinate_index] @ _sensor_shapes(case, model).T
+
+
+def fit_receptances(
+    frequencies: ArrayLike, values: ArrayLike, tolerance: float = 1e-9
+) -> Callable[[ArrayLike], Complex[np.ndarray, "pole sensor"]]:
+    """Receptances as functions of complex s, from measured ones at `frequencies` (Hz).
+
+    `values` (frequency, sensor) are deflections per command, in m per command. Poles lie off the
+    axis of frequencies, so a rational function is fitted to the values and their conjugates, for
+    each sensor, to a relative `tolerance`: that of the noise (AAA: Nakatsukasa, Sete and Trefethen,
+    SIAM Journal on Scientific Computing 40, 2018). Raises ValueError for arrays that do not fit.
+    """
+    from scipy.interpolate import AAA  # imported here: it takes longer than all else
+
+    frequencies, values = np.asarray(frequencies, float), np.asarray(values, complex)
+    if frequencies.ndim != 1 or values.ndim != 2 or len(values) != len(frequencies):
+        raise ValueError(
+            "frequencies must be (frequency,) and values (frequency, sensor), not"
+            f" {frequencies.shape} and {values.shape}"
+        )
+    points = 2j * np.pi * frequencies
+    both = np.concatenate([points, points.conj()])
+    fits = [
+        AAA(both, np.concatenate([column, column.conj()]), rtol=tolerance) for column in values.T
+    ]
+    return lambda s: np.stack([fit(np.asarray(s, complex)) for fit in fits], axis=-1)
+
+
+def receptance_gains(
+    assigned: ArrayLike,
+    poles: ArrayLike,
+    delay: float = 0.0,
+    kept: ArrayLike = (),
+    kept_poles: ArrayLike = (),
+    actuator: int = 0,
+) -> ReceptanceFeedback:
+    """Feedback that makes `poles` (1/s) poles of the loop, and keeps others.
+
+    `assigned` (pole, sensor) are the receptances at the poles, one of each conjugate pair. The
+    modes of the open-loop poles `kept_poles` (1/s) with deflections `kept` (pole, sensor) at the
+    sensors do not change. Each complex pole takes two gains, each real one one; where gains are
+    left, the smallest are taken. Raises ValueError if there are too few sensors, or if the poles
+    cannot be assigned.
+    """
+    assigned, poles = xp.asarray(assigned) + 0j, np.asarray(poles, complex)
+    count = assigned.shape[1]
+    kept = np.asarray(kept, complex).reshape(-1, count)
+    kept_poles = np.asarray(kept_poles, complex).reshape(-1)
+    # Velocities by the size of the poles: gains of both kinds then are of one size.
+    scale = float(np.mean(np.abs(poles)))
+    delayed = assigned * np.exp(-poles * delay)[:, None]
+    rows = xp.concatenate([delayed, kept * xp.max(xp.abs(delayed))])
+    all_poles = np.concatenate([poles, kept_poles])
+    system = xp.concatenate([rows, rows * all_poles[:, None] / scale], axis=1)
+    right = xp.concatenate([xp.ones(poles.shape[0]), xp.zeros(kept_poles.shape[0])])
+    complex_rows = np.abs(all_poles.imag) > 1e-9 * scale
+    system = xp.concatenate([system.real, system.imag[complex_rows]])
+    right = xp.concatenate([right, xp.zeros(int(complex_rows.sum()))])
+    if system.shape[0] > 2 * count:
+        raise ValueError(
+            f"{system.shape[0]} real conditions for poles exceed the {2 * count} gains of {count}"
+            " sensors: assign or keep fewer poles, or add sensors"
+        )
+    # Rows of one size: receptances at resonances are larger by orders of magnitude than others.
+    size = xp.max(xp.abs(system), axis=1, keepdims=True)
+    gains = xp.linalg.pinv(system / size) @ (right / size[:, 0])
+    if not is_jax(gains) and not np.allclose(system @ gains, right, rtol=0.0, atol=1e-6):
+        raise ValueError(
+            "these poles cannot be assigned with these sensors: their conditions contradict each"
+            " other; move a sensor away from nodes, or assign fewer poles"
+        )
+    return ReceptanceFeedback(gains[:count], gains[count:] / scale, xp.asarray(delay), actuator)
+
+
+def receptance_feedback(
+    case: Case,
+    poles: ArrayLike,
+    *,
+    keep: Sequence[int] = (),
+    delay: float = 0.0,
+    actuator: int = 0,
+) -> ReceptanceFeedback:
+    """Feedback of deflections at the sensors, and their rates, that assigns poles (1/s).
+
+    `poles` are one of each conjugate pair; `keep` are the indices, from 0, of modes whose poles and
+    shapes stay, in the order of their frequencies with supports and actuators. Loads and filters
+    are left out. Differentiable in the numbers of the case, unless modes are kept. Raises
+    ValueError as `receptance_gains` does, for an invalid case, and for modes that it does not have.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, modes=12),
+    ...     actuators=[jb.PointForce(position=0.21)],
+    ...     sensors=[jb.Sensor(position=0.18), jb.Sensor(position=0.39)],
+    ... )
+    >>> law = jb.receptance_feedback(case, [-12.8 + 127.5j, -30.7 + 511.5j])
+    >>> bool(abs(jb.closed_loop_poles(case, law) - (-12.8 + 127.5j)).min() < 1e-8)
+    True
+    """
+    model = _checked_model(case, actuator)
+    shapes, kept_poles = np.zeros((0, len(case.sensors))), np.zeros(0)
+    if len(keep):
+        found, vectors = _oscillating_modes(concrete_case(case))
+        if min(keep) < 0 or max(keep) >= len(found):
+            raise ValueError(f"keep must list modes from 0 to {len(found) - 1}, not {list(keep)}")
+        kept_poles = found[list(keep)]
+        vectors = vectors[model.coordinate_index, list(keep)]
+        shapes = (_sensor_shapes(case, model) @ vectors).T
+        shapes = shapes / np.abs(shapes).max(axis=1, keepdims=True)
+    assigned = receptances(case, poles, actuator)
+    return receptance_gains(assigned, poles, delay, shapes, kept_poles, actuator)
+
+
+def closed_loop_poles(
+    case: Case, feedback: ReceptanceFeedback, delay: float | None = None, count: int = 24
+) -> Complex[np.ndarray, " pole"]:
+    """Rightmost poles (1/s) of the loop with non-negative imaginary part, the rightmost first.
+
+    A delayed loop has infinitely many poles: the equation is collocated at Chebyshev points over
+    the delay (Breda, Maset and Vermiglio, SIAM Journal on Scientific Computing 27, 2005), and the
+    `count` rightmost poles are refined by inverse iteration. `delay` (s) may differ from that of
+    the design, which tells how robust it is. Loads and filters are left out. Raises ValueError for
+    an invalid case; needs known numbers.
+    """
+    case = concrete_case(case)
+    model = _checked_model(case, feedback.actuator)
+    delay = float(concrete(feedback.delay)) if delay is None else delay
+    shapes = _sensor_shapes(case, model)
+    row = np.zeros(model.state_count)
+    row[model.coordinate_index] = concrete(feedback.displacement) @ shapes
+    row[model.rate_index] = concrete(feedback.velocity) @ shapes
+    loop = np.outer(model.command_matrix[:, feedback.actuator], row)
+    if delay == 0.0:
+        poles = np.linalg.eigvals(model.A + loop)
+    else:
+        # Rates by the highest frequency, so that all states are of one size.
+        size = np.ones(model.state_count)
+        size[model.rate_index] = np.sqrt(np.abs(model.A).max())
+        scaled = [matrix * size / size[:, None] for matrix in (model.A, loop)]
+        poles = np.array(
+            [_refined(*scaled, delay, *start) for start in _starts(*scaled, delay, 3 * count)]
+        )
+    poles = poles[np.isfinite(poles) & (poles.imag >= 0)]
+    poles = poles[np.argsort(-poles.real)]
+    distinct = [i for i, s in enumerate(poles) if np.all(np.abs(poles[:i] - s) > 1e-9 * abs(s))]
+    return poles[distinct][:count]
+
+
+def _checked_model(case: Case, actuator: int) -> ModalModel:
+    check_case(case)
+    if not 0 <= actuator < len(case.actuators):
+        raise ValueError(f"there is no actuator {actuator}; the case has {len(case.actuators)}")
+    if not case.sensors:
+        raise ValueError("there are no sensors, whose deflections the law feeds back")
+    return modal_model(case)
+
+
+def _sensor_shapes(case: Case, model: ModalModel) -> Float[Array, "sensor mode"]:
+    """Deflections at the sensors of unit coordinates."""
+    return model.shapes(case.sensor_positions, (0,))[0]
+
+
+def _oscillating_modes(case: Case):
+    """Open-loop poles (1/s) of positive imaginary part in ascending order, and their vectors."""
+    values, vectors = np.linalg.eig(modal_model(case).A)
+    order = np.argsort(values.imag)
+    order = order[values[order].imag > 0]
+    return values[order], vectors[:, order]
+
+
+def _starts(A, loop, delay: float, wanted: int):
+    """Rightmost estimates (s, z) of z' = A z + loop z(t - delay), collocated over the delay."""
+    count, states = COLLOCATION_NODES, len(A)
+    nodes = np.cos(np.pi * np.arange(count + 1) / count)
+    weights = np.r_[2.0, np.ones(count - 1), 2.0] * (-1.0) ** np.arange(count + 1)
+    distances = nodes[:, None] - nodes + np.eye(count + 1)
+    derivative = np.outer(weights, 1 / weights) / distances
+    derivative -= np.diag(derivative.sum(axis=1))
+    matrix = np.kron(2 / delay * derivative, np.eye(states))
+    matrix[:states] = 0.0
+    matrix[:states, :states] = A
+    matrix[:states, -states:] = loop
+    values, vectors = np.linalg.eig(matrix)
+    upper = np.argsort(-values.real)
+    upper = upper[values[upper].imag >= 0][:wanted]
+    # Feedback may leave modes beyond the reach of the collocation nearly where they are.
+    own, own_vectors = np.linalg.eig(A)
+    high = own.imag * delay > count / 2
+    yield from zip(values[upper], vectors[:states, upper].T, strict=True)
+    yield from zip(own[high], own_vectors[:, high].T, strict=True)
+
+
+def _refined(A, loop, delay: float, s: complex, vector) -> complex:
+    """Pole near s of (s - A - loop exp(-s delay)) z = 0, by nonlinear inverse iteration.
+
+    NaN if it does not converge: collocation has poles of its own far to the left.
+    """
+    identity = np.eye(len(A))
+    for _ in range(REFINEMENTS):
+        delayed = loop * np.exp(-s * delay)
+        try:
+            solved = np.linalg.solve(s * identity - A - delayed, vector + delay * delayed @ vector)
+        except np.linalg.LinAlgError:  # singular: a pole, to rounding
+            return complex(s)
+        step = np.vdot(vector, vector) / np.vdot(vector, solved)
+        s, vector = s - step, solved / np.linalg.norm(solved)
+        if not np.abs(s) * delay < MAX_TURN:
+            break
+        if np.abs(step) < 1e-13 * np.abs(s):
+            return complex(s)
+    return complex(np.nan, np.nan)
