@@ -4,6 +4,8 @@ from .analysis.amplification import (
     envelope as envelope,
 )
 from .analysis.bound.bound import bound as bound
+from .analysis.plausibility import check as check
+from .analysis.plausible_numbers import Plausibility as Plausibility
 from .analysis.ride import (
     RideMeasures as RideMeasures,
     ride_measures as ride_measures,
@@ -19,6 +21,9 @@ from .case.actuators.point import PointForce as PointForce
 from .case.actuators.shaker import Shaker as Shaker
 from .case.actuators.spring import SpringDamper as SpringDamper
 from .case.beam import Beam as Beam, Support as Support
+from .case.beam_parts.damping import rayleigh_coefficients as rayleigh_coefficients
+from .case.beam_parts.hinge import Hinge as Hinge
+from .case.beam_parts.segment import Segment as Segment
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
 from .case.filters import Filter as Filter
 from .case.loads.axles import Axles as Axles
@@ -37,6 +42,8 @@ from .case.loads.quarter_car import QuarterCar as QuarterCar
 from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad
 from .case.loads.wagon import Wagon as Wagon
+from .case.loads.walking.crowd import Crowd as Crowd
+from .case.loads.walking.pedestrian import Pedestrian as Pedestrian
 from .case.profiles.bump import BumpProfile as BumpProfile
 from .case.profiles.iso8608 import ISO8608Profile as ISO8608Profile
 from .case.profiles.rail import RailProfile as RailProfile
@@ -83,6 +90,7 @@ from .model.frequency_response import (
     receptance as receptance,
 )
 from .model.modes import modes as modes
+from .model.settlement import settlement_response as settlement_response
 from .model.state_space import state_space as state_space
 from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force
 from .model.statics import (

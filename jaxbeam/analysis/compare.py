@@ -1,7 +1,7 @@
 """Comparison of controllers on one case, with the uncontrolled run and the least achievable peak.
 
 A new metric takes a field of `PerformanceMetrics`, its value in `performance_metrics`, and a column
-and a key in `jaxbeam.cli.compare`.
+and a key in `jaxbeam.cli.commands.compare`.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Dynamics of the loop opened at the commands, as functions of its state; moving or frozen loads.
 
-The state holds plant with sensor filters, states of law and digital filters, and the queues of
-delayed readings and commands. Limits, ranges and resolution are left out.
+The state holds plant with sensor filters and vehicles, states of law and digital filters, and the
+queues of delayed readings and commands. Limits, ranges and resolution are left out.
 """
 
 import math
@@ -134,7 +134,8 @@ class LoopDynamics(eqx.Module):
         command_queue = xp.zeros(
             (_split_delay(timing.delay / timing.period)[0] + 1, len(case.actuators))
         )
-        state = xp.zeros(self.augmented_plant.modal_model.state_count)
+        plant = self.augmented_plant
+        state = xp.zeros(plant.modal_model.state_count + plant.vehicle_states)
         return ravel_pytree(
             (
                 state,
@@ -217,7 +218,8 @@ class LoopDynamics(eqx.Module):
 
     def _sensor_inputs(self, state, command, t):
         """Inputs of the sensors (sensor,) after their analogue filters."""
-        signals = self.output_rows @ self.augmented_plant.to_modal(state)
+        beam = state[: self.output_rows.shape[1]]
+        signals = self.output_rows @ self.augmented_plant.to_modal(beam)
         has_feedthrough = np.array([s.has_feedthrough for s in self.plant.case.sensors], bool)
         if not has_feedthrough.any():
             return signals
@@ -228,7 +230,8 @@ class LoopDynamics(eqx.Module):
         return xp.where(has_feedthrough, accelerations, signals)
 
     def _measurement(self, readings, state, command):
-        model_state = self.augmented_plant.to_modal(state)[: self.plant.modal_model.state_count]
+        beam = state[: self.output_rows.shape[1]]
+        model_state = self.augmented_plant.to_modal(beam)[: self.plant.modal_model.state_count]
         return Measurement(readings, self.plant.from_modal(model_state), command)
 
 

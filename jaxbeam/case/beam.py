@@ -4,7 +4,17 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.declared_checks import suggestion, validate_direct_or_derived
+from jaxbeam.case.beam_parts.damping import MATERIALS
+from jaxbeam.case.beam_parts.hinge import Hinge
+from jaxbeam.case.beam_parts.properties import (
+    OPTIONAL,
+    mass_per_length,
+    mean,
+    rigidity,
+    validate_segments,
+)
+from jaxbeam.case.beam_parts.segment import Segment
+from jaxbeam.case.declared_checks import check_on_beam, suggestion, validate_direct_or_derived
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     ON_BEAM,
@@ -14,10 +24,12 @@ from jaxbeam.case.fields import (
     count,
     is_concrete,
     number,
+    parts,
 )
 from jaxbeam.runtime.arrays import Array
 
 MAX_MODES = 1000  # more modes would take minutes to compute
+SAME_POSITION = 1e-9  # of the length: closer positions are one
 
 # Whether an end condition holds the deflection and the rotation of the end.
 END_CONDITIONS = {
@@ -43,16 +55,26 @@ class Support(eqx.Module):
     rotational_stiffness: Float[Array, ""] = number(
         "N m/rad", "spring against rotation", NOT_NEGATIVE, default=0.0
     )
+    mass: Float[Array, ""] | None = number(
+        "kg", "mass of an elastic bearing that moves with the beam", NOT_NEGATIVE, default=None
+    )
 
 
 class Beam(eqx.Module):
-    """Straight Euler-Bernoulli beam of uniform section.
+    """Straight beam, by default an Euler-Bernoulli beam of uniform section.
 
     Give either `flexural_rigidity` and `mass_per_length`, or the rectangular section and material
     `width`, `height`, `youngs_modulus`, `density` (height is measured in the bending direction).
 
+    `segments`, from left to right, make it stepped or tapered; `hinges` lie between its ends. With
+    a `shear_stiffness` it is a Timoshenko beam; `rotary_inertia` is that of its sections. A Winkler
+    foundation pushes back with `foundation_stiffness` times the deflection. The `axial_force` is
+    constant, tension positive, compression negative.
+
     Damping is modal: one `damping_ratio` for all modes or one for each; or, when
-    `rayleigh_damping` is given, proportional to mass and stiffness, D = a M + b K.
+    `rayleigh_damping` is given, proportional to mass and stiffness, D = a M + b K. A `loss_factor`
+    eta of hysteretic damping is taken as the equivalent ratio eta / 2 of every mode. A `material`
+    has the ratio of EN 1991-2, table 6.6, for the longest span of the beam.
     """
 
     length: Float[Array, ""] = number("m", "total length", POSITIVE)
@@ -76,20 +98,51 @@ class Beam(eqx.Module):
     rayleigh_damping: Float[Array, "2"] | None = number(
         "1/s, s", "coefficients a (of mass) and b (of stiffness)", NOT_NEGATIVE, default=None
     )
+    shear_stiffness: Float[Array, ""] | None = number(
+        "N", "shear stiffness kappa G A; rigid in shear if left out", POSITIVE, default=None
+    )
+    rotary_inertia: Float[Array, ""] | None = number(
+        "kg m", "mass moment of inertia per length, rho I", NOT_NEGATIVE, default=None
+    )
+    foundation_stiffness: Float[Array, ""] | None = number(
+        "N/m^2", "elastic foundation, force per length and deflection", NOT_NEGATIVE, default=None
+    )
+    loss_factor: Float[Array, ""] | None = number(
+        "1", "loss factor of hysteretic damping", NOT_NEGATIVE, default=None
+    )
+    material: str = choice("material of a bridge, for its damping", "", *MATERIALS, default="")
+    axial_force: Float[Array, ""] | None = number(
+        "N", "axial force, tension positive", default=None
+    )
+    segments: tuple[Segment, ...] = parts("segments, from left to right", Segment)
+    hinges: tuple[Hinge, ...] = parts("hinges between the ends", Hinge)
 
     @property
     def bending_stiffness(self) -> Float[Array, ""]:
-        """Bending stiffness E I in N m^2, given or from the rectangular section."""
+        """Bending stiffness E I in N m^2, given or from the rectangular section.
+
+        Of segments the mean over the length.
+        """
+        if self.segments:
+            return mean(self, rigidity)
         if self.flexural_rigidity is not None:
             return self.flexural_rigidity
         return self.youngs_modulus * self.width * self.height**3 / 12
 
     @property
     def linear_density(self) -> Float[Array, ""]:
-        """Mass per length in kg/m, given or from section and density."""
+        """Mass per length in kg/m, given or from section and density; of segments the mean."""
+        if self.segments:
+            return mean(self, mass_per_length)
         if self.mass_per_length is not None:
             return self.mass_per_length
         return self.density * self.width * self.height
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether it has a uniform section, rigid in shear, without anything that this excludes."""
+        others = (self.axial_force, *(getattr(self, name) for name in OPTIONAL))
+        return not (self.segments or self.hinges) and all(value is None for value in others)
 
     @property
     def left_end(self) -> str:
@@ -114,6 +167,17 @@ class Beam(eqx.Module):
                 return (
                     f"{address}.ends: no end is called {end!r}; {suggestion(end, END_CONDITIONS)}"
                 )
+        if self.segments:
+            inconsistent = validate_segments(address, self)
+        else:
+            inconsistent = self._validate_section(address)
+        if inconsistent is not None:
+            return inconsistent
+        if self.modes > MAX_MODES:
+            return f"{address}.modes must not exceed {MAX_MODES}; it is {self.modes}"
+        return self._validate_hinges(address) or self._validate_damping(address)
+
+    def _validate_section(self, address: str) -> str | None:
         section = ("width", "height")
         unclear = validate_direct_or_derived(
             address, self, "flexural_rigidity", ("youngs_modulus",), section
@@ -128,9 +192,25 @@ class Beam(eqx.Module):
                         " youngs_modulus and density instead of flexural_rigidity and"
                         " mass_per_length"
                     )
-        if self.modes > MAX_MODES:
-            return f"{address}.modes must not exceed {MAX_MODES}; it is {self.modes}"
-        return self._validate_damping(address)
+        return None
+
+    def _validate_hinges(self, address: str) -> str | None:
+        positions = []
+        for i, hinge in enumerate(self.hinges):
+            if not (is_concrete(hinge.position) and is_concrete(self.length)):
+                return None
+            check_on_beam(f"{address}.hinges.{i}.position", hinge.position, self.length)
+            position, length = float(concrete(hinge.position)), float(concrete(self.length))
+            margin = SAME_POSITION * length
+            if not margin < position < length - margin:
+                return (
+                    f"{address}.hinges.{i} is at an end of the beam, at {position:g} m; write"
+                    f" {address}.ends = 'pinned-pinned', say, for an end that turns"
+                )
+            if any(abs(position - other) < margin for other in positions):
+                return f"{address}.hinges.{i} is at the position of another, {position:g} m"
+            positions.append(position)
+        return None
 
     def _validate_damping(self, address: str) -> str | None:
         ratio_shape = np.shape(self.damping_ratio)
@@ -139,7 +219,13 @@ class Beam(eqx.Module):
                 f"{address}.damping_ratio lists {ratio_shape[0]} values for {self.modes} modes;"
                 " give one for each mode, or a single number for all"
             )
-        both_given = self.rayleigh_damping is not None and is_concrete(self.damping_ratio)
-        if both_given and concrete(self.damping_ratio).any():
-            return f"{address} has both damping_ratio and rayleigh_damping; leave one out"
+        given = []
+        if is_concrete(self.damping_ratio) and concrete(self.damping_ratio).any():
+            given.append("damping_ratio")
+        for name in ("rayleigh_damping", "loss_factor", "material"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, str) and not value):
+                given.append(name)
+        if len(given) > 1:
+            return f"{address} has both {given[0]} and {given[1]}; leave one out"
         return None

@@ -28,6 +28,8 @@ from jaxbeam.case.fields import (
 from jaxbeam.case.joint_addresses import ALL, each_address
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
 from jaxbeam.case.profiles.base import AbstractProfile
+from jaxbeam.case.quantities import OF_QUANTITY
+from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array, set_at, xp
 
@@ -218,14 +220,16 @@ def unit_at(case: Case, address: str) -> str:
             part = part[int(name)]
         elif dataclasses.is_dataclass(part):
             unit = type(part).__dataclass_fields__[name].metadata.get("unit", "")
-            if isinstance(part, Sensor) and unit == "unit of quantity":
+            if isinstance(part, Sensor) and unit == OF_QUANTITY:
                 unit = part.unit
             part = getattr(part, name)
+        elif ", " in unit:  # an entry of a list of several units
+            unit = unit.split(", ")[int(name)]
     return unit
 
 
 def replace(case: Case, values: dict[str, Any]) -> Case:
-    """A copy of a case with other numbers at some addresses (SI units).
+    """A copy of a case with other numbers at some addresses (SI units, or as text with a unit).
 
     `loads.*.speed` sets the speed of all loads. It is differentiable by the values. Raises
     ValueError for an unknown address, one that some load lacks, or a wrong shape.
@@ -238,6 +242,8 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
         (one, value) for key, value in values.items() for one in _own_addresses(case, key, known)
     ]
     for address, value in each:
+        if isinstance(value, str | list | tuple):
+            value = in_si(value, unit_at(case, address), address)
         value = xp.asarray(value, float)
         parent, entry = _parent_and_entry(address, index)
         if address in index:

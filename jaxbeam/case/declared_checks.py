@@ -26,6 +26,7 @@ from jaxbeam.case.fields import (
     is_concrete,
 )
 from jaxbeam.case.kinds import kinds
+from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.runtime.arrays import Array
 
 SHORT_REPR = reprlib.Repr()  # shortens wrong values, which error messages quote
@@ -192,7 +193,7 @@ def _check_increasing(names: list[str], numbers: np.ndarray, unit: str) -> None:
 def _unit_suffix(field: dataclasses.Field) -> str:
     """Unit of a field as it follows a number, with a space before it."""
     unit = field.metadata.get("unit", "1")
-    return "" if unit in ("1", "unit of quantity") else f" {unit}"
+    return "" if unit in ("1", OF_QUANTITY) else f" {unit}"
 
 
 def _in_unit(field: dataclasses.Field) -> str:

@@ -20,12 +20,14 @@ from jaxbeam.runtime.module import Module
 class Estimate(eqx.Module):
     """Estimate of the state of the plant, and of the weights of the loads (N) if estimated too.
 
-    The state is that of the plant for which the filter is designed. `weights` has one entry for
-    each load of the case, zero while it is off the beam; None where weights are not estimated.
+    The state is that of the beam of the plant for which the filter is designed. `weights` has one
+    entry for each wheel of the case, zero while it is off the beam; None where weights are not
+    estimated. `vehicles` are the states of vehicles, None where the filter does not have them.
     """
 
     state: Float[Array, " state"]
-    weights: Float[Array, " load"] | None = None
+    weights: Float[Array, " wheel"] | None = None
+    vehicles: Float[Array, " vehicle_state"] | None = None
 
 
 class AbstractSampledFilter(Module):
@@ -80,6 +82,11 @@ class AbstractEstimator(eqx.Module, metaclass=AcceptsFormerArguments):
     @property
     def runs_compiled(self) -> bool:
         """As `AbstractController.runs_compiled`, in the steps of the filter."""
+        return False
+
+    @property
+    def has_vehicles(self) -> bool:
+        """Whether estimates have the states of vehicles."""
         return False
 
     @abc.abstractmethod

@@ -14,18 +14,28 @@ import jax
 import jax.extend
 import numpy as np
 
+from jaxbeam.case.reading.units import in_si
 from jaxbeam.runtime.arrays import xp
 
 
-def _as_array(value):
-    """A number as a float array; tracers and placeholders of JAX as they are."""
-    if isinstance(value, int | float | np.ndarray | np.generic | list | tuple):
-        return xp.asarray(value, float)
-    return value
+def _as_array(unit: str, meaning: str):
+    """Converter of a number to a float array; tracers and placeholders of JAX stay as they are.
+
+    Quantities with units, as "25 m", become numbers in the SI unit.
+    """
+
+    def convert(value):
+        if isinstance(value, str | list | tuple) and _has_text(value):
+            value = in_si(value, unit, meaning)
+        if isinstance(value, int | float | np.ndarray | np.generic | list | tuple):
+            return xp.asarray(value, float)
+        return value
+
+    return convert
 
 
-def _as_optional_array(value):
-    return None if value is None else _as_array(value)
+def _has_text(value) -> bool:
+    return isinstance(value, str) or any(isinstance(entry, str | list) for entry in value)
 
 
 # Constraints of numbers, phrased to follow "must" in error messages; see `declared_checks`.
@@ -38,10 +48,11 @@ INCREASING = "increase"
 def number(unit: str, meaning: str, constraint: str = "", **options):
     """Field for a number of a case: a differentiable leaf with its SI unit and its meaning.
 
-    With `default=None` the number may be left out; its absence is part of the tree's structure.
-    `constraint` is one of the above; without one any finite value is allowed.
+    With `default=None` the number may be left out; its absence is part of the tree's structure. A
+    text with a unit, as "25 m", is converted to the SI unit. `constraint` is one of the above;
+    without one any finite value is allowed.
     """
-    converter = _as_optional_array if options.get("default", 0.0) is None else _as_array
+    converter = _as_array(unit, meaning)
     metadata = {"unit": unit, "meaning": meaning, "constraint": constraint}
     return eqx.field(converter=converter, metadata=metadata, **options)
 

@@ -6,13 +6,16 @@ responses, and histories of records derive from it (rows: `model.sensing.output_
 
 from typing import NamedTuple
 
+OF_QUANTITY = "unit of quantity"  # unit of the entries of a sensor that are in that of its quantity
+
 
 class Quantity(NamedTuple):
     """Unit of a quantity, and its orders of derivation of w by position and by time.
 
     The derivative is multiplied by -z `at_fibre`, z (m) being the height of a fibre above the
     neutral axis; by the bending stiffness E I if it is a `section_force`, to which active moments
-    of patches belong; and divided by the section modulus (m^3) if it is `over_modulus`.
+    of patches belong; and divided by the section modulus (m^3) if it is `over_modulus`. A slope
+    `of_axis` is w' also where a section that is flexible in shear has another rotation.
     """
 
     unit: str
@@ -21,6 +24,12 @@ class Quantity(NamedTuple):
     at_fibre: bool = False
     section_force: bool = False
     over_modulus: bool = False
+    of_axis: bool = False
+
+    @property
+    def field(self) -> int:
+        """Order of the field of the beam (see `model.modes.Modes.fields`); -1 is the slope w'."""
+        return -1 if self.of_axis else self.x_derivative
 
     @property
     def bends(self) -> bool:
@@ -37,7 +46,7 @@ QUANTITIES = {
     "deflection": Quantity("m"),
     "velocity": Quantity("m/s", time_derivative=1),
     "acceleration": Quantity("m/s^2", time_derivative=2),
-    "slope": Quantity("rad", x_derivative=1),
+    "slope": Quantity("rad", x_derivative=1, of_axis=True),
     "rotation": Quantity("rad", x_derivative=1),
     "curvature": Quantity("1/m", x_derivative=2),
     "strain": Quantity("1", x_derivative=2, at_fibre=True),

@@ -16,7 +16,8 @@ from jaxbeam.case.fields import (
     part,
 )
 from jaxbeam.case.filters import Filter
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.quantities import OF_QUANTITY, QUANTITIES
+from jaxbeam.case.reading.units import in_si
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
 
@@ -33,18 +34,18 @@ class Sensor(Module):
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
     quantity: str = choice("measured quantity", *QUANTITIES, default="deflection")
-    offset: Float[Array, ""] = number("unit of quantity", "constant added", default=0.0)
+    offset: Float[Array, ""] = number(OF_QUANTITY, "constant added", default=0.0)
     fibre_distance: Float[Array, ""] | None = number(
         "m", "height of the strain gauge above the neutral axis", default=None
     )
     noise: Float[Array, ""] | None = number(
-        "unit of quantity", "standard deviation of white noise", NOT_NEGATIVE, default=None
+        OF_QUANTITY, "standard deviation of white noise", NOT_NEGATIVE, default=None
     )
     range: Float[Array, "2"] | None = number(
-        "unit of quantity", "smallest and largest reading", INCREASING, default=None
+        OF_QUANTITY, "smallest and largest reading", INCREASING, default=None
     )
     resolution: Float[Array, ""] | None = number(
-        "unit of quantity", "step between readings", POSITIVE, default=None
+        OF_QUANTITY, "step between readings", POSITIVE, default=None
     )
     filter: Filter | None = part("filter of the signal or of its samples", Filter)
     sampling_period: Float[Array, ""] | None = number(
@@ -57,6 +58,12 @@ class Sensor(Module):
         "m^3", "bending moment over stress; negative for a fibre above the axis", default=None
     )
     name: str = choice("label in results; its number and quantity if left out", default="")
+
+    def __post_init__(self):
+        for name in ("offset", "noise", "range", "resolution"):
+            value = getattr(self, name)
+            if isinstance(value, str | list | tuple) and self.quantity in QUANTITIES:
+                setattr(self, name, in_si(value, self.unit, name))
 
     @property
     def unit(self) -> str:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.beam_parts.properties import has
 from jaxbeam.case.case import Case, parts
 from jaxbeam.case.declared_checks import (
     POSITION_TOLERANCE,
@@ -57,6 +58,7 @@ def check_case(case: Case) -> None:
         if error is not None:
             raise ValueError(error)
     _check_supports(case.supports, case.beam.length)
+    _check_kinks(case)
     _check_profile(case)
     _check_labels(case.sensors)
     for i, sensor in enumerate(case.sensors):
@@ -80,6 +82,12 @@ def _position_fields(part_class: type) -> list[str]:
 
 
 def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> None:
+    for i, support in enumerate(supports):
+        if support.mass is not None and support.stiffness is None:
+            raise ValueError(
+                f"supports.{i}.mass would have no effect, since the support is rigid: give"
+                f" supports.{i}.stiffness too, or leave the mass out"
+            )
     rigid = [
         (float(concrete(support.position)), i)
         for i, support in enumerate(supports)
@@ -91,6 +99,37 @@ def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> 
                 f"supports.{min(i, j)} and supports.{max(i, j)} both hold the beam rigidly at"
                 f" {left:g} m; remove one"
             )
+
+
+def _check_kinks(case: Case) -> None:
+    """Validate that no mass rolls rigidly over a point at which the slope of the beam jumps."""
+    beam = case.beam
+    where = None
+    if beam.hinges:
+        where = "at beam.hinges.0"
+    elif has(beam, "shear_stiffness"):
+        inner = [i for i, support in enumerate(case.supports) if _inside(support.position, beam)]
+        if inner:
+            where = f"at supports.{inner[0]} of a beam with shear_stiffness"
+        elif any(segment.shear_stiffness is not None for segment in beam.segments[1:]):
+            where = "between beam.segments of different shear_stiffness"
+    if where is None:
+        return
+    for i, load in enumerate(case.loads):
+        if not all(map(known_numbers, (load, case.run, beam))):
+            continue
+        if np.any(concrete(load.vehicle(case.run.gravity).wheel_masses)):
+            raise ValueError(
+                f"loads.{i} has a mass that is rigidly on the beam, and would need an infinite"
+                f" force where the slope of the beam jumps, {where}: use a sprung wheel or a force"
+            )
+
+
+def _inside(position, beam: Beam) -> bool:
+    if not (is_concrete(position) and is_concrete(beam.length)):
+        return False
+    share = float(concrete(position)) / float(concrete(beam.length))
+    return POSITION_TOLERANCE < share < 1 - POSITION_TOLERANCE
 
 
 def _check_profile(case: Case) -> None:

@@ -9,22 +9,24 @@ from typing import NoReturn
 
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from jaxbeam.cli.compare import compare
-from jaxbeam.cli.describe import describe
-from jaxbeam.cli.export import export
-from jaxbeam.cli.frequency import frf, modes
-from jaxbeam.cli.identify import identify
-from jaxbeam.cli.models import compare_models, design_experiment
+from jaxbeam.cli.commands.check import check
+from jaxbeam.cli.commands.compare import compare
+from jaxbeam.cli.commands.describe import describe
+from jaxbeam.cli.commands.export import export
+from jaxbeam.cli.commands.frequency import frf, modes
+from jaxbeam.cli.commands.identify import identify
+from jaxbeam.cli.commands.models import compare_models, design_experiment
+from jaxbeam.cli.commands.new import new
+from jaxbeam.cli.commands.simulate import simulate
+from jaxbeam.cli.commands.stability import stability
+from jaxbeam.cli.commands.sweep import native, sweep
+from jaxbeam.cli.commands.thesis import demo, reproduce
+from jaxbeam.cli.commands.tune import tune
+from jaxbeam.cli.commands.weigh import identify_responses, weigh
 from jaxbeam.cli.options import print_message
-from jaxbeam.cli.simulate import simulate
-from jaxbeam.cli.stability import stability
-from jaxbeam.cli.sweep import native, sweep
-from jaxbeam.cli.thesis import demo, reproduce
-from jaxbeam.cli.tune import tune
-from jaxbeam.cli.weigh import identify_responses, weigh
 
 COMMANDS = {
-    "Simulation": (modes, frf, simulate, sweep, describe),
+    "Simulation": (new, check, describe, modes, frf, simulate, sweep),
     "Control": (compare, stability, tune, export),
     "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
     "Other": (demo, reproduce, native),

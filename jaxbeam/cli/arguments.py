@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxbeam.case.reading.units import is_quantity, number_and_unit
+
 
 def parse_assignment(option: str, text: str) -> tuple[str, str]:
     """Address and value of ADDRESS=VALUE. Raises ValueError if one is empty."""
@@ -15,14 +17,20 @@ def parse_assignment(option: str, text: str) -> tuple[str, str]:
 
 
 def parse_value(text: str) -> Any:
-    """Value of a text: a number, a list of numbers (with or without brackets), or else a word."""
+    """Value of a text: a number, a list of numbers (with or without brackets), or else a word.
+
+    Quantities, as "25 m", are words.
+    """
     for read in (int, float):
         try:
             return read(text)
         except ValueError:
             pass
+    entries = text.removeprefix("[").removesuffix("]").split(",")
+    if len(entries) > 1 and any(map(is_quantity, entries)):
+        return [entry.strip() if is_quantity(entry) else parse_value(entry) for entry in entries]
     try:
-        return [float(entry) for entry in text.removeprefix("[").removesuffix("]").split(",")]
+        return [float(entry) for entry in entries]
     except ValueError:
         return text
 
@@ -73,7 +81,10 @@ def parse_sweep_values(texts: Iterable[str]) -> dict[str, list[float] | list[str
     return values
 
 
-def _range_values(text: str, value: str) -> list[float]:
+def _range_values(text: str, value: str) -> list[Any]:
+    start, *rest = value.split(":")
+    if len(rest) == 2 and is_quantity(start):
+        return _quantity_range(text, start, *rest)
     limits = _parse_numbers("--over", text, value.split(":"))
     if len(limits) != 3 or not (limits[2] >= 1 and limits[2] % 1 == 0):
         raise ValueError(
@@ -86,6 +97,19 @@ def _range_values(text: str, value: str) -> list[float]:
     if limits[2] > MAX_RUNS:
         raise ValueError(f"--over {text}: a range may have {MAX_RUNS:.0e} values, no more")
     return np.linspace(limits[0], limits[1], int(limits[2])).tolist()
+
+
+def _quantity_range(text: str, start: str, stop: str, count: str) -> list[str]:
+    """Quantities of START:STOP:COUNT with a unit, as 60 km/h:200 km/h:15."""
+    (first, unit), (last, other) = number_and_unit(start), (0.0, "")
+    if is_quantity(stop):
+        last, other = number_and_unit(stop)
+    if unit != other:
+        raise ValueError(
+            f"--over {text}: both ends of a range have the same unit, as in 60 km/h:200 km/h:15"
+        )
+    values = _range_values(text, f"{first!r}:{last!r}:{count}")
+    return [f"{value!r} {unit}" for value in values]
 
 
 def input_output_pair(text: str) -> tuple[str, str]:
@@ -184,11 +208,15 @@ def check_exists(kind: str, *paths: Path) -> None:
             raise FileNotFoundError(f"{path}: there is no such {kind}")
 
 
-def check_suffix(path: Path | None, suffix: str, content: str) -> None:
-    """Raises ValueError if a file has not the suffix of its content."""
-    if path and path.suffix != suffix:
+TABLE_SUFFIXES = (".csv", ".xlsx", ".mat", ".parquet")
+
+
+def check_suffix(path: Path | None, suffix: str, content: str, others: Sequence[str] = ()) -> None:
+    """Raises ValueError if a file has not the suffix of its content, nor one of the others."""
+    if path and path.suffix not in (suffix, *others):
+        more = f", or {', '.join(others)}" if others else ""
         raise ValueError(
-            f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}"
+            f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}{more}"
         )
 
 

@@ -4,6 +4,8 @@ Nothing here imports JAX or NumPy before a case is read, so that help and errors
 printed within a few tenths of a second; a test checks it.
 """
 
+import dataclasses
+import itertools
 import json
 import math
 import sys
@@ -27,8 +29,9 @@ Free = Annotated[
 Over = Annotated[
     tuple[str, ...],
     Parameter(
-        help="ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: values of a parameter, or words, as"
-        " loads.0.train=HSLM-A1,HSLM-A2; all combinations are computed if it is repeated for more."
+        help="ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,...: values of a parameter, with units, as"
+        " 60 km/h:200 km/h:15, or words, as loads.0.train=HSLM-A1,HSLM-A2; all combinations are"
+        " computed if it is repeated for more."
     ),
 ]
 Starts = Annotated[
@@ -83,7 +86,11 @@ class CaseOptions(OutputOptions):
 
     set_: Annotated[
         tuple[str, ...],
-        Parameter("--set", help="ADDRESS=VALUE: change an entry of the case; repeat it for more."),
+        Parameter(
+            "--set",
+            help="ADDRESS=VALUE: change an entry of the case, also with a unit, as"
+            " beam.length='25 m'; repeat it for more.",
+        ),
     ] = ()
 
     def check_case(self, path: Path) -> None:
@@ -108,6 +115,29 @@ class CaseOptions(OutputOptions):
         from jaxbeam.files.case_file import with_settings
 
         return with_settings(jb.load_case(path), changes)
+
+
+def print_plausibility(
+    case: "jb.Case", options: PrintOptions, *others: "jb.Case"
+) -> dict[str, Any]:
+    """Print the line of plausibility of a case and warn of what looks wrong; the numbers for JSON.
+
+    The warnings are also those of other cases. The line is left out with `--json`.
+    """
+    found, *more = map(jb.check, (case, *others))
+    warnings = dict.fromkeys(itertools.chain(found.warnings, *(one.warnings for one in more)))
+    found = dataclasses.replace(found, warnings=tuple(warnings))
+    if not options.json_:
+        print(f"plausibility: {found}", flush=True)
+    for warning in found.warnings:
+        print_message(f"warning: {warning}")
+    return numbers_of(found)
+
+
+def numbers_of(found: "jb.Plausibility") -> dict[str, Any]:
+    """Numbers and warnings of plausibility by their names in JSON (SI units)."""
+    names = ("span_over_deflection", "speed_ratio")
+    return dataclasses.asdict(found) | {name: getattr(found, name) for name in names}
 
 
 def enable_compile_cache() -> None:

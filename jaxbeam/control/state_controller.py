@@ -20,6 +20,7 @@ from jaxbeam.control.state_law import (
     TrueState,
 )
 from jaxbeam.estimation.sampled_plant import sample_timing
+from jaxbeam.estimation.simulated_vehicles import ContinuousWithVehicles, SampledWithVehicles
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import modal_row
@@ -34,6 +35,8 @@ class AbstractStateController(AbstractController):
     The design plant is that of the case, with the parameters of the `design` model where these
     differ; its states are those of `state_space` in the chosen coordinates. Without an `estimator`
     the law receives the true state, of which a design with fewer modes receives the first ones.
+    States of vehicles, where a law needs them, are those of an estimator that has them, or else
+    simulated from the state of the beam and the known vehicles.
     """
 
     coordinates: str = choice(
@@ -70,6 +73,8 @@ class AbstractStateController(AbstractController):
     def design_law(self, plant):
         design_plant = self.design_plant(plant)
         law = self.design_state_law(plant, design_plant)
+        estimated = self.estimator is not None and self.estimator.has_vehicles
+        simulates = law.needs_vehicles and not estimated
         if self.estimator is None:
             filter = TrueState(_design_state_map(plant, design_plant))
         elif self.period is None:
@@ -77,7 +82,11 @@ class AbstractStateController(AbstractController):
         else:
             filter = self.estimator.sampled_filter(design_plant, sample_timing(self))
         if self.period is None:
+            if simulates:
+                filter = ContinuousWithVehicles(filter, design_plant)
             return ContinuousStateLaw(law, filter)
+        if simulates:
+            filter = SampledWithVehicles(filter, design_plant, sample_timing(self))
         return SampledStateLaw(law, filter)
 
     def breakpoints(self, case):
@@ -152,6 +161,6 @@ def deflection_rows(
     plant: Plant, positions: Float[Array, " position"]
 ) -> Float[Array, "position state"]:
     """Rows that map the states of a plant to the deflections at positions (m)."""
-    rows = modal_row(plant.modal_model.shapes, plant.case, positions, "deflection")
+    rows = modal_row(plant.modal_model.fields, plant.case, positions, "deflection")
     rows = rows / plant.coordinate_scale
     return xp.pad(rows, ((0, 0), (0, plant.modal_model.state_count - rows.shape[1])))

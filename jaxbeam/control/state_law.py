@@ -28,6 +28,11 @@ class AbstractStateLaw(Module):
     Fields of the class hold the design; they are constant during a run.
     """
 
+    @property
+    def needs_vehicles(self) -> bool:
+        """Whether the estimate must have the states of the vehicles."""
+        return False
+
     def initial_state(self) -> Any:
         """State of the law at the start of a run."""
         return ()

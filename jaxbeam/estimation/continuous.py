@@ -10,9 +10,10 @@ from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractContinuousFilter, Estimate
 from jaxbeam.estimation.sensor_chain import FilteredPlant
+from jaxbeam.estimation.simulated_vehicles import with_loads
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array
 
 
 class AbstractLinearFilter(AbstractContinuousFilter):
@@ -63,9 +64,9 @@ class TimeInvariantFilter(AbstractLinearFilter):
 class ContinuousCrossingFilter(AbstractLinearFilter):
     """Filter for a plant with its moving loads, with a gain that varies over the run.
 
-    The weights of the loads are the last states x; the estimate includes them if
-    `estimates_weights`. `dual_gain` is the transposed gain over the time back from the end of the
-    run, of `duration` (s).
+    States of vehicles and weights of the loads are the last states x; the estimate includes the
+    weights if `estimates_weights`. `dual_gain` is the transposed gain over the time back from the
+    end of the run, of `duration` (s).
     """
 
     filtered: FilteredPlant
@@ -81,8 +82,5 @@ class ContinuousCrossingFilter(AbstractLinearFilter):
 
     def estimate(self, state, measurement, t):
         estimate = super().estimate(state, measurement, t)
-        if not self.estimates_weights:
-            return estimate
-        plant = self.filtered.plant
-        weights = (self.initial + state)[plant.modal_model.state_count :]
-        return Estimate(estimate.state, xp.where(plant.loads.on_beam(t), weights, 0.0))
+        x = (self.initial + state)[self.filtered.plant.modal_model.state_count :]
+        return with_loads(self.filtered.plant, estimate.state, x, t, self.estimates_weights)

@@ -9,6 +9,7 @@ from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.gains import filter_gain
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
+from jaxbeam.estimation.simulated_vehicles import with_loads
 from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.runtime.arrays import Array, xp
 
@@ -36,9 +37,10 @@ class OneStepPrediction(NamedTuple):
 class CrossingFilter(AbstractSampledFilter):
     """Time-varying Kalman filter; its covariance is propagated during the run.
 
-    The first `plant_states` states x are those of the plant; those of analogue filters follow, the
-    weights of the loads, and those of the sensors (see `sensor_chain`). `scale` is the size of the
-    states before those of the sensors, `noise_intensity` that of the white noise in their rates.
+    The first `plant_states` states x are those of the plant; those of analogue filters follow, of
+    the vehicles, the weights of the loads, and those of the sensors (see `sensor_chain`). `scale`
+    is the size of the states before those of the sensors, `noise_intensity` that of the white noise
+    in their rates.
     """
 
     filtered: FilteredPlant
@@ -82,7 +84,5 @@ class CrossingFilter(AbstractSampledFilter):
 
     def _estimate(self, x, t) -> Estimate:
         plant = self.filtered.plant
-        if not self.estimates_weights:
-            return Estimate(x[: self.plant_states])
-        weights = x[plant.modal_model.state_count : self.sensor_chain.plant_states]
-        return Estimate(x[: self.plant_states], xp.where(plant.loads.on_beam(t), weights, 0.0))
+        added = x[plant.modal_model.state_count : self.sensor_chain.plant_states]
+        return with_loads(plant, x[: self.plant_states], added, t, self.estimates_weights)

@@ -32,7 +32,8 @@ class Kalman(AbstractEstimator):
     white noise of standard deviation `measurement_noise`. The `loads` are "ignored", and the
     filter is time-invariant; or "known": plant and gain vary as they cross; or their weights are
     "estimated" too, starting from those of the design with the standard deviation
-    `weight_deviation`. Times, speeds and inertia of the crossing are known.
+    `weight_deviation`. Times, speeds, inertia, vehicles and profile of the crossing are known; the
+    states of vehicles are estimated, and each of their wheels has a weight of its own.
 
     Filters of the sensors and their delays of up to `max_delay_periods` periods are part of the
     plant, so that innovations are white. Noise is that of the samples: behind a digital filter it
@@ -73,10 +74,15 @@ class Kalman(AbstractEstimator):
     def runs_compiled(self) -> bool:
         return self.loads != "ignored"
 
+    @property
+    def has_vehicles(self):
+        return self.loads != "ignored"
+
     def sampled_filter(self, plant, timing):
         filtered = filtered_plant(plant)
         filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
-        states, loads = intensity.shape[0], plant.weights.shape[0]
+        states, start = intensity.shape[0], plant.augmented_start
+        loads = start.shape[0]  # states of vehicles, weights, and one for what else is known
         variance, scale = self.reading_variance(plant), balance(filtered_model.unloaded.A)
         plant_states = plant.modal_model.state_count
         if self.loads == "ignored":
@@ -89,14 +95,14 @@ class Kalman(AbstractEstimator):
             )
             return ConstantGainFilter(transition, C, D, sensor_offsets(plant), gain, plant_states)
         sensors = sensor_chain(plant, variance, timing, states + loads, self.max_delay_periods)
-        no_state, weight_states = xp.zeros(sensors.state_count), np.s_[states : states + loads]
+        no_state, load_states = xp.zeros(sensors.state_count), np.s_[states : states + loads]
         return CrossingFilter(
             filtered,
             sensors,
             xp.append(scale, xp.ones(loads)),
             xp.pad(intensity, (0, loads)),
-            set_at(no_state, weight_states, plant.weights),
-            xp.diag(set_at(no_state, weight_states, self.weight_variance(plant))),
+            set_at(no_state, load_states, start),
+            xp.diag(set_at(no_state, load_states, self.load_variance(plant))),
             plant_states,
             self.loads == "estimated",
         )
@@ -105,7 +111,7 @@ class Kalman(AbstractEstimator):
         filtered, count = filtered_plant(plant), len(plant.case.sensors)
         filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
         noise = xp.diag(xp.broadcast_to(self.measurement_intensity, (count,)))
-        states, loads = intensity.shape[0], plant.weights.shape[0]
+        states, start = intensity.shape[0], plant.augmented_start
         offset, plant_states = sensor_offsets(plant), plant.modal_model.state_count
         zero_state = xp.zeros(states)
         if self.loads == "ignored":
@@ -121,14 +127,14 @@ class Kalman(AbstractEstimator):
 
         crossing_times = filtered_model.loads.entry_exit_times().reshape(-1)
         events = xp.concatenate([xp.zeros(1), xp.clip(crossing_times, 0.0, end), end[None]])
-        initial_covariance = xp.diag(xp.append(zero_state, self.weight_variance(plant)))
-        Q = xp.pad(intensity, (0, loads))
+        initial_covariance = xp.diag(xp.append(zero_state, self.load_variance(plant)))
+        Q = xp.pad(intensity, (0, start.shape[0]))
         table = finite_horizon(
             dual_system, xp.sort(end - events), self.points, Q, noise, initial_covariance
         )[0]
         return ContinuousCrossingFilter(
             offset,
-            xp.append(zero_state, plant.weights),
+            xp.append(zero_state, start),
             plant_states,
             filtered,
             table,
@@ -136,12 +142,20 @@ class Kalman(AbstractEstimator):
             self.loads == "estimated",
         )
 
-    def weight_variance(self, plant: Plant) -> Float[Array, " load"]:
-        """Variance of the weights of the loads (N^2) at the start; zero where they are known."""
-        loads = plant.weights.shape[0]
+    def load_variance(self, plant: Plant) -> Float[Array, " added"]:
+        """Variance of the states that `Plant.augmented` adds, at the start: that of the weights.
+
+        In N^2; zero where they are known, and for states of vehicles. The deviation of a load is
+        that of each of its wheels.
+        """
+        variance, count = xp.zeros_like(plant.augmented_start), plant.weights.shape[0]
         if self.weight_deviation is None:
-            return xp.zeros(loads)
-        return xp.broadcast_to(self.weight_deviation**2, (loads,))
+            return variance
+        deviation = self.weight_deviation
+        if deviation.ndim:
+            deviation = deviation[np.array(plant.loads.load_of_wheel)]
+        weights = np.s_[plant.vehicle_states : plant.vehicle_states + count]
+        return set_at(variance, weights, xp.broadcast_to(deviation**2, (count,)))
 
     def noise_intensity(self, plant: Plant) -> Square:
         """Intensity of the white noise in the rates of the states, (unit of each)^2 s."""

@@ -42,18 +42,29 @@ class EventSchedule(eqx.Module):
 
 
 def sample_schedule(
-    times: Float[Array, " time"], equally_spaced: bool, lead_samples: int = 0
+    times: Float[Array, " time"],
+    equally_spaced: bool,
+    lead_samples: int = 0,
+    end: Float[Array, ""] | None = None,
 ) -> EventSchedule:
     """Schedule of a run without controller: samples at ascending times (s), which may be traced.
 
-    The first `lead_samples` times are events without a sample.
+    The first `lead_samples` times are events without a sample, and so is the `end` (s) of the run,
+    if it is not the last sample.
     """
     count = times.shape[0]
     sample_events = xp.arange(lead_samples, count)
     if equally_spaced:
-        spacing = (times[-1] - times[0]) / (count - 1)
-        return EventSchedule(times, xp.zeros(count - 1, int), spacing[None], sample_events)
-    return EventSchedule(times, xp.arange(count - 1), xp.diff(times), sample_events)
+        lengths = ((times[-1] - times[0]) / (count - 1))[None]
+        length_index = xp.zeros(count - 1, int)
+    else:
+        lengths, length_index = xp.diff(times), xp.arange(count - 1)
+    if end is not None:
+        end = xp.maximum(end, times[-1])
+        length_index = xp.append(length_index, lengths.shape[0])
+        lengths = xp.append(lengths, end - times[-1])
+        times = xp.append(times, end)
+    return EventSchedule(times, length_index, lengths, sample_events)
 
 
 def controller_schedule(
@@ -63,21 +74,24 @@ def controller_schedule(
     arrival_times: list[Float[np.ndarray, "_"]],
     sensor_delays: list[float],
     breakpoints: Float[np.ndarray, " breakpoint"],
+    end: float | None = None,
 ) -> EventSchedule:
-    """Schedule of a run with a controller, from rest at zero to the last sample.
+    """Schedule of a run with a controller, from rest at zero to the `end` (s).
+
+    By default it ends with the last sample, before which it never does.
 
     The controller acts at `control_times` (s), and its commands take effect `delay` (s) later. The
     readings of each sensor are available at its `arrival_times` (s), taken from the signal
     `sensor_delays` (s) before. `breakpoints` (s) are those of prescribed commands.
     """
-    end = float(sample_times[-1])
+    end = float(sample_times[-1] if end is None else max(end, sample_times[-1]))
     signal_times = [
         arrivals - lag for arrivals, lag in zip(arrival_times, sensor_delays, strict=True)
     ]
     all_times = np.sort(
         np.concatenate(
             [
-                np.zeros(1),
+                np.array([0.0, end]),
                 sample_times,
                 control_times,
                 control_times + delay,

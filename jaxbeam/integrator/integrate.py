@@ -30,11 +30,11 @@ from jaxbeam.integrator.vehicles.propagators import vehicle_state_norm
 from jaxbeam.integrator.vehicles.steps import (
     StepInput,
     VehicleStep,
-    initial_vehicle_states,
     vehicles_of,
 )
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.vehicles.vehicle_states import initial_vehicle_states
 from jaxbeam.runtime.arrays import (
     Array,
     any_jax,

@@ -76,7 +76,7 @@ def supports(case: Case) -> bool:
         case.controller is None
         and case.profile is None
         and not any(
-            load.vehicle(case.run.gravity).names or load.force_history() for load in case.loads
+            load.vehicle(case.run.gravity).names or load.force_histories() for load in case.loads
         )
     )
     return plain and deflections_only(case) and available()

@@ -14,7 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.model.modes import Layout, assemble_matrices, section_properties, supported_matrices
+from jaxbeam.model.layout import Layout, is_uniform
+from jaxbeam.model.modes import assemble_matrices, section_properties, supported_matrices
+from jaxbeam.model.theory.statics import SectionFlexibility, is_held, section_flexibility
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, set_at, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
@@ -51,6 +53,11 @@ class Flexibility(eqx.Module):
     series: Float[Array, "segment degree source"]
     sources: FlexibilityPoints
     source_weights: Float[Array, "point source"]
+
+    @property
+    def breakpoints(self) -> Float[Array, " breakpoint"]:
+        """Positions (in L) between which the deflection is a cubic."""
+        return xp.concatenate([self.nodes, self.sources.positions])
 
     def __call__(
         self, y: Float[Array, "*position"], derivative: int = 0
@@ -110,12 +117,16 @@ def _segment_bending(
 
 def flexibility(
     case: Case, layout: Layout, x: Float[Array, " position"], x_derivative: int
-) -> Flexibility:
+) -> Flexibility | SectionFlexibility:
     """Flexibility for unit forces at positions x (m), or for their x-derivatives.
 
-    With nodal stiffness K, forces f of suspensions of stiffness k and their rows B:
+    Of a beam that is not uniform see `model.theory.statics`; of others, with nodal stiffness K,
+    forces f of suspensions of stiffness k and their rows B:
+
     K u - B' f = load,  f = -k (B u + bending of the segment under the suspension).
     """
+    if not is_uniform(case):
+        return section_flexibility(case, layout, x, x_derivative)
     length = case.beam.length
     nodes, stiffness, _, to_series = assemble_matrices(case, _cubic_layout(layout))
     rigidity = xp.stack(
@@ -207,6 +218,10 @@ def check_supported(case: Case, layout: Layout) -> None:
 
     Raises ValueError for a beam that can move as a rigid body.
     """
+    if not is_uniform(case):
+        if not is_held(case, layout):
+            raise ValueError(_unsupported(case))
+        return
     length, unit = case.beam.length, case.beam.length**3 / case.beam.bending_stiffness
     nodes, suspension_points, factors, suspension_stiffness = _support_conditions(case, layout)
     translation, rotation = np.array([1.0, 0.0]), np.array([0.0, 1.0])
@@ -235,7 +250,11 @@ def check_supported(case: Case, layout: Layout) -> None:
         (min(1.0, float(k)) * np.outer(row, row) for row, k in restraints), np.zeros((2, 2))
     )
     if np.linalg.eigvalsh(resistance)[0] < MIN_RIGID_BODY_STIFFNESS:
-        raise ValueError(
-            f"the beam ({case.beam.ends}) can move as a rigid body, so it has no static"
-            " deflection; hold its ends or add supports"
-        )
+        raise ValueError(_unsupported(case))
+
+
+def _unsupported(case: Case) -> str:
+    return (
+        f"the beam ({case.beam.ends}) can move as a rigid body, so it has no static deflection;"
+        " hold its ends or add supports"
+    )

@@ -241,9 +241,8 @@ def _wheels(loads: Sequence[AbstractLoad], vehicles: Sequence[VehicleModel]) -> 
 
     groups, histories, first_wheel = [], {}, 0
     for load, vehicle, count in zip(loads, vehicles, counts, strict=True):
-        history = load.force_history()
-        if history is not None:
-            histories[first_wheel] = jax.tree.map(lambda part: part[..., None], history)
+        for wheel, history in load.force_histories().items():
+            histories[first_wheel + wheel] = jax.tree.map(lambda part: part[..., None], history)
         if vehicle.names:
             groups.append(_vehicle_group(vehicle, first_wheel, count))
         first_wheel += count * vehicle.offsets.shape[0]

@@ -71,6 +71,11 @@ class ModalModel(Module):
         rows = self.modes.shape_derivatives(x, derivatives)
         return rows if self.mode_map is None else rows @ self.mode_map
 
+    def fields(self, x, orders: tuple[int, ...]) -> Float[Array, "order *position mode"]:
+        """Rows from q to fields of the beam at positions x (m): see `Modes.fields`."""
+        rows = self.modes.fields(x, orders)
+        return rows if self.mode_map is None else rows @ self.mode_map
+
     def stiffness(self) -> Float[Array, "mode mode"]:
         """Stiffness matrix K of the coordinates q, suspensions included, in 1/s^2."""
         return -self.A[self.rate_index, self.coordinate_index]
@@ -125,7 +130,8 @@ def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> Moda
     mass = xp.eye(count)
     for i, (actuator, attachment) in enumerate(zip(case.actuators, attachments, strict=True)):
         terms = (
-            factor * modes.shapes(x, order) for x, order, factor in actuator.displacement_map()
+            factor * modes.fields(x, (order,))[0]
+            for x, order, factor in actuator.displacement_map()
         )
         shape = sum(terms, xp.zeros(count))
         displacement_map = set_at(displacement_map, i, shape)

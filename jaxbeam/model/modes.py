@@ -7,9 +7,9 @@ of the degree; frequencies have a relative error of about 1e-11. Rigid
 supports remove a degree of freedom instead of adding a penalty, and springs of any stiffness
 enter through a Cholesky factor, so neither costs accuracy. The problem is solved in beam units
 (length L, mass m L, stiffness E I / L^3), so beams that differ only in those share one solution.
+Beams that are not uniform have their elements in `model.theory`.
 """
 
-import dataclasses
 import functools
 
 import equinox as eqx
@@ -18,97 +18,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
-from jaxbeam.case.beam import END_CONDITIONS
+from jaxbeam.case.beam_parts.damping import MATERIALS
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete
+from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
+from jaxbeam.model.theory.buckling import check_buckling
+from jaxbeam.model.theory.elements import assemble_sections, bending_basis
+from jaxbeam.model.theory.fields import SLOPE, FieldParts, section_fields
+from jaxbeam.model.theory.sections import Sections, sections
 from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
 
-NODE_TOLERANCE = 1e-9  # of the length: closer nodes are one node
 ROUNDING_SHARE = 4e-15  # of the largest coefficient of a shape: smaller ones are rounding errors
-
-
-@dataclasses.dataclass(frozen=True)
-class Layout:
-    """Nodes, segments and end conditions along the beam: order and incidence, hence static.
-
-    `nodes[i]` lists the parts at node i, as indices into `_node_positions(case)`; `constrained[i]`
-    says whether its deflection and rotation are zero; segment i, from node i to i + 1, carries the
-    patches `patches[i]` (indices of actuators) and a polynomial of degree `degrees[i]`.
-    """
-
-    nodes: tuple[tuple[int, ...], ...]
-    constrained: tuple[tuple[bool, bool], ...]
-    patches: tuple[tuple[int, ...], ...]
-    degrees: tuple[int, ...]
-
-
-def _node_positions(case: Case) -> list:
-    """Positions (m) of possible nodes: both ends, every support, both edges of every patch."""
-    patch_ends = [
-        edge for _, patch in _stiffened_sections(case) for edge in (patch.start, patch.end)
-    ]
-    return [0.0, case.beam.length, *(s.position for s in case.supports), *patch_ends]
-
-
-def _stiffened_sections(case: Case) -> list:
-    """Index of each actuator that stiffens the section of the beam, and its stiffening."""
-    pairs = ((i, actuator.section_stiffening()) for i, actuator in enumerate(case.actuators))
-    return [(i, bonded) for i, bonded in pairs if bonded is not None]
-
-
-def mesh_layout(case: Case) -> Layout:
-    """Layout of nodes and segments of a case; its numbers must be concrete (not inside `jit`)."""
-    length = float(concrete(case.beam.length))
-    positions = np.array([float(concrete(x)) / length for x in _node_positions(case)])
-    nodes: list[list[int]] = []
-    for index in np.argsort(positions, kind="stable"):
-        if nodes and positions[index] - positions[nodes[-1][0]] < NODE_TOLERANCE:
-            nodes[-1].append(int(index))
-        else:
-            nodes.append([int(index)])
-    # The lowest index comes first: an end keeps its exact position where a support sits on it.
-    nodes = [sorted(node) for node in nodes]
-
-    def node_conditions(node):
-        ends = (case.beam.left_end, case.beam.right_end)
-        end_constraints = [END_CONDITIONS[ends[i]] for i in node if i < 2]
-        rigid = any(case.supports[i - 2].stiffness is None for i in node if 1 < i < first_patch_end)
-        return (rigid or any(w[0] for w in end_constraints), any(w[1] for w in end_constraints))
-
-    first_patch_end = 2 + len(case.supports)
-    node_positions = np.array([positions[node[0]] for node in nodes])
-    midpoints = (node_positions[1:] + node_positions[:-1]) / 2
-    patches = tuple(
-        tuple(
-            i
-            for n, (i, _) in enumerate(_stiffened_sections(case))
-            if positions[first_patch_end + 2 * n] < middle < positions[first_patch_end + 2 * n + 1]
-        )
-        for middle in midpoints
-    )
-    # A wave of wavenumber k over a length l needs a little more than k l / 2 terms.
-    phases = np.pi / 2 * (case.beam.modes + len(nodes)) * np.diff(node_positions)
-    degrees = tuple(int(np.ceil(z + 4 * z ** (1 / 3) + 9)) for z in phases)
-    constrained = tuple(node_conditions(node) for node in nodes)
-    return Layout(tuple(map(tuple, nodes)), constrained, patches, degrees)
 
 
 @functools.cache
 def _reference_element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Basis on t in [-1, 1] as Chebyshev series (degree, function), its mass and bending matrices.
-
-    The four Hermite cubics (deflection and slope at both ends), then functions that vanish with
-    their slope at both ends: Legendre polynomials integrated twice, orthonormal in bending.
-    """
-    hermite = np.array([[2, -3, 0, 1], [1, -1, -1, 1], [2, 3, 0, -1], [-1, -1, 1, 1]]) / 4.0
-    basis = np.zeros((degree + 1, degree + 1))
-    for i, cubic in enumerate(hermite):
-        basis[:4, i] = legendre.poly2leg(cubic)
-    for n in range(4, degree + 1):
-        bubble = legendre.legint(np.eye(n - 1)[n - 2] * np.sqrt((2 * n - 3) / 2), 2, lbnd=-1)
-        basis[: bubble.size, n] = bubble
+    """`bending_basis` as Chebyshev series (degree, function), its mass and bending matrices."""
+    basis = bending_basis(degree)
     weights = 2 / (2 * np.arange(degree + 1) + 1)
     mass = basis.T @ (weights[:, None] * basis)
     curvature = legendre.legder(basis, 2)
@@ -123,6 +50,9 @@ class Modes(eqx.Module):
     derivative (see `eigen`). Stiffness is of order one for the lowest mode in the
     `stiffness_unit` E I / (m L^4). Shapes are mass-normalised, in kg^-1/2, positive near the left
     end; `series` are their Chebyshev series between the `nodes` (m) of the `layout`.
+
+    Those of a beam that is not uniform have its `sections`, and if it is flexible in shear the
+    `rotation_series` (m^-1 kg^-1/2) of its rotation phi; otherwise phi is the slope w'.
     """
 
     stiffness: Float[Array, " mode"]
@@ -133,6 +63,8 @@ class Modes(eqx.Module):
     series: Float[Array, "segment degree mode"]
     stiffness_unit: Float[Array, ""]
     layout: Layout = eqx.field(static=True)
+    sections: Sections | None = None
+    rotation_series: Float[Array, "segment degree mode"] | None = None
 
     def lowest(self, count: int) -> "Modes":
         """The lowest modes, as many as `count`."""
@@ -146,6 +78,10 @@ class Modes(eqx.Module):
             series=self.series[..., selection],
             stiffness_unit=self.stiffness_unit,
             layout=self.layout,
+            sections=self.sections,
+            rotation_series=(
+                None if self.rotation_series is None else self.rotation_series[..., selection]
+            ),
         )
 
     @property
@@ -187,6 +123,30 @@ class Modes(eqx.Module):
         """Several x-derivatives of the mode shapes at once; the cost is little more than of one."""
         return piecewise_chebyshev(self.nodes, self.series, x, derivatives)
 
+    def fields(self, x, orders: tuple[int, ...]) -> Float[Array, "order *position mode"]:
+        """Fields of the mode shapes at positions x (m) that section forces and actuators need.
+
+        Of orders 0 to 3 (or SLOPE): deflection w, rotation phi of the section, curvature phi', and
+        shear force over bending stiffness V / E I. Those of a uniform beam are w, w', w'', w'''.
+        """
+        if self.sections is None:
+            derivatives = tuple(1 if order == SLOPE else order for order in orders)
+            return self.shape_derivatives(x, derivatives)
+        modes = FieldParts(
+            self.nodes, self.series, self.rotation_series, self.stiffness / self.stiffness_unit
+        )
+        return section_fields(self.sections, modes, x, orders)
+
+
+def mesh_layout(case: Case) -> Layout:
+    """Layout of nodes and elements of a case; its numbers must be concrete (not inside `jit`).
+
+    Raises ValueError for a beam that buckles under its axial force.
+    """
+    layout = find_layout(case)
+    check_buckling(case, layout)
+    return layout
+
 
 def _safe_sqrt(square):
     """Square root whose derivative at zero is zero."""
@@ -198,20 +158,35 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     """Lowest `case.beam.modes` natural modes of the beam on its supports.
 
     Euler-Bernoulli beam, E I w'''' + m w_tt = 0, with supports, rotational springs and bonded
-    patches; suspensions of actuators and support dampers are left to the modal model.
+    patches; suspensions of actuators and support dampers are left to the modal model. The equations
+    of beams that are not uniform are in `model.theory.elements`.
     Differentiable in every number, at repeated frequencies too. Inside `jit`, pass the `layout`
     found outside by `mesh_layout(case)`.
     """
     layout = mesh_layout(case) if layout is None else layout
-    beam = case.beam
-    nodes, stiffness, mass, to_series = assemble_matrices(case, layout)
+    beam, found, to_rotation = case.beam, None, None
+    if is_uniform(case):
+        nodes, stiffness, mass, to_series = assemble_matrices(case, layout)
+    else:
+        found = sections(case, layout)
+        nodes = found.nodes
+        stiffness, mass, to_series, to_rotation = assemble_sections(case, layout, found)
     values, vectors, coupling = eigen(stiffness, mass)
     lowest = slice(beam.modes)
     values, coupling = values[lowest], coupling[lowest, lowest]
     values, coupling = values * _stiffness_unit(beam), coupling * _stiffness_unit(beam)
-    series = xp.einsum("std,dm->stm", to_series, vectors[:, lowest])
-    series = _without_rounding(series) / xp.sqrt(beam.linear_density * beam.length)
-    return normalised_modes(beam, values, coupling, nodes * beam.length, series, layout)
+    unit = xp.sqrt(beam.linear_density * beam.length)
+
+    def shapes(to_series):
+        series = xp.einsum("std,dm->stm", to_series, vectors[:, lowest])
+        return _without_rounding(series) / unit
+
+    rotation = None if to_rotation is None else shapes(to_rotation) / beam.length
+    nodes = nodes * beam.length
+    span = longest_span(case, layout, nodes)
+    return normalised_modes(
+        beam, values, coupling, nodes, shapes(to_series), layout, found, rotation, span
+    )
 
 
 def _without_rounding(series):
@@ -224,9 +199,11 @@ def _without_rounding(series):
     return series - stop_gradient(noise)
 
 
-def normalised_modes(beam, values, coupling, nodes, series, layout: Layout) -> Modes:
+def normalised_modes(
+    beam, values, coupling, nodes, series, layout: Layout, sections=None, rotation=None, span=None
+) -> Modes:
     """Modes of given stiffness (1/s^2) with the beam's damping, positive near the left end."""
-    damping, damping_coupling = _damping(beam, values, coupling)
+    damping, damping_coupling = _damping(beam, values, coupling, span)
     left_values = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
     signs = stop_gradient(xp.where(left_values < 0, -1.0, 1.0))
     sign_products = signs[:, None] * signs[None, :]
@@ -239,6 +216,8 @@ def normalised_modes(beam, values, coupling, nodes, series, layout: Layout) -> M
         series * signs,
         _stiffness_unit(beam),
         layout,
+        sections,
+        None if rotation is None else rotation * signs,
     )
 
 
@@ -253,7 +232,7 @@ def assemble_matrices(case: Case, layout: Layout):
     The series have the shape (segment, degree, unknown).
     """
     beam, degrees = case.beam, layout.degrees
-    positions = xp.stack([x / beam.length for x in _node_positions(case)])
+    positions = xp.stack([x / beam.length for x in node_positions(case)])
     nodes = positions[np.array([node[0] for node in layout.nodes])]
     nodal_unknowns = [[-1, -1] for _ in layout.nodes]
     size = 0
@@ -318,7 +297,7 @@ def supported_matrices(case: Case, layout: Layout):
                 yield case.supports[index - 2], i
 
 
-def _damping(beam, values, coupling):
+def _damping(beam, values, coupling, span):
     """Modal damping (1/s), and damping between repeated modes (mode, mode).
 
     Rayleigh damping, a + b K; or modal ratios, D = 2 zeta sqrt(K), whose derivative between
@@ -327,7 +306,12 @@ def _damping(beam, values, coupling):
     if beam.rayleigh_damping is not None:
         mass_factor, stiffness_factor = beam.rayleigh_damping
         return mass_factor + stiffness_factor * values, stiffness_factor * coupling
-    ratios = xp.broadcast_to(beam.damping_ratio, values.shape)
+    ratio = beam.damping_ratio
+    if beam.loss_factor is not None:
+        ratio = beam.loss_factor / 2
+    if beam.material:
+        ratio = MATERIALS[beam.material].at(beam.length if span is None else span)
+    ratios = xp.broadcast_to(ratio, values.shape)
     omega = _safe_sqrt(values)
     sums = omega[:, None] + omega[None, :]
     coupling_factor = xp.where(

@@ -2,10 +2,13 @@
 
     z' = A(t) z + B(t) u + B_f(t) W,     y = C(t) z + D(t) (u, W)
 
-with the states z = (q, q', states of the actuators), eqs (2.36) and (2.46) of the thesis, commands
-u, and the weights W of the loads (N, positive downwards). The inverse of the mass matrix
-I + sum m psi psi^T of the beam with its loads is a low-rank update, one rank for each load.
+with the states z = (q, q', states of the actuators, states of the vehicles), eqs (2.36) and (2.46)
+of the thesis, commands u, and the static wheel loads W (N, positive downwards). The inverse of the
+mass matrix I + sum m psi psi^T of the beam with its loads is a low-rank update, one rank for each
+wheel. Heights and pitch of vehicles are measured from static equilibrium.
 """
+
+import dataclasses
 
 import equinox as eqx
 import numpy as np
@@ -13,12 +16,19 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.model.contact import surface_rows
 from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.vehicles.contact_rows import (
+    ContactRows,
+    contact_rows,
+    has_known_disturbance,
+    known_disturbance,
+    vehicle_system,
+)
+from jaxbeam.model.vehicles.vehicle_states import initial_vehicle_states, vehicle_signals
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
@@ -40,7 +50,7 @@ class Plant(Module):
 
     @property
     def states(self) -> tuple[Signal, ...]:
-        """Names and units of the states: coordinates, their rates, states of the actuators."""
+        """Names and units of the beam's states: coordinates, their rates, those of actuators."""
         modes = range(1, self.coordinate_scale.shape[0] + 1)
         name, unit = self.coordinate
         coordinates = [Signal(f"{name}_{n}", unit) for n in modes]
@@ -53,24 +63,43 @@ class Plant(Module):
         )
 
     @property
-    def weights(self) -> Float[Array, " load"]:
-        """Weights W of the loads in N, on the beam or off it."""
+    def weights(self) -> Float[Array, " wheel"]:
+        """Static loads W of the wheels in N, on the beam or off it."""
         return self.loads.weight[:, 0]
 
+    @property
+    def vehicle_states(self) -> int:
+        """Number of states of the vehicles, which follow those of the beam."""
+        return self.loads.vehicle_states
+
+    @property
+    def augmented_start(self) -> Float[Array, " added"]:
+        """States that `augmented` adds to those of the beam, at the start of a run."""
+        start = initial_vehicle_states(self.loads)
+        vehicles = xp.zeros(0) if start is None else start[:, 0]
+        one = xp.ones(int(has_known_disturbance(self.loads)))
+        return xp.concatenate([vehicles, self.weights, one])
+
+    def on_static_loads(self) -> "Plant":
+        """The plant without springs of vehicles: wheels have their static loads and masses."""
+        wheels = dataclasses.replace(self.loads.wheels, stiffness=None, damping=None, vehicles=())
+        return dataclasses.replace(self, loads=dataclasses.replace(self.loads, wheels=wheels))
+
     def from_modal(self, states: Float[Array, "state *batch"]) -> Float[Array, "state *batch"]:
-        """States z from the states of the modal model, whose order is (q_1, q_1', q_2, ...)."""
+        """States of the beam from those of the modal model, with the order (q_1, q_1', ...)."""
         ordered = states[self._state_order]
         return ordered * self._state_scales.reshape(-1, *(1,) * (states.ndim - 1))
 
     def to_modal(self, states: Float[Array, "state *batch"]) -> Float[Array, "state *batch"]:
-        """States of the modal model from the states z."""
+        """States of the modal model from those of the beam."""
         scaled = states / self._state_scales.reshape(-1, *(1,) * (states.ndim - 1))
         return scaled[np.argsort(self._state_order)]
 
     def at(self, t: Float[Array, ""] | float) -> StateSpace:
         """System with the loads frozen at a time (s); inputs are the commands, then the weights.
 
-        At the instant at which a load enters or leaves, the system just after it.
+        Its last states are those of the vehicles, whose wheels travel at their speed. At the
+        instant at which a wheel enters or leaves, the system just after it.
         """
         return _plant_at(self, xp.asarray(t, float))
 
@@ -94,22 +123,30 @@ class Plant(Module):
     def augmented(self, t: Float[Array, ""] | float) -> StateSpace:
         """System augmented by the weights as constant states, eq. (5.8) of the thesis.
 
-        Its inputs are the commands; the initial values of the added states are the `weights`.
+        Its inputs are the commands; the states added to those of the beam start at
+        `augmented_start`. With a profile, or forces that vary in time, a last state is 1: its
+        columns are their effect on the beam and on the vehicles.
         """
         frozen_system, commands = self.at(t), len(self.case.actuators)
-        loads = frozen_system.inputs[commands:]
-        zero_rows = np.zeros((len(loads), len(frozen_system.states)))
+        columns = frozen_system.B[:, commands:], frozen_system.D[:, commands:]
+        constants = frozen_system.inputs[commands:]
+        if has_known_disturbance(self.loads):
+            weight, surface = known_disturbance(self.loads, xp.asarray(t, float))
+            vehicle_rates = vehicle_system(self.loads)[1] @ surface
+            vehicle_rates = xp.concatenate([xp.zeros(len(self.states)), vehicle_rates])
+            disturbance = columns[0] @ weight + vehicle_rates, columns[1] @ weight
+            columns = tuple(
+                xp.concatenate([old, new[:, None]], axis=1)
+                for old, new in zip(columns, disturbance, strict=True)
+            )
+            constants = (*constants, Signal("known_disturbance", "1"))
+        count = len(constants)
         return StateSpace(
-            A=xp.block(
-                [
-                    [frozen_system.A, frozen_system.B[:, commands:]],
-                    [zero_rows, np.zeros((len(loads),) * 2)],
-                ]
-            ),
-            B=xp.concatenate([frozen_system.B[:, :commands], np.zeros((len(loads), commands))]),
-            C=xp.concatenate([frozen_system.C, frozen_system.D[:, commands:]], axis=1),
+            A=xp.pad(xp.concatenate([frozen_system.A, columns[0]], axis=1), ((0, count), (0, 0))),
+            B=xp.pad(frozen_system.B[:, :commands], ((0, count), (0, 0))),
+            C=xp.concatenate([frozen_system.C, columns[1]], axis=1),
             D=frozen_system.D[:, :commands],
-            states=frozen_system.states + loads,
+            states=frozen_system.states + constants,
             inputs=frozen_system.inputs[:commands],
             outputs=frozen_system.outputs,
         )
@@ -127,43 +164,39 @@ class Plant(Module):
         actuator_scales = xp.ones(self.modal_model.state_count - 2 * self.coordinate_scale.shape[0])
         return xp.concatenate([self.coordinate_scale, self.coordinate_scale, actuator_scales])
 
-    def _contact_matrices(self, t):
-        """Shape rows (load, mode), contact rows (load, state) and masses (kg) on the beam at t."""
-        loads = self.loads
-        position, speed, acceleration = loads.kinematics(t)
-        active = loads.on_beam(t)
-        rows = surface_rows(self.modal_model, position, speed, acceleration, active)
-        count = loads.wheel_count
-        mass = xp.where(active, loads.inertia[:, 0], 0.0)
-        return (
-            rows.shape.reshape(count, self.coordinate_scale.size),
-            rows.acceleration.reshape(count, self.modal_model.state_count),
-            mass,
-        )
-
-    def _system_with_loads(self, shape_rows, contact_rows, mass) -> StateSpace:
-        """System with loads of given masses (kg), shape and contact rows on the beam."""
-        model = self.modal_model
+    def _system_with_loads(self, contact: ContactRows | None) -> StateSpace:
+        """System with loads of given contact rows, or without loads."""
+        model, states = self.modal_model, self.modal_model.state_count
         rates, matrix, command = model.rate_index, model.A, model.command_matrix
-        # The contact forces: (1 + m S S') r = -W - m (rows z + S forces of the commands).
-        force_input = set_at(
-            xp.zeros((model.state_count, shape_rows.shape[0])), rates, shape_rows.T
-        )
-        contact_matrix = xp.eye(len(mass)) + mass * (shape_rows @ shape_rows.T)
-        force_input = solve_small(contact_matrix[:, :, None], force_input.T[:, :, None])[:, :, 0].T
-        matrix = matrix - force_input @ (mass[:, None] * contact_rows)
-        command = command - force_input @ (mass[:, None] * (shape_rows @ command[rates]))
-        inputs = xp.concatenate([command, -force_input], axis=1)
+        order, scales, signals, weights = self._state_order, self._state_scales, self.states, ()
+        inputs = command
+        if contact is not None:
+            if contact.surface is not None:
+                A, B, _ = vehicle_system(self.loads)
+                matrix = xp.block([[matrix, xp.zeros((states, len(A)))], [B @ contact.surface, A]])
+                added = len(A)
+                command = xp.pad(command, ((0, added), (0, 0)))
+                order = np.append(order, np.arange(states, states + added))
+                scales = xp.append(scales, xp.ones(added))
+                signals = signals + vehicle_signals(self.loads)
+            # The contact forces: (1 + m S S') r = -W - V x - m S (forces of the commands).
+            shape, mass = contact.shape, contact.mass
+            force_input = set_at(xp.zeros((len(matrix), len(mass))), rates, shape.T)
+            contact_matrix = xp.eye(len(mass)) + mass * (shape @ shape.T)
+            solution = solve_small(contact_matrix[:, :, None], force_input.T[:, :, None])
+            force_input = solution[:, :, 0].T
+            matrix = matrix - force_input @ contact.force
+            command = command - force_input @ (mass[:, None] * (shape @ command[rates]))
+            inputs = xp.concatenate([command, -force_input], axis=1)
+            weights = tuple(Signal(f"load_{i}", "N") for i in range(len(mass)))
         C, D = sensor_rows(model, self.case, self.case.sensors).of_system(model, matrix, inputs)
-        order, scales = self._state_order, self._state_scales
-        loads = tuple(Signal(f"load_{i}", "N") for i in range(len(mass)))
         return StateSpace(
             A=matrix[np.ix_(order, order)] * scales[:, None] / scales,
             B=inputs[order] * scales[:, None],
             C=C[:, order] / scales,
             D=D,
-            states=self.states,
-            inputs=_command_signals(self.case) + loads,
+            states=signals,
+            inputs=_command_signals(self.case) + weights,
             outputs=tuple(
                 Signal(f"sensor_{i}_{s.quantity}", s.unit) for i, s in enumerate(self.case.sensors)
             ),
@@ -172,13 +205,12 @@ class Plant(Module):
 
 @compiled_if_traced
 def _plant_at(plant: Plant, t) -> StateSpace:
-    return plant._system_with_loads(*plant._contact_matrices(t))
+    return plant._system_with_loads(contact_rows(plant.modal_model, plant.loads, t))
 
 
 @compiled_if_traced
 def _unloaded_plant(plant: Plant) -> StateSpace:
-    modes, states = plant.coordinate_scale.shape[0], plant.modal_model.state_count
-    return plant._system_with_loads(xp.zeros((0, modes)), xp.zeros((0, states)), xp.zeros(0))
+    return plant._system_with_loads(None)
 
 
 def _command_signals(case: Case) -> tuple[Signal, ...]:

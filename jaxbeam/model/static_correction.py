@@ -10,12 +10,14 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Float
 
+from jaxbeam.case.beam_parts.properties import has
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import is_concrete
 from jaxbeam.model.flexibility import check_supported
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
 from jaxbeam.model.statics import influence_line, static_deflection_per_port_force
+from jaxbeam.model.theory.sections import rigidity_at
 from jaxbeam.runtime.arrays import Array, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 
@@ -49,7 +51,7 @@ def residual_port_flexibility(
 def _modal_port_flexibility(case: Case, layout: Layout, x, derivative: int):
     model = modal_model(case, layout)
     amplitudes = solve(model.stiffness(), model.displacement_map.T)
-    return xp.moveaxis(model.shapes(x, (derivative,))[0] @ amplitudes, -1, 0)
+    return xp.moveaxis(model.fields(x, (derivative,))[0] @ amplitudes, -1, 0)
 
 
 def residual_flexibility(
@@ -70,7 +72,7 @@ def _modal_influence_line(case: Case, layout: Layout, x, load_positions, derivat
     model = modal_model(case, layout)
     load_shapes = model.shapes(load_positions.reshape(-1), (0,))[0]
     amplitudes = solve(model.stiffness(), -load_shapes.T)
-    line = model.shapes(x.reshape(-1), (derivative,))[0] @ amplitudes
+    line = model.fields(x.reshape(-1), (derivative,))[0] @ amplitudes
     return line.T.reshape((*load_positions.shape, *x.shape))
 
 
@@ -101,7 +103,7 @@ def corrected_history(
     uncorrected.
     """
     x, layout = xp.asarray(x, float), modes.layout
-    history = xp.tensordot(motion.coordinates, modes.shapes(x, derivative), axes=[1, -1])
+    history = xp.tensordot(motion.coordinates, modes.fields(x, (derivative,))[0], axes=[1, -1])
     if not is_supported(case, layout):
         return history
     if case.loads:
@@ -134,7 +136,8 @@ def port_forces(
     for i, actuator in enumerate(case.actuators):
         attachment = actuator.attachment()
         terms = (
-            factor * modes.shapes(x, order) for x, order, factor in actuator.displacement_map()
+            factor * modes.fields(x, (order,))[0]
+            for x, order, factor in actuator.displacement_map()
         )
         shape = sum(terms, xp.zeros(motion.rates.shape[1]))
         force = attachment.static_gain * motion.command[:, i]
@@ -156,7 +159,9 @@ def is_supported(case: Case, layout: Layout) -> bool:
         except ValueError:
             return False
         return True
-    held = sum(fixed for fixed, _ in layout.constrained)
+    if has(case.beam, "foundation_stiffness"):
+        return True
+    held = sum(fixed for fixed, _ in layout.constrained) - len(case.beam.hinges)
     held += sum(support.stiffness is not None for support in case.supports)
     held += len(case.actuators)
     return held >= 2 or (held == 1 and any(clamped for _, clamped in layout.constrained))
@@ -212,7 +217,10 @@ def shear_force(case: Case, x, third_derivative) -> Float[Array, "..."]:
 def section_stiffness(case: Case, x) -> Float[Array, "*position"]:
     """Bending stiffness E I of the section at x (m) in N m^2, patches included."""
     x = xp.asarray(x, float)
-    rigidity = xp.full(x.shape, case.beam.bending_stiffness)
+    if case.beam.segments:
+        rigidity = rigidity_at(case, x)
+    else:
+        rigidity = xp.full(x.shape, case.beam.bending_stiffness)
     for patch in filter(None, (actuator.section_stiffening() for actuator in case.actuators)):
         inside = _unit_step(case, x, patch.start) - _unit_step(case, x, patch.end)
         rigidity = rigidity + patch.bending_stiffness * inside

@@ -156,7 +156,7 @@ def _static_peak(case: Case, layout: Layout, x):
     greens = flexibility(case, layout, x.reshape(-1), 0)
     loads = load_set(case)
     windows = loads.entry_exit_times()
-    nodes = xp.concatenate([greens.nodes, greens.sources.positions])
+    nodes = greens.breakpoints
     table_times = [load.times for load in case.loads if load.times is not None]
     passages = loads.passage_times(nodes * length)
     events = xp.concatenate([windows.reshape(-1), passages, *table_times])

@@ -3,6 +3,7 @@
 from jaxbeam.runtime.arrays import custom_jvp, solve_triangular, xp
 
 REPEATED_EIGENVALUE_TOLERANCE = 1e-6  # relative: closer eigenvalues are treated as repeated
+MASSLESS = 1e-20  # share of the mass in a vector: of less, there is only rounding
 RIGID_BODY_EIGENVALUE = 1e-10  # in beam units: eigenvalues below are zero, of rigid-body modes
 
 
@@ -20,7 +21,9 @@ def eigen(stiffness, mass):
     inverse, vectors = xp.linalg.eigh((flexibility + flexibility.T) / 2)
     vectors = solve_triangular(factor.T, vectors[:, ::-1], lower=False)
     inverse = xp.maximum(inverse[::-1], xp.finfo(inverse.dtype).tiny)
-    vectors = vectors / xp.sqrt(xp.sum(vectors * (mass @ vectors), axis=0))
+    squares = xp.sum(vectors * (mass @ vectors), axis=0)
+    # Vectors without mass, of infinite frequency, stay finite; of the others nothing changes.
+    vectors = vectors / xp.sqrt(xp.maximum(squares, MASSLESS))
     # The error of Rayleigh's quotient is that of the vector squared.
     values = xp.sum(vectors * (stiffness @ vectors), axis=0)
     values = xp.where(values > RIGID_BODY_EIGENVALUE, values, 0.0)

@@ -23,13 +23,18 @@ from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
 
 
-def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> EventSchedule:
-    """Events of control, sensors and commands of a case up to the last of the saved samples (s)."""
-    controller, end = case.controller, samples[-1]
+def loop_schedule(
+    case: Case, samples: Float[np.ndarray, " time"], end: float | None = None
+) -> EventSchedule:
+    """Events of control, sensors and commands of a case up to the `end` (s) of the run.
+
+    By default it ends with the last of the saved samples (s).
+    """
+    controller, end = case.controller, float(samples[-1] if end is None else max(end, samples[-1]))
     breakpoints = controller.breakpoints(case)
     breakpoints = np.zeros(0) if breakpoints is None else concrete(breakpoints)
     if controller.period is None:
-        return controller_schedule(samples, np.zeros(0), 0.0, [], [], breakpoints)
+        return controller_schedule(samples, np.zeros(0), 0.0, [], [], breakpoints, end)
 
     def sampling_times(period):
         return np.arange(int(np.floor(end / period * (1 + 1e-12))) + 1) * period
@@ -47,6 +52,7 @@ def loop_schedule(case: Case, samples: Float[np.ndarray, " time"]) -> EventSched
         [sampling_times(float(p)) for p in sampling_periods],
         delays,
         breakpoints,
+        end,
     )
 
 

@@ -105,8 +105,9 @@ class IntegrationPlan(eqx.Module):
     Valid for cases that differ in numbers only, if these keep the order of supports and loads and
     change frequencies little. `substeps` is the number of steps from sample to sample (with a
     controller from event to event), `error` relative to the largest deflection. `lead_samples` are
-    added before the first sample, back to the start of the run. With a controller the `schedule`
-    holds its events and the samples.
+    added before the first sample, back to the start of the run. The run ends with the last sample,
+    or `to_duration` at the duration of the case. With a controller the `schedule` holds its events,
+    the samples and the end.
     """
 
     shapes: StaticShapes = eqx.field(static=True)
@@ -115,6 +116,7 @@ class IntegrationPlan(eqx.Module):
     equally_spaced: bool = eqx.field(static=True)
     error: float = eqx.field(static=True)
     schedule: EventSchedule | None = None
+    to_duration: bool = eqx.field(static=True, default=False)
 
 
 def integration_plan(
@@ -122,17 +124,20 @@ def integration_plan(
 ) -> IntegrationPlan:
     """Integration plan of a case with concrete numbers, for samples at `times` (s).
 
-    Default times are those of the run. `tolerance` is relative to the largest deflection. Raises
-    ValueError for an invalid case, RuntimeError if no time step meets the tolerance.
+    Default times are those of the run, which ends at its duration. `tolerance` is relative to the
+    largest deflection. Raises ValueError for an invalid case, RuntimeError if no time step meets
+    the tolerance.
     """
     check_case(case)
     case = concrete_case(case)
     shapes = static_shapes(case)
-    samples = np.asarray(sample_times(case) if times is None else concrete(times))
+    to_duration = times is None
+    samples = np.asarray(sample_times(case) if to_duration else concrete(times))
     if case.controller is not None:
-        schedule = loop_schedule(case, samples)
+        end = float(case.run.duration) if to_duration else None
+        schedule = loop_schedule(case, samples, end)
         substeps, error = _choose_substeps(case, shapes, schedule, tolerance)
-        return IntegrationPlan(shapes, substeps, 0, False, error, schedule)
+        return IntegrationPlan(shapes, substeps, 0, False, error, schedule, to_duration)
     step, error = choose_step_size(case, shapes, tolerance)
     intervals = np.diff(samples)
     equally_spaced = bool(
@@ -141,7 +146,9 @@ def integration_plan(
     lead_samples = max(0, int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE)))
     _check_step_count(samples.size * (intervals.max() / step), step)
     substeps = steps_per_interval(intervals.max(), step)
-    return IntegrationPlan(shapes, substeps, lead_samples, equally_spaced, error)
+    return IntegrationPlan(
+        shapes, substeps, lead_samples, equally_spaced, error, to_duration=to_duration
+    )
 
 
 def steps_per_interval(interval: float, max_step: float) -> int:
@@ -178,7 +185,8 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
 def sample_times(case: Case) -> Float[Array, " time"]:
     """Times (s) of the samples of a run: from 0 to its duration at its sample rate.
 
-    Raises ValueError if there are more than MAX_STEPS.
+    A run too short for a second sample has one at its end. Raises ValueError if there are more than
+    MAX_STEPS.
     """
     duration, rate = float(concrete(case.run.duration)), float(concrete(case.run.sample_rate))
     if duration * rate > MAX_STEPS:
@@ -186,7 +194,8 @@ def sample_times(case: Case) -> Float[Array, " time"]:
             f"run.duration ({duration:g} s) and run.sample_rate ({rate:g} Hz) make"
             f" {duration * rate:.3g} samples, more than {MAX_STEPS:.0e}: lower one of them"
         )
-    return xp.arange(max(2, int(np.floor(duration * rate * (1 + 1e-12))) + 1)) / rate
+    intervals = int(np.floor(duration * rate * (1 + 1e-12)))
+    return xp.arange(intervals + 1) / rate if intervals else xp.array([0.0, duration])
 
 
 @compiled_if_traced

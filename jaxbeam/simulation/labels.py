@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
 
 MAX_LISTED = 4  # wheels in a sentence
@@ -26,6 +27,8 @@ def contact_sentence(case: Case, lost_times, lost_positions, lowest_forces) -> s
     Times are NaN for wheels that press on the beam throughout. The first of many wheels are listed.
     """
     lost = np.flatnonzero(np.isfinite(lost_times))
+    if case.loads and not _any_on_beam(case):
+        return "no load is on the beam during the run"
     if not lost.size:
         return "every load presses on the beam throughout"
     labels = wheel_labels(case)
@@ -37,3 +40,9 @@ def contact_sentence(case: Case, lost_times, lost_positions, lowest_forces) -> s
     ]
     more = lost.size - first.size
     return "; ".join([*parts, f"{more} more wheels lose contact"] if more else parts)
+
+
+def _any_on_beam(case: Case) -> bool:
+    """Whether any wheel is on the beam at some time of the run."""
+    enter, leave = concrete(load_set(case).entry_exit_times()).T
+    return bool(np.any((enter < concrete(case.run.duration)) & (leave > 0)))

@@ -13,6 +13,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.netcdf import write_netcdf
+from jaxbeam.files.tables import write_table
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.measurement import sensor_readings
@@ -23,6 +24,7 @@ from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.extremes import Extremes, sensor_extremes
 from jaxbeam.simulation.labels import contact_sentence, wheel_labels
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
+from jaxbeam.simulation.record_table import record_columns
 from jaxbeam.simulation.result_variables import (
     MODE_FIELDS,
     MODE_VARIABLES,
@@ -295,6 +297,23 @@ class Record(eqx.Module):
         import xarray
 
         return xarray.Dataset(*self._dataset_parts())
+
+    @property
+    def columns(self) -> dict[str, Float[np.ndarray, " time"]]:
+        """Histories by head, as "midspan deflection (m)": `pandas.DataFrame(columns)` works."""
+        histories = self.sensor_values, self.contact_force, self.command
+        return record_columns(self.case, self.times, *histories)
+
+    def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
+        """Write the record to .nc (all of it), or its `columns` to .csv, .xlsx, .mat or .parquet.
+
+        Raises FileExistsError if the file exists, without `overwrite`; ValueError for another
+        ending; ImportError, with what to install, if a package is missing (see `write_table`).
+        """
+        if os.fspath(path).endswith(".nc"):
+            self.to_netcdf(path, overwrite)
+        else:
+            write_table(path, self.columns, overwrite)
 
     def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the labelled dataset to a netCDF file.

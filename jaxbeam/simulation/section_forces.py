@@ -16,6 +16,7 @@ from jaxbeam.model.static_correction import (
     port_forces,
     shear_force as shear_of_third_derivative,
 )
+from jaxbeam.model.theory.fields import SLOPE
 from jaxbeam.runtime.arrays import Array, xp
 
 SIDES = ("left", "right")
@@ -24,7 +25,9 @@ SIDES = ("left", "right")
 def shear_force(
     case: Case, modes: Modes, motion: Motion, x, side: str = "right"
 ) -> Float[Array, "time *position"]:
-    """Shear force dM/dx in N on one side, "left" or "right", of positions x (m).
+    """Shear force in N on one side, "left" or "right", of positions x (m).
+
+    It is dM/dx, less the rotary inertia of a section that has one.
 
     Raises ValueError for another side.
     """
@@ -55,13 +58,14 @@ def _support_nodes(case: Case, modes: Modes) -> np.ndarray:
 def reactions(case: Case, modes: Modes, motion: Motion) -> Float[Array, "time support"]:
     """Reactions in N, positive upwards, at `support_positions`; forces of their dampers included.
 
-    R = V(x+) - V(x-) + F, with the contact forces F of loads that stand on the support.
+    R = S(x+) - S(x-) + F, with the vertical force S = V - T w' of the section under an axial force
+    T, and the contact forces F of loads that stand on the support. The mass of a bearing is part of
+    it: the reaction is that on the ground.
     """
     nodes, step = _support_nodes(case, modes), SIDE_SHARE * case.beam.length
     x = modes.nodes[nodes]
     first, last = nodes == 0, nodes == modes.nodes.shape[0] - 1
-    right = shear_force(case, modes, motion, x, "right")
-    left = shear_force(case, modes, motion, x, "left")
+    right, left = (_vertical_force(case, modes, motion, x, side) for side in ("right", "left"))
     reaction = xp.where(last, 0.0, right) - xp.where(first, 0.0, left)
     # Loads between the sections on both sides; none are beyond the ends.
     low, high = xp.where(first, -xp.inf, x - step), xp.where(last, xp.inf, x + step)
@@ -75,4 +79,19 @@ def reactions(case: Case, modes: Modes, motion: Motion) -> Float[Array, "time su
             if order == 0:
                 at_support = (place > low) & (place <= high)
                 reaction = reaction - factor * xp.where(at_support, force[:, None], 0.0)
+    for support in case.supports:
+        if support.mass is not None:
+            acceleration = motion.accelerations @ modes.shapes(support.position)
+            there = (support.position > low) & (support.position <= high)
+            inertia = xp.where(there, support.mass * acceleration[:, None], 0.0)
+            reaction = reaction + inertia
     return reaction
+
+
+def _vertical_force(case: Case, modes: Modes, motion: Motion, x, side: str):
+    """Vertical force V - T w' in N on one side of positions x."""
+    shear = shear_force(case, modes, motion, x, side)
+    if case.beam.axial_force is None:
+        return shear
+    slope = corrected_history(case, modes, motion, beside(case, x, side), SLOPE)
+    return shear - case.beam.axial_force * slope

@@ -48,9 +48,10 @@ def simulate(
 
     Integrates q'' + D q' + K q = sum of shapes(x_a) r_a, with r_a the contact forces (see
     `jaxbeam.model.contact`), to `tolerance` (relative to the largest deflection) by exponential
-    collocation. Samples are at the sample rate of the run or at ascending `times` (s); they do not
-    depend on the time step. Differentiable in every number of the case, forward and in reverse.
-    Inside `jit` or `vmap`, give a `plan` made outside by
+    collocation. Samples are at the sample rate of the run, which ends at its duration, or at
+    ascending `times` (s), with the last of which it then ends. Samples do not depend on the time
+    step, peaks not on the sample rate. Differentiable in every number of the case, forward and in
+    reverse. Inside `jit` or `vmap`, give a `plan` made outside by
     `jaxbeam.simulation.integration_plan.integration_plan`.
 
     Raises ValueError for an invalid case or times, RuntimeError if no time step meets the
@@ -171,7 +172,10 @@ def integration_setup(
         spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
         lead_times = times[0] - spacing * xp.arange(plan.lead_samples, 0, -1)
         schedule = sample_schedule(
-            xp.concatenate([lead_times, times]), plan.equally_spaced, plan.lead_samples
+            xp.concatenate([lead_times, times]),
+            plan.equally_spaced,
+            plan.lead_samples,
+            case.run.duration if plan.to_duration else None,
         )
     else:
         schedule = plan.schedule

@@ -53,9 +53,11 @@ class Runner:
         self.histories, self.single = histories, single
         self.schedule = None
         if case.controller is not None:
-            self.schedule = loop_schedule(case, np.asarray(sample_times(case)))
+            self.schedule = loop_schedule(
+                case, np.asarray(sample_times(case)), float(case.run.duration)
+            )
         elif histories:
-            self.schedule = sample_schedule(sample_times(case), True)
+            self.schedule = sample_schedule(sample_times(case), True, end=case.run.duration)
         # More threads than cores, as some wait for the results of others.
         self.pool = ThreadPoolExecutor(2 * (os.cpu_count() or 1))
         # The variant that measures step sizes is compiled below, others on first use.

@@ -28,13 +28,12 @@ def compute_sweep(
     specification: SweepSpecification,
     path: Path | None,
     state: str,
-    overwrite: bool,
     client: Any,
     progress_bar: tqdm,
 ) -> "xarray.Dataset":
     """Dataset of a sweep; blocks are written to the store at a path, unless it is None.
 
-    `state` of the store is "new" or "resume" (see `resolve_action`); then the blocks in it are not
+    `state` of the store is "new" or "resume" (see `Writing`); then the blocks in it are not
     computed again, and count in the progress bar as done before. With a `client` of Dask its
     workers compute all blocks but the first.
     """
@@ -50,7 +49,7 @@ def compute_sweep(
             step_sizes_and_error = np.append(steps, error)
             content = specification.to_dict()
             block_store = sweep_store.create_store(
-                path, fingerprint, content, runner.block_count, step_sizes_and_error, overwrite
+                path, fingerprint, content, runner.block_count, step_sizes_and_error
             )
     missing = block_store.missing()
     remaining = sum(runner.run_count(block) for block in missing)

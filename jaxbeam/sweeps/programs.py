@@ -60,13 +60,19 @@ class Program(NamedTuple):
         """Loads of a batch, in all its runs."""
         varied = self.case_with(shared_values)
 
-        def wheels(values):
+        def wheels_of_run(values):
             pairs = zip(self.batched_addresses, values, strict=True)
             loads = load_set(replace(varied, dict(pairs)))
-            return jax.tree.map(lambda part: part[..., 0], loads.wheels)
+            wheels = loads.wheels
+            if loads.massless:  # known to be, which `vmap` would hide: no equations of contact
+                wheels = eqx.tree_at(_inertia, wheels, None)
+            return jax.tree.map(lambda part: part[..., 0], wheels)
 
-        wheels_of_runs = jax.vmap(wheels, out_axes=-1)(batched_values)
-        return dataclasses.replace(load_set(varied), wheels=wheels_of_runs)
+        wheels = jax.vmap(wheels_of_run, out_axes=-1)(batched_values)
+        if wheels.inertia is None:
+            massless = np.zeros(wheels.weight.shape)
+            wheels = eqx.tree_at(_inertia, wheels, massless, is_leaf=lambda leaf: leaf is None)
+        return dataclasses.replace(load_set(varied), wheels=wheels)
 
     def grid(self, model, shared_values, step_size):
         """Time grid of a batch for a longest step (s) and a number of extra steps per event."""
@@ -225,6 +231,10 @@ def _map_masked(function, mask, values):
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     return jax.lax.map(lambda row: jax.lax.cond(row[0], function, zeros, row[1]), (mask, values))
+
+
+def _inertia(wheels):
+    return wheels.inertia
 
 
 def _split_shared_model(models: ModalModel):

@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.aliases import current_address
-from jaxbeam.case.case import Case, list_sizes, own_addresses, replace, value_at
+from jaxbeam.case.case import Case, list_sizes, own_addresses, replace, unit_at, value_at
 from jaxbeam.case.declared_checks import describe_value
 from jaxbeam.case.joint_addresses import overlap
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
@@ -205,6 +206,8 @@ def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.nda
     """Values of one address as an array, with the checks that need no other address."""
     if any(np.ndim(value_at(case, one)) for one in own_addresses(case, address)):
         raise ValueError(f"{address} is a list; sweep over one of its entries, {address}.0")
+    if isinstance(values_given, list | tuple):
+        values_given = in_si(values_given, unit_at(case, address), address)
     try:
         values = np.atleast_1d(np.asarray(values_given, float))
     except (TypeError, ValueError, OverflowError):

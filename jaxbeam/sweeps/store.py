@@ -2,7 +2,9 @@
 
 During a sweep each block is one chunk of flat arrays in the group `blocks`, written before its flag
 in the array `done`. The labelled dataset then replaces the group; the store is complete when the
-group is gone. A fingerprint of all that determines the results protects against mixing sweeps.
+group is gone. A fingerprint of all that determines the results protects against mixing sweeps: the
+arrays of blocks are in a group named by it, so that a worker that was left behind by an earlier
+sweep at this path writes none of its blocks among those of another.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from jaxbeam.sweeps.zarr_files import (
     DAMAGE_ERRORS,
     FINGERPRINT_ATTRIBUTE,
     array_options,
+    blocks_mark,
     checksummed,
     explaining_damage,
     explaining_write_errors,
@@ -45,7 +48,10 @@ class ZarrStore(BlockStore):
 
         self._path = path
         with explaining_damage(path):
-            self._blocks: Any = zarr.open_group(path, mode="r+")[BLOCKS_GROUP]
+            group: Any = zarr.open_group(path, mode="r+", zarr_format=3)
+            mark = blocks_mark(str(group.attrs[FINGERPRINT_ATTRIBUTE]))
+            self._blocks: Any = group[BLOCKS_GROUP][mark]
+            self._folder = path / BLOCKS_GROUP / mark
             self.steps = np.asarray(self._blocks["steps"][:])
             self._flags = self._blocks["done"]
             self._count = self._flags.shape[0]
@@ -102,7 +108,7 @@ class ZarrStore(BlockStore):
         return self._arrays[name]
 
     def _is_flagged(self, block: int) -> bool:
-        if not (self._path / BLOCKS_GROUP / "done" / "c" / str(block)).is_file():
+        if not (self._folder / "done" / "c" / str(block)).is_file():
             return False
         try:
             return bool(self._flags[block])
@@ -124,7 +130,7 @@ class ZarrStore(BlockStore):
                 array = self._blocks[name]
                 size = array.chunks[0]
                 chunk = Path("c", str(block), *["0"] * (array.ndim - 1))
-                if not (self._path / BLOCKS_GROUP / name / chunk).is_file():
+                if not (self._folder / name / chunk).is_file():
                     return False
                 array[block * size : (block + 1) * size]
         except DAMAGE_ERRORS:
@@ -139,14 +145,14 @@ def read_dataset(path: Path) -> xarray.Dataset:
 
     shutil.rmtree(path / BLOCKS_GROUP, ignore_errors=True)  # chunks may remain after a kill
     with explaining_damage(path):
-        group = zarr.open_group(path, mode="r")
+        group = zarr.open_group(path, mode="r", zarr_format=3)
         arrays: dict[str, Any] = {
             part.name: group[part.name] for part in path.iterdir() if part.is_dir()
         }
         incomplete = [name for name, array in arrays.items() if not is_complete(array)]
         if incomplete:
             raise ValueError(f"parts of {', '.join(sorted(incomplete))} are missing")
-        return xarray.open_zarr(path, consolidated=False).load()
+        return xarray.open_zarr(path, consolidated=False, zarr_format=3).load()
 
 
 def status(path: Path) -> tuple[str, str] | None:
@@ -159,39 +165,15 @@ def status(path: Path) -> tuple[str, str] | None:
     if not path.exists():
         return None
     try:
-        fingerprint = str(zarr.open_group(path, mode="r").attrs[FINGERPRINT_ATTRIBUTE])
+        fingerprint = str(
+            zarr.open_group(path, mode="r", zarr_format=3).attrs[FINGERPRINT_ATTRIBUTE]
+        )
     except (KeyError, OSError, ValueError):
         raise FileExistsError(
             f"{path} exists and is not a sweep of jaxbeam; choose another name"
         ) from None
     unfinished = (path / BLOCKS_GROUP / "zarr.json").exists()
     return "unfinished" if unfinished else "complete", fingerprint
-
-
-def resolve_action(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> str:
-    """Action for a sweep at a path: "new", "resume", or "complete" for one that is finished.
-
-    Raises FileExistsError if a sweep exists, without `resume` or `overwrite`, ValueError for both,
-    or if the sweep to be resumed has another fingerprint, and as `check_writable`.
-    """
-    if resume and overwrite:
-        raise ValueError("resume continues a sweep, overwrite discards it; choose one of them")
-    existing = status(path)
-    if existing is None or overwrite:
-        check_writable(path)
-        return "new"
-    if not resume:
-        raise FileExistsError(
-            f"{path} holds a sweep already ({existing[0]}); resume it, overwrite it, or choose "
-            "another name"
-        )
-    if existing[1] != fingerprint:
-        raise ValueError(
-            f"{path} holds a sweep of another case, other values or settings, or by another"
-            " version (the C library of `jaxbeam native` is one): it cannot be resumed with"
-            " these; choose another name, or overwrite it"
-        )
-    return "complete" if existing[0] == "complete" else "resume"
 
 
 def check_writable(path: Path) -> None:
@@ -211,15 +193,14 @@ def create_store(
     specification: dict[str, Any],
     blocks: int,
     steps: np.ndarray,
-    overwrite: bool = False,
 ) -> ZarrStore:
     """New store for a number of blocks, with the specification of the sweep.
 
-    `steps` are the step sizes (s) of the batches and the error estimate. With `overwrite` a sweep
-    at the path is deleted. Raises OSError if the store cannot be written.
+    `steps` are the step sizes (s) of the batches and the error estimate. Raises OSError if the
+    store cannot be written.
     """
-    with new_store(path, fingerprint, overwrite) as group:
-        blocks_group = group[BLOCKS_GROUP]
+    with new_store(path, fingerprint) as group:
+        blocks_group = group[BLOCKS_GROUP].create_group(blocks_mark(fingerprint))
         blocks_group.create_array(
             "done", shape=(blocks,), chunks=(1,), dtype=bool, fill_value=False
         )

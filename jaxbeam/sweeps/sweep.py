@@ -9,11 +9,12 @@ from tqdm import tqdm
 
 from jaxbeam.case.case import Case
 from jaxbeam.simulation.integration_plan import TOLERANCE
-from jaxbeam.sweeps import store as sweep_store
 from jaxbeam.sweeps.computation import compute_sweep
 from jaxbeam.sweeps.specification import sweep_specification
+from jaxbeam.sweeps.store import read_dataset
 from jaxbeam.sweeps.truncation import warn_of_truncation
 from jaxbeam.sweeps.words import compute_word_sweep, split_words, word_sweep
+from jaxbeam.sweeps.writing import writing
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -35,7 +36,8 @@ def sweep(
 ) -> "xarray.Dataset":
     """Simulate a case for many values of the numbers, and for words, at given addresses.
 
-    `over` maps each address to a list of values (SI units): all combinations, with a dimension per
+    `over` maps each address to a list of values (SI units, or text with units, as
+    "60 km/h"): all combinations, with a dimension per
     address, or with `paired` the first of each, the second, and so on along `run`. An address such
     as `loads.*.speed` is the speed of all loads. A list of words, as trains of the library at
     `loads.0.train` or models of vehicles at `loads.0.model`, makes a case of each, and a dimension
@@ -58,12 +60,15 @@ def sweep(
     With a `store` each block is written to a zarr store when it is done; with `resume` an
     interrupted sweep continues from there, with bit-identical results. With a `client` of Dask
     (`distributed.Client`) its workers compute the blocks and write them to the store, in a folder
-    that they share.
+    that they share. One sweep at a time writes to a store; its lock, `.NAME.lock` beside it, ends
+    with the process. With `overwrite` the new sweep is written to a folder `.NAME.new` beside the
+    old one, which it replaces when it is complete; interrupted, it continues there when repeated.
 
     Raises ValueError for an unknown address, invalid values, a case without sensors, a controller
     in single precision, or a client without a store; FileExistsError if the store exists, without
-    `resume` or `overwrite`; OSError if it cannot be written; RuntimeError if no time step meets the
-    tolerance or workers keep dying.
+    `resume` or `overwrite`; OSError if it cannot be written, or another process writes it (an
+    `InUseError`, which says which); RuntimeError if no time step meets the tolerance or workers
+    keep dying.
     """
     if client is not None and store is None:
         raise ValueError("workers write their blocks to a store; name one")
@@ -74,14 +79,15 @@ def sweep(
     else:
         plan = sweep_specification(case, over, *settings)
     warn_of_truncation(case)
-    path = None if store is None else Path(store).absolute()
-    fingerprint = plan.fingerprint()
-    state = (
-        "new" if path is None else sweep_store.resolve_action(path, fingerprint, resume, overwrite)
-    )
-    if path is not None and state == "complete":
-        return sweep_store.read_dataset(path)
-    bar = tqdm(total=plan.count, unit="run", disable=not progress, file=sys.stderr)
-    with bar as progress_bar:
-        compute = compute_word_sweep if words else compute_sweep
-        return compute(plan, path, state, overwrite, client, progress_bar)
+    compute = compute_word_sweep if words else compute_sweep
+
+    def computed(folder: Path | None, state: str) -> "xarray.Dataset":
+        with tqdm(total=plan.count, unit="run", disable=not progress, file=sys.stderr) as bar:
+            return compute(plan, folder, state, client, bar)
+
+    if store is None:
+        return computed(None, "new")
+    with writing(Path(store).absolute(), plan.fingerprint(), resume, overwrite) as place:
+        if place.state == "complete":
+            return read_dataset(place.folder)
+        return computed(*place)

@@ -160,14 +160,13 @@ def compute_word_sweep(
     plan: WordSweep,
     path: Path | None,
     state: str,
-    overwrite: bool,
     client: Any,
     progress_bar: tqdm,
 ) -> "xarray.Dataset":
     """Dataset of a sweep over words, one word after the other (see `compute_sweep`)."""
     fingerprint = plan.fingerprint()
     if path is not None and state == "new":
-        with new_store(path, fingerprint, overwrite):
+        with new_store(path, fingerprint):
             pass
     datasets = []
     for i, part in enumerate(plan.sweeps):
@@ -184,10 +183,11 @@ def compute_word_sweep(
 
 def _compute_part(part, path, client, progress_bar) -> "xarray.Dataset":
     """Dataset of the sweep of numbers for one combination of words."""
-    state = "new"
-    if path is not None:
-        state = sweep_store.resolve_action(path, part.fingerprint(), path.exists(), False)
-    if path is not None and state == "complete":
+    found = None if path is None else sweep_store.status(path)
+    if path is not None and found == ("complete", part.fingerprint()):
         count_as_done(progress_bar, part.count)
         return sweep_store.read_dataset(path)
-    return compute_sweep(part, path, state, False, client, progress_bar)
+    if found and found[1] != part.fingerprint():
+        raise ValueError(f"{path} is not the part of its sweep that its place says")
+    state = "new" if found is None else "resume"
+    return compute_sweep(part, path, state, client, progress_bar)

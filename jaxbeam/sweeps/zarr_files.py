@@ -23,6 +23,11 @@ DAMAGE_ERRORS = (
 )  # of zarr, for damaged files
 
 
+def blocks_mark(fingerprint: str) -> str:
+    """Name of the group of the blocks of a sweep, within BLOCKS_GROUP."""
+    return fingerprint[:16]
+
+
 def checksummed() -> list[Any]:
     """Compressor of arrays, with a checksum by which damage is detected."""
     from zarr.codecs import ZstdCodec
@@ -65,29 +70,35 @@ def explaining_write_errors(path: Path):
 
 
 @contextlib.contextmanager
-def new_store(path: Path, fingerprint: str, overwrite: bool) -> Iterator[Any]:
-    """Group of a new, unfinished store at a path, to be filled; with `overwrite` in place of one.
+def new_store(path: Path, fingerprint: str) -> Iterator[Any]:
+    """Group of a new, unfinished store at a path where there is none, to be filled.
 
     Raises OSError if the store cannot be written.
     """
     import zarr
 
     # Written beside the path and renamed, so that a store is complete or does not exist.
-    temporary_path = path.with_name(f".{path.name}.new")
+    temporary_path = path.with_name(f".{path.name}.start")
     shutil.rmtree(temporary_path, ignore_errors=True)
     with explaining_write_errors(path):
-        group = zarr.create_group(temporary_path)
+        group = zarr.create_group(temporary_path, zarr_format=3)
         group.create_group(BLOCKS_GROUP)
         yield group
         group.attrs[FINGERPRINT_ATTRIBUTE] = fingerprint
-        if overwrite:
-            shutil.rmtree(path, ignore_errors=True)
         temporary_path.rename(path)
 
 
 def replace_blocks(path: Path, dataset: xarray.Dataset) -> None:
-    """Replace the blocks of a store by the labelled dataset of the sweep."""
+    """Replace the blocks of a store by the labelled dataset of the sweep.
+
+    Raises OSError if the store cannot be written, or is that of another sweep meanwhile.
+    """
+    import zarr
+
     with explaining_write_errors(path):
+        found = zarr.open_group(path, mode="r", zarr_format=3).attrs.get(FINGERPRINT_ATTRIBUTE)
+        if found != dataset.attrs[FINGERPRINT_ATTRIBUTE]:
+            raise OSError("another sweep has taken its place")
         # Arrays of an interrupted attempt may be incomplete.
         for folder in path.iterdir():
             if folder.is_dir() and folder.name != BLOCKS_GROUP:
@@ -102,9 +113,10 @@ def replace_blocks(path: Path, dataset: xarray.Dataset) -> None:
             path,
             mode="a",
             consolidated=False,
+            zarr_format=3,
             write_empty_chunks=True,
             encoding={name: {"compressors": checksummed()} for name in dataset.variables},
         )
         # Without its metadata the group is gone and the store complete.
         (path / BLOCKS_GROUP / "zarr.json").unlink()
-        shutil.rmtree(path / BLOCKS_GROUP)
+        shutil.rmtree(path / BLOCKS_GROUP, ignore_errors=True)

@@ -1,11 +1,13 @@
 """Commands: results printed and files written; one sentence for a command line that is wrong."""
 
 import itertools
+import json
 import math
 
 import numpy as np
 import pytest
 
+from jaxbeam.cli import main
 from tests.cli.example import CASE
 
 
@@ -97,6 +99,7 @@ def test_simulate_prints_and_writes_the_same(run, folder):
         "error_estimate",
         "steps",
         "verdict",
+        "plausibility",
     }
     printed = run("simulate case.toml -o out.nc --plot --animate out.gif")
     assert f"{float(record.peak_deflection[0]):.6g}" in printed
@@ -104,6 +107,65 @@ def test_simulate_prints_and_writes_the_same(run, folder):
     assert (folder / "out.nc").stat().st_size > 0
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "out.gif").read_bytes().startswith(b"GIF89a")
+
+
+def test_what_looks_wrong_is_said_before_a_run(run, folder, capsys):
+    found = run("check case.toml --json")
+    assert found["first_frequency"] == pytest.approx(frequency(1))
+    assert found["warnings"] == []
+    assert "nothing looks wrong" in run("check case.toml")
+    for command in ("simulate case.toml", "sweep case.toml --over loads.0.mass=0.1,0.5"):
+        lines = run(command).splitlines()
+        assert lines[0].startswith("plausibility: first frequency 20.39 Hz")
+    for command in ("check", "simulate", "sweep --over loads.0.speed=0.5,1"):
+        name, *more = command.split()
+        with pytest.raises(SystemExit):
+            main([name, "case.toml", *more, "--set", "run.duration=1.5", "--set", "loads.0.mass=9"])
+        printed = capsys.readouterr()
+        assert printed.err.count("jaxbeam: warning: the beam sags by") == 1
+        assert "written" not in printed.out
+
+
+def test_units_on_the_command_line(run, capsys):
+    options = ["--set", "beam.length=600 mm", "--set", "beam.damping_ratio=1 %,2 %,3 %", "--json"]
+    with pytest.raises(SystemExit):
+        main(["modes", "case.toml", *options])
+    found = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(found["damping_ratios"], [0.01, 0.02, 0.03], rtol=1e-9)
+    assert found["frequencies_hz"][0] == pytest.approx(frequency(1))
+    for over in ("3.6 km/h:7.2 km/h:3", "3.6 km/h,1.5 m/s,200 cm/s"):
+        with pytest.raises(SystemExit):
+            main(["sweep", "case.toml", "--over", f"loads.0.speed={over}", "--json"])
+        values = json.loads(capsys.readouterr().out)["values"]["loads.0.speed"]
+        np.testing.assert_allclose(values, [1.0, 1.5, 2.0], rtol=1e-12)
+    with pytest.raises(SystemExit):
+        main(["sweep", "case.toml", "--over", "loads.0.speed=3 km/h:7 m/s:3"])
+    assert "both ends of a range have the same unit" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["simulate", "case.toml", "--set", "loads.0.mass=5 N"])
+    assert "loads.0.mass must be in kg, or a unit of the same kind" in capsys.readouterr().err
+
+
+def test_a_case_is_described_in_numbers(run):
+    printed = run("describe case.toml")
+    assert "beam of 0.6 m, pinned-pinned: E I = 11.68 N m^2, 0.535 kg/m" in printed
+    assert f"natural frequencies (Hz): {frequency(1):.5g}, {frequency(2):.5g}" in printed
+    assert f"critical speed: {2 * 0.6 * frequency(1):.4g} m/s" in printed
+
+
+def test_a_record_as_a_table(run, folder):
+    assert "written: out.csv" in run("simulate case.toml -o out.csv")
+    heads, *rows = (folder / "out.csv").read_text().splitlines()
+    assert heads.split(",")[:2] == ["time (s)", "sensor 0 deflection (m)"]
+    assert len(rows) == 201
+
+
+def test_modes_as_a_table(run, folder):
+    assert "written: modes.csv" in run("modes case.toml -o modes.csv")
+    table = np.loadtxt(folder / "modes.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(table[:, 0], [1, 2, 3])
+    np.testing.assert_allclose(table[:, 1], [frequency(n) for n in (1, 2, 3)], rtol=1e-9)
+    np.testing.assert_allclose(table[:, 2], 0.03, rtol=1e-9)
 
 
 def test_an_accelerometer_is_not_reported_as_deflection(run):

@@ -27,7 +27,24 @@ COMPARISON = {
 }
 METRICS = {"peak", "worst_share", "mean_share", "after_exit", "saturated"}
 
+PLAUSIBILITY = dict.fromkeys(
+    (
+        "first_frequency",
+        "span",
+        "deflection",
+        "own_deflection",
+        "mass_ratio",
+        "crossing_time",
+        "speed",
+        "critical_speed",
+        "warnings",
+        "span_over_deflection",
+        "speed_ratio",
+    )
+)
+
 KEYS = {
+    "check case.toml": PLAUSIBILITY,
     "modes case.toml": {"frequencies_hz": None, "damping_ratios": None},
     "frf case.toml --pair force@0.3:deflection@0.3 --points 3": {
         "frequencies_hz": None,
@@ -58,8 +75,10 @@ KEYS = {
         "effort": None,
         "saturated": None,
         "verdict": None,
+        "plausibility": PLAUSIBILITY,
     },
     "describe case.toml": {
+        "case": PLAUSIBILITY | {"frequencies_hz": None},
         "vehicles": [
             {
                 "title": None,
@@ -73,12 +92,13 @@ KEYS = {
                 "degrees_of_freedom": None,
                 "frequencies_hz": None,
             }
-        ]
+        ],
     },
     "sweep case.toml --over loads.0.mass=0.3,0.5": {
         "values": {"loads.0.mass": None},
         "dimensions": None,
         "peak_deflection": None,
+        "plausibility": PLAUSIBILITY,
     },
     "stability controlled.toml --limits --headway 0.5": {
         "stable_without_loads": None,

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from jaxbeam.cli.export import GAIN_FILES
+from jaxbeam.cli.commands.export import GAIN_FILES
 from jaxbeam.files.export import WRITERS
 
 HEAVY = ("jax", "numpy", "scipy", "equinox", "matplotlib", "xarray", "tuning", "experiments")

@@ -17,20 +17,12 @@ from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.sweeps import cluster
 from jaxbeam.sweeps.specification import specification_from_dict, sweep_specification
 from jaxbeam.sweeps.store import ZarrStore, create_store
+from tests.sweeps.test_store import files_of
 from tests.sweeps.test_sweep import CASE
 
 distributed = pytest.importorskip("distributed")
 
 OVER = {"loads.0.mass": np.linspace(0.1, 0.9, 64), "loads.0.speed": np.linspace(1, 4, 48)}
-
-
-def files(store: Path) -> dict[str, bytes]:
-    """Every file of a store."""
-    return {
-        str(path.relative_to(store)): path.read_bytes()
-        for path in sorted(store.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +47,7 @@ def local_store(tmp_path_factory):
 
 def kill_one(client, store: Path) -> None:
     """Kill a worker as soon as three blocks are done."""
-    flags = store / "blocks" / "done" / "c"
-    while not flags.exists() or len(list(flags.iterdir())) < 3:
+    while len(list(store.glob("blocks/*/done/c/*"))) < 3:
         time.sleep(0.001)
     os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
 
@@ -70,7 +61,7 @@ def test_killed_worker_does_not_change_the_store(workers, local_store, tmp_path)
     found = jb.sweep(CASE, OVER, store=store, progress=False, client=workers)
     killer.join()
     assert not found.failed.any()
-    assert files(store) == files(local_store)
+    assert files_of(store) == files_of(local_store)
 
     # Started and killed on one machine, finished by the workers.
     second = tmp_path / "second.zarr"
@@ -93,7 +84,7 @@ def test_killed_worker_does_not_change_the_store(workers, local_store, tmp_path)
     with pytest.raises(SystemExit) as ended:
         main([*line, "--over", lists[0], "--over", lists[1]])
     assert ended.value.code == 0
-    assert files(second) == files(local_store)
+    assert files_of(second) == files_of(local_store)
     assert case.read_text() == tomli_w.dumps(tomllib.loads(case.read_text()))
 
 

@@ -39,6 +39,12 @@ CASES = {
         ],
         run=jb.Run(0.5, sample_rate=20000.0),
     ),
+    "Timoshenko": jb.Case(
+        dataclasses.replace(BEAM, shear_stiffness=4e3),
+        sensors=SENSORS,
+        loads=[jb.MovingForce(force=3.0, speed=4.0)],
+        run=jb.Run(0.4, sample_rate=20000.0),
+    ),
     "command": jb.Case(
         BEAM,
         actuators=[jb.Patch(0.4, 0.5, 2e-3, limits=[-200, 200])],

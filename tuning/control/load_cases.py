@@ -2,20 +2,24 @@
 
 import dataclasses
 import itertools
+import math
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats.qmc import LatinHypercube
 
 from jaxbeam.case.case import Case, crossing_times, replace
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.reading.tables import COUNT, NUMBERS, TABLE, check_entry, check_table
+from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.case.trajectory import NEVER
 
 AddressValues = dict[str, float]  # values of the case by address
 TABLES = ("training", "held_out")
+VALUES = NUMBERS._replace(description='a list of numbers, such as "loads.0.mass" = [0.2, 0.5]')
+MAX_LOAD_CASES = 100_000
 # Addresses of the plant begin with these.
 PLANT_PREFIXES = ("beam.", "supports.", "actuators.", "sensors.")
 
@@ -94,44 +98,41 @@ def read_load_cases(path: str | os.PathLike) -> LoadCases:
     Raises ValueError, naming the file and the key, for faulty content; OSError if the file cannot
     be read.
     """
+    content = read_toml(path, "file of load cases")
     try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise type(error)(f"cannot read the load cases {path}: {reason}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not valid TOML: {error}") from None
+        return _load_cases(content)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _load_cases(content: dict[str, Any]) -> LoadCases:
+    """Load cases from the tables of their file."""
     unknown = set(content) - set(TABLES)
     if unknown:
-        raise ValueError(
-            f"{path}: there is no table [{min(unknown)}]; it has [training], [held_out]"
-        )
+        raise ValueError(f"there is no table [{min(unknown)}]; it has [training], [held_out]")
+    check_table("", content, dict.fromkeys(TABLES, TABLE))
     runs = {}
     for name in TABLES:
         table = dict(content.get(name, {}))
         draw_options = {key: table.pop(key) for key in ("draws", "seed") if key in table}
         for address, entries in table.items():
-            numbers = isinstance(entries, list) and entries
-            if not numbers or not all(type(x) in (int, float) for x in entries):
-                raise ValueError(
-                    f"{path}: {name}.{address} must be a list of numbers, such as"
-                    f' "loads.0.mass" = [0.2, 0.5]'
-                )
-        runs[name] = _table_runs(table, draw_options, f"{path}: {name}")
-    try:
-        return LoadCases(**runs)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+            check_entry(f"{name}.{address}", entries, VALUES)
+        runs[name] = _table_runs(table, draw_options, name)
+    return LoadCases(**runs)
 
 
 def _table_runs(table, draw_options, where: str) -> tuple[AddressValues, ...]:
     """Runs of a table: the full grid of its lists, or draws from its ranges."""
-    if any(type(number) is not int or number < 0 for number in draw_options.values()):
-        raise ValueError(f"{where}: draws and seed are integers, such as draws = 12")
+    check_table(where, draw_options, {"draws": COUNT, "seed": COUNT})
+    count = draw_options.get("draws", math.prod(map(len, table.values())))
+    if count > MAX_LOAD_CASES:
+        raise ValueError(f"{where} has {count:.3g} runs, more than {MAX_LOAD_CASES}: take fewer")
     if "draws" not in draw_options:
         if draw_options:
             raise ValueError(f"{where}.seed is for drawing: say how many with draws = 12")
         return full_grid(table) if table else ()
+    if not table:
+        raise ValueError(f'{where}.draws needs ranges, such as "loads.0.mass" = [0.2, 0.5]')
     for address, entries in table.items():
         if len(entries) != 2:
             raise ValueError(

@@ -1,22 +1,30 @@
 """Description of a log, in a TOML file of the same stem: columns, units, sensors and loads."""
 
-import difflib
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.files.case_file import read_part
+from jaxbeam.case.reading.parts import read_parts
+from jaxbeam.case.reading.tables import (
+    COUNT,
+    NUMBER,
+    TABLE,
+    TABLES,
+    WORD,
+    check_entry,
+    check_table,
+)
+from jaxbeam.case.reading.toml_file import read_toml
 
-_KEYS = ("loads", "columns", "time", "runs")
+_KEYS = {"loads": TABLES, "columns": TABLE, "time": WORD, "runs": TABLE}
 _COLUMN_KEYS = {
-    "unit": (str, "a word"),
-    "sensitivity": (str, 'like "100 mV/g"'),
-    "sensor": (int, "an integer from 0"),
-    "position": ((int, float), "a number in m"),
-    "actuator": (int, "an integer from 0"),
+    "unit": WORD,
+    "sensitivity": WORD._replace(description='like "100 mV/g"'),
+    "sensor": COUNT,
+    "position": NUMBER._replace(description="a number in m"),
+    "actuator": COUNT,
 }
 
 
@@ -67,50 +75,34 @@ def read_description(log: Path) -> LogDescription:
     path = log.with_suffix(".toml")
     if not path.is_file():
         return LogDescription()
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: {error}") from None
+    data = read_toml(path, "description of a log")
     if "beam" in data:  # a case file of the same stem
         return LogDescription()
-    _check_keys(path, "", data, _KEYS)
+    try:
+        return _description(data)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _description(data: dict[str, Any]) -> LogDescription:
+    """Description from the tables of its file."""
+    check_table("", data, _KEYS)
     columns = {}
     for name, entry in data.get("columns", {}).items():
         entry = {"unit": entry} if isinstance(entry, str) else entry
         if not isinstance(entry, dict):
-            raise ValueError(f'{path}, columns.{name}: give a unit, {name} = "mm", or a table')
-        _check_keys(path, f"columns.{name}.", entry, _COLUMN_KEYS)
-        _check_types(path, f"columns.{name}.", entry)
+            raise ValueError(f'columns.{name}: give a unit, {name} = "mm", or a table')
+        check_table(f"columns.{name}", entry, _COLUMN_KEYS)
         columns[name] = entry
-    loads = _loads(path, "", data) if "loads" in data else None
+    loads = _loads("", data) if "loads" in data else None
     runs = {}
     for name, entry in data.get("runs", {}).items():
-        _check_keys(path, f"runs.{name}.", entry, ("loads",))
-        runs[name] = _loads(path, f"runs.{name}.", entry)
+        check_entry(f"runs.{name}", entry, TABLE)
+        check_table(f"runs.{name}", entry, {"loads": TABLES})
+        runs[name] = _loads(f"runs.{name}.", entry)
     return LogDescription(data.get("time"), columns, loads, runs)
 
 
-def _check_keys(path, prefix, data, known) -> None:
-    for key in data:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-            raise ValueError(f"{path}: unknown key {prefix}{key}; {hint}")
-
-
-def _check_types(path, prefix, entry) -> None:
-    for key, value in entry.items():
-        kind, description = _COLUMN_KEYS[key]
-        if not isinstance(value, kind) or isinstance(value, bool):
-            raise ValueError(f"{path}, {prefix}{key}: must be {description}, not {value!r}")
-
-
-def _loads(path, prefix, table) -> tuple[AbstractLoad, ...]:
+def _loads(prefix: str, table: dict[str, Any]) -> tuple[AbstractLoad, ...]:
     """Loads from their tables, as in a case file."""
-    try:
-        return tuple(
-            read_part(f"{prefix}loads.{i}", entry, AbstractLoad)
-            for i, entry in enumerate(table.get("loads", ()))
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    return read_parts(f"{prefix}loads", table.get("loads", []), AbstractLoad)

@@ -1,7 +1,7 @@
 """Lower bound on the peak deflection: the least peak over all commands within the limits.
 
-For given loads the deflection is affine in the held commands u_k (`input_influence`), and its least
-peak p is the optimum of a linear program,
+For given loads and a given profile the deflection is affine in the held commands u_k
+(`input_influence`), and its least peak p is the optimum of a linear program,
 
     minimise p   subject to   |w_0(x, t) + sum_k g_k(x, t) u_k| <= p,
                               u_min <= u_k <= u_max,   |u_k - u_(k-1)| <= rate * period,
@@ -165,8 +165,6 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
         raise ValueError(f"period {period:g} s is longer than the run, {case.run.duration:g} s")
     if not case.loads:
         raise ValueError("a bound needs loads, and the case has none; add one")
-    if case.profile is not None:
-        raise ValueError("a bound is that on a level surface: leave the profile out")
     influence = input_influence(case, positions, period, spacing)
     if not np.any(influence.unforced @ influence.deflection_rows.T):
         raise ValueError("no load deflects the beam at these positions during the run")

@@ -113,9 +113,10 @@ def input_influence(
     step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
     schedule = controller_schedule(times, hold_times, 0.0, [], [], np.zeros(0))
     substeps = steps_per_interval(np.diff(times).max(), step)
-    # Runs with hold -1 (the unforced one) or a hold after the end (padding) have no command.
-    hold_index = np.append(-1, np.repeat(np.arange(count), actuators))
-    actuator_index = np.append(0, np.tile(np.arange(actuators), count))
+    # Runs with hold -1 (the unforced one) or a hold after the end (padding) have no command; those
+    # of a first one after the end are disturbed by the profile alone, as all with a command are.
+    hold_index = np.append([-1, count], np.repeat(np.arange(count), actuators))
+    actuator_index = np.append([0, 0], np.tile(np.arange(actuators), count))
     batch_size = min(MAX_BATCH_SIZE, hold_index.size)
     padding = -hold_index.size % batch_size
     hold_index, actuator_index = (
@@ -133,7 +134,9 @@ def input_influence(
         ],
         axis=-1,
     )
-    response = coordinates[..., 1 : count * actuators + 1]
+    response = coordinates[..., 2 : count * actuators + 2]
+    if case.profile is not None:
+        response = response - coordinates[..., 1:2]
     return InputInfluence(
         _deflection_rows(uncontrolled_case, shapes, positions),
         hold_times,

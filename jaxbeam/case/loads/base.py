@@ -45,9 +45,9 @@ class AbstractLoad(eqx.Module):
         start = self.speed, self.entry_time, self.deceleration, length, self.start_position
         return BrakingTrajectory(*start)
 
-    def force_history(self) -> ForceHistory | None:
-        """Force of its one wheel over time in addition to the static load, or None."""
-        return None
+    def force_histories(self) -> dict[int, ForceHistory]:
+        """Forces over time of its wheels in addition to the static loads, by index of the wheel."""
+        return {}
 
     def total_mass(self, gravity: Float[Array, ""]) -> Float[Array, ""] | None:
         """Mass (kg) whose weight its wheels carry; None for a force that is no weight."""

@@ -64,8 +64,8 @@ class VaryingForce(AbstractVehicleLoad):
     def vehicle(self, gravity):
         return plain_wheels(self.force, xp.zeros(()))
 
-    def force_history(self):
+    def force_histories(self):
         phases = xp.zeros_like(self.frequencies) if self.phases is None else self.phases
         none = np.zeros(0)
         table = (none, none) if self.forces is None else (self.force_times, self.forces)
-        return ForceHistory(self.frequencies, self.amplitudes, phases, *table)
+        return {0: ForceHistory(self.frequencies, self.amplitudes, phases, *table)}

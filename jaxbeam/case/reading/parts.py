@@ -9,6 +9,8 @@ from jaxbeam.case.aliases import current_keys, current_kind
 from jaxbeam.case.declared_checks import check_field, describe_value, missing_error, suggestion
 from jaxbeam.case.fields import describe_shape, fits_shape
 from jaxbeam.case.kinds import kinds
+from jaxbeam.case.quantities import OF_QUANTITY, QUANTITIES
+from jaxbeam.case.reading.units import in_si
 
 
 def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
@@ -34,7 +36,8 @@ def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
         elif "parts" in fields[key].metadata:
             values[key] = read_parts(f"{address}.{key}", value, fields[key].metadata["parts"])
         else:
-            _check_type(f"{address}.{key}", value, fields[key])
+            values[key] = _in_si(f"{address}.{key}", value, _unit(fields[key], values))
+            _check_type(f"{address}.{key}", values[key], fields[key])
     for name, field in fields.items():
         if field.default is dataclasses.MISSING and name not in values:
             raise missing_error(f"{address}.{name}", field)
@@ -62,6 +65,21 @@ def _class_of_kind(address: str, kind: Any, family: type) -> type:
         hint = suggestion(str(kind), classes)
         raise ValueError(f"{address}.kind cannot be {describe_value(kind)}; {hint}")
     return classes[kind]
+
+
+def _in_si(address: str, value: Any, unit: str) -> Any:
+    """An entry with its quantities in SI units; words and counts stay."""
+    return in_si(value, unit, address) if unit and isinstance(value, str | list) else value
+
+
+def _unit(field: dataclasses.Field, values: dict[str, Any]) -> str:
+    """SI unit of an entry of a table, "" for a word or a count."""
+    unit = field.metadata.get("unit", "")
+    if unit == OF_QUANTITY:
+        quantity = values.get("quantity", "deflection")
+        known = isinstance(quantity, str) and quantity in QUANTITIES
+        return QUANTITIES[quantity].unit if known else unit
+    return unit
 
 
 def _check_type(address: str, value: Any, field: dataclasses.Field) -> None:

@@ -68,7 +68,7 @@ class AbstractCrossingRegulator(AbstractRegulator):
 
     @abc.abstractmethod
     def gain_table(self, plant: Plant) -> GainTable:
-        """Gains over the crossing for a plant; weights of loads fed forward are its last states."""
+        """Gains over the crossing for a plant: of its states, and of the weights fed forward."""
 
     def validate(self, case):
         if not case.loads:
@@ -83,15 +83,19 @@ class AbstractCrossingRegulator(AbstractRegulator):
     def gain_schedule(self, plant: Plant, design_plant: Plant) -> GainSchedule:
         """Schedule designed for one plant, for the times of entry and exit of the other."""
         table, shares = self.gain_table(design_plant), self.feedback_shares
-        load_weights = design_plant.weights if self.load_feedforward else xp.zeros(0)
+        vehicle_states = self.vehicle_states(design_plant)
+        load_weights = xp.zeros(0)
+        if self.load_feedforward:
+            load_weights = design_plant.augmented_start[design_plant.vehicle_states :]
         last_gain = table(xp.ones(()))
         if self.after == "time-invariant":
             last_gain = self.time_invariant_gain(design_plant)
         states = shares.shape[0]
-        final_gain = xp.zeros((last_gain.shape[0], states + load_weights.shape[0]))
+        further = vehicle_states + load_weights.shape[0]
+        final_gain = xp.zeros((last_gain.shape[0], states + further))
         if self.after != "none":
             final_gain = set_at(final_gain, np.s_[:, :states], last_gain[:, :states])
-        shares = xp.concatenate([shares, xp.ones_like(load_weights)])
+        shares = xp.concatenate([shares, xp.ones(further)])
         events = crossing_events(design_plant if self.entries == "predicted" else plant)
         return GainSchedule(
             GainTable(table.breakpoints, table.coefficients * shares),
@@ -101,7 +105,12 @@ class AbstractCrossingRegulator(AbstractRegulator):
             events[-1],
             self.fade_time,
             self.load_feedforward,
+            vehicle_states,
         )
+
+    def vehicle_states(self, plant: Plant) -> int:
+        """Number of states of vehicles that are fed back, after those of the beam."""
+        return plant.vehicle_states
 
     def events(self, case: Case) -> Float[np.ndarray, " event"]:
         """Times (s) of entry and exit between which the table runs, ascending."""
@@ -153,11 +162,19 @@ class AbstractFiniteHorizonRegulator(AbstractCrossingRegulator):
 
 
 class StepLQR(AbstractCrossingRegulator):
-    """Regulator of the plant frozen at each time, eqs (3.10) and (3.11) of the thesis."""
+    """Regulator of the plant frozen at each time, eqs (3.10) and (3.11) of the thesis.
+
+    Vehicles are static wheel loads and the masses of wheels in its design.
+    """
 
     kind: ClassVar[str] = "lqr-step"
 
+    def vehicle_states(self, plant):
+        return 0
+
     def gain_table(self, plant):
+        plant = plant.on_static_loads()
+
         def system_at(t):
             return plant.A(t), plant.B(t)
 
@@ -169,7 +186,10 @@ class StepLQR(AbstractCrossingRegulator):
 
 
 class FiniteLQR(AbstractFiniteHorizonRegulator):
-    """Optimal regulator over the crossing, eqs (3.3) to (3.9) of the thesis."""
+    """Optimal regulator over the crossing, eqs (3.3) to (3.9) of the thesis.
+
+    States of vehicles, about static equilibrium, are fed back too, with no weight of their own.
+    """
 
     kind: ClassVar[str] = "lqr-finite"
 
@@ -178,7 +198,8 @@ class AugmentedLQR(AbstractFiniteHorizonRegulator):
     """Optimal regulator over the crossing with known weights of the loads, eq. (5.8) of the thesis.
 
     The weights of all loads are constant states of the plant: the command responds to loads on the
-    beam, and, as their entry times are known or predicted, to later ones.
+    beam, and, as their entry times are known or predicted, to later ones. With a profile or forces
+    that vary in time, which are known too, a further constant state is 1.
     """
 
     kind: ClassVar[str] = "lqr-augmented"
@@ -191,19 +212,24 @@ class AugmentedLQR(AbstractFiniteHorizonRegulator):
 def finite_horizon_gains(
     regulator: AbstractFiniteHorizonRegulator, plant: Plant
 ) -> tuple[GainTable, Float[Array, "breakpoint state state"]]:
-    """Table of optimal gains for a plant, and P at its breakpoints, load states included."""
+    """Table of optimal gains for a plant, and P at its breakpoints.
+
+    Their states are those of beam and vehicles and, if the weights are fed forward, constants; see
+    `Plant.augmented`.
+    """
     Q, R = regulator.weights(plant)
     F = Q if regulator.terminal_weight is None else xp.diag(regulator.terminal_weight)
-    load_count = plant.weights.shape[0] if regulator.load_feedforward else 0
-    Q, F = (xp.pad(weight, (0, load_count)) for weight in (Q, F))
+    with_weights = regulator.load_feedforward
+    further = plant.augmented_start.shape[0] if with_weights else plant.vehicle_states
+    Q, F = (xp.pad(weight, (0, further)) for weight in (Q, F))
     problem = crossing_events(plant), regulator.points, Q, R, F
     if plant.modal_model.state_count == 2 * plant.coordinate_scale.shape[0]:
-        return finite_horizon_coupled(*crossing_plant(plant, load_count > 0), *problem)
+        return finite_horizon_coupled(*crossing_plant(plant, with_weights), *problem)
 
     # The coupled method assumes gains that are polynomials within an interval, which those of an
     # actuator with a lag much shorter than the interval are not.
     def system_at(t):
-        system = plant.augmented(t) if load_count else plant.at(t)
+        system = plant.augmented(t) if with_weights else plant.at(t)
         return system.A, system.B[:, : len(plant.case.actuators)]
 
     return finite_horizon(system_at, *problem)

@@ -14,9 +14,10 @@ from jaxbeam.runtime.arrays import Array, xp
 class GainSchedule(AbstractStateLaw):
     """u = -K(t) x with a table of gains K from `start` to `end` (s), and `final_gain` from then on.
 
-    The final gain decays with a time constant `fade_time` (s), or stays if that is None. With
-    `load_feedforward` x ends with the weights of the loads (N), estimated ones or `load_weights`;
-    else `load_weights` is empty.
+    The final gain decays with a time constant `fade_time` (s), or stays if that is None. After
+    the states of the beam x has the `vehicle_states` and, with `load_feedforward`, the weights of
+    the loads (N), estimated ones or `load_weights`, with 1 for other known disturbances, if there
+    are any; else `load_weights` is empty.
     """
 
     table: GainTable
@@ -26,6 +27,11 @@ class GainSchedule(AbstractStateLaw):
     end: Float[Array, ""]
     fade_time: Float[Array, ""] | None = None
     load_feedforward: bool = eqx.field(static=True, default=False)
+    vehicle_states: int = eqx.field(static=True, default=0)
+
+    @property
+    def needs_vehicles(self):
+        return self.vehicle_states > 0
 
     def gain(self, t: Float[Array, ""]) -> Float[Array, "actuator column"]:
         """Gain at a time (s); zero before the start."""
@@ -39,8 +45,10 @@ class GainSchedule(AbstractStateLaw):
     def step(self, state, estimate, measurement, t):
         load_weights = self.load_weights
         if self.load_feedforward and estimate.weights is not None:
-            load_weights = estimate.weights
-        x = xp.concatenate([estimate.state, load_weights])
+            known = load_weights[estimate.weights.shape[0] :]
+            load_weights = xp.concatenate([estimate.weights, known])
+        vehicles = estimate.vehicles if self.vehicle_states else xp.zeros(0)
+        x = xp.concatenate([estimate.state, vehicles, load_weights])
         return ControlStep(-self.gain(t) @ x, state)
 
 

@@ -9,6 +9,7 @@ actuators, eq. (7.28). The first move is applied; the problem is solved again at
 from typing import ClassVar
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.fields import (
@@ -46,8 +47,10 @@ class MPC(AbstractStateController):
     model does not explain is assumed to persist: this is the incremental form (7.1), which removes
     the steady deflection under constant loads. With loads "known" their weights are fed forward
     along their way, those of later loads included, and only the rest is assumed to persist; a
-    "time-varying" prediction includes their masses too, with new F and Phi at each sample. The
-    delay is part of the prediction.
+    "time-varying" prediction includes their masses too, with new F and Phi at each sample.
+    Vehicles are predicted with their states: with loads "known" or a "time-varying" prediction the
+    forces of their springs, which deflection and profile change, are those to come. The delay is
+    part of the prediction.
 
     Limits and rate limits of each actuator are kept; a `soft_limit` on deflections is exceeded
     where that costs less, at `soft_weight` times the square of the excess. With the `terminal` cost
@@ -147,7 +150,9 @@ class MPC(AbstractStateController):
         states = sampled.A.shape[0]
         positions = design_plant.case.sensor_positions if self.positions is None else self.positions
         C = deflection_rows(design_plant, positions)
-        C = xp.pad(C, ((0, 0), (0, states - C.shape[1])))  # the delay adds states
+        beam, loaded_plant = C.shape[1], self._loaded_plant(design_plant)
+        C = xp.pad(C, ((0, 0), (0, states - beam)))  # the delay adds states
+        vehicles = 0 if loaded_plant is None else loaded_plant.vehicle_states
         basis = move_basis(self.horizon, self.moves, self.laguerre_pole)
         maps = move_maps(basis, len(actuators))
         weights = output_weights(self.horizon, C.shape[0], self.horizon_weight, self.output_weight)
@@ -156,15 +161,15 @@ class MPC(AbstractStateController):
         return MPCLaw(
             sampled_plant=sampled,
             prediction=predict(repeat_plant(sampled, self.horizon), C, maps, xp.zeros(0)),
-            C=C,
+            C=_with_vehicles(C, beam, vehicles, 1),
             move_maps=maps,
             limits=command_limits(actuators, maps[:limited_periods], self.period),
             output_weights=weights,
             move_weights=xp.broadcast_to(self.move_weight, (len(actuators),)),
             soft_limit=self.soft_limit,
             soft_weight=self.soft_weight,
-            terminal_cost=self._terminal_cost(sampled, C, weights),
-            loaded_plant=self._loaded_plant(design_plant),
+            terminal_cost=self._terminal_cost(sampled, C, weights, vehicles),
+            loaded_plant=loaded_plant,
             period=self.period,
             delay=self.delay,
             known_weights=self.loads == "known",
@@ -172,17 +177,29 @@ class MPC(AbstractStateController):
         )
 
     def _loaded_plant(self, design_plant: Plant) -> Plant | None:
-        """Plant of predictions that vary with time, or None; its loads may be massless."""
+        """Plant of predictions that vary with time, or None; its wheels may be massless."""
         if self.prediction == "time-varying":
             return design_plant
         if self.loads == "ignored":
             return None
         return eqx.tree_at(lambda m: m.loads.wheels.inertia, design_plant, replace_fn=xp.zeros_like)
 
-    def _terminal_cost(self, sampled, C, weights):
-        """P of the terminal cost, of the incremental model under its regulator, or None."""
+    def _terminal_cost(self, sampled, C, weights, vehicles):
+        """P of the terminal cost, of the incremental model under its regulator, or None.
+
+        States of vehicles have no cost of their own.
+        """
         if self.terminal == "none":
             return None
         A, B, output_rows = incremental_model(sampled.A, sampled.B, C)
         Q = output_rows.T @ (weights[-1, :, None] * output_rows)
-        return dare(A, B, Q, xp.diag(xp.broadcast_to(self.move_weight, B.shape[1])))
+        P = dare(A, B, Q, xp.diag(xp.broadcast_to(self.move_weight, B.shape[1])))
+        beam = sampled.A.shape[0] - (0 if self.delay is None else B.shape[1])
+        return _with_vehicles(_with_vehicles(P, beam, vehicles, 0), beam, vehicles, 1)
+
+
+def _with_vehicles(matrix, beam: int, count: int, axis: int):
+    """A matrix with zeros for the states of vehicles after the `beam` ones, along an axis."""
+    before, after = xp.split(matrix, [beam], axis=axis)
+    zeros = xp.zeros_like(xp.take(matrix, np.zeros(count, int), axis=axis))
+    return xp.concatenate([before, zeros, after], axis=axis)

@@ -42,8 +42,9 @@ class MPCLaw(AbstractStateLaw):
 
     `sampled_plant` and `prediction` are those of the unloaded plant; with a `loaded_plant` both are
     computed at each sample from that plant frozen in the middle of each period, without the weights
-    of the loads if not `known_weights`. `output_weights` are those of squared deflections in each
-    period, `move_weights` those of squared moves.
+    of the loads if not `known_weights`. The states are those of the beam, then those of the
+    vehicles of the loaded plant, and with a delay the last commands. `output_weights` are those of
+    squared deflections in each period, `move_weights` those of squared moves.
     """
 
     sampled_plant: SampledPlant
@@ -62,11 +63,22 @@ class MPCLaw(AbstractStateLaw):
     known_weights: bool = eqx.field(static=True)
     solver: str = eqx.field(static=True)
 
+    @property
+    def vehicle_states(self) -> int:
+        """Number of states of vehicles in the prediction."""
+        return 0 if self.loaded_plant is None else self.loaded_plant.vehicle_states
+
+    @property
+    def needs_vehicles(self):
+        return self.vehicle_states > 0
+
     def initial_state(self):
-        return xp.zeros(self.sampled_plant.A.shape[0])
+        return xp.zeros(self.C.shape[1])
 
     def step(self, state, estimate, measurement, t):
         previous_state, previous_command, state = state, measurement.command, estimate.state
+        if self.vehicle_states:
+            state = xp.concatenate([state, estimate.vehicles])
         if self.delay is not None:
             state = xp.concatenate([state, previous_command])
         past_plant, prediction, weights = self._predict(t, estimate)
@@ -78,19 +90,25 @@ class MPCLaw(AbstractStateLaw):
         return ControlStep(previous_command + xp.where(solved, move, 0.0), state, solved)
 
     def _predict(self, t, estimate):
-        """Plant over the last period, prediction from t (s), and the weights of the loads in it."""
+        """Plant over the last period, prediction from t (s), and the known inputs in it.
+
+        These are the weights of the loads, and one for other known disturbances.
+        """
         if self.loaded_plant is None:
             return self.sampled_plant, self.prediction, xp.zeros(0)
-        plant, weights = self.loaded_plant, self.loaded_plant.weights
+        plant = self.loaded_plant
+        states = plant.modal_model.state_count + plant.vehicle_states
+        weights = plant.augmented_start[plant.vehicle_states :]
         if not self.known_weights:
             weights = xp.zeros_like(weights)
         elif estimate.weights is not None:
-            weights = estimate.weights
+            known = weights[estimate.weights.shape[0] :]
+            weights = xp.concatenate([estimate.weights, known])
 
         def sample(time):
-            system, actuators = plant.at(time), self.move_weights.shape[0]
-            B, B_f = xp.split(system.B, [actuators], axis=1)
-            return sampled_plant(system.A, B, B_f, self.period, self.delay)
+            system = plant.augmented(time)
+            A, known_inputs = system.A[:states, :states], system.A[:states, states:]
+            return sampled_plant(A, system.B[:states], known_inputs, self.period, self.delay)
 
         horizon = self.move_maps.shape[0]
         midpoints = t + (xp.arange(-1, horizon) + 0.5) * self.period

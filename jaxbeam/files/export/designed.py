@@ -24,9 +24,11 @@ from jaxbeam.estimation.observer import Observer
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.files.export.gains import Gains
 from jaxbeam.model.linear_system import StateSpace
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.sensor_signals import sensor_sections
 from jaxbeam.model.state_space import state_space
+from jaxbeam.model.vehicles.vehicle_states import vehicle_signals
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 
@@ -75,7 +77,7 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
     columns, commands = design.system.states, design.system.inputs
     extra_columns = design.table.shape[-1] - len(columns)
     if extra_columns and varies:
-        columns += tuple((f"load_{i}", "N") for i in range(extra_columns))
+        columns += _further_columns(case)[:extra_columns]
     elif extra_columns:
         columns += tuple((f"last_{name}", unit) for name, unit in commands)
     decay_time = getattr(law, "fade_time", None)
@@ -95,6 +97,17 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
         estimator=np.asarray(design.estimator),
         reading_count=len(case.sensors) if design.estimator.size else 0,
     )
+
+
+def _further_columns(case: Case) -> tuple:
+    """Names and units of what a regulator over the crossing feeds back or forward too, in turn.
+
+    States of vehicles, weights of the wheels, and 1 for other known disturbances.
+    """
+    loads = load_set(case)
+    weights = tuple((f"load_{i}", "N") for i in range(loads.wheel_count))
+    vehicles = () if isinstance(case.controller, ScheduledLQR) else vehicle_signals(loads)
+    return (*vehicles, *weights, ("known_disturbance", "1"))
 
 
 def _digital_filters(case: Case) -> np.ndarray:

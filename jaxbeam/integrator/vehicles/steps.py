@@ -132,19 +132,6 @@ class Vehicles(eqx.Module):
         return forces, xp.concatenate([next_vehicle_states(*t, surface) for t in triples])
 
 
-def initial_vehicle_states(loads: LoadSet) -> Float[Array, "state batch"] | None:
-    """States of all vehicles at rest in static equilibrium at t = 0; None without any."""
-    wheels = loads.wheels
-    if not wheels.vehicles:
-        return None
-    surface = xp.zeros_like(wheels.stiffness)
-    motion = loads.surface_motion(*loads.kinematics(xp.zeros(())))
-    if motion is not None:
-        surface = surface + wheels.stiffness * motion[0][:, None]
-    states = [group.initial_state(surface[group.wheels]) for group in wheels.vehicles]
-    return xp.concatenate([part.reshape(-1, part.shape[-1]) for part in states])
-
-
 def solve_rows(
     matrix: Float[Array, "row row batch"], right: Float[Array, "row batch"]
 ) -> Float[Array, "row batch"]:

@@ -30,6 +30,7 @@ from jaxbeam.model.static_correction import (
     residual_flexibility,
     residual_port_flexibility,
 )
+from jaxbeam.model.theory.statics import SectionFlexibility
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, set_at, solve, xp
 from jaxbeam.runtime.module import Module
@@ -61,7 +62,7 @@ class LoadInfluence(Module):
     nodes: Float[Array, " node"]
     series: Float[Array, "segment degree output"]
     length: Float[Array, ""]
-    greens: tuple[Flexibility, ...]
+    greens: tuple[Flexibility | SectionFlexibility, ...]
     factors: tuple[Float[Array, " _"], ...]
     outputs: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     count: int = eqx.field(static=True)

@@ -28,15 +28,15 @@ from jaxbeam.model.static_correction import (
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.module import Module
 
-# Positions x (m) and orders of derivation to the shapes (order, *position, mode), as
-# `ModalModel.shapes` and `Modes.shape_derivatives`.
-Shapes = Callable[..., Float[Array, "order *position mode"]]
+# Positions x (m) and orders of fields to their rows (order, *position, mode), as
+# `ModalModel.fields` and `Modes.fields`.
+Fields = Callable[..., Float[Array, "order *position mode"]]
 
 SIDE_SHARE = 1e-12  # of the length: distance from a position to a section beside it
 
 
 def modal_row(
-    shapes: Shapes, case: Case, x, name: str, fibre_distance=None, section_modulus=None
+    fields: Fields, case: Case, x, name: str, fibre_distance=None, section_modulus=None
 ) -> Float[Array, "*position mode"]:
     """Rows that take d^n q / dt^n to a quantity at positions x (m), static correction excluded.
 
@@ -45,7 +45,7 @@ def modal_row(
     """
     parameters = fibre_distance, section_modulus
     quantity = quantity_of(name, *parameters)
-    row = shapes(x, (quantity.x_derivative,))[0]
+    row = fields(x, (quantity.field,))[0]
     return quantity_factor(case, x, quantity, *parameters)[..., None] * row
 
 
@@ -88,11 +88,12 @@ class OutputRows(Module):
     def of_system(
         self, model: ModalModel, A: Float[Array, "state state"], B: Float[Array, "state input"]
     ) -> tuple[Float[Array, "output state"], Float[Array, "output input"]]:
-        """C and D of y = C z + D u where z' = A z + B u; the states are those of the model.
+        """C and D of y = C z + D u where z' = A z + B u; the first states are those of the model.
 
         Commands are the first of the inputs.
         """
         C, _ = self.on_states(model)
+        C = xp.pad(C, ((0, 0), (0, A.shape[1] - C.shape[1])))
         D = xp.zeros((C.shape[0], B.shape[1]))
         D = set_at(D, np.s_[:, : self.on_commands.shape[1]], self.on_commands)
         rates = model.rate_index
@@ -115,7 +116,7 @@ def sensor_rows(model: ModalModel, case: Case, sensors: Sequence[Sensor]) -> Out
     rows, on_commands = [], []
     for sensor, quantity in zip(sensors, quantities, strict=True):
         x, parameters = sensor.position, (sensor.fibre_distance, sensor.section_modulus)
-        rows.append(modal_row(model.shapes, case, x, sensor.quantity, *parameters))
+        rows.append(modal_row(model.fields, case, x, sensor.quantity, *parameters))
         active = active_moments(case, x)
         if quantity.has_active_moment:
             modulus = sensor.section_modulus if quantity.over_modulus else 1.0
@@ -155,7 +156,7 @@ def quantity_history(
     parameters = fibre_distance, section_modulus
     quantity = quantity_of(name, *parameters)
     if not quantity.bends:
-        rows = modal_row(modes.shape_derivatives, case, x, name, *parameters)
+        rows = modal_row(modes.fields, case, x, name, *parameters)
         amplitudes = (motion.coordinates, motion.rates, motion.accelerations)
         return xp.tensordot(amplitudes[quantity.time_derivative], rows, axes=[1, -1])
     x = beside(case, x)

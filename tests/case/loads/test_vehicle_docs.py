@@ -18,7 +18,8 @@ def test_loads_of_the_page_are_valid():
     case = case_from_dict({"beam": BEAM, **tomllib.loads(KINDS)})
     check_case(case)
     assert {load.kind for load in case.loads} == {
-        "oscillator", "quarter-car", "half-car", "wagon", "axles", "varying-force", "vehicle"
+        "oscillator", "quarter-car", "half-car", "wagon", "axles", "varying-force", "pedestrian",
+        "crowd", "vehicle"
     }  # fmt: skip
 
 

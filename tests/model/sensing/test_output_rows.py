@@ -42,7 +42,7 @@ def test_rows_are_x_derivatives_of_the_deflection(name):
     expected = -FIBRE * expected if quantity.at_fibre else expected
     expected = 11.68 * expected if quantity.section_force else expected
     expected = expected / MODULUS if quantity.over_modulus else expected
-    found = modal_row(model.shapes, CASE, 0.45, name, FIBRE, MODULUS)
+    found = modal_row(model.fields, CASE, 0.45, name, FIBRE, MODULUS)
     assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
 
 

@@ -155,7 +155,7 @@ def test_latin_hypercube_of_load_cases(tmp_path):
     assert tuning.read_load_cases(file).training == rows
     for text, message in {
         'draws = 0\n"a" = [1.0, 2.0]': "the number of draws must be 1 or more",
-        'draws = 2.5\n"a" = [1.0, 2.0]': "draws and seed are integers",
+        'draws = 2.5\n"a" = [1.0, 2.0]': "training.draws must be a whole number",
         'seed = 2\n"a" = [1.0, 2.0]': "training.seed is for drawing",
         'draws = 2\n"a" = [1.0, 2.0, 3.0]': "must be a range, low and high",
         'draws = 2\n"a" = [2.0, 1.0]': "a range must ascend",

@@ -293,7 +293,7 @@ def test_load_cases_from_a_file(tmp_path):
         with pytest.raises(ValueError, match=message) as caught:
             tuning.read_load_cases(file)
         assert str(file) in str(caught.value)
-    with pytest.raises(FileNotFoundError, match="cannot read the load cases"):
+    with pytest.raises(FileNotFoundError, match="cannot read the file of load cases"):
         tuning.read_load_cases(tmp_path / "none.toml")
 
 

@@ -91,7 +91,7 @@ def test_case_file_with_the_name_of_the_log(tmp_path):
     [
         ("colums = 1", "unknown key colums; did you mean 'columns'"),
         ("[columns]\nd1 = {units = 'mm'}", "unknown key columns.d1.units; did you mean 'unit'"),
-        ("[columns]\nd1 = {sensor = 0.5}", "columns.d1.sensor: must be an integer"),
+        ("[columns]\nd1 = {sensor = 0.5}", "columns.d1.sensor must be a whole number"),
         ("[columns]\nd1 = 3", "columns.d1: give a unit"),
         ("[columns]\nd3 = 'mm'", "no column 'd3'; did you mean 'd1'|no column 'd3'"),
         ("[[loads]]\nkind = 'mass'\nmas = 1", "loads.0 has no key 'mas'; .*'mass'"),

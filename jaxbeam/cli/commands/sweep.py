@@ -13,7 +13,14 @@ from jaxbeam.cli.arguments import (
     parse_sweep_values,
     refuse_option,
 )
-from jaxbeam.cli.options import CaseOptions, Output, Over, PrintOptions, table
+from jaxbeam.cli.options import (
+    CaseOptions,
+    Output,
+    Over,
+    PrintOptions,
+    print_plausibility,
+    table,
+)
 
 
 def sweep(
@@ -66,6 +73,7 @@ def sweep(
     if not resume:
         options.check_outputs(output, picture)
     parsed_case = options.read(case)
+    plausibility = _print_plausibility(parsed_case, values, options)
 
     from jaxbeam.sweeps.cluster import connect
 
@@ -85,16 +93,36 @@ def sweep(
         from jaxbeam.plot import plot_sweep
 
         plot_sweep(results).savefig(picture)
+    values = {address: results[address].to_numpy().tolist() for address in values}  # in SI units
     peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
     del peaks["peak_time"]
     numbers = {name: found.to_numpy() for name, found in peaks.items()}
     dimensions = results["peak_time"].dims
     options.report(
-        {"values": values, "dimensions": dimensions, **numbers},
+        {
+            "values": values,
+            "dimensions": dimensions,
+            **numbers,
+            "plausibility": plausibility,
+        },
         _lines(parsed_case, peaks, results["failed"], values),
         output,
         picture,
     )
+
+
+def _print_plausibility(case: "jb.Case", values, options: CaseOptions) -> dict:
+    """Plausibility of the first run in a line, with warnings of the first and the last one."""
+    from jaxbeam.files.case_file import with_settings
+
+    try:
+        first, last = (
+            with_settings(case, {address: found[end] for address, found in values.items()})
+            for end in (0, -1)
+        )
+    except ValueError:
+        return {}  # the sweep says what is wrong, of all values
+    return print_plausibility(first, options, last)
 
 
 def _lines(case: "jb.Case", peaks, failed, values) -> list[str]:

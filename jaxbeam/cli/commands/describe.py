@@ -1,4 +1,4 @@
-"""Command about vehicles: `describe`."""
+"""Command about cases and vehicles: `describe`."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.cli.arguments import check_suffix
-from jaxbeam.cli.options import OutputOptions, PrintOptions, table
+from jaxbeam.cli.options import OutputOptions, PrintOptions, numbers_of, print_message, table
 
 if TYPE_CHECKING:
     from jaxbeam.case.loads.base import AbstractLoad
@@ -18,7 +18,7 @@ GRAVITY = 9.81  # m/s^2, of vehicles without a case
 def describe(
     source: str = "", /, *, plot: Path | None = None, options: OutputOptions = OutputOptions()
 ) -> None:
-    """Describe vehicles: static wheel loads, masses, and natural frequencies on a rigid road.
+    """Describe vehicles, static wheel loads and frequencies, and cases in numbers.
 
     Parameters
     ----------
@@ -45,7 +45,8 @@ def describe(
         vehicle = load_vehicle(Path(source))
         title = vehicle.title or Path(source).stem
         results = [_result(title, vehicle.source, vehicle.model, GRAVITY)]
-    lines: list[str] = []
+    is_case = is_file and ("beam" in content or "loads" in content)
+    about, lines = _about_case(source) if is_case else ({}, [])
     for result in results:
         lines += [*([""] if lines else []), *_lines(result)]
     drawn = plot if results else None
@@ -54,7 +55,39 @@ def describe(
 
         titles = [result["title"] for result in results]
         plot_vehicles(_loads(source, content), titles).savefig(drawn)
-    options.report({"vehicles": results}, lines or ["the case has no loads"], drawn)
+    options.report({"vehicles": results} | about, lines, drawn)
+
+
+def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
+    """What a case is, in numbers by their names in JSON and in words."""
+    import jaxbeam as jb
+
+    case = jb.load_case(path)
+    found, frequencies = jb.check(case), jb.modes(case).frequencies
+    for warning in found.warnings:
+        print_message(f"warning: {warning}")
+    beam = case.beam
+    held = f"{beam.ends}, {len(case.supports)} supports between" if case.supports else beam.ends
+    lines = [
+        case.title or Path(path).stem,
+        f"beam of {float(beam.length):.6g} m, {held}: E I = {float(beam.bending_stiffness):.6g}"
+        f" N m^2, {float(beam.linear_density):.6g} kg/m",
+        f"natural frequencies (Hz): {', '.join(f'{one:.5g}' for one in frequencies)}",
+    ]
+    if found.own_deflection is not None:
+        lines.append(f"static deflection under its own weight: {found.own_deflection:.4g} m")
+    if found.deflection:
+        lines.append(
+            f"largest static deflection under the loads: {found.deflection:.4g} m, 1/"
+            f"{found.span_over_deflection:.4g} of the span of {found.span:.4g} m"
+        )
+    if found.critical_speed is not None:
+        lines.append(f"critical speed: {found.critical_speed:.4g} m/s")
+    lines.append(f"plausibility: {found}")
+    if not case.loads:
+        lines.append("the case has no loads")
+    numbers = numbers_of(found) | {"frequencies_hz": frequencies}
+    return {"case": numbers}, lines
 
 
 def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":

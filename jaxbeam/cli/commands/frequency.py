@@ -7,6 +7,7 @@ from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import (
+    TABLE_SUFFIXES,
     check_suffix,
     figure_path,
     frequency_grid,
@@ -16,24 +17,46 @@ from jaxbeam.cli.arguments import (
 from jaxbeam.cli.options import CaseOptions, Output, table
 
 
-def modes(case: Path, /, *, plot: bool = False, options: CaseOptions = CaseOptions()) -> None:
+def modes(
+    case: Path,
+    /,
+    *,
+    output: Output = None,
+    plot: bool = False,
+    options: CaseOptions = CaseOptions(),
+) -> None:
     """Compute natural frequencies and damping ratios.
 
     Parameters
     ----------
     case
         Case file, TOML.
+    output
+        Write the table to this file: OUT.csv, .xlsx, .mat or .parquet.
     plot
         Draw the mode shapes to CASE_modes.png in this folder.
     """
+    check_suffix(output, TABLE_SUFFIXES[0], "a table of modes", TABLE_SUFFIXES[1:])
     picture = figure_path(None, case.with_stem(f"{case.stem}_modes")) if plot else None
-    options.check_outputs(picture)
+    options.check_outputs(output, picture)
     parsed_case = options.read(case)
     found = jb.modes(parsed_case)
     if picture:
         from jaxbeam.plot import plot_modes
 
         plot_modes(parsed_case, found).savefig(picture)
+    if output:
+        import numpy as np
+
+        from jaxbeam.files.tables import write_table
+
+        heads = ("mode", "frequency (Hz)", "damping ratio")
+        numbers = (
+            np.arange(1.0, 1 + len(found.frequencies)),
+            found.frequencies,
+            found.damping_ratios,
+        )
+        write_table(output, dict(zip(heads, numbers, strict=True)), options.overwrite)
     rows = zip(found.frequencies, found.damping_ratios, strict=True)
     options.report(
         {"frequencies_hz": found.frequencies, "damping_ratios": found.damping_ratios},
@@ -44,6 +67,7 @@ def modes(case: Path, /, *, plot: bool = False, options: CaseOptions = CaseOptio
                 for i, (frequency, ratio) in enumerate(rows, 1)
             ],
         ),
+        output,
         picture,
     )
 

@@ -5,8 +5,8 @@ import warnings
 from pathlib import Path
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import check_suffix, figure_path
-from jaxbeam.cli.options import CaseOptions, Output, table
+from jaxbeam.cli.arguments import TABLE_SUFFIXES, check_suffix, figure_path
+from jaxbeam.cli.options import CaseOptions, Output, print_plausibility, table
 
 MAX_WHEELS = 8  # of a load, or bodies, with a row each
 
@@ -27,17 +27,19 @@ def simulate(
     case
         Case file, TOML.
     output
-        Write the record to this netCDF file, OUT.nc.
+        Write the record to this netCDF file, OUT.nc, or what sensors measure, contact forces and
+        commands to a table: OUT.csv, .xlsx, .mat or .parquet.
     plot
         Draw the record to a PNG beside the output, or named after the case.
     animate
         Write an animation of the run to this file, OUT.gif.
     """
-    check_suffix(output, ".nc", "a record")
+    check_suffix(output, ".nc", "a record", TABLE_SUFFIXES)
     check_suffix(animate, ".gif", "an animation")
     picture = figure_path(output, case) if plot else None
     options.check_outputs(output, picture, animate)
     parsed_case = options.read(case)
+    plausibility = print_plausibility(parsed_case, options)
 
     from jaxbeam.simulation.simulate import ContactLossWarning
 
@@ -45,7 +47,7 @@ def simulate(
         warnings.simplefilter("ignore", ContactLossWarning)  # the verdict tells it
         record = jb.simulate(parsed_case)
     if output:
-        record.to_netcdf(output, options.overwrite)
+        record.save(output, options.overwrite)
     if picture:
         from jaxbeam.plot import plot_record
 
@@ -54,7 +56,8 @@ def simulate(
         from jaxbeam.plot import animate as write_animation
 
         write_animation(record, animate, overwrite=options.overwrite)
-    options.report(_to_dict(record), _lines(record), output, picture, animate)
+    content = _to_dict(record) | {"plausibility": plausibility}
+    options.report(content, _lines(record), output, picture, animate)
 
 
 def _to_dict(record: "jb.Record") -> dict:

@@ -1,0 +1,1 @@
+"""Parts of a beam: segments of stepped and tapered beams, hinges."""

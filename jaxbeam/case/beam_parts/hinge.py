@@ -1,0 +1,20 @@
+"""Hinge inside a beam."""
+
+import equinox as eqx
+from jaxtyping import Float
+
+from jaxbeam.case.fields import NOT_NEGATIVE, ON_BEAM, number
+from jaxbeam.runtime.arrays import Array
+
+
+class Hinge(eqx.Module):
+    """Hinge between the ends of a beam: no bending moment, or that of a rotational spring.
+
+    The deflection is continuous, the rotation jumps. A moment M = k (phi_right - phi_left) is that
+    of a semi-rigid joint of `rotational_stiffness` k.
+    """
+
+    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
+    rotational_stiffness: Float[Array, ""] = number(
+        "N m/rad", "spring between both sides", NOT_NEGATIVE, default=0.0
+    )

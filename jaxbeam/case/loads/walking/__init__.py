@@ -1,0 +1,1 @@
+"""People on the beam: the forces of their steps, pedestrians, crowds."""

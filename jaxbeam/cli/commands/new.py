@@ -1,0 +1,33 @@
+"""Command `new`: a commented case to start from."""
+
+from importlib import resources
+from pathlib import Path
+
+from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.cli.arguments import refuse_option
+from jaxbeam.cli.options import Output, OutputOptions
+
+KINDS = ("footbridge", "road-bridge", "railway-bridge", "laboratory-rig")
+
+
+def new(kind: str, /, *, output: Output = None, options: OutputOptions = OutputOptions()) -> None:
+    """Write a commented case to start from, which runs as it is.
+
+    Parameters
+    ----------
+    kind
+        footbridge, road-bridge, railway-bridge or laboratory-rig.
+    output
+        Write it to this file; KIND.toml in this folder if left out.
+    """
+    refuse_option(
+        kind not in KINDS,
+        f"there is no case of kind {kind!r} to start from: {', '.join(KINDS)}",
+    )
+    path = output or Path(f"{kind}.toml")
+    options.check_outputs(path)
+    starter = resources.files("jaxbeam") / "files" / "starters" / f"{kind}.toml"
+    path.write_text(starter.read_text(encoding="utf-8"), encoding="utf-8")
+    title = read_toml(path)["title"]
+    lines = [f"written: {path}", f"{title}; run it: jaxbeam simulate {path} --plot"]
+    options.report({"path": str(path), "title": title}, lines)

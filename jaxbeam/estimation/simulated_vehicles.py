@@ -1,0 +1,112 @@
+"""States of vehicles, simulated beside a filter that does not estimate them.
+
+The vehicles, their trajectories and the profile are known; they are driven by the estimated motion
+of the beam, so that no sensor in a vehicle is needed.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.estimator import AbstractContinuousFilter, AbstractSampledFilter, Estimate
+from jaxbeam.estimation.sampled_plant import SampleTiming
+from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import Array, xp
+
+
+class VehicleMemory(NamedTuple):
+    """State of the filter, and state of beam and vehicles and the command at the last sample."""
+
+    filter_state: Any
+    state: Float[Array, " all"]
+    command: Float[Array, " actuator"]
+
+
+class SampledWithVehicles(AbstractSampledFilter):
+    """A sampled filter with the states of the vehicles of a plant.
+
+    From sample to sample they are those of the coupled plant that starts from the estimated state
+    of the beam, by `SampleTiming.transition`.
+    """
+
+    filter: AbstractSampledFilter
+    plant: Plant
+    timing: SampleTiming
+
+    def initial_state(self):
+        commands = xp.zeros(len(self.plant.case.actuators))
+        beam = xp.zeros(self.plant.modal_model.state_count)
+        vehicles = self.plant.augmented_start[: self.plant.vehicle_states]
+        state = xp.concatenate([beam, vehicles])
+        return VehicleMemory(self.filter.initial_state(), state, commands)
+
+    def update(self, state: VehicleMemory, measurement, t):
+        plant = self.plant
+        estimate, filter_state = self.filter.update(state.filter_state, measurement, t)
+        beam, constants = plant.modal_model.state_count, _constants(plant, estimate)
+
+        def matrices_at(time):
+            system = plant.augmented(time)
+            return system.A, system.B
+
+        x = xp.concatenate([state.state, constants])
+        size = x.shape[0]
+        transition = self.timing.transition(matrices_at, np.zeros((size, size)), xp.ones(size), t)
+        predicted = transition.predict(x, state.command, measurement.command)
+        vehicles = predicted[beam : beam + plant.vehicle_states]
+        # A run starts at rest: there is no period before it.
+        vehicles = xp.where(t > 0, vehicles, state.state[beam:])
+        estimate = dataclasses.replace(estimate, vehicles=vehicles)
+        present = xp.concatenate([estimate.state, vehicles])
+        return estimate, VehicleMemory(filter_state, present, measurement.command)
+
+
+class ContinuousWithVehicles(AbstractContinuousFilter):
+    """A filter in continuous time with the states of the vehicles of a plant.
+
+    They are integrated, as differences from those at the start, after the states of the filter.
+    """
+
+    filter: AbstractContinuousFilter
+    plant: Plant
+
+    @property
+    def state_count(self):
+        return self.filter.state_count + self.plant.vehicle_states
+
+    def estimate(self, state, measurement, t):
+        own = self.filter.state_count
+        estimate = self.filter.estimate(state[:own], measurement, t)
+        vehicles = self.plant.augmented_start[: self.plant.vehicle_states] + state[own:]
+        return dataclasses.replace(estimate, vehicles=vehicles)
+
+    def rates(self, state, measurement, command, t):
+        estimate, own = self.estimate(state, measurement, t), self.filter.state_count
+        system, beam = self.plant.augmented(t), self.plant.modal_model.state_count
+        x = xp.concatenate([estimate.state, estimate.vehicles, _constants(self.plant, estimate)])
+        rates = system.A @ x + system.B @ command
+        of_filter = self.filter.rates(state[:own], measurement, command, t)
+        return xp.concatenate([of_filter, rates[beam : beam + self.plant.vehicle_states]])
+
+
+def _constants(plant: Plant, estimate: Estimate):
+    """Constant states of the augmented plant, with estimated weights where there are any."""
+    constants = plant.augmented_start[plant.vehicle_states :]
+    if estimate.weights is None:
+        return constants
+    return xp.concatenate([estimate.weights, constants[estimate.weights.shape[0] :]])
+
+
+def with_loads(plant: Plant, state, added, t, with_weights: bool) -> Estimate:
+    """Estimate of a plant from the states that `Plant.augmented` adds, at t (s).
+
+    It has the weights only `with_weights`; they are zero for wheels off the beam.
+    """
+    count = plant.vehicle_states
+    vehicles = added[:count] if count else None
+    if not with_weights:
+        return Estimate(state, vehicles=vehicles)
+    weights = added[count : count + plant.weights.shape[0]]
+    return Estimate(state, xp.where(plant.loads.on_beam(t), weights, 0.0), vehicles)

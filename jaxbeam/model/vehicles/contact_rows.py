@@ -1,0 +1,104 @@
+"""Contact law of the wheels as rows on the states of beam and vehicles, for systems in matrices.
+
+With x the states of the modal model and then those of the vehicles, in the order of the integrator,
+the law of `contact` is
+
+    (1 + m S S') r = -W - V x - m S q_u'',     q = Y x,     z' = A z + B q  (`vehicle_system`),
+
+for contact forces r (upwards on the beam), the mode shapes S at the wheels, the modal accelerations
+q_u'' of the commands, and the forces q = k y + c y' that the beam exerts on springs of vehicles.
+The profile and forces that vary in time add to W and q what `known_disturbance` returns.
+"""
+
+import equinox as eqx
+from jaxtyping import Float
+
+from jaxbeam.model.contact import surface_rows
+from jaxbeam.model.load_set import LoadSet
+from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.runtime.arrays import Array, block_diag, set_at, xp
+
+
+class ContactRows(eqx.Module):
+    """S, m (kg; zero off the beam), V and Y at some times; see the module. Y has no vehicle part.
+
+    Without vehicles Y is None.
+    """
+
+    shape: Float[Array, "*time wheel mode"]
+    mass: Float[Array, "*time wheel"]
+    force: Float[Array, "*time wheel all"]
+    surface: Float[Array, "*time wheel state"] | None
+
+
+def contact_rows(model: ModalModel, loads: LoadSet, times: Float[Array, "*time"]) -> ContactRows:
+    """Contact law at times (s); at those of entry and exit, that just after."""
+    kinematics = (*loads.kinematics(times), loads.on_beam(times))
+    position, speed, acceleration, active = (xp.moveaxis(part, 0, -1) for part in kinematics)
+    wheels, springs = loads.wheels, bool(loads.wheels.vehicles)
+    rows = surface_rows(model, position, speed, acceleration, active, springs)
+    sizes = {"shape": model.mode_count, "state": model.state_count}
+    shape = rows.shape.reshape(*position.shape, sizes["shape"])
+    of_acceleration = rows.acceleration.reshape(*position.shape, sizes["state"])
+    mass = xp.where(active, loads.inertia[:, 0], 0.0)
+    force = mass[..., None] * of_acceleration
+    if not springs:
+        return ContactRows(shape, mass, force, None)
+    surface = wheels.stiffness * rows.deflection.reshape(force.shape)
+    surface = surface + wheels.damping * rows.velocity.reshape(force.shape)
+    of_vehicles = xp.where(active[..., None], vehicle_system(loads)[2], 0.0)
+    return ContactRows(
+        shape, mass, xp.concatenate([force + surface, -of_vehicles], axis=-1), surface
+    )
+
+
+def vehicle_system(
+    loads: LoadSet,
+) -> tuple[
+    Float[Array, "vehicle_state vehicle_state"],
+    Float[Array, "vehicle_state wheel"],
+    Float[Array, "wheel vehicle_state"],
+]:
+    """A, B and H of all vehicles as one system, z' = A z + B q, pressing with q - H z; one run."""
+    states, wheels = loads.vehicle_states, loads.wheel_count
+    blocks, B, H, first = [], xp.zeros((states, wheels)), xp.zeros((wheels, states)), 0
+    for group in loads.wheels.vehicles:
+        size, count = group.A.shape[0], group.wheels_per_vehicle
+        for i in range(group.count):
+            wheel = group.first_wheel + i * count
+            own, under = slice(first, first + size), slice(wheel, wheel + count)
+            blocks.append(group.A[..., 0])
+            B, H = (
+                set_at(B, (own, under), group.B[..., 0]),
+                set_at(H, (under, own), group.H[..., 0]),
+            )
+            first += size
+    return (block_diag(*blocks) if blocks else xp.zeros((0, 0))), B, H
+
+
+def has_known_disturbance(loads: LoadSet) -> bool:
+    """Whether anything but the static loads disturbs the beam: a profile, forces over time."""
+    return loads.profile is not None or bool(loads.wheels.histories)
+
+
+def known_disturbance(
+    loads: LoadSet, times: Float[Array, "*time"]
+) -> tuple[Float[Array, "*time wheel"], Float[Array, "*time wheel"]]:
+    """What profile and forces over time add to the weights W and to the forces q (N).
+
+    Before the start of a run vehicles stand where they are at t = 0.
+    """
+    weight = (loads.varying_weight(times) - loads.weight)[..., 0]
+    if loads.profile is None:
+        return weight, xp.zeros_like(weight)
+    moves = xp.asarray(times) >= 0
+    position, speed, acceleration = loads.kinematics(xp.maximum(times, 0.0))
+    speed, acceleration = (xp.where(moves, part, 0.0) for part in (speed, acceleration))
+    motion = loads.surface_motion(position, speed, acceleration)
+    assert motion is not None
+    height, rate, curvature = (xp.moveaxis(part, 0, -1) for part in motion)
+    weight = weight + loads.inertia[:, 0] * curvature
+    if not loads.wheels.vehicles:
+        return weight, xp.zeros_like(weight)
+    surface = loads.wheels.stiffness[:, 0] * height + loads.wheels.damping[:, 0] * rate
+    return weight + surface, surface

@@ -1,0 +1,187 @@
+"""Lock of a file or folder that one process writes: a file beside it says which, and since when.
+
+A lock outlives the crash of its process and is then taken over: on the same machine when no process
+of that number and start time is left, from other machines when its last sign of life (the time of
+the file, set by a thread) is older than MAX_SILENCE. Times are those of the file system, so that
+clocks of the machines may differ.
+"""
+
+import contextlib
+import datetime
+import json
+import os
+import platform
+import threading
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from jaxbeam.runtime.cache_folder import temporary_file
+
+SIGN_OF_LIFE = 10.0  # s, between two signs of life
+MAX_SILENCE = 120.0  # s, after which a process of another machine counts as gone
+
+
+class InUseError(OSError):
+    """Error that says which process writes a file, and what to do."""
+
+
+@contextlib.contextmanager
+def writer_lock(path: Path) -> Iterator[None]:
+    """Hold the lock of a path, which need not exist, in a file `.NAME.lock` beside it.
+
+    Raises InUseError if another process (or thread) holds it, OSError if the folder cannot be
+    written to.
+    """
+    lock = lock_file(path)
+    content = json.dumps(_this_process()).encode()
+    while not _acquire(path, lock, content):
+        time.sleep(0.01)
+    ended = threading.Event()
+    thread = threading.Thread(target=_give_signs_of_life, args=(lock, ended), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        with contextlib.suppress(FileNotFoundError):
+            if lock.read_bytes() == content:
+                lock.unlink()
+
+
+def lock_file(path: Path) -> Path:
+    """Path of the lock of a path."""
+    return path.with_name(f".{path.name}.lock")
+
+
+def _acquire(path: Path, lock: Path, content: bytes) -> bool:
+    """Take a lock that is free, or whose process is gone; False if another does so just now."""
+    with temporary_file(path.parent, content) as own:
+        os.chmod(own, 0o644)  # others may read who holds it
+        if _link(own, lock, content):
+            return True
+        held, silence = _content_and_silence(lock, os.stat(own).st_mtime)
+        if held is None:  # released in between
+            return False
+        if _holder_lives(held, silence):
+            raise InUseError(_description(path, lock, held, silence))
+        return _take_over(own, lock, content, held)
+
+
+def _take_over(own: str, lock: Path, content: bytes, held: bytes) -> bool:
+    """Take the lock of a process that is gone; False if another process does so just now.
+
+    One process at a time may: that which has the file `.takeover`.
+    """
+    takeover = lock.with_name(f"{lock.name}.takeover")
+    if not _link(own, takeover, content):
+        other, silence = _content_and_silence(takeover, os.stat(own).st_mtime)
+        if other is not None and not _holder_lives(other, silence):
+            takeover.unlink(missing_ok=True)
+        return False
+    try:
+        if _content_and_silence(lock, 0.0)[0] != held:
+            return False
+        os.replace(own, lock)
+        return True
+    finally:
+        takeover.unlink(missing_ok=True)
+
+
+def _link(own: str, target: Path, content: bytes) -> bool:
+    """Give a file a second name; False if there is a file of this name."""
+    try:
+        os.link(own, target)  # one step on network file systems too, content included
+    except FileExistsError:
+        return False
+    except OSError:  # a file system without links
+        try:
+            with open(target, "xb") as file:
+                file.write(content)
+        except FileExistsError:
+            return False
+    return True
+
+
+def _content_and_silence(lock: Path, now: float) -> tuple[bytes | None, float]:
+    """Content of a lock (None without one), and the time since its last sign of life, in s."""
+    try:
+        return lock.read_bytes(), now - lock.stat().st_mtime
+    except FileNotFoundError:
+        return None, 0.0
+
+
+def _holder(held: bytes) -> dict[str, Any]:
+    """What a lock says of its process; empty if it is damaged."""
+    try:
+        content = json.loads(held)
+        return content if isinstance(content, dict) else {}
+    except ValueError:
+        return {}
+
+
+def _holder_lives(held: bytes, silence: float) -> bool:
+    """Whether the process that holds a lock lives, as far as can be known from here."""
+    holder = _holder(held)
+    machine = _machine()
+    if machine is not None and holder.get("machine") == machine:
+        start = _start_time(holder.get("process", 0))
+        return start is not None and start == holder.get("start")
+    return silence < MAX_SILENCE
+
+
+def _give_signs_of_life(lock: Path, ended: threading.Event) -> None:
+    """Set the time of a lock until the end."""
+    while not ended.wait(SIGN_OF_LIFE):
+        with contextlib.suppress(OSError):
+            os.utime(lock)
+
+
+def _this_process() -> dict[str, Any]:
+    """What tells this holding of a lock from all others."""
+    return {
+        "host": platform.node(),
+        "process": os.getpid(),
+        "since": datetime.datetime.now().astimezone().isoformat(" ", "seconds"),
+        "machine": _machine(),
+        "start": _start_time(os.getpid()),
+        "token": uuid.uuid4().hex,
+    }
+
+
+def _machine() -> str | None:
+    """What tells apart machines, their starts, and containers; None if process times are unknown.
+
+    Host names do not: two machines may share one.
+    """
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return None
+
+
+def _start_time(process: int) -> int | None:
+    """Start time of a running process of this machine, in clock ticks; None if it has ended."""
+    try:
+        # The name of the program, in parentheses, may contain anything.
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return None if fields[0] in "ZX" else int(fields[19])
+
+
+def _description(path: Path, lock: Path, held: bytes, silence: float) -> str:
+    """Who holds a lock, and what to do."""
+    holder = _holder(held)
+    who = "another process"
+    if holder:
+        who = f"process {holder.get('process')} on {holder.get('host')} since {holder.get('since')}"
+    return (
+        f"{path} is being written by {who} (last sign of life {max(silence, 0):.0f} s ago): wait"
+        " until it ends, stop it, or choose another name; if it was killed on another machine,"
+        f" its lock {lock} ends {MAX_SILENCE:.0f} s after the last sign of life"
+    )

@@ -1,0 +1,302 @@
+"""Frequencies of beams that are not uniform: references, closed forms, shooting, derivatives."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case.case import replace, value_at
+from jaxbeam.model.layout import find_layout
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.theory.buckling import critical_axial_force
+from tests.differences import central
+from tests.modules import ROOT
+from tests.oracles.shooting import ShootingBeam
+
+REFERENCES = {
+    case["case"]: case
+    for case in json.loads((ROOT / "tests" / "data" / "beams.json").read_text())["cases"]
+}
+UNIT = {"length": 1.0, "flexural_rigidity": 1.0, "mass_per_length": 1.0}
+ENDS = {
+    "ss": "pinned-pinned",
+    "clamped_free": "clamped-free",
+    "clamped(thick)-free": "clamped-free",
+}
+STEPPED = [jb.Segment(0.5, 1.0, 1.0), jb.Segment(0.5, 0.4, 0.7)]
+TAPERED = [jb.Segment(None, [1.0, -1.5, 0.75, -0.125], [1.0, -0.5])]
+FIXED = [jb.Segment(None, 1.0, 1.0)]
+
+# A beam of everything at once.
+EVERYTHING = jb.Case(
+    jb.Beam(
+        length=10.0,
+        modes=4,
+        ends="clamped-pinned",
+        shear_stiffness=3e3,
+        rotary_inertia=0.3,
+        foundation_stiffness=2.0,
+        axial_force=-3.0,
+        segments=[
+            jb.Segment(4.0, [1e3, -300.0], [10.0, -2.0]),
+            jb.Segment(None, [700.0, 100.0], 8.0, shear_stiffness=[2e3, 100.0]),
+        ],
+        hinges=[jb.Hinge(6.0, 200.0)],
+    ),
+    supports=[jb.Support(7.5, stiffness=300.0, mass=2.0)],
+)
+NUMBERS = [
+    "beam.length", "beam.shear_stiffness", "beam.rotary_inertia", "beam.foundation_stiffness",
+    "beam.axial_force", "beam.segments.0.length", "beam.segments.0.flexural_rigidity.1",
+    "beam.segments.0.mass_per_length.1", "beam.segments.1.shear_stiffness.0",
+    "beam.hinges.0.position", "beam.hinges.0.rotational_stiffness", "supports.0.mass",
+]  # fmt: skip
+
+
+def frequencies(supports=(), **beam) -> np.ndarray:
+    return np.asarray(jb.modes(jb.Case(jb.Beam(**beam), supports)).angular_frequencies)
+
+
+@pytest.mark.parametrize("ends", ["ss", "clamped-clamped", "clamped-free", "clamped-pinned"])
+def test_timoshenko_reference(ends):
+    reference = REFERENCES["6a-timoshenko-frequencies-hL0.1"]
+    found = frequencies(
+        **UNIT,
+        modes=5,
+        ends=ENDS.get(ends, ends),
+        shear_stiffness=5 / 6 / 2.6 * 1200,
+        rotary_inertia=0.01 / 12,
+    )
+    assert_allclose(np.sqrt(found), reference["outputs"]["lambda_"][ends], rtol=5e-10)
+
+
+@pytest.mark.parametrize(
+    ("name", "segments", "tolerance"),
+    [
+        ("6c-stepped-frequencies", STEPPED, 1e-9),
+        ("6c-tapered-frequencies-0.5", TAPERED, 1e-8),
+        ("6d-winkler", FIXED, 5e-9),
+    ],
+)
+def test_reference(name, segments, tolerance):
+    """To the nine digits that the references have."""
+    foundation = 500.0 if name == "6d-winkler" else None
+    for ends, expected in REFERENCES[name]["outputs"]["omega"].items():
+        if ends == "rule":
+            continue
+        found = frequencies(
+            length=1.0,
+            modes=4,
+            ends=ENDS.get(ends, ends),
+            segments=segments,
+            foundation_stiffness=foundation,
+        )
+        assert_allclose(found, expected, rtol=tolerance, err_msg=ends)
+
+
+def test_taper_by_height():
+    """Of a rectangular section, the depth alone gives stiffness and mass."""
+    by_height = frequencies(
+        length=1.0, modes=4, width=1.0, youngs_modulus=12.0, density=1.0,
+        segments=[jb.Segment(height=[1.0, -0.5])],
+    )  # fmt: skip
+    assert_allclose(by_height, frequencies(length=1.0, modes=4, segments=TAPERED), rtol=1e-12)
+
+
+@pytest.mark.parametrize("force", [-9.8, -5.0, 40.0, 4000.0])
+def test_axial_force(force):
+    """Closed form of two pins: omega^2 = (n pi)^4 + T (n pi)^2."""
+    k = np.arange(1, 6) * np.pi
+    found = frequencies(**UNIT, modes=5, axial_force=force)
+    assert_allclose(found, np.sqrt(k**4 + force * k**2), rtol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("ends", "critical"),
+    [
+        ("pinned-pinned", np.pi**2),
+        ("clamped-clamped", 4 * np.pi**2),
+        ("clamped-free", np.pi**2 / 4),
+        ("clamped-pinned", 4.493409457909064**2),  # tan k = k
+    ],
+)
+def test_buckling(ends, critical):
+    """Euler's loads are refused, and named; shy of them the first frequency is nearly zero."""
+    assert frequencies(**UNIT, ends=ends, axial_force=-critical * (1 - 1e-9))[0] < 1e-2
+    with pytest.raises(ValueError, match=rf"beam.axial_force is .* buckles at -{critical:.6g} N"):
+        frequencies(**UNIT, ends=ends, axial_force=-critical * (1 + 1e-9))
+    with pytest.raises(ValueError, match="any compression"):
+        frequencies(**UNIT, ends="free-free", axial_force=-1.0)
+
+
+def test_rotary_inertia_alone():
+    """Rayleigh's beam on two pins: omega^2 (1 + r k^2) = k^4."""
+    k = np.arange(1, 5) * np.pi
+    found = frequencies(**UNIT, modes=4, rotary_inertia=0.01)
+    assert_allclose(found, k**2 / np.sqrt(1 + 0.01 * k**2), rtol=1e-12)
+
+
+def test_stiff_shear_is_euler_bernoulli():
+    for ends in ("pinned-pinned", "clamped-free"):
+        thin, stiff = (
+            frequencies(**UNIT, ends=ends, modes=5, shear_stiffness=shear) for shear in (None, 1e14)
+        )
+        assert_allclose(stiff, thin, rtol=1e-11)
+
+
+def test_bearing_mass():
+    """A mass on a spring at the free end of a clamped beam: Rayleigh's equation of the tip."""
+    spring, mass = 20.0, 0.7
+    found = frequencies(
+        [jb.Support(1.0, stiffness=spring, mass=mass)], **UNIT, ends="clamped-free", modes=4
+    )
+    k = np.sqrt(found)
+    stiffness = (1 + np.cosh(k) * np.cos(k)) * k**3
+    tip = np.cosh(k) * np.sin(k) - np.sinh(k) * np.cos(k)
+    residual = (stiffness + (spring - mass * k**4) * tip) / (k**3 * np.cosh(k))
+    assert_allclose(residual, 0, atol=1e-9)
+
+
+def test_hinge_of_two_cantilevers():
+    """Clamped at both ends, hinged midway: symmetric modes are those of cantilevers of half length.
+
+    Antisymmetric ones have a zero deflection at the hinge: clamped and pinned.
+    """
+    found = frequencies(**UNIT, ends="clamped-clamped", modes=4, hinges=[jb.Hinge(0.5)])
+    cantilever = np.array([1.875104068711961, 4.694091132974175])
+    propped = np.array([3.926602312047919, 7.068582745628732])
+    expected = np.sort(np.concatenate([cantilever, propped])) ** 2 / 0.25
+    assert_allclose(found, expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("ends", ["clamped-pinned", "free-guided", "clamped-free"])
+def test_shooting(ends):
+    """Taper, shear, rotary inertia, foundation and tension at once, with a step."""
+    segments = [
+        jb.Segment(0.8, [3.0, -1.0], [2.0, -0.5], shear_stiffness=[90.0, -30.0]),
+        jb.Segment(None, [1.5, 0.5, 0.5], 1.1, shear_stiffness=40.0, rotary_inertia=[0.01, 0.01]),
+    ]
+    found = frequencies(
+        length=1.5,
+        ends=ends,
+        modes=4,
+        segments=segments,
+        shear_stiffness=1.0,
+        rotary_inertia=0.02,
+        foundation_stiffness=7.0,
+        axial_force=2.0,
+    )
+
+    def piecewise(first, second):
+        return lambda x: first(x / 0.8) if x < 0.8 else second((x - 0.8) / 0.7)
+
+    beam = ShootingBeam(
+        1.5,
+        piecewise(lambda s: 3 - s, lambda s: 1.5 + 0.5 * s + 0.5 * s**2),
+        piecewise(lambda s: 2 - 0.5 * s, lambda s: 1.1),
+        piecewise(lambda s: 1 / (90 - 30 * s), lambda s: 1 / 40),
+        piecewise(lambda s: 0.02, lambda s: 0.01 + 0.01 * s),
+        foundation=7.0,
+        axial=2.0,
+        ends=ends,
+        breaks=[0.8],
+    )
+    assert_allclose(found, [beam.frequency_near(omega) for omega in found], rtol=1e-9)
+
+
+def test_steep_taper():
+    """A depth that falls to a tenth, against shooting."""
+    taper = [1.0, -2.7, 2.43, -0.729]  # (1 - 0.9 s)^3
+    found = frequencies(
+        length=1.0, modes=5, ends="clamped-free", segments=[jb.Segment(None, taper, [1.0, -0.9])]
+    )
+    beam = ShootingBeam(
+        1.0, lambda x: (1 - 0.9 * x) ** 3, lambda x: 1 - 0.9 * x, ends="clamped-free"
+    )
+    assert_allclose(found, [beam.frequency_near(omega) for omega in found], rtol=1e-9)
+
+
+def test_derivatives_of_frequencies_and_fields():
+    layout, x = mesh_layout(EVERYTHING), 3.3
+    scales = np.array([float(value_at(EVERYTHING, name)) for name in NUMBERS])
+
+    def results(relative):
+        case = replace(EVERYTHING, dict(zip(NUMBERS, scales * (1 + relative), strict=True)))
+        modes = jb.modes(case, layout)
+        fields = modes.fields(x + 0 * relative[0], (0, 1, 2, 3))
+        return jnp.concatenate([modes.frequencies, fields.reshape(-1)])
+
+    expected = central(results, np.zeros(len(NUMBERS)), 1e-3)
+    scale = np.abs(expected).max(axis=1, keepdims=True)
+    found = jax.jit(jax.jacrev(results))(jnp.zeros(len(NUMBERS)))
+    assert_allclose(found / scale, expected / scale, rtol=1e-6, atol=1e-8)
+
+
+def test_derivatives_without_rotary_inertia():
+    """Shear without rotary inertia has massless functions, whose derivatives stay finite."""
+    case = jb.Case(jb.Beam(**UNIT, modes=3, shear_stiffness=50.0))
+    layout = mesh_layout(case)
+
+    def results(relative):
+        return jb.modes(
+            replace(case, {"beam.shear_stiffness": 50 * (1 + relative[0])}), layout
+        ).frequencies
+
+    found = jax.jit(jax.jacrev(results))(jnp.zeros(1))
+    assert_allclose(found, central(results, np.zeros(1), 1e-2), rtol=1e-7)
+
+
+def bad_beams():
+    yield {**UNIT, "hinges": [jb.Hinge(0.0)]}, "hinges.0 is at an end"
+    yield {**UNIT, "hinges": [jb.Hinge(0.5), jb.Hinge(0.5)]}, "hinges.1 is at the position"
+    yield {**UNIT, "hinges": [jb.Hinge(1.5)]}, "hinges.0.position must lie on the beam"
+    yield {**UNIT, "shear_stiffness": 0.0}, "shear_stiffness must be positive"
+    yield {"length": 1.0, "segments": [jb.Segment(0.4, 1.0, 1.0)]}, "add up to 0.4 m"
+    yield {"length": 1.0, "segments": [jb.Segment(None, 1.0)]}, "mass_per_length is missing"
+    yield {"length": 1.0, "segments": [jb.Segment(None, [1.0, -1.0], 1.0)]}, "must be positive all"
+    yield {"length": 1.0, "segments": [*FIXED, *FIXED]}, "segments.0.length is missing"
+    yield (
+        {"length": 1.0, "segments": [jb.Segment(1.0, 1.0, 1.0), *FIXED]},
+        "leave nothing of beam.length",
+    )
+    yield (
+        {"length": 1.0, "segments": [jb.Segment(0.5, 1.0, 1.0, shear_stiffness=9.0), *FIXED]},
+        r"segments.1.shear_stiffness is missing",
+    )
+
+
+@pytest.mark.parametrize(("beam", "message"), list(bad_beams()))
+def test_bad_beams(beam, message):
+    with pytest.raises(ValueError, match=message):
+        jb.simulate(jb.Case(jb.Beam(**beam)))
+
+
+def test_bad_loads_and_bearings():
+    mass = jb.MovingMass(mass=1.0, speed=1.0)
+    with pytest.raises(ValueError, match="infinite force where the slope of the beam jumps, at"):
+        jb.simulate(jb.Case(jb.Beam(**UNIT, hinges=[jb.Hinge(0.5)]), loads=[mass]))
+    with pytest.raises(ValueError, match="supports.0.mass would have no effect"):
+        jb.simulate(jb.Case(jb.Beam(**UNIT), supports=[jb.Support(0.5, mass=1.0)]))
+
+
+def test_both_branches_of_timoshenko():
+    """Two pins: a omega^4 - (1 + k^2 (r + 1 / kGA)) omega^2 + k^4 = 0, and pure shear at k = 0."""
+    shear, rotary = 384.615384615, 0.01 / 12
+    k = np.arange(1, 30) * np.pi
+    a, b = rotary / shear, 1 + k**2 * (rotary + 1 / shear)
+    root = np.sqrt(b**2 - 4 * a * k**4)
+    squares = np.concatenate([(b - root) / (2 * a), (b + root) / (2 * a), [shear / rotary]])
+    found = frequencies(**UNIT, modes=24, shear_stiffness=shear, rotary_inertia=rotary)
+    assert_allclose(found, np.sqrt(np.sort(squares))[:24], rtol=1e-10)
+
+
+@pytest.mark.parametrize("shear", [5.0, 50.0])
+def test_buckling_with_shear(shear):
+    """Engesser's load: P_E / (1 + P_E / kGA)."""
+    critical = np.pi**2 / (1 + np.pi**2 / shear)
+    case = jb.Case(jb.Beam(**UNIT, shear_stiffness=shear, axial_force=-1.0))
+    assert_allclose(critical_axial_force(case, find_layout(case)), -critical, rtol=1e-10)

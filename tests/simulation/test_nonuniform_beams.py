@@ -1,0 +1,260 @@
+"""Runs of beams that are not uniform: references, finite elements, equilibrium, statics, sweeps."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case.beam_parts.properties import rigidity
+from jaxbeam.case.case import replace
+from jaxbeam.case.loads.oscillator import Oscillator
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.statics import static_deflection_per_command
+from jaxbeam.simulation.corrected_deflection import corrected_deflection
+from tests.differences import central
+from tests.modules import ROOT
+from tests.oracles.section_elements import crossing, modes
+from tests.oracles.shooting import ShootingBeam
+
+REFERENCES = {
+    case["case"]: case["outputs"]
+    for case in json.loads((ROOT / "tests" / "data" / "beams.json").read_text())["cases"]
+}
+UNIT = {"length": 1.0, "flexural_rigidity": 1.0, "mass_per_length": 1.0}
+CUBE = [1.0, -1.5, 0.75, -0.125]  # (1 - s / 2)^3
+TAPERED = [jb.Segment(None, CUBE, [1.0, -0.5])]
+
+
+def smallest(beam: jb.Beam, speed: float) -> tuple[float, float]:
+    """Smallest statically corrected deflection midway under a unit force, and its time over T."""
+    case = jb.Case(beam, loads=[jb.MovingForce(force=1.0, speed=speed)], run=jb.Run(1 / speed))
+    shares = np.linspace(0, 1, 4001)
+    record = jb.simulate(case, times=shares / speed)
+    deflection = corrected_deflection(record, 0.5)
+    i = np.argmin(deflection)
+    return float(deflection[i]), shares[i]
+
+
+def test_force_on_a_timoshenko_beam():
+    beam = jb.Beam(**UNIT, modes=60, shear_stiffness=96.15384615384615, rotary_inertia=0.01 / 3)
+    expected = REFERENCES["6b-moving-force-timoshenko-hL0.2-a0.3"]
+    assert_allclose(smallest(beam, 0.3 * np.pi)[0], expected["w_min"], rtol=3e-6)
+    static = jb.influence_line(jb.Case(beam), 0.5, 0.5)
+    assert_allclose(static, expected["static_mid"], rtol=3e-8)  # to the digits of the reference
+
+
+def test_force_on_a_tapered_beam():
+    expected = REFERENCES["6c-moving-force-tapered"]
+    found, share = smallest(jb.Beam(length=1.0, modes=12, segments=TAPERED), 0.5)
+    assert_allclose(found, expected["w_min"], rtol=8e-6)  # accuracy of the reference
+    assert_allclose(share, expected["t"] * 0.5, atol=2e-4)
+
+
+@pytest.mark.parametrize("foundation", [100, 1000])
+@pytest.mark.parametrize("ratio", ["0.3", "0.6"])
+def test_force_on_a_foundation(foundation, ratio):
+    expected = REFERENCES["6d-winkler"]["moving"][f"kf{foundation}_v{ratio}pi"]
+    beam = jb.Beam(**UNIT, modes=40, foundation_stiffness=foundation)
+    found, share = smallest(beam, float(ratio) * np.pi)
+    assert_allclose(found, expected["w_min"], rtol=3e-6)
+    assert_allclose(share, expected["t_over_T"], atol=2e-4)
+
+
+def complete_beam(**others) -> jb.Beam:
+    """Tapered Timoshenko beam on a foundation, in tension."""
+    segments = [jb.Segment(None, CUBE, [1.0, -0.5], shear_stiffness=[90.0, -45.0])]
+    return jb.Beam(
+        length=1.0,
+        modes=8,
+        shear_stiffness=90.0,
+        rotary_inertia=0.003,
+        foundation_stiffness=40.0,
+        axial_force=3.0,
+        segments=segments,
+        **others,
+    )
+
+
+COMPLETE = ShootingBeam(
+    1.0,
+    lambda x: (1 - x / 2) ** 3,
+    lambda x: 1 - x / 2,
+    lambda x: 1 / (90 - 45 * x),
+    lambda x: 0.003,
+    foundation=40.0,
+    axial=3.0,
+    ends="clamped-pinned",
+)
+
+
+@pytest.mark.parametrize("mass", [0.0, 0.4])
+def test_load_against_finite_elements(mass):
+    load = jb.MovingMass(mass=mass, speed=0.7) if mass else jb.MovingForce(force=2.0, speed=0.7)
+    gravity = 2.0 / mass if mass else 9.81
+    case = jb.Case(
+        complete_beam(ends="clamped-pinned"), loads=[load], run=jb.Run(1 / 0.7, gravity=gravity)
+    )
+    times = np.linspace(0, 1 / 0.7, 57)
+    record = jb.simulate(case, times=times)
+    coarse, fine = (modes(COMPLETE, 8, elements) for elements in (80, 160))
+    frequencies = (4 * fine[0] - coarse[0]) / 3  # Richardson's extrapolation
+    assert_allclose(record.modes.angular_frequencies, frequencies, rtol=2e-6)
+    first, second = (crossing(*found, times, 0.7, 2.0, mass, 0.5) for found in (coarse, fine))
+    expected = (4 * second - first) / 3
+    found = record.at(0.5, "deflection")
+    assert_allclose(found, expected, rtol=0, atol=5e-6 * np.abs(expected).max())
+
+
+def test_hinge_and_bearing_against_finite_elements():
+    """A force over a hinge with a spring, and over an elastic bearing that has a mass."""
+    case = jb.Case(
+        jb.Beam(**UNIT, modes=6, ends="clamped-pinned", hinges=[jb.Hinge(0.4, 0.5)]),
+        supports=[jb.Support(0.7, stiffness=300.0, mass=0.2)],
+        loads=[jb.MovingForce(force=2.0, speed=0.7)],
+        run=jb.Run(1 / 0.7),
+    )
+    times = np.linspace(0, 1 / 0.7, 57)
+    record = jb.simulate(case, times=times)
+    plain = ShootingBeam(1.0, lambda x: 1.0, lambda x: 1.0, ends="clamped-pinned")
+    frequencies, nodes, shapes = modes(plain, 6, 100, ((70, 300.0, 0.2),), ((40, 0.5),))
+    assert_allclose(record.modes.angular_frequencies, frequencies, rtol=1e-6)
+    fine = [np.interp(0.55, nodes, shape) for shape in shapes.T]
+    assert_allclose(np.abs(record.modes.shapes(0.55)), np.abs(fine), rtol=0, atol=2e-3)
+    # A spline on each side of the hinge.
+    expected = _crossing_with_hinge(frequencies, nodes, shapes, times, 0.7, 2.0, 0.55)
+    found = record.at(0.55, "deflection")
+    assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+    moment = record.bending_moment(0.4)
+    jump = record.at(0.4 + 1e-9, "rotation") - record.at(0.4 - 1e-9, "rotation")
+    # The moment is corrected, the rotation is not: with the correction of the rotation they agree.
+    corrected = corrected_deflection(record, 0.4 + 1e-9, 1) - corrected_deflection(
+        record, 0.4 - 1e-9, 1
+    )
+    assert_allclose(moment, 0.5 * corrected, atol=1e-6 * np.abs(moment).max())
+    assert np.abs(jump).max() > 0.01
+
+
+def _crossing_with_hinge(frequencies, nodes, shapes, times, speed, weight, x):
+    from scipy.integrate import solve_ivp
+    from scipy.interpolate import CubicSpline
+
+    sides = [CubicSpline(nodes[:41], shapes[:41]), CubicSpline(nodes[40:], shapes[40:])]
+
+    def row(place):
+        return sides[int(place > 0.4)](place)
+
+    def rate(t, state):
+        force = -weight * row(min(speed * t, 1.0))
+        return np.concatenate([state[6:], -(frequencies**2) * state[:6] + force])
+
+    solution = solve_ivp(
+        rate, (0, times[-1]), np.zeros(12), "DOP853", times, rtol=1e-10, atol=1e-13, max_step=0.01
+    )
+    return row(x) @ solution.y[:6]
+
+
+def test_equilibrium():
+    """Reactions, loads, foundation and inertia add up to zero at every instant."""
+    case = jb.Case(
+        complete_beam(ends="free-pinned"),
+        supports=[jb.Support(0.0, stiffness=200.0, mass=0.3), jb.Support(0.6)],
+        loads=[jb.MovingForce(force=2.0, speed=0.7)],
+        run=jb.Run(1 / 0.7),
+    )
+    times = np.linspace(0, 1 / 0.7, 38)[1:-1]
+    record = jb.simulate(case, times=times)
+    points, weights = np.polynomial.legendre.leggauss(40)
+    total = np.sum(np.asarray(record.reactions), axis=1) - 2.0
+    for left, right in zip(
+        [np.zeros(times.size), np.minimum(0.7 * times, 0.6), np.maximum(0.7 * times, 0.6)],
+        [np.minimum(0.7 * times, 0.6), np.maximum(0.7 * times, 0.6), np.ones(times.size)],
+        strict=True,
+    ):
+        for i in range(times.size):
+            x = left[i] + (points + 1) / 2 * (right[i] - left[i])
+            deflection = np.asarray(corrected_deflection(record, x))[i]
+            acceleration = np.asarray(record.at(x, "acceleration"))[i]
+            load = 40.0 * deflection + (1 - x / 2) * acceleration
+            total[i] -= (right[i] - left[i]) / 2 * np.sum(weights * load)
+    # The reaction on the ground includes the inertia of the bearing.
+    bearing = 0.3 * np.asarray(record.at(0.0, "acceleration"))
+    assert_allclose(total - bearing, 0, atol=1e-8)
+
+
+def test_static_closed_forms():
+    """Shear flexibility adds P x (L - x) / (L kGA); tension that of a beam-column."""
+    force = 7.0
+    shear = jb.Case(jb.Beam(**UNIT, shear_stiffness=25.0))
+    assert_allclose(jb.influence_line(shear, 0.3, 0.3), -((0.3 * 0.7) ** 2) / 3 - 0.21 / 25)
+    tension = jb.Case(jb.Beam(**UNIT, axial_force=force))
+    a = np.sqrt(force)
+    expected = -1 / (4 * force) * (1 - np.tanh(a / 2) / (a / 2))
+    assert_allclose(jb.influence_line(tension, 0.5, 0.5), expected, rtol=1e-11)
+    long = jb.Case(jb.Beam(60.0, 1.0, 1.0, foundation_stiffness=4.0))  # beta = 1 / m
+    found = [float(jb.influence_line(long, 30.0, 30.0, derivative=d)) for d in (0, 2)]
+    assert_allclose(found, [-1 / 8, 1 / 4], rtol=1e-11)  # Hetenyi: P beta / 2 k, P / 4 beta
+
+
+def test_influence_lines_are_reciprocal_and_derive():
+    """Fields of order 0, 1, 2 by differences; the moment is E I phi' of a stepped beam."""
+    beam = complete_beam(ends="clamped-pinned")
+    case, y, step = jb.Case(beam, [jb.Support(0.7)]), np.array([0.2, 0.85]), 1e-4
+    line = jb.influence_line(case, y, y)
+    assert_allclose(line, np.transpose(line), rtol=1e-11)
+
+    def at(x, order):
+        return np.asarray(jb.influence_line(case, x, y, derivative=order))
+
+    slope = (at(0.4 + step, 1) - at(0.4 - step, 1)) / (2 * step)
+    assert_allclose(slope, at(0.4, 2), rtol=1e-7)
+
+    def moment(x):
+        return float(rigidity(beam, beam.segments[0], np.array(x))) * at(x, 2)
+
+    shear = (moment(0.4 + step) - moment(0.4 - step)) / (2 * step)
+    expected = float(rigidity(beam, beam.segments[0], np.array(0.4))) * at(0.4, 3)
+    assert_allclose(shear, expected, rtol=1e-7)
+
+
+def test_gradient_of_a_peak_and_sweep():
+    case = jb.Case(
+        complete_beam(ends="clamped-pinned"),
+        sensors=[jb.Sensor(0.5)],
+        loads=[jb.MovingMass(mass=0.4, speed=0.7)],
+        run=jb.Run(1 / 0.7),
+    )
+    names = ["beam.axial_force", "beam.foundation_stiffness", "beam.rotary_inertia"]
+    start, layout, times = np.array([3.0, 40.0, 0.003]), mesh_layout(case), np.linspace(0, 1, 9)
+
+    def deflections(relative):
+        changed = replace(case, dict(zip(names, start * (1 + relative), strict=True)))
+        return jnp.asarray(jb.simulate(changed, times=times).deflection)[-1]
+
+    assert layout.parts
+    found = jax.jacfwd(deflections)(jnp.zeros(3))
+    assert_allclose(found, central(deflections, np.zeros(3), 1e-3), rtol=1e-5)
+    swept = jb.sweep(case, {"beam.axial_force": [-3.0, 3.0], "beam.shear_stiffness": [90.0]})
+    single = float(jb.simulate(case).peak_deflection[0])
+    assert_allclose(swept.peak_deflection.values[1, 0, 0], single, rtol=1e-6)
+
+
+def test_patch_and_oscillator_on_a_hinged_timoshenko_beam():
+    """A patch turns sections: its static effect is that of two couples, by reciprocity."""
+    patch = jb.Patch(start=0.2, end=0.35, moment_per_volt=2.0)
+    case = jb.Case(
+        jb.Beam(**UNIT, modes=30, shear_stiffness=30.0, ends="clamped-pinned"),
+        actuators=[patch],
+        loads=[Oscillator(mass=0.3, stiffness=40.0, damping=0.1, speed=0.7)],
+        run=jb.Run(1 / 0.7),
+    )
+    rotation = [float(jb.influence_line(case, x, 0.6, derivative=1)) for x in (0.2, 0.35)]
+    found = static_deflection_per_command(case, 0.6)
+    assert_allclose(found, [-2.0 * (rotation[0] - rotation[1])], rtol=1e-11)
+    modal = jb.modes(case).fields(0.2, (1,))[0] - jb.modes(case).fields(0.35, (1,))[0]
+    steady = 2.0 * np.sum(modal * jb.modes(case).shapes(0.6) / jb.modes(case).stiffness)
+    assert_allclose(found[0], steady, atol=2e-3 * np.abs(rotation[0]))  # of 30 modes
+    assert np.all(np.isfinite(jb.simulate(case).deflection))
