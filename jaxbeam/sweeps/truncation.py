@@ -24,7 +24,7 @@ from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
 LEFT_OUT = 2  # highest modes whose dynamic part estimates that of all modes beyond
-SAMPLES = 2000  # of the run from which errors of corrected quantities are estimated
+SAMPLES = 400  # of the run from which errors of corrected quantities are estimated
 ESTIMATE_TOLERANCE = 1e-3  # of that run
 
 
